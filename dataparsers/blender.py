@@ -1,0 +1,137 @@
+"""NeRF-Synthetic and D-NeRF scenes: transforms_{train,val,test}.json written by Blender, RGBA images.
+
+Mildenhall et al. 2020; with `time` in each frame, Pumarola et al. 2021 (D-NeRF).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from framework import Cameras, DataError, DataParser, ParsedScene
+from framework.cameras import check_pose
+from framework.dataset import Split, existing, image_size
+
+
+@dataclass(frozen=True)
+class Blender(DataParser):
+    """Flags of the blender format."""
+
+    downscale_factor: int = 1
+    """Reduce images by this whole number."""
+    scale_factor: float = 1.0
+    """Multiply camera positions, and so the scene, by this."""
+    half_size: float = 1.5
+    """Half the edge of the box around the origin that holds the scene, in the input's units."""
+    near: float = 2.0
+    """Distance from a camera at which the scene may start, in the input's units."""
+    far: float = 6.0
+    """Distance from a camera at which the scene ends, in the input's units."""
+
+    @classmethod
+    def recognizes(cls, path: Path) -> bool:
+        return (path / "transforms_train.json").is_file()
+
+    def parse(self, path: Path | None, split: Split) -> ParsedScene:
+        if path is None:
+            raise DataError("the blender format needs a folder: --data DIR")
+        if self.downscale_factor < 1:
+            raise DataError(f"--downscale-factor is {self.downscale_factor}; it must be a whole number from 1")
+        file = path / f"transforms_{split}.json"
+        content = read_json(file)
+        frames = content.get("frames")
+        if not isinstance(frames, list) or not frames:
+            raise DataError(f"{file} lists no frames")
+        where = [f"{file}: frame {index}" for index in range(len(frames))]
+        paths = [_image_path(path, frame, place) for frame, place in zip(frames, where, strict=True)]
+        poses = torch.stack([read_pose(frame, place) for frame, place in zip(frames, where, strict=True)])
+        keep = existing(paths, split)
+        width, height = image_size(paths[int(keep[0])])
+        scene = ParsedScene(
+            image_paths=tuple(paths),
+            cameras=self._cameras(poses, _focal_length(content, width, file), width, height),
+            box=torch.tensor([[-1.0], [1.0]]).expand(2, 3) * self.half_size * self.scale_factor,
+            near=self.near * self.scale_factor,
+            far=self.far * self.scale_factor,
+            times=_times(frames, where),
+            scale=self.scale_factor,
+            downscale_factor=self.downscale_factor,
+        )
+        return scene[keep]
+
+    def _cameras(self, poses: Tensor, focal: float, width: int, height: int) -> Cameras:
+        count = len(poses)
+        poses = poses[:, :3].clone()
+        poses[:, :, 3] *= self.scale_factor
+        return Cameras(
+            camera_to_worlds=poses,
+            fx=torch.full((count,), focal),
+            fy=torch.full((count,), focal),
+            cx=torch.full((count,), width / 2),
+            cy=torch.full((count,), height / 2),
+            widths=torch.full((count,), width),
+            heights=torch.full((count,), height),
+        )
+
+
+def read_json(file: Path) -> dict[str, Any]:
+    """A JSON file that holds an object.
+
+    Raises: DataError where it is missing, not JSON, or something else.
+    """
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DataError(f"cannot read {file}: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{file} is not JSON: {error}") from error
+    if not isinstance(content, dict):
+        raise DataError(f"{file} must hold a JSON object with 'frames'")
+    return content
+
+
+def read_pose(frame: Any, where: str) -> Tensor:
+    """The frame's (4, 4) camera-to-world matrix, checked.
+
+    Raises: DataError where it is absent, of another shape, not finite or not rigid.
+    """
+    try:
+        pose = torch.tensor(frame["transform_matrix"], dtype=torch.float32)
+    except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise DataError(f"{where}: 'transform_matrix' is not a 4x4 matrix of numbers") from error
+    check_pose(pose, where)
+    return pose if pose.shape[0] == 4 else torch.cat([pose, torch.tensor([[0.0, 0.0, 0.0, 1.0]])])
+
+
+def _image_path(folder: Path, frame: Any, where: str) -> Path:
+    """Blender writes paths without an ending."""
+    name = frame.get("file_path") if isinstance(frame, dict) else None
+    if not isinstance(name, str) or not name:
+        raise DataError(f"{where}: 'file_path' is missing")
+    path = folder / name
+    return path if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".webp") else path.with_name(path.name + ".png")
+
+
+def _focal_length(content: dict[str, Any], width: int, file: Path) -> float:
+    """In pixels, from the horizontal field of view."""
+    angle = content.get("camera_angle_x")
+    if not isinstance(angle, (int, float)) or not 0 < angle < math.pi:
+        raise DataError(f"{file}: 'camera_angle_x' is {angle!r}; it must be an angle between 0 and pi radians")
+    return 0.5 * width / math.tan(0.5 * angle)
+
+
+def _times(frames: list[Any], where: list[str]) -> Tensor | None:
+    """(M,) in [0, 1], or None where no frame has a time."""
+    if not any("time" in frame for frame in frames):
+        return None
+    for frame, place in zip(frames, where, strict=True):
+        time = frame.get("time")
+        if not isinstance(time, (int, float)) or not 0 <= time <= 1:
+            raise DataError(f"{place}: 'time' is {time!r}; it must be a number from 0 to 1")
+    return torch.tensor([float(frame["time"]) for frame in frames])

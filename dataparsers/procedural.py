@@ -1,0 +1,67 @@
+"""The embedded scene: solids with exact depth and normals, rendered in seconds when no data is given.
+
+It is written once, in the blender format, to the user's cache folder (NERFLOOM_CACHE, else XDG_CACHE_HOME, else
+~/.cache), and read from there.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from dataparsers.blender import Blender
+from framework import DataError, DataParser, ParsedScene
+from framework.console import say
+from framework.dataset import Split
+
+VERSION = 1
+"""Raised whenever the scene's look changes, so that old caches are not read."""
+
+
+@dataclass(frozen=True)
+class Procedural(DataParser):
+    """Flags of the embedded scene."""
+
+    size: int = 200
+    """Width and height of the images, pixels."""
+    num_train: int = 80
+    """Training images."""
+    moving: bool = False
+    """The variant that changes with time."""
+    scene_seed: int = 0
+    """Seed of the camera positions."""
+
+    @classmethod
+    def recognizes(cls, path: Path) -> bool:
+        return False  # it has no folder of its own
+
+    def parse(self, path: Path | None, split: Split) -> ParsedScene:
+        if path is not None:
+            raise DataError(f"the embedded scene reads no data: leave out --data {path}")
+        if self.size < 1 or self.num_train < 1:
+            raise DataError("--size and --num-train must be at least 1")
+        return Blender().parse(self._written(), split)
+
+    def _written(self) -> Path:
+        """The scene's folder, rendered first where it is not in the cache."""
+        from dataparsers.procedural_scene import write_dataset  # only where something is to be rendered
+
+        kind = "moving" if self.moving else "static"
+        folder = cache_folder() / f"procedural-v{VERSION}-{kind}-{self.size}px-{self.num_train}-seed{self.scene_seed}"
+        if not folder.is_dir():
+            say(f"rendering the embedded scene into {folder}")
+            try:
+                write_dataset(
+                    folder, size=self.size, num_train=self.num_train, moving=self.moving, seed=self.scene_seed
+                )
+            except OSError as error:
+                raise DataError(f"cannot write {folder}: {error.strerror}; set NERFLOOM_CACHE to a writable folder") from error
+        return folder
+
+
+def cache_folder() -> Path:
+    """Where generated data is kept between runs."""
+    if "NERFLOOM_CACHE" in os.environ:
+        return Path(os.environ["NERFLOOM_CACHE"])
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nerfloom"

@@ -1,0 +1,53 @@
+"""Where the scene is: boxes, how rays cross them, and the contraction of unbounded space."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def intersect_box(origins: Tensor, directions: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
+    """Distances at which rays enter and leave an axis-aligned box (slab method, Kay and Kajiya 1986).
+
+    A ray parallel to a face stays in or out of that slab; one that starts inside enters at 0. A ray that
+    misses, or only touches, gets enter = leave = 0: an interval without length.
+
+    Args:
+        origins, directions: (R, 3).
+        box: (2, 3) smallest and largest corner.
+    Returns: enter (R,), leave (R,), with 0 <= enter <= leave.
+    """
+    parallel = directions == 0
+    safe = torch.where(parallel, torch.ones_like(directions), directions)
+    low, high = (box[0] - origins) / safe, (box[1] - origins) / safe
+    enter, leave = torch.minimum(low, high), torch.maximum(low, high)
+    inside_slab = (origins >= box[0]) & (origins <= box[1])
+    infinity = torch.full_like(enter, torch.inf)
+    enter = torch.where(parallel, torch.where(inside_slab, -infinity, infinity), enter)
+    leave = torch.where(parallel, torch.where(inside_slab, infinity, -infinity), leave)
+    enter, leave = enter.amax(-1).clamp(min=0), leave.amin(-1)
+    hit = leave > enter
+    zero = torch.zeros_like(enter)
+    return torch.where(hit, enter, zero), torch.where(hit, leave, zero)
+
+
+def to_unit_box(positions: Tensor, box: Tensor) -> Tensor:
+    """Scene coordinates (N, 3) to [0, 1]^3 inside `box` (2, 3)."""
+    return (positions - box[0]) / (box[1] - box[0])
+
+
+def contract(positions: Tensor) -> Tensor:
+    """All of space into the ball of radius 2: x inside the unit ball, (2 - 1/|x|) x/|x| outside.
+
+    mip-NeRF 360 (Barron et al. 2022), equation 10. Positions are clamped so that their square stays finite,
+    and max(1, |x|^2) keeps value and gradient finite at the origin.
+
+    Args:
+        positions: (..., 3).
+    Returns: (..., 3) with norm at most 2.
+    """
+    limit = torch.finfo(positions.dtype).max ** 0.5 / 4
+    clamped = positions.clamp(-limit, limit)
+    squared = (clamped * clamped).sum(-1, keepdim=True).clamp(min=1)
+    norm = squared.sqrt()
+    return clamped * ((2 * norm - 1) / squared)

@@ -1,0 +1,131 @@
+"""Cameras: from a pixel to a ray.
+
+Conventions: OpenGL axes (x right, y up, the camera looks down -z); pixel (column, row) = (0, 0) is the top left
+one and its centre lies at (0.5, 0.5); `camera_to_worlds` maps camera to scene coordinates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from framework.errors import DataError
+from framework.rays import Rays
+
+ROTATION_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """M cameras. Intrinsics are in pixels of the images they go with."""
+
+    camera_to_worlds: Tensor
+    """(M, 3, 4) rigid transform from camera to scene."""
+    fx: Tensor
+    """(M,) horizontal focal length, pixels."""
+    fy: Tensor
+    """(M,) vertical focal length, pixels."""
+    cx: Tensor
+    """(M,) principal point's column, pixels."""
+    cy: Tensor
+    """(M,) principal point's row, pixels."""
+    widths: Tensor
+    """(M,) int64 image widths."""
+    heights: Tensor
+    """(M,) int64 image heights."""
+    model: str = "pinhole"
+    """Name of the projection, a key of `PROJECTIONS`."""
+
+    def __len__(self) -> int:
+        return self.camera_to_worlds.shape[0]
+
+    def __getitem__(self, index: Tensor | slice) -> Cameras:
+        """The cameras chosen by a slice, a mask or an index tensor."""
+        chosen = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "model"}
+        return Cameras(**chosen, model=self.model)
+
+    def to(self, device: torch.device | str) -> Cameras:
+        """The same cameras on `device`."""
+        moved = {f.name: getattr(self, f.name).to(device) for f in fields(self) if f.name != "model"}
+        return Cameras(**moved, model=self.model)
+
+    def scaled(self, factor: float) -> Cameras:
+        """The cameras of images resized by `factor` (2.0 = twice as wide).
+
+        Sizes are rounded down as images are when reduced by a whole number.
+        """
+        intrinsics = {name: getattr(self, name) * factor for name in ("fx", "fy", "cx", "cy")}
+        sizes = {name: (getattr(self, name) * factor + 1e-6).long() for name in ("widths", "heights")}
+        return Cameras(self.camera_to_worlds, **intrinsics, **sizes, model=self.model)
+
+    def rays(
+        self, camera_indices: Tensor, columns: Tensor, rows: Tensor, near: float, far: float, times: Tensor | None = None
+    ) -> Rays:
+        """Rays through pixel centres.
+
+        Args:
+            camera_indices: (R,) camera of each ray.
+            columns, rows: (R,) pixel indices; may be fractional.
+            near, far: the distances between which the scene lies.
+            times: (M,) time of each camera.
+        Returns: R rays with unit directions, pixel radii, times and camera indices.
+        """
+        project = PROJECTIONS[self.model]
+        x = (columns + 0.5 - self.cx[camera_indices]) / self.fx[camera_indices]
+        y = (rows + 0.5 - self.cy[camera_indices]) / self.fy[camera_indices]
+        local = project(x, y)
+        length = local.norm(dim=-1)
+        poses = self.camera_to_worlds[camera_indices]
+        directions = torch.einsum("rij,rj->ri", poses[:, :, :3], local / length[:, None])
+        # Mip-NeRF sets the radius to 2 / sqrt(12) pixels, at distance `length` along the unit direction.
+        pixel_radii = 2 / 12**0.5 / (self.fx[camera_indices] * length)
+        return Rays(
+            origins=poses[:, :, 3],
+            directions=directions,
+            nears=torch.full_like(x, near),
+            fars=torch.full_like(x, far),
+            pixel_radii=pixel_radii,
+            times=None if times is None else times[camera_indices],
+            camera_indices=camera_indices,
+        )
+
+    def image_rays(self, index: int, near: float, far: float, times: Tensor | None = None) -> Rays:
+        """All rays of one image, row by row: R = height * width."""
+        device = self.fx.device
+        height, width = int(self.heights[index]), int(self.widths[index])
+        rows = torch.arange(height, device=device).repeat_interleave(width)
+        columns = torch.arange(width, device=device).repeat(height)
+        return self.rays(torch.full_like(rows, index), columns, rows, near, far, times)
+
+
+def pinhole(x: Tensor, y: Tensor) -> Tensor:
+    """Direction (R, 3) in the camera's frame of normalised image coordinates; image y points down."""
+    return torch.stack([x, -y, -torch.ones_like(x)], dim=-1)
+
+
+PROJECTIONS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {"pinhole": pinhole}
+"""Projection name -> function from normalised image coordinates to a direction. Lens models are added here."""
+
+
+def check_pose(pose: Tensor, where: str) -> None:
+    """Refuse a camera pose that is not a finite rigid motion.
+
+    Args:
+        pose: (4, 4) or (3, 4) camera-to-world matrix.
+        where: what to call it in the message.
+    Raises: DataError that names `where` and what is wrong.
+    """
+    if pose.shape not in ((4, 4), (3, 4)):
+        raise DataError(f"{where}: the pose has shape {tuple(pose.shape)}; a 4x4 matrix is needed")
+    if not bool(torch.isfinite(pose).all()):
+        raise DataError(f"{where}: the pose holds a value that is not finite (NaN or infinity)")
+    rotation = pose[:3, :3].double()
+    error = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max().item()
+    if error > ROTATION_TOLERANCE or torch.linalg.det(rotation).item() < 0:
+        raise DataError(
+            f"{where}: the pose is not rigid (its rotation is off an orthonormal, right-handed one by {error:.2g}); "
+            "remove scale, shear or mirroring from the matrix"
+        )

@@ -1,0 +1,67 @@
+"""ns-eval: measure a trained run on held-out views."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from framework.cli.common import run_command
+from framework.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class EvalFlags:
+    """Measure a trained run on held-out views."""
+
+    load_config: Path
+    """The run's config.yml."""
+    output_path: Path | None = None
+    """Where the JSON goes; eval.json beside config.yml if not given."""
+    render_output_path: Path | None = None
+    """Folder for renders and comparisons (photograph | render | error) of every view."""
+    load_checkpoint: Path | None = None
+    """A checkpoint other than the run's newest."""
+    data: Path | None = None
+    """The data's folder, where it has moved since training."""
+    split: Literal["test", "val", "train"] = "test"
+    """Which images."""
+    max_images: int | None = None
+    """Evaluate at most this many images, evenly spread; all if not given."""
+    round_to_uint8: bool = False
+    """Measure pictures as they would be stored, rounded to 8 bits."""
+    device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
+    """Device to render on."""
+
+
+def main() -> None:
+    """The ns-eval command."""
+    run_command(_command)
+
+
+def _command(arguments: list[str]) -> None:
+    import tyro
+
+    flags = tyro.cli(EvalFlags, prog="ns-eval", args=arguments, config=(tyro.conf.FlagConversionOff,))
+    if flags.max_images is not None and flags.max_images < 1:
+        raise ConfigError(f"--max-images is {flags.max_images}; it must be at least 1")
+    from framework.cli.session import load_split
+    from framework.console import say
+    from framework.evaluation.evaluator import evaluate
+    from framework.evaluation.load import load_trained
+    from framework.evaluation.report import write_evaluation
+
+    trained = load_trained(flags.load_config, flags.load_checkpoint, flags.device_type, flags.data)
+    dataset = load_split(trained.run, flags.split).to(trained.model.device)
+    found = evaluate(
+        trained.model,
+        dataset,
+        max_images=flags.max_images,
+        pictures=flags.render_output_path,
+        round_to_uint8=flags.round_to_uint8,
+    )
+    output = flags.output_path or trained.run.folder / "eval.json"
+    write_evaluation(output, trained.run, trained.checkpoint, found)
+    say(f"{flags.split}: {found.line()}")
+    say(f"LPIPS {found.lpips_note}")
+    say(f"written to {output}")

@@ -1,0 +1,96 @@
+"""A training session from start to end: data, training, final evaluation, and what is printed."""
+
+from __future__ import annotations
+
+from framework.console import say
+from framework.dataset import Dataset, Split, load_dataset
+from framework.device import choose_device
+from framework.errors import DataError
+from framework.evaluation.evaluator import evaluate
+from framework.evaluation.report import write_evaluation
+from framework.training.checkpoint import FOLDER, load_newest
+from framework.training.run import Run, create_folder, write_transforms
+from framework.training.trainer import Trainer
+
+PICTURES = 4
+
+
+def start(run: Run) -> None:
+    """Train a new run."""
+    trainer = _prepare(run)
+    create_folder(run)
+    write_transforms(run, trainer.train_set)
+    trainer.restore_as_configured()
+    _finish(run, trainer)
+
+
+def resume(run: Run) -> None:
+    """Go on with a run from its newest checkpoint; from the beginning where it has none."""
+    trainer = _prepare(run)
+    checkpoint = load_newest(run.folder / FOLDER, trainer.device)
+    if checkpoint is None:
+        trainer.restore_as_configured()
+        say(f"{run.folder} has no checkpoint: starting from the beginning")
+    else:
+        trainer.restore(checkpoint)
+        say(f"resuming {run.folder} at step {trainer.state.step:,}")
+    _finish(run, trainer)
+
+
+def _prepare(run: Run) -> Trainer:
+    device = choose_device(run.config.machine)
+    train_set = load_split(run, "train").to(device)
+    eval_set = first_split(run, ("val", "test"))
+    scene = train_set.scene
+    say(
+        f"{run.method} on {run.config.data or 'the embedded scene'} ({run.dataparser}): {len(train_set)} images, "
+        f"{scene.image_size} pixels, {'with' if scene.has_alpha else 'no'} alpha, on {device.type}"
+    )
+    trainer = Trainer(run, train_set, None if eval_set is None else eval_set.to(device))
+    say(f"{trainer.model.size():,} parameters; writing to {run.folder}")
+    return trainer
+
+
+def _finish(run: Run, trainer: Trainer) -> None:
+    outcome = trainer.train()
+    state = trainer.state
+    say(
+        f"{outcome.reason}: step {state.step:,}, {state.seconds:.1f} s of training, "
+        f"{state.rays / max(state.seconds, 1e-9) / 1e3:.1f}k rays/s"
+        + (f", {state.skipped} steps skipped as not finite" if state.skipped else "")
+    )
+    say(f"checkpoint: {outcome.checkpoint}")
+    if outcome.interrupted:
+        say(f"continue with: ns-train --resume {run.folder}")
+        return
+    test_set = first_split(run, ("test", "val"))
+    if test_set is None or run.config.max_eval_images == 0:
+        return
+    found = evaluate(
+        trainer.model,
+        test_set.to(trainer.device),
+        max_images=run.config.max_eval_images,
+        pictures=run.folder / "pictures",
+        max_pictures=PICTURES,
+    )
+    write_evaluation(run.folder / "eval.json", run, outcome.checkpoint, found)
+    say(f"test: {found.line()}")
+    say(f"pictures (photograph | render | error): {run.folder / 'pictures'}")
+    say(f"evaluate again with: ns-eval --load-config {run.config_path}")
+
+
+def load_split(run: Run, split: Split) -> Dataset:
+    """Parse and decode a split of the run's data."""
+    return load_dataset(run.parser.parse(run.config.data, split), split)
+
+
+def first_split(run: Run, splits: tuple[Split, ...]) -> Dataset | None:
+    """The first of `splits` that the data has; None, with a note, where it has none."""
+    errors = []
+    for split in splits:
+        try:
+            return load_split(run, split)
+        except DataError as error:
+            errors.append(str(error))
+    say(f"no images to evaluate on: {errors[0]}")
+    return None

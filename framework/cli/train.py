@@ -1,0 +1,133 @@
+"""ns-train: train a method on a data set."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from framework.cli.common import run_command
+from framework.errors import ConfigError, nearest
+from framework.registry import registered, summary
+
+if TYPE_CHECKING:
+    from framework.training.run import Run
+
+USAGE = """\
+usage: ns-train METHOD [--data DIR] [flags] [FORMAT [format flags]]
+       ns-train --load-config FILE [flags]     train as a recipe or an earlier run says
+       ns-train --resume RUN_FOLDER [flags]    go on with a run that was stopped
+"""
+
+
+def main() -> None:
+    """The ns-train command."""
+    run_command(_command)
+
+
+def _command(arguments: list[str]) -> None:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_overview())
+        return
+    if arguments[0] in ("--resume", "--load-config"):
+        if len(arguments) < 2:
+            raise ConfigError(f"{arguments[0]} needs a path")
+        path, flags = Path(arguments[1]), arguments[2:]
+        if arguments[0] == "--resume":
+            from framework.cli.session import resume
+
+            resume(_parse_flags(_read_run(path / "config.yml"), flags))
+            return
+        run = _read_run(path)
+    else:
+        run, flags = _default_run(arguments[0]), arguments[1:]
+        if "--load-config" in flags:  # nerfstudio's order: METHOD ... --load-config FILE
+            index = flags.index("--load-config")
+            run = _read_run(Path(flags[index + 1]))
+            flags = flags[:index] + flags[index + 2 :]
+    from framework.cli.session import start
+
+    start(_parse_flags(run, flags, fresh=True))
+
+
+def _overview() -> str:
+    lines = [USAGE, "methods:"]
+    lines += [f"  {name:<16}{summary(entry)}" for name, entry in registered("methods").items()]
+    lines += ["", "data formats (recognised by themselves, or named after the flags):"]
+    lines += [f"  {name:<16}{summary(entry)}" for name, entry in registered("dataparsers").items()]
+    lines += ["", "ns-train METHOD --help shows the method's flags."]
+    return "\n".join(lines)
+
+
+def _default_run(method: str) -> Run:
+    """A method with its default settings, its data not known yet."""
+    if method not in registered("methods"):
+        raise ConfigError(f"unknown method '{method}'. {nearest(method, registered('methods'))}")
+    from framework.registry import load_dataparser, load_method
+    from framework.training.run import Run
+
+    return Run(method, load_method(method).config, "", load_dataparser("procedural")(), Path())
+
+
+def _read_run(path: Path) -> Run:
+    from framework.training.run import read_run
+
+    return read_run(path)
+
+
+def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
+    """`run` with its settings and its data format's changed by command-line flags, in any order.
+
+    A first look finds --data and the format's name; the second knows all flags.
+    """
+    import tyro
+
+    from framework.registry import load_dataparser, recognize
+    from framework.training.run import run_folder
+
+    options = (tyro.conf.FlagConversionOff, tyro.conf.ConsolidateSubcommandArgs)
+    asks_for_help = bool({"-h", "--help"} & set(flags))
+    looked: Any = run.config
+    named = run.dataparser
+    rest = [flag for flag in flags if flag in registered("dataparsers")]
+    if not asks_for_help:
+        looked, unknown = tyro.cli(
+            type(run.config), prog=f"ns-train {run.method}", args=flags, default=run.config, config=options,
+            return_unknown_args=True,
+        )
+        rest = [flag for flag in unknown if flag in registered("dataparsers")]
+    if rest:
+        named, flags = rest[0], _without(flags, rest[0])
+    elif asks_for_help:
+        named = named or "procedural"
+    elif not named or looked.data != run.config.data:
+        named = recognize(looked.data)
+    parser = run.parser if named == run.dataparser else load_dataparser(named)()
+
+    # One flat set of flags: the method's and the data format's, so that their order does not matter.
+    both = tyro.conf.OmitArgPrefixes[
+        dataclasses.make_dataclass("Flags", [("method", type(run.config)), ("format", type(parser))])  # type: ignore[misc]
+    ]
+    parsed: Any = tyro.cli(
+        both,
+        prog=f"ns-train {run.method}",
+        description=f"{summary(registered('methods')[run.method])}\n\nData format: {named}",
+        args=flags,
+        default=both.__origin__(run.config, parser) if hasattr(both, "__origin__") else None,
+        config=options,
+    )
+    folder = run_folder(run.method, parsed.method) if fresh else run.folder
+    return dataclasses.replace(run, config=parsed.method, dataparser=named, parser=parsed.format, folder=folder)
+
+
+def _without(flags: list[str], name: str) -> list[str]:
+    """`flags` less the format's name: its first place that is not the value of a flag, else its last."""
+    places = [index for index, flag in enumerate(flags) if flag == name]
+    free = [index for index in places if index == 0 or not flags[index - 1].startswith("--") or "=" in flags[index - 1]]
+    drop = (free or places[-1:])[0]
+    return flags[:drop] + flags[drop + 1 :]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,192 @@
+"""Settings: one flat frozen dataclass a method, to and from plain YAML.
+
+This module imports neither torch nor any method, so that the command line answers at once.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union
+
+import yaml
+
+from framework.errors import ConfigError, nearest
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class MachineConfig:
+    """Where the run happens."""
+
+    seed: int = 42
+    """Random seed. The same seed, machine and thread count give the same bits."""
+    device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
+    """Device to train on; auto takes CUDA where it is present."""
+    num_threads: int | None = None
+    """Processor threads; all cores if not given."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """What every method can be told. A method's config derives from this and changes the defaults."""
+
+    data: Path | None = None
+    """Folder of the data set. The embedded scene if not given."""
+    output_dir: Path = Path("outputs")
+    """Folder under which the run's folder is made."""
+    experiment_name: str | None = None
+    """First part of the run's folder; the data folder's name if not given."""
+    timestamp: str | None = None
+    """Last part of the run's folder; date and time if not given."""
+    max_num_iterations: int = 30_000
+    """Stop after this many steps."""
+    max_seconds: float | None = None
+    """Stop after this many seconds of training; evaluation and saving do not count."""
+    target_psnr: float | None = None
+    """Stop once the periodic evaluation over all images reaches this PSNR, dB."""
+    steps_per_save: int = 2_000
+    """Steps between checkpoints."""
+    seconds_per_save: float = 60.0
+    """A checkpoint is written at the latest after this many seconds of training."""
+    save_only_latest_checkpoint: bool = True
+    """Keep the two newest checkpoints, not all."""
+    steps_per_eval_image: int = 500
+    """Steps between renders of one evaluation image."""
+    steps_per_eval_all_images: int = 25_000
+    """Steps between evaluations over all images of the validation split."""
+    seconds_per_eval_all_images: float | None = None
+    """Seconds of training between evaluations over all images of the validation split, besides the steps above;
+    15 if --target-psnr is given and this is not."""
+    max_eval_images: int | None = None
+    """Evaluate at most this many images, evenly spread; all if not given, none for 0."""
+    vis: Literal["tensorboard", "none"] = "tensorboard"
+    """Where curves and pictures go during training."""
+    mixed_precision: bool | None = None
+    """Networks in bfloat16; density, compositing and losses stay float32. If not given, where the device has
+    bfloat16 matrix instructions."""
+    load_dir: Path | None = None
+    """Start from the newest checkpoint in this folder."""
+    load_checkpoint: Path | None = None
+    """Start from this checkpoint."""
+    num_rays_per_batch: int = 4_096
+    """Pixels in a training step."""
+    samples_per_batch: int | None = None
+    """Let the number of pixels follow, so that a step evaluates about this many samples."""
+    learning_rate: float = 5e-4
+    """Adam's learning rate at the start."""
+    lr_schedule: Literal["constant", "exponential", "cosine", "hold-exponential"] = "exponential"
+    """How the learning rate falls over the budget (steps or seconds, whichever is further spent);
+    hold-exponential keeps it for the first half."""
+    lr_final: float = 0.1
+    """Learning rate at the end of the budget, as a share of the first."""
+    lr_warmup_steps: int = 0
+    """Steps over which the learning rate rises from zero."""
+    adam_beta1: float = 0.9
+    """Adam's decay of the mean gradient."""
+    adam_beta2: float = 0.999
+    """Adam's decay of the squared gradient."""
+    adam_eps: float = 1e-8
+    """Adam's epsilon."""
+    background: Literal["auto", "random", "white", "black"] = "auto"
+    """Behind transparent pixels during training; auto is random where images have alpha, black elsewhere.
+    Evaluation is over black where black is trained or nothing is transparent, over white otherwise."""
+    eval_num_rays_per_chunk: int = 8_192
+    """Rays rendered at once in evaluation. It changes memory and speed, never the picture."""
+    machine: MachineConfig = field(default_factory=MachineConfig)
+    """Seed, device and threads."""
+
+    def __post_init__(self) -> None:
+        for name in ("max_num_iterations", "num_rays_per_batch", "eval_num_rays_per_chunk", "steps_per_save"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{_flag(name)} is {getattr(self, name)}; it must be at least 1")
+        if self.max_seconds is not None and not self.max_seconds > 0:
+            raise ConfigError(f"--max-seconds is {self.max_seconds}; it must be more than 0")
+        if not self.learning_rate > 0 or not 0 < self.lr_final <= 1:
+            raise ConfigError("--learning-rate must be more than 0, and --lr-final in (0, 1]")
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")
+
+
+def to_plain(value: Any) -> Any:
+    """A config as numbers, strings, lists and dictionaries, fit for the safe YAML dumper."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, (list, tuple)):
+        return [to_plain(item) for item in value]
+    return value
+
+
+def from_plain(default: T, values: dict[str, Any], where: str) -> T:
+    """`default` (a dataclass instance) with the given fields replaced.
+
+    Args:
+        values: plain values, as read from YAML.
+        where: what to call the source in messages.
+    Raises: ConfigError for an unknown key (naming the nearest) or a value of the wrong type.
+    """
+    hints = typing.get_type_hints(type(default))
+    known = {f.name for f in dataclasses.fields(default)}  # type: ignore[arg-type]
+    changes = {}
+    for key, value in values.items():
+        if key not in known:
+            raise ConfigError(f"{where}: unknown key '{key}'. {nearest(str(key), known)}")
+        current = getattr(default, key)
+        if dataclasses.is_dataclass(current) and isinstance(value, dict):
+            changes[key] = from_plain(current, value, f"{where}: {key}")
+        else:
+            changes[key] = _convert(value, hints[key], f"{where}: '{key}'")
+    return dataclasses.replace(default, **changes)  # type: ignore[type-var]
+
+
+def _convert(value: Any, hint: Any, where: str) -> Any:
+    """`value` as the type that `hint` asks for."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (Union, types.UnionType):
+        if value is None and type(None) in arguments:
+            return None
+        return _convert(value, next(a for a in arguments if a is not type(None)), where)
+    if origin is Literal:
+        if value in arguments:
+            return value
+        raise ConfigError(f"{where} is {value!r}; it must be one of {', '.join(map(str, arguments))}")
+    if origin is tuple and isinstance(value, (list, tuple)):
+        inner = arguments[:1] * len(value) if arguments[-1] is Ellipsis else arguments
+        if len(inner) == len(value):
+            return tuple(_convert(item, kind, where) for item, kind in zip(value, inner, strict=True))
+    if hint is Path and isinstance(value, str):
+        return Path(value)
+    if hint is float and isinstance(value, str):  # YAML 1.1 reads 1e-3 as a string
+        try:
+            return float(value)
+        except ValueError:
+            pass
+    if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        return float(value)
+    if isinstance(hint, type) and isinstance(value, hint) and (hint is not int or not isinstance(value, bool)):
+        return value
+    raise ConfigError(f"{where} is {value!r}; it must be {getattr(hint, '__name__', hint)}")
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """A YAML file that holds a mapping, read by the safe loader.
+
+    Raises: ConfigError where it is missing, not YAML, or not a mapping.
+    """
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not plain YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path} must hold keys and values, such as 'method: instant-ngp'")
+    return values

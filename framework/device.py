@@ -1,0 +1,64 @@
+"""Where a run computes, and in which precision."""
+
+from __future__ import annotations
+
+import platform
+from functools import cache
+from pathlib import Path
+
+import torch
+
+from framework.config import MachineConfig
+from framework.errors import ConfigError
+from framework.kernels.math import bits
+
+
+def choose_device(machine: MachineConfig) -> torch.device:
+    """The device asked for, with its threads set.
+
+    Raises: ConfigError where this machine does not have it.
+    """
+    if machine.num_threads is not None:
+        if machine.num_threads < 1:
+            raise ConfigError(f"--machine.num-threads is {machine.num_threads}; it must be at least 1")
+        torch.set_num_threads(machine.num_threads)
+    available = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    if machine.device_type == "auto":
+        return torch.device("cuda" if available["cuda"] else "cpu")
+    if not available[machine.device_type]:
+        raise ConfigError(f"--machine.device-type {machine.device_type}: this machine or this torch has none")
+    return torch.device(machine.device_type)
+
+
+def has_bfloat16(device: torch.device) -> bool:
+    """Whether the device multiplies bfloat16 matrices in hardware."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported()
+    return device.type == "cpu" and bool({"amx_bf16", "avx512_bf16"} & _processor_flags())
+
+
+@cache
+def _processor_flags() -> frozenset[str]:
+    """Instruction sets of a Linux processor; empty elsewhere."""
+    if platform.system() != "Linux":
+        return frozenset()
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return frozenset()
+    return next((frozenset(line.split(":", 1)[1].split()) for line in lines if line.startswith("flags")), frozenset())
+
+
+def seed_step(seed: int, step: int) -> None:
+    """Give step `step` its own random stream.
+
+    Every draw is then a function of (seed, step): a resumed run repeats an uninterrupted one bit for bit, and
+    what an evaluation between two steps draws does not matter.
+    """
+    torch.manual_seed(bits(seed, step))
+
+
+def wait_for(device: torch.device) -> None:
+    """Let pending work end, so that a clock can be read."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)

@@ -1,0 +1,37 @@
+"""Encodings that hold parameters. Those without are functions in `framework.kernels`."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from framework.kernels.hash_grid import HashGridLayout, hash_grid
+
+
+class HashGrid(nn.Module):
+    """Multiresolution hash grid over [0, 1]^3 (Instant-NGP, section 3).
+
+    Args:
+        num_levels: L.
+        features_per_level: F.
+        base_resolution, max_resolution: cells along an axis at the first and last level.
+        log2_table_size: largest table of one level, as a power of two.
+    """
+
+    def __init__(
+        self,
+        num_levels: int = 16,
+        features_per_level: int = 2,
+        base_resolution: int = 16,
+        max_resolution: int = 2048,
+        log2_table_size: int = 19,
+    ) -> None:
+        super().__init__()
+        self.layout = HashGridLayout.build(num_levels, base_resolution, max_resolution, log2_table_size)
+        # Small random values, as in the paper's section 4: features start near zero but not alike.
+        self.table = nn.Parameter(torch.empty(self.layout.num_entries, features_per_level).uniform_(-1e-4, 1e-4))
+        self.num_features = num_levels * features_per_level
+
+    def forward(self, positions: Tensor) -> Tensor:
+        """Positions (N, 3) in [0, 1] to features (N, L * F)."""
+        return hash_grid(positions, self.table, self.layout)

@@ -1,0 +1,175 @@
+"""One evaluator for every method: the same numbers at the end of training and from `ns-eval`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import fmean, stdev
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from framework.console import track
+from framework.dataset import Dataset
+from framework.evaluation.images import comparison, write_image
+from framework.evaluation.metrics import load_lpips, psnr, ssim
+from framework.model import Model
+from framework.pixels import composite
+from framework.rays import Rays
+from framework.device import has_bfloat16, wait_for
+
+
+@dataclass(frozen=True)
+class RenderedImage:
+    """A whole picture."""
+
+    rgb: Tensor
+    """(H, W, 3)."""
+    depth: Tensor
+    """(H, W) median distance along the ray, scene units."""
+    accumulation: Tensor
+    """(H, W) opacity."""
+    seconds: float
+    """Time it took."""
+
+
+@torch.no_grad()
+def render_rays(model: Model, rays: Rays, shape: tuple[int, int], background: Tensor) -> RenderedImage:
+    """Render H * W rays as a picture, a chunk at a time.
+
+    Args:
+        model: in any mode; it is put into evaluation mode and back.
+        rays: H * W rays, row by row.
+        shape: (H, W).
+        background: (3,) colour behind what is not opaque.
+    """
+    was_training = model.training
+    model.eval()
+    start = time.perf_counter()
+    parts = []
+    with torch.autocast(model.device.type, torch.bfloat16, enabled=use_bfloat16(model)):
+        for chunk in _chunks(rays, model.config.eval_num_rays_per_chunk):
+            out = model.render(chunk, background)
+            parts.append((out.rgb.float(), out.median_depth.float(), out.accumulation.float()))
+    wait_for(model.device)
+    seconds = time.perf_counter() - start
+    model.train(was_training)
+    rgb, depth, accumulation = (torch.cat(column) for column in zip(*parts, strict=True))
+    return RenderedImage(rgb.view(*shape, 3), depth.view(shape), accumulation.view(shape), seconds)
+
+
+def use_bfloat16(model: Model) -> bool:
+    """The run's precision: as configured, else as the device allows."""
+    chosen = model.config.mixed_precision
+    return has_bfloat16(model.device) if chosen is None else chosen
+
+
+def _chunks(rays: Rays, size: int) -> Iterator[Rays]:
+    return (rays[start : start + size] for start in range(0, len(rays), size))
+
+
+def render_view(model: Model, dataset: Dataset, index: int, background: Tensor) -> RenderedImage:
+    """The model's picture of the data set's view `index`, with the appearance meant for evaluation."""
+    cameras, scene = dataset.cameras, model.scene
+    rays = cameras.image_rays(index, scene.near, scene.far, dataset.times)
+    shape = (int(cameras.heights[index]), int(cameras.widths[index]))
+    # An evaluation camera's number must not be taken for a training camera's.
+    return render_rays(model, replace(rays, camera_indices=None), shape, background)
+
+
+def evaluation_background(model: Model) -> Tensor:
+    """(3,) black where training is over black or no photograph is transparent, else white."""
+    black = model.config.background == "black" or not model.scene.has_alpha
+    return torch.full((3,), 0.0 if black else 1.0, device=model.device)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What an evaluation found."""
+
+    per_image: list[dict[str, Any]]
+    """name, psnr, ssim and lpips of each image."""
+    results: dict[str, Any]
+    """Means, standard deviations and speed, under nerfstudio's keys."""
+    lpips_note: str
+    """Which LPIPS was used, or why none."""
+
+    def line(self) -> str:
+        """The results in a line."""
+        r = self.results
+        lpips = "absent" if r["lpips"] is None else f"{r['lpips']:.4f}"
+        return (
+            f"PSNR {r['psnr']:.2f} dB  SSIM {r['ssim']:.4f}  LPIPS {lpips}  "
+            f"{r['num_rays_per_sec'] / 1e3:.1f}k rays/s  {1 / r['fps']:.2f} s/image  ({r['num_images']} images)"
+        )
+
+
+def evaluate(
+    model: Model,
+    dataset: Dataset,
+    *,
+    max_images: int | None = None,
+    pictures: Path | None = None,
+    max_pictures: int | None = None,
+    round_to_uint8: bool = False,
+    title: str = "Evaluating",
+) -> Evaluation:
+    """Render views and compare them with their photographs.
+
+    Args:
+        model: the trained model.
+        dataset: views with photographs, on the model's device.
+        max_images: at most this many views, evenly spread; all if None.
+        pictures: folder for renders and comparisons (photograph | render | error); none if None.
+        max_pictures: write only the first so many.
+        round_to_uint8: measure the picture as it would be stored.
+    Raises: ValueError where there is nothing to evaluate.
+    """
+    chosen = spread(len(dataset), max_images)
+    if not chosen:
+        raise ValueError("there is no image to evaluate")
+    lpips, lpips_note = load_lpips()
+    background = evaluation_background(model)
+    rows, seconds, rays = [], 0.0, 0
+    for index in track(chosen, title, total=len(chosen)):
+        target = composite(dataset.image(index).float() / 255, background)
+        view = render_view(model, dataset, index, background)
+        rgb = view.rgb.clamp(0, 1)
+        if round_to_uint8:
+            rgb = (rgb * 255).round() / 255
+        rows.append(
+            {
+                "name": dataset.names[index],
+                "psnr": psnr(rgb, target),
+                "ssim": ssim(rgb, target) if min(rgb.shape[:2]) >= 11 else None,
+                "lpips": None if lpips is None else lpips(rgb, target),
+                "seconds": view.seconds,
+            }
+        )
+        seconds, rays = seconds + view.seconds, rays + rgb.shape[0] * rgb.shape[1]
+        if pictures is not None and (max_pictures is None or len(rows) <= max_pictures):
+            stem = f"{index:04d}_{Path(dataset.names[index]).stem}"
+            write_image(pictures / f"{stem}.png", rgb)
+            write_image(pictures / f"{stem}_comparison.png", comparison(rgb, target))
+    results = {**_statistics(rows), "num_rays_per_sec": rays / seconds, "fps": len(rows) / seconds}
+    return Evaluation(rows, {**results, "num_images": len(rows)}, lpips_note)
+
+
+def spread(total: int, limit: int | None) -> list[int]:
+    """At most `limit` of the numbers 0 .. total - 1, evenly spread."""
+    if limit is None or limit >= total:
+        return list(range(total))
+    return [index * total // limit for index in range(limit)]
+
+
+def _statistics(rows: list[dict[str, Any]]) -> dict[str, float | None]:
+    """Mean and standard deviation of each metric; None where it is absent."""
+    out: dict[str, float | None] = {}
+    for name in ("psnr", "ssim", "lpips"):
+        values = [row[name] for row in rows if row[name] is not None]
+        out[name] = fmean(values) if values else None
+        out[f"{name}_std"] = (stdev(values) if len(values) > 1 else 0.0) if values else None
+    return out

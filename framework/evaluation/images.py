@@ -1,0 +1,43 @@
+"""Pictures: renders, comparisons and animations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import torch
+from torch import Tensor
+
+ERROR_AT_WHITE = 0.25
+"""Mean absolute error that an error map shows as white."""
+
+
+def to_uint8(image: Tensor) -> np.ndarray:
+    """(H, W, 3) in [0, 1] to uint8, rounded."""
+    return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+
+
+def heat(values: Tensor) -> Tensor:
+    """(H, W) in [0, 1] as black, red, yellow, white (H, W, 3)."""
+    return torch.stack([3 * values, 3 * values - 1, 3 * values - 2], dim=-1).clamp(0, 1)
+
+
+def comparison(prediction: Tensor, target: Tensor) -> Tensor:
+    """Photograph | render | error, side by side: (H, 3 W, 3)."""
+    error = (prediction - target).abs().mean(-1) / ERROR_AT_WHITE
+    return torch.cat([target, prediction.clamp(0, 1), heat(error)], dim=1)
+
+
+def write_image(path: Path, image: Tensor) -> None:
+    """(H, W, 3) in [0, 1] as an 8-bit PNG; makes the folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    iio.imwrite(path, to_uint8(image))
+
+
+def write_animation(path: Path, frames: Sequence[Tensor], fps: float) -> None:
+    """(H, W, 3) frames in [0, 1] as an endless animation; the ending (.gif, .webp, .png) chooses the format."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    images = np.stack([to_uint8(frame) for frame in frames])
+    iio.imwrite(path, images, duration=1000 / fps, loop=0)

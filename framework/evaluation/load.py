@@ -1,0 +1,62 @@
+"""A trained run from its folder: what evaluation, rendering and export start from."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from framework.device import choose_device
+from framework.errors import CheckpointError
+from framework.model import Model
+from framework.scene import Scene
+from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest
+from framework.training.run import Run, read_run
+from framework.training.trainer import build_model, restore_model
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A run with its model, ready to render."""
+
+    run: Run
+    """Method, settings and folder."""
+    model: Model[Any]
+    """In evaluation mode, on its device."""
+    checkpoint: Path
+    """Where its parameters came from."""
+    content: dict[str, Any]
+    """The checkpoint, for transform, scale and state."""
+
+
+def load_trained(
+    config_path: Path, checkpoint: Path | None = None, device_type: Any = "auto", data: Path | None = None
+) -> Trained:
+    """Load a run's model.
+
+    Args:
+        config_path: the run's config.yml.
+        checkpoint: which one; the newest readable if None.
+        device_type: auto, cpu, cuda or mps.
+        data: where the data is now, if it has moved.
+    Raises: ConfigError or CheckpointError where something is missing or does not fit.
+    """
+    run = read_run(config_path)
+    machine = dataclasses.replace(run.config.machine, device_type=device_type)
+    config = dataclasses.replace(run.config, machine=machine, data=data or run.config.data)
+    run = dataclasses.replace(run, config=config)
+    device = choose_device(machine)
+    content = load_checkpoint(checkpoint, device) if checkpoint else load_newest(run.folder / FOLDER, device)
+    if content is None:
+        raise CheckpointError(f"{run.folder / FOLDER} holds no checkpoint")
+    try:
+        scene = Scene(**{**content["scene"], "box": content["scene"]["box"].cpu()})
+    except (KeyError, TypeError, AttributeError) as error:
+        raise CheckpointError(f"the checkpoint of {run.folder} lacks the scene: {error}") from error
+    model = build_model(run.method, config, scene).to(device).eval()
+    restore_model(model, content)
+    path = checkpoint or run.folder / FOLDER / f"step-{content['state']['step']:09d}.ckpt"
+    return Trained(run, model, path, content)
+
+

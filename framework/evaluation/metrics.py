@@ -1,0 +1,70 @@
+"""Image metrics on (H, W, 3) tensors in [0, 1]."""
+
+from __future__ import annotations
+
+import importlib.util
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+MAX_PSNR = 100.0
+"""dB. Identical images would have infinity, which JSON cannot hold."""
+
+
+def psnr(prediction: Tensor, target: Tensor) -> float:
+    """Peak signal-to-noise ratio in dB for a peak of 1; 100 for identical images."""
+    error = (prediction.double() - target.double()).square().mean().clamp(min=10 ** (-MAX_PSNR / 10))
+    return float(-10 * error.log10())
+
+
+def ssim(prediction: Tensor, target: Tensor) -> float:
+    """Structural similarity (Wang et al. 2004): data range 1, 11x11 Gaussian window with sigma 1.5.
+
+    Averaged over the windows that lie inside the image and over channels.
+
+    Raises: ValueError for an image smaller than the window.
+    """
+    if min(prediction.shape[:2]) < 11:
+        raise ValueError(f"SSIM needs at least 11x11 pixels, not {prediction.shape[1]}x{prediction.shape[0]}")
+    offsets = torch.arange(-5, 6, dtype=torch.float64, device=prediction.device)
+    line = torch.exp(-(offsets**2) / (2 * 1.5**2))
+    line = line / line.sum()
+
+    def blur(image: Tensor) -> Tensor:
+        return functional.conv2d(functional.conv2d(image, line.view(1, 1, 11, 1)), line.view(1, 1, 1, 11))
+
+    x, y = (image.double().permute(2, 0, 1)[:, None] for image in (prediction, target))
+    mean_x, mean_y = blur(x), blur(y)
+    variance_x, variance_y = blur(x * x) - mean_x**2, blur(y * y) - mean_y**2
+    covariance = blur(x * y) - mean_x * mean_y
+    c1, c2 = 0.01**2, 0.03**2
+    similarity = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
+    return float((similarity / ((mean_x**2 + mean_y**2 + c1) * (variance_x + variance_y + c2))).mean())
+
+
+def load_lpips() -> tuple[Callable[[Tensor, Tensor], float] | None, str]:
+    """LPIPS with AlexNet (Zhang et al. 2018), where the `lpips` extra and the network's weights are present.
+
+    Returns: the metric, or None; and a line that says which, and why.
+    """
+    if importlib.util.find_spec("lpips") is None or importlib.util.find_spec("torchvision") is None:
+        return None, "absent: pip install 'nerfloom[lpips]'"
+    weights = Path(torch.hub.get_dir()) / "checkpoints"
+    if not list(weights.glob("alexnet-*.pth")):
+        return None, f"absent: AlexNet's weights are not in {weights}"
+    import lpips
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torchvision's notices about renamed arguments
+        network = lpips.LPIPS(net="alex", verbose=False).eval()
+
+    def measure(prediction: Tensor, target: Tensor) -> float:
+        pair = [(image.float().cpu().permute(2, 0, 1)[None] * 2 - 1) for image in (prediction, target)]
+        with torch.no_grad():
+            return float(network(*pair))
+
+    return measure, "AlexNet"

@@ -1,0 +1,1 @@
+"""Fields: what the scene is at a point. One file a family."""

@@ -1,0 +1,63 @@
+"""The field of NeRF (Mildenhall et al. 2020), appendix A, figure 7: one large network."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from framework.fields.base import MLP, Field
+from framework.kernels.frequency import frequency_encoding
+
+
+class NeRFField(Field):
+    """8 layers of 256 with the position fed in again at the fifth; colour from 256 features and the direction.
+
+    Args:
+        width: features of a hidden layer; the colour layer has half of it.
+        depth: hidden layers before density.
+        skip: the layer that is fed the encoded position again.
+        position_frequencies, direction_frequencies: L of the two encodings (10 and 4 in the paper).
+    """
+
+    def __init__(
+        self,
+        width: int = 256,
+        depth: int = 8,
+        skip: int = 5,
+        position_frequencies: int = 10,
+        direction_frequencies: int = 4,
+    ) -> None:
+        super().__init__()
+        self.position_frequencies = position_frequencies
+        self.direction_frequencies = direction_frequencies
+        encoded = 3 + 6 * position_frequencies
+        self.before_skip = MLP(encoded, *[width] * skip)
+        self.after_skip = MLP(width + encoded, *[width] * (depth - skip))
+        self.sigma_head = nn.Linear(width, 1)
+        self.feature_head = nn.Linear(width, width)
+        self.color_head = MLP(width + 3 + 6 * direction_frequencies, width // 2, 3)
+        self._initialise()
+
+    def _initialise(self) -> None:
+        """Glorot weights and zero biases, as the authors' code has them.
+
+        The density starts slightly positive: a ReLU that is negative everywhere never gets a gradient and
+        leaves the image empty for good (a failure every reimplementation has met).
+        """
+        for layer in self.modules():
+            if isinstance(layer, nn.Linear):
+                nn.init.xavier_uniform_(layer.weight)
+                nn.init.zeros_(layer.bias)
+        nn.init.constant_(self.sigma_head.bias, 0.1)
+
+    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        encoded = frequency_encoding(positions, self.position_frequencies)
+        hidden = torch.relu(self.before_skip(encoded))
+        hidden = torch.relu(self.after_skip(torch.cat([hidden, encoded.to(hidden.dtype)], dim=-1)))
+        sigma = torch.relu(self.sigma_head(hidden).squeeze(-1).float())
+        return sigma, hidden
+
+    def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
+        encoded = frequency_encoding(directions, self.direction_frequencies)
+        features = self.feature_head(features)
+        return torch.sigmoid(self.color_head(torch.cat([features, encoded.to(features.dtype)], dim=-1)).float())

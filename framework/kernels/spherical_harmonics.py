@@ -1,0 +1,47 @@
+"""Real spherical harmonics up to degree 4, the view encoding of Instant-NGP (Mueller et al. 2022, section 5.4).
+
+Constants as in Sloan 2008, "Stupid spherical harmonics tricks", appendix A2, with the Condon-Shortley phase.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+MAX_LEVELS = 4
+
+
+def spherical_harmonics(directions: Tensor, levels: int = 4) -> Tensor:
+    """The first levels^2 real spherical harmonics Y_l^m, ordered l = 0, 1, ..., m = -l ... l.
+
+    Args:
+        directions: (N, 3) unit vectors.
+        levels: number of bands, 1 to 4 (what papers call degree).
+    Returns: (N, levels^2), orthonormal over the sphere.
+    Raises: ValueError for another number of levels.
+    """
+    if not 1 <= levels <= MAX_LEVELS:
+        raise ValueError(f"spherical harmonics have 1 to {MAX_LEVELS} levels, not {levels}")
+    x, y, z = directions.unbind(-1)
+    bands = [torch.full_like(x, 0.28209479177387814)]
+    if levels > 1:
+        bands += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
+    if levels > 2:
+        bands += [
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (3 * z * z - 1),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (x * x - y * y),
+        ]
+    if levels > 3:
+        bands += [
+            -0.5900435899266435 * y * (3 * x * x - y * y),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (5 * z * z - 1),
+            0.3731763325901154 * z * (5 * z * z - 3),
+            -0.4570457994644658 * x * (5 * z * z - 1),
+            1.445305721320277 * z * (x * x - y * y),
+            -0.5900435899266435 * x * (x * x - 3 * y * y),
+        ]
+    return torch.stack(bands, dim=-1)

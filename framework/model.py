@@ -1,0 +1,71 @@
+"""What the trainer and the evaluator know of a method."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from framework.config import TrainConfig
+from framework.losses import mean_squared_error
+from framework.pixels import Batch
+from framework.rays import Rays
+from framework.renderers import Rendered
+from framework.scene import Scene
+
+ConfigT = TypeVar("ConfigT", bound=TrainConfig)
+
+
+class Model(nn.Module, ABC, Generic[ConfigT]):
+    """A radiance field that can be trained. `self.training` tells random sampling (True) from fixed (False).
+
+    Args:
+        config: the method's settings.
+        scene: facts about the data.
+    """
+
+    def __init__(self, config: ConfigT, scene: Scene) -> None:
+        super().__init__()
+        self.config = config
+        self.scene = scene
+
+    @abstractmethod
+    def render(self, rays: Rays, background: Tensor) -> Rendered:
+        """Colour, depth and opacity of R rays over `background`, (R, 3) or (3,). R may be 0."""
+
+    def loss(self, rendered: Rendered, batch: Batch, step: int) -> dict[str, Tensor]:
+        """Named scalars; their sum is minimised. The mean squared error of every level by default."""
+        losses = {"rgb": mean_squared_error(rendered.rgb, batch.rgb)}
+        if rendered.coarse is not None:
+            losses["rgb_coarse"] = mean_squared_error(rendered.coarse.rgb, batch.rgb)
+        return losses
+
+    def param_groups(self) -> list[dict[str, Any]]:
+        """Adam's parameter groups. Each has `params` and may set `lr`, `betas`, `eps`, `weight_decay`."""
+        return [{"params": list(self.parameters())}]
+
+    def before_step(self, step: int) -> None:
+        """Schedules that are functions of `step`, and refreshing what samplers know."""
+
+    @property
+    def device(self) -> torch.device:
+        return next(self.parameters()).device
+
+    def size(self) -> int:
+        """Number of trainable parameters."""
+        return sum(parameter.numel() for parameter in self.parameters())
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method as its file declares it; its name is the entry point's, its summary the file's first line."""
+
+    model: type[Model[Any]]
+    """Built as `model(config, scene)`."""
+    config: TrainConfig
+    """Default settings."""
+    paper: str
+    """Where it was published."""

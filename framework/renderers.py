@@ -1,0 +1,95 @@
+"""Volume rendering: from samples with density and colour to a pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from framework.fields.base import Field
+from framework.kernels.compositing import ray_sum, weights_and_transmittance
+from framework.rays import Rays, Samples
+from framework.samplers.base import Sampler
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What a model makes of R rays."""
+
+    rgb: Tensor
+    """(R, 3) colour over the background."""
+    depth: Tensor
+    """(R,) expected distance: the mean of t under the weights; the ray's far end where it met nothing."""
+    median_depth: Tensor
+    """(R,) distance at which half of the light is gone; the ray's far end where it never is."""
+    accumulation: Tensor
+    """(R,) opacity, the sum of the weights."""
+    num_samples: int
+    """Field evaluations spent on these rays."""
+    weights: Tensor | None = None
+    """(N,) weight of each sample."""
+    samples: Samples | None = None
+    """The samples themselves."""
+    coarse: Rendered | None = None
+    """An earlier level's picture, for methods that supervise it."""
+
+    def over(self, coarse: Rendered) -> Rendered:
+        """This picture with the coarse level it was refined from; the evaluations of both count."""
+        return replace(self, coarse=coarse, num_samples=self.num_samples + coarse.num_samples)
+
+
+def volume_render(rays: Rays, samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor) -> Rendered:
+    """Composite packed samples (NeRF, equation 3).
+
+    Args:
+        rays: R rays, for their far end.
+        samples: N intervals.
+        sigma: (N,) density.
+        rgb: (N, 3) colour.
+        background: (R, 3) or (3,) what shows where the ray is not opaque.
+    """
+    sigma, rgb = _at_least_float32(sigma), _at_least_float32(rgb)
+    weights, transmittance = weights_and_transmittance(sigma, samples)
+    accumulation = ray_sum(weights, samples)
+    left = (1 - accumulation).clamp(min=0)
+    color = ray_sum(weights[:, None] * rgb, samples) + left[:, None] * background
+    with torch.no_grad():
+        moment = ray_sum(weights * samples.t, samples)
+        seen = accumulation > 1e-6
+        mean = moment / torch.where(seen, accumulation, torch.ones_like(accumulation))
+        depth = torch.where(seen, torch.minimum(mean, rays.fars), rays.fars)
+        median = _median_depth(rays, samples, weights, transmittance)
+    return Rendered(color, depth, median, accumulation, len(samples), weights, samples)
+
+
+def _median_depth(rays: Rays, samples: Samples, weights: Tensor, transmittance: Tensor) -> Tensor:
+    """(R,) t of the first sample behind which transmittance is at most 1/2."""
+    behind = transmittance - weights
+    far = rays.fars[samples.ray_indices]
+    candidates = torch.where(behind <= 0.5, torch.minimum(samples.t, far), far)
+    return rays.fars.to(candidates.dtype).scatter_reduce(0, samples.ray_indices, candidates, "amin")
+
+
+def _at_least_float32(values: Tensor) -> Tensor:
+    return values if values.dtype == torch.float64 else values.float()
+
+
+def render_field(field: Field, sampler: Sampler, rays: Rays, background: Tensor, jitter: bool) -> Rendered:
+    """Sample, evaluate and composite: what most methods do with a ray.
+
+    A sampler that has evaluated density already hands it over; it is not evaluated again.
+    """
+    samples = sampler.sample(rays, field.density, jitter)
+    if samples.sigma is None or samples.features is None:
+        samples = samples.evaluated(*field.density(samples.positions(rays), samples.times(rays)))
+    return shade(field, rays, samples, background)
+
+
+def shade(field: Field, rays: Rays, samples: Samples, background: Tensor) -> Rendered:
+    """Colour and composite samples whose density and features are attached."""
+    assert samples.sigma is not None and samples.features is not None
+    owners = samples.ray_indices
+    cameras = None if rays.camera_indices is None else rays.camera_indices[owners]
+    rgb = field.color(samples.features, rays.directions[owners], cameras)
+    return volume_render(rays, samples, samples.sigma, rgb, background)

@@ -1,0 +1,34 @@
+"""Inverse-transform sampling of a piecewise-constant density: NeRF, section 5.2."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def inverse_cdf(edges: Tensor, weights: Tensor, u: Tensor, padding: float = 1e-5) -> Tensor:
+    """Points whose density is proportional to `weights` over the bins between `edges`.
+
+    Args:
+        edges: (R, B + 1) sorted bin edges.
+        weights: (R, B) at least 0. `padding` is added to each, so that a ray without weight is sampled evenly.
+        u: (R, S) in [0, 1]: random or evenly spaced, in any order.
+    Returns: (R, S) points within [edges[:, 0], edges[:, -1]], in the order of u.
+    """
+    weights = weights + padding
+    cdf = torch.cumsum(weights / weights.sum(-1, keepdim=True), dim=-1)
+    # Rounding leaves the end off 1 by some 1e-7: it is set, not hoped for.
+    cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf[:, :-1].clamp(max=1), torch.ones_like(cdf[:, :1])], dim=-1)
+    above = torch.searchsorted(cdf, u.contiguous(), right=True).clamp(1, weights.shape[-1])
+    low, high = cdf.gather(-1, above - 1), cdf.gather(-1, above)
+    width = high - low
+    empty = width <= 0
+    fraction = torch.where(empty, torch.zeros_like(u), (u - low) / torch.where(empty, torch.ones_like(u), width))
+    return torch.lerp(edges.gather(-1, above - 1), edges.gather(-1, above), fraction.clamp(0, 1))
+
+
+def uniform_variates(num_rays: int, count: int, jitter: bool, device: torch.device) -> Tensor:
+    """u (R, count) for `inverse_cdf`: independent uniform numbers, or `count` evenly spaced ones (evaluation)."""
+    if jitter:
+        return torch.rand(num_rays, count, device=device)
+    return ((torch.arange(count, device=device) + 0.5) / count).expand(num_rays, count)

@@ -1,0 +1,44 @@
+"""Samples in bins of equal length between near and far: NeRF, equation 2."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from framework.fields.base import DensityFunction
+from framework.rays import Rays, Samples
+
+LAST_INTERVAL = 1e10
+"""The authors' code lets the last sample stand for everything behind it."""
+
+
+def stratified_points(rays: Rays, count: int, jitter: bool) -> Tensor:
+    """(R, count) distances, one in each of `count` equal bins: random in its bin, or its middle."""
+    shape = (len(rays), count)
+    within = torch.rand(shape, device=rays.nears.device) if jitter else torch.full(shape, 0.5, device=rays.nears.device)
+    fraction = (torch.arange(count, device=rays.nears.device) + within) / count
+    return torch.lerp(rays.nears[:, None], rays.fars[:, None], fraction)
+
+
+def samples_from_points(points: Tensor) -> Samples:
+    """Point samples (R, S), sorted, as NeRF's quadrature takes them: the interval of point i ends at point i + 1."""
+    ends = torch.cat([points[:, 1:], points[:, -1:] + LAST_INTERVAL], dim=-1)
+    return Samples.regular(points, ends, points)
+
+
+@dataclass(frozen=True)
+class UniformSampler:
+    """`count` samples between near and far on every ray, one in each of `count` equal bins."""
+
+    count: int
+
+    def sample(self, rays: Rays, density: DensityFunction, jitter: bool) -> Samples:
+        edges = torch.linspace(0, 1, self.count + 1, device=rays.nears.device)
+        t = torch.lerp(rays.nears[:, None], rays.fars[:, None], edges)
+        points = stratified_points(rays, self.count, jitter)
+        return Samples.regular(t[:, :-1], t[:, 1:], points)
+
+    def update(self, step: int, density: DensityFunction) -> None:
+        """A uniform sampler knows nothing that could grow old."""

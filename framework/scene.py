@@ -1,0 +1,27 @@
+"""What a method is told about the scene it is to learn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Facts read from the data before anything is trained."""
+
+    box: Tensor
+    """(2, 3) smallest and largest corner of the part of space that matters, scene units."""
+    near: float
+    """Distance from a camera at which the scene may start."""
+    far: float
+    """Distance from a camera at which the scene ends."""
+    num_cameras: int
+    """Training images."""
+    has_alpha: bool
+    """The photographs tell what is background."""
+    moving: bool
+    """The photographs have times."""
+    image_size: int
+    """The longer side of the largest training image, pixels."""

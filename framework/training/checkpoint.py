@@ -1,0 +1,90 @@
+"""Checkpoints: tensors and plain data only, written so that a killed process never leaves half of one."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from framework.console import say
+from framework.errors import CheckpointError
+
+FOLDER = "nerfstudio_models"
+FORMAT = 1
+_NAME = re.compile(r"step-(\d{9})\.ckpt")
+
+
+def write_atomically(path: Path, write: Any) -> None:
+    """Call `write(file)` on a temporary file beside `path`, flush it to disk and rename it.
+
+    Raises: OSError as it comes; `path` is then as it was, and no temporary file is left.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bool) -> Path:
+    """Write `state` as step-%09d.ckpt; then, unless `keep_all`, remove all but the two newest.
+
+    Raises: CheckpointError where it cannot be written; older checkpoints are untouched then.
+    """
+    path = folder / f"step-{step:09d}.ckpt"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, lambda file: torch.save({"format": FORMAT, **state}, file))
+    except (OSError, RuntimeError) as error:
+        raise CheckpointError(f"cannot write {path}: {error}; earlier checkpoints stand") from error
+    if not keep_all:
+        for old in list_checkpoints(folder)[:-2]:
+            old.unlink(missing_ok=True)
+    return path
+
+
+def list_checkpoints(folder: Path) -> list[Path]:
+    """Checkpoints in a folder, oldest first."""
+    return sorted(path for path in folder.glob("step-*.ckpt") if _NAME.fullmatch(path.name))
+
+
+def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
+    """Read a checkpoint. Nothing in it is executed (`weights_only`).
+
+    Raises: CheckpointError where it is missing, cut short or not one of ours.
+    """
+    try:
+        state = torch.load(path, map_location=device, weights_only=True)
+    except FileNotFoundError as error:
+        raise CheckpointError(f"there is no checkpoint {path}") from error
+    except Exception as error:  # torch raises RuntimeError, UnpicklingError, EOFError, KeyError, OSError and more
+        raise CheckpointError(f"{path} is damaged or not a checkpoint of nerfloom") from error
+    if not isinstance(state, dict) or state.get("format") != FORMAT or "model" not in state:
+        raise CheckpointError(f"{path} is not a checkpoint of this version of nerfloom (format {FORMAT})")
+    return state
+
+
+def load_newest(folder: Path, device: torch.device | str = "cpu") -> dict[str, Any] | None:
+    """The newest readable checkpoint of a folder, or None where the folder has none.
+
+    A damaged one is reported and the one before it is taken.
+
+    Raises: CheckpointError where there are checkpoints, but none can be read.
+    """
+    paths = list_checkpoints(folder)
+    for path in reversed(paths):
+        try:
+            return load_checkpoint(path, device)
+        except CheckpointError as error:
+            say(f"{error}; trying the one before")
+    if paths:
+        raise CheckpointError(f"none of the {len(paths)} checkpoints in {folder} can be read")
+    return None

@@ -1,0 +1,90 @@
+"""How a run shows itself while it goes: a progress bar, TensorBoard, a learning curve."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from torch import Tensor
+
+from framework.console import console, say
+
+SECONDS_BETWEEN_LINES = 15.0
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """What one training step showed."""
+
+    step: int
+    """Steps done, this one included."""
+    seconds: float
+    """Training seconds so far."""
+    progress: float
+    """Share of the budget spent."""
+    loss: float
+    psnr: float
+    """Of the batch, dB, smoothed."""
+    rays_per_second: float
+    samples_per_ray: float
+
+    def line(self) -> str:
+        return (
+            f"step {self.step:,}  loss {self.loss:.5f}  PSNR {self.psnr:.2f} dB  "
+            f"{self.rays_per_second / 1e3:.1f}k rays/s  {self.samples_per_ray:.1f} samples/ray"
+        )
+
+
+class ProgressBar:
+    """A bar on a terminal; a line every 15 seconds elsewhere."""
+
+    def __init__(self, title: str) -> None:
+        columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), TimeRemainingColumn())
+        self._bar = Progress(*columns, TextColumn("{task.fields[state]}"), console=console, transient=True)
+        self._task = self._bar.add_task(title, total=1.0, state="")
+        self._last_line = time.monotonic()
+
+    def __enter__(self) -> ProgressBar:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+    def show(self, report: StepReport) -> None:
+        """Bring the bar up to date."""
+        self._bar.update(self._task, completed=report.progress, state=report.line())
+        if not console.is_terminal and time.monotonic() - self._last_line > SECONDS_BETWEEN_LINES:
+            self._last_line = time.monotonic()
+            say(f"{report.seconds:5.0f} s  {report.line()}")
+
+
+class TensorBoard:
+    """Curves and pictures for TensorBoard; does nothing where switched off."""
+
+    def __init__(self, folder: Path, enabled: bool) -> None:
+        self._writer: Any = None
+        if enabled:
+            from torch.utils.tensorboard import SummaryWriter  # slow to import, so only on use
+
+            self._writer = SummaryWriter(str(folder))  # type: ignore[no-untyped-call]
+
+    def scalars(self, values: dict[str, float], step: int) -> None:
+        if self._writer is not None:
+            for name, value in values.items():
+                self._writer.add_scalar(name, value, step)
+
+    def image(self, name: str, image: Tensor, step: int) -> None:
+        """`image` (H, W, 3) in [0, 1]."""
+        if self._writer is not None:
+            self._writer.add_image(name, image.clamp(0, 1), step, dataformats="HWC")
+
+    def close(self) -> None:
+        if self._writer is not None:
+            self._writer.close()

@@ -1,0 +1,113 @@
+"""A run: a method, its settings, a data set, and the folder that everything about them goes into.
+
+    outputs/{experiment}/{method}/{YYYY-mm-dd_HHMMSS}/
+        config.yml                    all settings, plain YAML
+        dataparser_transforms.json    from the input's frame to the scene's
+        nerfstudio_models/            checkpoints
+        learning_curve.json           seconds, step, PSNR
+        eval.json, pictures/          the final evaluation
+        events.out.tfevents.*         TensorBoard
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from framework.config import TrainConfig, from_plain, read_yaml, to_plain
+from framework.dataset import DataParser, Dataset
+from framework.errors import ConfigError
+from framework.registry import load_dataparser, load_method, recognize
+from framework.training.checkpoint import write_atomically
+
+
+@dataclass(frozen=True)
+class Run:
+    """What is trained on what, with which settings."""
+
+    method: str
+    """Name of the method."""
+    config: TrainConfig
+    """Its settings."""
+    dataparser: str
+    """Name of the data format."""
+    parser: DataParser
+    """The data format with its flags."""
+    folder: Path
+    """Where the run's files go."""
+
+    @property
+    def config_path(self) -> Path:
+        return self.folder / "config.yml"
+
+
+def run_folder(method: str, config: TrainConfig) -> Path:
+    """outputs/{experiment}/{method}/{timestamp}, from the settings and the clock."""
+    experiment = config.experiment_name or (config.data.resolve().name if config.data else "procedural")
+    timestamp = config.timestamp or datetime.now().strftime("%Y-%m-%d_%H%M%S")
+    return config.output_dir / experiment / method / timestamp
+
+
+def create_folder(run: Run) -> None:
+    """Make the run's folder and write config.yml.
+
+    Raises: ConfigError where the folder exists already or cannot be written.
+    """
+    if run.config_path.exists():
+        raise ConfigError(
+            f"{run.folder} already holds a run; continue it with 'ns-train --resume {run.folder}', "
+            "or choose another --timestamp"
+        )
+    config = run.config
+    if config.data is not None:
+        config = dataclasses.replace(config, data=config.data.resolve())
+    document = {
+        "method": run.method,
+        "dataparser": {"name": run.dataparser, **to_plain(run.parser)},
+        **to_plain(config),
+    }
+    text = yaml.safe_dump(document, sort_keys=False)
+    try:
+        run.folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(run.config_path, lambda file: file.write(text.encode()))
+    except OSError as error:
+        raise ConfigError(f"cannot write the run's folder {run.folder}: {error.strerror}") from error
+
+
+def read_run(path: Path) -> Run:
+    """A run, or a recipe for one, from a YAML file.
+
+    Keys are `method`, optionally `dataparser` (with `name` and the format's flags), and the method's settings.
+
+    Raises: ConfigError for an unknown method, format or key, or a value of the wrong type.
+    """
+    values = read_yaml(path)
+    method = values.pop("method", None)
+    if not isinstance(method, str):
+        raise ConfigError(f"{path} does not say which method, as in 'method: instant-ngp'")
+    data_flags = values.pop("dataparser", None) or {}
+    config = from_plain(load_method(method).config, values, str(path))
+    if not isinstance(data_flags, dict):
+        raise ConfigError(f"{path}: 'dataparser' must hold keys and values, such as 'name: blender'")
+    data_flags = dict(data_flags)
+    name = data_flags.pop("name", None) or recognize(config.data)
+    parser = from_plain(load_dataparser(name)(), data_flags, f"{path}: dataparser")
+    return Run(method, config, name, parser, path.parent)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Plain data as indented JSON, atomically."""
+    text = json.dumps(content, indent=2, allow_nan=False) + "\n"
+    write_atomically(path, lambda file: file.write(text.encode()))
+
+
+def write_transforms(run: Run, dataset: Dataset) -> None:
+    """dataparser_transforms.json, as nerfstudio writes it."""
+    content = {"transform": dataset.transform.tolist(), "scale": dataset.scale}
+    write_json(run.folder / "dataparser_transforms.json", content)

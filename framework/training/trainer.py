@@ -1,0 +1,346 @@
+"""One trainer for every method: steps, checkpoints, periodic evaluation, and when to stop."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from framework.config import TrainConfig, to_plain
+from framework.console import say
+from framework.dataset import Dataset
+from framework.device import seed_step, wait_for
+from framework.errors import CheckpointError, DivergenceError
+from framework.evaluation.evaluator import evaluate, evaluation_background, render_view, use_bfloat16
+from framework.evaluation.images import comparison
+from framework.evaluation.metrics import MAX_PSNR
+from framework.model import Model
+from framework.pixels import Background, Batch, composite, draw_batch
+from framework.registry import load_method
+from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest, save_checkpoint
+from framework.training.optim import first_non_finite, learning_rate_factor, make_optimizer, set_learning_rate
+from framework.training.progress import ProgressBar, StepReport, TensorBoard
+from framework.training.run import Run, write_json
+
+STEPS_PER_LOG = 25
+MAX_BAD_STEPS = 10
+"""Non-finite steps in a row after which a run stops."""
+FIRST_SAMPLES_PER_RAY = 256.0
+"""What is assumed before anything is known, when the batch follows the number of samples."""
+SMALLEST_BATCH, LARGEST_BATCH = 64, 2**17
+"""Rays in a step, when their number follows the samples."""
+
+
+@dataclass
+class State:
+    """What changes as a run goes, besides parameters; a checkpoint holds all of it."""
+
+    step: int = 0
+    """Steps done."""
+    seconds: float = 0.0
+    """Seconds of training, without evaluation and saving."""
+    rays: int = 0
+    """Rays trained on."""
+    skipped: int = 0
+    """Steps dropped because a loss or gradient was not finite."""
+    samples_per_ray: float = FIRST_SAMPLES_PER_RAY
+    """Running mean."""
+    train_mse: float = 1.0
+    """Running mean over batches, uncorrected."""
+    curve: tuple[tuple[float, int, float], ...] = ()
+    """(seconds, step, PSNR) of each evaluation over all images."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How training ended."""
+
+    reason: str
+    """Why it stopped."""
+    interrupted: bool
+    """Whether somebody stopped it."""
+    checkpoint: Path
+    """The last state."""
+
+
+class Trainer:
+    """Trains one run.
+
+    Args:
+        run: method, settings and folder.
+        train_set: images to learn from, on the device.
+        eval_set: images of the periodic evaluation, or None for none.
+    """
+
+    def __init__(self, run: Run, train_set: Dataset, eval_set: Dataset | None) -> None:
+        self.run, self.config = run, run.config
+        self.train_set, self.eval_set = train_set, eval_set
+        self.device = train_set.pixels.device
+        torch.manual_seed(self.config.machine.seed)
+        self.model = build_model(run.method, self.config, train_set.scene).to(self.device)
+        self.optimizer = make_optimizer(self.model, self.config)
+        self.state = State()
+        self._bad_in_a_row = 0
+        self._last_save = self._last_eval = 0.0
+
+    # -- checkpoints ------------------------------------------------------------------------------------------
+
+    @property
+    def checkpoint_folder(self) -> Path:
+        return self.run.folder / FOLDER
+
+    def save(self) -> Path:
+        """Write a checkpoint from which training goes on with the same bits."""
+        self._last_save = self.state.seconds
+        scene = self.model.scene
+        content = {
+            "method": self.run.method,
+            "config": to_plain(self.config),
+            "scene": {**vars(scene), "box": scene.box.cpu()},
+            "transform": self.train_set.transform,
+            "scale": self.train_set.scale,
+            "model": self.model.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "state": vars(self.state),
+        }
+        return save_checkpoint(
+            self.checkpoint_folder, self.state.step, content, keep_all=not self.config.save_only_latest_checkpoint
+        )
+
+    def restore(self, checkpoint: dict[str, Any]) -> None:
+        """Continue from a checkpoint's content.
+
+        Raises: CheckpointError where it belongs to another method or other sizes.
+        """
+        restore_model(self.model, checkpoint)
+        try:
+            rates = [group["initial_lr"] for group in self.optimizer.param_groups]
+            self.optimizer.load_state_dict(checkpoint["optimizer"])
+            for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
+                group["initial_lr"] = rate  # a rate given on the command line counts
+            self.state = State(**checkpoint["state"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise CheckpointError(f"the checkpoint's optimiser does not fit: {error}") from error
+        self._last_save = self._last_eval = self.state.seconds
+
+    def restore_as_configured(self) -> None:
+        """Start from --load-checkpoint or --load-dir, where given."""
+        if self.config.load_checkpoint is not None:
+            self.restore(load_checkpoint(self.config.load_checkpoint, self.device))
+        elif self.config.load_dir is not None:
+            checkpoint = load_newest(self.config.load_dir, self.device)
+            if checkpoint is None:
+                raise CheckpointError(f"--load-dir {self.config.load_dir}: there is no checkpoint")
+            self.restore(checkpoint)
+
+    # -- the run ----------------------------------------------------------------------------------------------
+
+    def train(self) -> Outcome:
+        """Train until a budget is spent, a target is met, or somebody stops it; then save.
+
+        Raises: DivergenceError after ten non-finite steps in a row; the last checkpoint stands.
+        """
+        board = TensorBoard(self.run.folder, self.config.vis == "tensorboard")
+        with _stop_signals() as stopped, ProgressBar(self.run.method) as bar:
+            while (reason := self._reason_to_stop(stopped)) is None:
+                report = self.train_step()
+                bar.show(report)
+                self._log(report, board)
+                if self._due_to_save():
+                    self._try_to_save()
+                self._evaluate_if_due(board)
+        board.close()
+        self._write_curve()
+        return Outcome(reason, bool(stopped), self.save())
+
+    def _reason_to_stop(self, stopped: list[int]) -> str | None:
+        if stopped:
+            return "stopped by " + signal.Signals(stopped[0]).name
+        if self.state.step >= self.config.max_num_iterations:
+            return f"{self.config.max_num_iterations} steps done"
+        if self.config.max_seconds is not None and self.state.seconds >= self.config.max_seconds:
+            return f"{self.config.max_seconds:g} s of training spent"
+        target, curve = self.config.target_psnr, self.state.curve
+        if target is not None and curve and curve[-1][2] >= target:
+            return f"{target:g} dB reached"
+        return None
+
+    @property
+    def progress(self) -> float:
+        """Share of the budget spent, steps or seconds, whichever is further."""
+        done = self.state.step / self.config.max_num_iterations
+        if self.config.max_seconds is not None:
+            done = max(done, self.state.seconds / self.config.max_seconds)
+        return min(done, 1.0)
+
+    def train_step(self) -> StepReport:
+        """One batch, one step of Adam."""
+        state, start = self.state, time.perf_counter()
+        seed_step(self.config.machine.seed, state.step)
+        self.model.train()
+        set_learning_rate(self.optimizer, learning_rate_factor(self.config, state.step, self.progress))
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=use_bfloat16(self.model)):
+            self.model.before_step(state.step)
+            batch = draw_batch(self.train_set, self._batch_size(), self._background())
+            rendered = self.model.render(batch.rays, batch.background)
+            losses = self.model.loss(rendered, batch, state.step)
+        loss = torch.stack(list(losses.values())).sum()
+        self._descend(loss)
+        mse = float((rendered.rgb.detach() - batch.rgb).square().mean())
+        wait_for(self.device)
+        seconds = time.perf_counter() - start
+        self._account(batch, rendered.num_samples, mse, seconds)
+        return StepReport(
+            step=state.step,
+            seconds=state.seconds,
+            progress=self.progress,
+            loss=float(loss),
+            psnr=self._train_psnr(),
+            rays_per_second=len(batch.rays) / seconds,
+            samples_per_ray=state.samples_per_ray,
+        )
+
+    def _descend(self, loss: Tensor) -> None:
+        """Backward and step, unless something is not finite: then the step is dropped and counted.
+
+        bfloat16 has float32's range, so no gradient scaling is needed.
+        """
+        self.optimizer.zero_grad(set_to_none=True)
+        finite = bool(torch.isfinite(loss))
+        if finite and loss.requires_grad:
+            loss.backward()  # type: ignore[no-untyped-call]
+            gradients = [p.grad for p in self.model.parameters() if p.grad is not None]
+            finite = bool(torch.isfinite(torch.nn.utils.get_total_norm(gradients)))
+            if finite:
+                self.optimizer.step()
+        self._bad_in_a_row = 0 if finite else self._bad_in_a_row + 1
+        self.state.skipped += not finite
+        if self._bad_in_a_row >= MAX_BAD_STEPS:
+            culprit = first_non_finite(self.model) or "the loss"
+            raise DivergenceError(
+                f"step {self.state.step}: {MAX_BAD_STEPS} steps in a row were not finite, first in {culprit}; "
+                f"the last good checkpoint is in {self.checkpoint_folder}. Lower --learning-rate, or check the data"
+            )
+
+    def _batch_size(self) -> int:
+        if self.config.samples_per_batch is None:
+            return self.config.num_rays_per_batch
+        wanted = round(self.config.samples_per_batch / max(self.state.samples_per_ray, 0.1))
+        return min(max(wanted, SMALLEST_BATCH), LARGEST_BATCH)
+
+    def _background(self) -> Background:
+        if self.config.background != "auto":
+            return self.config.background
+        return "random" if self.model.scene.has_alpha else "black"
+
+    def _account(self, batch: Batch, num_samples: int, mse: float, seconds: float) -> None:
+        state = self.state
+        state.step += 1
+        state.seconds += seconds
+        state.rays += len(batch.rays)
+        state.samples_per_ray += 0.2 * (num_samples / max(len(batch.rays), 1) - state.samples_per_ray)
+        weight = max(0.02, 1 / state.step)
+        state.train_mse += weight * (mse - state.train_mse)
+
+    def _train_psnr(self) -> float:
+        return min(-10 * float(torch.tensor(max(self.state.train_mse, 1e-12)).log10()), MAX_PSNR)
+
+    # -- looking on -------------------------------------------------------------------------------------------
+
+    def _log(self, report: StepReport, board: TensorBoard) -> None:
+        if report.step % STEPS_PER_LOG == 0:
+            values = {
+                "train/loss": report.loss,
+                "train/psnr": report.psnr,
+                "train/rays_per_second": report.rays_per_second,
+                "train/samples_per_ray": report.samples_per_ray,
+                "train/skipped_steps": float(self.state.skipped),
+            }
+            for index, group in enumerate(self.optimizer.param_groups):
+                values[f"learning_rate/{group.get('name', index)}"] = group["lr"]
+            board.scalars(values, report.step)
+
+    def _evaluate_if_due(self, board: TensorBoard) -> None:
+        """Periodic evaluation; its time does not count as training."""
+        config, step = self.config, self.state.step
+        if self.eval_set is None or config.max_eval_images == 0:
+            return
+        if step % config.steps_per_eval_image == 0:
+            index = (step // config.steps_per_eval_image - 1) % len(self.eval_set)
+            background = evaluation_background(self.model)
+            view = render_view(self.model, self.eval_set, index, background)
+            target = composite(self.eval_set.image(index).float() / 255, background)
+            board.image("eval/photograph_render_error", comparison(view.rgb, target), step)
+        every = config.seconds_per_eval_all_images
+        if every is None and config.target_psnr is not None:
+            every = 15.0
+        due = every is not None and self.state.seconds - self._last_eval >= every
+        if due or step % config.steps_per_eval_all_images == 0:
+            self._last_eval = self.state.seconds
+            found = evaluate(self.model, self.eval_set, max_images=config.max_eval_images, title="Evaluating")
+            self.state.curve += ((self.state.seconds, step, found.results["psnr"]),)
+            board.scalars({"eval/psnr": found.results["psnr"]}, step)
+            say(f"{self.state.seconds:5.0f} s  step {step:,}  {found.line()}")
+            self._write_curve()
+
+    def _write_curve(self) -> None:
+        rows = [{"seconds": s, "step": n, "psnr": p} for s, n, p in self.state.curve]
+        write_json(self.run.folder / "learning_curve.json", rows)
+
+    def _due_to_save(self) -> bool:
+        aged = self.state.seconds - self._last_save >= self.config.seconds_per_save
+        return aged or self.state.step % self.config.steps_per_save == 0
+
+    def _try_to_save(self) -> None:
+        """A full disk must not end a run that still fits into memory: it is reported, and tried again later."""
+        try:
+            self.save()
+        except CheckpointError as error:
+            say(f"warning: {error}")
+
+
+def build_model(method: str, config: TrainConfig, scene: Any) -> Model[Any]:
+    """A method's model with fresh parameters."""
+    return load_method(method).model(config, scene)
+
+
+def restore_model(model: Model[Any], checkpoint: dict[str, Any]) -> None:
+    """Load a checkpoint's parameters into a model.
+
+    Raises: CheckpointError where names or sizes differ.
+    """
+    try:
+        model.load_state_dict(checkpoint["model"])
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())[:300]
+        raise CheckpointError(f"the checkpoint does not fit the model's settings: {reason}") from error
+
+
+@contextmanager
+def _stop_signals() -> Iterator[list[int]]:
+    """Ctrl-C and SIGTERM end the run after the step at hand; a second one ends it at once.
+
+    Yields the list of signals received.
+    """
+    received: list[int] = []
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        signal.signal(number, previous[number])
+
+    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        for number in previous:
+            signal.signal(number, handle)
+        yield received
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

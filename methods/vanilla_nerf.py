@@ -1,0 +1,108 @@
+"""NeRF as published in 2020: one large network on frequency encodings, coarse and fine sampling.
+
+Mildenhall et al., "NeRF: Representing Scenes as Neural Radiance Fields for View Synthesis", ECCV 2020. With
+`--sampler occupancy` one network of the same shape is sampled through an occupancy grid instead: empty and hidden
+space is skipped (as in NerfAcc, Li et al. 2023).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from framework import Method, Model, Rays, Rendered, Scene, TrainConfig
+from framework.fields.nerf import NeRFField
+from framework.renderers import render_field, shade
+from framework.samplers.inverse_cdf import inverse_cdf, uniform_variates
+from framework.samplers.occupancy import OccupancySampler
+from framework.samplers.uniform import samples_from_points, stratified_points
+
+
+@dataclass(frozen=True)
+class VanillaNeRFConfig(TrainConfig):
+    """Settings of vanilla-nerf; the defaults are the paper's."""
+
+    max_num_iterations: int = 200_000
+    num_rays_per_batch: int = 1_024
+    learning_rate: float = 5e-4
+    lr_final: float = 0.1
+    background: Literal["auto", "random", "white", "black"] = "white"
+    sampler: Literal["hierarchical", "occupancy"] = "hierarchical"
+    """hierarchical: 64 coarse and 64 + 128 fine samples through two networks. occupancy: one network, marched
+    through an occupancy grid."""
+    num_coarse_samples: int = 64
+    """Stratified samples a ray for the coarse network."""
+    num_fine_samples: int = 128
+    """Further samples a ray for the fine network, drawn where the coarse one found something."""
+    num_layers: int = 8
+    """Layers before density."""
+    hidden_width: int = 256
+    """Features of a layer."""
+    position_frequencies: int = 10
+    """L of the position's encoding."""
+    direction_frequencies: int = 4
+    """L of the direction's encoding."""
+    grid_resolution: int = 128
+    """Cells along an axis of the occupancy grid."""
+    num_steps: int = 512
+    """Steps along the box's diagonal with the occupancy grid."""
+    early_stop: float = 1e-4
+    """Transmittance below which the rest of a ray is dropped, with the occupancy grid."""
+
+
+class VanillaNeRF(Model[VanillaNeRFConfig]):
+    """Two networks trained together (equations 5 and 6), or one with an occupancy grid."""
+
+    def __init__(self, config: VanillaNeRFConfig, scene: Scene) -> None:
+        super().__init__(config, scene)
+        self.fine = self._field()
+        self.coarse = self._field() if config.sampler == "hierarchical" else None
+        self.sampler = (
+            OccupancySampler(scene.box, config.grid_resolution, config.num_steps, config.early_stop)
+            if config.sampler == "occupancy"
+            else None
+        )
+
+    def _field(self) -> NeRFField:
+        c = self.config
+        return NeRFField(
+            c.hidden_width,
+            c.num_layers,
+            skip=c.num_layers // 2 + 1,
+            position_frequencies=c.position_frequencies,
+            direction_frequencies=c.direction_frequencies,
+        )
+
+    def render(self, rays: Rays, background: Tensor) -> Rendered:
+        if self.sampler is not None:
+            return render_field(self.fine, self.sampler, rays, background, self.training)
+        return self._render_hierarchical(rays, background)
+
+    def _render_hierarchical(self, rays: Rays, background: Tensor) -> Rendered:
+        assert self.coarse is not None
+        points = stratified_points(rays, self.config.num_coarse_samples, self.training)
+        coarse = self._render_points(self.coarse, rays, points, background)
+        assert coarse.weights is not None and coarse.samples is not None
+        weights = coarse.samples.padded(coarse.weights).detach()
+        middles = (points[:, 1:] + points[:, :-1]) / 2
+        u = uniform_variates(len(rays), self.config.num_fine_samples, self.training, points.device)
+        drawn = inverse_cdf(middles, weights[:, 1:-1], u)
+        merged = torch.cat([points, drawn], dim=-1).sort(dim=-1).values
+        fine = self._render_points(self.fine, rays, merged, background)
+        return fine.over(coarse)
+
+    @staticmethod
+    def _render_points(field: NeRFField, rays: Rays, points: Tensor, background: Tensor) -> Rendered:
+        samples = samples_from_points(points)
+        samples = samples.evaluated(*field.density(samples.positions(rays), samples.times(rays)))
+        return shade(field, rays, samples, background)
+
+    def before_step(self, step: int) -> None:
+        if self.sampler is not None:
+            self.sampler.update(step, self.fine.density)
+
+
+METHOD = Method(VanillaNeRF, VanillaNeRFConfig(), paper="arXiv:2003.08934")

@@ -56,7 +56,9 @@ class Procedural(DataParser):
                     folder, size=self.size, num_train=self.num_train, moving=self.moving, seed=self.scene_seed
                 )
             except OSError as error:
-                raise DataError(f"cannot write {folder}: {error.strerror}; set NERFLOOM_CACHE to a writable folder") from error
+                raise DataError(
+                    f"cannot write {folder}: {error.strerror}; set NERFLOOM_CACHE to a writable folder"
+                ) from error
         return folder
 
 

@@ -62,7 +62,13 @@ class Cameras:
         return Cameras(self.camera_to_worlds, **intrinsics, **sizes, model=self.model)
 
     def rays(
-        self, camera_indices: Tensor, columns: Tensor, rows: Tensor, near: float, far: float, times: Tensor | None = None
+        self,
+        camera_indices: Tensor,
+        columns: Tensor,
+        rows: Tensor,
+        near: float,
+        far: float,
+        times: Tensor | None = None,
     ) -> Rays:
         """Rays through pixel centres.
 

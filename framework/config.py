@@ -60,15 +60,13 @@ class TrainConfig:
     steps_per_eval_all_images: int = 25_000
     """Steps between evaluations over all images of the validation split."""
     seconds_per_eval_all_images: float | None = None
-    """Seconds of training between evaluations over all images of the validation split, besides the steps above;
-    15 if --target-psnr is given and this is not."""
+    """Seconds of training between evaluations over all images; 15 if --target-psnr is given and this is not."""
     max_eval_images: int | None = None
     """Evaluate at most this many images, evenly spread; all if not given, none for 0."""
     vis: Literal["tensorboard", "none"] = "tensorboard"
     """Where curves and pictures go during training."""
     mixed_precision: bool | None = None
-    """Networks in bfloat16; density, compositing and losses stay float32. If not given, where the device has
-    bfloat16 matrix instructions."""
+    """bfloat16 networks, float32 density and compositing. If not given: where the device multiplies bfloat16 fast."""
     load_dir: Path | None = None
     """Start from the newest checkpoint in this folder."""
     load_checkpoint: Path | None = None
@@ -80,8 +78,7 @@ class TrainConfig:
     learning_rate: float = 5e-4
     """Adam's learning rate at the start."""
     lr_schedule: Literal["constant", "exponential", "cosine", "hold-exponential"] = "exponential"
-    """How the learning rate falls over the budget (steps or seconds, whichever is further spent);
-    hold-exponential keeps it for the first half."""
+    """Learning rate over the budget (steps or seconds, whichever is further spent); hold-: constant for half of it."""
     lr_final: float = 0.1
     """Learning rate at the end of the budget, as a share of the first."""
     lr_warmup_steps: int = 0
@@ -93,8 +90,7 @@ class TrainConfig:
     adam_eps: float = 1e-8
     """Adam's epsilon."""
     background: Literal["auto", "random", "white", "black"] = "auto"
-    """Behind transparent pixels during training; auto is random where images have alpha, black elsewhere.
-    Evaluation is over black where black is trained or nothing is transparent, over white otherwise."""
+    """Behind transparent pixels in training; auto: random if images have alpha. Evaluation: white, or black if trained."""
     eval_num_rays_per_chunk: int = 8_192
     """Rays rendered at once in evaluation. It changes memory and speed, never the picture."""
     machine: MachineConfig = field(default_factory=MachineConfig)

@@ -51,6 +51,11 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
         """Schedules that are functions of `step`, and refreshing what samplers know."""
 
     @property
+    def samples_per_batch(self) -> int | None:
+        """Samples a training step should evaluate, the number of rays following; None for a fixed number of rays."""
+        return self.config.samples_per_batch
+
+    @property
     def device(self) -> torch.device:
         return next(self.parameters()).device
 

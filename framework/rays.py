@@ -6,7 +6,7 @@ ray in scene units, sigma density in 1/length, T transmittance, w weight.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
@@ -38,11 +38,16 @@ class Rays:
 
     def __getitem__(self, index: Tensor | slice) -> Rays:
         """The rays chosen by a slice, a mask or an index tensor."""
-        return Rays(*(None if (v := getattr(self, f.name)) is None else v[index] for f in fields(self)))
+        return self._map(lambda values: values[index])
 
     def to(self, device: torch.device | str) -> Rays:
         """The same rays on `device`."""
-        return Rays(*(None if (v := getattr(self, f.name)) is None else v.to(device) for f in fields(self)))
+        return self._map(lambda values: values.to(device))
+
+    def _map(self, change: Callable[[Tensor], Tensor]) -> Rays:
+        """The same rays with every field that is known changed."""
+        known = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{name: change(values) for name, values in known.items() if values is not None})
 
     def points(self, ray_indices: Tensor, t: Tensor) -> Tensor:
         """Positions (N, 3) at distances `t` (N,) along the rays `ray_indices` (N,)."""
@@ -132,10 +137,3 @@ class Samples:
     def evaluated(self, sigma: Tensor, features: Tensor) -> Samples:
         """The same samples with their density (N,) and features (N, F) attached."""
         return replace(self, sigma=sigma, features=features)
-
-
-def concatenate(parts: Iterable[Rays]) -> Rays:
-    """One batch from several; an optional field survives only if every part has it."""
-    parts = list(parts)
-    columns = ([getattr(part, f.name) for part in parts] for f in fields(Rays))
-    return Rays(*(None if any(v is None for v in column) else torch.cat(column) for column in columns))

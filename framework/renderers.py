@@ -88,7 +88,8 @@ def render_field(field: Field, sampler: Sampler, rays: Rays, background: Tensor,
 
 def shade(field: Field, rays: Rays, samples: Samples, background: Tensor) -> Rendered:
     """Colour and composite samples whose density and features are attached."""
-    assert samples.sigma is not None and samples.features is not None
+    if samples.sigma is None or samples.features is None:
+        raise ValueError("shade() needs samples whose density and features are attached")
     owners = samples.ray_indices
     cameras = None if rays.camera_indices is None else rays.camera_indices[owners]
     rgb = field.color(samples.features, rays.directions[owners], cameras)

@@ -20,6 +20,9 @@ from framework.samplers.inverse_cdf import inverse_cdf, uniform_variates
 from framework.samplers.occupancy import OccupancySampler
 from framework.samplers.uniform import samples_from_points, stratified_points
 
+OCCUPANCY_SAMPLES_PER_BATCH = 2**13
+"""With the occupancy grid the number of samples a ray varies a hundredfold, so the number of rays follows it."""
+
 
 @dataclass(frozen=True)
 class VanillaNeRFConfig(TrainConfig):
@@ -31,8 +34,7 @@ class VanillaNeRFConfig(TrainConfig):
     lr_final: float = 0.1
     background: Literal["auto", "random", "white", "black"] = "white"
     sampler: Literal["hierarchical", "occupancy"] = "hierarchical"
-    """hierarchical: 64 coarse and 64 + 128 fine samples through two networks. occupancy: one network, marched
-    through an occupancy grid."""
+    """hierarchical: 64 coarse and 64 + 128 fine samples, two networks. occupancy: one network and an occupancy grid."""
     num_coarse_samples: int = 64
     """Stratified samples a ray for the coarse network."""
     num_fine_samples: int = 128
@@ -61,7 +63,9 @@ class VanillaNeRF(Model[VanillaNeRFConfig]):
         self.fine = self._field()
         self.coarse = self._field() if config.sampler == "hierarchical" else None
         self.sampler = (
-            OccupancySampler(scene.box, config.grid_resolution, config.num_steps, config.early_stop)
+            OccupancySampler(
+                scene.box, config.grid_resolution, config.num_steps, config.early_stop, moving=scene.moving
+            )
             if config.sampler == "occupancy"
             else None
         )
@@ -85,8 +89,8 @@ class VanillaNeRF(Model[VanillaNeRFConfig]):
         assert self.coarse is not None
         points = stratified_points(rays, self.config.num_coarse_samples, self.training)
         coarse = self._render_points(self.coarse, rays, points, background)
-        assert coarse.weights is not None and coarse.samples is not None
-        weights = coarse.samples.padded(coarse.weights).detach()
+        assert coarse.weights is not None
+        weights = coarse.weights.view(points.shape).detach()
         middles = (points[:, 1:] + points[:, :-1]) / 2
         u = uniform_variates(len(rays), self.config.num_fine_samples, self.training, points.device)
         drawn = inverse_cdf(middles, weights[:, 1:-1], u)
@@ -99,6 +103,12 @@ class VanillaNeRF(Model[VanillaNeRFConfig]):
         samples = samples_from_points(points)
         samples = samples.evaluated(*field.density(samples.positions(rays), samples.times(rays)))
         return shade(field, rays, samples, background)
+
+    @property
+    def samples_per_batch(self) -> int | None:
+        if self.config.sampler == "occupancy" and self.config.samples_per_batch is None:
+            return OCCUPANCY_SAMPLES_PER_BATCH
+        return self.config.samples_per_batch
 
     def before_step(self, step: int) -> None:
         if self.sampler is not None:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from framework.cli.common import run_command
 from framework.errors import ConfigError, nearest
@@ -93,7 +92,11 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
     rest = [flag for flag in flags if flag in registered("dataparsers")]
     if not asks_for_help:
         looked, unknown = tyro.cli(
-            type(run.config), prog=f"ns-train {run.method}", args=flags, default=run.config, config=options,
+            type(run.config),
+            prog=f"ns-train {run.method}",
+            args=flags,
+            default=run.config,
+            config=options,
             return_unknown_args=True,
         )
         rest = [flag for flag in unknown if flag in registered("dataparsers")]
@@ -106,15 +109,17 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
     parser = run.parser if named == run.dataparser else load_dataparser(named)()
 
     # One flat set of flags: the method's and the data format's, so that their order does not matter.
-    both = tyro.conf.OmitArgPrefixes[
-        dataclasses.make_dataclass("Flags", [("method", type(run.config)), ("format", type(parser))])  # type: ignore[misc]
+    fields = [
+        (name, Annotated[type(value), tyro.conf.arg(name="")])
+        for name, value in (("method", run.config), ("format", parser))
     ]
+    both = dataclasses.make_dataclass("Flags", fields)
     parsed: Any = tyro.cli(
         both,
         prog=f"ns-train {run.method}",
         description=f"{summary(registered('methods')[run.method])}\n\nData format: {named}",
         args=flags,
-        default=both.__origin__(run.config, parser) if hasattr(both, "__origin__") else None,
+        default=both(run.config, parser),
         config=options,
     )
     folder = run_folder(run.method, parsed.method) if fresh else run.folder
@@ -130,4 +135,4 @@ def _without(flags: list[str], name: str) -> list[str]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

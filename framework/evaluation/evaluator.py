@@ -14,12 +14,12 @@ from torch import Tensor
 
 from framework.console import track
 from framework.dataset import Dataset
+from framework.device import has_bfloat16, wait_for
 from framework.evaluation.images import comparison, write_image
 from framework.evaluation.metrics import load_lpips, psnr, ssim
 from framework.model import Model
 from framework.pixels import composite
 from framework.rays import Rays
-from framework.device import has_bfloat16, wait_for
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from itertools import pairwise
 
 from torch import Tensor, nn
 
@@ -43,7 +44,7 @@ class MLP(nn.Sequential):
 
     def __init__(self, *widths: int, bias: bool = True) -> None:
         layers: list[nn.Module] = []
-        for index, (inputs, outputs) in enumerate(zip(widths, widths[1:], strict=False)):
+        for index, (inputs, outputs) in enumerate(pairwise(widths)):
             if index:
                 layers.append(nn.ReLU(inplace=True))
             layers.append(nn.Linear(inputs, outputs, bias=bias))

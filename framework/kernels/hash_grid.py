@@ -107,7 +107,7 @@ class _HashGrid(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
         positions, table, *saved = ctx.saved_tensors
         grad = grad.to(table.dtype)
         grad_positions = grad_table = None

@@ -18,7 +18,7 @@ class _TruncatedExp(torch.autograd.Function):
         return value
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Tensor:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
         (value,) = ctx.saved_tensors
         return grad * value
 

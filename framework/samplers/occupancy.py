@@ -21,10 +21,12 @@ from framework.rays import Rays, Samples
 
 COARSE = 8
 """Steps that are tested together against the dilated grid before each is tested by itself."""
+CHUNK = 2**15
+"""Cells evaluated at once."""
 WARM_UP_STEPS = 256
 SHUFFLE_STRIDE = 2654435761
 """A prime, so that its multiples visit every cell once a pass, far from one another."""
-WAVES = (8, 8, 16, 16, 32, 32, 64)
+WAVES = (8, 16, 32, 64, 128)
 """Samples a ray in each wave; the last size repeats."""
 
 
@@ -128,10 +130,12 @@ class OccupancySampler(nn.Module):
         if step == 0 or step % (8 if warming_up else 16):
             return
         cells = self._shuffled(step // 8 - 1) if warming_up else self._drawn()
-        unit = torch.stack([cells // self.resolution**2, cells // self.resolution % self.resolution, cells % self.resolution])
-        unit = (unit.t() + torch.rand(len(cells), 3, device=cells.device)) / self.resolution
+        n = self.resolution
+        corner = torch.stack([cells // n**2, cells // n % n, cells % n], dim=-1)
+        unit = (corner + torch.rand(len(cells), 3, device=cells.device)) / n
         times = torch.rand(len(cells), device=cells.device) if self.moving else None
-        sigma, _ = density(torch.lerp(self.box[0], self.box[1], unit), times)
+        positions = torch.lerp(self.box[0], self.box[1], unit)
+        sigma = _in_chunks(density, positions, times)
         decayed = self.density_grid[cells] * (0.7 if warming_up else 0.95)
         seen = torch.isfinite(decayed)
         self.density_grid[cells] = torch.where(seen, torch.maximum(decayed, sigma), sigma)
@@ -140,11 +144,15 @@ class OccupancySampler(nn.Module):
         self._find_reachable()
 
     def _shuffled(self, turn: int) -> Tensor:
-        """The cells of one of the first updates: two passes over the grid by step WARM_UP_STEPS."""
+        """The cells of one of the first updates: four passes over the grid by step WARM_UP_STEPS.
+
+        Of cells already found empty, which stay so unless the field changes its mind, one in eight is looked at.
+        """
         num_cells = self.resolution**3
-        share = math.ceil(2 * num_cells * 8 / WARM_UP_STEPS)
+        share = math.ceil(4 * num_cells * 8 / WARM_UP_STEPS)
         places = torch.arange(turn * share, (turn + 1) * share, device=self.occupied.device)
-        return places * SHUFFLE_STRIDE % num_cells
+        cells = places * SHUFFLE_STRIDE % num_cells
+        return cells[self.occupied[cells] | (torch.rand(share, device=cells.device) < 1 / 8)]
 
     def _drawn(self) -> Tensor:
         """Half anywhere, half among occupied cells. A cell drawn twice is evaluated twice, harmlessly."""
@@ -161,12 +169,26 @@ class OccupancySampler(nn.Module):
         """Cells from which an occupied one lies within half a run of COARSE steps, along any axis."""
         cell = ((self.box[1] - self.box[0]) / self.resolution).min().item()
         radius = math.ceil((COARSE - 1) / 2 * self.step_size / cell)
-        grid = self.occupied.view(1, 1, self.resolution, self.resolution, self.resolution).float()
+        grid = self.occupied.view(self.resolution, self.resolution, self.resolution)
         for axis in range(3):
-            kernel = [2 * radius + 1 if axis == other else 1 for other in range(3)]
-            padding = [radius if axis == other else 0 for other in range(3)]
-            grid = functional.max_pool3d(grid, kernel, stride=1, padding=padding)
-        self.reachable.copy_(grid.view(-1) > 0)
+            grid = _dilated(grid, radius, axis)
+        self.reachable.copy_(grid.reshape(-1))
+
+
+def _dilated(grid: Tensor, radius: int, axis: int) -> Tensor:
+    """Cells with a true cell within `radius` along `axis`."""
+    out, size = grid.clone(), grid.shape[axis]
+    for shift in range(1, min(radius, size - 1) + 1):
+        out.narrow(axis, 0, size - shift).logical_or_(grid.narrow(axis, shift, size - shift))
+        out.narrow(axis, shift, size - shift).logical_or_(grid.narrow(axis, 0, size - shift))
+    return out
+
+
+def _in_chunks(density: DensityFunction, positions: Tensor, times: Tensor | None) -> Tensor:
+    """Density (N,) at positions (N, 3), a chunk at a time: fresh memory of many megabytes costs more than the work."""
+    parts = positions.split(CHUNK)
+    when = [None] * len(parts) if times is None else times.split(CHUNK)
+    return torch.cat([density(part, t)[0] for part, t in zip(parts, when, strict=True)])
 
 
 def evaluate_in_waves(rays: Rays, samples: Samples, density: DensityFunction, early_stop: float) -> Samples:

@@ -73,7 +73,7 @@ class TensorBoard:
         if enabled:
             from torch.utils.tensorboard import SummaryWriter  # slow to import, so only on use
 
-            self._writer = SummaryWriter(str(folder))  # type: ignore[no-untyped-call]
+            self._writer = SummaryWriter(str(folder))
 
     def scalars(self, values: dict[str, float], step: int) -> None:
         if self._writer is not None:

@@ -202,7 +202,7 @@ class Trainer:
             step=state.step,
             seconds=state.seconds,
             progress=self.progress,
-            loss=float(loss),
+            loss=float(loss.detach()),
             psnr=self._train_psnr(),
             rays_per_second=len(batch.rays) / seconds,
             samples_per_ray=state.samples_per_ray,
@@ -216,7 +216,7 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         finite = bool(torch.isfinite(loss))
         if finite and loss.requires_grad:
-            loss.backward()  # type: ignore[no-untyped-call]
+            loss.backward()
             gradients = [p.grad for p in self.model.parameters() if p.grad is not None]
             finite = bool(torch.isfinite(torch.nn.utils.get_total_norm(gradients)))
             if finite:
@@ -231,9 +231,10 @@ class Trainer:
             )
 
     def _batch_size(self) -> int:
-        if self.config.samples_per_batch is None:
+        samples = self.model.samples_per_batch
+        if samples is None:
             return self.config.num_rays_per_batch
-        wanted = round(self.config.samples_per_batch / max(self.state.samples_per_ray, 0.1))
+        wanted = round(samples / max(self.state.samples_per_ray, 0.1))
         return min(max(wanted, SMALLEST_BATCH), LARGEST_BATCH)
 
     def _background(self) -> Background:
@@ -336,7 +337,7 @@ def _stop_signals() -> Iterator[list[int]]:
         received.append(number)
         signal.signal(number, previous[number])
 
-    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    previous: dict[int, Any] = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         for number in previous:
             signal.signal(number, handle)

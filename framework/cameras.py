@@ -85,7 +85,8 @@ class Cameras:
         local = project(x, y)
         length = local.norm(dim=-1)
         poses = self.camera_to_worlds[camera_indices]
-        directions = torch.einsum("rij,rj->ri", poses[:, :, :3], local / length[:, None])
+        # Products and sums rather than a matrix product, which autocast would round to bfloat16.
+        directions = (poses[:, :, :3] * (local / length[:, None])[:, None, :]).sum(-1)
         # Mip-NeRF sets the radius to 2 / sqrt(12) pixels, at distance `length` along the unit direction.
         pixel_radii = 2 / 12**0.5 / (self.fx[camera_indices] * length)
         return Rays(

@@ -90,7 +90,7 @@ class TrainConfig:
     adam_eps: float = 1e-8
     """Adam's epsilon."""
     background: Literal["auto", "random", "white", "black"] = "auto"
-    """Behind transparent pixels in training; auto: random if images have alpha. Evaluation: white, or black if trained."""
+    """Behind transparent pixels in training; auto: random if images have alpha. Evaluation is over white, or black."""
     eval_num_rays_per_chunk: int = 8_192
     """Rays rendered at once in evaluation. It changes memory and speed, never the picture."""
     machine: MachineConfig = field(default_factory=MachineConfig)

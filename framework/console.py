@@ -21,5 +21,5 @@ def say(message: str) -> None:
 def track(items: Iterable[T], title: str, total: int) -> Iterator[T]:
     """Iterate with a progress bar that goes away at the end."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         yield from progress.track(items, total=total, description=title)

@@ -58,6 +58,18 @@ def seed_step(seed: int, step: int) -> None:
     torch.manual_seed(bits(seed, step))
 
 
+def peak_memory(device: torch.device) -> int:
+    """Most memory held so far, bytes: the device's on CUDA, else the process's; 0 where the system does not tell."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if platform.system() == "Darwin" else peak * 1024
+
+
 def wait_for(device: torch.device) -> None:
     """Let pending work end, so that a clock can be read."""
     if device.type == "cuda":

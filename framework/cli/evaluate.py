@@ -48,8 +48,8 @@ def _command(arguments: list[str]) -> None:
     from framework.cli.session import load_split
     from framework.console import say
     from framework.evaluation.evaluator import evaluate
-    from framework.evaluation.load import load_trained
-    from framework.evaluation.report import write_evaluation
+    from framework.training.report import write_evaluation
+    from framework.training.trained import load_trained
 
     trained = load_trained(flags.load_config, flags.load_checkpoint, flags.device_type, flags.data)
     dataset = load_split(trained.run, flags.split).to(trained.model.device)

@@ -67,8 +67,8 @@ def _orbit(flags: OrbitFlags) -> None:
     from framework.console import say, track
     from framework.evaluation.evaluator import evaluation_background, render_rays
     from framework.evaluation.images import write_animation
-    from framework.evaluation.load import load_trained
     from framework.evaluation.paths import orbit
+    from framework.training.trained import load_trained
 
     trained = load_trained(flags.load_config, flags.load_checkpoint, flags.device_type, flags.data)
     model, scene = trained.model, trained.model.scene

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from framework.console import say
 from framework.dataset import Dataset, Split, load_dataset
-from framework.device import choose_device
+from framework.device import choose_device, peak_memory
 from framework.errors import DataError
 from framework.evaluation.evaluator import evaluate
-from framework.evaluation.report import write_evaluation
 from framework.training.checkpoint import FOLDER, load_newest
+from framework.training.report import write_evaluation
 from framework.training.run import Run, create_folder, write_transforms
 from framework.training.trainer import Trainer
 
@@ -56,7 +56,8 @@ def _finish(run: Run, trainer: Trainer) -> None:
     state = trainer.state
     say(
         f"{outcome.reason}: step {state.step:,}, {state.seconds:.1f} s of training, "
-        f"{state.rays / max(state.seconds, 1e-9) / 1e3:.1f}k rays/s"
+        f"{state.rays / max(state.seconds, 1e-9) / 1e3:.1f}k rays/s, "
+        f"{peak_memory(trainer.device) / 2**30:.2f} GiB at most"
         + (f", {state.skipped} steps skipped as not finite" if state.skipped else "")
     )
     say(f"checkpoint: {outcome.checkpoint}")

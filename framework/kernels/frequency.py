@@ -20,5 +20,5 @@ def frequency_encoding(x: Tensor, num_frequencies: int, include_input: bool = Tr
     """
     scales = 2.0 ** torch.arange(num_frequencies, device=x.device, dtype=x.dtype)
     angles = x[:, None, :] * scales[:, None]
-    waves = torch.stack([angles.sin(), angles.cos()], dim=2).reshape(x.shape[0], -1)
+    waves = torch.stack([angles.sin(), angles.cos()], dim=2).flatten(1)
     return torch.cat([x, waves], dim=-1) if include_input else waves

@@ -26,7 +26,8 @@ class StepReport:
     """Training seconds so far."""
     progress: float
     """Share of the budget spent."""
-    loss: float
+    losses: dict[str, float]
+    """The batch's loss terms by name."""
     psnr: float
     """Of the batch, dB, smoothed."""
     rays_per_second: float
@@ -34,7 +35,7 @@ class StepReport:
 
     def line(self) -> str:
         return (
-            f"step {self.step:,}  loss {self.loss:.5f}  PSNR {self.psnr:.2f} dB  "
+            f"step {self.step:,}  loss {sum(self.losses.values()):.5f}  PSNR {self.psnr:.2f} dB  "
             f"{self.rays_per_second / 1e3:.1f}k rays/s  {self.samples_per_ray:.1f} samples/ray"
         )
 
@@ -44,7 +45,8 @@ class ProgressBar:
 
     def __init__(self, title: str) -> None:
         columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), TimeRemainingColumn())
-        self._bar = Progress(*columns, TextColumn("{task.fields[state]}"), console=console, transient=True)
+        state = TextColumn("{task.fields[state]}")
+        self._bar = Progress(*columns, state, console=console, transient=True, disable=not console.is_terminal)
         self._task = self._bar.add_task(title, total=1.0, state="")
         self._last_line = time.monotonic()
 

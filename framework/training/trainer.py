@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.config import TrainConfig, to_plain
+from framework.config import to_plain
 from framework.console import say
 from framework.dataset import Dataset
 from framework.device import seed_step, wait_for
@@ -22,13 +22,12 @@ from framework.errors import CheckpointError, DivergenceError
 from framework.evaluation.evaluator import evaluate, evaluation_background, render_view, use_bfloat16
 from framework.evaluation.images import comparison
 from framework.evaluation.metrics import MAX_PSNR
-from framework.model import Model
 from framework.pixels import Background, Batch, composite, draw_batch
-from framework.registry import load_method
 from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest, save_checkpoint
 from framework.training.optim import first_non_finite, learning_rate_factor, make_optimizer, set_learning_rate
 from framework.training.progress import ProgressBar, StepReport, TensorBoard
 from framework.training.run import Run, write_json
+from framework.training.trained import build_model, restore_model
 
 STEPS_PER_LOG = 25
 MAX_BAD_STEPS = 10
@@ -187,9 +186,9 @@ class Trainer:
         seed_step(self.config.machine.seed, state.step)
         self.model.train()
         set_learning_rate(self.optimizer, learning_rate_factor(self.config, state.step, self.progress))
+        batch = draw_batch(self.train_set, self._batch_size(), self._background())
         with torch.autocast(self.device.type, torch.bfloat16, enabled=use_bfloat16(self.model)):
             self.model.before_step(state.step)
-            batch = draw_batch(self.train_set, self._batch_size(), self._background())
             rendered = self.model.render(batch.rays, batch.background)
             losses = self.model.loss(rendered, batch, state.step)
         loss = torch.stack(list(losses.values())).sum()
@@ -202,7 +201,7 @@ class Trainer:
             step=state.step,
             seconds=state.seconds,
             progress=self.progress,
-            loss=float(loss.detach()),
+            losses={name: float(value.detach()) for name, value in losses.items()},
             psnr=self._train_psnr(),
             rays_per_second=len(batch.rays) / seconds,
             samples_per_ray=state.samples_per_ray,
@@ -259,7 +258,7 @@ class Trainer:
     def _log(self, report: StepReport, board: TensorBoard) -> None:
         if report.step % STEPS_PER_LOG == 0:
             values = {
-                "train/loss": report.loss,
+                **{f"train/loss/{name}": value for name, value in report.losses.items()},
                 "train/psnr": report.psnr,
                 "train/rays_per_second": report.rays_per_second,
                 "train/samples_per_ray": report.samples_per_ray,
@@ -306,23 +305,6 @@ class Trainer:
             self.save()
         except CheckpointError as error:
             say(f"warning: {error}")
-
-
-def build_model(method: str, config: TrainConfig, scene: Any) -> Model[Any]:
-    """A method's model with fresh parameters."""
-    return load_method(method).model(config, scene)
-
-
-def restore_model(model: Model[Any], checkpoint: dict[str, Any]) -> None:
-    """Load a checkpoint's parameters into a model.
-
-    Raises: CheckpointError where names or sizes differ.
-    """
-    try:
-        model.load_state_dict(checkpoint["model"])
-    except RuntimeError as error:
-        reason = " ".join(str(error).split())[:300]
-        raise CheckpointError(f"the checkpoint does not fit the model's settings: {reason}") from error
 
 
 @contextmanager

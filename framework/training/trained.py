@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from framework.config import TrainConfig
 from framework.device import choose_device
 from framework.errors import CheckpointError
 from framework.model import Model
+from framework.registry import load_method
 from framework.scene import Scene
 from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest
 from framework.training.run import Run, read_run
-from framework.training.trainer import build_model, restore_model
 
 
 @dataclass(frozen=True)
@@ -60,3 +61,18 @@ def load_trained(
     return Trained(run, model, path, content)
 
 
+def build_model(method: str, config: TrainConfig, scene: Scene) -> Model[Any]:
+    """A method's model with fresh parameters."""
+    return load_method(method).model(config, scene)
+
+
+def restore_model(model: Model[Any], checkpoint: dict[str, Any]) -> None:
+    """Load a checkpoint's parameters into a model.
+
+    Raises: CheckpointError where names or sizes differ.
+    """
+    try:
+        model.load_state_dict(checkpoint["model"])
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())[:300]
+        raise CheckpointError(f"the checkpoint does not fit the model's settings: {reason}") from error

@@ -35,8 +35,9 @@ def exclusive_sum(values: Tensor, samples: Samples) -> Tensor:
     if samples.per_ray is not None:
         padded = samples.padded(values)
         return (padded.cumsum(-1) - padded).reshape(-1)
-    # One running sum over all rays, minus its value where the ray starts: float64 keeps what cancels.
-    running = values.double().cumsum(0)
+    # One running sum over all rays, minus its value where the ray starts: float64, which Apple's GPUs lack, keeps
+    # what cancels.
+    running = (values if values.device.type == "mps" else values.double()).cumsum(0)
     before = running - values
     starts = torch.cat([running.new_zeros(1), running])[samples.offsets[:-1]]
     return (before - starts[samples.ray_indices]).to(values.dtype)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -147,8 +147,12 @@ class Trainer:
 
         Raises: DivergenceError after ten non-finite steps in a row; the last checkpoint stands.
         """
-        board = TensorBoard(self.run.folder, self.config.vis == "tensorboard")
-        with _stop_signals() as stopped, ProgressBar(self.run.method) as bar:
+        enabled = self.config.vis == "tensorboard"
+        with (
+            _stop_signals() as stopped,
+            closing(TensorBoard(self.run.folder, enabled)) as board,
+            ProgressBar(self.run.method) as bar,
+        ):
             while (reason := self._reason_to_stop(stopped)) is None:
                 report = self.train_step()
                 bar.show(report)
@@ -156,7 +160,6 @@ class Trainer:
                 if self._due_to_save():
                     self._try_to_save()
                 self._evaluate_if_due(board)
-        board.close()
         self._write_curve()
         return Outcome(reason, bool(stopped), self.save())
 
@@ -216,8 +219,8 @@ class Trainer:
         finite = bool(torch.isfinite(loss))
         if finite and loss.requires_grad:
             loss.backward()
-            gradients = [p.grad for p in self.model.parameters() if p.grad is not None]
-            finite = bool(torch.isfinite(torch.nn.utils.get_total_norm(gradients)))
+            norms = [torch.linalg.vector_norm(p.grad) for p in self.model.parameters() if p.grad is not None]
+            finite = bool(torch.isfinite(torch.stack(norms)).all())
             if finite:
                 self.optimizer.step()
         self._bad_in_a_row = 0 if finite else self._bad_in_a_row + 1
@@ -273,7 +276,7 @@ class Trainer:
         config, step = self.config, self.state.step
         if self.eval_set is None or config.max_eval_images == 0:
             return
-        if step % config.steps_per_eval_image == 0:
+        if step % config.steps_per_eval_image == 0 and config.vis != "none":
             index = (step // config.steps_per_eval_image - 1) % len(self.eval_set)
             background = evaluation_background(self.model)
             view = render_view(self.model, self.eval_set, index, background)
@@ -293,7 +296,10 @@ class Trainer:
 
     def _write_curve(self) -> None:
         rows = [{"seconds": s, "step": n, "psnr": p} for s, n, p in self.state.curve]
-        write_json(self.run.folder / "learning_curve.json", rows)
+        try:
+            write_json(self.run.folder / "learning_curve.json", rows)
+        except OSError as error:
+            say(f"warning: cannot write learning_curve.json: {error.strerror}; the checkpoint holds the curve too")
 
     def _due_to_save(self) -> bool:
         aged = self.state.seconds - self._last_save >= self.config.seconds_per_save

@@ -52,7 +52,7 @@ class Blender(DataParser):
         paths = [_image_path(path, frame, place) for frame, place in zip(frames, where, strict=True)]
         poses = torch.stack([read_pose(frame, place) for frame, place in zip(frames, where, strict=True)])
         keep = existing(paths, split)
-        width, height = image_size(paths[int(keep[0])])
+        width, height = image_size([paths[index] for index in keep.tolist()])
         scene = ParsedScene(
             image_paths=tuple(paths),
             cameras=self._cameras(poses, _focal_length(content, width, file), width, height),

@@ -126,16 +126,19 @@ def existing(paths: Sequence[Path], split: str) -> Tensor:
     return torch.tensor([index for index, path in enumerate(paths) if path.is_file()])
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image file, from its header.
+def image_size(paths: Sequence[Path]) -> tuple[int, int]:
+    """Width and height of the first of some image files that can be read, from its header.
 
-    Raises: DataError where it cannot be read.
+    Raises: DataError where none can be read.
     """
-    try:
-        height, width = iio.improps(path, plugin="pillow").shape[:2]
-    except Exception as error:
-        raise DataError(f"{path} is not a readable image: {one_line(error)}") from error
-    return width, height
+    reason = ""
+    for path in paths:
+        try:
+            height, width = iio.improps(path, plugin="pillow").shape[:2]
+            return width, height
+        except Exception as error:  # whatever the decoder raises, as in `read_image`
+            reason = reason or f"{path} is not a readable image: {one_line(error)}"
+    raise DataError(reason or "there is no image to read a size from")
 
 
 def load_dataset(parsed: ParsedScene, split: str) -> Dataset:

@@ -23,8 +23,13 @@ def run_command(command: Callable[[list[str]], None]) -> None:
             raise
         say(f"error: {error}")
         sys.exit(1)
+    except BrokenPipeError:
+        sys.exit(1)
+    except OSError as error:
+        if debug:
+            raise
+        say(f"error: {error}")
+        sys.exit(1)
     except KeyboardInterrupt:
         say("interrupted")
         sys.exit(130)
-    except BrokenPipeError:
-        sys.exit(1)

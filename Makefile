@@ -1,0 +1,42 @@
+# make demo   train on the embedded scene for a minute, and leave pictures
+# make test   the fast tests
+# Both make .venv first. Running them again is quick: the installation is redone only when its inputs change.
+
+PYTHON ?= python3
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+
+.PHONY: demo test test-all lint clean
+
+demo: .venv/installed
+	@run=outputs/demo/instant-ngp/$$(date +%Y-%m-%d_%H%M%S); \
+	$(BIN)/ns-train instant-ngp --max-seconds 60 --experiment-name demo --timestamp $$(basename $$run) && \
+	$(BIN)/ns-render orbit --load-config $$run/config.yml --output-path $$run/orbit.gif && \
+	echo "held-out photograph | render | error:" && ls $$run/pictures/*_comparison.png && \
+	echo "turntable:" && ls $$run/orbit.gif
+
+test: .venv/installed-test
+	$(BIN)/python -m pytest -m "not slow"
+
+test-all: .venv/installed-test
+	$(BIN)/python -m pytest
+
+lint: .venv/installed-test
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+.venv/bin/python:
+	$(PYTHON) -m venv .venv
+
+.venv/installed: .venv/bin/python pyproject.toml constraints.txt
+	@echo "installing nerfloom into .venv"
+	$(PIP) -e .
+	@touch $@
+
+.venv/installed-test: .venv/installed
+	@echo "installing the test extra into .venv"
+	$(PIP) -e '.[test]'
+	@touch $@
+
+clean:
+	rm -rf .venv outputs

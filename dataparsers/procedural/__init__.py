@@ -12,7 +12,7 @@ from pathlib import Path
 
 from dataparsers.blender import Blender
 from framework import DataError, DataParser, ParsedScene
-from framework.console import say
+from framework.console import say, track
 from framework.dataset import Split
 
 VERSION = 1
@@ -45,15 +45,16 @@ class Procedural(DataParser):
 
     def _written(self) -> Path:
         """The scene's folder, rendered first where it is not in the cache."""
-        from dataparsers.procedural_scene import write_dataset  # only where something is to be rendered
+        from dataparsers.procedural.views import write_dataset  # only where something is to be rendered
 
         kind = "moving" if self.moving else "static"
         folder = cache_folder() / f"procedural-v{VERSION}-{kind}-{self.size}px-{self.num_train}-seed{self.scene_seed}"
         if not folder.is_dir():
             say(f"rendering the embedded scene into {folder}")
+            counts = {"train": self.num_train, "val": 8, "test": 16}
             try:
                 write_dataset(
-                    folder, size=self.size, num_train=self.num_train, moving=self.moving, seed=self.scene_seed
+                    folder, size=self.size, counts=counts, moving=self.moving, seed=self.scene_seed, progress=track
                 )
             except OSError as error:
                 raise DataError(

@@ -1,0 +1,204 @@
+"""Views of the embedded scene, and the data set made of them."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from dataparsers.procedural.scene import trace_rows
+
+CAMERA_ANGLE = 0.6911
+"""Horizontal field of view, radians: NeRF-Synthetic's."""
+RADIUS = 4.0
+"""Distance of the cameras from the origin, scene units."""
+SUPERSAMPLE = 3
+"""Rays along each side of a pixel."""
+# Below torch's threshold for splitting one operation over threads: the parallelism is over views instead.
+_CHUNK_RAYS = 32_000
+
+
+def _camera_rays(
+    camera_to_world: npt.ArrayLike, camera_angle_x: float, size: tuple[int, int], x: Tensor, y: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Origin (3, 1) and unit directions (3, R) of rays through pixel coordinates x, y (R,)."""
+    pose = torch.as_tensor(np.asarray(camera_to_world, dtype=np.float64)).to(x)
+    focal = 0.5 * size[0] / math.tan(0.5 * camera_angle_x)
+    u, v = (x - 0.5 * size[0]) / focal, (0.5 * size[1] - y) / focal
+    scale = (u * u + v * v + 1.0).rsqrt()
+    axes = pose[:3, :3, None]
+    return pose[:3, 3:4], (axes[:, 0] * u + axes[:, 1] * v - axes[:, 2]) * scale
+
+
+def _pixel_grid(size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Column and row (H W,) of every pixel, float64."""
+    row, column = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in size[::-1]), indexing="ij")
+    return column.flatten(), row.flatten()
+
+
+def _render_geometry(
+    camera_to_world: npt.ArrayLike, camera_angle_x: float, size: tuple[int, int], time: float
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Depth (H, W) and normals (H, W, 3) at the pixel centres, computed in float64."""
+    column, row = _pixel_grid(size)
+    depth, normals = [], []
+    for x, y in zip(column.split(_CHUNK_RAYS), row.split(_CHUNK_RAYS), strict=True):
+        hit = trace_rows(*_camera_rays(camera_to_world, camera_angle_x, size, x + 0.5, y + 0.5), time, colour=False)
+        depth.append(hit.depth)
+        normals.append(hit.normals)
+    shape = size[::-1]
+    return (
+        torch.cat(depth).float().reshape(shape).numpy(),
+        torch.cat(normals, 1).T.float().reshape(*shape, 3).numpy(),
+    )
+
+
+def _render_rgba(
+    camera_to_world: npt.ArrayLike, camera_angle_x: float, size: tuple[int, int], time: float, supersample: int
+) -> npt.NDArray[np.uint8]:
+    """Straight colour and coverage (H, W, 4) from supersample^2 float32 rays on a regular grid in every pixel."""
+    column, row = (c.float() for c in _pixel_grid(size))
+    image = torch.zeros(4, column.numel())
+    steps = (torch.arange(supersample, dtype=torch.float32) + 0.5) / supersample
+    dy, dx = (c.flatten() for c in torch.meshgrid(steps, steps, indexing="ij"))
+    for pixels in torch.arange(column.numel()).split(max(1, _CHUNK_RAYS // supersample**2)):
+        x, y = ((c[pixels, None] + d).flatten() for c, d in ((column, dx), (row, dy)))
+        hit = trace_rows(*_camera_rays(camera_to_world, camera_angle_x, size, x, y), time)
+        samples = torch.cat([hit.rgb, hit.hit[None]]).reshape(4, -1, supersample**2)
+        image[:, pixels] = samples.mean(2)
+    image[:3] /= image[3].clamp(min=1e-6)
+    return (image * 255.0).round().to(torch.uint8).T.reshape(size[1], size[0], 4).numpy()
+
+
+@torch.no_grad()
+def render_view(
+    camera_to_world: npt.ArrayLike,
+    camera_angle_x: float,
+    width: int,
+    height: int,
+    time: float = 0.0,
+    supersample: int = SUPERSAMPLE,
+    geometry: bool = True,
+) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32] | None, npt.NDArray[np.float32] | None]:
+    """One view of the scene.
+
+    Args:
+        camera_to_world: (3, 4) or (4, 4), OpenGL axes (x right, y up, looking down -z), outside of the solids.
+        camera_angle_x: horizontal field of view in radians; the focal length is the same vertically and the
+            principal point is the image centre; pixel centres are at +0.5.
+        width, height: pixels.
+        time: in [0, 1].
+        supersample: rays along each side of a pixel.
+        geometry: compute depth and normals too.
+    Returns: rgba (H, W, 4) uint8 with straight colour and the covered fraction of the pixel, depth (H, W) float32
+        along the rays through the pixel centres (inf for background) and world normals (H, W, 3) float32 there, or
+        None for both.
+    """
+    size = (width, height)
+    rgba = _render_rgba(camera_to_world, camera_angle_x, size, time, supersample)
+    if not geometry:
+        return rgba, None, None
+    return rgba, *_render_geometry(camera_to_world, camera_angle_x, size, time)
+
+
+def camera_pose(azimuth: float, elevation: float) -> npt.NDArray[np.float64]:
+    """Camera-to-world (4, 4) at RADIUS from the origin, looking at it; angles in radians."""
+    back = np.array(
+        [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
+    )
+    right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(back, right), back, RADIUS * back], axis=1)
+    return pose
+
+
+def camera_poses(split: str, count: int, seed: int) -> list[npt.NDArray[np.float64]]:
+    """Poses of a split: training cameras jittered over the upper sphere, test cameras on an orbit between them.
+
+    Training and validation cameras are a Fibonacci lattice from 5 degrees under the horizon to 75 above it, turned
+    and jittered by the seed; test cameras circle once while they rise and sink.
+    """
+    turns = np.arange(count) / count
+    if split == "test":
+        return [camera_pose(2 * math.pi * t, math.radians(30 + 22 * math.sin(4 * math.pi * t))) for t in turns]
+    random = np.random.default_rng([seed, len(split)])
+    low, high = math.sin(math.radians(-5.0)), math.sin(math.radians(75.0))
+    heights = low + (high - low) * (np.arange(count) + random.uniform(0.2, 0.8, count)) / count
+    golden = math.pi * (3.0 - math.sqrt(5.0))
+    azimuths = random.uniform(0, 2 * math.pi) + golden * np.arange(count) + random.uniform(-0.2, 0.2, count)
+    return [camera_pose(azimuth, math.asin(height)) for azimuth, height in zip(azimuths, heights, strict=True)]
+
+
+def write_dataset(
+    folder: Path,
+    *,
+    size: int = 200,
+    counts: dict[str, int] | None = None,
+    moving: bool = False,
+    seed: int = 0,
+    progress: Callable[[Any, str, int], Any] = lambda jobs, title, total: jobs,
+) -> None:
+    """Write a data set in NeRF-Synthetic's format, complete or not at all.
+
+    For each split `transforms_{split}.json` and RGBA images; for val and test also `r_000_geometry.npz` with the
+    exact depth (H, W) along the ray, inf for background, and the world normals (H, W, 3).
+
+    Args:
+        folder: where it goes. If it appears meanwhile, what is there is kept.
+        size: width and height, pixels.
+        counts: images of each split, train, val and test.
+        moving: each frame has a time; else the scene stands still at time 0.
+        seed: of the camera positions. The same seed gives the same bytes.
+        progress: wraps the iteration over views, with a title and their number.
+    Raises: OSError where it cannot be written.
+    """
+    counts = counts or {"train": 80, "val": 8, "test": 16}
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
+    try:
+        jobs = [job for split, count in counts.items() for job in _lay_out(temporary, split, count, moving, seed)]
+        with ThreadPoolExecutor() as pool:
+            done = pool.map(lambda job: _write_view(*job, size=size), jobs)
+            for _ in progress(done, "Rendering the embedded scene", len(jobs)):
+                pass
+        try:
+            temporary.rename(folder)
+        except OSError:
+            if not folder.is_dir():  # else another process was faster, with the same bytes
+                raise
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _lay_out(
+    folder: Path, split: str, count: int, moving: bool, seed: int
+) -> list[tuple[Path, npt.NDArray[np.float64], float]]:
+    """Write a split's json, and return the file, pose and time of each of its views."""
+    (folder / split).mkdir(parents=True, exist_ok=True)
+    frames, jobs = [], []
+    for index, pose in enumerate(camera_poses(split, count, seed)):
+        time = index / max(count - 1, 1) if moving else 0.0
+        frame: dict[str, Any] = {"file_path": f"./{split}/r_{index:03d}", "transform_matrix": pose.tolist()}
+        frames.append({**frame, "time": time} if moving else frame)
+        jobs.append((folder / split / f"r_{index:03d}.png", pose, time))
+    content = {"camera_angle_x": CAMERA_ANGLE, "frames": frames}
+    (folder / f"transforms_{split}.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
+    return jobs
+
+
+def _write_view(path: Path, pose: npt.NDArray[np.float64], time: float, *, size: int) -> None:
+    rgba, depth, normals = render_view(pose, CAMERA_ANGLE, size, size, time, geometry=path.parent.name != "train")
+    iio.imwrite(path, rgba)
+    if depth is not None and normals is not None:
+        np.savez_compressed(path.with_name(f"{path.stem}_geometry.npz"), depth=depth, normals=normals)

@@ -1,0 +1,45 @@
+"""Pictures: what is written is read back by an independent reader."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from framework.evaluation.images import ERROR_AT_WHITE, comparison, heat, write_animation, write_image
+
+
+def test_a_written_image_reads_back_rounded(tmp_path: Path) -> None:
+    image = torch.tensor([[[0.0, 0.5, 1.0], [1.5, -1.0, 0.2]]])
+    write_image(tmp_path / "new" / "a.png", image)
+    with Image.open(tmp_path / "new" / "a.png") as read:
+        assert [read.getpixel((0, 0)), read.getpixel((1, 0))] == [(0, 128, 255), (255, 0, 51)]
+
+
+def test_heat_runs_from_black_over_red_and_yellow_to_white() -> None:
+    colors = heat(torch.tensor([[0.0, 1 / 3, 2 / 3, 1.0]]))[0]
+    expected = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [1, 1, 1]])
+    torch.testing.assert_close(colors, expected, atol=1e-6, rtol=0)
+
+
+def test_comparison_is_photograph_render_error() -> None:
+    target, prediction = torch.zeros(2, 2, 3), torch.full((2, 2, 3), ERROR_AT_WHITE)
+    side_by_side = comparison(prediction, target)
+    assert side_by_side.shape == (2, 6, 3)
+    torch.testing.assert_close(side_by_side[:, :2], target)
+    torch.testing.assert_close(side_by_side[:, 2:4], prediction)
+    torch.testing.assert_close(side_by_side[:, 4:], torch.ones(2, 2, 3))
+
+
+@pytest.mark.parametrize("ending", [".gif", ".webp", ".png"])
+def test_an_animation_has_all_its_frames(tmp_path: Path, ending: str) -> None:
+    frames = [torch.full((8, 8, 3), level) for level in (0.0, 0.25, 0.5, 1.0)]
+    path = tmp_path / f"a{ending}"
+    write_animation(path, frames, fps=10)
+    with Image.open(path) as read:
+        assert getattr(read, "n_frames", 1) == 4
+        levels = []
+        for index in range(4):
+            read.seek(index)
+            levels.append(read.convert("RGB").getpixel((4, 4))[0])
+    assert levels == pytest.approx([0, 64, 128, 255], abs=3)

@@ -1,0 +1,40 @@
+"""Camera paths: against geometry worked out by hand."""
+
+import pytest
+import torch
+
+from framework.cameras import Cameras, check_pose
+from framework.evaluation.paths import look_at, orbit
+
+UP = torch.tensor([0.0, 0.0, 1.0])
+
+
+def test_look_at_from_the_x_axis() -> None:
+    pose = look_at(torch.tensor([3.0, 0, 0]), torch.zeros(3), UP)
+    # Looking along -x: the camera's z is world x, its y is world z, so its x is y cross z = world y.
+    expected = torch.tensor([[0.0, 0, 1, 3], [1, 0, 0, 0], [0, 1, 0, 0]])
+    torch.testing.assert_close(pose, expected)
+
+
+@pytest.mark.parametrize("position", [(0.0, 0.0, 2.0), (0.0, 0.0, -2.0), (1.0, 2.0, 3.0)])
+def test_look_at_is_rigid_even_along_the_vertical(position: tuple[float, float, float]) -> None:
+    pose = look_at(torch.tensor(position), torch.zeros(3), UP)
+    check_pose(pose, "look_at")
+    ahead = -pose[:, 2]
+    torch.testing.assert_close(ahead, -torch.tensor(position) / torch.tensor(position).norm())
+
+
+def test_orbit_keeps_height_and_distance_and_looks_at_the_centre() -> None:
+    poses = torch.eye(4)[:3].repeat(2, 1, 1)
+    poses[0, :, 3] = torch.tensor([3.0, 0, 1])
+    poses[1, :, 3] = torch.tensor([0.0, 5, 3])
+    ones = torch.ones(2)
+    cameras = Cameras(poses, ones, ones, ones, ones, ones.long(), ones.long())
+    path = orbit(cameras, torch.zeros(3), 8)
+    centers = path.camera_to_worlds[:, :, 3]
+    torch.testing.assert_close(centers[:, 2], torch.full((8,), 2.0))
+    torch.testing.assert_close(centers[:, :2].norm(dim=-1), torch.full((8,), 4.0))
+    ahead = -path.camera_to_worlds[:, :, 2]
+    torch.testing.assert_close(torch.linalg.cross(ahead, centers), torch.zeros(8, 3), atol=1e-5, rtol=0)
+    for pose in path.camera_to_worlds:
+        check_pose(pose, "orbit")

@@ -132,7 +132,7 @@ PARTS: dict[str, Part] = {
 }
 _NAMES = tuple(PARTS)
 _LIGHT_AZIMUTH, _LIGHT_HEIGHT = math.radians(-118.0), math.radians(54.0)
-_LIGHT: Colour = (  # unit vector towards the sun
+LIGHT: Colour = (  # unit vector towards the sun
     math.cos(_LIGHT_HEIGHT) * math.cos(_LIGHT_AZIMUTH),
     math.cos(_LIGHT_HEIGHT) * math.sin(_LIGHT_AZIMUTH),
     math.sin(_LIGHT_HEIGHT),
@@ -225,7 +225,7 @@ def _distance(poses: list[_Pose], p: Tensor) -> Tensor:
 def _sunlight(poses: list[_Pose], p: Tensor) -> Tensor:
     """Visible fraction (R,) of the sun from points (3, R): soft, from how near the light ray passes each part."""
     visible = torch.ones_like(p[0])
-    light = p.new_tensor(_LIGHT)[:, None].expand_as(p)
+    light = p.new_tensor(LIGHT)[:, None].expand_as(p)
     for (name, part), pose in zip(PARTS.items(), poses, strict=True):
         if name == "plinth":  # everything else stands on it and the light comes from above
             continue
@@ -261,7 +261,7 @@ def _shade(poses: list[_Pose], p: Tensor, normal: Tensor, view: Tensor, which: T
         gloss[mine] = part.gloss
     outside = p + 1e-3 * normal
     sun = _sunlight(poses, outside)
-    facing = dot(normal, p.new_tensor(_LIGHT)[:, None]).clamp(min=0.0)
+    facing = dot(normal, p.new_tensor(LIGHT)[:, None]).clamp(min=0.0)
     # Ambient occlusion: how much less room there is along the normal than over an open plane.
     rooms = [(_distance(poses, p + h * normal) / h).clamp(0.0, 1.0) for h in (0.06, 0.2)]
     room = rooms[0] + rooms[1]
@@ -272,7 +272,7 @@ def _shade(poses: list[_Pose], p: Tensor, normal: Tensor, view: Tensor, which: T
     n, v, g = normal[:, shiny], view[:, shiny], gloss[shiny]
     slope = dot(n, v)
     fresnel = 0.05 + 0.95 * (1.0 + slope).clamp(0.0, 1.0) ** 5
-    halfway = p.new_tensor(_LIGHT)[:, None] - v
+    halfway = p.new_tensor(LIGHT)[:, None] - v
     sparkle = (dot(n, halfway) / dot(halfway, halfway).sqrt()).clamp(min=0.0) ** 90 * sun[shiny]
     mirror = _surroundings(v - 2.0 * slope * n) * fresnel + 1.2 * sparkle
     light[:, shiny] += g * mirror * (0.3 + 0.35 * room[shiny])

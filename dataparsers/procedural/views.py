@@ -137,7 +137,8 @@ def camera_poses(split: str, count: int, seed: int) -> list[npt.NDArray[np.float
     heights = low + (high - low) * (np.arange(count) + random.uniform(0.2, 0.8, count)) / count
     golden = math.pi * (3.0 - math.sqrt(5.0))
     azimuths = random.uniform(0, 2 * math.pi) + golden * np.arange(count) + random.uniform(-0.2, 0.2, count)
-    return [camera_pose(azimuth, math.asin(height)) for azimuth, height in zip(azimuths, heights, strict=True)]
+    order = random.permutation(count)  # of a moving scene, each time is then seen from high and from low
+    return [camera_pose(azimuths[index], math.asin(heights[index])) for index in order]
 
 
 def write_dataset(

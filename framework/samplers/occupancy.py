@@ -87,14 +87,13 @@ class OccupancySampler(nn.Module):
         """All steps of R rays whose middle lies in an occupied cell."""
         enter, leave = intersect_box(rays.origins, rays.directions, self.box)
         enter, leave = torch.maximum(enter, rays.nears), torch.minimum(leave, rays.fars)
-        if jitter:
-            enter = enter - torch.rand_like(enter) * self.step_size
-        counts = ((leave - enter) / self.step_size).ceil().clamp(min=0, max=self.num_steps + 1)
+        first = enter - torch.rand_like(enter) * self.step_size if jitter else enter
+        counts = ((leave - first) / self.step_size).ceil().clamp(min=0, max=self.num_steps + 2)
         counts = torch.where(leave > enter, counts, torch.zeros_like(counts)).long()
 
         # Coarse: the middle of each run of COARSE steps against the dilated grid.
         run_rays, run = _ranges((counts + COARSE - 1) // COARSE)
-        middle = enter[run_rays] + (run * COARSE + COARSE / 2) * self.step_size
+        middle = first[run_rays] + (run * COARSE + COARSE / 2) * self.step_size
         keep = self.reachable[self.cells(rays.points(run_rays, middle))]
         run_rays, run = run_rays[keep], run[keep]
 
@@ -102,10 +101,10 @@ class OccupancySampler(nn.Module):
         steps = run[:, None] * COARSE + torch.arange(COARSE, device=run.device)
         ray_indices = run_rays.repeat_interleave(COARSE)
         steps = steps.reshape(-1)
-        starts = enter[ray_indices] + steps * self.step_size
+        starts = first[ray_indices] + steps * self.step_size
         middle = starts + self.step_size / 2
         cells = self.cells(rays.points(ray_indices, middle))
-        keep = self.occupied[cells] & (middle >= rays.nears[ray_indices]) & (middle < leave[ray_indices])
+        keep = self.occupied[cells] & (middle >= enter[ray_indices]) & (middle < leave[ray_indices])
         ray_indices, starts = ray_indices[keep], starts[keep]
         per_ray = torch.bincount(ray_indices, minlength=len(rays))
         offsets = functional.pad(per_ray.cumsum(0), (1, 0))

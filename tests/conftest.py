@@ -1,0 +1,99 @@
+"""Shared by the tests: a tiny data set, tiny settings, and where real data is."""
+
+import json
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+
+torch.set_num_threads(2)
+
+TINY_NGP = [
+    "--num-levels", "4", "--max-resolution", "64", "--log2-table-size", "12", "--grid-resolution", "16",
+    "--num-steps", "64", "--samples-per-batch", "4096",
+]  # fmt: skip
+TINY_NERF = ["--num-layers", "3", "--hidden-width", "32", "--num-coarse-samples", "16", "--num-fine-samples", "16"]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _cache(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Generated data goes to a folder of this test session, not to the user's cache."""
+    os.environ["NERFLOOM_CACHE"] = str(tmp_path_factory.mktemp("cache"))
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """The folder of real photographs; tests that need it are skipped without."""
+    folder = os.environ.get("NERFLOOM_DATA")
+    if not folder:
+        pytest.skip("NERFLOOM_DATA is not set: it names the folder of real photographs")
+    return Path(folder)
+
+
+def ball_view(azimuth: float, size: int) -> tuple[np.ndarray, list[list[float]]]:
+    """A ball of radius 1, coloured by its normal, seen from distance 4: RGBA (size, size, 4) and the pose (4, 4)."""
+    back = np.array([math.cos(azimuth), math.sin(azimuth), 0.3])
+    back /= np.linalg.norm(back)
+    right = np.cross([0, 0, 1.0], back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(back, right), back, 4 * back], axis=1)
+    focal = 0.5 * size / math.tan(0.35)
+    rows, columns = np.mgrid[:size, :size] + 0.5
+    local = np.stack([(columns - size / 2) / focal, -(rows - size / 2) / focal, -np.ones_like(rows)], -1)
+    directions = local @ pose[:3, :3].T
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    nearest = -(directions @ pose[:3, 3])
+    miss2 = 16 - nearest**2
+    hit = miss2 < 1
+    points = pose[:3, 3] + (nearest - np.sqrt(np.clip(1 - miss2, 0, None)))[..., None] * directions
+    rgba = np.concatenate([0.5 + 0.5 * points, hit[..., None]], -1) * hit[..., None]
+    return (rgba * 255).round().astype(np.uint8), pose.tolist()
+
+
+def write_tiny(folder: Path, size: int = 20, counts: tuple[int, int, int] = (10, 2, 3)) -> Path:
+    """A Blender-format data set of a ball."""
+    for split, count in zip(("train", "val", "test"), counts, strict=True):
+        (folder / split).mkdir(parents=True)
+        frames = []
+        for index in range(count):
+            image, pose = ball_view(2 * math.pi * (index + 0.1 * len(split)) / count, size)
+            iio.imwrite(folder / split / f"r_{index}.png", image)
+            frames.append({"file_path": f"./{split}/r_{index}", "transform_matrix": pose})
+        content = {"camera_angle_x": 0.7, "frames": frames}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(content))
+    return folder
+
+
+@pytest.fixture
+def tiny(tmp_path: Path) -> Path:
+    """A fresh tiny data set that a test may damage."""
+    return write_tiny(tmp_path / "ball")
+
+
+@pytest.fixture(scope="session")
+def shared_tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny data set that tests only read."""
+    return write_tiny(tmp_path_factory.mktemp("data") / "ball")
+
+
+EditJson = Callable[[Callable[[dict[str, Any]], Any]], None]
+
+
+@pytest.fixture
+def edit_json(tiny: Path) -> EditJson:
+    """Change the tiny data set's transforms_train.json in place."""
+
+    def edit(change: Callable[[dict[str, Any]], Any]) -> None:
+        file = tiny / "transforms_train.json"
+        content = json.loads(file.read_text())
+        change(content)
+        file.write_text(json.dumps(content))
+
+    return edit

@@ -1,0 +1,148 @@
+"""The embedded scene: it is the truth of other tests, so it is held against independent truths here."""
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+
+from dataparsers.procedural import Procedural
+from dataparsers.procedural.scene import LIGHT, PARTS, inside, trace
+from dataparsers.procedural.views import CAMERA_ANGLE, camera_poses, render_view, write_dataset
+
+
+def camera_rays(count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rays from a sphere of radius 4 towards points near the origin, float64."""
+    generator = torch.Generator().manual_seed(seed)
+    origins = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    origins[:, 2].abs_()
+    origins = 4 * origins / origins.norm(dim=-1, keepdim=True)
+    directions = (torch.rand(count, 3, generator=generator, dtype=torch.float64) - 0.5) * 2 - origins
+    return origins, directions / directions.norm(dim=-1, keepdim=True)
+
+
+@pytest.mark.parametrize("time", [0.0, 0.37])
+def test_hits_lie_where_outside_turns_inside(time: float) -> None:
+    origins, directions = camera_rays(20000)
+    found = trace(origins, directions, time)
+    hit = found.hit
+    assert 0.3 < hit.double().mean() < 0.99
+    before = origins[hit] + (found.depth[hit] - 1e-6)[:, None] * directions[hit]
+    after = origins[hit] + (found.depth[hit] + 1e-6)[:, None] * directions[hit]
+    grazing = (found.normals[hit] * directions[hit]).sum(-1).abs() < 1e-2
+    assert not bool((inside(before, time) & ~grazing).any())
+    assert bool((inside(after, time) | grazing).all())
+    # Nothing solid is met on the way: random points in front of the hit, and anywhere on rays that miss.
+    end = torch.where(hit, found.depth, torch.full_like(found.depth, 8.0))
+    for share in torch.rand(20, generator=torch.Generator().manual_seed(1), dtype=torch.float64):
+        on_the_way = origins + (share * (end - 1e-6))[:, None] * directions
+        assert not bool(inside(on_the_way, time).any())
+
+
+def test_normals_are_the_gradient_of_depth() -> None:
+    """The plane through a hit, seen by a slightly turned ray, predicts that ray's depth to second order."""
+    origins, directions = camera_rays(5000, seed=1)
+    turned = directions + 1e-7 * torch.randn(5000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    turned = turned / turned.norm(dim=-1, keepdim=True)
+    a, b = trace(origins, directions), trace(origins, turned)
+    smooth = a.hit & b.hit & (a.part == b.part) & ((a.normals * b.normals).sum(-1) > 0.99)
+    smooth &= (a.normals * directions).sum(-1) < -0.1
+    plane = ((a.depth[:, None] * directions) * a.normals).sum(-1) / (turned * a.normals).sum(-1)
+    error = (plane - b.depth)[smooth].abs().max().item()
+    print(f"embedded scene: normals predict neighbouring depth to {error:.1e}")
+    assert int(smooth.sum()) > 1500
+    assert error < 1e-8
+
+
+def test_a_ray_straight_down_on_the_ball() -> None:
+    x, y, z = PARTS["ball"].centre
+    found = trace(torch.tensor([[x, y, 5.0]], dtype=torch.float64), torch.tensor([[0, 0, -1.0]], dtype=torch.float64))
+    assert found.depth.item() == pytest.approx(5 - z - 0.36, abs=1e-12)
+    torch.testing.assert_close(found.normals, torch.tensor([[0, 0, 1.0]], dtype=torch.float64))
+    assert list(PARTS)[int(found.part)] == "ball"
+
+
+def seen_from(point: torch.Tensor, position: Sequence[float]) -> torch.Tensor:
+    origin = torch.tensor([position], dtype=torch.float64)
+    direction = point - origin
+    hit = trace(origin, direction / direction.norm())
+    torch.testing.assert_close(origin + hit.depth[:, None] * direction / direction.norm(), point, atol=1e-9, rtol=0)
+    return hit.rgb[0]
+
+
+def test_only_the_glossy_ball_looks_different_from_elsewhere() -> None:
+    toward_sun = torch.tensor(LIGHT, dtype=torch.float64)
+    ball = (torch.tensor(PARTS["ball"].centre, dtype=torch.float64) + 0.36 * toward_sun)[None]
+    floor = torch.tensor([[0.25, -0.55, -0.45]], dtype=torch.float64)
+    first = (ball[0] + 3 * toward_sun).tolist()  # looks straight into the highlight
+    second = (-2.5, -0.5, 2.0)
+    assert (seen_from(ball, first) - seen_from(ball, second)).abs().max() > 0.1
+    torch.testing.assert_close(seen_from(floor, first), seen_from(floor, second), atol=1e-9, rtol=0)
+
+
+def test_alpha_is_the_covered_share_of_the_pixel() -> None:
+    pose = camera_poses("train", 5, 0)[2]
+    coarse, depth, _ = render_view(pose, CAMERA_ANGLE, 24, 24, supersample=4)
+    fine, _, _ = render_view(pose, CAMERA_ANGLE, 24 * 16, 24 * 16, supersample=1, geometry=False)
+    truth = (fine[..., 3].reshape(24, 16, 24, 16) / 255).mean((1, 3))
+    assert np.abs(coarse[..., 3] / 255 - truth).max() < 0.2  # 16 against 256 samples
+    assert abs((coarse[..., 3] / 255).mean() - truth.mean()) < 0.003
+    assert depth is not None
+    assert (np.isfinite(depth) == (truth > 0.5))[np.abs(truth - 0.5) > 0.45].all()
+
+
+def test_everything_is_inside_the_box() -> None:
+    points = torch.rand(200_000, 3, generator=torch.Generator().manual_seed(0)) * 6 - 3
+    for time in (0.0, 0.25, 0.5, 1.0):
+        solid = points[inside(points, time)]
+        assert len(solid) > 100
+        assert solid.abs().max() < 1.4
+
+
+def folder_bytes(folder: Path) -> dict[str, bytes]:
+    return {str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
+
+
+def test_the_data_set_is_complete_and_repeats(tmp_path: Path) -> None:
+    counts = {"train": 3, "val": 1, "test": 2}
+    for name in ("a", "b"):
+        write_dataset(tmp_path / name, size=16, counts=counts, moving=True, seed=5)
+    first, second = folder_bytes(tmp_path / "a"), folder_bytes(tmp_path / "b")
+    assert first.keys() == second.keys()
+    assert {name for name in first if first[name] != second[name] and not name.endswith(".npz")} == set()
+    frames = json.loads(first["transforms_train.json"])["frames"]
+    assert [frame["time"] for frame in frames] == [0, 0.5, 1]
+    assert iio.imread(tmp_path / "a" / "train" / "r_000.png").shape == (16, 16, 4)
+    with np.load(tmp_path / "a" / "test" / "r_001_geometry.npz") as geometry:
+        assert geometry["depth"].shape == (16, 16)
+        assert geometry["normals"].shape == (16, 16, 3)
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_the_moving_scene_starts_as_the_standing_one() -> None:
+    pose = camera_poses("test", 4, 0)[1]
+    still, start, later = (render_view(pose, CAMERA_ANGLE, 32, 32, t, geometry=False)[0] for t in (0.0, 0.0, 0.5))
+    np.testing.assert_array_equal(still, start)
+    assert (start != later).any(-1).mean() > 0.02
+
+
+def test_an_interrupted_write_leaves_nothing(tmp_path: Path) -> None:
+    def stop(jobs: object, title: str, total: int) -> object:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_dataset(tmp_path / "scene", size=8, counts={"train": 2}, progress=stop)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_parser_renders_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NERFLOOM_CACHE", str(tmp_path))
+    parsed = Procedural(size=8, num_train=2).parse(None, "train")
+    stamp = parsed.image_paths[0].stat().st_mtime_ns
+    again = Procedural(size=8, num_train=2).parse(None, "train")
+    assert again.image_paths[0].stat().st_mtime_ns == stamp
+    assert math.isclose(again.cameras.fx[0].item(), 4 / math.tan(CAMERA_ANGLE / 2), rel_tol=1e-6)

@@ -1,0 +1,167 @@
+"""The occupancy sampler: nothing that matters is skipped, nothing is evaluated twice."""
+
+import pytest
+import torch
+
+from framework.bounds import intersect_box
+from framework.rays import Rays, Samples
+from framework.renderers import volume_render
+from framework.samplers.occupancy import WARM_UP_STEPS, OccupancySampler, evaluate_in_waves
+
+BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+
+
+def random_rays(count: int, seed: int = 0, near: float = 0.0) -> Rays:
+    """From a sphere of radius 3 towards points in and near the box."""
+    generator = torch.Generator().manual_seed(seed)
+    origins = torch.randn(count, 3, generator=generator)
+    origins = 3 * origins / origins.norm(dim=-1, keepdim=True)
+    directions = torch.rand(count, 3, generator=generator) * 3 - 1.5 - origins
+    directions = directions / directions.norm(dim=-1, keepdim=True)
+    return Rays(origins, directions, torch.full((count,), near), torch.full((count,), 10.0))
+
+
+def ball_density(radius: float, sigma: float = 50.0):
+    def density(positions: torch.Tensor, times: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
+        inside = positions.norm(dim=-1) < radius
+        return inside * sigma, positions
+
+    return density
+
+
+@pytest.mark.parametrize("jitter", [True, False])
+def test_a_full_grid_covers_each_rays_chord(jitter: bool) -> None:
+    torch.manual_seed(0)
+    rays = random_rays(300)
+    sampler = OccupancySampler(BOX, resolution=16, num_steps=100)
+    samples = sampler.march(rays, jitter)
+    enter, leave = intersect_box(rays.origins, rays.directions, BOX)
+    lengths = torch.zeros(300).index_add(0, samples.ray_indices, samples.deltas)
+    assert bool(((lengths - (leave - enter)).abs() <= 1.001 * sampler.step_size).all())
+    assert bool((samples.t >= enter[samples.ray_indices] - 1e-5).all())
+    assert bool((samples.t <= leave[samples.ray_indices] + 1e-5).all())
+
+
+@pytest.mark.parametrize(("resolution", "num_steps"), [(8, 64), (32, 128), (64, 64), (16, 512)])
+def test_skipping_finds_exactly_the_occupied_steps(resolution: int, num_steps: int) -> None:
+    """Brute force over every step; only steps within rounding of a cell's face may differ."""
+    rays = random_rays(200, seed=1)
+    sampler = OccupancySampler(BOX, resolution=resolution, num_steps=num_steps)
+    sampler.occupied.copy_(torch.rand(resolution**3, generator=torch.Generator().manual_seed(2)) < 0.02)
+    sampler._find_reachable()
+    samples = sampler.march(rays, jitter=False)
+    quarter = sampler.step_size / 4
+    found = {(int(r), round(float(t) / quarter)) for r, t in zip(samples.ray_indices, samples.t, strict=True)}
+
+    enter, leave = (v.double() for v in intersect_box(rays.origins, rays.directions, BOX))
+    occupied = sampler.occupied.view(resolution, resolution, resolution)
+    missed = extra = 0
+    for step in range(num_steps + 1):
+        t = enter + (step + 0.5) * sampler.step_size
+        cell = (rays.origins + t[:, None] * rays.directions + 1) / 2 * resolution
+        clear = ((cell - cell.round()).abs() > 1e-3).all(-1) & ((t - leave).abs() > 1e-4)
+        index = cell.floor().long().clamp(0, resolution - 1)
+        truth = occupied[index[:, 0], index[:, 1], index[:, 2]] & (t < leave)
+        for ray in clear.nonzero().squeeze(-1).tolist():
+            has = (ray, round(float(t[ray]) / quarter)) in found
+            missed += bool(truth[ray]) and not has
+            extra += has and not bool(truth[ray])
+    assert (missed, extra) == (0, 0)
+    assert len(found) > 20
+
+
+class CountingField:
+    """Random but fixed densities; counts what is asked of it."""
+
+    def __init__(self) -> None:
+        self.weight = torch.nn.Parameter(torch.randn(3, 4, generator=torch.Generator().manual_seed(0)) * 3)
+        self.asked: list[torch.Tensor] = []
+
+    def density(self, positions: torch.Tensor, times: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
+        self.asked.append(positions.detach())
+        features = (positions @ self.weight).sin()
+        return 8 * features[:, 0].clamp(min=0) ** 2, features
+
+
+def test_waves_without_early_stop_equal_one_evaluation() -> None:
+    rays = random_rays(60)
+    candidates = OccupancySampler(BOX, resolution=8, num_steps=90).march(rays, jitter=False)
+    field = CountingField()
+    waves = evaluate_in_waves(rays, candidates, field.density, early_stop=0.0)
+    assert sum(len(a) for a in field.asked) == len(candidates)
+    assert torch.cat(field.asked).unique(dim=0).shape[0] == len(candidates)  # nothing twice
+    sigma, features = field.density(candidates.positions(rays), None)
+    torch.testing.assert_close(waves.sigma, sigma)
+    torch.testing.assert_close(waves.features, features)
+    torch.testing.assert_close(waves.t_starts, candidates.t_starts)
+    assert waves.offsets.tolist() == candidates.offsets.tolist()
+    assert waves.sigma is not None
+    (by_waves,) = torch.autograd.grad(waves.sigma.square().sum(), field.weight, retain_graph=True)
+    (at_once,) = torch.autograd.grad(sigma.square().sum(), field.weight)
+    torch.testing.assert_close(by_waves, at_once, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("early_stop", [1e-1, 1e-3])
+def test_early_stop_keeps_its_bound_and_saves(early_stop: float) -> None:
+    rays = random_rays(400)
+    candidates = OccupancySampler(BOX, resolution=8, num_steps=400).march(rays, jitter=False)
+    field = CountingField()
+
+    def render(stop: float) -> tuple[torch.Tensor, int]:
+        samples = evaluate_in_waves(rays, candidates, field.density, stop)
+        assert samples.sigma is not None
+        assert samples.features is not None
+        colors = samples.features[:, :3] * 0.5 + 0.5
+        return volume_render(rays, samples, samples.sigma, colors, torch.ones(3)).rgb, len(samples)
+
+    (full, all_samples), (stopped, fewer) = render(0.0), render(early_stop)
+    worst = (full - stopped).abs().max().item()
+    print(f"early stop at {early_stop:g}: colour off by at most {worst:.1e}, {fewer / all_samples:.0%} of the samples")
+    assert 0 < worst <= early_stop
+    assert fewer < all_samples
+
+
+def test_rays_that_meet_nothing() -> None:
+    sampler = OccupancySampler(BOX, resolution=8, num_steps=32)
+    away = Rays(torch.full((3, 3), 5.0), torch.eye(3), torch.zeros(3), torch.full((3,), 10.0))
+    field = CountingField()
+    for rays in (away, away[:0]):
+        samples = sampler.sample(rays, field.density, jitter=True)
+        assert len(samples) == 0
+        assert samples.num_rays == len(rays)
+        assert samples.features is not None
+    sampler.occupied.zero_()
+    sampler._find_reachable()
+    assert len(sampler.sample(random_rays(10), field.density, jitter=True)) == 0
+
+
+def train_grid(sampler: OccupancySampler, density, steps: range) -> None:
+    for step in steps:
+        torch.manual_seed(step)
+        sampler.update(step, density)
+
+
+def test_the_grid_learns_a_ball_and_notices_when_it_grows() -> None:
+    resolution = 16
+    sampler = OccupancySampler(BOX, resolution=resolution, num_steps=64)
+    train_grid(sampler, ball_density(0.5), range(WARM_UP_STEPS + 1))
+    centers = (torch.cartesian_prod(*[torch.arange(resolution)] * 3) + 0.5) / resolution * 2 - 1
+    half_diagonal = 3**0.5 / resolution
+    distance = centers.norm(dim=-1)
+    well_inside, well_outside = distance < 0.5 - half_diagonal, distance > 0.5 + half_diagonal
+    assert bool(sampler.occupied[well_inside].all())
+    assert not bool(sampler.occupied[well_outside].any())
+    train_grid(sampler, ball_density(0.8), range(WARM_UP_STEPS + 1, WARM_UP_STEPS + 16 * 600))
+    assert bool(sampler.occupied[distance < 0.8 - half_diagonal].all())
+
+
+def test_state_survives_a_checkpoint() -> None:
+    sampler = OccupancySampler(BOX, resolution=16, num_steps=64)
+    train_grid(sampler, ball_density(0.5), range(WARM_UP_STEPS))
+    copy = OccupancySampler(BOX, resolution=16, num_steps=64)
+    copy.load_state_dict(sampler.state_dict())
+    rays = random_rays(50)
+    first, second = (s.march(rays, jitter=False) for s in (sampler, copy))
+    assert isinstance(first, Samples)
+    torch.testing.assert_close(first.t_starts, second.t_starts, rtol=0, atol=0)
+    assert first.offsets.tolist() == second.offsets.tolist()

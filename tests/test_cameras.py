@@ -1,0 +1,114 @@
+"""Cameras against cases worked out by hand."""
+
+import math
+
+import pytest
+import torch
+
+from framework.cameras import Cameras, check_pose
+from framework.errors import DataError
+
+
+def camera(pose: torch.Tensor | None = None) -> Cameras:
+    """A 4x2 image, focal lengths 2 and 4, principal point (2.5, 0.5)."""
+    pose = torch.eye(4)[:3] if pose is None else pose
+    values = [torch.tensor([v]) for v in (2.0, 4.0, 2.5, 0.5)]
+    return Cameras(pose[None], *values, torch.tensor([4]), torch.tensor([2]))
+
+
+def test_rays_by_hand() -> None:
+    """Pixel (2, 0) is the principal ray. Pixel (0, 1): x = (0.5 - 2.5) / 2 = -1, y = (1.5 - 0.5) / 4 = 1/4, down."""
+    zero = torch.zeros(2, dtype=torch.long)
+    rays = camera().rays(zero, torch.tensor([2, 0]), torch.tensor([0, 1]), 0.1, 9.0)
+    length = math.sqrt(1 + 1 / 16 + 1)
+    expected = torch.tensor([[0, 0, -1.0], [-1 / length, -0.25 / length, -1 / length]])
+    error = (rays.directions - expected).abs().max().item()
+    print(f"camera rays: off the hand-computed ones by {error:.1e}")
+    assert error < 1e-7
+    assert rays.nears.tolist() == pytest.approx([0.1, 0.1])
+    assert rays.fars.tolist() == [9, 9]
+    assert rays.pixel_radii is not None
+    assert rays.pixel_radii.tolist() == pytest.approx([2 / math.sqrt(12) / 2, 2 / math.sqrt(12) / 2 / length])
+
+
+def test_a_turned_and_moved_camera() -> None:
+    """A quarter turn about z: x becomes y, y becomes -x. Looks down still."""
+    pose = torch.tensor([[0.0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7]])
+    rays = camera(pose).rays(torch.tensor([0]), torch.tensor([0]), torch.tensor([1]), 0.0, 1.0)
+    length = math.sqrt(1 + 1 / 16 + 1)
+    torch.testing.assert_close(rays.origins, torch.tensor([[5.0, 6, 7]]))
+    torch.testing.assert_close(rays.directions, torch.tensor([[0.25, -1, -1]]) / length)
+
+
+def test_image_rays_run_row_by_row() -> None:
+    cameras = camera()
+    rays = cameras.image_rays(0, 0.0, 1.0)
+    assert len(rays) == 8
+    one = cameras.rays(torch.tensor([0]), torch.tensor([1]), torch.tensor([1]), 0.0, 1.0)
+    torch.testing.assert_close(rays.directions[5:6], one.directions)
+    torch.testing.assert_close(rays.directions.norm(dim=-1), torch.ones(8))
+
+
+def test_scaled_cameras_see_the_same() -> None:
+    """The corner shared by four small pixels is the centre of the large pixel that holds them."""
+    large, small = camera(), camera().scaled(0.5)
+    assert (small.widths.item(), small.heights.item()) == (2, 1)
+    a = large.rays(torch.tensor([0]), torch.tensor([0.5]), torch.tensor([0.5]), 0, 1)
+    b = small.rays(torch.tensor([0]), torch.tensor([0]), torch.tensor([0]), 0, 1)
+    torch.testing.assert_close(a.directions, b.directions)
+
+
+def test_autocast_does_not_round_rays() -> None:
+    torch.manual_seed(0)
+    rotation = torch.linalg.qr(torch.randn(3, 3)).Q
+    pose = torch.cat([rotation * torch.linalg.det(rotation).sign(), torch.zeros(3, 1)], dim=1)
+    exact = camera(pose).image_rays(0, 0.0, 1.0).directions
+    with torch.autocast("cpu", torch.bfloat16):
+        cast = camera(pose).image_rays(0, 0.0, 1.0).directions
+    torch.testing.assert_close(cast, exact, rtol=0, atol=0)
+
+
+def test_times_and_indices_travel() -> None:
+    cameras = camera()[torch.tensor([0, 0, 0])]
+    rays = cameras.rays(torch.tensor([2, 0]), torch.zeros(2), torch.zeros(2), 0, 1, torch.tensor([0.0, 0.5, 1.0]))
+    assert rays.times is not None
+    assert rays.times.tolist() == [1.0, 0.0]
+    assert rays.camera_indices is not None
+    assert rays.camera_indices.tolist() == [2, 0]
+    assert len(rays[torch.tensor([True, False])]) == 1
+
+
+def broken(change: str) -> torch.Tensor:
+    pose = torch.eye(4)
+    if change == "nan":
+        pose[0, 3] = math.nan
+    elif change == "inf":
+        pose[1, 1] = math.inf
+    elif change == "scaled":
+        pose[:3, :3] *= 1.1
+    elif change == "mirrored":
+        pose[0, 0] = -1
+    elif change == "shape":
+        pose = pose[:2]
+    return pose
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("nan", "not finite"),
+        ("inf", "not finite"),
+        ("scaled", "not rigid"),
+        ("mirrored", "not rigid"),
+        ("shape", "4x4"),
+    ],
+)
+def test_bad_poses_are_refused_by_name(change: str, words: str) -> None:
+    with pytest.raises(DataError, match=f"frame 7.*{words}"):
+        check_pose(broken(change), "frame 7")
+
+
+def test_good_poses_pass() -> None:
+    for pose in (torch.eye(4), torch.eye(4)[:3]):
+        check_pose(pose, "frame 7")
+        assert pose.isfinite().all()

@@ -1,0 +1,72 @@
+"""Batches: each ray goes through the pixel whose colour it has."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from scipy import stats
+
+from dataparsers.blender import Blender
+from framework.dataset import Dataset, load_dataset
+from framework.pixels import composite, draw_batch
+
+
+@pytest.fixture
+def dataset(shared_tiny: Path) -> Dataset:
+    return load_dataset(Blender().parse(shared_tiny, "train"), "train")
+
+
+def test_rays_and_colours_belong_together(dataset: Dataset) -> None:
+    """Project each ray back into its camera, look the pixel up, and composite by hand."""
+    torch.manual_seed(0)
+    batch = draw_batch(dataset, 500, "random")
+    assert batch.rays.camera_indices is not None
+    cameras = dataset.cameras
+    for ray in range(500):
+        index = int(batch.rays.camera_indices[ray])
+        local = cameras.camera_to_worlds[index][:, :3].T @ batch.rays.directions[ray]
+        column = local[0] / -local[2] * cameras.fx[index] + cameras.cx[index] - 0.5
+        row = -local[1] / -local[2] * cameras.fy[index] + cameras.cy[index] - 0.5
+        assert abs(column - column.round()) < 1e-3
+        rgba = dataset.image(index)[int(row.round()), int(column.round())].double() / 255
+        expected = rgba[:3] * rgba[3] + batch.background[ray] * (1 - rgba[3])
+        torch.testing.assert_close(batch.rgb[ray].double(), expected, atol=1e-6, rtol=0)
+    assert batch.background.std() > 0.2
+
+
+def test_pixels_are_drawn_evenly_and_by_the_seed(dataset: Dataset) -> None:
+    torch.manual_seed(3)
+    first = draw_batch(dataset, 20000, "white")
+    torch.manual_seed(3)
+    second = draw_batch(dataset, 20000, "white")
+    torch.testing.assert_close(first.rgb, second.rgb, rtol=0, atol=0)
+    assert first.rays.camera_indices is not None
+    counts = torch.bincount(first.rays.camera_indices, minlength=len(dataset))
+    assert stats.chisquare(counts.numpy()).pvalue > 1e-3
+    assert bool((first.background == 1).all())
+
+
+def test_images_of_different_sizes_share_one_buffer() -> None:
+    from framework.cameras import Cameras
+    from framework.scene import Scene
+
+    sizes = torch.tensor([[4, 2], [3, 5]])
+    pixels = torch.cat([torch.full((8, 3), 10), torch.full((15, 3), 200)]).to(torch.uint8)
+    ones = torch.ones(2)
+    cameras = Cameras(torch.eye(4)[:3].repeat(2, 1, 1), ones, ones, ones, ones, sizes[:, 0], sizes[:, 1])
+    scene = Scene(torch.zeros(2, 3), 0, 1, 2, False, False, 5)
+    offsets = torch.tensor([0, 8, 23])
+    data = Dataset(pixels, offsets, cameras, None, ("a", "b"), scene, torch.eye(4)[:3], 1.0)
+    assert data.image(0).shape == (2, 4, 3)
+    assert data.image(1).shape == (5, 3, 3)
+    torch.manual_seed(0)
+    batch = draw_batch(data, 1000, "black")
+    assert batch.alpha is None
+    assert batch.rays.camera_indices is not None
+    expected = torch.tensor([10.0, 200.0])[batch.rays.camera_indices] / 255
+    torch.testing.assert_close(batch.rgb[:, 0], expected)
+
+
+def test_compositing_of_opaque_images_changes_nothing() -> None:
+    rgb = torch.rand(5, 3)
+    assert composite(rgb, torch.rand(5, 3)) is rgb

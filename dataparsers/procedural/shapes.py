@@ -225,5 +225,5 @@ def _falling_root(p: Tensor, q: Tensor, r: Tensor, low: Tensor, high: Tensor) ->
         value = ((t * t + p) * t + q) * t + r
         low, high = torch.where(value > 0.0, t, low), torch.where(value > 0.0, high, t)
         step = t - value / ((4.0 * t * t + 2.0 * p) * t + q)
-        t = torch.where((step > low) & (step < high), step, 0.5 * (low + high))
+        t = torch.where((step >= low) & (step <= high), step, 0.5 * (low + high))  # a root found is a bound itself
     return t

@@ -42,6 +42,7 @@ class HashGridLayout:
         return self.offsets[-1]
 
     def is_dense(self, level: int) -> bool:
+        """Whether each vertex of a level has an entry of its own."""
         return (self.resolutions[level] + 1) ** 3 <= self.offsets[level + 1] - self.offsets[level]
 
 

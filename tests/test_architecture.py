@@ -1,0 +1,133 @@
+"""The house: imports run one way, files and functions stay small, everything public says what it is."""
+
+import ast
+import importlib
+import inspect
+from pathlib import Path
+
+import pytest
+
+import framework
+
+ROOT = Path(__file__).parents[1]
+FILES = sorted(file for folder in ("framework", "methods", "dataparsers") for file in (ROOT / folder).rglob("*.py"))
+
+
+def tree(file: Path) -> ast.Module:
+    return ast.parse(file.read_text(encoding="utf-8"))
+
+
+def imports(node: ast.AST) -> set[str]:
+    """Modules named by import statements anywhere below `node`, `from a import b` as a and a.b."""
+    found = set()
+    for item in ast.walk(node):
+        if isinstance(item, ast.Import):
+            found |= {alias.name for alias in item.names}
+        elif isinstance(item, ast.ImportFrom) and item.module:
+            found |= {item.module} | {f"{item.module}.{alias.name}" for alias in item.names}
+    return found
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda f: str(f.relative_to(ROOT)))
+def test_the_framework_knows_no_method_and_no_format(file: Path) -> None:
+    if file.relative_to(ROOT).parts[0] == "framework":
+        assert not {name for name in imports(tree(file)) if name.split(".")[0] in ("methods", "dataparsers")}
+    elif file.relative_to(ROOT).parts[0] == "methods":
+        assert not {name for name in imports(tree(file)) if name.split(".")[0] == "dataparsers"}
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda f: str(f.relative_to(ROOT)))
+def test_sizes(file: Path) -> None:
+    assert len(file.read_text().splitlines()) <= 400
+    for node in ast.walk(tree(file)):
+        if isinstance(node, ast.FunctionDef):
+            assert (node.end_lineno or 0) - node.lineno + 1 <= 65, node.name
+
+
+def undocumented(file: Path) -> list[str]:
+    """Public definitions without a docstring; a method that overrides or implements one inherits it."""
+    missing = [] if ast.get_docstring(tree(file)) or file.name == "py.typed" else ["the module"]
+    for node in tree(file).body:
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_"):
+            if not ast.get_docstring(node):
+                missing.append(node.name)
+            if isinstance(node, ast.ClassDef) and not node.bases:
+                missing += [
+                    f"{node.name}.{item.name}"
+                    for item in node.body
+                    if isinstance(item, ast.FunctionDef)
+                    and not item.name.startswith("_")
+                    and not ast.get_docstring(item)
+                    and not {getattr(d, "id", "") for d in item.decorator_list} & {"property"}
+                ]
+    return missing
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda f: str(f.relative_to(ROOT)))
+def test_everything_public_has_a_docstring(file: Path) -> None:
+    implements_protocol = {"uniform.py", "shapes.py", "progress.py"}
+    missing = [name for name in undocumented(file) if not (file.name in implements_protocol and "." in name)]
+    assert missing == []
+
+
+def test_the_public_interface_is_documented_and_complete() -> None:
+    assert len(framework.__all__) > 10
+    for name in framework.__all__:
+        thing = getattr(framework, name)
+        assert inspect.getdoc(thing), name
+        if inspect.isclass(thing):
+            for member, value in vars(thing).items():
+                if inspect.isfunction(value) and not member.startswith("_"):
+                    assert inspect.getdoc(getattr(thing, member)), f"{name}.{member}"
+    with pytest.raises(AttributeError, match="no attribute 'Nonsense'"):
+        _ = framework.Nonsense
+
+
+def test_every_setting_has_a_help_text() -> None:
+    """The string under a field is its help on the command line."""
+    checked = 0
+    for file in FILES:
+        for node in ast.walk(tree(file)):
+            if not (isinstance(node, ast.ClassDef) and node.name.endswith(("Config", "Flags"))):
+                continue
+            bases = {getattr(base, "id", "") for base in node.bases}
+            inherited = {f.name for b in bases - {"", "Protocol"} for f in _fields(file, b)}
+            for item, after in zip(node.body, [*node.body[1:], None], strict=True):
+                if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name):
+                    described = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+                    assert described or item.target.id in inherited, f"{file.name}: {node.name}.{item.target.id}"
+                    checked += 1
+    assert checked > 40
+
+
+def _fields(file: Path, base: str):
+    import dataclasses
+
+    module = importlib.import_module(".".join(file.relative_to(ROOT).with_suffix("").parts))
+    return dataclasses.fields(getattr(module, base)) if dataclasses.is_dataclass(getattr(module, base, None)) else ()
+
+
+def test_no_import_circles_in_the_framework() -> None:
+    names = {
+        ".".join(f.relative_to(ROOT).with_suffix("").parts): f
+        for f in FILES
+        if f.parts[len(ROOT.parts)] == "framework" and f.name != "__init__.py"
+    }
+
+    def top_level(file: Path) -> set[str]:
+        body = [n for n in tree(file).body if isinstance(n, (ast.Import, ast.ImportFrom))]
+        return {name for node in body for name in imports(node) if name in names}
+
+    edges = {name: top_level(file) for name, file in names.items()}
+    finished: set[str] = set()
+
+    def visit(name: str, path: tuple[str, ...]) -> None:
+        assert name not in path, " -> ".join([*path, name])
+        if name not in finished:
+            for other in edges[name]:
+                visit(other, (*path, name))
+            finished.add(name)
+
+    for name in names:
+        visit(name, ())
+    assert len(finished) == len(names) > 20

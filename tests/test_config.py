@@ -1,0 +1,83 @@
+"""Settings: to YAML and back, and wrong ones refused by name."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import yaml
+
+from framework.config import TrainConfig, from_plain, to_plain
+from framework.errors import ConfigError
+from framework.registry import load_method, registered
+from framework.training.run import read_run
+
+
+@pytest.mark.parametrize("method", ["instant-ngp", "vanilla-nerf"])
+def test_every_methods_config_survives_yaml(method: str) -> None:
+    config = dataclasses.replace(load_method(method).config, data=Path("a/b"), max_seconds=2.5, target_psnr=30.0)
+    text = yaml.safe_dump(to_plain(config))
+    assert from_plain(load_method(method).config, yaml.safe_load(text), "text") == config
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"learning_rat": 1}, "unknown key 'learning_rat'. Did you mean 'learning_rate'"),
+        ({"machine": {"sed": 1}}, "unknown key 'sed'"),
+        ({"max_num_iterations": "many"}, "'max_num_iterations' is 'many'; it must be int"),
+        ({"max_num_iterations": 1.5}, "must be int"),
+        ({"max_num_iterations": True}, "must be int"),
+        ({"max_num_iterations": None}, "must be int"),
+        ({"save_only_latest_checkpoint": 1}, "must be bool"),
+        ({"lr_schedule": "linear"}, "must be one of constant, exponential"),
+        ({"data": 3}, "must be Path"),
+        ({"max_num_iterations": 0}, "--max-num-iterations is 0; it must be at least 1"),
+        ({"max_seconds": -1}, "--max-seconds is -1"),
+        ({"learning_rate": 0}, "must be more than 0"),
+    ],
+)
+def test_wrong_values_are_named(values: dict, words: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        from_plain(TrainConfig(), values, "file.yml")
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_numbers_as_yaml_writes_them() -> None:
+    config = from_plain(TrainConfig(), yaml.safe_load("{learning_rate: 1e-3, max_seconds: 5}"), "text")
+    assert (config.learning_rate, config.max_seconds) == (0.001, 5.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "must hold keys and values"),
+        ("- a\n- b", "must hold keys and values"),
+        ("a: [1", "is not plain YAML"),
+        ("max_seconds: 3", "does not say which method"),
+        ("method: instant-npg", "Did you mean 'instant-ngp'"),
+        ("method: instant-ngp\ndataparser: blender", "must hold keys and values"),
+        ("method: instant-ngp\ndataparser: {name: blendr}", "unknown data format 'blendr'. Did you mean 'blender'"),
+        ("method: instant-ngp\ndataparser: {name: blender, nea: 1}", "unknown key 'nea'. Did you mean 'near'"),
+    ],
+)
+def test_bad_recipes_are_refused_in_one_line(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "recipe.yml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as error:
+        read_run(path)
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_recipe_cannot_run_code(tmp_path: Path) -> None:
+    path, proof = tmp_path / "recipe.yml", tmp_path / "proof"
+    path.write_text(f"method: !!python/object/apply:os.system ['touch {proof}']")
+    with pytest.raises(ConfigError, match="not plain YAML"):
+        read_run(path)
+    assert not proof.exists()
+
+
+@pytest.mark.parametrize("path", sorted((Path(__file__).parents[1] / "configs").glob("*.yml")), ids=lambda p: p.name)
+def test_the_recipes_of_this_repository_load(path: Path) -> None:
+    assert read_run(path).method in registered("methods")

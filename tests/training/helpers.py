@@ -1,0 +1,71 @@
+"""Tiny runs for the trainer's tests."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from dataparsers.blender import Blender
+from framework.cli.session import load_split
+from framework.registry import load_method
+from framework.training.run import Run, create_folder
+from framework.training.trainer import Trainer
+
+TINY: dict[str, dict[str, Any]] = {
+    "instant-ngp": {
+        "num_levels": 4,
+        "max_resolution": 64,
+        "log2_table_size": 12,
+        "grid_resolution": 16,
+        "num_steps": 64,
+        "samples_per_batch": 4096,
+    },
+    "vanilla-nerf": {
+        "num_layers": 3,
+        "hidden_width": 32,
+        "num_coarse_samples": 16,
+        "num_fine_samples": 16,
+        "num_rays_per_batch": 128,
+        "learning_rate": 5e-3,
+    },
+    "vanilla-nerf+occupancy": {
+        "num_layers": 3,
+        "hidden_width": 32,
+        "sampler": "occupancy",
+        "grid_resolution": 16,
+        "num_steps": 64,
+        "samples_per_batch": 4096,
+        "learning_rate": 5e-3,
+    },
+}
+
+
+def tiny_run(kind: str, data: Path, folder: Path, **changes: Any) -> Run:
+    """A run of a method on the tiny data set; `kind` may carry '+variant'."""
+    method = kind.split("+")[0]
+    settings = {"data": data, "vis": "none", "seconds_per_save": 1e9, **TINY.get(kind, {}), **changes}
+    config = dataclasses.replace(load_method(method).config, **settings)
+    return Run(method, config, "blender", Blender(), folder)
+
+
+def tiny_trainer(kind: str, data: Path, folder: Path, evaluated: bool = False, **changes: Any) -> Trainer:
+    """A trainer whose folder exists."""
+    run = tiny_run(kind, data, folder, **changes)
+    create_folder(run)
+    return Trainer(run, load_split(run, "train"), load_split(run, "val") if evaluated else None)
+
+
+def tensors(trainer: Trainer) -> dict[str, torch.Tensor]:
+    """Everything a run's future depends on."""
+    out = {f"model.{k}": v.clone() for k, v in trainer.model.state_dict().items()}
+    for index, state in trainer.optimizer.state_dict()["state"].items():
+        out |= {f"optimizer.{index}.{k}": v.clone() for k, v in state.items()}
+    return out
+
+
+def assert_same_bits(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> None:
+    """Every tensor equal to the last bit."""
+    assert a.keys() == b.keys()
+    different = [name for name in a if not torch.equal(a[name], b[name])]
+    assert different == []

@@ -1,0 +1,83 @@
+"""Checkpoints: whole or not at all, and never code."""
+
+import errno
+import pickle
+from pathlib import Path
+
+import pytest
+import torch
+
+from framework.errors import CheckpointError
+from framework.training.checkpoint import list_checkpoints, load_checkpoint, load_newest, save_checkpoint
+
+
+def save(folder: Path, step: int, keep_all: bool = False) -> Path:
+    return save_checkpoint(folder, step, {"model": {"w": torch.full((50,), float(step))}}, keep_all)
+
+
+def test_the_two_newest_are_kept(tmp_path: Path) -> None:
+    for step in (1, 2, 30):
+        path = save(tmp_path, step)
+    assert path.name == "step-000000030.ckpt"
+    assert [p.name for p in list_checkpoints(tmp_path)] == ["step-000000002.ckpt", "step-000000030.ckpt"]
+    assert load_checkpoint(path)["model"]["w"][0] == 30
+    save(tmp_path, 31, keep_all=True)
+    assert len(list_checkpoints(tmp_path)) == 3
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.3, 0.99])
+def test_one_cut_short_falls_back_to_the_one_before(
+    tmp_path: Path, keep: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save(tmp_path, 1)
+    newest = save(tmp_path, 2)
+    whole = newest.read_bytes()
+    newest.write_bytes(whole[: int(len(whole) * keep)])
+    state = load_newest(tmp_path)
+    assert state is not None
+    assert state["model"]["w"][0] == 1
+    assert "step-000000002.ckpt is damaged" in capsys.readouterr().err
+    with pytest.raises(CheckpointError, match="damaged"):
+        load_checkpoint(newest)
+    (tmp_path / "step-000000001.ckpt").write_bytes(b"")
+    with pytest.raises(CheckpointError, match="none of the 2 checkpoints"):
+        load_newest(tmp_path)
+
+
+def test_missing_and_foreign_files(tmp_path: Path) -> None:
+    assert load_newest(tmp_path) is None
+    with pytest.raises(CheckpointError, match="there is no checkpoint"):
+        load_checkpoint(tmp_path / "step-000000001.ckpt")
+    torch.save({"format": 99, "model": {}}, tmp_path / "a.ckpt")
+    with pytest.raises(CheckpointError, match="not a checkpoint of this version"):
+        load_checkpoint(tmp_path / "a.ckpt")
+
+
+class Malicious:
+    def __init__(self, proof: Path) -> None:
+        self.proof = proof
+
+    def __reduce__(self) -> tuple:
+        return (Path.touch, (self.proof,))
+
+
+def test_a_checkpoint_cannot_run_code(tmp_path: Path) -> None:
+    for name, write in (("a.ckpt", torch.save), ("b.ckpt", lambda o, p: p.write_bytes(pickle.dumps(o)))):
+        write({"format": 1, "model": Malicious(tmp_path / "proof")}, tmp_path / name)
+        with pytest.raises(CheckpointError):
+            load_checkpoint(tmp_path / name)
+    assert not (tmp_path / "proof").exists()
+
+
+def test_a_full_disk_leaves_the_old_one_and_no_rubbish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save(tmp_path, 1)
+
+    def full(content: object, file: object) -> None:
+        file.write(b"x" * 1000)  # type: ignore[attr-defined]
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(CheckpointError, match="No space left on device; earlier checkpoints stand"):
+        save(tmp_path, 2)
+    assert [p.name for p in tmp_path.iterdir()] == ["step-000000001.ckpt"]
+    assert load_checkpoint(tmp_path / "step-000000001.ckpt")["model"]["w"][0] == 1

@@ -1,0 +1,242 @@
+"""The trainer: it learns, it repeats itself bit for bit, it resumes, it stops, and it does not hide NaN."""
+
+import json
+import math
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from framework import Batch, Method, Model, Rays, Rendered, registry
+from framework.errors import CheckpointError, ConfigError, DivergenceError
+from framework.evaluation.evaluator import evaluate, evaluation_background, render_view
+from framework.training.checkpoint import list_checkpoints, load_checkpoint
+from framework.training.run import create_folder
+from methods.instant_ngp import InstantNGP, InstantNGPConfig
+from tests.training.helpers import TINY, assert_same_bits, tensors, tiny_run, tiny_trainer
+
+KINDS = list(TINY)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_learns(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer(kind, shared_tiny, tmp_path / "run", evaluated=True, max_num_iterations=250)
+    assert trainer.eval_set is not None
+    before = evaluate(trainer.model, trainer.eval_set).results["psnr"]
+    outcome = trainer.train()
+    after = evaluate(trainer.model, trainer.eval_set).results["psnr"]
+    print(f"{kind}: {before:.1f} -> {after:.1f} dB in 250 steps")
+    assert after > before + 6
+    assert outcome.reason == "250 steps done"
+    assert trainer.state.skipped == 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_resuming_continues_with_the_same_bits(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
+    """Interrupted after 20 steps, evaluated in between, resumed in a new trainer: as if nothing had happened."""
+    whole = tiny_trainer(kind, shared_tiny, tmp_path / "whole", max_num_iterations=45)
+    whole.train()
+
+    first = tiny_trainer(kind, shared_tiny, tmp_path / "parts", evaluated=True, max_num_iterations=45)
+    for _ in range(20):
+        first.train_step()
+    assert first.eval_set is not None
+    evaluate(first.model, first.eval_set)
+    checkpoint = first.save()
+    torch.rand(7)  # whatever happens to the generator in between
+    second = tiny_trainer(kind, shared_tiny, tmp_path / "second", max_num_iterations=45)
+    second.restore(load_checkpoint(checkpoint))
+    assert second.state.step == 20
+    second.train()
+    assert_same_bits(tensors(whole), tensors(second))
+    assert second.state.rays == whole.state.rays
+
+
+def test_another_seed_gives_other_bits(shared_tiny: Path, tmp_path: Path) -> None:
+    from framework.config import MachineConfig
+
+    runs = [
+        tiny_trainer("instant-ngp", shared_tiny, tmp_path / str(seed), machine=MachineConfig(seed=seed))
+        for seed in (1, 2)
+    ]
+    assert not torch.equal(runs[0].model.field.grid.table, runs[1].model.field.grid.table)
+
+
+def test_budgets(shared_tiny: Path, tmp_path: Path) -> None:
+    by_time = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "a", max_seconds=0.3)
+    assert by_time.train().reason == "0.3 s of training spent"
+    assert 0.3 <= by_time.state.seconds < 5
+    assert by_time.progress == 1.0
+    by_psnr = tiny_trainer(
+        "instant-ngp", shared_tiny, tmp_path / "b", evaluated=True, target_psnr=12.0, steps_per_eval_all_images=20
+    )
+    assert by_psnr.train().reason == "12 dB reached"
+    curve = json.loads((tmp_path / "b" / "learning_curve.json").read_text())
+    assert curve[-1]["psnr"] >= 12.0
+    assert curve[-1]["step"] == by_psnr.state.step
+    assert curve[-1]["seconds"] == pytest.approx(by_psnr.state.seconds)
+
+
+def test_checkpoints_hold_plain_data_and_fit_their_model_only(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=6, steps_per_save=2)
+    last = trainer.train().checkpoint
+    assert [p.name for p in list_checkpoints(last.parent)] == ["step-000000004.ckpt", "step-000000006.ckpt"]
+    content = torch.load(last, weights_only=True)
+    assert content["method"] == "instant-ngp"
+    assert content["state"]["step"] == 6
+    other = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "other", hidden_width=32)
+    with pytest.raises(CheckpointError, match="does not fit the model's settings"):
+        other.restore(content)
+
+
+def test_load_dir_and_load_checkpoint(shared_tiny: Path, tmp_path: Path) -> None:
+    last = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=6).train().checkpoint
+    for setting in ({"load_dir": last.parent}, {"load_checkpoint": last}):
+        trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / str(len(list(tmp_path.iterdir()))), **setting)
+        trainer.restore_as_configured()
+        assert trainer.state.step == 6
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "none", load_dir=tmp_path / "nowhere")
+    with pytest.raises(CheckpointError, match=r"--load-dir .*nowhere: there is no checkpoint"):
+        trainer.restore_as_configured()
+
+
+def test_a_full_disk_does_not_end_a_run(
+    shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=8, steps_per_save=2)
+    trainer.train_step()
+    trainer.save()
+    true_save, failures = torch.save, []
+
+    def sometimes_full(content: Any, file: Any) -> None:
+        if trainer.state.step < 8:
+            failures.append(trainer.state.step)
+            raise OSError(28, "No space left on device")
+        true_save(content, file)
+
+    monkeypatch.setattr(torch, "save", sometimes_full)
+    trainer.train()
+    assert failures == [2, 4, 6]
+    assert capsys.readouterr().err.count("No space left on device") == 3
+    kept = [p.name for p in list_checkpoints(trainer.checkpoint_folder)]
+    assert kept == ["step-000000001.ckpt", "step-000000008.ckpt"]
+
+
+def test_a_folder_with_a_run_is_not_taken_twice(shared_tiny: Path, tmp_path: Path) -> None:
+    run = tiny_run("instant-ngp", shared_tiny, tmp_path / "run")
+    create_folder(run)
+    with pytest.raises(ConfigError, match="already holds a run; continue it with 'ns-train --resume"):
+        create_folder(run)
+
+
+def test_a_folder_that_cannot_be_written(shared_tiny: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(ConfigError, match="cannot write the run's folder"):
+        create_folder(tiny_run("instant-ngp", shared_tiny, tmp_path / "file" / "run"))
+
+
+@dataclass(frozen=True)
+class SickConfig(InstantNGPConfig):
+    """instant-ngp that breaks at the given steps."""
+
+    bad_steps: tuple[int, ...] = ()
+    where: str = "loss"
+
+
+class Sick(InstantNGP):
+    """Its loss or its gradients are NaN at the chosen steps."""
+
+    config: SickConfig
+
+    def loss(self, rendered: Rendered, batch: Batch, step: int) -> dict[str, Tensor]:
+        losses = super().loss(rendered, batch, step)
+        if step in self.config.bad_steps:
+            if self.config.where == "loss":
+                losses["rgb"] = losses["rgb"] * math.nan
+            else:  # finite loss, NaN gradient: sqrt at 0
+                losses["sick"] = (self.field.density_head[0].weight * 0).sum().sqrt()
+        return losses
+
+
+METHOD = Method(Sick, SickConfig(), paper="none")
+
+
+@pytest.fixture
+def sick(monkeypatch: pytest.MonkeyPatch) -> None:
+    entry = EntryPoint("sick", "tests.training.test_trainer:METHOD", "nerfloom.methods")
+    known = {**registry.registered("methods"), "sick": entry}
+    monkeypatch.setattr(registry, "registered", lambda kind: known)
+
+
+@pytest.mark.usefixtures("sick")
+@pytest.mark.parametrize("where", ["loss", "gradient"])
+def test_non_finite_steps_are_dropped_and_counted(where: str, shared_tiny: Path, tmp_path: Path) -> None:
+    settings = {**TINY["instant-ngp"], "bad_steps": (3, 5, 6), "where": where, "max_num_iterations": 12}
+    trainer = tiny_trainer("sick", shared_tiny, tmp_path / "run", **settings)
+    for _ in range(3):
+        trainer.train_step()
+    before = tensors(trainer)
+    trainer.train_step()
+    assert_same_bits(before, tensors(trainer))
+    trainer.train()
+    assert trainer.state.skipped == 3
+    assert all(bool(torch.isfinite(p).all()) for p in trainer.model.parameters())
+
+
+@pytest.mark.usefixtures("sick")
+def test_ten_in_a_row_stop_the_run_and_the_checkpoint_stands(shared_tiny: Path, tmp_path: Path) -> None:
+    settings = {**TINY["instant-ngp"], "bad_steps": tuple(range(4, 99)), "where": "gradient", "steps_per_save": 4}
+    trainer = tiny_trainer("sick", shared_tiny, tmp_path / "run", **settings)
+    with pytest.raises(DivergenceError, match=r"10 steps in a row .* field\.density_head\.0\.weight\.grad"):
+        trainer.train()
+    saved = load_checkpoint(list_checkpoints(trainer.checkpoint_folder)[0])
+    assert all(bool(torch.isfinite(v).all()) for k, v in saved["model"].items() if "grid" not in k)
+
+
+def test_an_empty_grid_is_harmless(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run")
+    sampler = trainer.model.sampler
+    sampler.occupied.zero_()
+    sampler._find_reachable()
+    report = trainer.train_step()
+    assert trainer.state.skipped == 0
+    assert math.isfinite(sum(report.losses.values()))
+    rays = trainer.train_set.cameras.image_rays(0, 0.0, 10.0)
+    background = torch.tensor([0.1, 0.2, 0.3])
+    for part in (rays, rays[:0]):
+        out = trainer.model.render(part, background)
+        torch.testing.assert_close(out.rgb, background.expand(len(part), 3))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_picture_does_not_depend_on_the_chunks(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
+    pictures = []
+    for chunk in (57, 8192):
+        trainer = tiny_trainer(kind, shared_tiny, tmp_path / str(chunk), True, eval_num_rays_per_chunk=chunk)
+        for _ in range(5):
+            trainer.train_step()
+        assert trainer.eval_set is not None
+        view = render_view(trainer.model, trainer.eval_set, 0, evaluation_background(trainer.model))
+        pictures.append((view.rgb, view.depth))
+    torch.testing.assert_close(pictures[0][0], pictures[1][0], atol=2e-3, rtol=0)  # bfloat16 products differ by size
+    assert isinstance(trainer.model, Model)
+
+
+def test_evaluation_cameras_are_not_taken_for_training_ones(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", evaluated=True)
+    seen: list[Rays] = []
+    true_render = trainer.model.render
+
+    def spy(rays: Rays, background: Tensor) -> Rendered:
+        seen.append(rays)
+        return true_render(rays, background)
+
+    trainer.model.render = spy  # type: ignore[method-assign]
+    assert trainer.eval_set is not None
+    evaluate(trainer.model, trainer.eval_set)
+    assert seen
+    assert all(rays.camera_indices is None for rays in seen)

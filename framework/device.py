@@ -10,7 +10,6 @@ import torch
 
 from framework.config import MachineConfig
 from framework.errors import ConfigError
-from framework.kernels.math import bits
 
 
 def choose_device(machine: MachineConfig) -> torch.device:
@@ -55,7 +54,16 @@ def seed_step(seed: int, step: int) -> None:
     Every draw is then a function of (seed, step): a resumed run repeats an uninterrupted one bit for bit, and
     what an evaluation between two steps draws does not matter.
     """
-    torch.manual_seed(bits(seed, step))
+    torch.manual_seed(stream_seed(seed, step))
+
+
+def stream_seed(seed: int, step: int) -> int:
+    """A well mixed 63-bit number: the seed of the random stream of one step."""
+    state = 0x9E3779B97F4A7C15
+    for value in (seed, step):
+        state = ((state ^ (value & 0xFFFFFFFFFFFFFFFF)) * 0xBF58476D1CE4E5B9) & 0xFFFFFFFFFFFFFFFF
+        state ^= state >> 31
+    return state >> 1
 
 
 def peak_memory(device: torch.device) -> int:

@@ -29,9 +29,10 @@ class VanillaNeRFConfig(TrainConfig):
     """Settings of vanilla-nerf; the defaults are the paper's."""
 
     max_num_iterations: int = 200_000
-    num_rays_per_batch: int = 1_024
+    num_rays_per_batch: int = 4_096
     learning_rate: float = 5e-4
     lr_final: float = 0.1
+    adam_eps: float = 1e-7
     background: Literal["auto", "random", "white", "black"] = "white"
     sampler: Literal["hierarchical", "occupancy"] = "hierarchical"
     """hierarchical: 64 coarse and 64 + 128 fine samples, two networks. occupancy: one network and an occupancy grid."""

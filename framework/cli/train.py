@@ -29,25 +29,36 @@ def _command(arguments: list[str]) -> None:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_overview())
         return
-    if arguments[0] in ("--resume", "--load-config"):
-        if len(arguments) < 2:
-            raise ConfigError(f"{arguments[0]} needs a path")
-        path, flags = Path(arguments[1]), arguments[2:]
-        if arguments[0] == "--resume":
-            from framework.cli.session import resume
+    resumed, flags = _take(arguments, "--resume")
+    recipe, flags = _take(flags, "--load-config")
+    if resumed is not None:
+        from framework.cli.session import resume
 
-            resume(_parse_flags(_read_run(path / "config.yml"), flags))
-            return
-        run = _read_run(path)
+        resume(_parse_flags(_read_run(Path(resumed) / "config.yml"), flags))
+        return
+    if recipe is not None:
+        run = _read_run(Path(recipe))
+        if flags and flags[0] in registered("methods"):  # nerfstudio's order: METHOD ... --load-config FILE
+            if flags[0] != run.method:
+                raise ConfigError(f"{recipe} is for {run.method}, not for {flags[0]}")
+            flags = flags[1:]
     else:
-        run, flags = _default_run(arguments[0]), arguments[1:]
-        if "--load-config" in flags:  # nerfstudio's order: METHOD ... --load-config FILE
-            index = flags.index("--load-config")
-            run = _read_run(Path(flags[index + 1]))
-            flags = flags[:index] + flags[index + 2 :]
+        run, flags = _default_run(flags[0]), flags[1:]
     from framework.cli.session import start
 
     start(_parse_flags(run, flags, fresh=True))
+
+
+def _take(arguments: list[str], flag: str) -> tuple[str | None, list[str]]:
+    """The value of `flag`, wherever it stands, and the other arguments."""
+    for index, argument in enumerate(arguments):
+        if argument == flag:
+            if index + 1 == len(arguments):
+                raise ConfigError(f"{flag} needs a path")
+            return arguments[index + 1], arguments[:index] + arguments[index + 2 :]
+        if argument.startswith(flag + "="):
+            return argument[len(flag) + 1 :], arguments[:index] + arguments[index + 1 :]
+    return None, arguments
 
 
 def _overview() -> str:
@@ -61,6 +72,8 @@ def _overview() -> str:
 
 def _default_run(method: str) -> Run:
     """A method with its default settings, its data not known yet."""
+    if method.startswith("-"):
+        raise ConfigError(f"the method comes first, before {method}; ns-train --help lists them")
     if method not in registered("methods"):
         raise ConfigError(f"unknown method '{method}'. {nearest(method, registered('methods'))}")
     from framework.registry import load_dataparser, load_method

@@ -36,12 +36,3 @@ def safe_normalize(v: Tensor, eps: float = 1e-12) -> Tensor:
     squared = (v * v).sum(-1, keepdim=True)
     usable = squared > eps * eps
     return torch.where(usable, v / torch.where(usable, squared, torch.ones_like(squared)).sqrt(), torch.zeros_like(v))
-
-
-def bits(*values: int) -> int:
-    """One well mixed 63-bit number from several: the seed of a random stream named by those values."""
-    state = 0x9E3779B97F4A7C15
-    for value in values:
-        state = ((state ^ (value & 0xFFFFFFFFFFFFFFFF)) * 0xBF58476D1CE4E5B9) & 0xFFFFFFFFFFFFFFFF
-        state ^= state >> 31
-    return state >> 1

@@ -30,6 +30,8 @@ from framework.training.run import Run, write_json
 from framework.training.trained import build_model, restore_model
 
 STEPS_PER_LOG = 25
+PICTURE_SHARE = 0.1
+"""Pictures for TensorBoard are left out where they would take more than this share of the training time."""
 MAX_BAD_STEPS = 10
 """Non-finite steps in a row after which a run stops."""
 FIRST_SAMPLES_PER_RAY = 256.0
@@ -88,7 +90,7 @@ class Trainer:
         self.optimizer = make_optimizer(self.model, self.config)
         self.state = State()
         self._bad_in_a_row = 0
-        self._last_save = self._last_eval = 0.0
+        self._last_save = self._last_eval = self._picture_seconds = 0.0
 
     # -- checkpoints ------------------------------------------------------------------------------------------
 
@@ -276,12 +278,14 @@ class Trainer:
         config, step = self.config, self.state.step
         if self.eval_set is None or config.max_eval_images == 0:
             return
-        if step % config.steps_per_eval_image == 0 and config.vis != "none":
+        affordable = self._picture_seconds <= PICTURE_SHARE * self.state.seconds
+        if step % config.steps_per_eval_image == 0 and config.vis != "none" and affordable:
             index = (step // config.steps_per_eval_image - 1) % len(self.eval_set)
             background = evaluation_background(self.model)
             view = render_view(self.model, self.eval_set, index, background)
             target = composite(self.eval_set.image(index).float() / 255, background)
             board.image("eval/photograph_render_error", comparison(view.rgb, target), step)
+            self._picture_seconds += view.seconds
         every = config.seconds_per_eval_all_images
         if every is None and config.target_psnr is not None:
             every = 15.0

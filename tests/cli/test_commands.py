@@ -45,6 +45,7 @@ def test_method_help_shows_its_flags_without_prefix() -> None:
         (["instant-ngp", "--data", "."], "error: --data .: no known data format is found there"),
         (["--load-config", "no.yml"], "error: cannot read no.yml: No such file or directory"),
         (["--resume"], "error: --resume needs a path"),
+        (["--data", "x"], "error: the method comes first, before --data"),
     ],
 )
 def test_errors_are_one_line(arguments: list[str], words: str, tmp_path: Path) -> None:

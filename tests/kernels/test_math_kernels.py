@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from framework.kernels.math import bits, safe_normalize, truncated_exp
+from framework.kernels.math import safe_normalize, truncated_exp
 
 
 @pytest.mark.parametrize("x", [-1e30, -100.0, 0.0, 3.0, 14.9])
@@ -40,11 +40,3 @@ def test_safe_normalize() -> None:
     assert v.grad is not None
     assert bool(torch.isfinite(v.grad).all())
     assert torch.autograd.gradcheck(safe_normalize, torch.randn(4, 3, dtype=torch.float64, requires_grad=True))
-
-
-def test_bits_name_different_streams() -> None:
-    seeds = {bits(seed, step) for seed in range(40) for step in range(500)}
-    assert len(seeds) == 40 * 500
-    assert all(0 <= seed < 2**63 for seed in seeds)
-    share = sum(bin(seed).count("1") for seed in seeds) / (63 * len(seeds))
-    assert share == pytest.approx(0.5, abs=0.005)

@@ -14,13 +14,6 @@ import torch
 
 torch.set_num_threads(2)
 
-TINY_NGP = [
-    "--num-levels", "4", "--max-resolution", "64", "--log2-table-size", "12", "--grid-resolution", "16",
-    "--num-steps", "64", "--samples-per-batch", "4096",
-]  # fmt: skip
-TINY_NERF = ["--num-layers", "3", "--hidden-width", "32", "--num-coarse-samples", "16", "--num-fine-samples", "16"]
-
-
 @pytest.fixture(scope="session", autouse=True)
 def _cache(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Generated data goes to a folder of this test session, not to the user's cache."""

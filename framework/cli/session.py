@@ -86,12 +86,10 @@ def load_split(run: Run, split: Split) -> Dataset:
 
 
 def first_split(run: Run, splits: tuple[Split, ...]) -> Dataset | None:
-    """The first of `splits` that the data has; None, with a note, where it has none."""
-    errors = []
+    """The first of `splits` that can be read; each that cannot is reported. None where none can."""
     for split in splits:
         try:
             return load_split(run, split)
         except DataError as error:
-            errors.append(str(error))
-    say(f"no images to evaluate on: {errors[0]}")
+            say(f"no '{split}' images to evaluate on: {error}")
     return None

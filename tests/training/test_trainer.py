@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from framework import Batch, Method, Model, Rays, Rendered, registry
+from framework.cli.session import first_split
 from framework.errors import CheckpointError, ConfigError, DivergenceError
 from framework.evaluation.evaluator import evaluate, evaluation_background, render_view
 from framework.training.checkpoint import list_checkpoints, load_checkpoint
@@ -124,6 +125,19 @@ def test_a_full_disk_does_not_end_a_run(
     assert capsys.readouterr().err.count("No space left on device") == 3
     kept = [p.name for p in list_checkpoints(trainer.checkpoint_folder)]
     assert kept == ["step-000000001.ckpt", "step-000000008.ckpt"]
+
+
+def test_a_split_that_cannot_be_read_is_reported(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tiny / "transforms_val.json").write_text("{")
+    run = tiny_run("instant-ngp", tiny, tiny)
+    found = first_split(run, ("val", "test"))
+    assert found is not None
+    assert len(found) == 3
+    (tiny / "transforms_test.json").unlink()
+    assert first_split(run, ("val", "test")) is None
+    said = capsys.readouterr().err
+    assert said.count("no 'val' images to evaluate on") == 2
+    assert said.count("no 'test' images to evaluate on: cannot read") == 1
 
 
 def test_a_folder_with_a_run_is_not_taken_twice(shared_tiny: Path, tmp_path: Path) -> None:

@@ -18,6 +18,11 @@ from framework import Cameras, DataError, DataParser, ParsedScene
 from framework.cameras import check_pose
 from framework.dataset import Split, existing, image_size
 
+LONGEST_NAME = 250
+"""Characters of a file's or folder's name; most systems allow 255 bytes."""
+SMALLEST_ANGLE = 1e-6
+"""Radians. Below, the focal length grows beyond what float32 can tell from infinity."""
+
 
 @dataclass(frozen=True)
 class Blender(DataParser):
@@ -115,13 +120,15 @@ def _image_path(folder: Path, frame: Any, where: str) -> Path:
     if not isinstance(name, str) or not name:
         raise DataError(f"{where}: 'file_path' is missing")
     path = folder / name
+    if not path.name or "\0" in name or max(len(part) for part in path.parts) > LONGEST_NAME:
+        raise DataError(f"{where}: 'file_path' is not the name of a file")
     return path if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".webp") else path.with_name(path.name + ".png")
 
 
 def _focal_length(content: dict[str, Any], width: int, file: Path) -> float:
     """In pixels, from the horizontal field of view."""
     angle = content.get("camera_angle_x")
-    if not isinstance(angle, (int, float)) or not 0 < angle < math.pi:
+    if not isinstance(angle, (int, float)) or isinstance(angle, bool) or not SMALLEST_ANGLE < angle < math.pi:
         raise DataError(f"{file}: 'camera_angle_x' is {angle!r}; it must be an angle between 0 and pi radians")
     return 0.5 * width / math.tan(0.5 * angle)
 
@@ -132,6 +139,6 @@ def _times(frames: list[Any], where: list[str]) -> Tensor | None:
         return None
     for frame, place in zip(frames, where, strict=True):
         time = frame.get("time")
-        if not isinstance(time, (int, float)) or not 0 <= time <= 1:
+        if not isinstance(time, (int, float)) or isinstance(time, bool) or not 0 <= time <= 1:
             raise DataError(f"{place}: 'time' is {time!r}; it must be a number from 0 to 1")
     return torch.tensor([float(frame["time"]) for frame in frames])

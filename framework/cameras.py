@@ -131,6 +131,8 @@ def check_pose(pose: Tensor, where: str) -> None:
         raise DataError(f"{where}: the pose holds a value that is not finite (NaN or infinity)")
     rotation = pose[:3, :3].double()
     error = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max().item()
+    if pose.shape[0] == 4:
+        error = max(error, (pose[3] - torch.tensor([0.0, 0.0, 0.0, 1.0])).abs().max().item())
     if error > ROTATION_TOLERANCE or torch.linalg.det(rotation).item() < 0:
         raise DataError(
             f"{where}: the pose is not rigid (its rotation is off an orthonormal, right-handed one by {error:.2g}); "

@@ -97,9 +97,23 @@ class TrainConfig:
     """Seed, device and threads."""
 
     def __post_init__(self) -> None:
-        for name in ("max_num_iterations", "num_rays_per_batch", "eval_num_rays_per_chunk", "steps_per_save"):
+        for name in (
+            "max_num_iterations",
+            "num_rays_per_batch",
+            "eval_num_rays_per_chunk",
+            "steps_per_save",
+            "steps_per_eval_image",
+            "steps_per_eval_all_images",
+        ):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{_flag(name)} is {getattr(self, name)}; it must be at least 1")
+        if self.max_eval_images is not None and self.max_eval_images < 0:
+            raise ConfigError(f"--max-eval-images is {self.max_eval_images}; it must be at least 0")
+        for name in ("adam_beta1", "adam_beta2"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ConfigError(f"{_flag(name)} is {getattr(self, name)}; it must be at least 0 and less than 1")
+        if not self.adam_eps >= 0:
+            raise ConfigError(f"--adam-eps is {self.adam_eps}; it must be at least 0")
         if self.max_seconds is not None and not self.max_seconds > 0:
             raise ConfigError(f"--max-seconds is {self.max_seconds}; it must be more than 0")
         if not self.learning_rate > 0 or not 0 < self.lr_final <= 1:
@@ -166,7 +180,10 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
         except ValueError:
             pass
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:
+            pass
     if isinstance(hint, type) and isinstance(value, hint) and (hint is not int or not isinstance(value, bool)):
         return value
     raise ConfigError(f"{where} is {value!r}; it must be {getattr(hint, '__name__', hint)}")
@@ -181,7 +198,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         values = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # bad text, bad dates, absurd nesting
         raise ConfigError(f"{path} is not plain YAML: {' '.join(str(error).split())}") from error
     if not isinstance(values, dict):
         raise ConfigError(f"{path} must hold keys and values, such as 'method: instant-ngp'")

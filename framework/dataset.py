@@ -205,7 +205,7 @@ def read_image(path: Path, factor: int = 1) -> np.ndarray:
     """
     try:
         mode = str(iio.immeta(path, plugin="pillow").get("mode", ""))
-        if mode.startswith(("I", "F")):
+        if mode.startswith(("I", "F")) or _is_deep_png(path):
             raise DataError(f"{path} has more than 8 bits a channel; convert it to an 8-bit PNG")
         image = np.asarray(iio.imread(path, plugin="pillow", mode="RGBA"))
     except DataError:
@@ -215,12 +215,22 @@ def read_image(path: Path, factor: int = 1) -> np.ndarray:
     return image if factor == 1 else reduce_image(image, factor)
 
 
+def _is_deep_png(path: Path) -> bool:
+    """Whether a PNG has 16 bits a channel, which Pillow would cut to 8 without a word (bit depth: byte 24)."""
+    with path.open("rb") as file:
+        head = file.read(25)
+    return head[:8] == b"\x89PNG\r\n\x1a\n" and head[24:] == b"\x10"
+
+
 def reduce_image(image: np.ndarray, factor: int) -> np.ndarray:
     """Box filter by a whole number: (H, W, 4) uint8 to (H // factor, W // factor, 4).
 
     Colours are averaged weighted by alpha, so that transparent pixels lend none of theirs.
     """
     height, width = image.shape[0] // factor, image.shape[1] // factor
+    if height == 0 or width == 0:
+        size = f"{image.shape[1]}x{image.shape[0]}"
+        raise DataError(f"an image of {size} pixels has none left at --downscale-factor {factor}")
     blocks = image[: height * factor, : width * factor].reshape(height, factor, width, factor, 4).astype(np.float64)
     alpha = blocks[..., 3:].sum((1, 3))
     color = (blocks[..., :3] * blocks[..., 3:]).sum((1, 3)) / np.maximum(alpha, 1)

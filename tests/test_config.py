@@ -34,6 +34,13 @@ def test_every_methods_config_survives_yaml(method: str) -> None:
         ({"max_num_iterations": 0}, "--max-num-iterations is 0; it must be at least 1"),
         ({"max_seconds": -1}, "--max-seconds is -1"),
         ({"learning_rate": 0}, "must be more than 0"),
+        ({"learning_rate": float("nan")}, "must be more than 0"),
+        ({"learning_rate": 10**400}, "'learning_rate'"),
+        ({"steps_per_eval_image": 0}, "--steps-per-eval-image"),
+        ({"steps_per_eval_all_images": 0}, "--steps-per-eval-all-images"),
+        ({"max_eval_images": -1}, "--max-eval-images"),
+        ({"adam_beta1": 1.5}, "--adam-beta1"),
+        ({"adam_eps": -1.0}, "--adam-eps"),
     ],
 )
 def test_wrong_values_are_named(values: dict, words: str) -> None:
@@ -54,6 +61,10 @@ def test_numbers_as_yaml_writes_them() -> None:
         ("", "must hold keys and values"),
         ("- a\n- b", "must hold keys and values"),
         ("a: [1", "is not plain YAML"),
+        ("method: 2020-99-99", "is not plain YAML"),
+        ("method: instant-ngp\nmachine: [1]", "'machine' is [1]"),
+        ("method: instant-ngp\n3: 4", "unknown key '3'"),
+        ("method: instant-ngp\ndataparser: {name: 3}", "unknown data format '3'"),
         ("max_seconds: 3", "does not say which method"),
         ("method: instant-npg", "Did you mean 'instant-ngp'"),
         ("method: instant-ngp\ndataparser: blender", "must hold keys and values"),
@@ -68,6 +79,17 @@ def test_bad_recipes_are_refused_in_one_line(tmp_path: Path, text: str, words: s
         read_run(path)
     assert words in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_deeply_nested_recipe_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "recipe.yml"
+    path.write_text("a: " + "[" * 5_000)
+    error: Exception | None = None
+    try:
+        read_run(path)
+    except Exception as caught:  # not pytest.raises: a thousand frames of a RecursionError take minutes to print
+        error = caught
+    assert type(error) is ConfigError
 
 
 def test_a_recipe_cannot_run_code(tmp_path: Path) -> None:

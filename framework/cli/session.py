@@ -18,9 +18,9 @@ PICTURES = 4
 def start(run: Run) -> None:
     """Train a new run."""
     trainer = _prepare(run)
+    trainer.restore_as_configured()
     create_folder(run)
     write_transforms(run, trainer.train_set)
-    trainer.restore_as_configured()
     _finish(run, trainer)
 
 

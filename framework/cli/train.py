@@ -99,26 +99,22 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
     from framework.training.run import run_folder
 
     options = (tyro.conf.FlagConversionOff, tyro.conf.ConsolidateSubcommandArgs)
-    asks_for_help = bool({"-h", "--help"} & set(flags))
-    looked: Any = run.config
-    named = run.dataparser
-    rest = [flag for flag in flags if flag in registered("dataparsers")]
-    if not asks_for_help:
-        looked, unknown = tyro.cli(
-            type(run.config),
-            prog=f"ns-train {run.method}",
-            args=flags,
-            default=run.config,
-            config=options,
-            return_unknown_args=True,
-        )
-        rest = [flag for flag in unknown if flag in registered("dataparsers")]
-    if rest:
-        named, flags = rest[0], _without(flags, rest[0])
-    elif asks_for_help:
-        named = named or "procedural"
-    elif not named or looked.data != run.config.data:
+    looked, unknown = tyro.cli(
+        type(run.config),
+        prog=f"ns-train {run.method}",
+        args=[flag for flag in flags if flag not in ("-h", "--help")],
+        default=run.config,
+        config=options,
+        return_unknown_args=True,
+    )
+    if (word := _stray_word(unknown)) is not None:
+        if word not in registered("dataparsers"):
+            raise ConfigError(f"unknown data format '{word}'. {nearest(word, registered('dataparsers'))}")
+        named, flags = word, _without(flags, word)
+    elif not run.dataparser or looked.data != run.config.data:
         named = recognize(looked.data)
+    else:
+        named = run.dataparser
     parser = run.parser if named == run.dataparser else load_dataparser(named)()
 
     # One flat set of flags: the method's and the data format's, so that their order does not matter.
@@ -137,6 +133,17 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
     )
     folder = run_folder(run.method, parsed.method) if fresh else run.folder
     return dataclasses.replace(run, config=parsed.method, dataparser=named, parser=parsed.format, folder=folder)
+
+
+def _stray_word(unknown: list[str]) -> str | None:
+    """The first word that is neither a flag nor a flag's value: the name of a data format."""
+    for index, word in enumerate(unknown):
+        if word.startswith("-"):
+            continue
+        before = unknown[index - 1] if index else ""
+        if not before.startswith("--") or "=" in before or word in registered("dataparsers"):
+            return word
+    return None
 
 
 def _without(flags: list[str], name: str) -> list[str]:

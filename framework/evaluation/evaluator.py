@@ -100,9 +100,9 @@ class Evaluation:
     def line(self) -> str:
         """The results in a line."""
         r = self.results
-        lpips = "absent" if r["lpips"] is None else f"{r['lpips']:.4f}"
+        ssim, lpips = ("absent" if r[name] is None else f"{r[name]:.4f}" for name in ("ssim", "lpips"))
         return (
-            f"PSNR {r['psnr']:.2f} dB  SSIM {r['ssim']:.4f}  LPIPS {lpips}  "
+            f"PSNR {r['psnr']:.2f} dB  SSIM {ssim}  LPIPS {lpips}  "
             f"{r['num_rays_per_sec'] / 1e3:.1f}k rays/s  {1 / r['fps']:.2f} s/image  ({r['num_images']} images)"
         )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,8 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bo
         write_atomically(path, lambda file: torch.save({"format": FORMAT, **state}, file))
     except (OSError, RuntimeError) as error:
         raise CheckpointError(f"cannot write {path}: {error}; earlier checkpoints stand") from error
+    for remnant in folder.glob(".step-*.ckpt.*.tmp"):  # of a process that was killed while writing
+        remnant.unlink(missing_ok=True)
     if not keep_all:
         for old in list_checkpoints(folder)[:-2]:
             old.unlink(missing_ok=True)
@@ -62,7 +65,9 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
     Raises: CheckpointError where it is missing, cut short or not one of ours.
     """
     try:
-        state = torch.load(path, map_location=device, weights_only=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch's doubts about foreign pickles; they are refused below
+            state = torch.load(path, map_location=device, weights_only=True)
     except FileNotFoundError as error:
         raise CheckpointError(f"there is no checkpoint {path}") from error
     except Exception as error:  # torch raises RuntimeError, UnpicklingError, EOFError, KeyError, OSError and more

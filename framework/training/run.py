@@ -96,7 +96,7 @@ def read_run(path: Path) -> Run:
     if not isinstance(data_flags, dict):
         raise ConfigError(f"{path}: 'dataparser' must hold keys and values, such as 'name: blender'")
     data_flags = dict(data_flags)
-    name = data_flags.pop("name", None) or recognize(config.data)
+    name = str(data_flags.pop("name", None) or recognize(config.data))
     parser = from_plain(load_dataparser(name)(), data_flags, f"{path}: dataparser")
     return Run(method, config, name, parser, path.parent)
 

@@ -306,6 +306,8 @@ class Trainer:
             say(f"warning: cannot write learning_curve.json: {error.strerror}; the checkpoint holds the curve too")
 
     def _due_to_save(self) -> bool:
+        if self._bad_in_a_row:  # what is saved now might be ruined, and would push out what is not
+            return False
         aged = self.state.seconds - self._last_save >= self.config.seconds_per_save
         return aged or self.state.step % self.config.steps_per_save == 0
 

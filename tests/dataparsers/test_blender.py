@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from dataparsers.blender import Blender
-from framework.dataset import load_dataset, read_image, reduce_image
+from framework.dataset import Split, load_dataset, read_image, reduce_image
 from framework.errors import DataError
 from tests.conftest import EditJson
 
@@ -99,6 +99,18 @@ BAD = {
     "mirrored pose": (matrix(lambda m: [r.__setitem__(0, -r[0]) for r in m[:3]]), "frame 4: the pose is not rigid"),
     "time on one frame only": (frame(time=0.5), "frame 0: 'time' is None"),
     "time beyond one": (lambda c: [f.update(time=5) for f in c["frames"]], "frame 0: 'time' is 5"),
+    "nan time": (lambda c: [f.update(time=math.nan) for f in c["frames"]], "frame 0: 'time' is nan"),
+    "text time": (lambda c: [f.update(time="now") for f in c["frames"]], "frame 0: 'time' is 'now'"),
+    "true as time": (lambda c: [f.update(time=True) for f in c["frames"]], "frame 0: 'time' is True"),
+    "true as angle": (put("camera_angle_x", True), "'camera_angle_x' is True"),
+    "huge angle": (put("camera_angle_x", 4.0), "'camera_angle_x' is 4.0"),
+    "angle whose tangent is zero": (put("camera_angle_x", 5e-324), "'camera_angle_x' is 5e-324"),
+    "angle with an infinite focal length": (put("camera_angle_x", 1e-320), "'camera_angle_x' is 1e-320"),
+    "huge whole number in pose": (matrix(lambda m: m[0].__setitem__(3, 10**400)), "frame 4: 'transform_matrix'"),
+    "deep pose": (frame(transform_matrix=[[[[1]]]]), "frame 4: the pose has shape"),
+    "projective pose": (matrix(lambda m: m.__setitem__(3, [0, 0, 0, 2])), "frame 4: the pose is not rigid"),
+    "file is the root": (frame(file_path="/"), "frame 4: 'file_path'"),
+    "file name too long for the disk": (frame(file_path="a" * 10_000), "frame 4: 'file_path'"),
 }
 
 
@@ -185,11 +197,12 @@ def test_no_folder_and_bad_flags(tiny: Path) -> None:
 
 
 @pytest.mark.data
-def test_real_lego(real_data: Path) -> None:
-    data = load_dataset(Blender().parse(real_data / "lego", "test"), "test")
-    assert len(data) == 50
-    assert data.image(0).shape == (400, 400, 4)
-    assert len(Blender().parse(real_data / "lego", "train").image_paths) == 100
+@pytest.mark.parametrize(("split", "count"), [("train", 100), ("val", 25), ("test", 50)])
+def test_real_lego(real_data: Path, split: Split, count: int) -> None:
+    data = load_dataset(Blender().parse(real_data / "lego", split), split)
+    assert len(data) == count
+    assert {data.image(index).shape for index in range(count)} == {(400, 400, 4)}
+    assert data.scene.has_alpha
 
 
 @pytest.mark.data

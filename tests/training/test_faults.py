@@ -112,3 +112,26 @@ def test_killed_before_the_first_checkpoint(shared_tiny: Path, tmp_path: Path) -
     saved = load_newest(folder / "nerfstudio_models")
     assert saved is not None
     assert saved["state"]["step"] == 5
+
+
+def test_a_really_full_disk_says_why_and_spares_the_old_checkpoint(shared_tiny: Path, tmp_path: Path) -> None:
+    """Files may not grow beyond 20 kB: the operating system itself refuses to write."""
+    resource = pytest.importorskip("resource")
+    folder = train(shared_tiny, tmp_path, "--max-num-iterations", 4, "--max-eval-images", 0)
+    flags = ["--max-num-iterations", "12", "--steps-per-save", "4"]
+    done = subprocess.run(
+        [command("ns-train"), "--resume", str(folder), *flags],
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000)),
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert done.stderr.strip().splitlines()[-1].startswith("error: cannot write ")
+    assert [path.name for path in (folder / "nerfstudio_models").iterdir()] == ["step-000000004.ckpt"]
+    assert done.stderr.count("earlier checkpoints stand") == 3  # at 8, at 12, and at the end: it went on
+    saved = load_newest(folder / "nerfstudio_models")
+    assert saved is not None
+    assert saved["state"]["step"] == 4
+    assert "File too large" in done.stderr

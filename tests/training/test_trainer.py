@@ -1,7 +1,10 @@
 """The trainer: it learns, it repeats itself bit for bit, it resumes, it stops, and it does not hide NaN."""
 
+import dataclasses
 import json
 import math
+import os
+import signal
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -11,12 +14,14 @@ import pytest
 import torch
 from torch import Tensor
 
+from dataparsers.blender import Blender
 from framework import Batch, Method, Model, Rays, Rendered, registry
-from framework.cli.session import first_split
+from framework.cli.session import first_split, load_split
 from framework.errors import CheckpointError, ConfigError, DivergenceError
 from framework.evaluation.evaluator import evaluate, evaluation_background, render_view
 from framework.training.checkpoint import list_checkpoints, load_checkpoint
 from framework.training.run import create_folder
+from framework.training.trainer import Trainer, _stop_signals
 from methods.instant_ngp import InstantNGP, InstantNGPConfig
 from tests.training.helpers import TINY, assert_same_bits, tensors, tiny_run, tiny_trainer
 
@@ -254,3 +259,91 @@ def test_evaluation_cameras_are_not_taken_for_training_ones(shared_tiny: Path, t
     evaluate(trainer.model, trainer.eval_set)
     assert seen
     assert all(rays.camera_indices is None for rays in seen)
+
+
+def test_looking_on_changes_no_bit(shared_tiny: Path, tmp_path: Path) -> None:
+    """Pictures for TensorBoard and evaluations between steps leave the trained bits alone."""
+    blind = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "blind", max_num_iterations=20)
+    looking = {"steps_per_eval_image": 3, "steps_per_eval_all_images": 7, "vis": "tensorboard"}
+    seeing = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "seeing", True, max_num_iterations=20, **looking)
+    blind.train()
+    seeing.train()
+    assert_same_bits(tensors(blind), tensors(seeing))
+    assert len(json.loads((tmp_path / "seeing" / "learning_curve.json").read_text())) == 2
+    assert list((tmp_path / "seeing").glob("events.out.tfevents.*"))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_metrics_do_not_depend_on_the_chunks(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
+    found = []
+    for chunk in (57, 400, 8192):
+        settings = {"eval_num_rays_per_chunk": chunk, "mixed_precision": False}
+        trainer = tiny_trainer(kind, shared_tiny, tmp_path / str(chunk), evaluated=True, **settings)
+        for _ in range(10):
+            trainer.train_step()
+        assert trainer.eval_set is not None
+        found.append(evaluate(trainer.model, trainer.eval_set).results)
+    for other in found[1:]:
+        for name in ("psnr", "ssim"):
+            assert other[name] == pytest.approx(found[0][name], abs=1e-4)
+
+
+def test_a_small_picture_has_no_ssim_and_no_lpips_and_says_so(tiny: Path, tmp_path: Path) -> None:
+    run = dataclasses.replace(tiny_run("instant-ngp", tiny, tmp_path / "run"), parser=Blender(downscale_factor=2))
+    create_folder(run)
+    trainer = Trainer(run, load_split(run, "train"), load_split(run, "val"))
+    assert trainer.eval_set is not None
+    found = evaluate(trainer.model, trainer.eval_set)
+    assert found.results["ssim"] is None
+    assert math.isfinite(found.results["psnr"])
+    assert "SSIM absent" in found.line()
+
+
+def test_a_second_ctrl_c_ends_at_once() -> None:
+    with pytest.raises(KeyboardInterrupt), _stop_signals() as received:  # noqa: PT012
+        os.kill(os.getpid(), signal.SIGINT)
+        assert received == [signal.SIGINT]
+        os.kill(os.getpid(), signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_good_checkpoint_outlives_a_divergence(shared_tiny: Path, tmp_path: Path) -> None:
+    """Ten bad steps, each of which would be saved: the state from before must still be there."""
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", steps_per_save=2)
+    for _ in range(3):
+        trainer.train_step()
+    trainer.save()
+    for group in trainer.optimizer.param_groups:
+        group["initial_lr"] = 1e38  # the next step is finite, and ruins every parameter
+    with pytest.raises(DivergenceError, match="the last good checkpoint is in"):
+        trainer.train()
+    losses = []
+    for path in list_checkpoints(trainer.checkpoint_folder):
+        again = tiny_trainer("instant-ngp", shared_tiny, tmp_path / path.stem)
+        again.restore(load_checkpoint(path))
+        losses.append(sum(again.train_step().losses.values()))
+    assert any(math.isfinite(loss) for loss in losses), losses
+
+
+def test_what_a_killed_save_left_behind_is_cleared_by_the_next(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=4, steps_per_save=2)
+    trainer.checkpoint_folder.mkdir(parents=True)
+    (trainer.checkpoint_folder / ".step-000000001.ckpt.99999999.tmp").write_bytes(b"half of one")
+    trainer.train()
+    names = sorted(path.name for path in trainer.checkpoint_folder.iterdir())
+    assert names == ["step-000000002.ckpt", "step-000000004.ckpt"]
+
+
+@pytest.mark.parametrize("key", ["model", "optimizer", "state"])
+def test_a_checkpoint_with_a_part_of_another_kind_is_refused(key: str, shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run")
+    content = {**load_checkpoint(trainer.save()), key: [1]}
+    with pytest.raises(CheckpointError):
+        trainer.restore(content)
+
+
+def test_a_checkpoint_of_another_method_is_refused(shared_tiny: Path, tmp_path: Path) -> None:
+    saved = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "a").save()
+    other = tiny_trainer("vanilla-nerf", shared_tiny, tmp_path / "b")
+    with pytest.raises(CheckpointError, match="does not fit"):
+        other.restore(load_checkpoint(saved))

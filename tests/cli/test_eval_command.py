@@ -1,0 +1,167 @@
+"""ns-eval: its numbers against the pictures it writes, and what it says where something is wrong."""
+
+import json
+import pickle
+import shutil
+import statistics
+import sys
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from PIL import Image
+
+from framework.cli.evaluate import main
+from tests.cli.helpers import run, train
+from tests.conftest import Refused
+
+
+@pytest.fixture(scope="module")
+def trained(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with checkpoints at steps 20 and 40."""
+    return train(shared_tiny, tmp_path_factory.mktemp("out"), "--max-num-iterations", 40, "--steps-per-save", 20)
+
+
+@pytest.fixture
+def finished(trained: Path, tmp_path: Path) -> Path:
+    """A copy of that run, which a test may damage."""
+    return Path(shutil.copytree(trained, tmp_path / "ball" / "instant-ngp" / "t"))
+
+
+def no_constant(name: str) -> NoReturn:
+    raise AssertionError(f"{name} is not JSON")
+
+
+def evaluate(monkeypatch: pytest.MonkeyPatch, folder: Path, *flags: object) -> dict[str, Any]:
+    """Run ns-eval; returns its file, read strictly."""
+    words = ["ns-eval", "--load-config", folder / "config.yml", "--output-path", folder / "new" / "e.json", *flags]
+    monkeypatch.setattr(sys, "argv", list(map(str, words)))
+    main()
+    return json.loads((folder / "new" / "e.json").read_text(), parse_constant=no_constant)
+
+
+def edit_config(folder: Path, **values: object) -> None:
+    config = yaml.safe_load((folder / "config.yml").read_text())
+    (folder / "config.yml").write_text(yaml.safe_dump({**config, **values}))
+
+
+def test_the_file_has_nerfstudios_keys_and_its_means(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = evaluate(monkeypatch, finished)
+    assert found["experiment_name"] == "ball"
+    assert found["method_name"] == "instant-ngp"
+    assert found["checkpoint"] == "step-000000040.ckpt"
+    for name in ("psnr", "ssim"):
+        values = [row[name] for row in found["per_image"]]
+        assert found["results"][name] == pytest.approx(statistics.fmean(values))
+        assert found["results"][f"{name}_std"] == pytest.approx(statistics.stdev(values))
+    assert found["results"]["fps"] > 0
+    assert found["results"]["num_rays_per_sec"] == pytest.approx(found["results"]["fps"] * 400)
+
+
+def test_lpips_that_is_absent_is_null_with_a_reason(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("framework.evaluation.metrics.importlib.util.find_spec", lambda name: None)
+    found = evaluate(monkeypatch, finished, "--max-images", 1)
+    assert (found["results"]["lpips"], found["results"]["lpips_std"]) == (None, None)
+    assert found["lpips"] == "absent: pip install 'nerfloom[lpips]'"
+
+
+def test_rounded_numbers_are_those_of_the_written_pictures(
+    finished: Path, shared_tiny: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """PSNR from the files alone: the PNG against the photograph over white."""
+    pictures = finished / "renders"
+    found = evaluate(monkeypatch, finished, "--render-output-path", pictures, "--round-to-uint8", "True")
+    for index, row in enumerate(found["per_image"]):
+        with Image.open(pictures / f"{index:04d}_r_{index}.png") as picture:
+            render = np.asarray(picture, dtype=np.float64) / 255
+        with Image.open(shared_tiny / "test" / f"r_{index}.png") as picture:
+            rgba = np.asarray(picture, dtype=np.float64) / 255
+        photograph = rgba[..., :3] * rgba[..., 3:] + (1 - rgba[..., 3:])
+        assert row["psnr"] == pytest.approx(-10 * np.log10(((render - photograph) ** 2).mean()), abs=1e-4)
+
+
+def test_the_chunk_size_changes_no_number(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = evaluate(monkeypatch, finished)
+    edit_config(finished, eval_num_rays_per_chunk=37)
+    chunked = evaluate(monkeypatch, finished)
+    for name in ("psnr", "psnr_std", "ssim", "ssim_std"):
+        assert chunked["results"][name] == pytest.approx(plain["results"][name], abs=1e-4)
+
+
+def test_any_split_and_any_checkpoint(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert len(evaluate(monkeypatch, finished, "--split", "train")["per_image"]) == 10
+    newest = evaluate(monkeypatch, finished, "--split", "val")
+    assert len(newest["per_image"]) == 2
+    older = finished / "nerfstudio_models" / "step-000000020.ckpt"
+    found = evaluate(monkeypatch, finished, "--split", "val", "--load-checkpoint", older)
+    assert found["checkpoint"] == older.name
+    assert found["results"]["psnr"] != newest["results"]["psnr"]
+
+
+def test_a_damaged_newest_checkpoint_falls_back(
+    finished: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    newest = finished / "nerfstudio_models" / "step-000000040.ckpt"
+    newest.write_bytes(newest.read_bytes()[:-500])
+    found = evaluate(monkeypatch, finished, "--max-images", 1)
+    assert found["checkpoint"] == "step-000000020.ckpt"
+    assert f"{newest} is damaged" in capsys.readouterr().err
+
+
+def test_what_is_missing_is_named(finished: Path, tmp_path: Path, refused: Refused) -> None:
+    config = finished / "config.yml"
+    (tmp_path / "file").write_text("in the way")
+    cases: list[tuple[list[object], str]] = [
+        (["--load-config", tmp_path / "no.yml"], f"cannot read {tmp_path / 'no.yml'}: No such file"),
+        (["--load-config", finished], f"cannot read {finished}: Is a directory"),
+        (["--load-config", config, "--max-images", 0], "--max-images is 0"),
+        (["--load-config", config, "--data", tmp_path / "gone"], str(tmp_path / "gone" / "transforms_test.json")),
+        (["--load-config", config, "--load-checkpoint", tmp_path / "no.ckpt"], "there is no checkpoint"),
+        (["--load-config", config, "--load-checkpoint", tmp_path / "file"], f"{tmp_path / 'file'} is damaged"),
+        (["--load-config", config, "--output-path", tmp_path / "file" / "e.json"], str(tmp_path / "file")),
+    ]
+    for arguments, words in cases:
+        assert words in refused(main, *arguments)
+
+
+def test_data_that_has_gone_is_named_by_its_folder(finished: Path, tmp_path: Path, refused: Refused) -> None:
+    edit_config(finished, data=str(tmp_path / "elsewhere"))
+    assert str(tmp_path / "elsewhere") in refused(main, "--load-config", finished / "config.yml")
+
+
+def test_settings_that_do_not_fit_the_checkpoint(finished: Path, refused: Refused) -> None:
+    edit_config(finished, hidden_width=32)
+    said = refused(main, "--load-config", finished / "config.yml")
+    assert "the checkpoint does not fit the model's settings" in said
+
+
+class Malicious:
+    def __init__(self, proof: Path) -> None:
+        self.proof = proof
+
+    def __reduce__(self) -> tuple[Any, tuple[Path]]:
+        return (Path.touch, (self.proof,))
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_a_checkpoint_that_would_run_code_does_not(zipped: bool, finished: Path, tmp_path: Path) -> None:
+    evil, proof = tmp_path / "evil.ckpt", tmp_path / "proof"
+    content = {"format": 1, "model": Malicious(proof)}
+    if zipped:
+        torch.save(content, evil)
+    else:
+        evil.write_bytes(pickle.dumps(content))
+    done = run("ns-eval", "--load-config", finished / "config.yml", "--load-checkpoint", evil)
+    assert done.returncode == 1
+    assert done.stderr.strip() == f"error: {evil} is damaged or not a checkpoint of nerfloom"
+    assert not proof.exists()
+
+
+def test_a_missing_flag_is_named() -> None:
+    done = run("ns-eval")
+    assert done.returncode == 2
+    assert "--load-config" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,124 @@
+"""Images in memory: what is decoded is what was stored, hand-computed where it is changed."""
+
+import struct
+import zlib
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from dataparsers.blender import Blender
+from framework.dataset import existing, image_size, load_dataset, read_image
+from framework.errors import DataError
+from framework.pixels import background_colors, composite
+
+
+def write_deep_png(path: Path, channels: int, size: int = 20) -> None:
+    """A valid PNG of 16 bits a channel, written by hand: imageio and Pillow write none in colour."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    color_type = {1: 0, 3: 2, 4: 6}[channels]
+    row = b"\0" + struct.pack(f">{size * channels}H", *[40000] * size * channels)
+    header = struct.pack(">IIBBBBB", size, size, 16, color_type, 0, 0, 0)
+    parts = [chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(row * size)), chunk(b"IEND", b"")]
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_sixteen_bits_a_channel_are_refused_not_cut(tmp_path: Path, channels: int) -> None:
+    write_deep_png(tmp_path / "deep.png", channels)
+    with pytest.raises(DataError, match=r"deep\.png has more than 8 bits a channel; convert it"):
+        read_image(tmp_path / "deep.png")
+
+
+def test_a_sixteen_bit_image_in_a_set_is_skipped_and_named(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_deep_png(tiny / "train" / "r_3.png", 1)
+    assert len(load_dataset(Blender().parse(tiny, "train"), "train")) == 9
+    said = capsys.readouterr().err
+    assert "1 of 10 images are unreadable and skipped" in said
+    assert "r_3.png has more than 8 bits" in said
+
+
+def test_palette_images_keep_their_transparency(tmp_path: Path) -> None:
+    picture = Image.new("P", (2, 1))
+    picture.putpalette([10, 20, 30, 200, 100, 50])
+    picture.putdata([0, 1])
+    picture.save(tmp_path / "p.png", transparency=1)
+    assert read_image(tmp_path / "p.png").tolist() == [[[10, 20, 30, 255], [200, 100, 50, 0]]]
+
+
+def test_an_opaque_set_has_no_alpha_and_is_kept_in_three_channels(tiny: Path) -> None:
+    for file in (tiny / "train").glob("*.png"):
+        iio.imwrite(file, np.full((20, 20, 4), 255, dtype=np.uint8))
+    data = load_dataset(Blender().parse(tiny, "train"), "train")
+    assert not data.scene.has_alpha
+    assert data.image(0).shape == (20, 20, 3)
+
+
+@pytest.mark.parametrize(("kind", "behind"), [("white", 1.0), ("black", 0.0)])
+def test_loaded_alpha_is_straight_and_composited_by_hand(tiny: Path, kind: str, behind: float) -> None:
+    rgba = np.zeros((20, 20, 4), dtype=np.uint8)
+    rgba[4, 7] = (200, 100, 0, 51)  # a fifth opaque
+    iio.imwrite(tiny / "train" / "r_0.png", rgba)
+    image = load_dataset(Blender().parse(tiny, "train"), "train").image(0)
+    assert image[4, 7].tolist() == [200, 100, 0, 51]
+    background = background_colors(kind, 1, torch.device("cpu"))  # type: ignore[arg-type]
+    found = composite(image[4, 7][None].float() / 255, background)
+    expected = [[value / 255 * 0.2 + 0.8 * behind for value in (200, 100, 0)]]
+    torch.testing.assert_close(found, torch.tensor(expected))
+
+
+def test_a_transparent_neighbour_lends_no_colour_when_images_are_reduced(tiny: Path) -> None:
+    rgba = np.zeros((20, 20, 4), dtype=np.uint8)
+    rgba[..., :3] = 255
+    rgba[0, 0] = (30, 60, 90, 255)
+    iio.imwrite(tiny / "train" / "r_0.png", rgba)
+    image = load_dataset(Blender(downscale_factor=2).parse(tiny, "train"), "train").image(0)
+    assert image[0, 0].tolist() == [30, 60, 90, 64]  # 255 / 4 = 63.75
+
+
+@pytest.mark.parametrize("factor", [3, 20])
+def test_a_rest_that_fills_no_block_is_cut_off(tiny: Path, factor: int) -> None:
+    data = load_dataset(Blender(downscale_factor=factor).parse(tiny, "train"), "train")
+    assert data.image(0).shape == (20 // factor, 20 // factor, 4)
+    assert data.cameras.fx[0].item() == pytest.approx(10 / np.tan(0.35) / factor)
+
+
+@pytest.mark.parametrize("factor", [21, 1000])
+def test_reducing_to_nothing_is_an_error(tiny: Path, factor: int) -> None:
+    with pytest.raises(DataError, match="downscale"):
+        load_dataset(Blender(downscale_factor=factor).parse(tiny, "train"), "train")
+
+
+def test_the_size_comes_from_the_first_image_that_can_be_read(tiny: Path) -> None:
+    paths = [tiny / "train" / f"r_{index}.png" for index in range(3)]
+    paths[0].write_bytes(b"no image")
+    assert image_size(paths) == (20, 20)
+    with pytest.raises(DataError, match=r"r_0\.png is not a readable image"):
+        image_size(paths[:1])
+
+
+def test_missing_files_are_counted_once_and_all_missing_is_an_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paths = [tmp_path / f"{index}.png" for index in range(4)]
+    paths[1].touch()
+    assert existing(paths, "val").tolist() == [1]
+    said = capsys.readouterr().err
+    assert said.count("split 'val': 3 of 4 images are missing and skipped") == 1
+    assert str(paths[0]) in said
+    with pytest.raises(DataError, match="split 'test' has no image: its data lists 1, of which none exists"):
+        existing(paths[:1], "test")
+
+
+def test_moving_a_set_to_a_device_keeps_everything(shared_tiny: Path) -> None:
+    data = load_dataset(Blender().parse(shared_tiny, "val"), "val")
+    moved = data.to("cpu")
+    assert torch.equal(moved.pixels, data.pixels)
+    assert moved.names == data.names
+    assert torch.equal(moved.image(1), data.image(1))

@@ -8,6 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+# Threads that spin while they wait make a step fifty times slower where the cores are shared. Read when torch loads.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 import imageio.v3 as iio
 import numpy as np
 import pytest

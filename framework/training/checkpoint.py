@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import warnings
@@ -43,7 +44,9 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bo
     path = folder / f"step-{step:09d}.ckpt"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, lambda file: torch.save({"format": FORMAT, **state}, file))
+        content = io.BytesIO()  # written by torch itself, a full disk is reported as "unexpected pos"
+        torch.save({"format": FORMAT, **state}, content)
+        write_atomically(path, lambda file: file.write(content.getbuffer()))
     except (OSError, RuntimeError) as error:
         raise CheckpointError(f"cannot write {path}: {error}; earlier checkpoints stand") from error
     for remnant in folder.glob(".step-*.ckpt.*.tmp"):  # of a process that was killed while writing

@@ -14,9 +14,9 @@ import yaml
 from framework.cli.train import _default_run, _parse_flags, main
 from framework.registry import load_method
 from framework.training.run import Run, create_folder
-from tests.cli.helpers import TINY_NGP, run, train
+from tests.cli.helpers import TINY_NGP, run
 from tests.conftest import Refused
-from tests.training.helpers import tiny_run
+from tests.training.helpers import tiny_run, tiny_trainer
 
 Capture = pytest.CaptureFixture[str]
 
@@ -205,7 +205,9 @@ def test_resuming_from_damaged_checkpoints(
     shared_tiny: Path, tmp_path: Path, refused: Refused, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     """The newest is cut short: the one before is taken, and the command says so. Both: an error."""
-    folder = train(shared_tiny, tmp_path, "--max-num-iterations", 6, "--steps-per-save", 3, "--max-eval-images", 0)
+    folder = tmp_path / "run"
+    steps = {"max_num_iterations": 6, "steps_per_save": 3, "max_eval_images": 0}
+    tiny_trainer("instant-ngp", shared_tiny, folder, **steps).train()
     older, newer = (folder / "nerfstudio_models" / f"step-00000000{step}.ckpt" for step in (3, 6))
     newer.write_bytes(newer.read_bytes()[:1000])
     monkeypatch.setattr(sys, "argv", ["ns-train", "--resume", str(folder)])

@@ -11,6 +11,7 @@ import torch
 
 from framework.training.checkpoint import list_checkpoints, load_newest
 from tests.cli.helpers import TINY_NGP, command, train
+from tests.training.helpers import tiny_trainer
 
 STEPS = 20_000
 
@@ -56,13 +57,14 @@ def test_a_signal_saves_and_says_where(number: signal.Signals, shared_tiny: Path
 
 
 def kill_and_resume(data: Path, output: Path, kills: int, steps: int, seed: int = 0) -> Path:
-    """Train to the end through `kills` SIGKILLs, each at a random moment while checkpoints are being written."""
+    """Train to the end through `kills` SIGKILLs at random moments, one in each stretch of the run."""
     moments = random.Random(seed)
     flags, folder = new_run(data, output, steps)
     process = start(*flags)
     step = -1
-    for _ in range(kills):
-        step = wait_for_checkpoint(process, folder, after=step)
+    for kill in range(kills):
+        earliest = int(steps * (kill + moments.random()) / (kills + 1))
+        step = wait_for_checkpoint(process, folder, after=max(step, earliest))
         time.sleep(moments.uniform(0, 0.05))
         process.kill()
         process.communicate()
@@ -89,12 +91,13 @@ def assert_same_end(first: Path, second: Path) -> None:
     print(f"{len(a['model'])} tensors of the model and Adam's are equal bit for bit at step {a['state']['step']}")
 
 
-@pytest.mark.parametrize(("kills", "steps"), [(2, 300), pytest.param(20, 1500, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("kills", "steps"), [(2, 150), pytest.param(20, 1500, marks=pytest.mark.slow)])
 def test_killed_runs_end_with_the_same_bits(kills: int, steps: int, shared_tiny: Path, tmp_path: Path) -> None:
     whole = train(shared_tiny, tmp_path / "whole", "--max-num-iterations", steps, "--max-eval-images", 0)
     assert_same_end(whole, kill_and_resume(shared_tiny, tmp_path / "killed", kills, steps))
 
 
+@pytest.mark.slow
 def test_killed_before_the_first_checkpoint(shared_tiny: Path, tmp_path: Path) -> None:
     flags, folder = new_run(shared_tiny, tmp_path, 5)
     process = start(*flags)
@@ -117,7 +120,8 @@ def test_killed_before_the_first_checkpoint(shared_tiny: Path, tmp_path: Path) -
 def test_a_really_full_disk_says_why_and_spares_the_old_checkpoint(shared_tiny: Path, tmp_path: Path) -> None:
     """Files may not grow beyond 20 kB: the operating system itself refuses to write."""
     resource = pytest.importorskip("resource")
-    folder = train(shared_tiny, tmp_path, "--max-num-iterations", 4, "--max-eval-images", 0)
+    folder = tmp_path / "run"
+    tiny_trainer("instant-ngp", shared_tiny, folder, max_num_iterations=4, max_eval_images=0).train()
     flags = ["--max-num-iterations", "12", "--steps-per-save", "4"]
     done = subprocess.run(
         [command("ns-train"), "--resume", str(folder), *flags],

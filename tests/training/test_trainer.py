@@ -28,7 +28,7 @@ from tests.training.helpers import TINY, assert_same_bits, tensors, tiny_run, ti
 KINDS = list(TINY)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [*KINDS[:2], pytest.param(KINDS[2], marks=pytest.mark.slow)])
 def test_it_learns(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer(kind, shared_tiny, tmp_path / "run", evaluated=True, max_num_iterations=250)
     assert trainer.eval_set is not None

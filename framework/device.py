@@ -33,18 +33,17 @@ def has_bfloat16(device: torch.device) -> bool:
     """Whether the device multiplies bfloat16 matrices in hardware."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported()
-    return device.type == "cpu" and bool({"amx_bf16", "avx512_bf16"} & _processor_flags())
+    return device.type == "cpu" and bool({"amx_bf16", "avx512_bf16"} & processor_features())
 
 
 @cache
-def _processor_flags() -> frozenset[str]:
-    """Instruction sets of a Linux processor; empty elsewhere."""
-    if platform.system() != "Linux":
-        return frozenset()
+def processor_features() -> frozenset[str]:
+    """Instruction sets of this processor, in Linux's names; elsewhere what torch found of AVX2 and AVX-512."""
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
-        return frozenset()
+        found = {"AVX2": {"avx2", "fma"}, "AVX512": {"avx2", "fma", "avx512f", "avx512bw", "avx512dq", "avx512vl"}}
+        return frozenset(found.get(torch.backends.cpu.get_cpu_capability(), ()))
     return next((frozenset(line.split(":", 1)[1].split()) for line in lines if line.startswith("flags")), frozenset())
 
 
@@ -54,7 +53,12 @@ def seed_step(seed: int, step: int) -> None:
     Every draw is then a function of (seed, step): a resumed run repeats an uninterrupted one bit for bit, and
     what an evaluation between two steps draws does not matter.
     """
-    torch.manual_seed(stream_seed(seed, step))
+    number = stream_seed(seed, step)
+    torch.default_generator.manual_seed(number)
+    if torch.cuda.is_initialized():  # torch.manual_seed would note every call for a CUDA that may come later
+        torch.cuda.manual_seed_all(number)
+    if torch.backends.mps.is_available():
+        torch.mps.manual_seed(number)
 
 
 def stream_seed(seed: int, step: int) -> int:

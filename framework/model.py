@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from framework.config import TrainConfig
+from framework.encodings import HashGrid
 from framework.losses import mean_squared_error
 from framework.pixels import Batch
 from framework.rays import Rays
@@ -44,8 +45,20 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
         return losses
 
     def param_groups(self) -> list[dict[str, Any]]:
-        """Adam's parameter groups. Each has `params` and may set `lr`, `betas`, `eps`, `weight_decay`."""
-        return [{"params": list(self.parameters())}]
+        """Adam's parameter groups. Each has `params` and may set `lr`, `betas`, `eps`, `sparse`.
+
+        By default the tables of hash grids that ask for it are a group that is updated sparsely.
+        """
+        tables = [module.table for module in self.modules() if isinstance(module, HashGrid) and module.sparse]
+        rest = [p for p in self.parameters() if not any(p is table for table in tables)]
+        groups: list[dict[str, Any]] = [{"params": rest, "name": "networks"}]
+        return groups + ([{"params": tables, "name": "tables", "sparse": True}] if tables else [])
+
+    def collect_gradients(self) -> None:
+        """End of the backward pass: add what kernels left to be added all at once."""
+        for grid in self.modules():
+            if isinstance(grid, HashGrid):
+                grid.collect_gradient()
 
     def before_step(self, step: int) -> None:
         """Schedules that are functions of `step`, and refreshing what samplers know."""

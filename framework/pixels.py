@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from framework.dataset import Dataset
+from framework.kernels import native
 from framework.rays import Rays
 
 Background = Literal["random", "white", "black"]
@@ -42,16 +43,58 @@ def composite(rgba: Tensor, background: Tensor) -> Tensor:
     return rgba[..., :3] * rgba[..., 3:] + background * (1 - rgba[..., 3:])
 
 
+_draw = native.function("draw_pinhole", "pqpqpppppp" + "pipppppppi")
+
+
 def draw_batch(dataset: Dataset, count: int, background: Background) -> Batch:
     """`count` pixels, each pixel of the set being equally likely, drawn with replacement by torch's generator."""
     device = dataset.pixels.device
     flat = torch.randint(len(dataset.pixels), (count,), device=device)
+    return gather_batch(dataset, flat, background_colors(background, count, device))
+
+
+def gather_batch(dataset: Dataset, flat: Tensor, behind: Tensor) -> Batch:
+    """The pixels `flat` (R,), counted through all images, over the background `behind` (R, 3)."""
+    cameras = dataset.cameras
+    if cameras.model == "pinhole" and native.usable(cameras.camera_to_worlds, behind):
+        return _gather_compiled(dataset, flat, behind)
+    return gather_batch_reference(dataset, flat, behind)
+
+
+def gather_batch_reference(dataset: Dataset, flat: Tensor, behind: Tensor) -> Batch:
+    """As `gather_batch`, in torch, for any camera and device."""
     images = torch.searchsorted(dataset.offsets, flat, right=True) - 1
     within = flat - dataset.offsets[images]
     widths = dataset.cameras.widths[images]
     scene = dataset.scene
     rays = dataset.cameras.rays(images, within % widths, within // widths, scene.near, scene.far, dataset.times)
     rgba = dataset.pixels[flat].float() / 255
-    behind = background_colors(background, count, device)
     alpha = rgba[:, 3] if rgba.shape[-1] == 4 else None
     return Batch(rays, composite(rgba, behind), behind, alpha)
+
+
+def _gather_compiled(dataset: Dataset, flat: Tensor, behind: Tensor) -> Batch:
+    cameras, scene, count, images = dataset.cameras, dataset.scene, len(flat), len(dataset)
+    channels = dataset.pixels.shape[1]
+    origins, directions, rgb = (torch.empty(count, 3) for _ in range(3))
+    radii, alpha, indices = torch.empty(count), torch.empty(count), torch.empty(count, dtype=torch.int64)
+    intrinsics = [native.pointer(getattr(cameras, name), name, (images,)) for name in ("fx", "fy", "cx", "cy")]
+    _draw(
+        native.pointer(flat, "pixel indices", (count,), torch.int64), count,
+        native.pointer(dataset.offsets, "offsets", (images + 1,), torch.int64), images,
+        native.pointer(cameras.widths, "widths", (images,), torch.int64),
+        native.pointer(cameras.camera_to_worlds, "poses", (images, 3, 4)), *intrinsics,
+        native.pointer(dataset.pixels, "pixels", (len(dataset.pixels), channels), torch.uint8), channels,
+        native.pointer(behind, "the background", (count, 3)), origins.data_ptr(), directions.data_ptr(),
+        radii.data_ptr(), indices.data_ptr(), rgb.data_ptr(), alpha.data_ptr(), native.threads(),
+    )  # fmt: skip
+    rays = Rays(
+        origins,
+        directions,
+        torch.full((count,), scene.near),
+        torch.full((count,), scene.far),
+        radii,
+        None if dataset.times is None else dataset.times[indices],
+        indices,
+    )
+    return Batch(rays, rgb, behind, alpha if channels == 4 else None)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from framework.fields.base import Field
-from framework.kernels.compositing import ray_sum, weights_and_transmittance
+from framework.kernels.compositing import composite
 from framework.rays import Rays, Samples
 from framework.samplers.base import Sampler
 
@@ -50,25 +50,11 @@ def volume_render(rays: Rays, samples: Samples, sigma: Tensor, rgb: Tensor, back
         background: (R, 3) or (3,) what shows where the ray is not opaque.
     """
     sigma, rgb = _at_least_float32(sigma), _at_least_float32(rgb)
-    weights, transmittance = weights_and_transmittance(sigma, samples)
-    accumulation = ray_sum(weights, samples)
-    left = (1 - accumulation).clamp(min=0)
-    color = ray_sum(weights[:, None] * rgb, samples) + left[:, None] * background
-    with torch.no_grad():
-        moment = ray_sum(weights * samples.t, samples)
-        seen = accumulation > 1e-6
-        mean = moment / torch.where(seen, accumulation, torch.ones_like(accumulation))
-        depth = torch.where(seen, torch.minimum(mean, rays.fars), rays.fars)
-        median = _median_depth(rays, samples, weights, transmittance)
-    return Rendered(color, depth, median, accumulation, len(samples), weights, samples)
-
-
-def _median_depth(rays: Rays, samples: Samples, weights: Tensor, transmittance: Tensor) -> Tensor:
-    """(R,) t of the first sample behind which transmittance is at most 1/2."""
-    behind = transmittance - weights
-    far = rays.fars[samples.ray_indices]
-    candidates = torch.where(behind <= 0.5, torch.minimum(samples.t, far), far)
-    return rays.fars.to(candidates.dtype).scatter_reduce(0, samples.ray_indices, candidates, "amin")
+    found = composite(samples, sigma, rgb, background.to(rgb.dtype), rays.fars)
+    seen = found.opacity.detach() > 1e-6
+    mean = found.moment / torch.where(seen, found.opacity.detach(), torch.ones_like(found.moment))
+    depth = torch.where(seen, torch.minimum(mean, rays.fars), rays.fars)
+    return Rendered(found.color, depth, found.median, found.opacity, len(samples), found.weights, samples)
 
 
 def _at_least_float32(values: Tensor) -> Tensor:

@@ -41,6 +41,8 @@ class InstantNGPConfig(TrainConfig):
     """Cells along an axis at the finest level. If not given: a power of two, at least twice the images' longer side."""
     log2_table_size: int = 17
     """Entries of a level's table at most, as a power of two."""
+    sparse_updates: bool = True
+    """Adam updates only the table entries that a step used."""
     hidden_width: int = 64
     """Features of a layer of the two networks."""
     grid_resolution: int = 128
@@ -58,7 +60,12 @@ class InstantNGP(Model[InstantNGPConfig]):
         super().__init__(config, scene)
         finest = config.max_resolution or 2 ** (2 * scene.image_size - 1).bit_length()
         grid = HashGrid(
-            config.num_levels, config.features_per_level, config.base_resolution, finest, config.log2_table_size
+            config.num_levels,
+            config.features_per_level,
+            config.base_resolution,
+            finest,
+            config.log2_table_size,
+            config.sparse_updates,
         )
         self.field = HashField(scene.box, grid, config.hidden_width)
         self.sampler = OccupancySampler(

@@ -6,7 +6,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from itertools import pairwise
 
+import torch
 from torch import Tensor, nn
+
+from framework.kernels.mlp import Activation, mlp
 
 DensityFunction = Callable[[Tensor, Tensor | None], tuple[Tensor, Tensor]]
 """(positions (N, 3), times (N,) or None) -> density (N,), features (N, F). What samplers are given."""
@@ -35,17 +38,29 @@ class Field(nn.Module, ABC):
 
 
 class MLP(nn.Sequential):
-    """Linear layers with ReLU between them, and nothing after the last.
+    """Linear layers with ReLU between them.
 
     Args:
         widths: features of the input, of each hidden layer, and of the output.
-        bias: whether the layers have one.
+        bias: whether the layers have one. Without, and at most 128 wide, the network runs as one compiled kernel.
+        activation: of the output.
     """
 
-    def __init__(self, *widths: int, bias: bool = True) -> None:
+    def __init__(self, *widths: int, bias: bool = True, activation: Activation = "none") -> None:
         layers: list[nn.Module] = []
         for index, (inputs, outputs) in enumerate(pairwise(widths)):
             if index:
                 layers.append(nn.ReLU(inplace=True))
             layers.append(nn.Linear(inputs, outputs, bias=bias))
         super().__init__(*layers)
+        self.bias = bias
+        self.activation = activation
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """(N, D_i) parts, which stand side by side, to (N, outputs)."""
+        if not self.bias:
+            return mlp(inputs, [layer.weight for layer in self if isinstance(layer, nn.Linear)], self.activation)
+        out = super().forward(inputs[0] if len(inputs) == 1 else torch.cat(inputs, dim=-1))
+        if self.activation == "relu":
+            return torch.relu(out)
+        return torch.sigmoid(out) if self.activation == "sigmoid" else out

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.bounds import to_unit_box
 from framework.encodings import HashGrid
 from framework.fields.base import MLP, Field
 from framework.kernels.math import truncated_exp
@@ -24,21 +23,26 @@ class HashField(Field):
     """
 
     box: Tensor
+    scale: Tensor
+    shift: Tensor
 
     def __init__(
         self, box: Tensor, grid: HashGrid, width: int = 64, num_features: int = 16, direction_levels: int = 4
     ) -> None:
         super().__init__()
         self.register_buffer("box", box.clone())
+        size = box[1] - box[0]
+        self.register_buffer("scale", 1 / size, persistent=False)
+        self.register_buffer("shift", -box[0] / size, persistent=False)
         self.grid = grid
         self.direction_levels = direction_levels
         self.density_head = MLP(grid.num_features, width, num_features, bias=False)
-        self.color_head = MLP(num_features + direction_levels**2, width, width, 3, bias=False)
+        self.color_head = MLP(num_features + direction_levels**2, width, width, 3, bias=False, activation="sigmoid")
 
     def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        features = self.density_head(self.grid(to_unit_box(positions, self.box)))
+        features = self.density_head(self.grid(torch.addcmul(self.shift, positions, self.scale)))
         return truncated_exp(features[:, 0]), features
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         view = spherical_harmonics(directions, self.direction_levels)
-        return torch.sigmoid(self.color_head(torch.cat([features, view.to(features.dtype)], dim=-1)).float())
+        return self.color_head(features, view.to(features.dtype)).float()

@@ -12,9 +12,12 @@ optical depth below 6e-8, so that a thousand thin samples would vanish.
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import torch
 from torch import Tensor
 
+from framework.kernels import native
 from framework.rays import Samples
 
 MAX_OPTICAL_DEPTH = 1e3
@@ -61,3 +64,151 @@ def weights_and_transmittance(sigma: Tensor, samples: Samples) -> tuple[Tensor, 
     tau = optical_depth(sigma, samples.deltas)
     transmittance = torch.exp(-exclusive_sum(tau, samples).clamp(min=0))
     return transmittance * -torch.expm1(-tau), transmittance
+
+
+class Composited(NamedTuple):
+    """What light along R rays adds up to."""
+
+    color: Tensor
+    """(R, 3) over the background."""
+    opacity: Tensor
+    """(R,) the sum of the weights."""
+    moment: Tensor
+    """(R,) the sum of weight * t; without gradient."""
+    median: Tensor
+    """(R,) the t behind which at most half of the light is left, or the ray's far end; without gradient."""
+    weights: Tensor
+    """(N,)"""
+
+
+def composite_reference(
+    samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor, fars: Tensor
+) -> Composited:
+    """The sums in torch: the truth, in any float type. Arguments as for `composite`."""
+    weights, transmittance = weights_and_transmittance(sigma, samples)
+    opacity = ray_sum(weights, samples)
+    left = (1 - opacity).clamp(min=0)
+    color = ray_sum(weights[:, None] * rgb, samples) + left[:, None] * background
+    with torch.no_grad():
+        moment = ray_sum(weights * samples.t, samples)
+        far = fars[samples.ray_indices]
+        seen = torch.where(transmittance - weights <= 0.5, torch.minimum(samples.t, far), far)
+        median = fars.to(seen.dtype).scatter_reduce(0, samples.ray_indices, seen, "amin")
+    return Composited(color, opacity, moment, median, weights)
+
+
+_forward = native.function("composite_forward", "ppppppqpppppppi")
+_backward = native.function("composite_backward", "pppppqppppppppi")
+
+
+class _Composite(torch.autograd.Function):
+    """The compiled sums: one pass over a ray forward, two backward."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, sigma: Tensor, rgb: Tensor, starts: Tensor, ends: Tensor, points: Tensor | None, offsets: Tensor,
+        background: Tensor, fars: Tensor,
+    ) -> tuple[Tensor, ...]:  # fmt: skip
+        count, rays = len(sigma), len(offsets) - 1
+        color, opacity, moment, median = fars.new_empty(rays, 3), *(torch.empty_like(fars) for _ in range(3))
+        weights = torch.empty_like(sigma)
+        _forward(
+            native.pointer(sigma, "sigma", (count,)), native.pointer(rgb, "rgb", (count, 3)),
+            native.pointer(starts, "t_starts", (count,)), native.pointer(ends, "t_ends", (count,)),
+            None if points is None else native.pointer(points, "points", (count,)),
+            native.pointer(offsets, "offsets", (rays + 1,), torch.int64), rays,
+            native.pointer(background, "the background", (rays, 3)), native.pointer(fars, "fars", (rays,)),
+            color.data_ptr(), opacity.data_ptr(), moment.data_ptr(), median.data_ptr(), weights.data_ptr(),
+            native.threads(),
+        )  # fmt: skip
+        ctx.save_for_backward(sigma, rgb, starts, ends, offsets, background, weights, opacity)
+        ctx.mark_non_differentiable(moment, median)
+        ctx.set_materialize_grads(False)
+        return color, opacity, moment, median, weights
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        sigma, rgb, starts, ends, offsets, background, weights, opacity = ctx.saved_tensors
+        count, rays = len(sigma), len(offsets) - 1
+        of_color = torch.zeros_like(background) if grads[0] is None else grads[0].contiguous()
+        of_opacity, of_weights = (None if g is None else g.contiguous() for g in (grads[1], grads[4]))
+        of_sigma, of_rgb = torch.empty_like(sigma), torch.empty_like(rgb)
+        _backward(
+            sigma.data_ptr(), rgb.data_ptr(), starts.data_ptr(), ends.data_ptr(), offsets.data_ptr(), rays,
+            background.data_ptr(), weights.data_ptr(), opacity.data_ptr(),
+            native.pointer(of_color, "the colour's gradient", (rays, 3)),
+            None if of_opacity is None else native.pointer(of_opacity, "the opacity's gradient", (rays,)),
+            None if of_weights is None else native.pointer(of_weights, "the weights' gradient", (count,)),
+            of_sigma.data_ptr(), of_rgb.data_ptr(), native.threads(),
+        )  # fmt: skip
+        return of_sigma, of_rgb, None, None, None, None, None, None
+
+
+def composite(samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor, fars: Tensor) -> Composited:
+    """Colour, opacity and depth of R rays from N packed samples.
+
+    Args:
+        samples: the intervals.
+        sigma: (N,) density.
+        rgb: (N, 3) colour.
+        background: (R, 3) or (3,) what shows where a ray is not opaque.
+        fars: (R,) the rays' far ends.
+    """
+    background = background.expand(samples.num_rays, 3)
+    tensors = (sigma, rgb, samples.t_starts, samples.t_ends, samples.points, background, fars)
+    if native.usable(*tensors) and not any(t is not None and t.requires_grad for t in tensors[2:]):
+        sigma, rgb, starts, ends, points, background, fars = (
+            None if t is None else t.contiguous() for t in tensors
+        )  # type: ignore[assignment]
+        return Composited(*_Composite.apply(sigma, rgb, starts, ends, points, samples.offsets, background, fars))
+    return composite_reference(samples, sigma, rgb, background, fars)
+
+
+def distortion_reference(weights: Tensor, samples: Samples) -> Tensor:
+    """As `distortion`, over all pairs of samples of a ray: O(N^2), the truth."""
+    middles, losses = (samples.t_starts + samples.t_ends) / 2, []
+    for start, end in zip(samples.offsets[:-1].tolist(), samples.offsets[1:].tolist(), strict=True):
+        w, m, delta = weights[start:end], middles[start:end], samples.deltas[start:end]
+        pairs = (w[:, None] * w * (m[:, None] - m).abs()).sum()
+        losses.append(pairs + (w * w * delta).sum() / 3)
+    return torch.stack(losses) if losses else weights.sum()[None][:0]
+
+
+_distortion = native.function("distortion", "ppppqppi")
+
+
+class _Distortion(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
+        count, rays = len(weights), len(offsets) - 1
+        loss, of_weights = weights.new_empty(rays), torch.empty_like(weights)
+        _distortion(
+            native.pointer(weights, "weights", (count,)), native.pointer(starts, "t_starts", (count,)),
+            native.pointer(ends, "t_ends", (count,)), native.pointer(offsets, "offsets", (rays + 1,), torch.int64),
+            rays, loss.data_ptr(), of_weights.data_ptr(), native.threads(),
+        )  # fmt: skip
+        ctx.save_for_backward(of_weights, offsets)
+        return loss
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
+        of_weights, offsets = ctx.saved_tensors
+        return of_weights * grad.repeat_interleave(offsets[1:] - offsets[:-1]), None, None, None
+
+
+def distortion(weights: Tensor, samples: Samples) -> Tensor:
+    """How far a ray's light is spread along it (mip-NeRF 360, Barron et al. 2022, equation 15), in O(N).
+
+    Args:
+        weights: (N,).
+        samples: their intervals.
+    Returns: (R,) sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 delta_i / 3, in the unit of t.
+    """
+    if native.usable(weights, samples.t_starts, samples.t_ends) and not samples.t_starts.requires_grad:
+        starts, ends = samples.t_starts.contiguous(), samples.t_ends.contiguous()
+        return _Distortion.apply(weights.contiguous(), starts, ends, samples.offsets)
+    m, w = (samples.t_starts + samples.t_ends) / 2, weights
+    pairs = 2 * w * (m * exclusive_sum(w, samples) - exclusive_sum(w * m, samples))
+    return ray_sum(pairs + w * w * samples.deltas / 3, samples)

@@ -8,7 +8,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from framework.kernels import native
+
 MAX_LEVELS = 4
+_compiled = native.function("spherical_harmonics", "ppqipi")
 
 
 def spherical_harmonics(directions: Tensor, levels: int = 4) -> Tensor:
@@ -22,6 +25,17 @@ def spherical_harmonics(directions: Tensor, levels: int = 4) -> Tensor:
     """
     if not 1 <= levels <= MAX_LEVELS:
         raise ValueError(f"spherical harmonics have 1 to {MAX_LEVELS} levels, not {levels}")
+    if native.usable(directions) and not directions.requires_grad:
+        out = directions.new_empty(len(directions), levels**2)
+        directions = directions.contiguous()
+        address = native.pointer(directions, "directions", (len(directions), 3))
+        _compiled(address, None, len(directions), levels, out.data_ptr(), native.threads())
+        return out
+    return spherical_harmonics_reference(directions, levels)
+
+
+def spherical_harmonics_reference(directions: Tensor, levels: int = 4) -> Tensor:
+    """The same in torch: the truth, in any float type, differentiable."""
     x, y, z = directions.unbind(-1)
     bands = [torch.full_like(x, 0.28209479177387814)]
     if levels > 1:

@@ -1,9 +1,7 @@
 """Skip empty space with an occupancy grid, and what is hidden by marching in waves.
 
 The grid is Instant-NGP's (Mueller et al. 2022, appendix E.2): a moving maximum of the density in each cell, a cell
-being skipped while a step through it would be nearly transparent. Waves: a few samples of every ray are evaluated
-at a time, front to back, and only rays whose transmittance is not spent go on. What a wave evaluated is kept, so
-nothing is evaluated twice and hidden samples never are.
+being skipped while a step through it would be nearly transparent.
 """
 
 from __future__ import annotations
@@ -12,21 +10,19 @@ import math
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
-from framework.bounds import intersect_box
 from framework.fields.base import DensityFunction
-from framework.kernels.compositing import optical_depth
+from framework.kernels import native
+from framework.kernels.march import March, Occupancy, ReferenceMarch
+from framework.kernels.rows import take_rows
 from framework.rays import Rays, Samples
 
-COARSE = 8
-"""Steps that are tested together against the dilated grid before each is tested by itself."""
 CHUNK = 2**15
 """Cells evaluated at once."""
 WARM_UP_STEPS = 256
 SHUFFLE_STRIDE = 2654435761
 """A prime, so that its multiples visit every cell once a pass, far from one another."""
-WAVES = (8, 16, 32, 64, 128)
+WAVES = (8, 8, 16, 16, 32, 32, 64, 64, 128)
 """Samples a ray in each wave; the last size repeats."""
 
 
@@ -41,13 +37,14 @@ class OccupancySampler(nn.Module):
             off by. 0 keeps everything.
         alpha_threshold: a cell is occupied where one step through it has at least this opacity, or the grid's mean
             if that is less.
+        cone: growth of a step per unit of distance, beyond the distance where it exceeds the even step; 0 for even
+            steps throughout.
         moving: the scene changes with time: a cell is occupied if it is at any time.
     """
 
     box: Tensor
     density_grid: Tensor
     occupied: Tensor
-    reachable: Tensor
 
     def __init__(
         self,
@@ -56,65 +53,67 @@ class OccupancySampler(nn.Module):
         num_steps: int = 512,
         early_stop: float = 1e-4,
         alpha_threshold: float = 0.01,
+        cone: float = 0.0,
         moving: bool = False,
     ) -> None:
         super().__init__()
         self.resolution = resolution
         self.step_size = (box[1] - box[0]).norm().item() / num_steps
-        self.num_steps = num_steps
         self.early_stop = early_stop
         self.alpha_threshold = alpha_threshold
+        self.cone = cone
         self.moving = moving
         self.register_buffer("box", box.clone())
         self.register_buffer("density_grid", torch.full((resolution**3,), torch.inf))
         self.register_buffer("occupied", torch.ones(resolution**3, dtype=torch.bool))
-        self.register_buffer("reachable", torch.ones(resolution**3, dtype=torch.bool), persistent=False)
-        self.register_load_state_dict_post_hook(lambda module, _: module._find_reachable())
+        self._packed: Occupancy | None = None
+        self.register_load_state_dict_post_hook(lambda module, _: module._forget())
 
     @property
     def occupied_share(self) -> float:
         """Share of cells that are not skipped."""
         return self.occupied.float().mean().item()
 
+    @property
+    def occupancy(self) -> Occupancy:
+        """The grid as marching wants it."""
+        if self._packed is None or self._packed.occupied is not self.occupied:
+            self._packed = Occupancy.of(self.occupied, self.box, self.resolution)
+        return self._packed
+
+    def _forget(self) -> None:
+        self._packed = None
+
     # -- sampling ---------------------------------------------------------------------------------------------
 
     def sample(self, rays: Rays, density: DensityFunction, jitter: bool) -> Samples:
-        """Samples in occupied cells, as far as light gets; densities and features attached."""
-        return evaluate_in_waves(rays, self.march(rays, jitter), density, self.early_stop)
+        """Samples in occupied cells, as far as light gets; densities and features attached.
 
-    @torch.no_grad()
-    def march(self, rays: Rays, jitter: bool) -> Samples:
-        """All steps of R rays whose middle lies in an occupied cell."""
-        enter, leave = intersect_box(rays.origins, rays.directions, self.box)
-        enter, leave = torch.maximum(enter, rays.nears), torch.minimum(leave, rays.fars)
-        first = enter - torch.rand_like(enter) * self.step_size if jitter else enter
-        counts = ((leave - first) / self.step_size).ceil().clamp(min=0, max=self.num_steps + 2)
-        counts = torch.where(leave > enter, counts, torch.zeros_like(counts)).long()
-
-        # Coarse: the middle of each run of COARSE steps against the dilated grid.
-        run_rays, run = _ranges((counts + COARSE - 1) // COARSE)
-        middle = first[run_rays] + (run * COARSE + COARSE / 2) * self.step_size
-        keep = self.reachable[self.cells(rays.points(run_rays, middle))]
-        run_rays, run = run_rays[keep], run[keep]
-
-        # Fine: each step of the runs that are left.
-        steps = run[:, None] * COARSE + torch.arange(COARSE, device=run.device)
-        ray_indices = run_rays.repeat_interleave(COARSE)
-        steps = steps.reshape(-1)
-        starts = first[ray_indices] + steps * self.step_size
-        middle = starts + self.step_size / 2
-        cells = self.cells(rays.points(ray_indices, middle))
-        keep = self.occupied[cells] & (middle >= enter[ray_indices]) & (middle < leave[ray_indices])
-        ray_indices, starts = ray_indices[keep], starts[keep]
-        per_ray = torch.bincount(ray_indices, minlength=len(rays))
-        offsets = functional.pad(per_ray.cumsum(0), (1, 0))
-        return Samples(starts, starts + self.step_size, offsets)
-
-    def cells(self, positions: Tensor) -> Tensor:
-        """Index (N,) of the cell each position (N, 3) lies in; outside positions go to the nearest cell."""
-        scale = self.resolution / (self.box[1] - self.box[0])
-        x, y, z = ((positions - self.box[0]) * scale).long().clamp(0, self.resolution - 1).unbind(-1)
-        return (x * self.resolution + y) * self.resolution + z
+        What is dropped could have changed a colour channel by at most `early_stop`.
+        """
+        shift = torch.rand(len(rays), device=rays.origins.device) if jitter else None
+        compiled = native.usable(rays.origins, rays.directions, self.box)
+        march = (March if compiled else ReferenceMarch)(
+            rays, self.occupancy, self.step_size, self.cone, shift, self.early_stop
+        )
+        parts: list[tuple[Tensor, Tensor]] = []
+        while (wave := march.wave(WAVES[min(len(parts), len(WAVES) - 1)])) is not None:
+            parts.append(density(wave.positions, None if rays.times is None else rays.times[wave.owners]))
+            march.advance(parts[-1][0])
+        if not parts:  # no ray meets anything: still the field's own, empty, tensors
+            nothing = rays.origins[:0]
+            parts.append(density(nothing, None if rays.times is None else rays.times[:0]))
+        order, offsets = march.finish()
+        empty = rays.nears[:0]
+        starts = torch.cat([empty, *(wave.t_starts for wave in march.waves)])
+        ends = torch.cat([empty, *(wave.t_ends for wave in march.waves)])
+        return Samples(
+            starts.index_select(0, order),
+            ends.index_select(0, order),
+            offsets,
+            sigma=take_rows(torch.cat([part[0] for part in parts]), order),
+            features=take_rows(torch.cat([part[1] for part in parts]), order),
+        )
 
     # -- keeping the grid up ----------------------------------------------------------------------------------
 
@@ -140,7 +139,7 @@ class OccupancySampler(nn.Module):
         self.density_grid[cells] = torch.where(seen, torch.maximum(decayed, sigma), sigma)
         alpha = -torch.expm1(-self.density_grid * self.step_size)
         self.occupied.copy_(alpha >= min(self.alpha_threshold, alpha.mean().item()))
-        self._find_reachable()
+        self._forget()
 
     def _shuffled(self, turn: int) -> Tensor:
         """The cells of one of the first updates: four passes over the grid by step WARM_UP_STEPS.
@@ -164,76 +163,9 @@ class OccupancySampler(nn.Module):
             return anywhere
         return torch.cat([anywhere, occupied[torch.randint(len(occupied), (half,), device=device)]])
 
-    def _find_reachable(self) -> None:
-        """Cells from which an occupied one lies within half a run of COARSE steps, along any axis."""
-        cell = ((self.box[1] - self.box[0]) / self.resolution).min().item()
-        radius = math.ceil((COARSE - 1) / 2 * self.step_size / cell)
-        grid = self.occupied.view(self.resolution, self.resolution, self.resolution)
-        for axis in range(3):
-            grid = _dilated(grid, radius, axis)
-        self.reachable.copy_(grid.reshape(-1))
-
-
-def _dilated(grid: Tensor, radius: int, axis: int) -> Tensor:
-    """Cells with a true cell within `radius` along `axis`."""
-    out, size = grid.clone(), grid.shape[axis]
-    for shift in range(1, min(radius, size - 1) + 1):
-        out.narrow(axis, 0, size - shift).logical_or_(grid.narrow(axis, shift, size - shift))
-        out.narrow(axis, shift, size - shift).logical_or_(grid.narrow(axis, 0, size - shift))
-    return out
-
 
 def _in_chunks(density: DensityFunction, positions: Tensor, times: Tensor | None) -> Tensor:
     """Density (N,) at positions (N, 3), a chunk at a time: fresh memory of many megabytes costs more than the work."""
     parts = positions.split(CHUNK)
     when = [None] * len(parts) if times is None else times.split(CHUNK)
     return torch.cat([density(part, t)[0] for part, t in zip(parts, when, strict=True)])
-
-
-def evaluate_in_waves(rays: Rays, samples: Samples, density: DensityFunction, early_stop: float) -> Samples:
-    """Evaluate `samples` front to back, a wave at a time, and drop what lies behind a spent transmittance.
-
-    Args:
-        rays: R rays.
-        samples: candidates on them.
-        density: the field's density.
-        early_stop: transmittance under which a ray ends.
-    Returns: the samples that were evaluated, with density and features attached, gradients included. What was
-        dropped could have changed a colour channel by at most `early_stop`.
-    """
-    budget = -math.log(early_stop) if early_stop > 0 else math.inf
-    counts, firsts = samples.counts, samples.offsets[:-1]
-    spent = torch.zeros(len(rays), device=firsts.device)
-    alive = counts.nonzero().squeeze(-1)
-    parts: list[tuple[Tensor, Tensor, Tensor]] = []
-    start, wave = 0, 0
-    while len(alive) or not parts:
-        size = WAVES[min(wave, len(WAVES) - 1)]
-        owners, within = _ranges((counts[alive] - start).clamp(max=size))
-        owners = alive[owners]
-        chosen = firsts[owners] + start + within
-        t = (samples.t_starts[chosen] + samples.t_ends[chosen]) / 2
-        sigma, features = density(rays.points(owners, t), None if rays.times is None else rays.times[owners])
-        parts.append((chosen, sigma, features))
-        with torch.no_grad():
-            spent.index_add_(0, owners, optical_depth(sigma.float(), samples.deltas[chosen]))
-        start, wave = start + size, wave + 1
-        alive = alive[(counts[alive] > start) & (spent[alive] < budget)]
-    chosen = torch.cat([part[0] for part in parts])
-    order = chosen.argsort()
-    chosen = chosen[order]
-    per_ray = torch.bincount(samples.ray_indices[chosen], minlength=len(rays))
-    return Samples(
-        samples.t_starts[chosen],
-        samples.t_ends[chosen],
-        functional.pad(per_ray.cumsum(0), (1, 0)),
-        sigma=torch.cat([part[1] for part in parts])[order],
-        features=torch.cat([part[2] for part in parts])[order],
-    )
-
-
-def _ranges(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Owner (N,) and rank (N,) of each item when owner i has counts[i] of them: 0 .. counts[i] - 1."""
-    owners = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
-    firsts = counts.cumsum(0) - counts
-    return owners, torch.arange(len(owners), device=counts.device) - firsts[owners]

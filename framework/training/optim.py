@@ -2,25 +2,87 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
+from torch.optim.adam import adam
 
 from framework.config import TrainConfig
+from framework.kernels.adam import sparse_adam
+from framework.kernels.memory import table
 from framework.model import Model
 
 
-def make_optimizer(model: Model, config: TrainConfig) -> torch.optim.Adam:
+class Adam(torch.optim.Optimizer):
+    """Adam (Kingma and Ba 2015): torch's fused one, and a sparse one for groups with `sparse` set.
+
+    A sparse group holds tables (E, F) of which a step uses few entries. Their `grad` is allocated here once, so that
+    kernels can add to it, and is zero again after each step (`framework.kernels.adam`).
+    """
+
+    def __init__(self, groups: list[dict[str, Any]], lr: float, betas: tuple[float, float], eps: float) -> None:
+        super().__init__(groups, {"lr": lr, "betas": betas, "eps": eps, "sparse": False})
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                state = self.state[parameter]
+                state["exp_avg"], state["exp_avg_sq"] = (table(*parameter.shape, like=parameter) for _ in range(2))
+                if group["sparse"]:
+                    state["seen"] = torch.zeros_like(parameter[:, 0])
+                    parameter.grad = table(*parameter.shape, like=parameter)
+                else:
+                    state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """Forget gradients. Those of sparse groups are cleared by `step`, or here where there was none."""
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                if not group["sparse"]:
+                    parameter.grad = None
+                elif self.unused_gradients and parameter.grad is not None:
+                    parameter.grad.zero_()
+        self.unused_gradients = True
+
+    unused_gradients = True
+    """Whether something may have been added to gradients since the last step."""
+
+    @torch.no_grad()
+    def step(self, closure: None = None) -> None:  # type: ignore[override]
+        """One update of every parameter that has a gradient."""
+        for group in self.param_groups:
+            with_grad = [p for p in group["params"] if p.grad is not None]
+            states = [self.state[p] for p in with_grad]
+            if group["sparse"]:
+                for parameter, state in zip(with_grad, states, strict=True):
+                    moments = state["exp_avg"], state["exp_avg_sq"], state["seen"]
+                    assert parameter.grad is not None
+                    sparse_adam(parameter, parameter.grad, *moments, group["lr"], group["betas"], group["eps"])
+                continue
+            adam(
+                with_grad,
+                [p.grad for p in with_grad],
+                [state["exp_avg"] for state in states],
+                [state["exp_avg_sq"] for state in states],
+                [],
+                [state["step"] for state in states],
+                fused=bool(with_grad) and with_grad[0].device.type in ("cpu", "cuda"),
+                amsgrad=False,
+                beta1=group["betas"][0],
+                beta2=group["betas"][1],
+                lr=group["lr"],
+                weight_decay=0.0,
+                eps=group["eps"],
+                maximize=False,
+            )
+        self.unused_gradients = False
+
+
+def make_optimizer(model: Model, config: TrainConfig) -> Adam:
     """Adam over the model's parameter groups, each remembering the rate it starts from as `initial_lr`."""
     groups = []
     for group in model.param_groups():
         rate = group.get("lr", config.learning_rate)
         groups.append({**group, "lr": rate, "initial_lr": rate})
-    return torch.optim.Adam(
-        groups,
-        lr=config.learning_rate,
-        betas=(config.adam_beta1, config.adam_beta2),
-        eps=config.adam_eps,
-        fused=model.device.type in ("cpu", "cuda"),
-    )
+    return Adam(groups, config.learning_rate, (config.adam_beta1, config.adam_beta2), config.adam_eps)
 
 
 def learning_rate_factor(config: TrainConfig, step: int, progress: float) -> float:

@@ -22,6 +22,7 @@ from framework.errors import CheckpointError, DivergenceError
 from framework.evaluation.evaluator import evaluate, evaluation_background, render_view, use_bfloat16
 from framework.evaluation.images import comparison
 from framework.evaluation.metrics import MAX_PSNR
+from framework.kernels.adam import all_finite
 from framework.pixels import Background, Batch, composite, draw_batch
 from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest, save_checkpoint
 from framework.training.optim import first_non_finite, learning_rate_factor, make_optimizer, set_learning_rate
@@ -221,8 +222,8 @@ class Trainer:
         finite = bool(torch.isfinite(loss))
         if finite and loss.requires_grad:
             loss.backward()
-            norms = [torch.linalg.vector_norm(p.grad) for p in self.model.parameters() if p.grad is not None]
-            finite = bool(torch.isfinite(torch.stack(norms)).all())
+            self.model.collect_gradients()
+            finite = all(all_finite(p.grad) for p in self.model.parameters() if p.grad is not None)
             if finite:
                 self.optimizer.step()
         self._bad_in_a_row = 0 if finite else self._bad_in_a_row + 1

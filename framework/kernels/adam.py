@@ -1,0 +1,68 @@
+"""Adam (Kingma and Ba 2015) on a table of which a step touches few entries.
+
+Each entry sees Adam on the sequence of its own gradients that are not zero: its moments decay, and their bias is
+corrected, by the number of updates it has had, not by the number of steps. So an entry that is met for the first time
+after a thousand steps, or not for a thousand steps, moves as far as it should (Instant-NGP's optimiser skips entries
+the same way; Mueller et al. 2022, section 4).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from framework.kernels import native
+
+_sparse = native.function("adam_sparse", "pppppqifddfi", "q")
+_finite = native.function("all_finite", "pqi", "i")
+
+
+@torch.no_grad()
+def sparse_adam_reference(
+    values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
+    rate: float, betas: tuple[float, float], eps: float,
+) -> int:  # fmt: skip
+    """As `sparse_adam`, in torch, on any device and in any float type."""
+    rows = (grad != 0).any(-1).nonzero().squeeze(-1)
+    g = grad[rows]
+    seen[rows] += 1
+    count = seen[rows].double()
+    mean[rows] = betas[0] * mean[rows] + (1 - betas[0]) * g
+    square[rows] = betas[1] * square[rows] + (1 - betas[1]) * g * g
+    unbias1, unbias2 = ((1 / (1 - beta**count)).to(values.dtype)[:, None] for beta in betas)
+    values[rows] -= rate * unbias1 * mean[rows] / ((unbias2 * square[rows]).sqrt() + eps)
+    grad[rows] = 0
+    return len(rows)
+
+
+def sparse_adam(
+    values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
+    rate: float, betas: tuple[float, float], eps: float,
+) -> int:  # fmt: skip
+    """Update, in place, the entries that have a gradient, and set their gradient to zero.
+
+    Args:
+        values: (E, F) parameters.
+        grad: (E, F) gradient; an entry of zeros is left alone.
+        mean, square: (E, F) moments.
+        seen: (E,) updates each entry has had.
+        rate: learning rate.
+        betas: decay of the two moments.
+        eps: added to the root of the second.
+    Returns: how many entries were updated.
+    """
+    if not native.usable(values, grad, mean, square, seen):
+        return sparse_adam_reference(values, grad, mean, square, seen, rate, betas, eps)
+    shape = (values.shape[0], values.shape[1])
+    return _sparse(
+        native.pointer(values, "values", shape), native.pointer(mean, "mean", shape),
+        native.pointer(square, "square", shape), native.pointer(grad, "grad", shape),
+        native.pointer(seen, "seen", shape[:1]), *shape, rate, *betas, eps, native.threads(),
+    )  # fmt: skip
+
+
+def all_finite(values: Tensor) -> bool:
+    """Whether no value is infinite or NaN, in one pass."""
+    if native.usable(values) and values.is_contiguous():
+        return bool(_finite(values.data_ptr(), values.numel(), native.threads()))
+    return bool(torch.isfinite(values).all())

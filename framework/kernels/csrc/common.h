@@ -1,0 +1,78 @@
+// What every kernel shares: the exported C interface, vectors, threads.
+//
+// The code uses the compiler's vectors of LANES floats (GCC and Clang on any processor); the library is built once for
+// each instruction set and the right one is chosen when it is loaded (framework/kernels/native.py).
+#pragma once
+
+#include <cstdint>
+#include <cstring>
+
+#if defined(_WIN32)
+#define EXPORT extern "C" __declspec(dllexport)
+#else
+#define EXPORT extern "C" __attribute__((visibility("default")))
+#endif
+
+#if defined(__AVX512F__)
+constexpr int LANES = 16;
+#elif defined(__AVX2__)
+constexpr int LANES = 8;
+#else
+constexpr int LANES = 4;
+#endif
+
+typedef float Floats __attribute__((vector_size(LANES * 4)));
+typedef int32_t Ints __attribute__((vector_size(LANES * 4)));
+
+static inline Floats splat(float value) { return Floats{} + value; }
+
+static inline Floats load(const float* from) {
+    Floats out;
+    std::memcpy(&out, from, sizeof out);
+    return out;
+}
+
+static inline void store(float* to, Floats value) { std::memcpy(to, &value, sizeof value); }
+
+static inline Floats larger(Floats a, Floats b) { return a > b ? a : b; }
+static inline Floats smaller(Floats a, Floats b) { return a < b ? a : b; }
+
+// exp to 2 units in the last place: 2^n from the exponent's bits, the rest by a polynomial (Cephes' expf).
+static inline Floats exponential(Floats x) {
+    const Floats clipped = smaller(larger(x, splat(-87.3f)), splat(88.3f));
+    const Ints n = __builtin_convertvector(clipped * 1.44269504f + (clipped < 0 ? splat(-0.5f) : splat(0.5f)), Ints);
+    const Floats whole = __builtin_convertvector(n, Floats);
+    const Floats r = (clipped - whole * 0.693359375f) + whole * 2.12194440e-4f;
+    Floats p = splat(1.9875691500e-4f);
+    p = p * r + 1.3981999507e-3f;
+    p = p * r + 8.3334519073e-3f;
+    p = p * r + 4.1665795894e-2f;
+    p = p * r + 1.6666665459e-1f;
+    p = p * r + 5.0000001201e-1f;
+    p = p * r * r + r + 1.0f;
+    const Ints exponent = (n + 127) << 23;
+    Floats power;
+    std::memcpy(&power, &exponent, sizeof power);
+    const Floats value = p * power;
+    return x == x ? value : x;  // NaN stays NaN
+}
+
+// Threads: the caller says how many, and torch's own OpenMP runtime provides them (see native.py).
+#if defined(_OPENMP)
+extern "C" int omp_get_thread_num(void);
+static inline int thread_index() { return omp_get_thread_num(); }
+#else
+static inline int thread_index() { return 0; }
+#endif
+
+// The part [begin, end) of `count` items that belongs to thread `index` of `threads`, in whole multiples of `grain`.
+struct Part {
+    int64_t begin, end;
+    Part(int64_t count, int index, int threads, int64_t grain = 1) {
+        const int64_t grains = (count + grain - 1) / grain;
+        begin = grains * index / threads * grain;
+        end = grains * (index + 1) / threads * grain;
+        if (begin > count) begin = count;
+        if (end > count) end = count;
+    }
+};

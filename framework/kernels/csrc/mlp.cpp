@@ -1,0 +1,277 @@
+// Small fully connected networks without biases, ReLU between layers, in float32. See ../mlp.py for the reference.
+//
+// Samples go through all layers in blocks that stay in cache; nothing but the result leaves it. The backward pass
+// computes a block's hidden layers again, which costs less than writing them to memory and reading them back. Samples
+// whose incoming gradient is zero (hidden ones) are left out of it.
+#include "common.h"
+
+#include <vector>
+
+namespace {
+
+constexpr int BLOCK = 32;
+constexpr int MAX_LAYERS = 8;
+constexpr int MAX_WIDTH = 128;
+
+int padded(int width) { return (width + LANES - 1) / LANES * LANES; }
+
+// y (rows, width) = x (rows, inner) w (inner, width), all row-major; width a whole number of vectors, rows of ROWS.
+template <int ROWS, int VECTORS>
+inline void product_tile(const float* x, int ldx, const float* w, int ldw, int inner, float* y, int ldy) {
+    Floats sum[ROWS][VECTORS];
+#pragma GCC unroll 16
+    for (int r = 0; r < ROWS; r++)
+#pragma GCC unroll 4
+        for (int v = 0; v < VECTORS; v++) sum[r][v] = splat(0);
+    for (int k = 0; k < inner; k++) {
+        Floats row[VECTORS];
+#pragma GCC unroll 4
+        for (int v = 0; v < VECTORS; v++) row[v] = load(w + k * ldw + v * LANES);
+#pragma GCC unroll 16
+        for (int r = 0; r < ROWS; r++)
+#pragma GCC unroll 4
+            for (int v = 0; v < VECTORS; v++) sum[r][v] += x[r * ldx + k] * row[v];
+    }
+#pragma GCC unroll 16
+    for (int r = 0; r < ROWS; r++)
+#pragma GCC unroll 4
+        for (int v = 0; v < VECTORS; v++) store(y + r * ldy + v * LANES, sum[r][v]);
+}
+
+template <int ROWS, int VECTORS>
+inline void product_columns(const float* x, int ldx, const float* w, int ldw, int inner, float* y, int ldy) {
+    for (int r = 0; r < BLOCK; r += ROWS)
+        product_tile<ROWS, VECTORS>(x + r * ldx, ldx, w, ldw, inner, y + r * ldy, ldy);
+}
+
+// How many vectors of a row are summed at once: as many as leave every sum in a register.
+constexpr int WIDE = LANES == 16 ? 4 : 2;
+
+void product(const float* x, int ldx, const float* w, int inner, int width, float* y, int ldy) {
+    int column = 0;
+    for (; column + WIDE * LANES <= width; column += WIDE * LANES)
+        product_columns<4, WIDE>(x, ldx, w + column, width, inner, y + column, ldy);
+    for (; column + 2 * LANES <= width; column += 2 * LANES)
+        product_columns<LANES == 16 ? 8 : 4, 2>(x, ldx, w + column, width, inner, y + column, ldy);
+    for (; column < width; column += LANES)
+        product_columns<LANES == 16 ? 16 : 8, 1>(x, ldx, w + column, width, inner, y + column, ldy);
+}
+
+// dw (inner, width) += x^T (inner, rows) dy (rows, width), over one block of rows.
+template <int INNER, int VECTORS>
+inline void outer_tile(const float* x, int ldx, const float* dy, int ldy, float* dw, int width) {
+    Floats sum[INNER][VECTORS];
+#pragma GCC unroll 16
+    for (int k = 0; k < INNER; k++)
+#pragma GCC unroll 4
+        for (int v = 0; v < VECTORS; v++) sum[k][v] = load(dw + k * width + v * LANES);
+    for (int r = 0; r < BLOCK; r++) {
+        Floats row[VECTORS];
+#pragma GCC unroll 4
+        for (int v = 0; v < VECTORS; v++) row[v] = load(dy + r * ldy + v * LANES);
+#pragma GCC unroll 16
+        for (int k = 0; k < INNER; k++)
+#pragma GCC unroll 4
+            for (int v = 0; v < VECTORS; v++) sum[k][v] += x[r * ldx + k] * row[v];
+    }
+#pragma GCC unroll 16
+    for (int k = 0; k < INNER; k++)
+#pragma GCC unroll 4
+        for (int v = 0; v < VECTORS; v++) store(dw + k * width + v * LANES, sum[k][v]);
+}
+
+template <int INNER, int VECTORS>
+inline void outer_columns(const float* x, int ldx, const float* dy, int ldy, int inner, float* dw, int width) {
+    for (int k = 0; k < inner; k += INNER)
+        outer_tile<INNER, VECTORS>(x + k, ldx, dy, ldy, dw + k * width, width);
+}
+
+// inner is a whole number of vectors.
+void outer_product(const float* x, int ldx, const float* dy, int ldy, int inner, float* dw, int width) {
+    int column = 0;
+    for (; column + WIDE * LANES <= width; column += WIDE * LANES)
+        outer_columns<4, WIDE>(x, ldx, dy + column, ldy, inner, dw + column, width);
+    for (; column + 2 * LANES <= width; column += 2 * LANES)
+        outer_columns<4, 2>(x, ldx, dy + column, ldy, inner, dw + column, width);
+    for (; column < width; column += LANES)
+        outer_columns<LANES == 16 ? 16 : LANES == 8 ? 8 : 4, 1>(x, ldx, dy + column, ldy, inner, dw + column, width);
+}
+
+enum Activation { NONE = 0, RELU = 1, SIGMOID = 2 };
+
+void activate(float* values, int64_t count, int activation) {
+    for (int64_t i = 0; i < count; i += LANES) {
+        Floats v = load(values + i);
+        if (activation == RELU) v = v < 0 ? splat(0) : v;
+        if (activation == SIGMOID) v = 1 / (1 + exponential(-v));
+        store(values + i, v);
+    }
+}
+
+struct Network {
+    int layers;
+    int width[MAX_LAYERS + 1] = {}, wide[MAX_LAYERS + 1] = {};  // of the input and each layer; padded to whole vectors
+    std::vector<float> forward[MAX_LAYERS];   // (wide inputs, wide outputs), zeros outside
+    std::vector<float> backward[MAX_LAYERS];  // (wide outputs, wide inputs)
+
+    Network(const int64_t* widths, int count, const float* const* weights) : layers(count) {
+        for (int l = 0; l <= layers; l++) width[l] = int(widths[l]), wide[l] = padded(width[l]);
+        for (int l = 0; l < layers; l++) {
+            const int in = wide[l], out = wide[l + 1];
+            forward[l].assign(size_t(in) * out, 0);
+            backward[l].assign(size_t(in) * out, 0);
+            for (int o = 0; o < width[l + 1]; o++)
+                for (int i = 0; i < width[l]; i++)
+                    forward[l][i * out + o] = backward[l][o * in + i] = weights[l][o * width[l] + i];
+        }
+    }
+};
+
+// A block's activations: layer[0] is the input, layer[L] the output before its activation function.
+struct Block {
+    alignas(64) float layer[MAX_LAYERS + 1][BLOCK * MAX_WIDTH];
+};
+
+void run_forward(const Network& net, Block& block) {
+    for (int l = 0; l < net.layers; l++) {
+        const int in = net.wide[l], out = net.wide[l + 1];
+        product(block.layer[l], in, net.forward[l].data(), net.width[l], out, block.layer[l + 1], out);
+        if (l + 1 < net.layers) activate(block.layer[l + 1], BLOCK * out, RELU);
+    }
+}
+
+struct Inputs {  // the network's input, in parts that stand side by side
+    int parts;
+    const float* const* part;
+    const int64_t* width;
+
+    void read(float* to, int wide, const int64_t* rows, int count) const {
+        std::memset(to, 0, sizeof(float) * BLOCK * wide);
+        for (int r = 0; r < count; r++) {
+            float* at = to + r * wide;
+            for (int p = 0; p < parts; at += width[p++])
+                std::memcpy(at, part[p] + rows[r] * width[p], sizeof(float) * width[p]);
+        }
+    }
+};
+
+bool is_zero(const float* values, int count) {
+    for (int i = 0; i < count; i++)
+        if (values[i] != 0) return false;
+    return true;
+}
+
+// The gradient of a block's output, through the output's activation function.
+void read_output_gradient(const Network& net, const float* grad, const int64_t* rows, int count, int activation,
+                          const float* output, float* to) {
+    const int width = net.width[net.layers], wide = net.wide[net.layers];
+    std::memset(to, 0, sizeof(float) * BLOCK * wide);
+    for (int r = 0; r < count; r++) std::memcpy(to + r * wide, grad + rows[r] * width, sizeof(float) * width);
+    if (activation == NONE) return;
+    for (int i = 0; i < BLOCK * wide; i += LANES) {
+        Floats g = load(to + i), raw = load(output + i);
+        if (activation == RELU) g = raw > 0 ? g : splat(0);
+        if (activation == SIGMOID) {
+            const Floats y = 1 / (1 + exponential(-raw));
+            g = g * y * (1 - y);
+        }
+        store(to + i, g);
+    }
+}
+
+// One block's backward pass: adds to `sums`, leaves the input's gradient in the returned buffer.
+float* run_backward(const Network& net, const Block& block, float* grad, float* other, float* const* sums) {
+    for (int l = net.layers - 1; l >= 0; l--) {
+        const int in = net.wide[l], out = net.wide[l + 1];
+        outer_product(block.layer[l], in, grad, out, in, sums[l], out);
+        product(grad, out, net.backward[l].data(), net.width[l + 1], in, other, in);
+        if (l > 0)
+            for (int i = 0; i < BLOCK * in; i += LANES)
+                store(other + i, load(block.layer[l] + i) > 0 ? load(other + i) : splat(0));
+        float* swap = grad;
+        grad = other;
+        other = swap;
+    }
+    return grad;
+}
+
+}  // namespace
+
+// The input is `parts` arrays (count, part_widths[p]) side by side; widths are those of the input and every layer.
+EXPORT void mlp_forward(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
+                        const int64_t* widths, int layers, const float* const* weights, int activation, float* out,
+                        int threads) {
+    const Network net(widths, layers, weights);
+    const Inputs input{parts, inputs, part_widths};
+    const int64_t blocks = (count + BLOCK - 1) / BLOCK;
+#pragma omp parallel num_threads(threads) if (threads > 1)
+    {
+        Block block;
+#pragma omp for schedule(static)
+        for (int64_t b = 0; b < blocks; b++) {
+            const int size = int(count - b * BLOCK < BLOCK ? count - b * BLOCK : BLOCK);
+            int64_t rows[BLOCK];
+            for (int r = 0; r < size; r++) rows[r] = b * BLOCK + r;
+            input.read(block.layer[0], net.wide[0], rows, size);
+            run_forward(net, block);
+            float* last = block.layer[layers];
+            activate(last, BLOCK * net.wide[layers], activation);
+            for (int r = 0; r < size; r++)
+                std::memcpy(out + rows[r] * net.width[layers], last + r * net.wide[layers],
+                            sizeof(float) * net.width[layers]);
+        }
+    }
+}
+
+// Writes the inputs' gradients (parts that are null are left out) and the weights', (outputs, inputs) like them.
+EXPORT void mlp_backward(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
+                         const int64_t* widths, int layers, const float* const* weights, int activation,
+                         const float* grad, float* const* input_grads, float* const* weight_grads, int threads) {
+    const Network net(widths, layers, weights);
+    const Inputs input{parts, inputs, part_widths};
+    const int outputs = net.width[layers];
+    size_t total = 0;
+    for (int l = 0; l < layers; l++) total += net.forward[l].size();
+    std::vector<float> sums(total * threads, 0.0f);
+#pragma omp parallel num_threads(threads) if (threads > 1)
+    {
+        Block block;
+        alignas(64) float first[BLOCK * MAX_WIDTH], second[BLOCK * MAX_WIDTH];
+        float* mine[MAX_LAYERS];
+        float* at = sums.data() + total * thread_index();
+        for (int l = 0; l < layers; l++) mine[l] = at, at += net.forward[l].size();
+        const Part part(count, thread_index(), threads, BLOCK);
+        for (int64_t next = part.begin; next < part.end;) {
+            int64_t rows[BLOCK];
+            int size = 0;
+            for (; next < part.end && size < BLOCK; next++) {
+                if (!is_zero(grad + next * outputs, outputs)) {
+                    rows[size++] = next;
+                    continue;
+                }
+                for (int p = 0; p < parts; p++)
+                    if (input_grads[p])
+                        std::memset(input_grads[p] + next * part_widths[p], 0, sizeof(float) * part_widths[p]);
+            }
+            if (size == 0) break;
+            input.read(block.layer[0], net.wide[0], rows, size);
+            run_forward(net, block);
+            read_output_gradient(net, grad, rows, size, activation, block.layer[layers], first);
+            const float* dx = run_backward(net, block, first, second, mine);
+            for (int r = 0; r < size; r++) {
+                const float* from = dx + r * net.wide[0];
+                for (int p = 0; p < parts; from += part_widths[p++])
+                    if (input_grads[p])
+                        std::memcpy(input_grads[p] + rows[r] * part_widths[p], from, sizeof(float) * part_widths[p]);
+            }
+        }
+    }
+    const float* sum = sums.data();
+    for (int l = 0; l < layers; sum += net.forward[l].size(), l++)
+        for (int o = 0; o < net.width[l + 1]; o++)
+            for (int i = 0; i < net.width[l]; i++) {
+                float value = 0;
+                for (int t = 0; t < threads; t++) value += sum[total * t + i * net.wide[l + 1] + o];
+                weight_grads[l][o * net.width[l] + i] = value;
+            }
+}

@@ -1,0 +1,158 @@
+"""The compiled CPU kernels: finding the library that fits this processor, and calling it safely.
+
+Each kernel's Python file declares the C functions it calls with `function`, and hands over tensors through `pointer`,
+which checks them. The library holds no thread of its own: it runs on torch's OpenMP threads. ctypes releases Python's
+lock during a call.
+
+`NERFLOOM_KERNELS` overrides the choice: a variant's name (baseline, avx2, avx512), or "reference" for torch alone.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from framework.console import say
+from framework.device import processor_features
+from framework.errors import ConfigError
+
+FOLDER = Path(__file__).parent / "lib"
+NEEDS: dict[str, tuple[str, ...]] = {
+    "avx512": ("avx512f", "avx512bw", "avx512dq", "avx512vl", "fma"),
+    "avx2": ("avx2", "fma"),
+    "baseline": (),
+}
+"""Variant -> processor features it uses, the fastest first."""
+SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
+TYPES: dict[str, Any] = {
+    "p": ctypes.c_void_p,
+    "q": ctypes.c_int64,
+    "i": ctypes.c_int,
+    "f": ctypes.c_float,
+    "d": ctypes.c_double,
+}
+spent: dict[str, float] | None = None
+"""Seconds in each kernel, kept while this is a dictionary (benchmarks/profile_step.py)."""
+
+
+def variant() -> str:
+    """Which library is used: a name in `NEEDS`, or "reference" where there is none.
+
+    Raises: ConfigError where NERFLOOM_KERNELS asks for what is not there.
+    """
+    return _load()[0]
+
+
+def available() -> bool:
+    """Whether compiled kernels are used."""
+    return _load()[1] is not None
+
+
+@functools.cache
+def _load() -> tuple[str, ctypes.CDLL | None]:
+    asked = os.environ.get("NERFLOOM_KERNELS", "auto")
+    if asked == "reference":
+        return "reference", None
+    if asked == "auto":
+        fitting = [name for name, needs in NEEDS.items() if processor_features().issuperset(needs)]
+    elif asked in NEEDS:
+        fitting = [asked]
+    else:
+        raise ConfigError(f"NERFLOOM_KERNELS is '{asked}'; it must be one of auto, reference, {', '.join(NEEDS)}")
+    problem = "they were not built"
+    for name in fitting:
+        path = FOLDER / f"{name}{SUFFIX}"
+        if path.is_file():
+            try:
+                return name, ctypes.CDLL(str(path))
+            except OSError as error:
+                problem = str(error)
+    if asked != "auto":
+        raise ConfigError(f"NERFLOOM_KERNELS asks for '{asked}', but {FOLDER / asked}{SUFFIX} does not load: {problem}")
+    say(
+        f"note: without its compiled kernels ({problem}) nerfloom trains about 20 times slower on this processor; "
+        f"install a C++ compiler ({_compiler_hint()}), then 'pip install --force-reinstall --no-deps nerfloom'"
+    )
+    return "reference", None
+
+
+def _compiler_hint() -> str:
+    hints = {"Darwin": "'xcode-select --install'", "Windows": "clang"}
+    return hints.get(platform.system(), "the package g++ or clang")
+
+
+def function(name: str, arguments: str, result: str = "") -> Callable[..., Any]:
+    """A function of the library, found at its first call.
+
+    Args:
+        name: its C name.
+        arguments: a letter each: p pointer, q 64-bit integer, i int, f float, d double.
+        result: the same for what it returns; empty for nothing.
+    """
+    bound: list[Any] = []
+
+    def call(*values: Any) -> Any:
+        if not bound:
+            library = _load()[1]
+            if library is None:
+                raise RuntimeError(f"{name} was called without compiled kernels")
+            found = getattr(library, name)
+            found.argtypes = [TYPES[letter] for letter in arguments]
+            found.restype = TYPES[result] if result else None
+            bound.append(found)
+        if spent is None:
+            return bound[0](*values)
+        start = time.perf_counter()
+        out = bound[0](*values)
+        spent[name] = spent.get(name, 0.0) + time.perf_counter() - start
+        return out
+
+    return call
+
+
+def usable(*tensors: Tensor | None) -> bool:
+    """Whether compiled kernels exist and every given tensor is float32 on the processor."""
+    if not available():
+        return False
+    return all(t is None or (t.dtype is torch.float32 and t.device.type == "cpu") for t in tensors)
+
+
+def pointer(tensor: Tensor, what: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float32) -> int:
+    """The address of a tensor's data, after checking all that a kernel relies on.
+
+    Raises: ValueError that names `what` and what is wrong with it.
+    """
+    if tensor.device.type != "cpu":
+        raise ValueError(f"{what} is on {tensor.device}, not on the processor")
+    if tensor.dtype is not dtype:
+        raise ValueError(f"{what} is of type {tensor.dtype}, not {dtype}")
+    if tensor.shape != shape:
+        raise ValueError(f"{what} has shape {tuple(tensor.shape)}, not {shape}")
+    if not tensor.is_contiguous():
+        raise ValueError(f"{what} is not contiguous")
+    return tensor.data_ptr()
+
+
+def pointers(addresses: list[int | None]) -> Any:
+    """A C array of pointers; None is the null pointer. It must be kept alive during the call."""
+    return (ctypes.c_void_p * len(addresses))(*addresses)
+
+
+def integers(values: tuple[int, ...]) -> Any:
+    """A C array of 64-bit integers."""
+    return (ctypes.c_int64 * len(values))(*values)
+
+
+def threads() -> int:
+    """Threads a kernel may use: as many as torch does."""
+    return torch.get_num_threads()

@@ -1,0 +1,100 @@
+"""Builds the CPU kernels: plain shared libraries with a C interface, one for each instruction set.
+
+They know nothing of Python or torch, so one wheel a platform serves every Python and every torch version. Where no
+compiler is at hand the installation goes on without them.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from setuptools import Extension, setup
+from setuptools.command.build_ext import build_ext
+
+try:
+    from setuptools.command.bdist_wheel import bdist_wheel
+except ImportError:  # setuptools before 70.1
+    from wheel.bdist_wheel import bdist_wheel
+
+SOURCES = sorted(str(path) for path in Path("framework/kernels/csrc").glob("*.cpp"))
+AVX512 = ["-mavx512f", "-mavx512bw", "-mavx512dq", "-mavx512vl", "-mprefer-vector-width=512"]
+VARIANTS = {"baseline": []}
+if platform.machine().lower() in ("x86_64", "amd64"):
+    VARIANTS |= {"avx2": ["-mavx2", "-mfma"], "avx512": ["-mavx2", "-mfma", *AVX512]}
+FLAGS = ["-std=c++17", "-O3", "-g0", "-fno-math-errno", "-fno-trapping-math", "-fvisibility=hidden"]
+
+
+class BuildKernels(build_ext):
+    """Compiles every variant, or none."""
+
+    def get_ext_filename(self, fullname: str) -> str:
+        suffix = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
+        return os.path.join(*fullname.split(".")) + suffix
+
+    def get_export_symbols(self, ext: Extension) -> list[str]:
+        return []
+
+    def build_extensions(self) -> None:
+        try:
+            with ThreadPoolExecutor(os.cpu_count()) as pool:
+                list(pool.map(self.build_extension, self.extensions))
+        except Exception as error:  # whatever the compiler's wrapper raises
+            self.warn(f"the CPU kernels could not be built ({error}): nerfloom will train much slower on a processor")
+            for extension in self.extensions:
+                Path(self.get_ext_fullpath(extension.name)).unlink(missing_ok=True)
+
+    def build_extension(self, ext: Extension) -> None:
+        objects = self.compiler.compile(
+            ext.sources,
+            output_dir=os.path.join(self.build_temp, ext.name),  # the variants share their sources
+            extra_postargs=ext.extra_compile_args,
+            depends=ext.depends,
+        )
+        self.compiler.link_shared_object(
+            objects, self.get_ext_fullpath(ext.name), extra_postargs=ext.extra_link_args, target_lang="c++"
+        )
+
+    def get_outputs(self) -> list[str]:
+        return [path for path in super().get_outputs() if Path(path).exists()]
+
+    def copy_extensions_to_source(self) -> None:
+        built = [e for e in self.extensions if Path(self.build_lib, self.get_ext_filename(e.name)).exists()]
+        for extension in built:
+            Path(self.get_ext_filename(extension.name)).parent.mkdir(exist_ok=True)
+        self.extensions, everything = built, self.extensions
+        super().copy_extensions_to_source()
+        self.extensions = everything
+
+
+class AnyPythonWheel(bdist_wheel):
+    """The wheel depends on the platform, but on no version of Python."""
+
+    def get_tag(self) -> tuple[str, str, str]:
+        return "py3", "none", super().get_tag()[2]
+
+
+def threads() -> tuple[list[str], list[str]]:
+    """Flags to compile and link with. The OpenMP runtime is torch's own, found when the library is loaded."""
+    if sys.platform == "darwin":
+        return ["-Xpreprocessor", "-fopenmp"], ["-undefined", "dynamic_lookup"]
+    return ["-fopenmp"], []
+
+
+compile_flags, link_flags = threads()
+setup(
+    ext_modules=[
+        Extension(
+            f"framework.kernels.lib.{name}",
+            SOURCES,
+            extra_compile_args=[*FLAGS, *compile_flags, *flags],
+            extra_link_args=link_flags,
+            depends=["framework/kernels/csrc/common.h"],
+        )
+        for name, flags in VARIANTS.items()
+    ],
+    cmdclass={"build_ext": BuildKernels, "bdist_wheel": AnyPythonWheel},
+)

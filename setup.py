@@ -21,10 +21,16 @@ except ImportError:  # setuptools before 70.1
     from wheel.bdist_wheel import bdist_wheel
 
 SOURCES = sorted(str(path) for path in Path("framework/kernels/csrc").glob("*.cpp"))
+AVX2 = ["-mavx2", "-mfma"]
 AVX512 = ["-mavx512f", "-mavx512bw", "-mavx512dq", "-mavx512vl", "-mprefer-vector-width=512"]
+HEADERS = sorted(str(path) for path in Path("framework/kernels/csrc").glob("*.h"))
 VARIANTS = {"baseline": []}
 if platform.machine().lower() in ("x86_64", "amd64"):
-    VARIANTS |= {"avx2": ["-mavx2", "-mfma"], "avx512": ["-mavx2", "-mfma", *AVX512]}
+    VARIANTS |= {
+        "avx2": AVX2,
+        "avx512": [*AVX2, *AVX512],
+        "avx512_bf16": [*AVX2, *AVX512, "-mavx512bf16"],
+    }
 FLAGS = ["-std=c++17", "-O3", "-g0", "-fno-math-errno", "-fno-trapping-math", "-fvisibility=hidden"]
 
 
@@ -92,7 +98,7 @@ setup(
             SOURCES,
             extra_compile_args=[*FLAGS, *compile_flags, *flags],
             extra_link_args=link_flags,
-            depends=["framework/kernels/csrc/common.h"],
+            depends=[*HEADERS],
         )
         for name, flags in VARIANTS.items()
     ],

@@ -37,9 +37,9 @@ class HashGrid(nn.Module):
         self.table = nn.Parameter(table(self.layout.num_entries, features_per_level).uniform_(-1e-4, 1e-4))
         self.num_features = num_levels * features_per_level
 
-    def forward(self, positions: Tensor) -> Tensor:
-        """Positions (N, 3) in [0, 1] to features (N, L * F)."""
-        return hash_grid(positions, self.table, self.layout, self._pending if self.sparse else None)
+    def forward(self, positions: Tensor, known: Tensor | None = None) -> Tensor:
+        """Positions (N, 3) in [0, 1] to features (N, L * F), which may be `known` already (see `hash_grid`)."""
+        return hash_grid(positions, self.table, self.layout, self._pending if self.sparse else None, known)
 
     def collect_gradient(self) -> None:
         """Add what the backward pass left to the table's gradient (`table.grad`, which has to be allocated)."""

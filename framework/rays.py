@@ -76,6 +76,8 @@ class Samples:
     """(N,) distance at which the field is evaluated; the middle of the interval if None."""
     per_ray: int | None = None
     """S if every ray has exactly S samples."""
+    owners: Tensor | None = None
+    """(N,) `ray_indices`, where they are known already."""
     sigma: Tensor | None = None
     """(N,) density, where the sampler already evaluated it."""
     features: Tensor | None = None
@@ -104,6 +106,8 @@ class Samples:
     @cached_property
     def ray_indices(self) -> Tensor:
         """(N,) the ray that owns each sample."""
+        if self.owners is not None:
+            return self.owners
         rays = torch.arange(self.num_rays, device=self.offsets.device)
         return torch.repeat_interleave(rays, self.counts, output_size=len(self))
 

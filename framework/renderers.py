@@ -66,7 +66,7 @@ def render_field(field: Field, sampler: Sampler, rays: Rays, background: Tensor,
 
     A sampler that has evaluated density already hands it over; it is not evaluated again.
     """
-    samples = sampler.sample(rays, field.density, jitter)
+    samples = sampler.sample(rays, field, jitter)
     if samples.sigma is None or samples.features is None:
         samples = samples.evaluated(*field.density(samples.positions(rays), samples.times(rays)))
     return shade(field, rays, samples, background)
@@ -78,5 +78,5 @@ def shade(field: Field, rays: Rays, samples: Samples, background: Tensor) -> Ren
         raise ValueError("shade() needs samples whose density and features are attached")
     owners = samples.ray_indices
     cameras = None if rays.camera_indices is None else rays.camera_indices[owners]
-    rgb = field.color(samples.features, rays.directions[owners], cameras)
+    rgb = field.color(samples.features, rays.directions.index_select(0, owners), cameras)
     return volume_render(rays, samples, samples.sigma, rgb, background)

@@ -27,8 +27,6 @@ class InstantNGPConfig(TrainConfig):
     learning_rate: float = 1e-2
     lr_schedule: Literal["constant", "exponential", "cosine", "hold-exponential"] = "hold-exponential"
     lr_final: float = 0.02
-    # Layers of 64 gain nothing from torch's bfloat16 on processors without AMX, and lose a third with AVX512-BF16.
-    mixed_precision: bool | None = False
     adam_beta2: float = 0.99
     adam_eps: float = 1e-15
     num_levels: int = 16

@@ -28,6 +28,22 @@ class Field(nn.Module, ABC):
         Returns: sigma (N,) float32, at least 0, 1/length; features (N, F) for `color`.
         """
 
+    def trace(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor] | None:
+        """Density without gradient, and what `retrace` needs to attach one later.
+
+        For samplers that must know density before they know which samples they keep: tracing costs one evaluation,
+        and the gradient is computed for what is kept, all at once.
+
+        Returns: sigma (N,), features (N, F), memory (N, M); or None where the field does not offer it.
+        """
+        return None
+
+    def retrace(
+        self, positions: Tensor, times: Tensor | None, features: Tensor, memory: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """What `density` gives at `positions`, gradients included, from what `trace` gave there."""
+        raise NotImplementedError
+
     @abstractmethod
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         """Colour (N, 3) in [0, 1] of `features` (N, F) seen along unit `directions` (N, 3).
@@ -53,13 +69,21 @@ class MLP(nn.Sequential):
                 layers.append(nn.ReLU(inplace=True))
             layers.append(nn.Linear(inputs, outputs, bias=bias))
         super().__init__(*layers)
+        if not bias:  # He et al. 2015: with torch's smaller default the small networks wake up slowly
+            for layer in layers:
+                if isinstance(layer, nn.Linear):
+                    nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
         self.bias = bias
         self.activation = activation
 
-    def forward(self, *inputs: Tensor) -> Tensor:
-        """(N, D_i) parts, which stand side by side, to (N, outputs)."""
+    def forward(self, *inputs: Tensor, known: Tensor | None = None) -> Tensor:
+        """(N, D_i) parts, which stand side by side, to (N, outputs).
+
+        `known` is the result where it has been computed already (see `mlp`).
+        """
         if not self.bias:
-            return mlp(inputs, [layer.weight for layer in self if isinstance(layer, nn.Linear)], self.activation)
+            weights = [layer.weight for layer in self if isinstance(layer, nn.Linear)]
+            return mlp(inputs, weights, self.activation, known)
         out = super().forward(inputs[0] if len(inputs) == 1 else torch.cat(inputs, dim=-1))
         if self.activation == "relu":
             return torch.relu(out)

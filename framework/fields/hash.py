@@ -7,7 +7,7 @@ from torch import Tensor
 
 from framework.encodings import HashGrid
 from framework.fields.base import MLP, Field
-from framework.kernels.math import truncated_exp
+from framework.kernels.math import split_density, truncated_exp
 from framework.kernels.spherical_harmonics import spherical_harmonics
 
 
@@ -40,8 +40,21 @@ class HashField(Field):
         self.color_head = MLP(num_features + direction_levels**2, width, width, 3, bias=False, activation="sigmoid")
 
     def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        features = self.density_head(self.grid(torch.addcmul(self.shift, positions, self.scale)))
-        return truncated_exp(features[:, 0]), features
+        return split_density(self.density_head(self.grid(self._unit(positions))))
+
+    @torch.no_grad()
+    def trace(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        encoded = self.grid(self._unit(positions))
+        features = self.density_head(encoded)
+        return truncated_exp(features[:, 0]), features, encoded
+
+    def retrace(
+        self, positions: Tensor, times: Tensor | None, features: Tensor, memory: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        return split_density(self.density_head(self.grid(self._unit(positions), known=memory), known=features))
+
+    def _unit(self, positions: Tensor) -> Tensor:
+        return torch.addcmul(self.shift, positions, self.scale)
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         view = spherical_harmonics(directions, self.direction_levels)

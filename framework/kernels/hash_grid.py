@@ -114,22 +114,30 @@ class _HashGrid(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, positions: Tensor, table: Tensor, layout: HashGridLayout, pending: Pending | None
+        ctx: Any,
+        positions: Tensor,
+        table: Tensor,
+        layout: HashGridLayout,
+        pending: Pending | None,
+        known: Tensor | None,
     ) -> Tensor:
         count, features = len(positions), table.shape[1]
-        out = positions.new_empty(count, layout.num_levels * features)
-        _forward(
-            native.pointer(positions, "positions", (count, 3)), count,
-            native.pointer(table, "the hash table", (layout.num_entries, features)), features,
-            *layout.arrays, layout.num_levels, out.data_ptr(), native.threads(),
-        )  # fmt: skip
+        points = native.pointer(positions, "positions", (count, 3))
+        entries = native.pointer(table, "the hash table", (layout.num_entries, features))
+        if known is not None:
+            out = known.view_as(known)
+        else:
+            out = positions.new_empty(count, layout.num_levels * features)
+            _forward(
+                points, count, entries, features, *layout.arrays, layout.num_levels, out.data_ptr(), native.threads()
+            )
         ctx.save_for_backward(positions, table)
         ctx.layout, ctx.pending = layout, pending
         return out
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         positions, table = ctx.saved_tensors
         layout, count, features = ctx.layout, len(positions), table.shape[1]
         grad = grad.contiguous()
@@ -146,7 +154,7 @@ class _HashGrid(torch.autograd.Function):
                 positions.data_ptr(), count, table.data_ptr(), incoming, features, *layout.arrays,
                 layout.num_levels, grad_positions.data_ptr(), native.threads(),
             )  # fmt: skip
-        return grad_positions, grad_table, None, None
+        return grad_positions, grad_table, None, None, None
 
 
 def add_table_gradient(parts: Pending, into: Tensor, layout: HashGridLayout) -> None:
@@ -169,7 +177,11 @@ def add_table_gradient(parts: Pending, into: Tensor, layout: HashGridLayout) -> 
 
 
 def hash_grid(
-    positions: Tensor, table: Tensor, layout: HashGridLayout, pending: Pending | None = None
+    positions: Tensor,
+    table: Tensor,
+    layout: HashGridLayout,
+    pending: Pending | None = None,
+    known: Tensor | None = None,
 ) -> Tensor:
     """Multiresolution hash encoding.
 
@@ -179,6 +191,7 @@ def hash_grid(
         layout: resolutions and offsets.
         pending: where the compiled kernel's backward pass leaves what `add_table_gradient` needs, autograd getting
             no gradient of the table: several encodings then make one pass over it.
+        known: (N, L * F) the result, where it was computed before without a gradient: only the backward pass is left.
     Returns: (N, L * F) features in the table's type. First derivatives only; see `hash_grid_reference`.
     Raises: ValueError where a shape does not fit the layout.
     """
@@ -188,5 +201,5 @@ def hash_grid(
         raise ValueError(f"hash_grid: the table has shape {tuple(table.shape)}, not ({layout.num_entries}, F)")
     positions = positions.to(table.dtype)
     if native.usable(positions, table) and table.shape[1] in (1, 2, 4, 8):
-        return _HashGrid.apply(positions.contiguous(), table.contiguous(), layout, pending)
+        return _HashGrid.apply(positions.contiguous(), table.contiguous(), layout, pending, known)
     return hash_grid_reference(positions, table, layout)

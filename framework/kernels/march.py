@@ -21,8 +21,10 @@ from framework.kernels import native
 from framework.kernels.compositing import optical_depth
 from framework.rays import Rays
 
-BLOCK = 8
-"""Cells along an edge of a block of the coarser level; steps that the reference tests together."""
+BLOCK = 4
+"""Cells along an edge of a block of the coarser level."""
+RUN = 8
+"""Steps that the reference tests together."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class Occupancy:
     bits: Tensor | None
     """(n^3 / 8,) uint8, one bit a cell, for the compiled kernel; None without."""
     blocks: Tensor | None
-    """(ceil(n / 8)^3,) uint8, whether a block of 8^3 cells holds an occupied one."""
+    """(ceil(n / 4)^3,) uint8, how many blocks of 4^3 cells away the nearest with an occupied one is."""
 
     @classmethod
     def of(cls, occupied: Tensor, box: Tensor, resolution: int) -> Occupancy:
@@ -56,6 +58,29 @@ class Occupancy:
         scale = self.resolution / (self.box[1] - self.box[0])
         x, y, z = ((positions - self.box[0]) * scale).long().clamp(0, self.resolution - 1).unbind(-1)
         return (x * self.resolution + y) * self.resolution + z
+
+
+@torch.no_grad()
+def refresh_occupancy(
+    density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float
+) -> None:
+    """Mark, in place, the cells whose opacity over one step is at least `threshold`, or the mean if that is less.
+
+    Args:
+        density: (n^3,) what is known of each cell, multiplied by `decay` first; infinite where nothing is.
+        occupied: (n^3,) bool, written.
+        step: length of a step, scene units.
+    """
+    if native.usable(density):
+        cells = len(density)
+        _refresh(
+            native.pointer(density, "density", (cells,)), cells, decay, step, threshold,
+            native.pointer(occupied, "the occupancy", (cells,), torch.bool), native.threads(),
+        )  # fmt: skip
+        return
+    density *= decay
+    alpha = -torch.expm1(-density * step)
+    occupied.copy_(alpha >= min(threshold, alpha.mean().item()))
 
 
 @dataclass(frozen=True)
@@ -181,7 +206,7 @@ class ReferenceMarch:
     """The same in torch, on any device: all candidates are found first, and handed out wave by wave.
 
     Arguments as for `March`; `reach` (n^3,) bool tells cells from which an occupied one lies within half a run of
-    BLOCK even steps along any axis (`dilated`), so that runs without any are dropped together.
+    RUN even steps along any axis (`dilated`), so that runs without any are dropped together.
     """
 
     def __init__(
@@ -270,15 +295,15 @@ def candidates(
 def _near_occupied(
     rays: Rays, occupancy: Occupancy, step: float, first: Tensor, counts: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Owners and numbers of the steps in those runs of BLOCK that come near an occupied cell."""
+    """Owners and numbers of the steps in those runs of RUN that come near an occupied cell."""
     cell = ((occupancy.box[1] - occupancy.box[0]) / occupancy.resolution).min().item()
-    reach = dilated(occupancy, math.ceil((BLOCK - 1) / 2 * step / cell))
-    owners, run = ranges((counts + BLOCK - 1) // BLOCK)
-    middle = first[owners] + (run * BLOCK + BLOCK / 2) * step
+    reach = dilated(occupancy, math.ceil((RUN - 1) / 2 * step / cell))
+    owners, run = ranges((counts + RUN - 1) // RUN)
+    middle = first[owners] + (run * RUN + RUN / 2) * step
     keep = reach[occupancy.cells(rays.points(owners, middle))]
     owners, run = owners[keep], run[keep]
-    k = run[:, None] * BLOCK + torch.arange(BLOCK, device=run.device)
-    return owners.repeat_interleave(BLOCK), k.reshape(-1)
+    k = run[:, None] * RUN + torch.arange(RUN, device=run.device)
+    return owners.repeat_interleave(RUN), k.reshape(-1)
 
 
 def dilated(occupancy: Occupancy, radius: int) -> Tensor:
@@ -302,6 +327,7 @@ def ranges(counts: Tensor) -> tuple[Tensor, Tensor]:
 
 
 _pack: Callable[..., None] = native.function("pack_occupancy", "pipp")
+_refresh: Callable[..., float] = native.function("refresh_occupancy", "pqfffpi", "f")
 _begin: Callable[..., int] = native.function("march_begin", "pppppqpfppppi", "q")
 _wave: Callable[..., int] = native.function("march_wave", "pppppppqipffppipppppi", "q")
 _advance: Callable[..., int] = native.function("march_advance", "pqpipppfppp", "q")

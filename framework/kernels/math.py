@@ -31,6 +31,33 @@ def truncated_exp(x: Tensor) -> Tensor:
     return _TruncatedExp.apply(x.float() if x.dtype != torch.float64 else x)
 
 
+class _SplitDensity(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, features: Tensor) -> tuple[Tensor, Tensor]:
+        density = torch.exp(features[:, 0].clamp(max=MAX_LOG_DENSITY))
+        ctx.save_for_backward(density)
+        ctx.shape = features.shape
+        ctx.set_materialize_grads(False)
+        return density, features.view_as(features)
+
+    @staticmethod
+    def backward(ctx: Any, grad_density: Tensor | None, grad_features: Tensor | None) -> Tensor | None:
+        (density,) = ctx.saved_tensors
+        if grad_density is None:
+            return grad_features
+        out = grad_density.new_zeros(ctx.shape) if grad_features is None else grad_features.clone()
+        out[:, 0] += grad_density * density
+        return out
+
+
+def split_density(features: Tensor) -> tuple[Tensor, Tensor]:
+    """Density (N,), the `truncated_exp` of the first of F features, and the features (N, F) for the colour.
+
+    The same as slicing, but the two gradients meet in one pass.
+    """
+    return _SplitDensity.apply(features if features.dtype == torch.float64 else features.float())
+
+
 def safe_normalize(v: Tensor, eps: float = 1e-12) -> Tensor:
     """v / |v| over the last dimension; 0, with a zero gradient, where |v| < eps."""
     squared = (v * v).sum(-1, keepdim=True)

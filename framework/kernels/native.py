@@ -4,7 +4,7 @@ Each kernel's Python file declares the C functions it calls with `function`, and
 which checks them. The library holds no thread of its own: it runs on torch's OpenMP threads. ctypes releases Python's
 lock during a call.
 
-`NERFLOOM_KERNELS` overrides the choice: a variant's name (baseline, avx2, avx512), or "reference" for torch alone.
+`NERFLOOM_KERNELS` overrides the choice: a variant's name (baseline, avx2, avx512, avx512_bf16), or "reference" for torch alone.
 """
 
 from __future__ import annotations
@@ -27,8 +27,10 @@ from framework.device import processor_features
 from framework.errors import ConfigError
 
 FOLDER = Path(__file__).parent / "lib"
+_AVX512 = ("avx512f", "avx512bw", "avx512dq", "avx512vl", "fma")
 NEEDS: dict[str, tuple[str, ...]] = {
-    "avx512": ("avx512f", "avx512bw", "avx512dq", "avx512vl", "fma"),
+    "avx512_bf16": (*_AVX512, "avx512_bf16"),
+    "avx512": _AVX512,
     "avx2": ("avx2", "fma"),
     "baseline": (),
 }
@@ -89,6 +91,13 @@ def _load() -> tuple[str, ctypes.CDLL | None]:
 def _compiler_hint() -> str:
     hints = {"Darwin": "'xcode-select --install'", "Windows": "clang"}
     return hints.get(platform.system(), "the package g++ or clang")
+
+
+@functools.cache
+def has(name: str) -> bool:
+    """Whether the library in use has a function: some are built for processors with certain instructions only."""
+    library = _load()[1]
+    return library is not None and hasattr(library, name)
 
 
 def function(name: str, arguments: str, result: str = "") -> Callable[..., Any]:

@@ -1,11 +1,17 @@
-"""Choosing rows of a tensor, each at most once."""
+"""Choosing rows of tensors, each at most once."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import accumulate
 from typing import Any
 
 import torch
 from torch import Tensor
+
+from framework.kernels import native
+
+_gather = native.function("gather_rows", "ppipipqpi")
 
 
 class _TakeRows(torch.autograd.Function):
@@ -29,3 +35,28 @@ def take_rows(values: Tensor, rows: Tensor) -> Tensor:
         rows: (M,) int64, all different.
     """
     return _TakeRows.apply(values, rows)
+
+
+@torch.no_grad()
+def gather_rows(columns: Sequence[Sequence[Tensor]], order: Tensor) -> list[Tensor]:
+    """Rows of several tensors that come in parts, in one pass and without putting the parts together first.
+
+    Args:
+        columns: for each of the tensors its parts (N_p, ...); all have the same P parts of the same lengths.
+        order: (M,) int64 indices into the N_1 + ... + N_P rows.
+    Returns: (M, ...) of each tensor, without gradient.
+    """
+    first = columns[0]
+    if order.device.type != "cpu" or not native.available():
+        return [torch.cat(list(parts)).index_select(0, order) for parts in columns]
+    ends = tuple(accumulate(len(part) for part in first))
+    kept = [part.contiguous() for parts in columns for part in parts]
+    shapes = [(end - start, *parts[0].shape[1:]) for parts in columns for start, end in zip((0, *ends), ends)]  # noqa: B905
+    out = [parts[0].new_empty(len(order), *parts[0].shape[1:]) for parts in columns]
+    addresses = [native.pointer(part, "a part", shape, part.dtype) for part, shape in zip(kept, shapes, strict=True)]
+    _gather(
+        native.pointers(addresses), native.integers(tuple(t[:1].numel() * t.element_size() for t in out)), len(out),
+        native.integers(ends), len(first), native.pointer(order, "the order", (len(order),), torch.int64), len(order),
+        native.pointers([t.data_ptr() for t in out]), native.threads(),
+    )  # fmt: skip
+    return out

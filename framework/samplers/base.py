@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from framework.fields.base import DensityFunction
+from framework.fields.base import DensityFunction, Field
 from framework.rays import Rays, Samples
 
 
 class Sampler(Protocol):
     """Chooses samples. A sampler that learns is a `torch.nn.Module` as well, so that checkpoints hold its state."""
 
-    def sample(self, rays: Rays, density: DensityFunction, jitter: bool) -> Samples:
+    def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
         """Samples for R rays.
 
         Args:
             rays: where to sample.
-            density: the field's density, for samplers that look before they choose. What they evaluate they
-                attach to the result (`Samples.sigma`, `Samples.features`), gradients included.
+            field: what is sampled, for samplers that look before they choose. What they evaluate they attach to the
+                result (`Samples.sigma`, `Samples.features`), gradients included.
             jitter: random positions (training) or fixed ones (evaluation).
         """
 

@@ -11,15 +11,18 @@ import math
 import torch
 from torch import Tensor, nn
 
-from framework.fields.base import DensityFunction
+from framework.fields.base import DensityFunction, Field
 from framework.kernels import native
-from framework.kernels.march import March, Occupancy, ReferenceMarch
-from framework.kernels.rows import take_rows
+from framework.kernels.march import March, Occupancy, ReferenceMarch, refresh_occupancy
+from framework.kernels.rows import gather_rows, take_rows
 from framework.rays import Rays, Samples
 
 CHUNK = 2**15
 """Cells evaluated at once."""
 WARM_UP_STEPS = 256
+"""Steps during which the grid is visited in a fixed shuffle."""
+WARM_UP_DECAY, DECAY = 0.7, 0.9
+"""Of a cell's density: at each visit in the beginning, at each update afterwards."""
 SHUFFLE_STRIDE = 2654435761
 """A prime, so that its multiples visit every cell once a pass, far from one another."""
 WAVES = (8, 8, 16, 16, 32, 32, 64, 64, 128)
@@ -86,7 +89,7 @@ class OccupancySampler(nn.Module):
 
     # -- sampling ---------------------------------------------------------------------------------------------
 
-    def sample(self, rays: Rays, density: DensityFunction, jitter: bool) -> Samples:
+    def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
         """Samples in occupied cells, as far as light gets; densities and features attached.
 
         What is dropped could have changed a colour channel by at most `early_stop`.
@@ -96,24 +99,31 @@ class OccupancySampler(nn.Module):
         march = (March if compiled else ReferenceMarch)(
             rays, self.occupancy, self.step_size, self.cone, shift, self.early_stop
         )
-        parts: list[tuple[Tensor, Tensor]] = []
-        while (wave := march.wave(WAVES[min(len(parts), len(WAVES) - 1)])) is not None:
-            parts.append(density(wave.positions, None if rays.times is None else rays.times[wave.owners]))
-            march.advance(parts[-1][0])
-        if not parts:  # no ray meets anything: still the field's own, empty, tensors
-            nothing = rays.origins[:0]
-            parts.append(density(nothing, None if rays.times is None else rays.times[:0]))
+        traced = torch.is_grad_enabled()
+        found: list[tuple[Tensor, ...]] = []
+        while (wave := march.wave(WAVES[min(len(found), len(WAVES) - 1)])) is not None:
+            times = None if rays.times is None else rays.times[wave.owners]
+            values = field.trace(wave.positions, times) if traced else None
+            traced = values is not None
+            found.append(values or field.density(wave.positions, times))
+            march.advance(found[-1][0])
+        if not found:  # no ray meets anything: still the field's own, empty, tensors
+            found.append(field.density(rays.origins[:0], None if rays.times is None else rays.times[:0]))
+        if not march.waves:
+            empty = rays.nears[:0]
+            return Samples(empty, empty, march.finish()[1]).evaluated(*found[0])
         order, offsets = march.finish()
-        empty = rays.nears[:0]
-        starts = torch.cat([empty, *(wave.t_starts for wave in march.waves)])
-        ends = torch.cat([empty, *(wave.t_ends for wave in march.waves)])
-        return Samples(
-            starts.index_select(0, order),
-            ends.index_select(0, order),
-            offsets,
-            sigma=take_rows(torch.cat([part[0] for part in parts]), order),
-            features=take_rows(torch.cat([part[1] for part in parts]), order),
-        )
+        waves = march.waves
+        columns = [[w.t_starts for w in waves], [w.t_ends for w in waves], [w.owners for w in waves]]
+        if traced:
+            columns += [[w.positions for w in waves], [values[1] for values in found], [values[2] for values in found]]
+            starts, ends, owners, positions, features, memory = gather_rows(columns, order)
+            times = None if rays.times is None else rays.times[owners]
+            sigma, features = field.retrace(positions, times, features, memory)
+        else:
+            starts, ends, owners = gather_rows(columns, order)
+            sigma, features = (take_rows(torch.cat([values[i] for values in found]), order) for i in (0, 1))
+        return Samples(starts, ends, offsets, owners=owners, sigma=sigma, features=features)
 
     # -- keeping the grid up ----------------------------------------------------------------------------------
 
@@ -134,11 +144,13 @@ class OccupancySampler(nn.Module):
         times = torch.rand(len(cells), device=cells.device) if self.moving else None
         positions = torch.lerp(self.box[0], self.box[1], unit)
         sigma = _in_chunks(density, positions, times)
-        decayed = self.density_grid[cells] * (0.7 if warming_up else 0.95)
-        seen = torch.isfinite(decayed)
-        self.density_grid[cells] = torch.where(seen, torch.maximum(decayed, sigma), sigma)
-        alpha = -torch.expm1(-self.density_grid * self.step_size)
-        self.occupied.copy_(alpha >= min(self.alpha_threshold, alpha.mean().item()))
+        before = self.density_grid.index_select(0, cells)
+        if warming_up:  # the others have not been seen often enough to be forgotten
+            before *= WARM_UP_DECAY
+        seen = torch.isfinite(before)
+        self.density_grid.index_copy_(0, cells, torch.where(seen, torch.maximum(before, sigma), sigma))
+        decay = 1.0 if warming_up else DECAY
+        refresh_occupancy(self.density_grid, self.occupied, decay, self.step_size, self.alpha_threshold)
         self._forget()
 
     def _shuffled(self, turn: int) -> Tensor:

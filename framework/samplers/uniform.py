@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from framework.fields.base import DensityFunction
+from framework.fields.base import DensityFunction, Field
 from framework.rays import Rays, Samples
 
 LAST_INTERVAL = 1e10
@@ -34,7 +34,7 @@ class UniformSampler:
 
     count: int
 
-    def sample(self, rays: Rays, density: DensityFunction, jitter: bool) -> Samples:
+    def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
         edges = torch.linspace(0, 1, self.count + 1, device=rays.nears.device)
         t = torch.lerp(rays.nears[:, None], rays.fars[:, None], edges)
         points = stratified_points(rays, self.count, jitter)

@@ -1,7 +1,7 @@
 // Marching rays through an occupancy grid, a wave at a time. See ../march.py for the reference.
 //
 // A ray's candidates are the steps first + k * step (growing with distance beyond step / cone). A wave finds the next
-// `limit` candidates of every living ray whose middle lies in an occupied cell; blocks of 8^3 empty cells are crossed
+// `limit` candidates of every living ray whose middle lies in an occupied cell; blocks of 4^3 empty cells are crossed
 // at once.
 #include "common.h"
 
@@ -12,96 +12,89 @@
 
 namespace {
 
-constexpr int BLOCK = 8;  // cells along an edge of the coarser level
+constexpr int BLOCK = 4;  // cells along an edge of the coarser level
+
+// x, y, z and a lane that is not used.
+typedef float Four __attribute__((vector_size(16)));
+typedef int32_t FourInts __attribute__((vector_size(16)));
+
+inline Four four(const float* from) { return Four{from[0], from[1], from[2], 0}; }
 
 struct Grid {
     const uint8_t* bits;    // one bit a cell, 8 cells along z in a byte
-    const uint8_t* blocks;  // one byte a block of 8^3 cells: whether any of them is occupied
-    int resolution;
+    const uint8_t* blocks;  // one byte a block of 4^3 cells: distance, in blocks, to one that holds an occupied cell
+    int resolution, side;
 
-    bool occupied(const int* c) const {
+    bool occupied(FourInts c) const {
         const int64_t cell = (int64_t(c[0]) * resolution + c[1]) * resolution + c[2];
         return bits[cell >> 3] >> (cell & 7) & 1;
     }
-    bool block_occupied(const int* c) const {
-        const int64_t side = (resolution + BLOCK - 1) / BLOCK;
-        return blocks[(int64_t(c[0] / BLOCK) * side + c[1] / BLOCK) * side + c[2] / BLOCK];
+    int distance(FourInts c) const {
+        const FourInts b = c / BLOCK;
+        return blocks[(b[0] * side + b[1]) * side + b[2]];
     }
 };
 
 // Where step k of a ray starts: evenly spaced while step > cone * t, then growing by a factor of 1 + cone.
 struct Steps {
-    float first, step, cone;
-    int64_t even;  // steps before they grow
+    float first, step, inverse, cone;
+    float even = std::numeric_limits<float>::infinity();  // steps before they grow
 
-    Steps(float first, float step, float cone) : first(first), step(step), cone(cone) {
-        even = std::numeric_limits<int64_t>::max();
-        if (cone > 0) even = int64_t(std::ceil(std::max(step / cone - first, 0.0f) / step));
+    Steps(float first, float step, float cone) : first(first), step(step), inverse(1 / step), cone(cone) {
+        if (cone > 0) even = std::ceil(std::max(step / cone - first, 0.0f) / step);
     }
-    float start(int64_t k) const {
-        if (k <= even) return first + float(k) * step;
-        return (first + float(even) * step) * std::pow(1 + cone, float(k - even));
+    float start(int32_t k) const {
+        const float n = float(k);
+        if (n <= even) return first + n * step;
+        return (first + even * step) * std::pow(1 + cone, n - even);
     }
-    // The first step that may end beyond t; one too early rather than too late.
-    int64_t reaching(float t) const {
-        const float k = (t - first) / step;
-        if (k <= float(even)) return int64_t(k) - 1;
-        const float base = first + float(even) * step;
-        return even + int64_t(std::log(std::max(t / base, 1.0f)) / std::log1p(cone)) - 1;
+    // The last step that certainly ends before t.
+    int32_t before(float t) const {
+        float k = (t - first) * inverse;
+        if (k > even) k = even + std::log(t / (first + even * step)) / std::log1p(cone);
+        return int32_t(std::min(k, 2e9f)) - 1;
     }
 };
 
+// A ray in units of cells, from the grid's corner.
 struct Ray {
-    const float *origin, *direction;
-    float inverse[3];
+    Four origin, direction, inverse;
+    FourInts forward;  // -1 where the direction is positive
 
-    Ray(const float* origin, const float* direction) : origin(origin), direction(direction) {
-        for (int a = 0; a < 3; a++) inverse[a] = 1 / direction[a];
+    Ray(const float* o, const float* d, const float* box, int resolution) {
+        const Four low = four(box), scale = float(resolution) / (four(box + 3) - low + Four{0, 0, 0, 1});
+        origin = (four(o) - low) * scale;
+        direction = four(d) * scale;
+        forward = direction > 0;
+        // Along an axis that the ray does not move on, the face behind it is infinitely far ahead.
+        inverse = direction == 0 ? Four{} - std::numeric_limits<float>::infinity() : 1 / direction;
     }
-    float at(int axis, float t) const { return origin[axis] + t * direction[axis]; }
-};
-
-struct Frame {
-    float low[3], scale[3], cell[3];
-    int resolution;
-
-    Frame(const float* box, int resolution) : resolution(resolution) {
-        for (int a = 0; a < 3; a++) {
-            low[a] = box[a];
-            scale[a] = float(resolution) / (box[3 + a] - box[a]);
-            cell[a] = (box[3 + a] - box[a]) / float(resolution);
-        }
+    FourInts cell(float t, int resolution) const {
+        const FourInts c = __builtin_convertvector(origin + t * direction, FourInts), zero = {};
+        const FourInts last = zero + (resolution - 1), positive = c < 0 ? zero : c;
+        return positive > last ? last : positive;
     }
-    void find(const Ray& ray, float t, int* c) const {
-        for (int a = 0; a < 3; a++) {
-            const int index = int((ray.at(a, t) - low[a]) * scale[a]);
-            c[a] = index < 0 ? 0 : index >= resolution ? resolution - 1 : index;
-        }
-    }
-    // Distance at which the ray leaves the cube of `size` cells that cell c lies in.
-    float leave(const Ray& ray, const int* c, int size) const {
+    // Distance at which the ray leaves the cube of `size` cells that cell c lies in, and `more` cells around it.
+    float leave(FourInts c, int size, int more) const {
+        const FourInts corner = (c & -size) + (forward ? FourInts{} + (size + more) : FourInts{} - more);
+        const Four t = (__builtin_convertvector(corner, Four) - origin) * inverse;
         float nearest = std::numeric_limits<float>::infinity();
-        for (int a = 0; a < 3; a++) {
-            if (ray.direction[a] == 0) continue;
-            const int corner = c[a] / size * size + (ray.direction[a] > 0 ? size : 0);
-            nearest = std::min(nearest, (low[a] + float(corner) * cell[a] - ray.origin[a]) * ray.inverse[a]);
-        }
+        for (int a = 0; a < 3; a++) nearest = std::min(nearest, t[a]);  // the operands' order drops 0 * infinity
         return nearest;
     }
 };
 
-// Appends the starts and lengths of up to `limit` steps; returns how many, and the step to go on from.
-int march_ray(const Ray& ray, const Steps& steps, const Frame& frame, const Grid& grid, float enter, float leave,
-              int limit, int32_t& next, std::vector<float>& starts, std::vector<float>& ends) {
+// Appends the starts and ends of up to `limit` steps; returns how many, and the step to go on from.
+int march_ray(const Ray& ray, const Steps& steps, const Grid& grid, float enter, float leave, int limit,
+              int32_t& next, std::vector<float>& starts, std::vector<float>& ends) {
     int found = 0;
-    int64_t k = next;
+    int32_t k = next;
     while (found < limit) {
         const float start = steps.start(k), end = steps.start(k + 1), middle = (start + end) / 2;
         if (!(middle < leave)) break;
-        int c[3];
-        frame.find(ray, middle, c);
-        const bool near_occupied = grid.block_occupied(c);
-        if (near_occupied && grid.occupied(c)) {
+        const FourInts c = ray.cell(middle, grid.resolution);
+        const int distance = grid.distance(c);
+        if (distance == 0 && grid.occupied(c)) {
             if (middle >= enter) {
                 starts.push_back(start);
                 ends.push_back(end);
@@ -109,26 +102,75 @@ int march_ray(const Ray& ray, const Steps& steps, const Frame& frame, const Grid
             }
             k++;
         } else {
-            k = std::max(k + 1, steps.reaching(frame.leave(ray, c, near_occupied ? 1 : BLOCK)));
+            const float clear = distance == 0 ? ray.leave(c, 1, 0) : ray.leave(c, BLOCK, (distance - 1) * BLOCK);
+            k = std::max(k + 1, steps.before(clear));
         }
     }
-    next = int32_t(std::min<int64_t>(k, std::numeric_limits<int32_t>::max()));
+    next = k;
     return found;
 }
 
 }  // namespace
 
-// One bit a cell, and one byte a block of 8^3 cells, from one byte a cell.
+// One bit a cell, and for each block of 4^3 cells its distance (the largest over the axes, in blocks, at most 255) to a
+// block that holds an occupied cell; from one byte a cell.
 EXPORT void pack_occupancy(const uint8_t* occupied, int resolution, uint8_t* bits, uint8_t* blocks) {
     const int64_t cells = int64_t(resolution) * resolution * resolution, side = (resolution + BLOCK - 1) / BLOCK;
     std::memset(bits, 0, size_t((cells + 7) / 8));
     std::memset(blocks, 0, size_t(side * side * side));
     for (int64_t cell = 0; cell < cells; cell++) {
-        if (!occupied[cell]) continue;
+        uint64_t eight = 1;
+        if (cell % 8 == 0 && cell + 8 <= cells) std::memcpy(&eight, occupied + cell, 8);
+        if (eight == 0) cell += 7;
+        if (eight == 0 || !occupied[cell]) continue;
         bits[cell >> 3] |= uint8_t(1 << (cell & 7));
         const int64_t x = cell / resolution / resolution, y = cell / resolution % resolution, z = cell % resolution;
         blocks[(x / BLOCK * side + y / BLOCK) * side + z / BLOCK] = 1;
     }
+    for (int64_t b = 0; b < side * side * side; b++) blocks[b] = blocks[b] ? 0 : 255;
+    // The chessboard distance is exact after one pass forward and one back over all 26 neighbours (Rosenfeld, Pfaltz 1968).
+    for (int pass = 0; pass < 2; pass++)
+        for (int64_t i = 0; i < side * side * side; i++) {
+            const int64_t b = pass ? side * side * side - 1 - i : i;
+            const int64_t at[3] = {b / side / side, b / side % side, b % side};
+            int nearest = blocks[b];
+            for (int m = 0; m < 13; m++) {  // the half that this pass has been to
+                const int n = pass ? 26 - m : m;
+                const int64_t x = at[0] + n / 9 - 1, y = at[1] + n / 3 % 3 - 1, z = at[2] + n % 3 - 1;
+                if (x < 0 || y < 0 || z < 0 || x >= side || y >= side || z >= side) continue;
+                nearest = std::min(nearest, blocks[(x * side + y) * side + z] + 1);
+            }
+            blocks[b] = uint8_t(std::min<int>(blocks[b], nearest));
+        }
+}
+
+// Marks the cells whose opacity over one step is at least `threshold`, or the mean opacity if that is less. The grid of
+// densities is multiplied by `decay` first. Returns the threshold used.
+EXPORT float refresh_occupancy(float* density, int64_t cells, float decay, float step, float threshold,
+                               uint8_t* occupied, int threads) {
+    constexpr int64_t RUN = 4096;
+    const int64_t runs = (cells + RUN - 1) / RUN;
+    std::vector<double> opacity(size_t(runs), 0.0);  // of each run, so that the sum does not depend on the threads
+#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
+    for (int64_t run = 0; run < runs; run++) {
+        const int64_t end = std::min(cells, (run + 1) * RUN);
+        int64_t i = run * RUN;
+        Floats sum = splat(0);
+        for (; i + LANES <= end; i += LANES) {
+            const Floats value = load(density + i) * decay;
+            store(density + i, value);
+            sum += 1 - exponential(value * -step);
+        }
+        for (int lane = 0; lane < LANES; lane++) opacity[size_t(run)] += sum[lane];
+        for (; i < end; i++) opacity[size_t(run)] += -std::expm1((density[i] *= decay) * -step);
+    }
+    double total = 0;
+    for (double part : opacity) total += part;
+    const float least = std::min(threshold, float(total / double(cells)));
+    const float density_threshold = -std::log1p(-std::min(least, 1 - 1e-7f)) / step;
+#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
+    for (int64_t i = 0; i < cells; i++) occupied[i] = density[i] >= density_threshold;
+    return least;
 }
 
 // Where each ray enters and leaves the box, and its first step: `enter` less a share of a step. Returns the number of
@@ -167,21 +209,20 @@ EXPORT int64_t march_wave(const float* origins, const float* directions, const f
                           const float* box, float step, float cone, const uint8_t* bits, const uint8_t* blocks,
                           int resolution, int32_t* counts, float* starts, float* ends, int64_t* owners,
                           float* positions, int threads) {
-    const Grid grid{bits, blocks, resolution};
-    const Frame frame(box, resolution);
+    const Grid grid{bits, blocks, resolution, (resolution + BLOCK - 1) / BLOCK};
     std::vector<int64_t> totals(threads + 1, 0);
 #pragma omp parallel num_threads(threads) if (threads > 1)
     {
         const int me = thread_index();
         const Part part(living, me, threads);
-        std::vector<float> my_starts, my_ends;
-        my_starts.reserve(size_t(part.end - part.begin) * limit);
-        my_ends.reserve(size_t(part.end - part.begin) * limit);
+        static thread_local std::vector<float> my_starts, my_ends;  // kept, for fresh memory costs page faults
+        my_starts.clear();
+        my_ends.clear();
         for (int64_t i = part.begin; i < part.end; i++) {
             const int64_t r = alive[i];
-            const Ray ray(origins + r * 3, directions + r * 3);
+            const Ray ray(origins + r * 3, directions + r * 3, box, resolution);
             const Steps steps(first[r], step, cone);
-            counts[i] = march_ray(ray, steps, frame, grid, enter[r], leave[r], limit, next[r], my_starts, my_ends);
+            counts[i] = march_ray(ray, steps, grid, enter[r], leave[r], limit, next[r], my_starts, my_ends);
         }
         totals[me + 1] = int64_t(my_starts.size());
 #pragma omp barrier
@@ -232,4 +273,17 @@ EXPORT int64_t sort_by_ray(const int64_t* owners, const uint8_t* reached, int64_
     for (int64_t n = 0; n < count; n++)
         if (reached[n]) order[at[owners[n]]++] = n;
     return offsets[rays];
+}
+
+// Rows of `arrays` arrays, each in `parts` parts that stand one after another; ends holds the number of rows up to the
+// end of each part. Row order[m] of array a, of bytes[a] bytes, becomes row m of out[a]. part[a * parts + p].
+EXPORT void gather_rows(const uint8_t* const* part, const int64_t* bytes, int arrays, const int64_t* ends, int parts,
+                        const int64_t* order, int64_t count, uint8_t* const* out, int threads) {
+#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
+    for (int64_t m = 0; m < count; m++) {
+        const int64_t p = std::upper_bound(ends, ends + parts, order[m]) - ends;
+        const int64_t row = p ? order[m] - ends[p - 1] : order[m];
+        for (int a = 0; a < arrays; a++)
+            std::memcpy(out[a] + m * bytes[a], part[a * parts + p] + row * bytes[a], size_t(bytes[a]));
+    }
 }

@@ -3,17 +3,13 @@
 // Samples go through all layers in blocks that stay in cache; nothing but the result leaves it. The backward pass
 // computes a block's hidden layers again, which costs less than writing them to memory and reading them back. Samples
 // whose incoming gradient is zero (hidden ones) are left out of it.
-#include "common.h"
+#include "mlp.h"
 
 #include <vector>
 
+using namespace mlp;
+
 namespace {
-
-constexpr int BLOCK = 32;
-constexpr int MAX_LAYERS = 8;
-constexpr int MAX_WIDTH = 128;
-
-int padded(int width) { return (width + LANES - 1) / LANES * LANES; }
 
 // y (rows, width) = x (rows, inner) w (inner, width), all row-major; width a whole number of vectors, rows of ROWS.
 template <int ROWS, int VECTORS>
@@ -97,17 +93,6 @@ void outer_product(const float* x, int ldx, const float* dy, int ldy, int inner,
         outer_columns<LANES == 16 ? 16 : LANES == 8 ? 8 : 4, 1>(x, ldx, dy + column, ldy, inner, dw + column, width);
 }
 
-enum Activation { NONE = 0, RELU = 1, SIGMOID = 2 };
-
-void activate(float* values, int64_t count, int activation) {
-    for (int64_t i = 0; i < count; i += LANES) {
-        Floats v = load(values + i);
-        if (activation == RELU) v = v < 0 ? splat(0) : v;
-        if (activation == SIGMOID) v = 1 / (1 + exponential(-v));
-        store(values + i, v);
-    }
-}
-
 struct Network {
     int layers;
     int width[MAX_LAYERS + 1] = {}, wide[MAX_LAYERS + 1] = {};  // of the input and each layer; padded to whole vectors
@@ -137,45 +122,6 @@ void run_forward(const Network& net, Block& block) {
         const int in = net.wide[l], out = net.wide[l + 1];
         product(block.layer[l], in, net.forward[l].data(), net.width[l], out, block.layer[l + 1], out);
         if (l + 1 < net.layers) activate(block.layer[l + 1], BLOCK * out, RELU);
-    }
-}
-
-struct Inputs {  // the network's input, in parts that stand side by side
-    int parts;
-    const float* const* part;
-    const int64_t* width;
-
-    void read(float* to, int wide, const int64_t* rows, int count) const {
-        std::memset(to, 0, sizeof(float) * BLOCK * wide);
-        for (int r = 0; r < count; r++) {
-            float* at = to + r * wide;
-            for (int p = 0; p < parts; at += width[p++])
-                std::memcpy(at, part[p] + rows[r] * width[p], sizeof(float) * width[p]);
-        }
-    }
-};
-
-bool is_zero(const float* values, int count) {
-    for (int i = 0; i < count; i++)
-        if (values[i] != 0) return false;
-    return true;
-}
-
-// The gradient of a block's output, through the output's activation function.
-void read_output_gradient(const Network& net, const float* grad, const int64_t* rows, int count, int activation,
-                          const float* output, float* to) {
-    const int width = net.width[net.layers], wide = net.wide[net.layers];
-    std::memset(to, 0, sizeof(float) * BLOCK * wide);
-    for (int r = 0; r < count; r++) std::memcpy(to + r * wide, grad + rows[r] * width, sizeof(float) * width);
-    if (activation == NONE) return;
-    for (int i = 0; i < BLOCK * wide; i += LANES) {
-        Floats g = load(to + i), raw = load(output + i);
-        if (activation == RELU) g = raw > 0 ? g : splat(0);
-        if (activation == SIGMOID) {
-            const Floats y = 1 / (1 + exponential(-raw));
-            g = g * y * (1 - y);
-        }
-        store(to + i, g);
     }
 }
 
@@ -243,35 +189,16 @@ EXPORT void mlp_backward(const float* const* inputs, const int64_t* part_widths,
         const Part part(count, thread_index(), threads, BLOCK);
         for (int64_t next = part.begin; next < part.end;) {
             int64_t rows[BLOCK];
-            int size = 0;
-            for (; next < part.end && size < BLOCK; next++) {
-                if (!is_zero(grad + next * outputs, outputs)) {
-                    rows[size++] = next;
-                    continue;
-                }
-                for (int p = 0; p < parts; p++)
-                    if (input_grads[p])
-                        std::memset(input_grads[p] + next * part_widths[p], 0, sizeof(float) * part_widths[p]);
-            }
+            const int size = live_rows(grad, outputs, input_grads, input, next, part.end, rows);
             if (size == 0) break;
             input.read(block.layer[0], net.wide[0], rows, size);
             run_forward(net, block);
-            read_output_gradient(net, grad, rows, size, activation, block.layer[layers], first);
+            read_output_gradient(grad, outputs, net.wide[layers], rows, size, activation, block.layer[layers], first);
             const float* dx = run_backward(net, block, first, second, mine);
-            for (int r = 0; r < size; r++) {
-                const float* from = dx + r * net.wide[0];
-                for (int p = 0; p < parts; from += part_widths[p++])
-                    if (input_grads[p])
-                        std::memcpy(input_grads[p] + rows[r] * part_widths[p], from, sizeof(float) * part_widths[p]);
-            }
+            write_input_gradient(dx, net.wide[0], input, rows, size, input_grads);
         }
     }
     const float* sum = sums.data();
     for (int l = 0; l < layers; sum += net.forward[l].size(), l++)
-        for (int o = 0; o < net.width[l + 1]; o++)
-            for (int i = 0; i < net.width[l]; i++) {
-                float value = 0;
-                for (int t = 0; t < threads; t++) value += sum[total * t + i * net.wide[l + 1] + o];
-                weight_grads[l][o * net.width[l] + i] = value;
-            }
+        write_weight_gradient(sum, total, threads, net.width[l], net.width[l + 1], net.wide[l + 1], weight_grads[l]);
 }

@@ -1,0 +1,268 @@
+// The small networks of mlp.cpp with bfloat16 products and float32 sums, for processors that multiply bfloat16.
+//
+// Activations are rows of bfloat16, weights pairs of rows interleaved, as VDPBF16PS wants them: one instruction adds
+// two products to each of 16 sums.
+#include "mlp.h"
+
+#if defined(__AVX512BF16__)
+
+#include <immintrin.h>
+
+#include <vector>
+
+using namespace mlp;
+
+namespace {
+
+typedef uint16_t Half;  // bfloat16: the upper half of a float
+
+int wide(int width) { return (width + 31) / 32 * 32; }
+
+Half half(float value) {  // to nearest, ties to even; NaN stays NaN
+    uint32_t bits;
+    std::memcpy(&bits, &value, 4);
+    if (value != value) return Half(bits >> 16 | 0x40);
+    return Half((bits + 0x7fff + (bits >> 16 & 1)) >> 16);
+}
+
+inline __m512i halves(__m512 low, __m512 high) { return (__m512i)_mm512_cvtne2ps_pbh(high, low); }
+
+inline __m512bh pair(const Half* from) {
+    int32_t bits;
+    std::memcpy(&bits, from, 4);
+    return (__m512bh)_mm512_set1_epi32(bits);
+}
+
+// y (BLOCK, width) float = x (BLOCK, inner) bf16 times w, whose rows are interleaved in pairs: w[k / 2][column][k % 2].
+template <int ROWS, int VECTORS>
+inline void product_columns(const Half* x, int ldx, const Half* w, int width, int inner, float* y, int ldy) {
+    for (int first = 0; first < BLOCK; first += ROWS) {
+        __m512 sum[ROWS][VECTORS];
+#pragma GCC unroll 16
+        for (int r = 0; r < ROWS; r++)
+#pragma GCC unroll 4
+            for (int v = 0; v < VECTORS; v++) sum[r][v] = _mm512_setzero_ps();
+        for (int k = 0; k < inner; k += 2) {
+            __m512bh row[VECTORS];
+#pragma GCC unroll 4
+            for (int v = 0; v < VECTORS; v++) row[v] = (__m512bh)_mm512_loadu_si512(w + k * width + v * 32);
+#pragma GCC unroll 16
+            for (int r = 0; r < ROWS; r++) {
+                const __m512bh two = pair(x + (first + r) * ldx + k);
+#pragma GCC unroll 4
+                for (int v = 0; v < VECTORS; v++) sum[r][v] = _mm512_dpbf16_ps(sum[r][v], two, row[v]);
+            }
+        }
+#pragma GCC unroll 16
+        for (int r = 0; r < ROWS; r++)
+#pragma GCC unroll 4
+            for (int v = 0; v < VECTORS; v++) _mm512_storeu_ps(y + (first + r) * ldy + v * 16, sum[r][v]);
+    }
+}
+
+// width is a multiple of 16 here: a layer of 16 outputs needs no second half.
+void product(const Half* x, int ldx, const Half* w, int width, int inner, float* y, int ldy) {
+    int column = 0;
+    for (; column + 64 <= width; column += 64)
+        product_columns<4, 4>(x, ldx, w + column * 2, width, inner, y + column, ldy);
+    for (; column + 32 <= width; column += 32)
+        product_columns<8, 2>(x, ldx, w + column * 2, width, inner, y + column, ldy);
+    for (; column < width; column += 16)
+        product_columns<16, 1>(x, ldx, w + column * 2, width, inner, y + column, ldy);
+}
+
+// Pairs of rows interleaved, as the sum over rows wants them: to[r / 2][column][r % 2].
+void interleave(const Half* from, int width, Half* to) {
+    alignas(64) static const uint16_t ORDER[2][32] = {
+        {0, 32, 1, 33, 2, 34, 3, 35, 4, 36, 5, 37, 6, 38, 7, 39, 8, 40, 9, 41, 10, 42, 11, 43, 12, 44, 13, 45, 14, 46,
+         15, 47},
+        {16, 48, 17, 49, 18, 50, 19, 51, 20, 52, 21, 53, 22, 54, 23, 55, 24, 56, 25, 57, 26, 58, 27, 59, 28, 60, 29,
+         61, 30, 62, 31, 63}};
+    const __m512i low = _mm512_load_si512(ORDER[0]), high = _mm512_load_si512(ORDER[1]);
+    for (int r = 0; r < BLOCK; r += 2)
+        for (int c = 0; c < width; c += 32) {
+            const __m512i a = _mm512_loadu_si512(from + r * width + c);
+            const __m512i b = _mm512_loadu_si512(from + (r + 1) * width + c);
+            Half* at = to + r * width + c * 2;
+            _mm512_storeu_si512(at, _mm512_permutex2var_epi16(a, low, b));
+            _mm512_storeu_si512(at + 32, _mm512_permutex2var_epi16(a, high, b));
+        }
+}
+
+// dw (inner, width) += x^T dy over the block, both interleaved in pairs of rows.
+template <int INNER, int VECTORS>
+inline void outer_columns(const Half* x, int ldx, const Half* dy, int ldy, int inner, float* dw, int width) {
+    for (int k = 0; k < inner; k += INNER) {
+        __m512 sum[INNER][VECTORS];
+#pragma GCC unroll 16
+        for (int i = 0; i < INNER; i++)
+#pragma GCC unroll 4
+            for (int v = 0; v < VECTORS; v++) sum[i][v] = _mm512_loadu_ps(dw + (k + i) * width + v * 16);
+        for (int r = 0; r < BLOCK; r += 2) {
+            __m512bh row[VECTORS];
+#pragma GCC unroll 4
+            for (int v = 0; v < VECTORS; v++) row[v] = (__m512bh)_mm512_loadu_si512(dy + r * ldy + v * 32);
+#pragma GCC unroll 16
+            for (int i = 0; i < INNER; i++) {
+                const __m512bh two = pair(x + r * ldx + (k + i) * 2);
+#pragma GCC unroll 4
+                for (int v = 0; v < VECTORS; v++) sum[i][v] = _mm512_dpbf16_ps(sum[i][v], two, row[v]);
+            }
+        }
+#pragma GCC unroll 16
+        for (int i = 0; i < INNER; i++)
+#pragma GCC unroll 4
+            for (int v = 0; v < VECTORS; v++) _mm512_storeu_ps(dw + (k + i) * width + v * 16, sum[i][v]);
+    }
+}
+
+void outer_product(const Half* x, int ldx, const Half* dy, int ldy, int inner, float* dw, int width) {
+    int column = 0;
+    for (; column + 64 <= width; column += 64)
+        outer_columns<4, 4>(x, ldx, dy + column * 2, ldy, inner, dw + column, width);
+    for (; column + 32 <= width; column += 32)
+        outer_columns<8, 2>(x, ldx, dy + column * 2, ldy, inner, dw + column, width);
+    for (; column < width; column += 16)
+        outer_columns<16, 1>(x, ldx, dy + column * 2, ldy, inner, dw + column, width);
+}
+
+struct Network {
+    int layers;
+    int width[MAX_LAYERS + 1] = {};
+    int rows[MAX_LAYERS + 1] = {};     // width in whole pairs of vectors: of a row of activations
+    int columns[MAX_LAYERS + 1] = {};  // width in whole vectors: of what is summed
+    std::vector<Half> forward[MAX_LAYERS], backward[MAX_LAYERS];
+
+    Network(const int64_t* widths, int count, const float* const* weights) : layers(count) {
+        for (int l = 0; l <= layers; l++) {
+            width[l] = int(widths[l]);
+            rows[l] = wide(width[l]);
+            columns[l] = (width[l] + 15) / 16 * 16;
+        }
+        for (int l = 0; l < layers; l++) {
+            forward[l].assign(size_t(rows[l]) * columns[l + 1], 0);
+            backward[l].assign(size_t(rows[l + 1]) * columns[l], 0);
+            for (int o = 0; o < width[l + 1]; o++)
+                for (int i = 0; i < width[l]; i++) {
+                    const Half w = half(weights[l][o * width[l] + i]);
+                    forward[l][i / 2 * columns[l + 1] * 2 + o * 2 + i % 2] = w;
+                    backward[l][o / 2 * columns[l] * 2 + i * 2 + o % 2] = w;
+                }
+        }
+    }
+    int inner(int l) const { return (width[l] + 1) / 2 * 2; }
+    int64_t sums(int l) const { return int64_t(columns[l]) * columns[l + 1]; }
+};
+
+struct Block {
+    alignas(64) Half layer[MAX_LAYERS][BLOCK * MAX_WIDTH];  // the input and hidden activations
+    alignas(64) float output[BLOCK * MAX_WIDTH];            // of the last layer, before its activation function
+    alignas(64) float scratch[BLOCK * MAX_WIDTH];
+};
+
+// Rows of float (columns wide) to rows of bf16 (rows wide), where `keep` is positive if it is given.
+void to_halves(const float* from, int columns, Half* to, int rows, bool relu, const Half* keep) {
+    const __m512 zero = _mm512_setzero_ps();
+    for (int r = 0; r < BLOCK; r++)
+        for (int c = 0; c < rows; c += 32) {
+            __m512 a = _mm512_loadu_ps(from + r * columns + c);
+            __m512 b = c + 16 < columns ? _mm512_loadu_ps(from + r * columns + c + 16) : zero;
+            if (relu) {  // the operand order lets NaN through
+                a = _mm512_max_ps(zero, a);
+                b = _mm512_max_ps(zero, b);
+            }
+            __m512i out = halves(a, b);
+            if (keep) {
+                const __m512i k = _mm512_loadu_si512(keep + r * rows + c);
+                out = _mm512_maskz_mov_epi16(_mm512_test_epi16_mask(k, k), out);
+            }
+            _mm512_storeu_si512(to + r * rows + c, out);
+        }
+}
+
+void run_forward(const Network& net, Block& block) {
+    for (int l = 0; l < net.layers; l++) {
+        const bool last = l + 1 == net.layers;
+        float* out = last ? block.output : block.scratch;
+        product(block.layer[l], net.rows[l], net.forward[l].data(), net.columns[l + 1], net.inner(l), out,
+                net.columns[l + 1]);
+        if (!last) to_halves(out, net.columns[l + 1], block.layer[l + 1], net.rows[l + 1], true, nullptr);
+    }
+}
+
+void read_input(const Network& net, const Inputs& input, const int64_t* rows, int size, Block& block) {
+    const int columns = net.columns[0];
+    input.read(block.scratch, columns, rows, size);
+    to_halves(block.scratch, columns, block.layer[0], net.rows[0], false, nullptr);
+}
+
+}  // namespace
+
+// As mlp_forward and mlp_backward.
+EXPORT void mlp_forward_bf16(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
+                             const int64_t* widths, int layers, const float* const* weights, int activation,
+                             float* out, int threads) {
+    const Network net(widths, layers, weights);
+    const Inputs input{parts, inputs, part_widths};
+    const int64_t blocks = (count + BLOCK - 1) / BLOCK;
+    const int outputs = net.width[layers], columns = net.columns[layers];
+#pragma omp parallel num_threads(threads) if (threads > 1)
+    {
+        Block block;
+#pragma omp for schedule(static)
+        for (int64_t b = 0; b < blocks; b++) {
+            const int size = int(count - b * BLOCK < BLOCK ? count - b * BLOCK : BLOCK);
+            int64_t rows[BLOCK];
+            for (int r = 0; r < size; r++) rows[r] = b * BLOCK + r;
+            read_input(net, input, rows, size, block);
+            run_forward(net, block);
+            activate(block.output, BLOCK * columns, activation);
+            for (int r = 0; r < size; r++)
+                std::memcpy(out + rows[r] * outputs, block.output + r * columns, sizeof(float) * outputs);
+        }
+    }
+}
+
+EXPORT void mlp_backward_bf16(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
+                              const int64_t* widths, int layers, const float* const* weights, int activation,
+                              const float* grad, float* const* input_grads, float* const* weight_grads, int threads) {
+    const Network net(widths, layers, weights);
+    const Inputs input{parts, inputs, part_widths};
+    int64_t total = 0;
+    for (int l = 0; l < layers; l++) total += net.sums(l);
+    std::vector<float> sums(total * threads, 0.0f);
+#pragma omp parallel num_threads(threads) if (threads > 1)
+    {
+        Block block;
+        alignas(64) Half current[BLOCK * MAX_WIDTH], pairs_x[BLOCK * MAX_WIDTH], pairs_dy[BLOCK * MAX_WIDTH];
+        const Part part(count, thread_index(), threads, BLOCK);
+        for (int64_t next = part.begin; next < part.end;) {
+            int64_t rows[BLOCK];
+            const int size = live_rows(grad, net.width[layers], input_grads, input, next, part.end, rows);
+            if (size == 0) break;
+            read_input(net, input, rows, size, block);
+            run_forward(net, block);
+            read_output_gradient(grad, net.width[layers], net.columns[layers], rows, size, activation, block.output,
+                                 block.scratch);
+            to_halves(block.scratch, net.columns[layers], current, net.rows[layers], false, nullptr);
+            float* sum = sums.data() + total * (thread_index() + 1);
+            for (int l = layers - 1; l >= 0; l--) {
+                sum -= net.sums(l);
+                interleave(block.layer[l], net.rows[l], pairs_x);
+                interleave(current, net.rows[l + 1], pairs_dy);
+                outer_product(pairs_x, net.rows[l], pairs_dy, net.rows[l + 1], net.columns[l], sum,
+                              net.columns[l + 1]);
+                product(current, net.rows[l + 1], net.backward[l].data(), net.columns[l], net.inner(l + 1),
+                        block.scratch, net.columns[l]);
+                if (l > 0) to_halves(block.scratch, net.columns[l], current, net.rows[l], false, block.layer[l]);
+            }
+            write_input_gradient(block.scratch, net.columns[0], input, rows, size, input_grads);
+        }
+    }
+    const float* sum = sums.data();
+    for (int l = 0; l < layers; sum += net.sums(l), l++)
+        write_weight_gradient(sum, total, threads, net.width[l], net.width[l + 1], net.columns[l + 1],
+                              weight_grads[l]);
+}
+
+#endif

@@ -89,6 +89,10 @@ class TrainConfig:
     """Adam's decay of the squared gradient."""
     adam_eps: float = 1e-8
     """Adam's epsilon."""
+    silhouette_cells: bool = True
+    """Where photographs are transparent, cells of the occupancy grid that one of them shows empty are never marched."""
+    silhouette_pixels: bool = True
+    """Pixels whose ray meets only such cells are never drawn."""
     background: Literal["auto", "random", "white", "black"] = "auto"
     """Behind transparent pixels in training; auto: random if images have alpha. Evaluation is over white, or black."""
     eval_num_rays_per_chunk: int = 8_192

@@ -91,6 +91,8 @@ class Dataset:
     """(3, 4) from the input's frame to the scene's."""
     scale: float
     """Scene units per unit of the input."""
+    drawn: Tensor | None = None
+    """(K,) int64 pixels that are worth drawing, counted through all images; None for all."""
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -109,6 +111,7 @@ class Dataset:
             offsets=self.offsets.to(device),
             cameras=self.cameras.to(device),
             times=None if self.times is None else self.times.to(device),
+            drawn=None if self.drawn is None else self.drawn.to(device),
         )
 
 

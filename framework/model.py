@@ -15,6 +15,7 @@ from framework.losses import mean_squared_error
 from framework.pixels import Batch
 from framework.rays import Rays
 from framework.renderers import Rendered
+from framework.samplers.occupancy import OccupancySampler
 from framework.scene import Scene
 
 ConfigT = TypeVar("ConfigT", bound=TrainConfig)
@@ -53,6 +54,11 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
         rest = [p for p in self.parameters() if not any(p is table for table in tables)]
         groups: list[dict[str, Any]] = [{"params": rest, "name": "networks"}]
         return groups + ([{"params": tables, "name": "tables", "sparse": True}] if tables else [])
+
+    @property
+    def occupancy_samplers(self) -> list[OccupancySampler]:
+        """The grids that the photographs' silhouettes can empty before the first step."""
+        return [module for module in self.modules() if isinstance(module, OccupancySampler)]
 
     def collect_gradients(self) -> None:
         """End of the backward pass: add what kernels left to be added all at once."""

@@ -47,9 +47,12 @@ _draw = native.function("draw_pinhole", "pqpqpppppp" + "pipppppppi")
 
 
 def draw_batch(dataset: Dataset, count: int, background: Background) -> Batch:
-    """`count` pixels, each pixel of the set being equally likely, drawn with replacement by torch's generator."""
+    """`count` pixels, each of those worth drawing being equally likely, with replacement, by torch's generator."""
     device = dataset.pixels.device
-    flat = torch.randint(len(dataset.pixels), (count,), device=device)
+    if dataset.drawn is None:
+        flat = torch.randint(len(dataset.pixels), (count,), device=device)
+    else:
+        flat = dataset.drawn[torch.randint(len(dataset.drawn), (count,), device=device)]
     return gather_batch(dataset, flat, background_colors(background, count, device))
 
 

@@ -48,6 +48,7 @@ class OccupancySampler(nn.Module):
     box: Tensor
     density_grid: Tensor
     occupied: Tensor
+    carved: Tensor
 
     def __init__(
         self,
@@ -69,6 +70,7 @@ class OccupancySampler(nn.Module):
         self.register_buffer("box", box.clone())
         self.register_buffer("density_grid", torch.full((resolution**3,), torch.inf))
         self.register_buffer("occupied", torch.ones(resolution**3, dtype=torch.bool))
+        self.register_buffer("carved", torch.zeros(resolution**3, dtype=torch.bool))
         self._packed: Occupancy | None = None
         self.register_load_state_dict_post_hook(lambda module, _: module._forget())
 
@@ -76,6 +78,11 @@ class OccupancySampler(nn.Module):
     def occupied_share(self) -> float:
         """Share of cells that are not skipped."""
         return self.occupied.float().mean().item()
+
+    @property
+    def any_carved(self) -> bool:
+        """Whether silhouettes have emptied cells for good."""
+        return bool(self.carved.any())
 
     @property
     def occupancy(self) -> Occupancy:
@@ -127,6 +134,13 @@ class OccupancySampler(nn.Module):
 
     # -- keeping the grid up ----------------------------------------------------------------------------------
 
+    def carve(self, hull: Tensor) -> None:
+        """Cells outside `hull` (n^3,) are known to be empty (`framework.silhouettes`), and stay so for good."""
+        self.carved.copy_(~hull)
+        self.density_grid.masked_fill_(self.carved, 0)
+        self.occupied.logical_and_(hull)
+        self._forget()
+
     @torch.no_grad()
     def update(self, step: int, density: DensityFunction) -> None:
         """Evaluate some cells and mark anew which are occupied: every 8 steps at first, every 16 later.
@@ -151,6 +165,8 @@ class OccupancySampler(nn.Module):
         self.density_grid.index_copy_(0, cells, torch.where(seen, torch.maximum(before, sigma), sigma))
         decay = 1.0 if warming_up else DECAY
         refresh_occupancy(self.density_grid, self.occupied, decay, self.step_size, self.alpha_threshold)
+        if self.any_carved:
+            self.occupied.logical_and_(~self.carved)
         self._forget()
 
     def _shuffled(self, turn: int) -> Tensor:
@@ -162,7 +178,8 @@ class OccupancySampler(nn.Module):
         share = math.ceil(4 * num_cells * 8 / WARM_UP_STEPS)
         places = torch.arange(turn * share, (turn + 1) * share, device=self.occupied.device)
         cells = places * SHUFFLE_STRIDE % num_cells
-        return cells[self.occupied[cells] | (torch.rand(share, device=cells.device) < 1 / 8)]
+        looked_at = self.occupied[cells] | (torch.rand(share, device=cells.device) < 1 / 8)
+        return cells[looked_at & ~self.carved[cells]]
 
     def _drawn(self) -> Tensor:
         """Half anywhere, half among occupied cells. A cell drawn twice is evaluated twice, harmlessly."""
@@ -171,6 +188,7 @@ class OccupancySampler(nn.Module):
         device = self.occupied.device
         occupied = self.occupied.nonzero().squeeze(-1)
         anywhere = torch.randint(num_cells, (half,), device=device)
+        anywhere = anywhere[~self.carved[anywhere]]
         if len(occupied) == 0:
             return anywhere
         return torch.cat([anywhere, occupied[torch.randint(len(occupied), (half,), device=device)]])

@@ -6,7 +6,7 @@ import signal
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -24,6 +24,7 @@ from framework.evaluation.images import comparison
 from framework.evaluation.metrics import MAX_PSNR
 from framework.kernels.adam import all_finite
 from framework.pixels import Background, Batch, composite, draw_batch
+from framework.silhouettes import Silhouettes, pixels_near, visual_hull
 from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest, save_checkpoint
 from framework.training.optim import first_non_finite, learning_rate_factor, make_optimizer, set_learning_rate
 from framework.training.progress import ProgressBar, StepReport, TensorBoard
@@ -91,6 +92,7 @@ class Trainer:
         self.optimizer = make_optimizer(self.model, self.config)
         self.state = State()
         self._bad_in_a_row = 0
+        self._prepared = False
         self._last_save = self._last_eval = self._picture_seconds = 0.0
 
     # -- checkpoints ------------------------------------------------------------------------------------------
@@ -186,8 +188,27 @@ class Trainer:
             done = max(done, self.state.seconds / self.config.max_seconds)
         return min(done, 1.0)
 
+    def _prepare(self) -> None:
+        """What the photographs' silhouettes save. It counts as training time."""
+        self._prepared = True
+        start, samplers = time.perf_counter(), self.model.occupancy_samplers
+        scene, config = self.model.scene, self.config
+        known = scene.has_alpha and not scene.moving and self.train_set.cameras.model == "pinhole"
+        if not (samplers and known and config.silhouette_cells):
+            return
+        silhouettes = Silhouettes.of(self.train_set)
+        for sampler in samplers if self.state.step == 0 else ():
+            sampler.carve(visual_hull(silhouettes, sampler.box, sampler.resolution))
+        if config.silhouette_pixels:
+            hulls = [pixels_near(silhouettes, ~s.carved, s.box, s.resolution) for s in samplers]
+            self.train_set = replace(self.train_set, drawn=torch.cat(hulls).unique() if len(hulls) > 1 else hulls[0])
+        if self.state.step == 0:
+            self.state.seconds += time.perf_counter() - start
+
     def train_step(self) -> StepReport:
         """One batch, one step of Adam."""
+        if not self._prepared:
+            self._prepare()
         state, start = self.state, time.perf_counter()
         seed_step(self.config.machine.seed, state.step)
         self.model.train()

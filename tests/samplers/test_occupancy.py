@@ -4,9 +4,10 @@ import pytest
 import torch
 
 from framework.bounds import intersect_box
+from framework.fields.base import Field
 from framework.rays import Rays, Samples
 from framework.renderers import volume_render
-from framework.samplers.occupancy import WARM_UP_STEPS, OccupancySampler, evaluate_in_waves
+from framework.samplers.occupancy import WARM_UP_STEPS, OccupancySampler
 
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 
@@ -29,12 +30,22 @@ def ball_density(radius: float, sigma: float = 50.0):
     return density
 
 
+class Transparent(Field):
+    """Nothing anywhere: every candidate is a sample."""
+
+    def density(self, positions: torch.Tensor, times: torch.Tensor | None = None):
+        return torch.zeros(len(positions)), positions
+
+    def color(self, features, directions, camera_indices=None):
+        return features
+
+
 @pytest.mark.parametrize("jitter", [True, False])
 def test_a_full_grid_covers_each_rays_chord(jitter: bool) -> None:
     torch.manual_seed(0)
     rays = random_rays(300)
     sampler = OccupancySampler(BOX, resolution=16, num_steps=100)
-    samples = sampler.march(rays, jitter)
+    samples = sampler.sample(rays, Transparent(), jitter)
     enter, leave = intersect_box(rays.origins, rays.directions, BOX)
     lengths = torch.zeros(300).index_add(0, samples.ray_indices, samples.deltas)
     assert bool(((lengths - (leave - enter)).abs() <= 1.001 * sampler.step_size).all())
@@ -48,8 +59,8 @@ def test_skipping_finds_exactly_the_occupied_steps(resolution: int, num_steps: i
     rays = random_rays(200, seed=1)
     sampler = OccupancySampler(BOX, resolution=resolution, num_steps=num_steps)
     sampler.occupied.copy_(torch.rand(resolution**3, generator=torch.Generator().manual_seed(2)) < 0.02)
-    sampler._find_reachable()
-    samples = sampler.march(rays, jitter=False)
+    sampler._forget()
+    samples = sampler.sample(rays, Transparent(), jitter=False)
     quarter = sampler.step_size / 4
     found = {(int(r), round(float(t) / quarter)) for r, t in zip(samples.ray_indices, samples.t, strict=True)}
 
@@ -70,24 +81,45 @@ def test_skipping_finds_exactly_the_occupied_steps(resolution: int, num_steps: i
     assert len(found) > 20
 
 
-class CountingField:
+class CountingField(Field):
     """Random but fixed densities; counts what is asked of it."""
 
     def __init__(self) -> None:
+        super().__init__()
         self.weight = torch.nn.Parameter(torch.randn(3, 4, generator=torch.Generator().manual_seed(0)) * 3)
         self.asked: list[torch.Tensor] = []
 
-    def density(self, positions: torch.Tensor, times: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
+    def density(self, positions: torch.Tensor, times: torch.Tensor | None = None):
         self.asked.append(positions.detach())
         features = (positions @ self.weight).sin()
         return 8 * features[:, 0].clamp(min=0) ** 2, features
 
+    def color(self, features, directions, camera_indices=None):
+        return features[:, :3] * 0.5 + 0.5
 
-def test_waves_without_early_stop_equal_one_evaluation() -> None:
+
+class TracingField(CountingField):
+    """The same, which lets its gradient be attached later."""
+
+    def trace(self, positions: torch.Tensor, times: torch.Tensor | None = None):
+        with torch.no_grad():
+            sigma, features = self.density(positions)
+        return sigma, features, positions * 2
+
+    def retrace(self, positions, times, features, memory):
+        torch.testing.assert_close(memory, positions * 2)
+        attached = (positions @ self.weight).sin()
+        torch.testing.assert_close(attached, features)
+        return 8 * attached[:, 0].clamp(min=0) ** 2, attached
+
+
+@pytest.mark.parametrize("kind", [CountingField, TracingField])
+def test_waves_without_early_stop_equal_one_evaluation(kind) -> None:
     rays = random_rays(60)
-    candidates = OccupancySampler(BOX, resolution=8, num_steps=90).march(rays, jitter=False)
-    field = CountingField()
-    waves = evaluate_in_waves(rays, candidates, field.density, early_stop=0.0)
+    sampler = OccupancySampler(BOX, resolution=8, num_steps=90, early_stop=0.0)
+    candidates = sampler.sample(rays, Transparent(), jitter=False)
+    field = kind()
+    waves = sampler.sample(rays, field, jitter=False)
     assert sum(len(a) for a in field.asked) == len(candidates)
     assert torch.cat(field.asked).unique(dim=0).shape[0] == len(candidates)  # nothing twice
     sigma, features = field.density(candidates.positions(rays), None)
@@ -104,14 +136,14 @@ def test_waves_without_early_stop_equal_one_evaluation() -> None:
 @pytest.mark.parametrize("early_stop", [1e-1, 1e-3])
 def test_early_stop_keeps_its_bound_and_saves(early_stop: float) -> None:
     rays = random_rays(400)
-    candidates = OccupancySampler(BOX, resolution=8, num_steps=400).march(rays, jitter=False)
     field = CountingField()
 
     def render(stop: float) -> tuple[torch.Tensor, int]:
-        samples = evaluate_in_waves(rays, candidates, field.density, stop)
+        sampler = OccupancySampler(BOX, resolution=8, num_steps=400, early_stop=stop)
+        samples = sampler.sample(rays, field, jitter=False)
         assert samples.sigma is not None
         assert samples.features is not None
-        colors = samples.features[:, :3] * 0.5 + 0.5
+        colors = field.color(samples.features, None)
         return volume_render(rays, samples, samples.sigma, colors, torch.ones(3)).rgb, len(samples)
 
     (full, all_samples), (stopped, fewer) = render(0.0), render(early_stop)
@@ -121,18 +153,19 @@ def test_early_stop_keeps_its_bound_and_saves(early_stop: float) -> None:
     assert fewer < all_samples
 
 
-def test_rays_that_meet_nothing() -> None:
+@pytest.mark.parametrize("kind", [CountingField, TracingField])
+def test_rays_that_meet_nothing(kind) -> None:
     sampler = OccupancySampler(BOX, resolution=8, num_steps=32)
     away = Rays(torch.full((3, 3), 5.0), torch.eye(3), torch.zeros(3), torch.full((3,), 10.0))
-    field = CountingField()
+    field = kind()
     for rays in (away, away[:0]):
-        samples = sampler.sample(rays, field.density, jitter=True)
+        samples = sampler.sample(rays, field, jitter=True)
         assert len(samples) == 0
         assert samples.num_rays == len(rays)
         assert samples.features is not None
     sampler.occupied.zero_()
-    sampler._find_reachable()
-    assert len(sampler.sample(random_rays(10), field.density, jitter=True)) == 0
+    sampler._forget()
+    assert len(sampler.sample(random_rays(10), field, jitter=True)) == 0
 
 
 def train_grid(sampler: OccupancySampler, density, steps: range) -> None:
@@ -161,7 +194,7 @@ def test_state_survives_a_checkpoint() -> None:
     copy = OccupancySampler(BOX, resolution=16, num_steps=64)
     copy.load_state_dict(sampler.state_dict())
     rays = random_rays(50)
-    first, second = (s.march(rays, jitter=False) for s in (sampler, copy))
+    first, second = (s.sample(rays, Transparent(), jitter=False) for s in (sampler, copy))
     assert isinstance(first, Samples)
     torch.testing.assert_close(first.t_starts, second.t_starts, rtol=0, atol=0)
     assert first.offsets.tolist() == second.offsets.tolist()

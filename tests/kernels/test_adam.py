@@ -1,0 +1,89 @@
+"""Sparse Adam: each entry sees torch's own Adam on the sequence of its gradients that are not zero."""
+
+import pytest
+import torch
+
+from framework.kernels.adam import all_finite, sparse_adam, sparse_adam_reference
+from tests.kernels.compiled import needs_kernels, relative_error
+
+BETAS, EPS = (0.9, 0.99), 1e-15
+
+
+def tables(entries: int, features: int, dtype: torch.dtype = torch.float32) -> list[torch.Tensor]:
+    """values, mean, square and seen."""
+    torch.manual_seed(0)
+    values = torch.randn(entries, features, dtype=dtype)
+    return [values, torch.zeros_like(values), torch.zeros_like(values), torch.zeros(entries, dtype=dtype)]
+
+
+def gradients(entries: int, features: int, step: int) -> torch.Tensor:
+    """A gradient on about a fifth of the entries; the last entry is met at step 40 for the first time."""
+    generator = torch.Generator().manual_seed(step)
+    grad = torch.randn(entries, features, generator=generator) * 10.0 ** float(-step % 7)
+    grad[torch.rand(entries, generator=generator) > 0.2] = 0
+    grad[-1] = 0.5 if step == 40 else 0
+    return grad
+
+
+@pytest.mark.parametrize("features", [1, 2, 3, 4, 8])
+@pytest.mark.parametrize("update", [sparse_adam, sparse_adam_reference])
+def test_each_entry_sees_adam_on_its_own_gradients(update, features: int) -> None:
+    entries = 301
+    values, mean, square, seen = tables(entries, features)
+    truth = values.double().clone()
+    singles = [torch.nn.Parameter(row.clone()) for row in truth]
+    optimizers = [torch.optim.Adam([p], lr=1e-2, betas=BETAS, eps=EPS) for p in singles]
+    for step in range(60):
+        grad = gradients(entries, features, step)
+        touched = grad.any(-1)
+        for entry in touched.nonzero().squeeze(-1).tolist():
+            singles[entry].grad = grad[entry].double()
+            optimizers[entry].step()
+        assert update(values, grad, mean, square, seen, 1e-2, BETAS, EPS) == int(touched.sum())
+        assert not grad.any()
+    moved = torch.stack([p.detach() for p in singles]) - truth
+    assert relative_error(values.double() - truth, moved) < 1e-4
+    late = (values[-1].double() - truth[-1]).abs()
+    torch.testing.assert_close(late, torch.full_like(late, 1e-2), rtol=1e-4, atol=0)  # its first step is a full one
+    assert seen[-1] == 1
+
+
+@needs_kernels
+def test_compiled_equals_reference_far_into_a_run() -> None:
+    """Counts beyond the table of corrections, a size that is no multiple of a vector, and tiny gradients."""
+    mine, theirs = tables(1003, 2), tables(1003, 2)
+    for state in (mine, theirs):
+        state[3][:500] = 5000
+        state[2][:] = 1e-20
+    for step in range(5):
+        grad = gradients(1003, 2, step) * 1e-12
+        sparse_adam(mine[0], grad.clone(), *mine[1:], 1e-2, BETAS, EPS)
+        sparse_adam_reference(theirs[0], grad.clone(), *theirs[1:], 1e-2, BETAS, EPS)
+    for a, b in zip(mine, theirs, strict=True):
+        assert relative_error(a, b) < 1e-5
+
+
+@needs_kernels
+def test_threads_give_the_same_bits() -> None:
+    before, found = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            state = tables(20_000, 2)
+            for step in range(3):
+                sparse_adam(state[0], gradients(20_000, 2, step), *state[1:], 1e-2, BETAS, EPS)
+            found.append(state)
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other, strict=True))
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("place", [0, 4999, 10_002])
+def test_all_finite_sees_a_single_bad_value(bad: float, place: int) -> None:
+    values = torch.randn(10_003)
+    assert all_finite(values)
+    values[place] = bad
+    assert not all_finite(values)
+    assert all_finite(torch.full((100,), 3e38))
+    assert all_finite(torch.zeros(0))

@@ -1,0 +1,148 @@
+"""Small networks: compiled against the reference in float64, and where they go wrong first."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from framework.fields.base import MLP
+from framework.kernels import native
+from framework.kernels.mlp import Activation, mlp, mlp_reference
+from tests.kernels.compiled import needs_kernels, relative_error
+
+SHAPES: list[tuple[tuple[int, ...], tuple[int, ...]]] = [
+    ((32,), (64, 16)),
+    ((16, 16), (64, 64, 3)),
+    ((3,), (1,)),
+    ((5, 1, 7), (17, 33, 2)),
+    ((128,), (128, 128)),
+    ((48,), (16, 96, 32, 16, 16, 16, 16, 80)),
+]
+
+
+def network(parts: tuple[int, ...], layers: tuple[int, ...], count: int, seed: int = 0):
+    """Inputs and weights of a random network."""
+    torch.manual_seed(seed)
+    inputs = [torch.randn(count, part) for part in parts]
+    widths = (sum(parts), *layers)
+    weights = [torch.randn(b, a) * (2 / a) ** 0.5 for a, b in zip(widths, widths[1:], strict=False)]
+    return inputs, weights
+
+
+def value_and_gradients(run: Callable, inputs, weights, activation: Activation, direction, dtype: torch.dtype):
+    leaves = [t.to(dtype).requires_grad_() for t in (*inputs, *weights)]
+    out = run(leaves[: len(inputs)], leaves[len(inputs) :], activation)
+    return [out, *torch.autograd.grad((out * direction.to(out.dtype)).sum(), leaves)]
+
+
+@needs_kernels
+@pytest.mark.parametrize("activation", ["none", "relu", "sigmoid"])
+@pytest.mark.parametrize(("parts", "layers"), SHAPES)
+@pytest.mark.parametrize("count", [1, 31, 32, 333])
+def test_equals_the_reference(parts, layers, count: int, activation: Activation) -> None:
+    inputs, weights = network(parts, layers, count)
+    direction = torch.randn(count, layers[-1])
+    direction[::3] = 0  # samples without a gradient are left out of the backward pass
+    truth = value_and_gradients(mlp_reference, inputs, weights, activation, direction, torch.float64)
+    found = value_and_gradients(mlp, inputs, weights, activation, direction, torch.float32)
+    for a, b in zip(found, truth, strict=True):
+        assert a.shape == b.shape
+        assert relative_error(a, b) < 2e-5
+
+
+@pytest.mark.skipif(not native.has("mlp_forward_bf16"), reason="this processor multiplies no bfloat16")
+@pytest.mark.parametrize(("parts", "layers"), SHAPES)
+def test_bfloat16_products_err_as_rounded_inputs_do(parts, layers) -> None:
+    """Every product of bfloat16 is off by 2^-8 at most; over the layers gradients must still point the same way."""
+    inputs, weights = network(parts, layers, 500)
+    direction = torch.randn(500, layers[-1])
+    truth = value_and_gradients(mlp_reference, inputs, weights, "none", direction, torch.float64)
+
+    def autocast(*arguments):
+        with torch.autocast("cpu", torch.bfloat16):
+            return mlp(*arguments)
+
+    found = value_and_gradients(autocast, inputs, weights, "none", direction, torch.float32)
+    assert relative_error(found[0], truth[0]) < 0.01 * len(layers)
+    for a, b in zip(found, truth, strict=True):
+        cosine = torch.nn.functional.cosine_similarity(a.double().flatten(), b.flatten(), dim=0).item()
+        assert cosine > 1 - 2e-3 * len(layers)
+        assert not torch.equal(a, b.float())  # it really was bfloat16
+
+
+@needs_kernels
+def test_extreme_inputs_stay_what_they_are() -> None:
+    inputs, weights = network((8,), (16, 4), 70)
+    for value in (0.0, 1e30, -1e30, 1e-40):
+        inputs[0][3] = value
+        assert relative_error(mlp(inputs, weights), mlp_reference([x.double() for x in inputs], [w.double() for w in weights])) < 2e-5  # noqa: E501
+    inputs[0][3, 2] = float("nan")
+    out = mlp(inputs, weights)
+    assert bool(out[3].isnan().all())
+    assert bool(out[:3].isfinite().all() & out[4:].isfinite().all())
+    saturated = mlp([torch.full((2, 1), 1e4) * torch.tensor([[1.0], [-1.0]])], [torch.ones(1, 1)], "sigmoid")
+    assert saturated.tolist() == [[1.0], [0.0]]
+
+
+@needs_kernels
+def test_threads_agree_and_repeat_bit_for_bit() -> None:
+    inputs, weights = network((32,), (64, 16), 1000)
+    direction = torch.randn(1000, 16)
+    before = torch.get_num_threads()
+    try:
+        found = {}
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            runs = [value_and_gradients(mlp, inputs, weights, "none", direction, torch.float32) for _ in range(2)]
+            assert all(torch.equal(a, b) for a, b in zip(*runs, strict=True))
+            found[threads] = runs[0]
+    finally:
+        torch.set_num_threads(before)
+    for threads in (2, 3):
+        assert all(relative_error(a, b) < 1e-5 for a, b in zip(found[threads], found[1], strict=True))
+
+
+def test_a_known_result_is_taken_and_gets_the_gradient() -> None:
+    inputs, weights = network((6,), (8, 5), 40)
+    leaves = [t.requires_grad_() for t in (*inputs, *weights)]
+    result = mlp(leaves[:1], leaves[1:])
+    direction = torch.randn(40, 5)
+    expected = torch.autograd.grad((result * direction).sum(), leaves)
+    again = mlp(leaves[:1], leaves[1:], "none", known=result.detach())
+    assert torch.equal(again, result)
+    for a, b in zip(torch.autograd.grad((again * direction).sum(), leaves), expected, strict=True):
+        torch.testing.assert_close(a, b)
+
+
+def test_gradcheck_and_second_derivatives_of_the_reference() -> None:
+    torch.manual_seed(0)
+    leaves = [torch.randn(4, 3, dtype=torch.float64, requires_grad=True)]
+    leaves += [torch.randn(5, 3, dtype=torch.float64, requires_grad=True)]
+    leaves += [torch.randn(2, 5, dtype=torch.float64, requires_grad=True)]
+    assert torch.autograd.gradcheck(lambda x, a, b: mlp([x], [a, b], "sigmoid"), leaves)
+    assert torch.autograd.gradgradcheck(lambda x, a, b: mlp_reference([x], [a, b], "sigmoid"), leaves)
+
+
+def test_empty_input_and_layers_too_wide_to_fuse() -> None:
+    inputs, weights = network((4,), (8, 2), 0)
+    out = mlp([inputs[0].requires_grad_()], [w.requires_grad_() for w in weights])
+    assert out.shape == (0, 2)
+    out.sum().backward()
+    assert all(w.grad is not None and not w.grad.any() for w in weights)
+    wide = MLP(200, 300, 5, bias=False)
+    x = torch.randn(10, 200)
+    torch.testing.assert_close(wide(x), mlp_reference([x], [wide[0].weight, wide[2].weight]))
+
+
+@pytest.mark.parametrize("activation", ["none", "relu", "sigmoid"])
+def test_biases_and_activations(activation: Activation) -> None:
+    net = MLP(4, 6, 3, activation=activation)
+    x = torch.randn(10, 4)
+    raw = torch.relu(x @ net[0].weight.t() + net[0].bias) @ net[2].weight.t() + net[2].bias
+    expected = {"none": raw, "relu": raw.relu(), "sigmoid": raw.sigmoid()}[activation]
+    torch.testing.assert_close(net(x[:, :1], x[:, 1:]), expected)
+
+
+def test_weights_that_do_not_fit_are_named() -> None:
+    with pytest.raises(ValueError, match=r"mlp: weights of shapes \(8, 5\), \(3, 8\) do not fit inputs of 4 features"):
+        mlp([torch.zeros(2, 4)], [torch.zeros(8, 5), torch.zeros(3, 8)])

@@ -1,0 +1,95 @@
+"""Finding the compiled library, and what is checked before an address leaves Python."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from framework.kernels import native
+from tests.kernels.compiled import needs_kernels
+
+GOOD = torch.zeros(4, 3)
+
+
+@pytest.mark.parametrize(
+    ("tensor", "message"),
+    [
+        (GOOD.double(), "the table is of type torch.float64, not torch.float32"),
+        (GOOD[:3], r"the table has shape \(3, 3\), not \(4, 3\)"),
+        (torch.zeros(3, 4).t(), "the table is not contiguous"),
+        (torch.zeros(4, 3, device="meta"), "the table is on meta, not on the processor"),
+    ],
+)
+def test_pointer_names_what_is_wrong(tensor: torch.Tensor, message: str) -> None:
+    assert native.pointer(GOOD, "the table", (4, 3)) == GOOD.data_ptr()
+    with pytest.raises(ValueError, match=message):
+        native.pointer(tensor, "the table", (4, 3))
+
+
+def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    import os
+
+    run = [sys.executable, "-c", code]
+    return subprocess.run(run, env=os.environ | environment, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_the_reference_can_be_asked_for() -> None:
+    code = "from framework.kernels import native; print(native.variant(), native.available())"
+    assert python(code, NERFLOOM_KERNELS="reference").stdout.split() == ["reference", "False"]
+
+
+def test_an_unknown_variant_is_an_error_that_lists_the_known() -> None:
+    done = python("from framework.kernels import native; native.variant()", NERFLOOM_KERNELS="sse9")
+    assert done.returncode == 1
+    assert "NERFLOOM_KERNELS is 'sse9'; it must be one of auto, reference, avx512_bf16, avx512" in done.stderr
+
+
+def test_a_missing_library_is_said_once_and_torch_goes_on(tmp_path) -> None:
+    code = (
+        "from pathlib import Path\n"
+        "from framework.kernels import native\n"
+        f"native.FOLDER = Path({str(tmp_path)!r})\n"
+        "from framework.kernels.mlp import mlp\n"
+        "import torch\n"
+        "for _ in range(3): out = mlp([torch.ones(2, 3)], [torch.ones(1, 3)])\n"
+        "print(out.tolist())"
+    )
+    done = python(code, NERFLOOM_KERNELS="auto")
+    assert done.returncode == 0
+    said = done.stdout + done.stderr
+    assert said.count("without its compiled kernels") == 1
+    assert "[[3.0], [3.0]]" in said
+    broken = python(code, NERFLOOM_KERNELS="avx2")
+    assert broken.returncode == 1
+    assert "NERFLOOM_KERNELS asks for 'avx2'" in broken.stderr
+
+
+@needs_kernels
+def test_a_function_that_is_not_there() -> None:
+    assert not native.has("no_such_kernel")
+    with pytest.raises(AttributeError):
+        native.function("no_such_kernel", "")()
+
+
+@needs_kernels
+@pytest.mark.parametrize("variant", [name for name, needs in native.NEEDS.items()])
+def test_every_variant_that_fits_this_processor_gives_the_same_answer(variant: str) -> None:
+    if not native.processor_features().issuperset(native.NEEDS[variant]):
+        pytest.skip(f"this processor has no {variant}")
+    code = (
+        "import torch\n"
+        "from framework.kernels import native\n"
+        "from framework.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference\n"
+        "from framework.kernels.mlp import mlp, mlp_reference\n"
+        "torch.manual_seed(0)\n"
+        "layout = HashGridLayout.build(4, 4, 64, 10)\n"
+        "x, table = torch.rand(99, 3), torch.randn(layout.num_entries, 2)\n"
+        "encoded = hash_grid(x, table, layout)\n"
+        "error = (encoded - hash_grid_reference(x, table, layout)).abs().max()\n"
+        "weights = [torch.randn(20, 8), torch.randn(3, 20)]\n"
+        "other = (mlp([encoded], weights) - mlp_reference([encoded], weights)).abs().max()\n"
+        "print(native.variant(), bool(error < 1e-5), bool(other < 1e-4))"
+    )
+    done = python(code, NERFLOOM_KERNELS=variant)
+    assert done.stdout.split() == [variant, "True", "True"], done.stderr

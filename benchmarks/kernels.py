@@ -1,9 +1,10 @@
-"""Time per sample and error of each fast path against its torch reference, in one process, in alternating runs.
+"""Time per sample and error of each compiled kernel against its torch reference, in one process, in alternating runs.
 
     python benchmarks/kernels.py [--samples N] [--repeats K]
 
-writes benchmarks/results/kernels.json with the machine and versions. Times are medians; the ratio is the median of
-the ratios of neighbouring runs, which a machine whose speed drifts disturbs least.
+writes benchmarks/results/kernels-VARIANT.json with the machine, its measured ceilings and versions. Times are medians;
+the speed-up is the median of the ratios of neighbouring runs, which a machine whose speed drifts disturbs least.
+NERFLOOM_KERNELS=avx2 in the environment forces that variant.
 """
 
 from __future__ import annotations
@@ -12,55 +13,231 @@ import argparse
 import json
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from statistics import median
 
 import torch
 from torch import Tensor
 
+from framework.kernels import native
+from framework.kernels.adam import sparse_adam, sparse_adam_reference
+from framework.kernels.compositing import composite, composite_reference
 from framework.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
+from framework.kernels.march import March, Occupancy, ReferenceMarch
+from framework.kernels.mlp import mlp, mlp_reference
+from framework.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
+from framework.rays import Rays, Samples
 
-RESULTS = Path(__file__).parent / "results" / "kernels.json"
-
-
-def seconds(function: Callable[[], object]) -> float:
-    """Wall time of one call."""
-    start = time.perf_counter()
-    function()
-    return time.perf_counter() - start
+RESULTS = Path(__file__).parent / "results"
+BOX = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
 
 
-def forward_backward(encode: Callable[..., Tensor], positions: Tensor, table: Tensor, layout: HashGridLayout) -> None:
-    """One training step's worth of encoding."""
-    table.grad = None
-    encode(positions, table, layout).sum().backward()
+@dataclass(frozen=True)
+class Row:
+    """One kernel: run(function, inputs) for the compiled and the reference function on the same inputs."""
+
+    name: str
+    samples: int
+    inputs: list[Tensor]
+    compiled: Callable[..., Tensor]
+    reference: Callable[..., Tensor]
+    differentiable: bool = True
 
 
-def hash_grid_row(samples: int, repeats: int, log2_table_size: int) -> dict[str, object]:
-    """The hash grid with 16 levels of 2 features, finest 1024."""
+def rays_and_positions(count: int) -> tuple[Rays, Tensor]:
+    """Rays through the unit box, 16 points close together on each: what a trained scene's samples look like."""
+    origins = torch.nn.functional.normalize(torch.randn(count // 16, 3), dim=-1) * 2 + 0.5
+    directions = torch.nn.functional.normalize(torch.rand(count // 16, 3) - origins, dim=-1)
+    rays = Rays(origins, directions, torch.zeros(count // 16), torch.full((count // 16,), 9.0))
+    t = (2 + torch.rand(count // 16, 1) - 0.5) + torch.arange(16) * 0.003
+    positions = origins[:, None] + t[..., None] * directions[:, None]
+    return rays, positions.reshape(-1, 3).clamp(0, 1)
+
+
+def rows(count: int) -> Iterator[Row]:
+    """Every kernel that has a value per sample."""
     torch.manual_seed(0)
-    layout = HashGridLayout.build(16, 16, 1024, log2_table_size)
-    positions = torch.rand(samples, 3)
-    table = torch.randn(layout.num_entries, 2, requires_grad=True)
-    times: dict[str, list[float]] = {"fast": [], "reference": []}
+    _, positions = rays_and_positions(count)
+    for log2 in (15, 17, 19):
+        layout = HashGridLayout.build(16, 16, 1024, log2)
+        table = torch.randn(layout.num_entries, 2)
+        yield Row(
+            f"hash grid, 16 levels x 2, tables of 2^{log2}",
+            count,
+            [positions, table],
+            lambda x, t, layout=layout: hash_grid(x.detach(), t, layout),
+            lambda x, t, layout=layout: hash_grid_reference(x.detach(), t, layout),
+        )
+    layout = HashGridLayout.build(16, 16, 1024, 17)
+    yield Row(
+        "hash grid, gradient of positions too, 2^17",
+        count,
+        [positions, torch.randn(layout.num_entries, 2)],
+        lambda x, t: hash_grid(x, t, layout),
+        lambda x, t: hash_grid_reference(x, t, layout),
+    )
+    for name, widths, activation in (("32-64-16", (32, 64, 16), "none"), ("32-64-64-3", (32, 64, 64, 3), "sigmoid")):
+        inputs = [torch.randn(count, widths[0])]
+        inputs += [torch.randn(b, a) * (2 / a) ** 0.5 for a, b in pairwise(widths)]
+        for kind in ("float32", "bfloat16") if native.has("mlp_forward_bf16") else ("float32",):
+            yield Row(
+                f"network {name}, {kind}",
+                count,
+                inputs,
+                lambda x, *w, a=activation, k=kind: _autocast(k, lambda: mlp([x], w, a)),
+                lambda x, *w, a=activation: mlp_reference([x], w, a),
+            )
+    offsets = torch.arange(0, count + 1, 16)
+    starts = (torch.rand(count // 16, 1) + torch.arange(16) * 0.01).reshape(-1)
+    samples = Samples(starts, starts + 0.01, offsets)
+    background, fars = torch.rand(count // 16, 3), torch.full((count // 16,), 9.0)
+    yield Row(
+        "compositing, 16 samples a ray",
+        count,
+        [torch.rand(count) * 50, torch.rand(count, 3)],
+        lambda s, c: composite(samples, s, c, background, fars).color,
+        lambda s, c: composite_reference(_like(samples, s), s, c, background.to(s), fars.to(s)).color,
+    )
+    directions = torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
+    yield Row(
+        "spherical harmonics, 4 bands",
+        count,
+        [directions],
+        lambda d: spherical_harmonics(d.detach()),
+        lambda d: spherical_harmonics_reference(d.detach()),
+        differentiable=False,
+    )
+
+
+def _autocast(kind: str, run: Callable[[], Tensor]) -> Tensor:
+    with torch.autocast("cpu", torch.bfloat16, enabled=kind == "bfloat16"):
+        return run()
+
+
+def _like(samples: Samples, values: Tensor) -> Samples:
+    return Samples(samples.t_starts.to(values), samples.t_ends.to(values), samples.offsets)
+
+
+def timed(row: Row, repeats: int) -> dict[str, object]:
+    """Forward alone and forward with backward, compiled and reference in turn, on 1 thread and on all."""
+    out: dict[str, object] = {"kernel": row.name, "samples": row.samples}
+    for threads in sorted({1, native_threads}):
+        torch.set_num_threads(threads)
+        times: dict[str, list[float]] = {}
+        for repeat in range(repeats + 1):
+            for name, function in (("compiled", row.compiled), ("reference", row.reference)):
+                leaves = [t.clone().requires_grad_(row.differentiable) for t in row.inputs]
+                start = time.perf_counter()
+                value = function(*leaves)
+                middle = time.perf_counter()
+                if row.differentiable:
+                    value.sum().backward()
+                end = time.perf_counter()
+                if repeat:  # the first is a warm-up
+                    times.setdefault(f"{name} forward", []).append(middle - start)
+                    times.setdefault(f"{name} backward", []).append(end - middle)
+        for name, spent in times.items():
+            if row.differentiable or name.endswith("forward"):
+                out[f"{name}, ns per sample, {threads} threads"] = round(median(spent) / row.samples * 1e9, 1)
+        slow = [a + b for a, b in zip(times["reference forward"], times["reference backward"], strict=True)]
+        fast = [a + b for a, b in zip(times["compiled forward"], times["compiled backward"], strict=True)]
+        out[f"speed-up, {threads} threads"] = round(median(a / b for a, b in zip(slow, fast, strict=True)), 1)
+    out |= errors(row)
+    return out
+
+
+def errors(row: Row) -> dict[str, float]:
+    """Largest error of the value, and of all gradients, over the largest value of the truth in float64."""
+    found = []
+    for function, kind in ((row.compiled, torch.float32), (row.reference, torch.float64)):
+        leaves = [t.to(kind).requires_grad_(row.differentiable) for t in row.inputs]
+        value = function(*leaves)
+        if row.differentiable:
+            (value * torch.linspace(-1, 1, value.numel()).view_as(value).to(kind)).sum().backward()
+        found.append([value.detach(), *(leaf.grad for leaf in leaves if leaf.grad is not None)])
+    relative = [
+        ((a.double() - b).abs().max() / b.abs().max()).item() for a, b in zip(*found, strict=True) if b.abs().max() > 0
+    ]
+    return {"error of the value": relative[0], "largest error of a gradient": max(relative[1:], default=0.0)}
+
+
+def marching(repeats: int) -> dict[str, object]:
+    """All samples of 8192 rays through a grid of which 3 % are occupied."""
+    torch.manual_seed(0)
+    rays, _ = rays_and_positions(8192 * 16)
+    centers = (torch.cartesian_prod(*[torch.arange(128)] * 3) + 0.5) / 128 - 0.5
+    grid = Occupancy.of((centers.norm(dim=-1) - 0.3).abs() < 0.015, BOX, 128)
+    times: dict[str, list[float]] = {"compiled": [], "reference": []}
+    found = 0
     for repeat in range(repeats + 1):
-        for name, encode in (("fast", hash_grid), ("reference", hash_grid_reference)):
-            spent = seconds(lambda encode=encode: forward_backward(encode, positions, table, layout))  # type: ignore[misc]
-            if repeat:  # the first is a warm-up
-                times[name].append(spent)
-    ratios = [slow / fast for fast, slow in zip(times["fast"], times["reference"], strict=True)]
-    truth = hash_grid_reference(positions[:4096].double(), table.detach().double(), layout)
-    error = (hash_grid(positions[:4096], table.detach(), layout).double() - truth).abs().max() / truth.abs().max()
+        for name, kind in (("compiled", March), ("reference", ReferenceMarch)):
+            start = time.perf_counter()
+            march, found = kind(rays, grid, 3**0.5 / 512, 0.0, None, 1e-4), 0
+            while (wave := march.wave(16)) is not None:
+                march.advance(torch.zeros_like(wave.t_starts))
+                found += len(wave.t_starts)
+            if repeat:
+                times[name].append(time.perf_counter() - start)
     return {
-        "kernel": f"hash grid, 16 levels x 2, tables of 2^{log2_table_size}",
-        "samples": samples,
-        "fast_ns_per_sample": round(median(times["fast"]) / samples * 1e9, 1),
-        "reference_ns_per_sample": round(median(times["reference"]) / samples * 1e9, 1),
-        "speed_up": round(median(ratios), 2),
-        "speed_up_range": [round(min(ratios), 2), round(max(ratios), 2)],
-        "largest_error_relative_to_largest_value": float(error),
+        "kernel": f"marching, {len(rays)} rays, {found} samples, ns per ray",
+        **{name: round(median(spent) / len(rays) * 1e9) for name, spent in times.items()},
+        "speed-up": round(median(r / c for c, r in zip(times["compiled"], times["reference"], strict=True)), 1),
     }
+
+
+def updating(repeats: int) -> dict[str, object]:
+    """Sparse Adam on a table of which half of the entries have a gradient, ns per updated entry."""
+    torch.manual_seed(0)
+    entries = 2**19
+    grad = torch.randn(entries, 2) * (torch.rand(entries, 1) < 0.5)
+    times: dict[str, list[float]] = {"compiled": [], "reference": []}
+    updated = 0
+    for name, update in (("compiled", sparse_adam), ("reference", sparse_adam_reference)):
+        state = [torch.zeros(entries, 2), torch.zeros(entries, 2), torch.zeros(entries)]
+        values = torch.randn(entries, 2)
+        for repeat in range(repeats + 1):
+            mine = grad.clone()
+            start = time.perf_counter()
+            updated = update(values, mine, *state, 1e-2, (0.9, 0.95), 1e-15)
+            if repeat:
+                times[name].append(time.perf_counter() - start)
+    return {
+        "kernel": f"sparse Adam, {updated} of {entries} entries x 2, ns per updated entry",
+        **{name: round(median(spent) / updated * 1e9, 2) for name, spent in times.items()},
+        "speed-up": round(median(times["reference"]) / median(times["compiled"]), 1),
+    }
+
+
+def ceilings() -> dict[str, float]:
+    """What this machine can do at all, measured now with torch, on all threads."""
+    torch.set_num_threads(native_threads)
+
+    def best(run: Callable[[], object]) -> float:
+        spent = []
+        for _ in range(8):
+            start = time.perf_counter()
+            run()
+            spent.append(time.perf_counter() - start)
+        return min(spent)
+
+    source = torch.rand(2**25)
+    target = torch.empty_like(source)
+    a, b = torch.rand(1024, 1024), torch.rand(1024, 1024)
+    out = {
+        "copy, GB/s": 2 * source.numel() * 4 / best(lambda: target.copy_(source)) / 1e9,
+        "float32 matrix product, GFLOP/s": 2 * 1024**3 / best(lambda: a @ b) / 1e9,
+    }
+    half_a, half_b = a.bfloat16(), b.bfloat16()
+    out["bfloat16 matrix product, GFLOP/s"] = 2 * 1024**3 / best(lambda: half_a @ half_b) / 1e9
+    for megabytes in (1, 8, 64):
+        table = torch.rand(megabytes * 2**17, 2)
+        index = torch.randint(len(table), (2**20,))
+        seconds = best(lambda table=table, index=index: table.index_select(0, index))  # type: ignore[misc]
+        out[f"gather of 8 bytes from {megabytes} MB, G/s"] = 2**20 / seconds / 1e9
+    return {name: round(value, 3) for name, value in out.items()}
 
 
 def main() -> None:
@@ -69,17 +246,28 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=2**15)
     parser.add_argument("--repeats", type=int, default=9)
     flags = parser.parse_args()
-    rows = [hash_grid_row(flags.samples, flags.repeats, size) for size in (15, 17, 19)]
-    for row in rows:
-        print(row)
+    limits = ceilings()
+    print(limits)
+    table = []
+    for row in rows(flags.samples):
+        table.append(timed(row, flags.repeats))
+        print(table[-1], flush=True)
+    torch.set_num_threads(native_threads)
+    for extra in (marching(flags.repeats), updating(flags.repeats)):
+        table.append(extra)
+        print(extra, flush=True)
     machine = {
+        "kernels": native.variant(),
         "processor": platform.processor() or platform.machine(),
-        "threads": torch.get_num_threads(),
+        "threads": native_threads,
         "torch": torch.__version__,
         "python": platform.python_version(),
     }
-    RESULTS.write_text(json.dumps({"machine": machine, "rows": rows}, indent=2) + "\n")
+    content = {"machine": machine, "ceilings": limits, "rows": table}
+    (RESULTS / f"kernels-{native.variant()}.json").write_text(json.dumps(content, indent=2) + "\n")
 
+
+native_threads = torch.get_num_threads()
 
 if __name__ == "__main__":
     main()

@@ -100,6 +100,10 @@ class TrainConfig:
     machine: MachineConfig = field(default_factory=MachineConfig)
     """Seed, device and threads."""
 
+    def resolved(self) -> TrainConfig:
+        """The settings with what depends on other settings filled in, as they are written to config.yml."""
+        return self
+
     def __post_init__(self) -> None:
         for name in (
             "max_num_iterations",

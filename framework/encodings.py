@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-from framework.kernels.hash_grid import HashGridLayout, Pending, add_table_gradient, hash_grid
+from framework.kernels.hash_grid import HashGridLayout, TableGradient, hash_grid
 from framework.kernels.memory import table
 
 
@@ -16,8 +16,8 @@ class HashGrid(nn.Module):
         features_per_level: F.
         base_resolution, max_resolution: cells along an axis at the first and last level.
         log2_table_size: largest table of one level, as a power of two.
-        sparse: updates touch only the entries that a step used. The table's gradient is then collected, and added
-            to `table.grad` all at once by `collect_gradient`, which the optimiser calls.
+        sparse: updates touch only the entries that a step used. Compiled, the table's gradient then waits in
+            `deferred` for the optimiser, and `table.grad` stays None.
     """
 
     def __init__(
@@ -30,20 +30,12 @@ class HashGrid(nn.Module):
         sparse: bool = False,
     ) -> None:
         super().__init__()
-        self.sparse = sparse
-        self._pending: Pending = []
         self.layout = HashGridLayout.build(num_levels, base_resolution, max_resolution, log2_table_size)
         # Small random values, as in the paper's section 4: features start near zero but not alike.
         self.table = nn.Parameter(table(self.layout.num_entries, features_per_level).uniform_(-1e-4, 1e-4))
+        self.deferred = TableGradient(self.layout) if sparse else None
         self.num_features = num_levels * features_per_level
 
     def forward(self, positions: Tensor, known: Tensor | None = None) -> Tensor:
         """Positions (N, 3) in [0, 1] to features (N, L * F), which may be `known` already (see `hash_grid`)."""
-        return hash_grid(positions, self.table, self.layout, self._pending if self.sparse else None, known)
-
-    def collect_gradient(self) -> None:
-        """Add what the backward pass left to the table's gradient (`table.grad`, which has to be allocated)."""
-        if self._pending:
-            assert self.table.grad is not None
-            add_table_gradient(self._pending, self.table.grad, self.layout)
-            self._pending.clear()
+        return hash_grid(positions, self.table, self.layout, self.deferred, known)

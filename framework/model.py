@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -50,21 +51,20 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
 
         By default the tables of hash grids that ask for it are a group that is updated sparsely.
         """
-        tables = [module.table for module in self.modules() if isinstance(module, HashGrid) and module.sparse]
-        rest = [p for p in self.parameters() if not any(p is table for table in tables)]
+        grids = self.sparse_grids
+        rest = [p for p in self.parameters() if not any(p is grid.table for grid in grids)]
         groups: list[dict[str, Any]] = [{"params": rest, "name": "networks"}]
-        return groups + ([{"params": tables, "name": "tables", "sparse": True}] if tables else [])
+        return groups + ([{"params": [g.table for g in grids], "name": "tables", "sparse": True}] if grids else [])
+
+    @cached_property
+    def sparse_grids(self) -> list[HashGrid]:
+        """Hash grids whose tables are updated sparsely."""
+        return [module for module in self.modules() if isinstance(module, HashGrid) and module.deferred is not None]
 
     @property
     def occupancy_samplers(self) -> list[OccupancySampler]:
         """The grids that the photographs' silhouettes can empty before the first step."""
         return [module for module in self.modules() if isinstance(module, OccupancySampler)]
-
-    def collect_gradients(self) -> None:
-        """End of the backward pass: add what kernels left to be added all at once."""
-        for grid in self.modules():
-            if isinstance(grid, HashGrid):
-                grid.collect_gradient()
 
     def before_step(self, step: int) -> None:
         """Schedules that are functions of `step`, and refreshing what samplers know."""

@@ -81,12 +81,14 @@ def _gather_compiled(dataset: Dataset, flat: Tensor, behind: Tensor) -> Batch:
     channels = dataset.pixels.shape[1]
     origins, directions, rgb = (torch.empty(count, 3) for _ in range(3))
     radii, alpha, indices = torch.empty(count), torch.empty(count), torch.empty(count, dtype=torch.int64)
-    intrinsics = [native.pointer(getattr(cameras, name), name, (images,)) for name in ("fx", "fy", "cx", "cy")]
+    poses, widths = cameras.camera_to_worlds.contiguous(), cameras.widths.contiguous()
+    numbers = {name: getattr(cameras, name).contiguous() for name in ("fx", "fy", "cx", "cy")}
+    intrinsics = [native.pointer(values, name, (images,)) for name, values in numbers.items()]
     _draw(
         native.pointer(flat, "pixel indices", (count,), torch.int64), count,
         native.pointer(dataset.offsets, "offsets", (images + 1,), torch.int64), images,
-        native.pointer(cameras.widths, "widths", (images,), torch.int64),
-        native.pointer(cameras.camera_to_worlds, "poses", (images, 3, 4)), *intrinsics,
+        native.pointer(widths, "widths", (images,), torch.int64),
+        native.pointer(poses, "poses", (images, 3, 4)), *intrinsics,
         native.pointer(dataset.pixels, "pixels", (len(dataset.pixels), channels), torch.uint8), channels,
         native.pointer(behind, "the background", (count, 3)), origins.data_ptr(), directions.data_ptr(),
         radii.data_ptr(), indices.data_ptr(), rgb.data_ptr(), alpha.data_ptr(), native.threads(),

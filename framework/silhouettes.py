@@ -50,7 +50,7 @@ class Silhouettes:
         safe = nearest.clamp(min=1e-6)
         local = (centers - pose[:, 3]) @ pose[:, :2]
         fx, fy, cx, cy = (float(values[image]) for values in (cameras.fx, cameras.fy, cameras.cx, cameras.cy))
-        column, row = local[:, 0] / safe * (nearest / depth) * fx + cx, -local[:, 1] / safe * (nearest / depth) * fy + cy
+        column, row = cx + fx * local[:, 0] / depth, cy - fy * local[:, 1] / depth
         # A ball at an angle to the axis is seen as an ellipse, at most 1 / cos^2 as long as its height is wide.
         slant = 1 + (local / safe[:, None]).square().sum(-1)
         reach = radius / safe * max(fx, fy) * slant

@@ -5,7 +5,8 @@ Mueller et al., "Instant Neural Graphics Primitives with a Multiresolution Hash 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from torch import Tensor
@@ -16,6 +17,14 @@ from framework.fields.hash import HashField
 from framework.renderers import render_field
 from framework.samplers.occupancy import OccupancySampler
 
+PLANS = (
+    (60.0, 16, 512, 2**15, 1e-2),
+    (150.0, 17, 512, 2**15, 3e-3),
+    (math.inf, 18, 1024, 2**16, 1e-3),
+)
+"""What suits how much time: seconds of training at most, log2 of the table size, steps along the diagonal, samples a
+step, early stop in training. Small tables, batches and rays learn fastest; large ones get further."""
+
 
 @dataclass(frozen=True)
 class InstantNGPConfig(TrainConfig):
@@ -23,11 +32,12 @@ class InstantNGPConfig(TrainConfig):
 
     max_num_iterations: int = 20_000
     num_rays_per_batch: int = 8_192
-    samples_per_batch: int | None = 2**15
+    samples_per_batch: int | None = None
+    """Samples in a training step, the number of rays following. If not given: what suits the time (see `PLANS`)."""
     learning_rate: float = 1e-2
     lr_schedule: Literal["constant", "exponential", "cosine", "hold-exponential"] = "hold-exponential"
     lr_final: float = 0.02
-    adam_beta2: float = 0.99
+    adam_beta2: float = 0.95
     adam_eps: float = 1e-15
     num_levels: int = 16
     """Resolutions of the hash grid."""
@@ -36,19 +46,32 @@ class InstantNGPConfig(TrainConfig):
     base_resolution: int = 16
     """Cells along an axis at the coarsest level."""
     max_resolution: int | None = None
-    """Cells along an axis at the finest level. If not given: a power of two, at least twice the images' longer side."""
-    log2_table_size: int = 17
-    """Entries of a level's table at most, as a power of two."""
+    """Cells along an axis at the finest level. If not given: a power of two, at least the images' longer side."""
+    log2_table_size: int | None = None
+    """Entries of a level's table at most, as a power of two. If not given: what suits the time."""
     sparse_updates: bool = True
     """Adam updates only the table entries that a step used."""
     hidden_width: int = 64
     """Features of a layer of the two networks."""
     grid_resolution: int = 128
     """Cells along an axis of the occupancy grid."""
-    num_steps: int = 512
-    """Steps along the box's diagonal."""
+    num_steps: int | None = None
+    """Steps along the box's diagonal. If not given: what suits the time."""
     early_stop: float = 1e-4
-    """Transmittance below which the rest of a ray is dropped."""
+    """Transmittance below which the rest of a ray is dropped: the largest error of a colour channel."""
+    train_early_stop: float | None = None
+    """The same while training. If not given: what suits the time."""
+
+    def resolved(self) -> InstantNGPConfig:
+        seconds = math.inf if self.max_seconds is None else self.max_seconds
+        _, log2_table_size, num_steps, samples, stop = next(plan for plan in PLANS if seconds <= plan[0])
+        return replace(
+            self,
+            log2_table_size=self.log2_table_size or log2_table_size,
+            num_steps=self.num_steps or num_steps,
+            samples_per_batch=self.samples_per_batch or samples,
+            train_early_stop=stop if self.train_early_stop is None else self.train_early_stop,
+        )
 
 
 class InstantNGP(Model[InstantNGPConfig]):
@@ -56,7 +79,9 @@ class InstantNGP(Model[InstantNGPConfig]):
 
     def __init__(self, config: InstantNGPConfig, scene: Scene) -> None:
         super().__init__(config, scene)
-        finest = config.max_resolution or 2 ** (2 * scene.image_size - 1).bit_length()
+        assert config.log2_table_size is not None
+        assert config.num_steps is not None
+        finest = config.max_resolution or 2 ** (scene.image_size - 1).bit_length()
         grid = HashGrid(
             config.num_levels,
             config.features_per_level,
@@ -67,7 +92,12 @@ class InstantNGP(Model[InstantNGPConfig]):
         )
         self.field = HashField(scene.box, grid, config.hidden_width)
         self.sampler = OccupancySampler(
-            scene.box, config.grid_resolution, config.num_steps, config.early_stop, moving=scene.moving
+            scene.box,
+            config.grid_resolution,
+            config.num_steps,
+            config.early_stop,
+            config.train_early_stop,
+            moving=scene.moving,
         )
 
     def render(self, rays: Rays, background: Tensor) -> Rendered:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from framework.console import say
 from framework.dataset import Dataset, Split, load_dataset
 from framework.device import choose_device, peak_memory
@@ -9,7 +11,8 @@ from framework.errors import DataError
 from framework.evaluation.evaluator import evaluate
 from framework.training.checkpoint import FOLDER, load_newest
 from framework.training.report import write_evaluation
-from framework.training.run import Run, create_folder, write_transforms
+from framework.training.run import Run, create_folder, write_json, write_transforms
+from framework.training.skipping import as_plain, skip_report
 from framework.training.trainer import Trainer
 
 PICTURES = 4
@@ -17,6 +20,7 @@ PICTURES = 4
 
 def start(run: Run) -> None:
     """Train a new run."""
+    run = replace(run, config=run.config.resolved())
     trainer = _prepare(run)
     trainer.restore_as_configured()
     create_folder(run)
@@ -60,6 +64,10 @@ def _finish(run: Run, trainer: Trainer) -> None:
         f"{peak_memory(trainer.device) / 2**30:.2f} GiB at most"
         + (f", {state.skipped} steps skipped as not finite" if state.skipped else "")
     )
+    rungs = skip_report(trainer)
+    for rung in rungs:
+        say(rung.line())
+    write_json(run.folder / "skip_report.json", as_plain(rungs))
     say(f"checkpoint: {outcome.checkpoint}")
     if outcome.interrupted:
         say(f"continue with: ns-train --resume {run.folder}")

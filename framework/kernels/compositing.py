@@ -81,9 +81,7 @@ class Composited(NamedTuple):
     """(N,)"""
 
 
-def composite_reference(
-    samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor, fars: Tensor
-) -> Composited:
+def composite_reference(samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor, fars: Tensor) -> Composited:
     """The sums in torch: the truth, in any float type. Arguments as for `composite`."""
     weights, transmittance = weights_and_transmittance(sigma, samples)
     opacity = ray_sum(weights, samples)
@@ -158,10 +156,8 @@ def composite(samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor, 
     background = background.expand(samples.num_rays, 3)
     tensors = (sigma, rgb, samples.t_starts, samples.t_ends, samples.points, background, fars)
     if native.usable(*tensors) and not any(t is not None and t.requires_grad for t in tensors[2:]):
-        sigma, rgb, starts, ends, points, background, fars = (
-            None if t is None else t.contiguous() for t in tensors
-        )  # type: ignore[assignment]
-        return Composited(*_Composite.apply(sigma, rgb, starts, ends, points, samples.offsets, background, fars))
+        inputs = [None if t is None else t.contiguous() for t in tensors]
+        return Composited(*_Composite.apply(*inputs[:5], samples.offsets, *inputs[5:]))
     return composite_reference(samples, sigma, rgb, background, fars)
 
 

@@ -15,9 +15,8 @@ import torch
 from torch import Tensor
 
 from framework.kernels import native
+from framework.kernels.adam import all_finite
 
-Pending = list[tuple[Tensor, Tensor]]
-"""Positions (N, 3) and incoming gradient (N, L * F) of each encoding whose table gradient is still to be added."""
 PRIMES = (1, 2654435761, 805459861)
 
 
@@ -107,6 +106,53 @@ def hash_grid_reference(positions: Tensor, table: Tensor, layout: HashGridLayout
 _forward = native.function("hash_grid_forward", "pqpippipi", "i")
 _backward_table = native.function("hash_grid_backward_table", "pppiippipi", "i")
 _backward_positions = native.function("hash_grid_backward_positions", "pqppippipi", "i")
+_adam = native.function("hash_grid_adam", "pppiippippppfddfi", "q")
+
+
+class TableGradient:
+    """A table's gradient that is not added up yet: what the backward passes of several encodings left.
+
+    A step touches few entries. Adding them up level by level, with Adam at once on each, makes one pass over the
+    table where autograd's dense gradient makes many.
+    """
+
+    def __init__(self, layout: HashGridLayout) -> None:
+        self.layout = layout
+        self.parts: list[tuple[Tensor, Tensor]] = []
+        """Positions (N, 3) and incoming gradient (N, L * F) of each encoding."""
+
+    def finite(self) -> bool:
+        """Whether no incoming gradient is infinite or NaN."""
+        return all(all_finite(grad) for _, grad in self.parts)
+
+    def _arguments(self, features: int) -> tuple[Any, ...]:
+        ends = tuple(accumulate(len(positions) for positions, _ in self.parts))
+        positions = [native.pointer(x, "positions", (len(x), 3)) for x, _ in self.parts]
+        width = self.layout.num_levels * features
+        grads = [native.pointer(g, "the gradient", (len(x), width)) for x, g in self.parts]
+        layout = (*self.layout.arrays, self.layout.num_levels)
+        return native.pointers(positions), native.pointers(grads), native.integers(ends), len(ends), features, *layout
+
+    def add_to(self, grad: Tensor) -> None:
+        """Add it all to `grad` (E, F), and forget it."""
+        shape = (self.layout.num_entries, grad.shape[1])
+        into = native.pointer(grad, "the table's gradient", shape)
+        _backward_table(*self._arguments(shape[1]), into, native.threads())
+        self.parts.clear()
+
+    def adam(
+        self, table: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
+        rate: float, betas: tuple[float, float], eps: float,
+    ) -> int:  # fmt: skip
+        """One step of `framework.kernels.adam.sparse_adam` with this gradient, which is forgotten then."""
+        shape = (self.layout.num_entries, table.shape[1])
+        updated = _adam(
+            *self._arguments(shape[1]), native.pointer(table, "the table", shape), native.pointer(mean, "mean", shape),
+            native.pointer(square, "square", shape), native.pointer(seen, "seen", shape[:1]), rate, *betas, eps,
+            native.threads(),
+        )  # fmt: skip
+        self.parts.clear()
+        return updated
 
 
 class _HashGrid(torch.autograd.Function):
@@ -118,7 +164,7 @@ class _HashGrid(torch.autograd.Function):
         positions: Tensor,
         table: Tensor,
         layout: HashGridLayout,
-        pending: Pending | None,
+        deferred: TableGradient | None,
         known: Tensor | None,
     ) -> Tensor:
         count, features = len(positions), table.shape[1]
@@ -132,7 +178,7 @@ class _HashGrid(torch.autograd.Function):
                 points, count, entries, features, *layout.arrays, layout.num_levels, out.data_ptr(), native.threads()
             )
         ctx.save_for_backward(positions, table)
-        ctx.layout, ctx.pending = layout, pending
+        ctx.layout, ctx.deferred = layout, deferred
         return out
 
     @staticmethod
@@ -143,11 +189,13 @@ class _HashGrid(torch.autograd.Function):
         grad = grad.contiguous()
         incoming = native.pointer(grad, "the gradient", (count, layout.num_levels * features))
         grad_positions = grad_table = None
-        if ctx.needs_input_grad[1] and ctx.pending is not None:
-            ctx.pending.append((positions, grad))
+        if ctx.needs_input_grad[1] and ctx.deferred is not None:
+            ctx.deferred.parts.append((positions, grad))
         elif ctx.needs_input_grad[1]:
             grad_table = torch.zeros_like(table)
-            add_table_gradient([(positions, grad)], grad_table, layout)
+            alone = TableGradient(layout)
+            alone.parts.append((positions, grad))
+            alone.add_to(grad_table)
         if ctx.needs_input_grad[0]:
             grad_positions = torch.empty_like(positions)
             _backward_positions(
@@ -157,30 +205,11 @@ class _HashGrid(torch.autograd.Function):
         return grad_positions, grad_table, None, None, None
 
 
-def add_table_gradient(parts: Pending, into: Tensor, layout: HashGridLayout) -> None:
-    """Add the table's gradient of several encodings, as one: a large batch finds more of the table in cache.
-
-    Args:
-        parts: positions (N, 3) and incoming gradient (N, L * F) of each.
-        into: (E, F).
-    """
-    features = into.shape[1]
-    ends = tuple(accumulate(len(positions) for positions, _ in parts))
-    positions = [native.pointer(x, "positions", (len(x), 3)) for x, _ in parts]
-    width = layout.num_levels * features
-    grads = [native.pointer(g, "the gradient", (len(x), width)) for x, g in parts]
-    _backward_table(
-        native.pointers(positions), native.pointers(grads), native.integers(ends), len(parts), features,
-        *layout.arrays, layout.num_levels, native.pointer(into, "the table's gradient", (layout.num_entries, features)),
-        native.threads(),
-    )  # fmt: skip
-
-
 def hash_grid(
     positions: Tensor,
     table: Tensor,
     layout: HashGridLayout,
-    pending: Pending | None = None,
+    deferred: TableGradient | None = None,
     known: Tensor | None = None,
 ) -> Tensor:
     """Multiresolution hash encoding.
@@ -189,8 +218,7 @@ def hash_grid(
         positions: (N, 3) in [0, 1]; what lies outside is moved to the face.
         table: (E, F) entries of all levels, E = layout.num_entries.
         layout: resolutions and offsets.
-        pending: where the compiled kernel's backward pass leaves what `add_table_gradient` needs, autograd getting
-            no gradient of the table: several encodings then make one pass over it.
+        deferred: where the compiled kernel's backward pass leaves the table's gradient, autograd getting none.
         known: (N, L * F) the result, where it was computed before without a gradient: only the backward pass is left.
     Returns: (N, L * F) features in the table's type. First derivatives only; see `hash_grid_reference`.
     Raises: ValueError where a shape does not fit the layout.
@@ -201,5 +229,5 @@ def hash_grid(
         raise ValueError(f"hash_grid: the table has shape {tuple(table.shape)}, not ({layout.num_entries}, F)")
     positions = positions.to(table.dtype)
     if native.usable(positions, table) and table.shape[1] in (1, 2, 4, 8):
-        return _HashGrid.apply(positions.contiguous(), table.contiguous(), layout, pending, known)
+        return _HashGrid.apply(positions.contiguous(), table.contiguous(), layout, deferred, known)
     return hash_grid_reference(positions, table, layout)

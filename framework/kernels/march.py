@@ -61,9 +61,7 @@ class Occupancy:
 
 
 @torch.no_grad()
-def refresh_occupancy(
-    density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float
-) -> None:
+def refresh_occupancy(density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float) -> None:
     """Mark, in place, the cells whose opacity over one step is at least `threshold`, or the mean if that is less.
 
     Args:
@@ -112,7 +110,7 @@ class March:
     def __init__(
         self, rays: Rays, occupancy: Occupancy, step: float, cone: float, shift: Tensor | None, early_stop: float
     ) -> None:
-        assert occupancy.bits is not None and occupancy.blocks is not None
+        assert occupancy.bits is not None
         count = len(rays)
         self.rays, self.occupancy, self.step, self.cone = rays, occupancy, step, cone
         self.origins, self.directions = rays.origins.contiguous(), rays.directions.contiguous()
@@ -142,7 +140,8 @@ class March:
         if living == 0:
             return None
         o, room = self.occupancy, living * limit
-        assert o.bits is not None and o.blocks is not None
+        assert o.bits is not None
+        assert o.blocks is not None
         self.counts, self.limit = torch.empty(living, dtype=torch.int32), limit
         starts, ends, positions = torch.empty(room), torch.empty(room), torch.empty(room, 3)
         owners = torch.empty(room, dtype=torch.int64)
@@ -259,6 +258,7 @@ class ReferenceMarch:
 
 def step_start(first: Tensor, k: Tensor, step: float, cone: float) -> Tensor:
     """Where step k (N,) of rays that begin at `first` (N,) starts: even while step > cone * t, then geometric."""
+    k = k.to(first.dtype)
     even = first + k * step
     if cone == 0:
         return even

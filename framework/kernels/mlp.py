@@ -83,7 +83,9 @@ class _Call:
         parts = tuple(part.shape[1] for part in inputs)
         widths = (sum(parts), *(weight.shape[0] for weight in weights))
         self.arguments = (
-            native.pointers([native.pointer(x, "an input", (self.count, p)) for x, p in zip(inputs, parts, strict=True)]),
+            native.pointers([
+                native.pointer(part, "an input", (self.count, width)) for part, width in zip(inputs, parts, strict=True)
+            ]),
             native.integers(parts), len(parts), self.count, native.integers(widths), len(weights),
             native.pointers([
                 native.pointer(weight, f"weight {layer}", (widths[layer + 1], widths[layer]))

@@ -4,7 +4,8 @@ Each kernel's Python file declares the C functions it calls with `function`, and
 which checks them. The library holds no thread of its own: it runs on torch's OpenMP threads. ctypes releases Python's
 lock during a call.
 
-`NERFLOOM_KERNELS` overrides the choice: a variant's name (baseline, avx2, avx512, avx512_bf16), or "reference" for torch alone.
+`NERFLOOM_KERNELS` overrides the choice: a variant's name (baseline, avx2, avx512, avx512_bf16), or "reference" for
+torch alone.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -152,7 +153,7 @@ def pointer(tensor: Tensor, what: str, shape: tuple[int, ...], dtype: torch.dtyp
     return tensor.data_ptr()
 
 
-def pointers(addresses: list[int | None]) -> Any:
+def pointers(addresses: Sequence[int | None]) -> Any:
     """A C array of pointers; None is the null pointer. It must be kept alive during the call."""
     return (ctypes.c_void_p * len(addresses))(*addresses)
 

@@ -21,11 +21,11 @@ CHUNK = 2**15
 """Cells evaluated at once."""
 WARM_UP_STEPS = 256
 """Steps during which the grid is visited in a fixed shuffle."""
-WARM_UP_DECAY, DECAY = 0.7, 0.9
-"""Of a cell's density: at each visit in the beginning, at each update afterwards."""
+WARM_UP_DECAY, DECAY = 0.7, 0.8
+"""Of a cell's density at each visit, in the beginning and afterwards."""
 SHUFFLE_STRIDE = 2654435761
 """A prime, so that its multiples visit every cell once a pass, far from one another."""
-WAVES = (8, 8, 16, 16, 32, 32, 64, 64, 128)
+WAVES = (8, 8, 16, 32, 64, 128)
 """Samples a ray in each wave; the last size repeats."""
 
 
@@ -38,6 +38,7 @@ class OccupancySampler(nn.Module):
         num_steps: steps along the box's diagonal.
         early_stop: transmittance below which the rest of a ray is dropped: the most that any colour channel can be
             off by. 0 keeps everything.
+        train_early_stop: the same while training, where less exact colours teach as well; `early_stop` if None.
         alpha_threshold: a cell is occupied where one step through it has at least this opacity, or the grid's mean
             if that is less.
         cone: growth of a step per unit of distance, beyond the distance where it exceeds the even step; 0 for even
@@ -56,6 +57,7 @@ class OccupancySampler(nn.Module):
         resolution: int = 128,
         num_steps: int = 512,
         early_stop: float = 1e-4,
+        train_early_stop: float | None = None,
         alpha_threshold: float = 0.01,
         cone: float = 0.0,
         moving: bool = False,
@@ -64,6 +66,7 @@ class OccupancySampler(nn.Module):
         self.resolution = resolution
         self.step_size = (box[1] - box[0]).norm().item() / num_steps
         self.early_stop = early_stop
+        self.train_early_stop = early_stop if train_early_stop is None else train_early_stop
         self.alpha_threshold = alpha_threshold
         self.cone = cone
         self.moving = moving
@@ -72,7 +75,7 @@ class OccupancySampler(nn.Module):
         self.register_buffer("occupied", torch.ones(resolution**3, dtype=torch.bool))
         self.register_buffer("carved", torch.zeros(resolution**3, dtype=torch.bool))
         self._packed: Occupancy | None = None
-        self.register_load_state_dict_post_hook(lambda module, _: module._forget())
+        self.register_load_state_dict_post_hook(lambda module, _: module.forget())
 
     @property
     def occupied_share(self) -> float:
@@ -91,7 +94,8 @@ class OccupancySampler(nn.Module):
             self._packed = Occupancy.of(self.occupied, self.box, self.resolution)
         return self._packed
 
-    def _forget(self) -> None:
+    def forget(self) -> None:
+        """`occupied` has changed: pack it anew when it is asked for."""
         self._packed = None
 
     # -- sampling ---------------------------------------------------------------------------------------------
@@ -99,13 +103,12 @@ class OccupancySampler(nn.Module):
     def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
         """Samples in occupied cells, as far as light gets; densities and features attached.
 
-        What is dropped could have changed a colour channel by at most `early_stop`.
+        What is dropped could have changed a colour channel by at most `early_stop`, or `train_early_stop`.
         """
         shift = torch.rand(len(rays), device=rays.origins.device) if jitter else None
+        stop = self.train_early_stop if self.training else self.early_stop
         compiled = native.usable(rays.origins, rays.directions, self.box)
-        march = (March if compiled else ReferenceMarch)(
-            rays, self.occupancy, self.step_size, self.cone, shift, self.early_stop
-        )
+        march = (March if compiled else ReferenceMarch)(rays, self.occupancy, self.step_size, self.cone, shift, stop)
         traced = torch.is_grad_enabled()
         found: list[tuple[Tensor, ...]] = []
         while (wave := march.wave(WAVES[min(len(found), len(WAVES) - 1)])) is not None:
@@ -139,7 +142,7 @@ class OccupancySampler(nn.Module):
         self.carved.copy_(~hull)
         self.density_grid.masked_fill_(self.carved, 0)
         self.occupied.logical_and_(hull)
-        self._forget()
+        self.forget()
 
     @torch.no_grad()
     def update(self, step: int, density: DensityFunction) -> None:
@@ -159,15 +162,13 @@ class OccupancySampler(nn.Module):
         positions = torch.lerp(self.box[0], self.box[1], unit)
         sigma = _in_chunks(density, positions, times)
         before = self.density_grid.index_select(0, cells)
-        if warming_up:  # the others have not been seen often enough to be forgotten
-            before *= WARM_UP_DECAY
+        before *= WARM_UP_DECAY if warming_up else DECAY
         seen = torch.isfinite(before)
         self.density_grid.index_copy_(0, cells, torch.where(seen, torch.maximum(before, sigma), sigma))
-        decay = 1.0 if warming_up else DECAY
-        refresh_occupancy(self.density_grid, self.occupied, decay, self.step_size, self.alpha_threshold)
+        refresh_occupancy(self.density_grid, self.occupied, 1.0, self.step_size, self.alpha_threshold)
         if self.any_carved:
             self.occupied.logical_and_(~self.carved)
-        self._forget()
+        self.forget()
 
     def _shuffled(self, turn: int) -> Tensor:
         """The cells of one of the first updates: four passes over the grid by step WARM_UP_STEPS.

@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from torch import Tensor
 from torch.optim.adam import adam
 
 from framework.config import TrainConfig
-from framework.kernels.adam import sparse_adam
+from framework.kernels.adam import all_finite, sparse_adam
+from framework.kernels.hash_grid import TableGradient
 from framework.kernels.memory import table
 from framework.model import Model
 
@@ -16,64 +18,90 @@ from framework.model import Model
 class Adam(torch.optim.Optimizer):
     """Adam (Kingma and Ba 2015): torch's fused one, and a sparse one for groups with `sparse` set.
 
-    A sparse group holds tables (E, F) of which a step uses few entries. Their `grad` is allocated here once, so that
-    kernels can add to it, and is zero again after each step (`framework.kernels.adam`).
+    A sparse group holds tables (E, F) of which a step uses few entries (`framework.kernels.adam`). Their gradient is
+    what the backward pass left in `deferred`, or else `grad`.
+
+    Args:
+        groups: parameter groups.
+        deferred: of tables whose gradient is not added up by autograd.
+        lr, betas, eps: of groups that do not say.
     """
 
-    def __init__(self, groups: list[dict[str, Any]], lr: float, betas: tuple[float, float], eps: float) -> None:
+    def __init__(
+        self,
+        groups: list[dict[str, Any]],
+        deferred: dict[Tensor, TableGradient],
+        lr: float,
+        betas: tuple[float, float],
+        eps: float,
+    ) -> None:
         super().__init__(groups, {"lr": lr, "betas": betas, "eps": eps, "sparse": False})
+        self.deferred = deferred
+        self.entries_updated = 0
+        """Of sparse groups, over all steps."""
         for group in self.param_groups:
             for parameter in group["params"]:
                 state = self.state[parameter]
                 state["exp_avg"], state["exp_avg_sq"] = (table(*parameter.shape, like=parameter) for _ in range(2))
                 if group["sparse"]:
                     state["seen"] = torch.zeros_like(parameter[:, 0])
-                    parameter.grad = table(*parameter.shape, like=parameter)
                 else:
                     state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
 
     def zero_grad(self, set_to_none: bool = True) -> None:
-        """Forget gradients. Those of sparse groups are cleared by `step`, or here where there was none."""
-        for group in self.param_groups:
-            for parameter in group["params"]:
-                if not group["sparse"]:
-                    parameter.grad = None
-                elif self.unused_gradients and parameter.grad is not None:
-                    parameter.grad.zero_()
-        self.unused_gradients = True
+        """Forget gradients, those that wait included."""
+        super().zero_grad(set_to_none=True)
+        for gradient in self.deferred.values():
+            gradient.parts.clear()
 
-    unused_gradients = True
-    """Whether something may have been added to gradients since the last step."""
+    def first_bad(self) -> Tensor | None:
+        """The first parameter whose gradient is not finite; None where all are."""
+        for parameter in (p for group in self.param_groups for p in group["params"]):
+            waiting = self.deferred.get(parameter)
+            if parameter.grad is not None and not all_finite(parameter.grad):
+                return parameter
+            if waiting is not None and not waiting.finite():
+                return parameter
+        return None
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
         """One update of every parameter that has a gradient."""
         for group in self.param_groups:
-            with_grad = [p for p in group["params"] if p.grad is not None]
-            states = [self.state[p] for p in with_grad]
             if group["sparse"]:
-                for parameter, state in zip(with_grad, states, strict=True):
-                    moments = state["exp_avg"], state["exp_avg_sq"], state["seen"]
-                    assert parameter.grad is not None
-                    sparse_adam(parameter, parameter.grad, *moments, group["lr"], group["betas"], group["eps"])
-                continue
-            adam(
-                with_grad,
-                [p.grad for p in with_grad],
-                [state["exp_avg"] for state in states],
-                [state["exp_avg_sq"] for state in states],
-                [],
-                [state["step"] for state in states],
-                fused=bool(with_grad) and with_grad[0].device.type in ("cpu", "cuda"),
-                amsgrad=False,
-                beta1=group["betas"][0],
-                beta2=group["betas"][1],
-                lr=group["lr"],
-                weight_decay=0.0,
-                eps=group["eps"],
-                maximize=False,
-            )
-        self.unused_gradients = False
+                for parameter in group["params"]:
+                    self._step_sparse(parameter, group)
+            else:
+                self._step_dense(group)
+
+    def _step_sparse(self, parameter: Tensor, group: dict[str, Any]) -> None:
+        state, waiting = self.state[parameter], self.deferred.get(parameter)
+        moments = state["exp_avg"], state["exp_avg_sq"], state["seen"]
+        settings = group["lr"], group["betas"], group["eps"]
+        if waiting is not None and waiting.parts:
+            self.entries_updated += waiting.adam(parameter, *moments, *settings)
+        if parameter.grad is not None:
+            self.entries_updated += sparse_adam(parameter, parameter.grad, *moments, *settings)
+
+    def _step_dense(self, group: dict[str, Any]) -> None:
+        with_grad = [p for p in group["params"] if p.grad is not None]
+        states = [self.state[p] for p in with_grad]
+        adam(
+            with_grad,
+            [p.grad for p in with_grad],
+            [state["exp_avg"] for state in states],
+            [state["exp_avg_sq"] for state in states],
+            [],
+            [state["step"] for state in states],
+            fused=bool(with_grad) and with_grad[0].device.type in ("cpu", "cuda"),
+            amsgrad=False,
+            beta1=group["betas"][0],
+            beta2=group["betas"][1],
+            lr=group["lr"],
+            weight_decay=0.0,
+            eps=group["eps"],
+            maximize=False,
+        )
 
 
 def make_optimizer(model: Model, config: TrainConfig) -> Adam:
@@ -82,7 +110,10 @@ def make_optimizer(model: Model, config: TrainConfig) -> Adam:
     for group in model.param_groups():
         rate = group.get("lr", config.learning_rate)
         groups.append({**group, "lr": rate, "initial_lr": rate})
-    return Adam(groups, config.learning_rate, (config.adam_beta1, config.adam_beta2), config.adam_eps)
+    deferred: dict[Tensor, TableGradient] = {
+        grid.table: grid.deferred for grid in model.sparse_grids if grid.deferred is not None
+    }
+    return Adam(groups, deferred, config.learning_rate, (config.adam_beta1, config.adam_beta2), config.adam_eps)
 
 
 def learning_rate_factor(config: TrainConfig, step: int, progress: float) -> float:
@@ -114,11 +145,12 @@ def set_learning_rate(optimizer: torch.optim.Optimizer, factor: float) -> None:
         group["lr"] = group["initial_lr"] * factor
 
 
-def first_non_finite(model: Model) -> str | None:
+def first_non_finite(model: Model, optimizer: Adam) -> str | None:
     """The name of the first parameter that is not finite, or whose gradient is not; None where all are."""
+    bad = optimizer.first_bad()
     for name, parameter in model.named_parameters():
-        if not bool(torch.isfinite(parameter).all()):
+        if not all_finite(parameter):
             return name
-        if parameter.grad is not None and not bool(torch.isfinite(parameter.grad).all()):
+        if parameter is bad:
             return f"{name}.grad"
     return None

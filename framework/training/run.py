@@ -1,12 +1,13 @@
 """A run: a method, its settings, a data set, and the folder that everything about them goes into.
 
-    outputs/{experiment}/{method}/{YYYY-mm-dd_HHMMSS}/
-        config.yml                    all settings, plain YAML
-        dataparser_transforms.json    from the input's frame to the scene's
-        nerfstudio_models/            checkpoints
-        learning_curve.json           seconds, step, PSNR
-        eval.json, pictures/          the final evaluation
-        events.out.tfevents.*         TensorBoard
+outputs/{experiment}/{method}/{YYYY-mm-dd_HHMMSS}/
+    config.yml                    all settings, plain YAML
+    dataparser_transforms.json    from the input's frame to the scene's
+    nerfstudio_models/            checkpoints
+    learning_curve.json           seconds, step, PSNR
+    skip_report.json              what was skipped, and what that saved
+    eval.json, pictures/          the final evaluation
+    events.out.tfevents.*         TensorBoard
 """
 
 from __future__ import annotations

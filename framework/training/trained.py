@@ -63,7 +63,7 @@ def load_trained(
 
 def build_model(method: str, config: TrainConfig, scene: Scene) -> Model[Any]:
     """A method's model with fresh parameters."""
-    return load_method(method).model(config, scene)
+    return load_method(method).model(config.resolved(), scene)
 
 
 def restore_model(model: Model[Any], checkpoint: dict[str, Any]) -> None:

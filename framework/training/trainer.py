@@ -22,7 +22,6 @@ from framework.errors import CheckpointError, DivergenceError
 from framework.evaluation.evaluator import evaluate, evaluation_background, render_view, use_bfloat16
 from framework.evaluation.images import comparison
 from framework.evaluation.metrics import MAX_PSNR
-from framework.kernels.adam import all_finite
 from framework.pixels import Background, Batch, composite, draw_batch
 from framework.silhouettes import Silhouettes, pixels_near, visual_hull
 from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest, save_checkpoint
@@ -84,13 +83,14 @@ class Trainer:
     """
 
     def __init__(self, run: Run, train_set: Dataset, eval_set: Dataset | None) -> None:
-        self.run, self.config = run, run.config
+        self.run, self.config = run, run.config.resolved()
         self.train_set, self.eval_set = train_set, eval_set
         self.device = train_set.pixels.device
         torch.manual_seed(self.config.machine.seed)
         self.model = build_model(run.method, self.config, train_set.scene).to(self.device)
         self.optimizer = make_optimizer(self.model, self.config)
         self.state = State()
+        self.first_step = 0
         self._bad_in_a_row = 0
         self._prepared = False
         self._last_save = self._last_eval = self._picture_seconds = 0.0
@@ -133,6 +133,7 @@ class Trainer:
             self.state = State(**checkpoint["state"])
         except (KeyError, TypeError, ValueError) as error:
             raise CheckpointError(f"the checkpoint's optimiser does not fit: {error}") from error
+        self.first_step = self.state.step
         self._last_save = self._last_eval = self.state.seconds
 
     def restore_as_configured(self) -> None:
@@ -197,11 +198,16 @@ class Trainer:
         if not (samplers and known and config.silhouette_cells):
             return
         silhouettes = Silhouettes.of(self.train_set)
-        for sampler in samplers if self.state.step == 0 else ():
-            sampler.carve(visual_hull(silhouettes, sampler.box, sampler.resolution))
-        if config.silhouette_pixels:
-            hulls = [pixels_near(silhouettes, ~s.carved, s.box, s.resolution) for s in samplers]
-            self.train_set = replace(self.train_set, drawn=torch.cat(hulls).unique() if len(hulls) > 1 else hulls[0])
+        if self.state.step == 0:
+            hulls = [visual_hull(silhouettes, sampler.box, sampler.resolution) for sampler in samplers]
+            if not all(bool(hull.any()) for hull in hulls):
+                say("warning: the photographs' alpha leaves no part of the box; it is not used to skip anything")
+                return
+            for sampler, hull in zip(samplers, hulls, strict=True):
+                sampler.carve(hull)
+        if config.silhouette_pixels and all(sampler.any_carved for sampler in samplers):
+            near = [pixels_near(silhouettes, ~s.carved, s.box, s.resolution) for s in samplers]
+            self.train_set = replace(self.train_set, drawn=near[0] if len(near) == 1 else torch.cat(near).unique())
         if self.state.step == 0:
             self.state.seconds += time.perf_counter() - start
 
@@ -243,14 +249,13 @@ class Trainer:
         finite = bool(torch.isfinite(loss))
         if finite and loss.requires_grad:
             loss.backward()
-            self.model.collect_gradients()
-            finite = all(all_finite(p.grad) for p in self.model.parameters() if p.grad is not None)
+            finite = self.optimizer.first_bad() is None
             if finite:
                 self.optimizer.step()
         self._bad_in_a_row = 0 if finite else self._bad_in_a_row + 1
         self.state.skipped += not finite
         if self._bad_in_a_row >= MAX_BAD_STEPS:
-            culprit = first_non_finite(self.model) or "the loss"
+            culprit = first_non_finite(self.model, self.optimizer) or "the loss"
             raise DivergenceError(
                 f"step {self.state.step}: {MAX_BAD_STEPS} steps in a row were not finite, first in {culprit}; "
                 f"the last good checkpoint is in {self.checkpoint_folder}. Lower --learning-rate, or check the data"

@@ -19,12 +19,18 @@ COUNTS = [0, 1, 5, 0, 40, 7, 300, 0]
 
 
 def inputs(scale: float = 1.0) -> tuple[Samples, list[torch.Tensor], torch.Tensor]:
-    """Samples in float64, [sigma, rgb, background], far ends."""
+    """Samples in float64 that float32 holds exactly, [sigma, rgb, background], far ends."""
     samples, sigma = ragged(COUNTS)
+    samples = cast(cast(samples, torch.float32), torch.float64)
+    sigma = (sigma * scale).float().double()
     generator = torch.Generator().manual_seed(3)
     rgb = torch.rand(len(sigma), 3, generator=generator, dtype=torch.float64)
     background = torch.rand(len(COUNTS), 3, generator=generator, dtype=torch.float64)
-    return samples, [sigma * scale, rgb, background], torch.full((len(COUNTS),), 1e3, dtype=torch.float64)
+    return (
+        samples,
+        [sigma, rgb.float().double(), background.float().double()],
+        torch.full((len(COUNTS),), 1e3, dtype=torch.float64),
+    )
 
 
 def cast(samples: Samples, dtype: torch.dtype) -> Samples:

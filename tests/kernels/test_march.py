@@ -46,13 +46,15 @@ def walk(march, limit: int = 16, sigma: float = 0.0):
         middle = (wave.t_starts + wave.t_ends) / 2
         torch.testing.assert_close(wave.positions, march.rays.points(wave.owners, middle), rtol=1e-5, atol=1e-5)
     order, offsets = march.finish()
+    if not march.waves:
+        return [torch.zeros(0), torch.zeros(0), torch.zeros(0, dtype=torch.int64), offsets]
     columns = [torch.cat([getattr(w, n) for w in march.waves]) for n in ("t_starts", "t_ends", "owners")]
     return [column[order] for column in columns] + [offsets]
 
 
 @needs_kernels
 @pytest.mark.parametrize("cone", [0.0, 1 / 64])
-@pytest.mark.parametrize(("resolution", "share"), [(5, 0.3), (16, 0.03), (33, 0.002), (64, 0.0005), (64, 1.0), (8, 0.0)])
+@pytest.mark.parametrize(("resolution", "share"), [(5, 0.3), (16, 0.03), (33, 0.02), (64, 0.01), (64, 1.0), (8, 0.0)])
 def test_compiled_finds_what_the_reference_finds(resolution: int, share: float, cone: float) -> None:
     """Rounding decides about steps whose middle lies on a cell's face: less than one in a thousand."""
     rays, grid = random_rays(300), occupancy(resolution, share)

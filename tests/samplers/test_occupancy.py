@@ -59,7 +59,7 @@ def test_skipping_finds_exactly_the_occupied_steps(resolution: int, num_steps: i
     rays = random_rays(200, seed=1)
     sampler = OccupancySampler(BOX, resolution=resolution, num_steps=num_steps)
     sampler.occupied.copy_(torch.rand(resolution**3, generator=torch.Generator().manual_seed(2)) < 0.02)
-    sampler._forget()
+    sampler.forget()
     samples = sampler.sample(rays, Transparent(), jitter=False)
     quarter = sampler.step_size / 4
     found = {(int(r), round(float(t) / quarter)) for r, t in zip(samples.ray_indices, samples.t, strict=True)}
@@ -164,7 +164,7 @@ def test_rays_that_meet_nothing(kind) -> None:
         assert samples.num_rays == len(rays)
         assert samples.features is not None
     sampler.occupied.zero_()
-    sampler._forget()
+    sampler.forget()
     assert len(sampler.sample(random_rays(10), field, jitter=True)) == 0
 
 

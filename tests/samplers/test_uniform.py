@@ -3,12 +3,19 @@
 import pytest
 import torch
 
+from framework.fields.base import Field
 from framework.rays import Rays
 from framework.samplers.uniform import LAST_INTERVAL, UniformSampler, samples_from_points, stratified_points
 
 
-def no_density(positions: torch.Tensor, times: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
-    raise AssertionError("a uniform sampler does not look")
+class Unseen(Field):
+    """A uniform sampler does not look."""
+
+    def density(self, positions: torch.Tensor, times: torch.Tensor | None = None):
+        raise AssertionError
+
+    def color(self, features, directions, camera_indices=None):
+        raise AssertionError
 
 
 def some_rays(count: int) -> Rays:
@@ -39,7 +46,7 @@ def test_stratification_integrates_better_than_chance() -> None:
 
 def test_uniform_sampler_covers_the_ray() -> None:
     rays = some_rays(5)
-    samples = UniformSampler(8).sample(rays, no_density, jitter=False)
+    samples = UniformSampler(8).sample(rays, Unseen(), jitter=False)
     torch.testing.assert_close(samples.padded(samples.deltas).sum(-1), rays.fars - rays.nears)
     torch.testing.assert_close(samples.padded(samples.t_starts)[:, 0], rays.nears)
     torch.testing.assert_close(samples.t, (samples.t_starts + samples.t_ends) / 2)

@@ -1,105 +1,19 @@
 // Adam over the entries of a table that got a gradient. See ../adam.py for the reference and what is computed.
-#include "common.h"
-
-#include <cmath>
-#include <vector>
+#include "adam.h"
 
 namespace {
 
 constexpr int64_t RUN = 4096;  // values that a thread looks at together
 
-// 1 / (1 - beta^k) for k = 1, 2, ... until it is 1 in float32.
-std::vector<float> corrections(double beta) {
-    std::vector<float> out{1.0f};
-    double power = beta;
-    while (power > 1e-8 && out.size() < (1u << 24)) {
-        out.push_back(float(1 / (1 - power)));
-        power *= beta;
-    }
-    out.push_back(1.0f);
-    return out;
-}
-
-inline bool all_zero(const float* values) {
-    int32_t bits[LANES], any = 0;
-    std::memcpy(bits, values, sizeof bits);
-    for (int i = 0; i < LANES; i++) any |= bits[i];
-    return (any & 0x7fffffff) == 0;
-}
-
-struct Settings {
-    float keep1, add1, keep2, add2, rate, eps;
-    std::vector<float> unbias1, unbias2;  // by how often an entry has been updated
-};
-
-// LANES values, LANES / F entries. Returns how many of them had a gradient.
-template <int F>
-inline int update(float* values, float* mean, float* square, float* grad, float* seen, const Settings& s) {
-    constexpr int ENTRIES = LANES / F;
-    alignas(64) float unbias1[LANES], unbias2[LANES];
-    alignas(64) int32_t used[LANES];
-    int touched = 0;
-    for (int e = 0; e < ENTRIES; e++) {
-        bool any = false;
-        for (int f = 0; f < F; f++) any |= grad[e * F + f] != 0;
-        touched += any;
-        const size_t k = size_t(seen[e] += float(any));
-        for (int f = 0; f < F; f++) {
-            used[e * F + f] = -int32_t(any);
-            unbias1[e * F + f] = s.unbias1[k < s.unbias1.size() ? k : s.unbias1.size() - 1];
-            unbias2[e * F + f] = s.unbias2[k < s.unbias2.size() ? k : s.unbias2.size() - 1];
-        }
-    }
-    Ints mask;
-    std::memcpy(&mask, used, sizeof mask);
-    const Floats g = load(grad), m = s.keep1 * load(mean) + s.add1 * g, v = s.keep2 * load(square) + s.add2 * g * g;
-    alignas(64) float root[LANES];
-    store(root, load(unbias2) * v);
-    for (int i = 0; i < LANES; i++) root[i] = std::sqrt(root[i]);
-    const Floats p = load(values), moved = p - s.rate * load(unbias1) * m / (load(root) + s.eps);
-    store(values, mask ? moved : p);
-    store(mean, mask ? m : load(mean));
-    store(square, mask ? v : load(square));
-    store(grad, splat(0));
-    return touched;
-}
-
-// A single entry, where fewer than LANES values are left or an entry has an odd number of features.
-inline int update_entry(float* values, float* mean, float* square, float* grad, float* seen, int features,
-                        const Settings& s) {
-    bool any = false;
-    for (int f = 0; f < features; f++) any |= grad[f] != 0;
-    if (!any) return 0;
-    const size_t k = size_t(seen[0] += 1);
-    const float unbias1 = s.unbias1[k < s.unbias1.size() ? k : s.unbias1.size() - 1];
-    const float unbias2 = s.unbias2[k < s.unbias2.size() ? k : s.unbias2.size() - 1];
-    for (int f = 0; f < features; f++) {
-        mean[f] = s.keep1 * mean[f] + s.add1 * grad[f];
-        square[f] = s.keep2 * square[f] + s.add2 * grad[f] * grad[f];
-        values[f] -= s.rate * unbias1 * mean[f] / (std::sqrt(unbias2 * square[f]) + s.eps);
-        grad[f] = 0;
-    }
-    return 1;
-}
-
 template <int F>
 int64_t update_all(float* values, float* mean, float* square, float* grad, float* seen, int64_t entries, int features,
-                   const Settings& s, int threads) {
+                   const adam::Settings& s, int threads) {
     const int64_t per_run = RUN / features, runs = (entries + per_run - 1) / per_run;
     int64_t touched = 0;
 #pragma omp parallel for num_threads(threads) schedule(static) reduction(+ : touched) if (threads > 1)
     for (int64_t run = 0; run < runs; run++) {
         const int64_t last = (run + 1) * per_run < entries ? (run + 1) * per_run : entries;
-        int64_t e = run * per_run;
-        if constexpr (F > 0 && F <= LANES)
-            for (; e + LANES / F <= last; e += LANES / F) {
-                const int64_t i = e * F;
-                if (!all_zero(grad + i)) touched += update<F>(values + i, mean + i, square + i, grad + i, seen + e, s);
-            }
-        for (; e < last; e++) {
-            const int64_t i = e * features;
-            touched += update_entry(values + i, mean + i, square + i, grad + i, seen + e, features, s);
-        }
+        touched += adam::update_range<F>(values, mean, square, grad, seen, run * per_run, last, features, s);
     }
     return touched;
 }
@@ -110,8 +24,7 @@ int64_t update_all(float* values, float* mean, float* square, float* grad, float
 // values, mean, square, grad (E, F); seen (E): how often an entry has been updated.
 EXPORT int64_t adam_sparse(float* values, float* mean, float* square, float* grad, float* seen, int64_t entries,
                            int features, float rate, double beta1, double beta2, float eps, int threads) {
-    const Settings s{float(beta1), float(1 - beta1), float(beta2), float(1 - beta2), rate, eps,
-                     corrections(beta1), corrections(beta2)};
+    const adam::Settings s(rate, beta1, beta2, eps);
     const auto run = features == 1   ? update_all<1>
                      : features == 2 ? update_all<2>
                      : features == 4 ? update_all<4>

@@ -1,5 +1,5 @@
 // Multiresolution hash encoding, forward and backward (Instant-NGP, section 3). See ../hash_grid.py for the reference.
-#include "common.h"
+#include "adam.h"
 
 #include <vector>
 
@@ -145,21 +145,24 @@ void scatter_level(const Level& level, const float* positions, int64_t count, co
         const int size = block(n, count);
         load_positions(positions, n, size, xyz);
         find_cell<DENSE>(level, xyz[0], xyz[1], xyz[2], cell);
-        scatter<F>(cell, table + level.offset * F, size, grad + n * F);
+        scatter<F>(cell, table, size, grad + n * F);
     }
 }
 
-// Levels are shared out over threads, so that no two write to the same entry and the order of sums never changes.
-// The samples come in parts, which are as one: `ends` holds the number of samples up to the end of each.
+// Samples that come in parts, put together: positions, and the incoming gradient level by level.
 template <int F>
-void backward_table(const float* const* positions, const float* const* grads, const int64_t* ends, int parts,
-                    const int64_t* resolutions, const int64_t* offsets, int levels, float* table, int threads) {
-    const int64_t count = parts ? ends[parts - 1] : 0, stride = int64_t(levels) * F;
-    std::vector<float> by_level(size_t(count) * levels * F), points(size_t(count) * 3);
-    const int64_t chunks = (count + CHUNK - 1) / CHUNK;
-#pragma omp parallel num_threads(threads) if (threads > 1)
-    {
-#pragma omp for schedule(static)
+struct Gathered {
+    int64_t count;
+    int levels;
+    std::vector<float> points, by_level;
+
+    // `ends` holds the number of samples up to the end of each part.
+    Gathered(const float* const* positions, const float* const* grads, const int64_t* ends, int parts, int levels,
+             int threads)
+        : count(parts ? ends[parts - 1] : 0), levels(levels), points(size_t(count) * 3),
+          by_level(size_t(count) * levels * F) {
+        const int64_t stride = int64_t(levels) * F, chunks = (count + CHUNK - 1) / CHUNK;
+#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
         for (int64_t chunk = 0; chunk < chunks; chunk++) {
             const int64_t end = (chunk + 1) * CHUNK < count ? (chunk + 1) * CHUNK : count;
             int part = 0;
@@ -172,14 +175,47 @@ void backward_table(const float* const* positions, const float* const* grads, co
                     std::memcpy(&by_level[(l * count + n) * F], from + l * F, sizeof(float) * F);
             }
         }
+    }
+    // Adds a level's gradient to `table`, where that level's first entry stands.
+    void scatter_to(const Level& level, int l, float* table) const {
+        const auto run = level.dense ? scatter_level<F, true> : scatter_level<F, false>;
+        run(level, points.data(), count, &by_level[size_t(l) * count * F], table);
+    }
+};
+
+// Levels are shared out over threads, so that no two write to the same entry and the order of sums never changes.
+template <int F>
+void backward_table(const float* const* positions, const float* const* grads, const int64_t* ends, int parts,
+                    const int64_t* resolutions, const int64_t* offsets, int levels, float* table, int threads) {
+    const Gathered<F> samples(positions, grads, ends, parts, levels, threads);
+#pragma omp parallel for num_threads(threads) schedule(dynamic, 1) if (threads > 1)
+    for (int turn = 0; turn < levels; turn++) {
+        const int l = levels - 1 - turn;  // the slowest first
+        samples.scatter_to(level_of(resolutions, offsets, l), l, table + offsets[l] * F);
+    }
+}
+
+// The same, and Adam on each level while its gradient is still in cache. Returns how many entries were updated.
+template <int F>
+int64_t adam_table(const float* const* positions, const float* const* grads, const int64_t* ends, int parts,
+                   const int64_t* resolutions, const int64_t* offsets, int levels, float* values, float* mean,
+                   float* square, float* seen, const adam::Settings& settings, int threads) {
+    const Gathered<F> samples(positions, grads, ends, parts, levels, threads);
+    int64_t touched = 0;
+#pragma omp parallel num_threads(threads) reduction(+ : touched) if (threads > 1)
+    {
+        static thread_local std::vector<float> grad;  // zero between calls: the update clears what it has used
 #pragma omp for schedule(dynamic, 1)
         for (int turn = 0; turn < levels; turn++) {
-            const int l = levels - 1 - turn;  // the slowest first
-            const Level level = level_of(resolutions, offsets, l);
-            const auto run = level.dense ? scatter_level<F, true> : scatter_level<F, false>;
-            run(level, points.data(), count, &by_level[l * count * F], table);
+            const int l = levels - 1 - turn;
+            const int64_t first = offsets[l], entries = offsets[l + 1] - first, i = first * F;
+            if (grad.size() < size_t(entries) * F) grad.resize(size_t(entries) * F, 0.0f);
+            samples.scatter_to(level_of(resolutions, offsets, l), l, grad.data());
+            touched += adam::update_range<F>(values + i, mean + i, square + i, grad.data(), seen + first, 0, entries,
+                                             F, settings);
         }
     }
+    return touched;
 }
 
 template <int F, bool DENSE>
@@ -252,6 +288,22 @@ EXPORT int hash_grid_backward_table(const float* const* positions, const float* 
 #define CALL(F) backward_table<F>(positions, grads, ends, parts, resolutions, offsets, levels, table_grad, threads)
     FOR_FEATURES(features, CALL)
 #undef CALL
+}
+
+// Adam on what hash_grid_backward_table would add. Returns how many entries were updated, or -1 as above.
+EXPORT int64_t hash_grid_adam(const float* const* positions, const float* const* grads, const int64_t* ends, int parts,
+                              int features, const int64_t* resolutions, const int64_t* offsets, int levels,
+                              float* values, float* mean, float* square, float* seen, float rate, double beta1,
+                              double beta2, float eps, int threads) {
+    const adam::Settings settings(rate, beta1, beta2, eps);
+    const auto run = features == 1   ? adam_table<1>
+                     : features == 2 ? adam_table<2>
+                     : features == 4 ? adam_table<4>
+                     : features == 8 ? adam_table<8>
+                                     : nullptr;
+    if (!run) return -1;
+    return run(positions, grads, ends, parts, resolutions, offsets, levels, values, mean, square, seen, settings,
+               threads);
 }
 
 EXPORT int hash_grid_backward_positions(const float* positions, int64_t count, const float* table, const float* grad,

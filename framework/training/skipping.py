@@ -1,0 +1,126 @@
+"""What a run skipped, and what that saved: printed at its end and written to skip_report.json."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from framework.device import wait_for
+from framework.model import Model
+from framework.pixels import draw_batch
+from framework.rays import Rays
+from framework.samplers.occupancy import OccupancySampler
+
+if TYPE_CHECKING:
+    from framework.training.trainer import Trainer
+
+PROBE_RAYS = 1024
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One thing that is skipped."""
+
+    name: str
+    """What."""
+    skipped: float
+    """Share of all that there is, 0 to 1."""
+    rendering_saved: float | None
+    """How many times longer the probe's rays take to render without it; None where it saves nothing in rendering."""
+    switch: str
+    """How to turn it off."""
+
+    def line(self) -> str:
+        """One line for people."""
+        saved = "" if self.rendering_saved is None else f": rendering is {self.rendering_saved:.1f} x as fast"
+        return f"skipped {self.skipped:6.1%} of {self.name}{saved}  (off: {self.switch})"
+
+
+@torch.no_grad()
+def skip_report(trainer: Trainer) -> list[Rung]:
+    """Measure a trained run's rungs on a probe of random training rays. Empty where a method skips nothing."""
+    model, rungs = trainer.model, []
+    samplers = model.occupancy_samplers
+    if samplers:
+        rungs += _sampling_rungs(trainer, samplers)
+    entries = sum(grid.table.shape[0] for grid in model.sparse_grids)
+    steps = trainer.state.step - trainer.first_step
+    if entries and steps:
+        share = trainer.optimizer.entries_updated / (entries * steps)
+        rungs.append(Rung("table entries in a step's update", 1 - share, None, "--sparse-updates False"))
+    return rungs
+
+
+def _sampling_rungs(trainer: Trainer, samplers: list[OccupancySampler]) -> list[Rung]:
+    cells = sum(s.occupied.numel() for s in samplers)
+    pixels, drawn = len(trainer.train_set.pixels), trainer.train_set.drawn
+    carved = sum(int(s.carved.sum()) for s in samplers) / cells
+    empty = 1 - sum(int(s.occupied.sum()) for s in samplers) / cells
+    rays = draw_batch(trainer.train_set, PROBE_RAYS, "black").rays
+    usual, count = _probe(trainer.model, rays)
+    with _changed(samplers, early_stop=0.0):
+        unhidden, visible_count = _probe(trainer.model, rays)
+        with _changed(samplers, occupied=True):
+            everywhere, all_count = _probe(trainer.model, rays)
+    rungs = [
+        Rung(
+            "steps along a ray, in empty cells",
+            1 - visible_count / max(all_count, 1),
+            everywhere / unhidden,
+            "no switch",
+        ),
+        Rung("the samples left, hidden", 1 - count / max(visible_count, 1), unhidden / usual, "--early-stop 0"),
+        Rung("cells, empty", empty, None, "no switch"),
+    ]
+    if carved:
+        rungs.append(Rung("cells, outside the visual hull", carved, None, "--silhouette-cells False"))
+    if drawn is not None:
+        share = 1 - len(drawn) / pixels
+        rungs.append(Rung("pixels, which see background alone", share, None, "--silhouette-pixels False"))
+    return rungs
+
+
+def _probe(model: Model[Any], rays: Rays) -> tuple[float, int]:
+    """Seconds to render the rays, and samples evaluated for them."""
+    was_training = model.training
+    model.eval()
+    background = torch.zeros(3, device=model.device)
+    model.render(rays, background)  # once to warm up
+    wait_for(model.device)
+    start = time.perf_counter()
+    rendered = model.render(rays, background)
+    wait_for(model.device)
+    seconds = time.perf_counter() - start
+    model.train(was_training)
+    return seconds, rendered.num_samples
+
+
+@contextmanager
+def _changed(
+    samplers: list[OccupancySampler], early_stop: float | None = None, occupied: bool = False
+) -> Iterator[None]:
+    """Samplers without early stop, or with a full grid, for a while."""
+    before = [(s.early_stop, s.occupied.clone()) for s in samplers]
+    try:
+        for sampler in samplers:
+            if early_stop is not None:
+                sampler.early_stop = early_stop
+            if occupied:
+                sampler.occupied.fill_(True)
+            sampler.forget()
+        yield
+    finally:
+        for sampler, (stop, cells) in zip(samplers, before, strict=True):
+            sampler.early_stop = stop
+            sampler.occupied.copy_(cells)
+            sampler.forget()
+
+
+def as_plain(rungs: list[Rung]) -> list[dict[str, Any]]:
+    """For JSON."""
+    return [asdict(rung) for rung in rungs]

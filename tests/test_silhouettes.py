@@ -1,0 +1,77 @@
+"""The visual hull: no cell that matters is lost, and no pixel that could see one."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dataparsers.blender import Blender
+from framework.dataset import Dataset, load_dataset
+from framework.kernels.march import Occupancy, candidates
+from framework.silhouettes import Silhouettes, pixels_near, visual_hull
+from tests.conftest import write_tiny
+
+BOX = torch.tensor([[-1.5, -1.5, -1.5], [1.5, 1.5, 1.5]])
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """A ball of radius 1 seen from 24 sides, 40 pixels wide."""
+    folder = write_tiny(tmp_path_factory.mktemp("hull") / "ball", size=40, counts=(24, 1, 1))
+    return load_dataset(Blender().parse(folder, "train"), "train")
+
+
+def centers(resolution: int) -> torch.Tensor:
+    index = torch.cartesian_prod(*[torch.arange(resolution)] * 3)
+    return BOX[0] + (index + 0.5) * (BOX[1] - BOX[0]) / resolution
+
+
+@pytest.mark.parametrize("resolution", [7, 16, 32])
+def test_the_hull_holds_the_ball_and_little_else(ball: Dataset, resolution: int) -> None:
+    hull = visual_hull(Silhouettes.of(ball), BOX, resolution)
+    half_diagonal = 1.5 * 3**0.5 / resolution
+    distance = centers(resolution).norm(dim=-1)
+    assert bool(hull[distance < 1 + half_diagonal].all())  # every cell that touches the ball
+    # The cameras stand on one circle, so the hull tapers above and below; beyond that, nothing.
+    level = centers(resolution)[:, 2].abs() < 0.3
+    assert not bool(hull[level & (distance > 1.25 + 3 * half_diagonal)].any())
+
+
+def test_every_pixel_that_could_see_the_hull_is_kept(ball: Dataset) -> None:
+    resolution = 16
+    silhouettes = Silhouettes.of(ball)
+    hull = visual_hull(silhouettes, BOX, resolution)
+    kept = torch.zeros(len(ball.pixels), dtype=torch.bool)
+    kept[pixels_near(silhouettes, hull, BOX, resolution)] = True
+    grid = Occupancy.of(hull, BOX, resolution)
+    for image in range(len(ball)):
+        rays = ball.cameras.image_rays(image, 0.1, 20)
+        _, _, offsets = candidates(rays, grid, 0.01, 0.0, None)
+        sees = offsets.diff() > 0
+        mine = kept[image * 1600 : (image + 1) * 1600]
+        assert not bool((sees & ~mine).any())
+    assert 0.2 < kept.float().mean() < 0.8
+
+
+def test_an_object_that_leaves_the_frame_is_not_cut_off(ball: Dataset) -> None:
+    """Zoomed in until the ball fills every photograph: what no photograph shows whole stays."""
+    cameras = replace(ball.cameras, fx=ball.cameras.fx * 3, fy=ball.cameras.fy * 3)
+    pixels = ball.pixels.clone()
+    pixels[:, 3] = 255
+    hull = visual_hull(Silhouettes.of(replace(ball, cameras=cameras, pixels=pixels)), BOX, 16)
+    assert bool(hull.all())
+
+
+def test_a_camera_inside_the_box_says_nothing_of_what_is_behind_it(ball: Dataset) -> None:
+    poses = ball.cameras.camera_to_worlds.clone()
+    poses[:, :, 3] *= 0.3  # 1.2 from the middle
+    empty = ball.pixels.clone()
+    empty[:, 3] = 0
+    one = replace(ball, cameras=replace(ball.cameras, camera_to_worlds=poses), pixels=empty)
+    index = torch.tensor([0])
+    single = replace(one, cameras=one.cameras[index], offsets=one.offsets[:2], pixels=one.pixels[:1600])
+    silhouettes = Silhouettes.of(single)
+    hull = visual_hull(silhouettes, BOX, 16)
+    behind = silhouettes.depth(0, centers(16)) < 0
+    assert bool(hull[behind].all())
+    assert not bool(hull.all())

@@ -53,7 +53,7 @@ class Silhouettes:
         column, row = cx + fx * local[:, 0] / depth, cy - fy * local[:, 1] / depth
         # A ball at an angle to the axis is seen as an ellipse, at most 1 / cos^2 as long as its height is wide.
         slant = 1 + (local / safe[:, None]).square().sum(-1)
-        reach = radius / safe * max(fx, fy) * slant
+        reach = radius / safe * max(fx, fy) * slant + 1  # an edge is known to a pixel
         height, width = self.sums[image].shape[0] - 1, self.sums[image].shape[1] - 1
         left, right = (column - reach).floor(), (column + reach).ceil()
         top, bottom = (row - reach).floor(), (row + reach).ceil()
@@ -113,7 +113,7 @@ def pixels_near(silhouettes: Silhouettes, hull: Tensor, box: Tensor, resolution:
         focal = max(float(cameras.fx[image]), float(cameras.fy[image]))
         nearest = float(silhouettes.depth(image, centers).min()) - radius if len(centers) else 1.0
         slant = 1 + ((width / 2) ** 2 + (height / 2) ** 2) / focal**2
-        reach = int(2 * radius / nearest * focal * slant) + 3 if nearest > 0 else max(height, width)
+        reach = int(2 * radius / nearest * focal * slant) + 5 if nearest > 0 else max(height, width)
         rows, columns = torch.arange(height, device=box.device), torch.arange(width, device=box.device)
         top, bottom = (rows - reach).clamp(min=0), (rows + reach + 1).clamp(max=height)
         left, right = (columns - reach).clamp(min=0), (columns + reach + 1).clamp(max=width)

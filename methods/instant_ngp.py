@@ -18,12 +18,12 @@ from framework.renderers import render_field
 from framework.samplers.occupancy import OccupancySampler
 
 PLANS = (
-    (60.0, 16, 512, 2**15, 1e-2),
-    (150.0, 17, 512, 2**15, 3e-3),
-    (math.inf, 18, 1024, 2**16, 1e-3),
+    (60.0, 16, 512, 2**15, 1e-2, 1),
+    (150.0, 17, 512, 2**15, 3e-3, 2),
+    (math.inf, 18, 1024, 2**16, 3e-3, 2),
 )
 """What suits how much time: seconds of training at most, log2 of the table size, steps along the diagonal, samples a
-step, early stop in training. Small tables, batches and rays learn fastest; large ones get further."""
+step, early stop in training, finest cells a pixel. Small tables, batches and rays learn fastest; large ones get further."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,9 @@ class InstantNGPConfig(TrainConfig):
     base_resolution: int = 16
     """Cells along an axis at the coarsest level."""
     max_resolution: int | None = None
-    """Cells along an axis at the finest level. If not given: a power of two, at least the images' longer side."""
+    """Cells along an axis at the finest level. If not given: a power of two, `detail` cells a pixel or more."""
+    detail: int | None = None
+    """Finest cells along the images' longer side for each of its pixels. If not given: what suits the time."""
     log2_table_size: int | None = None
     """Entries of a level's table at most, as a power of two. If not given: what suits the time."""
     sparse_updates: bool = True
@@ -64,11 +66,12 @@ class InstantNGPConfig(TrainConfig):
 
     def resolved(self) -> InstantNGPConfig:
         seconds = math.inf if self.max_seconds is None else self.max_seconds
-        _, log2_table_size, num_steps, samples, stop = next(plan for plan in PLANS if seconds <= plan[0])
+        _, log2_table_size, num_steps, samples, stop, detail = next(plan for plan in PLANS if seconds <= plan[0])
         return replace(
             self,
             log2_table_size=self.log2_table_size or log2_table_size,
             num_steps=self.num_steps or num_steps,
+            detail=self.detail or detail,
             samples_per_batch=self.samples_per_batch or samples,
             train_early_stop=stop if self.train_early_stop is None else self.train_early_stop,
         )
@@ -81,7 +84,8 @@ class InstantNGP(Model[InstantNGPConfig]):
         super().__init__(config, scene)
         assert config.log2_table_size is not None
         assert config.num_steps is not None
-        finest = config.max_resolution or 2 ** (scene.image_size - 1).bit_length()
+        assert config.detail is not None
+        finest = config.max_resolution or 2 ** (config.detail * scene.image_size - 1).bit_length()
         grid = HashGrid(
             config.num_levels,
             config.features_per_level,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor, nn
 
 from framework.fields.base import MLP, Field
@@ -31,11 +30,11 @@ class NeRFField(Field):
         self.position_frequencies = position_frequencies
         self.direction_frequencies = direction_frequencies
         encoded = 3 + 6 * position_frequencies
-        self.before_skip = MLP(encoded, *[width] * skip)
-        self.after_skip = MLP(width + encoded, *[width] * (depth - skip))
-        self.sigma_head = nn.Linear(width, 1)
-        self.feature_head = nn.Linear(width, width)
-        self.color_head = MLP(width + 3 + 6 * direction_frequencies, width // 2, 3)
+        self.before_skip = MLP(encoded, *[width] * skip, activation="relu")
+        self.after_skip = MLP(width + encoded, *[width] * (depth - skip), activation="relu")
+        self.sigma_head = MLP(width, 1, activation="relu")
+        self.feature_head = MLP(width, width)
+        self.color_head = MLP(width + 3 + 6 * direction_frequencies, width // 2, 3, activation="sigmoid")
         self._initialise()
 
     def _initialise(self) -> None:
@@ -48,16 +47,14 @@ class NeRFField(Field):
             if isinstance(layer, nn.Linear):
                 nn.init.xavier_uniform_(layer.weight)
                 nn.init.zeros_(layer.bias)
-        nn.init.constant_(self.sigma_head.bias, 0.1)
+                if layer.out_features == 1:
+                    nn.init.constant_(layer.bias, 0.1)
 
     def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
         encoded = frequency_encoding(positions, self.position_frequencies)
-        hidden = torch.relu(self.before_skip(encoded))
-        hidden = torch.relu(self.after_skip(torch.cat([hidden, encoded.to(hidden.dtype)], dim=-1)))
-        sigma = torch.relu(self.sigma_head(hidden).squeeze(-1).float())
-        return sigma, hidden
+        hidden = self.after_skip(self.before_skip(encoded), encoded)
+        return self.sigma_head(hidden).squeeze(-1).float(), hidden
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         encoded = frequency_encoding(directions, self.direction_frequencies)
-        features = self.feature_head(features)
-        return torch.sigmoid(self.color_head(torch.cat([features, encoded.to(features.dtype)], dim=-1)).float())
+        return self.color_head(self.feature_head(features), encoded).float()

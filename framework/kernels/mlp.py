@@ -1,85 +1,108 @@
-"""Small fully connected networks: linear layers without biases, ReLU between them (tiny-cuda-nn's FullyFusedMLP,
-Mueller et al. 2021, "Real-time neural radiance caching", section 3).
+"""Small fully connected networks: linear layers, ReLU between them (tiny-cuda-nn's FullyFusedMLP, Mueller et al. 2021,
+"Real-time neural radiance caching", section 3).
 
-Layers of at most 128 features are too small for a matrix library: most of its time goes into moving activations
+Layers of a few hundred features are too small for a matrix library: most of its time goes into moving activations
 through memory. The compiled kernel takes a block of samples through all layers while it stays in cache.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any, Literal, TypeVar
 
 import torch
 from torch import Tensor
+from torch.nn.functional import linear
 
 from framework.kernels import native
 
+T = TypeVar("T")
 Activation = Literal["none", "relu", "sigmoid"]
 CODES: dict[Activation, int] = {"none": 0, "relu": 1, "sigmoid": 2}
-MAX_WIDTH = 128
+MAX_WIDTH = 320
 MAX_LAYERS = 8
 
 
-def mlp_reference(inputs: Sequence[Tensor], weights: Sequence[Tensor], activation: Activation = "none") -> Tensor:
+def mlp_reference(
+    inputs: Sequence[Tensor],
+    weights: Sequence[Tensor],
+    activation: Activation = "none",
+    biases: Sequence[Tensor] | None = None,
+) -> Tensor:
     """The network as torch writes it: the truth, in any float type. Arguments as for `mlp`."""
     x = torch.cat([part.to(weights[0].dtype) for part in inputs], dim=-1)
-    for weight in weights[:-1]:
-        x = torch.relu(x @ weight.t())
-    x = x @ weights[-1].t()
+    for layer, weight in enumerate(weights):
+        x = linear(torch.relu(x) if layer else x, weight, None if biases is None else biases[layer])
     if activation == "relu":
         return torch.relu(x)
     return torch.sigmoid(x) if activation == "sigmoid" else x
 
 
-_forward = native.function("mlp_forward", "ppiqpipipi")
-_backward = native.function("mlp_backward", "ppiqpipipppi")
-_forward_bf16 = native.function("mlp_forward_bf16", "ppiqpipipi")
-_backward_bf16 = native.function("mlp_backward_bf16", "ppiqpipipppi")
+_forward = native.function("mlp_forward", "ppiqpippipi")
+_backward = native.function("mlp_backward", "ppiqpippippppi")
+_forward_bf16 = native.function("mlp_forward_bf16", "ppiqpippipi")
+_backward_bf16 = native.function("mlp_backward_bf16", "ppiqpippippppi")
 
 
 class _MLP(torch.autograd.Function):
     """The compiled network. Its backward pass computes hidden layers again, and skips samples without a gradient."""
 
     @staticmethod
-    def forward(
-        ctx: Any, activation: Activation, num_inputs: int, known: Tensor | None, bf16: bool, *tensors: Tensor
-    ) -> Tensor:
-        inputs, weights = tensors[:num_inputs], tensors[num_inputs:]
-        call = _Call(inputs, weights)
+    def forward(ctx: Any, plan: _Plan, known: Tensor | None, *tensors: Tensor) -> Tensor:
+        call = _Call(plan, tensors)
         if known is not None:
             out = known.view_as(known)
         else:
-            out = inputs[0].new_empty(call.count, weights[-1].shape[0])
-            run = _forward_bf16 if bf16 else _forward
-            run(*call.arguments, CODES[activation], out.data_ptr(), native.threads())
+            out = tensors[0].new_empty(call.count, call.outputs)
+            run = _forward_bf16 if plan.bf16 else _forward
+            run(*call.arguments, CODES[plan.activation], out.data_ptr(), native.threads())
         ctx.save_for_backward(*tensors)
-        ctx.activation, ctx.num_inputs, ctx.bf16 = activation, num_inputs, bf16
+        ctx.plan = plan
         return out
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        inputs, weights = ctx.saved_tensors[: ctx.num_inputs], ctx.saved_tensors[ctx.num_inputs :]
-        call = _Call(inputs, weights)
+        plan, tensors = ctx.plan, ctx.saved_tensors
+        call = _Call(plan, tensors)
         grad = grad.contiguous()
-        needed = ctx.needs_input_grad[4 : 4 + len(inputs)]
-        input_grads = [torch.empty_like(part) if wanted else None for part, wanted in zip(inputs, needed, strict=True)]
-        weight_grads = [torch.empty_like(weight) for weight in weights]
-        run = _backward_bf16 if ctx.bf16 else _backward
+        grads = [
+            torch.empty_like(tensor) if wanted or index >= plan.inputs else None
+            for index, (tensor, wanted) in enumerate(zip(tensors, ctx.needs_input_grad[2:], strict=True))
+        ]
+        addresses = [None if g is None else g.data_ptr() for g in grads]
+        of_inputs, of_weights, of_biases = plan.split(addresses)
+        run = _backward_bf16 if plan.bf16 else _backward
         run(
-            *call.arguments, CODES[ctx.activation], native.pointer(grad, "the gradient", (call.count, grad.shape[1])),
-            native.pointers([None if part is None else part.data_ptr() for part in input_grads]),
-            native.pointers([weight.data_ptr() for weight in weight_grads]), native.threads(),
+            *call.arguments, CODES[plan.activation], native.pointer(grad, "the gradient", (call.count, call.outputs)),
+            native.pointers(of_inputs), native.pointers(of_weights),
+            native.pointers(of_biases or [None] * plan.layers), native.threads(),
         )  # fmt: skip
-        return None, None, None, None, *input_grads, *weight_grads
+        return None, None, *grads
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What a row of tensors means: inputs, then weights, then biases if there are any."""
+
+    inputs: int
+    layers: int
+    activation: Activation
+    bf16: bool
+
+    def split(self, values: Sequence[T]) -> tuple[Sequence[T], Sequence[T], Sequence[T]]:
+        """Inputs, weights, biases (none or one a layer)."""
+        last = self.inputs + self.layers
+        return values[: self.inputs], values[self.inputs : last], values[last:]
 
 
 class _Call:
     """The arguments that forward and backward share, checked. Holds the C arrays alive."""
 
-    def __init__(self, inputs: Sequence[Tensor], weights: Sequence[Tensor]) -> None:
-        self.count = inputs[0].shape[0]
+    def __init__(self, plan: _Plan, tensors: Sequence[Tensor]) -> None:
+        inputs, weights, biases = plan.split(tensors)
+        self.count, self.outputs = inputs[0].shape[0], weights[-1].shape[0]
         parts = tuple(part.shape[1] for part in inputs)
         widths = (sum(parts), *(weight.shape[0] for weight in weights))
         self.arguments = (
@@ -91,6 +114,9 @@ class _Call:
                 native.pointer(weight, f"weight {layer}", (widths[layer + 1], widths[layer]))
                 for layer, weight in enumerate(weights)
             ]),
+            native.pointers([
+                native.pointer(bias, f"bias {layer}", (widths[layer + 1],)) for layer, bias in enumerate(biases)
+            ] or [None] * len(weights)),
         )  # fmt: skip
 
 
@@ -98,6 +124,7 @@ def mlp(
     inputs: Sequence[Tensor],
     weights: Sequence[Tensor],
     activation: Activation = "none",
+    biases: Sequence[Tensor] | None = None,
     known: Tensor | None = None,
 ) -> Tensor:
     """A small network.
@@ -106,7 +133,9 @@ def mlp(
         inputs: parts (N, D_i) that stand side by side: as if concatenated, without the copy.
         weights: (out, in) of each layer, as torch's Linear stores them.
         activation: of the output; ReLU stands between layers.
+        biases: (out,) of each layer, or None for none.
         known: the result, where it was computed before without a gradient: only the backward pass is left.
+
     Under autocast the compiled products are of bfloat16, summed in float32, where the processor has instructions for
     that, and of float32 elsewhere.
 
@@ -119,7 +148,7 @@ def mlp(
         raise ValueError(f"mlp: weights of shapes {shapes} do not fit inputs of {widths[0]} features")
     small = max(widths) <= MAX_WIDTH and len(weights) <= MAX_LAYERS
     if small and native.usable(*inputs, *weights):
-        tensors = [x.contiguous() for x in (*inputs, *weights)]
+        tensors = [x.contiguous() for x in (*inputs, *weights, *(biases or ()))]
         bf16 = torch.is_autocast_enabled("cpu") and native.has("mlp_forward_bf16")
-        return _MLP.apply(activation, len(inputs), known, bf16, *tensors)
-    return mlp_reference(inputs, weights, activation)
+        return _MLP.apply(_Plan(len(inputs), len(weights), activation, bf16), known, *tensors)
+    return mlp_reference(inputs, weights, activation, biases)

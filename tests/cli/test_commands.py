@@ -87,7 +87,7 @@ def parse(data: Path, *flags: str):
 def test_flags_in_any_order_and_the_format_by_name(shared_tiny: Path) -> None:
     plain = parse(shared_tiny)
     assert plain.dataparser == "blender"
-    assert (plain.config.data, plain.config.mixed_precision) == (shared_tiny, False)
+    assert (plain.config.data, plain.config.mixed_precision) == (shared_tiny, None)
     many = [
         parse(shared_tiny, "--downscale-factor", "2", "--max-seconds", "3"),
         parse(shared_tiny, "--max-seconds", "3", "blender", "--downscale-factor", "2"),

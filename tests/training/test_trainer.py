@@ -220,7 +220,7 @@ def test_an_empty_grid_is_harmless(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run")
     sampler = trainer.model.sampler
     sampler.occupied.zero_()
-    sampler._find_reachable()
+    sampler.forget()
     report = trainer.train_step()
     assert trainer.state.skipped == 0
     assert math.isfinite(sum(report.losses.values()))

@@ -1,4 +1,4 @@
-// Small fully connected networks without biases, ReLU between layers, in float32. See ../mlp.py for the reference.
+// Small fully connected networks, ReLU between layers, in float32. See ../mlp.py for the reference.
 //
 // Samples go through all layers in blocks that stay in cache; nothing but the result leaves it. The backward pass
 // computes a block's hidden layers again, which costs less than writing them to memory and reading them back. Samples
@@ -98,18 +98,26 @@ struct Network {
     int width[MAX_LAYERS + 1] = {}, wide[MAX_LAYERS + 1] = {};  // of the input and each layer; padded to whole vectors
     std::vector<float> forward[MAX_LAYERS];   // (wide inputs, wide outputs), zeros outside
     std::vector<float> backward[MAX_LAYERS];  // (wide outputs, wide inputs)
+    std::vector<float> bias[MAX_LAYERS];      // (wide outputs), or none
 
-    Network(const int64_t* widths, int count, const float* const* weights) : layers(count) {
+    Network(const int64_t* widths, int count, const float* const* weights, const float* const* biases)
+        : layers(count) {
         for (int l = 0; l <= layers; l++) width[l] = int(widths[l]), wide[l] = padded(width[l]);
         for (int l = 0; l < layers; l++) {
             const int in = wide[l], out = wide[l + 1];
             forward[l].assign(size_t(in) * out, 0);
             backward[l].assign(size_t(in) * out, 0);
+            if (biases[l]) {
+                bias[l].assign(out, 0);
+                std::memcpy(bias[l].data(), biases[l], sizeof(float) * width[l + 1]);
+            }
             for (int o = 0; o < width[l + 1]; o++)
                 for (int i = 0; i < width[l]; i++)
                     forward[l][i * out + o] = backward[l][o * in + i] = weights[l][o * width[l] + i];
         }
     }
+    const float* bias_of(int l) const { return bias[l].empty() ? nullptr : bias[l].data(); }
+    int64_t sums(int l) const { return int64_t(wide[l] + 1) * wide[l + 1]; }
 };
 
 // A block's activations: layer[0] is the input, layer[L] the output before its activation function.
@@ -121,7 +129,7 @@ void run_forward(const Network& net, Block& block) {
     for (int l = 0; l < net.layers; l++) {
         const int in = net.wide[l], out = net.wide[l + 1];
         product(block.layer[l], in, net.forward[l].data(), net.width[l], out, block.layer[l + 1], out);
-        if (l + 1 < net.layers) activate(block.layer[l + 1], BLOCK * out, RELU);
+        if (l + 1 < net.layers || net.bias_of(l)) add_bias(block.layer[l + 1], net.bias_of(l), out, l + 1 < net.layers);
     }
 }
 
@@ -130,6 +138,7 @@ float* run_backward(const Network& net, const Block& block, float* grad, float* 
     for (int l = net.layers - 1; l >= 0; l--) {
         const int in = net.wide[l], out = net.wide[l + 1];
         outer_product(block.layer[l], in, grad, out, in, sums[l], out);
+        if (net.bias_of(l)) add_rows(grad, out, sums[l] + in * out);
         product(grad, out, net.backward[l].data(), net.width[l + 1], in, other, in);
         if (l > 0)
             for (int i = 0; i < BLOCK * in; i += LANES)
@@ -145,9 +154,9 @@ float* run_backward(const Network& net, const Block& block, float* grad, float* 
 
 // The input is `parts` arrays (count, part_widths[p]) side by side; widths are those of the input and every layer.
 EXPORT void mlp_forward(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
-                        const int64_t* widths, int layers, const float* const* weights, int activation, float* out,
-                        int threads) {
-    const Network net(widths, layers, weights);
+                        const int64_t* widths, int layers, const float* const* weights,
+                        const float* const* biases, int activation, float* out, int threads) {
+    const Network net(widths, layers, weights, biases);
     const Inputs input{parts, inputs, part_widths};
     const int64_t blocks = (count + BLOCK - 1) / BLOCK;
 #pragma omp parallel num_threads(threads) if (threads > 1)
@@ -171,13 +180,14 @@ EXPORT void mlp_forward(const float* const* inputs, const int64_t* part_widths, 
 
 // Writes the inputs' gradients (parts that are null are left out) and the weights', (outputs, inputs) like them.
 EXPORT void mlp_backward(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
-                         const int64_t* widths, int layers, const float* const* weights, int activation,
-                         const float* grad, float* const* input_grads, float* const* weight_grads, int threads) {
-    const Network net(widths, layers, weights);
+                         const int64_t* widths, int layers, const float* const* weights,
+                         const float* const* biases, int activation, const float* grad, float* const* input_grads,
+                         float* const* weight_grads, float* const* bias_grads, int threads) {
+    const Network net(widths, layers, weights, biases);
     const Inputs input{parts, inputs, part_widths};
     const int outputs = net.width[layers];
     size_t total = 0;
-    for (int l = 0; l < layers; l++) total += net.forward[l].size();
+    for (int l = 0; l < layers; l++) total += size_t(net.sums(l));
     std::vector<float> sums(total * threads, 0.0f);
 #pragma omp parallel num_threads(threads) if (threads > 1)
     {
@@ -185,7 +195,7 @@ EXPORT void mlp_backward(const float* const* inputs, const int64_t* part_widths,
         alignas(64) float first[BLOCK * MAX_WIDTH], second[BLOCK * MAX_WIDTH];
         float* mine[MAX_LAYERS];
         float* at = sums.data() + total * thread_index();
-        for (int l = 0; l < layers; l++) mine[l] = at, at += net.forward[l].size();
+        for (int l = 0; l < layers; l++) mine[l] = at, at += net.sums(l);
         const Part part(count, thread_index(), threads, BLOCK);
         for (int64_t next = part.begin; next < part.end;) {
             int64_t rows[BLOCK];
@@ -199,6 +209,7 @@ EXPORT void mlp_backward(const float* const* inputs, const int64_t* part_widths,
         }
     }
     const float* sum = sums.data();
-    for (int l = 0; l < layers; sum += net.forward[l].size(), l++)
-        write_weight_gradient(sum, total, threads, net.width[l], net.width[l + 1], net.wide[l + 1], weight_grads[l]);
+    for (int l = 0; l < layers; sum += net.sums(l), l++)
+        write_weight_gradient(sum, int64_t(total), threads, net.width[l], net.wide[l], net.width[l + 1],
+                              net.wide[l + 1], weight_grads[l], bias_grads[l]);
 }

@@ -7,7 +7,7 @@ namespace mlp {
 
 constexpr int BLOCK = 32;
 constexpr int MAX_LAYERS = 8;
-constexpr int MAX_WIDTH = 128;
+constexpr int MAX_WIDTH = 320;  // of NeRF's layer that is fed the encoded position again
 
 inline int padded(int width) { return (width + LANES - 1) / LANES * LANES; }
 
@@ -20,6 +20,23 @@ inline void activate(float* values, int64_t count, int activation) {
         if (activation == SIGMOID) v = 1 / (1 + exponential(-v));
         store(values + i, v);
     }
+}
+
+// Rows of a block plus a layer's bias, `wide` long; ReLU behind it where asked for.
+inline void add_bias(float* values, const float* bias, int wide, bool relu) {
+    for (int r = 0; r < BLOCK; r++)
+        for (int i = 0; i < wide; i += LANES) {
+            Floats v = load(values + r * wide + i);
+            if (bias) v += load(bias + i);
+            if (relu) v = v < 0 ? splat(0) : v;
+            store(values + r * wide + i, v);
+        }
+}
+
+// The bias's gradient: sums over a block's rows.
+inline void add_rows(const float* grad, int wide, float* sums) {
+    for (int r = 0; r < BLOCK; r++)
+        for (int i = 0; i < wide; i += LANES) store(sums + i, load(sums + i) + load(grad + r * wide + i));
 }
 
 struct Inputs {  // the network's input, in parts that stand side by side
@@ -86,9 +103,14 @@ inline void write_input_gradient(const float* from, int wide, const Inputs& inpu
     }
 }
 
-// The sums over threads, (wide inputs, wide outputs) each, to the weights' gradients (outputs, inputs).
-inline void write_weight_gradient(const float* sums, int64_t total, int threads, int in, int out, int wide_out,
-                                  float* grad) {
+// The sums over threads, (wide inputs, wide outputs) and one more row for the bias each, to the gradients of a layer's
+// weights (outputs, inputs) and bias (outputs).
+inline void write_weight_gradient(const float* sums, int64_t total, int threads, int in, int wide_in, int out,
+                                  int wide_out, float* grad, float* bias_grad) {
+    for (int o = 0; bias_grad && o < out; o++) {
+        bias_grad[o] = 0;
+        for (int t = 0; t < threads; t++) bias_grad[o] += sums[total * t + int64_t(wide_in) * wide_out + o];
+    }
     for (int o = 0; o < out; o++)
         for (int i = 0; i < in; i++) {
             float value = 0;

@@ -126,14 +126,26 @@ void outer_product(const Half* x, int ldx, const Half* dy, int ldy, int inner, f
         outer_columns<16, 1>(x, ldx, dy + column * 2, ldy, inner, dw + column, width);
 }
 
+// The bias's gradient: sums over a block's rows of bf16 (rows wide).
+void add_halves(const Half* grad, int rows, int columns, float* sums) {
+    for (int r = 0; r < BLOCK; r++)
+        for (int c = 0; c < columns; c += 16) {
+            const __m256i half_values = _mm256_loadu_si256((const __m256i*)(grad + r * rows + c));
+            const __m512 values = _mm512_castsi512_ps(_mm512_slli_epi32(_mm512_cvtepu16_epi32(half_values), 16));
+            _mm512_storeu_ps(sums + c, _mm512_add_ps(_mm512_loadu_ps(sums + c), values));
+        }
+}
+
 struct Network {
     int layers;
     int width[MAX_LAYERS + 1] = {};
     int rows[MAX_LAYERS + 1] = {};     // width in whole pairs of vectors: of a row of activations
     int columns[MAX_LAYERS + 1] = {};  // width in whole vectors: of what is summed
     std::vector<Half> forward[MAX_LAYERS], backward[MAX_LAYERS];
+    std::vector<float> bias[MAX_LAYERS];  // of whole vectors, or none
 
-    Network(const int64_t* widths, int count, const float* const* weights) : layers(count) {
+    Network(const int64_t* widths, int count, const float* const* weights, const float* const* biases)
+        : layers(count) {
         for (int l = 0; l <= layers; l++) {
             width[l] = int(widths[l]);
             rows[l] = wide(width[l]);
@@ -142,6 +154,10 @@ struct Network {
         for (int l = 0; l < layers; l++) {
             forward[l].assign(size_t(rows[l]) * columns[l + 1], 0);
             backward[l].assign(size_t(rows[l + 1]) * columns[l], 0);
+            if (biases[l]) {
+                bias[l].assign(size_t(columns[l + 1]), 0);
+                std::memcpy(bias[l].data(), biases[l], sizeof(float) * width[l + 1]);
+            }
             for (int o = 0; o < width[l + 1]; o++)
                 for (int i = 0; i < width[l]; i++) {
                     const Half w = half(weights[l][o * width[l] + i]);
@@ -151,7 +167,8 @@ struct Network {
         }
     }
     int inner(int l) const { return (width[l] + 1) / 2 * 2; }
-    int64_t sums(int l) const { return int64_t(columns[l]) * columns[l + 1]; }
+    int64_t sums(int l) const { return int64_t(columns[l] + 1) * columns[l + 1]; }
+    const float* bias_of(int l) const { return bias[l].empty() ? nullptr : bias[l].data(); }
 };
 
 struct Block {
@@ -186,6 +203,7 @@ void run_forward(const Network& net, Block& block) {
         float* out = last ? block.output : block.scratch;
         product(block.layer[l], net.rows[l], net.forward[l].data(), net.columns[l + 1], net.inner(l), out,
                 net.columns[l + 1]);
+        if (net.bias_of(l)) add_bias(out, net.bias_of(l), net.columns[l + 1], false);
         if (!last) to_halves(out, net.columns[l + 1], block.layer[l + 1], net.rows[l + 1], true, nullptr);
     }
 }
@@ -200,9 +218,9 @@ void read_input(const Network& net, const Inputs& input, const int64_t* rows, in
 
 // As mlp_forward and mlp_backward.
 EXPORT void mlp_forward_bf16(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
-                             const int64_t* widths, int layers, const float* const* weights, int activation,
-                             float* out, int threads) {
-    const Network net(widths, layers, weights);
+                             const int64_t* widths, int layers, const float* const* weights,
+                             const float* const* biases, int activation, float* out, int threads) {
+    const Network net(widths, layers, weights, biases);
     const Inputs input{parts, inputs, part_widths};
     const int64_t blocks = (count + BLOCK - 1) / BLOCK;
     const int outputs = net.width[layers], columns = net.columns[layers];
@@ -224,9 +242,11 @@ EXPORT void mlp_forward_bf16(const float* const* inputs, const int64_t* part_wid
 }
 
 EXPORT void mlp_backward_bf16(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
-                              const int64_t* widths, int layers, const float* const* weights, int activation,
-                              const float* grad, float* const* input_grads, float* const* weight_grads, int threads) {
-    const Network net(widths, layers, weights);
+                              const int64_t* widths, int layers, const float* const* weights,
+                              const float* const* biases, int activation, const float* grad,
+                              float* const* input_grads, float* const* weight_grads, float* const* bias_grads,
+                              int threads) {
+    const Network net(widths, layers, weights, biases);
     const Inputs input{parts, inputs, part_widths};
     int64_t total = 0;
     for (int l = 0; l < layers; l++) total += net.sums(l);
@@ -248,6 +268,8 @@ EXPORT void mlp_backward_bf16(const float* const* inputs, const int64_t* part_wi
             float* sum = sums.data() + total * (thread_index() + 1);
             for (int l = layers - 1; l >= 0; l--) {
                 sum -= net.sums(l);
+                if (net.bias_of(l)) add_halves(current, net.rows[l + 1], net.columns[l + 1],
+                                               sum + net.columns[l] * net.columns[l + 1]);
                 interleave(block.layer[l], net.rows[l], pairs_x);
                 interleave(current, net.rows[l + 1], pairs_dy);
                 outer_product(pairs_x, net.rows[l], pairs_dy, net.rows[l + 1], net.columns[l], sum,
@@ -261,8 +283,8 @@ EXPORT void mlp_backward_bf16(const float* const* inputs, const int64_t* part_wi
     }
     const float* sum = sums.data();
     for (int l = 0; l < layers; sum += net.sums(l), l++)
-        write_weight_gradient(sum, total, threads, net.width[l], net.width[l + 1], net.columns[l + 1],
-                              weight_grads[l]);
+        write_weight_gradient(sum, total, threads, net.width[l], net.columns[l], net.width[l + 1],
+                              net.columns[l + 1], weight_grads[l], bias_grads[l]);
 }
 
 #endif

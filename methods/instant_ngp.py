@@ -23,7 +23,7 @@ PLANS = (
     (math.inf, 18, 1024, 2**16, 3e-3, 2),
 )
 """What suits how much time: seconds of training at most, log2 of the table size, steps along the diagonal, samples a
-step, early stop in training, finest cells a pixel. Small tables, batches and rays learn fastest; large ones get further."""
+step, early stop in training, finest cells a pixel. Small tables and batches learn fastest; large ones get further."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ space is skipped (as in NerfAcc, Li et al. 2023).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -20,8 +20,11 @@ from framework.samplers.inverse_cdf import inverse_cdf, uniform_variates
 from framework.samplers.occupancy import OccupancySampler
 from framework.samplers.uniform import samples_from_points, stratified_points
 
-OCCUPANCY_SAMPLES_PER_BATCH = 2**13
+OCCUPANCY_SAMPLES_PER_BATCH = 2**12
 """With the occupancy grid the number of samples a ray varies a hundredfold, so the number of rays follows it."""
+OCCUPANCY_RATE = 2.0
+"""Times the learning rate with the occupancy grid. Smaller batches and longer steps (`num_steps`) at twice the rate
+reached 22.5 dB on Lego after 90 s on two cores, where 2^13 samples, 512 steps and the paper's rate were at 17."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +53,12 @@ class VanillaNeRFConfig(TrainConfig):
     """L of the direction's encoding."""
     grid_resolution: int = 128
     """Cells along an axis of the occupancy grid."""
-    num_steps: int = 512
+    num_steps: int = 192
     """Steps along the box's diagonal with the occupancy grid."""
     early_stop: float = 1e-4
     """Transmittance below which the rest of a ray is dropped, with the occupancy grid."""
+    train_early_stop: float = 1e-2
+    """The same while training."""
 
 
 class VanillaNeRF(Model[VanillaNeRFConfig]):
@@ -65,7 +70,12 @@ class VanillaNeRF(Model[VanillaNeRFConfig]):
         self.coarse = self._field() if config.sampler == "hierarchical" else None
         self.sampler = (
             OccupancySampler(
-                scene.box, config.grid_resolution, config.num_steps, config.early_stop, moving=scene.moving
+                scene.box,
+                config.grid_resolution,
+                config.num_steps,
+                config.early_stop,
+                config.train_early_stop,
+                moving=scene.moving,
             )
             if config.sampler == "occupancy"
             else None
@@ -104,6 +114,10 @@ class VanillaNeRF(Model[VanillaNeRFConfig]):
         samples = samples_from_points(points)
         samples = samples.evaluated(*field.density(samples.positions(rays), samples.times(rays)))
         return shade(field, rays, samples, background)
+
+    def param_groups(self) -> list[dict[str, Any]]:
+        faster = OCCUPANCY_RATE if self.sampler is not None else 1.0
+        return [{"params": list(self.parameters()), "lr": self.config.learning_rate * faster}]
 
     @property
     def samples_per_batch(self) -> int | None:

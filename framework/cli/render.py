@@ -33,6 +33,8 @@ class OrbitFlags:
     """Pictures per second."""
     downscale_factor: int = 1
     """Reduce the pictures by this whole number."""
+    max_error: str | None = None
+    """Rays end where the rest cannot change a colour by more than this, such as 1/255; 1e-4 if not given."""
     load_checkpoint: Path | None = None
     """A checkpoint other than the run's newest."""
     data: Path | None = None
@@ -62,9 +64,12 @@ def _orbit(flags: OrbitFlags) -> None:
         raise ConfigError("--num-frames and --downscale-factor must be at least 1, --fps more than 0")
     if flags.output_path.suffix.lower() not in (".gif", ".webp", ".png"):
         raise ConfigError(f"--output-path {flags.output_path}: the ending must be .gif, .webp or .png")
+    from contextlib import nullcontext
+
     import torch
 
     from framework.console import say, track
+    from framework.evaluation.error_bound import limited_error, parse_error
     from framework.evaluation.evaluator import evaluation_background, render_rays
     from framework.evaluation.images import write_animation
     from framework.evaluation.paths import orbit
@@ -77,10 +82,12 @@ def _orbit(flags: OrbitFlags) -> None:
     cameras = cameras.scaled(1 / (flags.downscale_factor * parsed.downscale_factor)).to(model.device)
     times = torch.linspace(0, 1, flags.num_frames, device=model.device) if scene.moving else None
     background = evaluation_background(model)
+    bound = None if flags.max_error is None else parse_error(flags.max_error)
     frames = []
-    for index in track(range(flags.num_frames), "Rendering", total=flags.num_frames):
-        rays = cameras.image_rays(index, scene.near, scene.far, times)
-        shape = (int(cameras.heights[index]), int(cameras.widths[index]))
-        frames.append(render_rays(model, rays, shape, background).rgb)
+    with nullcontext() if bound is None else limited_error(model, bound):
+        for index in track(range(flags.num_frames), "Rendering", total=flags.num_frames):
+            rays = cameras.image_rays(index, scene.near, scene.far, times)
+            shape = (int(cameras.heights[index]), int(cameras.widths[index]))
+            frames.append(render_rays(model, rays, shape, background).rgb)
     write_animation(flags.output_path, frames, flags.fps)
     say(f"animation: {flags.output_path}")

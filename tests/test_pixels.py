@@ -1,5 +1,6 @@
 """Batches: each ray goes through the pixel whose colour it has."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,7 @@ from scipy import stats
 
 from dataparsers.blender import Blender
 from framework.dataset import Dataset, load_dataset
-from framework.pixels import composite, draw_batch
+from framework.pixels import composite, draw_batch, gather_batch, gather_batch_reference
 
 
 @pytest.fixture
@@ -70,3 +71,24 @@ def test_images_of_different_sizes_share_one_buffer() -> None:
 def test_compositing_of_opaque_images_changes_nothing() -> None:
     rgb = torch.rand(5, 3)
     assert composite(rgb, torch.rand(5, 3)) is rgb
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_compiled_and_torch_make_the_same_batch(dataset: Dataset, channels: int) -> None:
+    same = replace(dataset, pixels=dataset.pixels[:, :channels].contiguous())
+    generator = torch.Generator().manual_seed(0)
+    flat = torch.randint(len(same.pixels), (1000,), generator=generator)
+    behind = torch.rand(1000, 3, generator=generator)
+    one, two = gather_batch(same, flat, behind), gather_batch_reference(same, flat, behind)
+    torch.testing.assert_close(one.rgb, two.rgb)
+    torch.testing.assert_close(one.alpha, two.alpha)
+    for name, value in vars(two.rays).items():
+        torch.testing.assert_close(getattr(one.rays, name), value)
+
+
+def test_only_pixels_worth_drawing_are_drawn(dataset: Dataset) -> None:
+    few = replace(dataset, drawn=torch.tensor([5, 401, 402]))
+    batch = draw_batch(few, 300, "white")
+    assert batch.rays.camera_indices is not None
+    assert set(batch.rays.camera_indices.tolist()) == {0, 1}
+    assert len(batch.rays.directions.unique(dim=0)) == 3

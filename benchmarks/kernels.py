@@ -25,6 +25,7 @@ from torch import Tensor
 from framework.kernels import native
 from framework.kernels.adam import sparse_adam, sparse_adam_reference
 from framework.kernels.compositing import composite, composite_reference
+from framework.kernels.frequency import frequency_encoding, frequency_encoding_reference
 from framework.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
 from framework.kernels.march import March, Occupancy, ReferenceMarch
 from framework.kernels.mlp import mlp, mlp_reference
@@ -100,6 +101,13 @@ def rows(count: int) -> Iterator[Row]:
         [torch.rand(count) * 50, torch.rand(count, 3)],
         lambda s, c: composite(samples, s, c, background, fars).color,
         lambda s, c: composite_reference(_like(samples, s), s, c, background.to(s), fars.to(s)).color,
+    )
+    yield Row(
+        "frequency encoding, 10 octaves of 3",
+        count,
+        [torch.rand(count, 3)],
+        lambda x: frequency_encoding(x, 10),
+        lambda x: frequency_encoding_reference(x, 10),
     )
     directions = torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
     yield Row(

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from framework.renderers import Rendered as Rendered
     from framework.samplers.base import Sampler as Sampler
     from framework.scene import Scene as Scene
+    from framework.scene_profile import Decision as Decision
 
 _HOMES = {
     "Batch": "pixels",
@@ -34,6 +35,7 @@ _HOMES = {
     "DataError": "errors",
     "DataParser": "dataset",
     "Dataset": "dataset",
+    "Decision": "scene_profile",
     "Field": "fields.base",
     "Method": "model",
     "Model": "model",

@@ -93,6 +93,8 @@ class TrainConfig:
     """Where photographs are transparent, cells of the occupancy grid that one of them shows empty are never marched."""
     silhouette_pixels: bool = True
     """Pixels whose ray meets only such cells are never drawn."""
+    draw_by_error: bool = False
+    """Draw half of the pixels where the error was large lately, with weights that keep the mean loss as it is."""
     background: Literal["auto", "random", "white", "black"] = "auto"
     """Behind transparent pixels in training; auto: random if images have alpha. Evaluation is over white, or black."""
     eval_num_rays_per_chunk: int = 8_192

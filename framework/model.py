@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -18,6 +18,7 @@ from framework.rays import Rays
 from framework.renderers import Rendered
 from framework.samplers.occupancy import OccupancySampler
 from framework.scene import Scene
+from framework.scene_profile import Decision
 
 ConfigT = TypeVar("ConfigT", bound=TrainConfig)
 
@@ -35,15 +36,22 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
         self.config = config
         self.scene = scene
 
+    learns_motion: ClassVar[bool] = False
+    """Whether it uses the photographs' times."""
+
+    def decisions(self) -> list[Decision]:
+        """What became of the method's options that were left to the data."""
+        return []
+
     @abstractmethod
     def render(self, rays: Rays, background: Tensor) -> Rendered:
         """Colour, depth and opacity of R rays over `background`, (R, 3) or (3,). R may be 0."""
 
     def loss(self, rendered: Rendered, batch: Batch, step: int) -> dict[str, Tensor]:
         """Named scalars; their sum is minimised. The mean squared error of every level by default."""
-        losses = {"rgb": mean_squared_error(rendered.rgb, batch.rgb)}
+        losses = {"rgb": mean_squared_error(rendered.rgb, batch.rgb, batch.weights)}
         if rendered.coarse is not None:
-            losses["rgb_coarse"] = mean_squared_error(rendered.coarse.rgb, batch.rgb)
+            losses["rgb_coarse"] = mean_squared_error(rendered.coarse.rgb, batch.rgb, batch.weights)
         return losses
 
     def param_groups(self) -> list[dict[str, Any]]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
 from torch import Tensor
 
 from framework.dataset import Dataset
+from framework.error_map import ErrorMap
 from framework.kernels import native
 from framework.rays import Rays
 
@@ -19,6 +20,8 @@ Background = Literal["random", "white", "black"]
 class Batch:
     """R pixels to learn from."""
 
+    pixels: Tensor
+    """(R,) int64 which they are, counted through all images."""
     rays: Rays
     """R rays through the pixels' centres."""
     rgb: Tensor
@@ -27,6 +30,8 @@ class Batch:
     """(R, 3) what shows where a photograph is transparent."""
     alpha: Tensor | None
     """(R,) opacity, where the photographs have it."""
+    weights: Tensor | None = None
+    """(R,) what each pixel's loss is multiplied by, where they were not drawn evenly; 1 in the mean."""
 
 
 def background_colors(kind: Background, count: int, device: torch.device) -> Tensor:
@@ -46,14 +51,21 @@ def composite(rgba: Tensor, background: Tensor) -> Tensor:
 _draw = native.function("draw_pinhole", "pqpqpppppp" + "pipppppppi")
 
 
-def draw_batch(dataset: Dataset, count: int, background: Background) -> Batch:
+def draw_pixels(dataset: Dataset, count: int) -> Tensor:
     """`count` pixels, each of those worth drawing being equally likely, with replacement, by torch's generator."""
     device = dataset.pixels.device
     if dataset.drawn is None:
-        flat = torch.randint(len(dataset.pixels), (count,), device=device)
-    else:
-        flat = dataset.drawn[torch.randint(len(dataset.drawn), (count,), device=device)]
-    return gather_batch(dataset, flat, background_colors(background, count, device))
+        return torch.randint(len(dataset.pixels), (count,), device=device)
+    return dataset.drawn[torch.randint(len(dataset.drawn), (count,), device=device)]
+
+
+def draw_batch(dataset: Dataset, count: int, background: Background, errors: ErrorMap | None = None) -> Batch:
+    """`count` pixels worth drawing with what they should show: evenly, or also where `errors` are large."""
+    behind = background_colors(background, count, dataset.pixels.device)
+    if errors is None:
+        return gather_batch(dataset, draw_pixels(dataset, count), behind)
+    flat, weights = errors.draw(draw_pixels(dataset, 2 * count), count)
+    return replace(gather_batch(dataset, flat, behind), weights=weights)
 
 
 def gather_batch(dataset: Dataset, flat: Tensor, behind: Tensor) -> Batch:
@@ -73,7 +85,7 @@ def gather_batch_reference(dataset: Dataset, flat: Tensor, behind: Tensor) -> Ba
     rays = dataset.cameras.rays(images, within % widths, within // widths, scene.near, scene.far, dataset.times)
     rgba = dataset.pixels[flat].float() / 255
     alpha = rgba[:, 3] if rgba.shape[-1] == 4 else None
-    return Batch(rays, composite(rgba, behind), behind, alpha)
+    return Batch(flat, rays, composite(rgba, behind), behind, alpha)
 
 
 def _gather_compiled(dataset: Dataset, flat: Tensor, behind: Tensor) -> Batch:
@@ -102,4 +114,4 @@ def _gather_compiled(dataset: Dataset, flat: Tensor, behind: Tensor) -> Batch:
         None if dataset.times is None else dataset.times[indices],
         indices,
     )
-    return Batch(rays, rgb, behind, alpha if channels == 4 else None)
+    return Batch(flat, rays, rgb, behind, alpha if channels == 4 else None)

@@ -25,6 +25,7 @@ def start(run: Run) -> None:
     trainer.restore_as_configured()
     create_folder(run)
     write_transforms(run, trainer.train_set)
+    write_json(run.folder / "scene_profile.json", trainer.profile().as_plain())
     _finish(run, trainer)
 
 
@@ -45,12 +46,10 @@ def _prepare(run: Run) -> Trainer:
     device = choose_device(run.config.machine)
     train_set = load_split(run, "train").to(device)
     eval_set = first_split(run, ("val", "test"))
-    scene = train_set.scene
-    say(
-        f"{run.method} on {run.config.data or 'the embedded scene'} ({run.dataparser}): {len(train_set)} images, "
-        f"{scene.image_size} pixels, {'with' if scene.has_alpha else 'no'} alpha, on {device.type}"
-    )
+    say(f"{run.method} on {run.config.data or 'the embedded scene'} ({run.dataparser}), on {device.type}")
     trainer = Trainer(run, train_set, None if eval_set is None else eval_set.to(device))
+    for line in trainer.profile().lines():
+        say(line)
     say(f"{trainer.model.size():,} parameters; writing to {run.folder}")
     return trainer
 

@@ -19,7 +19,7 @@ class HashField(Field):
         grid: the encoding.
         width: features of a hidden layer (64 in the paper).
         num_features: features handed from density to colour (16 in the paper, the first being log-density).
-        direction_levels: bands of spherical harmonics (4 in the paper).
+        direction_levels: bands of spherical harmonics (4 in the paper); 0 for colours that look alike from all sides.
     """
 
     box: Tensor
@@ -57,5 +57,7 @@ class HashField(Field):
         return torch.addcmul(self.shift, positions, self.scale)
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
+        if self.direction_levels == 0:
+            return self.color_head(features).float()
         view = spherical_harmonics(directions, self.direction_levels)
         return self.color_head(features, view.to(features.dtype)).float()

@@ -45,7 +45,7 @@ def sparse_adam(
         values: (E, F) parameters.
         grad: (E, F) gradient; an entry of zeros is left alone.
         mean, square: (E, F) moments.
-        seen: (E,) updates each entry has had.
+        seen: (E,) updates each entry has had, counted at least until the corrections are 1 in float32.
         rate: learning rate.
         betas: decay of the two moments.
         eps: added to the root of the second.

@@ -2,8 +2,46 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
+
+from framework.kernels import native
+
+_forward = native.function("frequency_encoding", "pqiiipi")
+_backward = native.function("frequency_encoding_backward", "ppqiiipi")
+
+
+def frequency_encoding_reference(x: Tensor, num_frequencies: int, include_input: bool = True) -> Tensor:
+    """The encoding in torch: the truth, in any float type. Arguments as for `frequency_encoding`."""
+    scales = 2.0 ** torch.arange(num_frequencies, device=x.device, dtype=x.dtype)
+    angles = x[:, None, :] * scales[:, None]
+    waves = torch.stack([angles.sin(), angles.cos()], dim=2).flatten(1)
+    return torch.cat([x, waves], dim=-1) if include_input else waves
+
+
+class _FrequencyEncoding(torch.autograd.Function):
+    """The compiled encoding."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, num_frequencies: int, include_input: bool) -> Tensor:
+        count, dims = x.shape
+        rows = x.new_empty(count, dims * (2 * num_frequencies + include_input))
+        address = native.pointer(x, "the input", (count, dims))
+        _forward(address, count, dims, num_frequencies, include_input, rows.data_ptr(), native.threads())
+        ctx.save_for_backward(rows)
+        ctx.settings = dims, num_frequencies, include_input
+        return rows
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        (rows,) = ctx.saved_tensors
+        grad, out = grad.contiguous(), rows.new_empty(len(rows), ctx.settings[0])
+        address = native.pointer(grad, "the gradient", tuple(rows.shape))
+        _backward(rows.data_ptr(), address, len(rows), *ctx.settings, out.data_ptr(), native.threads())
+        return out, None, None
 
 
 def frequency_encoding(x: Tensor, num_frequencies: int, include_input: bool = True) -> Tensor:
@@ -16,9 +54,9 @@ def frequency_encoding(x: Tensor, num_frequencies: int, include_input: bool = Tr
         x: (N, D) input.
         num_frequencies: L, at least 0.
         include_input: put x itself in front.
-    Returns: (N, D * (2 L + include_input)): [x, sin(x), cos(x), sin(2 x), cos(2 x), ...].
+    Returns: (N, D * (2 L + include_input)): [x, sin(x), cos(x), sin(2 x), cos(2 x), ...]. First derivatives only
+        where compiled.
     """
-    scales = 2.0 ** torch.arange(num_frequencies, device=x.device, dtype=x.dtype)
-    angles = x[:, None, :] * scales[:, None]
-    waves = torch.stack([angles.sin(), angles.cos()], dim=2).flatten(1)
-    return torch.cat([x, waves], dim=-1) if include_input else waves
+    if native.usable(x) and x.ndim == 2:
+        return _FrequencyEncoding.apply(x.contiguous(), num_frequencies, include_input)
+    return frequency_encoding_reference(x, num_frequencies, include_input)

@@ -4,6 +4,7 @@ outputs/{experiment}/{method}/{YYYY-mm-dd_HHMMSS}/
     config.yml                    all settings, plain YAML
     dataparser_transforms.json    from the input's frame to the scene's
     nerfstudio_models/            checkpoints
+    scene_profile.json            what the scene needs and what was decided by it
     learning_curve.json           seconds, step, PSNR
     skip_report.json              what was skipped, and what that saved
     eval.json, pictures/          the final evaluation

@@ -18,11 +18,13 @@ from framework.config import to_plain
 from framework.console import say
 from framework.dataset import Dataset
 from framework.device import seed_step, wait_for
+from framework.error_map import ErrorMap
 from framework.errors import CheckpointError, DivergenceError
 from framework.evaluation.evaluator import evaluate, evaluation_background, render_view, use_bfloat16
 from framework.evaluation.images import comparison
 from framework.evaluation.metrics import MAX_PSNR
 from framework.pixels import Background, Batch, composite, draw_batch
+from framework.scene_profile import Decision, SceneProfile
 from framework.silhouettes import Silhouettes, pixels_near, visual_hull
 from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest, save_checkpoint
 from framework.training.optim import first_non_finite, learning_rate_factor, make_optimizer, set_learning_rate
@@ -89,6 +91,7 @@ class Trainer:
         torch.manual_seed(self.config.machine.seed)
         self.model = build_model(run.method, self.config, train_set.scene).to(self.device)
         self.optimizer = make_optimizer(self.model, self.config)
+        self.errors = ErrorMap(train_set) if self.config.draw_by_error else None
         self.state = State()
         self.first_step = 0
         self._bad_in_a_row = 0
@@ -114,6 +117,7 @@ class Trainer:
             "model": self.model.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "state": vars(self.state),
+            "errors": None if self.errors is None else self.errors.errors,
         }
         return save_checkpoint(
             self.checkpoint_folder, self.state.step, content, keep_all=not self.config.save_only_latest_checkpoint
@@ -131,7 +135,9 @@ class Trainer:
             for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
                 group["initial_lr"] = rate  # a rate given on the command line counts
             self.state = State(**checkpoint["state"])
-        except (KeyError, TypeError, ValueError) as error:
+            if self.errors is not None and checkpoint.get("errors") is not None:
+                self.errors.errors.copy_(checkpoint["errors"])
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise CheckpointError(f"the checkpoint's optimiser does not fit: {error}") from error
         self.first_step = self.state.step
         self._last_save = self._last_eval = self.state.seconds
@@ -189,13 +195,34 @@ class Trainer:
             done = max(done, self.state.seconds / self.config.max_seconds)
         return min(done, 1.0)
 
+    def profile(self) -> SceneProfile:
+        """What the scene needs, and why."""
+        scene, decisions = self.model.scene, []
+        if self.config.background == "auto":
+            reason = f"{'the photographs have' if scene.has_alpha else 'no photograph has'} alpha"
+            decisions.append(Decision("background", self._background(), reason))
+        if self.model.occupancy_samplers and self.config.silhouette_cells:
+            obstacle = self._no_silhouettes()
+            choice = "not used" if obstacle else "space outside them is skipped from the start"
+            decisions.append(Decision("silhouettes", choice, obstacle or "alpha shows them"))
+        if scene.moving and not self.model.learns_motion:
+            decisions.append(Decision("times", "ignored", f"{self.run.method} learns a still scene: what moves blurs"))
+        return SceneProfile.of(self.train_set, decisions + self.model.decisions())
+
+    def _no_silhouettes(self) -> str | None:
+        """Why the photographs' alpha cannot tell what is empty; None where it can."""
+        scene, camera = self.model.scene, self.train_set.cameras.model
+        if not scene.has_alpha:
+            return "no photograph has alpha"
+        if scene.moving:
+            return "what is empty at one time may not be at another"
+        return None if camera == "pinhole" else f"the camera is {camera}, not pinhole"
+
     def _prepare(self) -> None:
         """What the photographs' silhouettes save. It counts as training time."""
         self._prepared = True
-        start, samplers = time.perf_counter(), self.model.occupancy_samplers
-        scene, config = self.model.scene, self.config
-        known = scene.has_alpha and not scene.moving and self.train_set.cameras.model == "pinhole"
-        if not (samplers and known and config.silhouette_cells):
+        start, samplers, config = time.perf_counter(), self.model.occupancy_samplers, self.config
+        if not samplers or not config.silhouette_cells or self._no_silhouettes():
             return
         silhouettes = Silhouettes.of(self.train_set)
         if self.state.step == 0:
@@ -219,14 +246,17 @@ class Trainer:
         seed_step(self.config.machine.seed, state.step)
         self.model.train()
         set_learning_rate(self.optimizer, learning_rate_factor(self.config, state.step, self.progress))
-        batch = draw_batch(self.train_set, self._batch_size(), self._background())
+        batch = draw_batch(self.train_set, self._batch_size(), self._background(), self.errors)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=use_bfloat16(self.model)):
             self.model.before_step(state.step)
             rendered = self.model.render(batch.rays, batch.background)
             losses = self.model.loss(rendered, batch, state.step)
         loss = torch.stack(list(losses.values())).sum()
         self._descend(loss)
-        mse = float((rendered.rgb.detach() - batch.rgb).square().mean())
+        squares = (rendered.rgb.detach() - batch.rgb).square().mean(-1)
+        if self.errors is not None:
+            self.errors.learn(batch.pixels, squares)
+        mse = float((squares if batch.weights is None else squares * batch.weights).mean())
         wait_for(self.device)
         seconds = time.perf_counter() - start
         self._account(batch, rendered.num_samples, mse, seconds)

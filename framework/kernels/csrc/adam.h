@@ -31,11 +31,29 @@ inline bool all_zero(const float* values) {
 struct Settings {
     float keep1, add1, keep2, add2, rate, eps;
     std::vector<float> unbias1, unbias2;  // by how often an entry has been updated
+    float settled;                        // updates after which both are 1
 
     Settings(float rate, double beta1, double beta2, float eps)
         : keep1(float(beta1)), add1(float(1 - beta1)), keep2(float(beta2)), add2(float(1 - beta2)), rate(rate),
-          eps(eps), unbias1(corrections(beta1)), unbias2(corrections(beta2)) {}
+          eps(eps), unbias1(corrections(beta1)), unbias2(corrections(beta2)),
+          settled(float((unbias1.size() > unbias2.size() ? unbias1.size() : unbias2.size()) - 1)) {}
 };
+
+// Moves LANES values where `mask` is set; the gradient is cleared. Corrections may be 1 or vectors.
+template <typename Factor>
+inline void move(float* values, float* mean, float* square, float* grad, Ints mask, Factor unbias1, Factor unbias2,
+                 const Settings& s) {
+    const Floats g = load(grad), m0 = load(mean), v0 = load(square);
+    const Floats m = s.keep1 * m0 + s.add1 * g, v = s.keep2 * v0 + s.add2 * g * g;
+    alignas(64) float root[LANES];
+    store(root, unbias2 * v);
+    for (int i = 0; i < LANES; i++) root[i] = std::sqrt(root[i]);
+    const Floats p = load(values), moved = p - s.rate * unbias1 * m / (load(root) + s.eps);
+    store(values, mask ? moved : p);
+    store(mean, mask ? m : m0);
+    store(square, mask ? v : v0);
+    store(grad, splat(0));
+}
 
 // LANES values, LANES / F entries. Returns how many of them had a gradient.
 template <int F>
@@ -57,16 +75,37 @@ inline int update(float* values, float* mean, float* square, float* grad, float*
     }
     Ints mask;
     std::memcpy(&mask, used, sizeof mask);
-    const Floats g = load(grad), m = s.keep1 * load(mean) + s.add1 * g, v = s.keep2 * load(square) + s.add2 * g * g;
-    alignas(64) float root[LANES];
-    store(root, load(unbias2) * v);
-    for (int i = 0; i < LANES; i++) root[i] = std::sqrt(root[i]);
-    const Floats p = load(values), moved = p - s.rate * load(unbias1) * m / (load(root) + s.eps);
-    store(values, mask ? moved : p);
-    store(mean, mask ? m : load(mean));
-    store(square, mask ? v : load(square));
-    store(grad, splat(0));
+    move(values, mean, square, grad, mask, load(unbias1), load(unbias2), s);
     return touched;
+}
+
+typedef int64_t Longs __attribute__((vector_size(LANES * 4)));
+
+// Whether LANES / F entries, F being 1 or 2, are all past the correction: then they need no look at each by itself.
+template <int F>
+inline bool all_settled(const float* seen, const Settings& s) {
+    bool settled = true;
+    for (int e = 0; e < LANES / F; e++) settled &= seen[e] >= s.settled;
+    return settled;
+}
+
+// As `update`, for settled entries, whose counts grow no more.
+template <int F>
+inline int update_settled(float* values, float* mean, float* square, float* grad, const Settings& s) {
+    Ints mask;
+    if constexpr (F == 2) {
+        Longs pairs;
+        std::memcpy(&pairs, grad, sizeof pairs);
+        const Longs any = (pairs & 0x7fffffff7fffffff) != 0;
+        std::memcpy(&mask, &any, sizeof mask);
+    } else {
+        std::memcpy(&mask, grad, sizeof mask);
+        mask = (mask & 0x7fffffff) != 0;
+    }
+    move(values, mean, square, grad, mask, 1.0f, 1.0f, s);
+    int touched = 0;
+    for (int i = 0; i < LANES; i++) touched -= mask[i];
+    return touched / F;
 }
 
 // A single entry, where fewer than LANES values are left or an entry has an odd number of features.
@@ -95,7 +134,13 @@ int64_t update_range(float* values, float* mean, float* square, float* grad, flo
     if constexpr (F > 0 && F <= LANES)
         for (; e + LANES / F <= end; e += LANES / F) {
             const int64_t i = e * F;
-            if (!all_zero(grad + i)) touched += update<F>(values + i, mean + i, square + i, grad + i, seen + e, s);
+            if (all_zero(grad + i)) continue;
+            if constexpr (F <= 2)
+                if (all_settled<F>(seen + e, s)) {
+                    touched += update_settled<F>(values + i, mean + i, square + i, grad + i, s);
+                    continue;
+                }
+            touched += update<F>(values + i, mean + i, square + i, grad + i, seen + e, s);
         }
     for (; e < end; e++) {
         const int64_t i = e * features;

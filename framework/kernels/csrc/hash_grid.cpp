@@ -85,6 +85,12 @@ inline void blend(const Cell& cell, const float* table, int count, float* out, i
 }
 
 template <int F>
+inline void prefetch(const Cell& cell, const float* table) {
+    for (int c = 0; c < CORNERS; c++)
+        for (int s = 0; s < LANES; s++) __builtin_prefetch(table + int64_t(cell.entry[c][s]) * F);
+}
+
+template <int F>
 inline void scatter(const Cell& cell, float* table, int count, const float* grad) {
     for (int s = 0; s < count; s++) {
         float g[F];
@@ -112,10 +118,16 @@ inline int block(int64_t first, int64_t end) { return int(end - first < LANES ? 
 template <int F, bool DENSE>
 void forward_level(const Level& level, const Floats (*xyz)[3], const float* table, int64_t begin, int64_t end,
                    float* out, int64_t stride) {
-    Cell cell;
-    for (int64_t n = begin; n < end; n += LANES, xyz++) {
-        find_cell<DENSE>(level, (*xyz)[0], (*xyz)[1], (*xyz)[2], cell);
-        blend<F>(cell, table + level.offset * F, block(n, end), out + n * stride, stride);
+    Cell cells[2];  // this block's and the next one's, whose entries are on their way meanwhile
+    const float* entries = table + level.offset * F;
+    find_cell<DENSE>(level, (*xyz)[0], (*xyz)[1], (*xyz)[2], cells[0]);
+    for (int64_t n = begin, turn = 0; n < end; n += LANES, turn ^= 1) {
+        if (n + LANES < end) {
+            xyz++;
+            find_cell<DENSE>(level, (*xyz)[0], (*xyz)[1], (*xyz)[2], cells[turn ^ 1]);
+            prefetch<F>(cells[turn ^ 1], entries);
+        }
+        blend<F>(cells[turn], entries, block(n, end), out + n * stride, stride);
     }
 }
 

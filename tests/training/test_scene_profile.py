@@ -1,0 +1,95 @@
+"""What is read from the data, what is decided by it, and that both are what the run then does."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from framework.cli.session import start
+from framework.training.trainer import Trainer
+from tests.training.helpers import assert_same_bits, tensors, tiny_run, tiny_trainer
+
+
+def decisions(trainer: Trainer) -> dict[str, tuple[str, str]]:
+    return {d.option: (d.choice, d.reason) for d in trainer.profile().decisions}
+
+
+def test_facts_and_decisions_of_photographs_with_alpha(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=1, max_resolution=None)
+    profile, data = trainer.profile(), trainer.train_set
+    assert profile.images == len(data)
+    assert (profile.width, profile.height) == (int(data.cameras.widths[0]), int(data.cameras.heights[0]))
+    assert profile.transparent == pytest.approx((data.pixels[:, 3].numpy() == 0).mean(), abs=1e-6)
+    found = decisions(trainer)
+    assert found["background"] == ("random", "the photographs have alpha")
+    assert found["silhouettes"][0].startswith("space outside them is skipped")
+    finest = trainer.model.field.grid.layout.resolutions[-1]  # type: ignore[union-attr]
+    assert found["finest cells along an axis"][0] == str(finest)
+    trainer.train()
+    assert trainer.model.occupancy_samplers[0].any_carved  # as announced
+
+
+def test_times_that_a_still_method_ignores_are_announced(shared_tiny: Path, tmp_path: Path) -> None:
+    run = tiny_run("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=1)
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "still", max_num_iterations=1)
+    still = trainer.train_set
+    moving = replace(still, times=torch.linspace(0, 1, len(still)), scene=replace(still.scene, moving=True))
+    (tmp_path / "run").mkdir()
+    found = decisions(Trainer(run, moving, None))
+    assert found["times"][0] == "ignored"
+    assert "instant-ngp" in found["times"][1]
+    assert found["silhouettes"][0] == "not used"
+    assert "times" not in decisions(trainer)
+
+
+def test_without_alpha_the_background_is_black_and_no_silhouette_used(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=1)
+    opaque = replace(
+        trainer.train_set,
+        pixels=trainer.train_set.pixels[:, :3].contiguous(),
+        scene=replace(trainer.train_set.scene, has_alpha=False),
+    )
+    found = Trainer(trainer.run, opaque, None)
+    assert decisions(found)["background"] == ("black", "no photograph has alpha")
+    assert decisions(found)["silhouettes"] == ("not used", "no photograph has alpha")
+    assert found.profile().transparent is None
+    found.train_step()
+    assert not found.model.occupancy_samplers[0].any_carved  # as announced
+
+
+def test_what_the_user_decided_is_not_called_a_decision(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer(
+        "instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=1, background="white", silhouette_cells=False
+    )
+    assert decisions(trainer) == {}
+
+
+def test_it_is_printed_and_saved(shared_tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = tiny_run("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=1, max_eval_images=0)
+    start(run)
+    printed = capsys.readouterr()
+    saved = json.loads((tmp_path / "run" / "scene_profile.json").read_text())
+    text = " ".join((printed.out + printed.err).split())
+    for decision in saved["decisions"]:
+        assert f"{decision['option']}: {decision['choice']}" in text
+    assert f"{saved['images']} images of {saved['width']} x {saved['height']}" in text
+
+
+def test_drawing_by_error_is_resumed_with_the_same_bits(shared_tiny: Path, tmp_path: Path) -> None:
+    settings = {"max_num_iterations": 12, "draw_by_error": True}
+    whole = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "whole", **settings)
+    whole.train()
+    first = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "first", **settings)
+    for _ in range(5):
+        first.train_step()
+    first.save()
+    second = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "second", load_dir=first.checkpoint_folder, **settings)
+    second.restore_as_configured()
+    second.train()
+    assert whole.errors is not None
+    assert second.errors is not None
+    assert torch.equal(whole.errors.errors, second.errors.errors)
+    assert len(whole.errors.errors.unique()) > 2  # something was learnt
+    assert_same_bits(tensors(whole), tensors(second))

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from framework.config import TrainConfig
-from framework.encodings import HashGrid
+from framework.encodings import FeaturePlanes, HashGrid
 from framework.losses import mean_squared_error
 from framework.pixels import Batch
 from framework.rays import Rays
@@ -57,7 +57,7 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
     def param_groups(self) -> list[dict[str, Any]]:
         """Adam's parameter groups. Each has `params` and may set `lr`, `betas`, `eps`, `sparse`.
 
-        By default the tables of hash grids that ask for it are a group that is updated sparsely.
+        By default the tables of encodings that ask for it are a group that is updated sparsely.
         """
         grids = self.sparse_grids
         rest = [p for p in self.parameters() if not any(p is grid.table for grid in grids)]
@@ -65,9 +65,10 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
         return groups + ([{"params": [g.table for g in grids], "name": "tables", "sparse": True}] if grids else [])
 
     @cached_property
-    def sparse_grids(self) -> list[HashGrid]:
-        """Hash grids whose tables are updated sparsely."""
-        return [module for module in self.modules() if isinstance(module, HashGrid) and module.deferred is not None]
+    def sparse_grids(self) -> list[HashGrid | FeaturePlanes]:
+        """Encodings whose tables are updated sparsely."""
+        tables = (m for m in self.modules() if isinstance(m, (HashGrid, FeaturePlanes)))
+        return [module for module in tables if module.deferred is not None]
 
     @property
     def occupancy_samplers(self) -> list[OccupancySampler]:

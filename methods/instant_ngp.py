@@ -13,7 +13,7 @@ from torch import Tensor
 
 from framework import Decision, Method, Model, Rays, Rendered, Scene, TrainConfig
 from framework.encodings import HashGrid
-from framework.fields.hash import HashField
+from framework.fields.encoded import EncodedField
 from framework.renderers import render_field
 from framework.samplers.occupancy import OccupancySampler
 
@@ -95,7 +95,7 @@ class InstantNGP(Model[InstantNGPConfig]):
             config.log2_table_size,
             config.sparse_updates,
         )
-        self.field = HashField(
+        self.field = EncodedField(
             scene.box, grid, config.hidden_width, direction_levels=4 if config.view_dependence else 0
         )
         self.sampler = OccupancySampler(
@@ -112,7 +112,7 @@ class InstantNGP(Model[InstantNGPConfig]):
             return []
         size, detail = self.scene.image_size, self.config.detail
         reason = f"each of the images' {size} pixels gets {detail} or more"
-        return [Decision("finest cells along an axis", f"{self.field.grid.layout.resolutions[-1]}", reason)]
+        return [Decision("finest cells along an axis", f"{self.field.encoding.layout.resolutions[-1]}", reason)]
 
     def render(self, rays: Rays, background: Tensor) -> Rendered:
         return render_field(self.field, self.sampler, rays, background, self.training)

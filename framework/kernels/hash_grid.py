@@ -121,6 +121,15 @@ class TableGradient:
         self.parts: list[tuple[Tensor, Tensor]] = []
         """Positions (N, 3) and incoming gradient (N, L * F) of each encoding."""
 
+    @property
+    def pending(self) -> bool:
+        """Whether there is any."""
+        return bool(self.parts)
+
+    def clear(self) -> None:
+        """Forget it."""
+        self.parts.clear()
+
     def finite(self) -> bool:
         """Whether no incoming gradient is infinite or NaN."""
         return all(all_finite(grad) for _, grad in self.parts)

@@ -12,6 +12,7 @@ from framework.config import TrainConfig
 from framework.kernels.adam import all_finite, sparse_adam
 from framework.kernels.hash_grid import TableGradient
 from framework.kernels.memory import table
+from framework.kernels.planes import PlanesGradient
 from framework.model import Model
 
 
@@ -30,7 +31,7 @@ class Adam(torch.optim.Optimizer):
     def __init__(
         self,
         groups: list[dict[str, Any]],
-        deferred: dict[Tensor, TableGradient],
+        deferred: dict[Tensor, TableGradient | PlanesGradient],
         lr: float,
         betas: tuple[float, float],
         eps: float,
@@ -52,7 +53,7 @@ class Adam(torch.optim.Optimizer):
         """Forget gradients, those that wait included."""
         super().zero_grad(set_to_none=True)
         for gradient in self.deferred.values():
-            gradient.parts.clear()
+            gradient.clear()
 
     def first_bad(self) -> Tensor | None:
         """The first parameter whose gradient is not finite; None where all are."""
@@ -78,7 +79,7 @@ class Adam(torch.optim.Optimizer):
         state, waiting = self.state[parameter], self.deferred.get(parameter)
         moments = state["exp_avg"], state["exp_avg_sq"], state["seen"]
         settings = group["lr"], group["betas"], group["eps"]
-        if waiting is not None and waiting.parts:
+        if waiting is not None and waiting.pending:
             self.entries_updated += waiting.adam(parameter, *moments, *settings)
         if parameter.grad is not None:
             self.entries_updated += sparse_adam(parameter, parameter.grad, *moments, *settings)
@@ -110,7 +111,7 @@ def make_optimizer(model: Model, config: TrainConfig) -> Adam:
     for group in model.param_groups():
         rate = group.get("lr", config.learning_rate)
         groups.append({**group, "lr": rate, "initial_lr": rate})
-    deferred: dict[Tensor, TableGradient] = {
+    deferred: dict[Tensor, TableGradient | PlanesGradient] = {
         grid.table: grid.deferred for grid in model.sparse_grids if grid.deferred is not None
     }
     return Adam(groups, deferred, config.learning_rate, (config.adam_beta1, config.adam_beta2), config.adam_eps)

@@ -5,7 +5,7 @@ import torch
 
 from framework.encodings import HashGrid
 from framework.fields.base import Field
-from framework.fields.hash import HashField
+from framework.fields.encoded import EncodedField
 from framework.fields.nerf import NeRFField
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
@@ -15,7 +15,7 @@ def make(kind: str) -> Field:
     torch.manual_seed(0)
     if kind == "nerf":
         return NeRFField()
-    return HashField(BOX, HashGrid(num_levels=4, max_resolution=64, log2_table_size=12))
+    return EncodedField(BOX, HashGrid(num_levels=4, max_resolution=64, log2_table_size=12))
 
 
 @pytest.mark.parametrize("kind", ["nerf", "hash"])

@@ -25,7 +25,7 @@ def test_facts_and_decisions_of_photographs_with_alpha(shared_tiny: Path, tmp_pa
     found = decisions(trainer)
     assert found["background"] == ("random", "the photographs have alpha")
     assert found["silhouettes"][0].startswith("space outside them is skipped")
-    finest = trainer.model.field.grid.layout.resolutions[-1]  # type: ignore[union-attr]
+    finest = trainer.model.field.encoding.layout.resolutions[-1]  # type: ignore[union-attr]
     assert found["finest cells along an axis"][0] == str(finest)
     trainer.train()
     assert trainer.model.occupancy_samplers[0].any_carved  # as announced

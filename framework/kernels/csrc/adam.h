@@ -126,6 +126,20 @@ inline int update_entry(float* values, float* mean, float* square, float* grad, 
     return 1;
 }
 
+// A single entry of whole vectors.
+inline int update_row(float* values, float* mean, float* square, float* grad, float* seen, int features,
+                      const Settings& s) {
+    bool none = true;
+    for (int i = 0; i < features; i += LANES) none &= all_zero(grad + i);
+    if (none) return 0;
+    const size_t k = size_t(seen[0] += 1);
+    const float unbias1 = s.unbias1[k < s.unbias1.size() ? k : s.unbias1.size() - 1];
+    const float unbias2 = s.unbias2[k < s.unbias2.size() ? k : s.unbias2.size() - 1];
+    for (int i = 0; i < features; i += LANES)
+        move(values + i, mean + i, square + i, grad + i, Ints{} - 1, unbias1, unbias2, s);
+    return 1;
+}
+
 // Entries [begin, end) in order. Returns how many had a gradient.
 template <int F>
 int64_t update_range(float* values, float* mean, float* square, float* grad, float* seen, int64_t begin, int64_t end,
@@ -142,6 +156,10 @@ int64_t update_range(float* values, float* mean, float* square, float* grad, flo
                 }
             touched += update<F>(values + i, mean + i, square + i, grad + i, seen + e, s);
         }
+    for (; F == 0 && features % LANES == 0 && e < end; e++) {
+        const int64_t i = e * features;
+        touched += update_row(values + i, mean + i, square + i, grad + i, seen + e, features, s);
+    }
     for (; e < end; e++) {
         const int64_t i = e * features;
         touched += update_entry(values + i, mean + i, square + i, grad + i, seen + e, features, s);

@@ -1,0 +1,269 @@
+"""Multiscale feature planes: K-Planes (Fridovich-Keil et al. 2023), section 3.
+
+Each pair of axes has a plane of features at every scale. A position's feature at a scale is the product, over the
+planes, of what bilinear interpolation finds at its projection (equation 2); the scales stand side by side.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from framework.kernels import memory, native
+from framework.kernels.adam import all_finite, sparse_adam
+
+
+@dataclass(frozen=True)
+class PlanesLayout:
+    """Where each plane's entries stand in the one table (E, F) that all share."""
+
+    resolutions: tuple[tuple[int, ...], ...]
+    """Vertices along each of D axes, per scale."""
+    axes: tuple[tuple[int, int], ...]
+    """The two axes of each plane. The first one's index runs fastest."""
+    offsets: tuple[tuple[int, ...], ...]
+    """First entry of each plane, per scale."""
+    num_entries: int
+
+    @classmethod
+    def build(cls, resolutions: tuple[tuple[int, ...], ...]) -> PlanesLayout:
+        """A plane for every pair of axes at every scale.
+
+        Raises: ValueError where an axis has fewer than two vertices, or the scales differ in their number of axes.
+        """
+        dims = {len(scale) for scale in resolutions}
+        if len(dims) != 1 or not dims <= {2, 3, 4}:
+            raise ValueError(f"planes need the same 2 to 4 axes at every scale, not {sorted(dims)}")
+        if min(min(scale) for scale in resolutions) < 2:
+            raise ValueError(f"planes need two vertices or more along each axis, not {resolutions}")
+        axes = tuple(combinations(range(dims.pop()), 2))
+        offsets, total = [], 0
+        for scale in resolutions:
+            firsts = []
+            for a, b in axes:
+                firsts.append(total)
+                total += scale[a] * scale[b]
+            offsets.append(tuple(firsts))
+        return cls(resolutions, axes, tuple(offsets), total)
+
+    @property
+    def dims(self) -> int:
+        """D, the number of axes."""
+        return len(self.resolutions[0])
+
+    @property
+    def num_scales(self) -> int:
+        return len(self.resolutions)
+
+    def plane(self, table: Tensor, scale: int, index: int) -> Tensor:
+        """A plane of a table (E, F) as a view (vertices along the second axis, along the first, F)."""
+        a, b = self.axes[index]
+        across, up = self.resolutions[scale][a], self.resolutions[scale][b]
+        first = self.offsets[scale][index]
+        return table[first : first + across * up].view(up, across, -1)
+
+    @cached_property
+    def arrays(self) -> tuple[Any, Any, Any]:
+        """Axes, resolutions and offsets as C arrays."""
+        flat = (tuple(value for row in rows for value in row) for rows in (self.axes, self.resolutions, self.offsets))
+        axes, resolutions, offsets = (native.integers(values) for values in flat)
+        return axes, resolutions, offsets
+
+
+def planes_reference(positions: Tensor, table: Tensor, layout: PlanesLayout) -> Tensor:
+    """The look-up as the paper writes it: the truth, in any float type, differentiable to any order."""
+    clamped, features = positions.clamp(0, 1), []
+    for scale, resolution in enumerate(layout.resolutions):
+        vertices = torch.tensor(resolution, device=positions.device)
+        scaled = clamped * (vertices - 1).to(positions)
+        cell = torch.minimum(scaled.detach().nan_to_num().long(), vertices - 2)
+        fraction = scaled - cell
+        product: Tensor | None = None
+        for index, (a, b) in enumerate(layout.axes):
+            across = resolution[a]
+            first = layout.offsets[scale][index] + cell[:, b] * across + cell[:, a]
+            fa, fb = fraction[:, a, None], fraction[:, b, None]
+            low = table[first] * (1 - fa) + table[first + 1] * fa
+            high = table[first + across] * (1 - fa) + table[first + across + 1] * fa
+            value = low * (1 - fb) + high * fb
+            product = value if product is None else product * value
+        assert product is not None
+        features.append(product)
+    return torch.cat(features, dim=-1)
+
+
+_TAIL = "iiiippp"
+_forward = native.function("planes_forward", "pqp" + _TAIL + "pi")
+_backward_table = native.function("planes_backward_table", "pqp" + _TAIL + "ppi")
+_backward_positions = native.function("planes_backward_positions", "pqp" + _TAIL + "ppi")
+
+
+class PlanesGradient:
+    """A table's gradient that is not added up yet: what the backward passes of several look-ups left.
+
+    A step touches few entries. They are added up in a table that is kept, and that Adam clears where it was used.
+    """
+
+    def __init__(self, layout: PlanesLayout) -> None:
+        self.layout = layout
+        self.parts: list[tuple[Tensor, Tensor]] = []
+        """Positions (N, D) and incoming gradient (N, S * F) of each look-up."""
+        self.bands: list[tuple[int, Tensor]] = []
+        """First entry and gradient (B, F) of each band of entries that was read as it is."""
+        self._sum: Tensor | None = None
+
+    def finite(self) -> bool:
+        """Whether no incoming gradient is infinite or NaN."""
+        return all(all_finite(grad) for _, grad in (*self.parts, *self.bands))
+
+    @property
+    def pending(self) -> bool:
+        """Whether there is any."""
+        return bool(self.parts or self.bands)
+
+    def clear(self) -> None:
+        """Forget it."""
+        self.parts.clear()
+        self.bands.clear()
+
+    def adam(
+        self, table: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
+        rate: float, betas: tuple[float, float], eps: float,
+    ) -> int:  # fmt: skip
+        """One step of `framework.kernels.adam.sparse_adam` with this gradient, which is forgotten then."""
+        if self._sum is None:
+            self._sum = memory.table(*table.shape)
+        for positions, grad in self.parts:
+            _add_to(self._sum, positions, table, grad, self.layout)
+        for first, grad in self.bands:
+            self._sum[first : first + len(grad)] += grad
+        self.clear()
+        return sparse_adam(table, self._sum, mean, square, seen, rate, betas, eps)
+
+
+class _Planes(torch.autograd.Function):
+    """The compiled look-up."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        positions: Tensor,
+        table: Tensor,
+        layout: PlanesLayout,
+        deferred: PlanesGradient | None,
+        known: Tensor | None,
+    ) -> Tensor:
+        if known is not None:
+            out = known.view_as(known)
+        else:
+            out = positions.new_empty(len(positions), layout.num_scales * table.shape[1])
+            _forward(*_arguments(positions, table, layout), out.data_ptr(), native.threads())
+        ctx.save_for_backward(positions, table)
+        ctx.layout, ctx.deferred = layout, deferred
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        positions, table = ctx.saved_tensors
+        grad = grad.contiguous()
+        of_positions = of_table = None
+        if ctx.needs_input_grad[0]:
+            of_positions = torch.empty_like(positions)
+            incoming = _incoming(grad, positions, table, ctx.layout)
+            arguments = _arguments(positions, table, ctx.layout)
+            _backward_positions(*arguments, incoming, of_positions.data_ptr(), native.threads())
+        if ctx.needs_input_grad[1] and ctx.deferred is not None:
+            ctx.deferred.parts.append((positions, grad))
+        elif ctx.needs_input_grad[1]:
+            of_table = torch.zeros_like(table)
+            _add_to(of_table, positions, table, grad, ctx.layout)
+        return of_positions, of_table, None, None, None
+
+
+def _add_to(total: Tensor, positions: Tensor, table: Tensor, grad: Tensor, layout: PlanesLayout) -> None:
+    into = native.pointer(total, "the planes' gradient", tuple(table.shape))
+    incoming = _incoming(grad, positions, table, layout)
+    _backward_table(*_arguments(positions, table, layout), incoming, into, native.threads())
+
+
+def _incoming(grad: Tensor, positions: Tensor, table: Tensor, layout: PlanesLayout) -> int:
+    return native.pointer(grad, "the gradient", (len(positions), layout.num_scales * table.shape[1]))
+
+
+def _arguments(positions: Tensor, table: Tensor, layout: PlanesLayout) -> tuple[Any, ...]:
+    count, features = len(positions), table.shape[1]
+    points = native.pointer(positions, "positions", (count, layout.dims))
+    entries = native.pointer(table, "the planes", (layout.num_entries, features))
+    sizes = layout.dims, features, layout.num_scales, len(layout.axes)
+    return points, count, entries, *sizes, *layout.arrays
+
+
+class _Band(torch.autograd.Function):
+    """Entries [first, first + count) of a table, as they are."""
+
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, first: int, count: int, deferred: PlanesGradient | None) -> Tensor:
+        ctx.first, ctx.shape, ctx.deferred = first, table.shape, deferred
+        return table[first : first + count].clone()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, None, None, None]:
+        if ctx.deferred is not None and native.usable(grad):
+            ctx.deferred.bands.append((ctx.first, grad))
+            return None, None, None, None
+        out = grad.new_zeros(ctx.shape)
+        out[ctx.first : ctx.first + len(grad)] = grad
+        return out, None, None, None
+
+
+def plane_band(
+    table: Tensor, layout: PlanesLayout, scale: int, index: int, first_row: int, rows: int,
+    deferred: PlanesGradient | None = None,
+) -> Tensor:  # fmt: skip
+    """Some rows of a plane, for regularisers that look at neighbours: a look at all of a large table is dear.
+
+    Args:
+        table: (E, F).
+        scale, index: which plane.
+        first_row, rows: along the plane's second axis.
+        deferred: where the gradient is left on the processor, as for `planes`.
+    Returns: (rows, vertices along the first axis, F).
+    """
+    across = layout.resolutions[scale][layout.axes[index][0]]
+    first = layout.offsets[scale][index] + first_row * across
+    return _Band.apply(table, first, rows * across, deferred).view(rows, across, -1)
+
+
+def planes(
+    positions: Tensor,
+    table: Tensor,
+    layout: PlanesLayout,
+    deferred: PlanesGradient | None = None,
+    known: Tensor | None = None,
+) -> Tensor:
+    """Multiscale plane features.
+
+    Args:
+        positions: (N, D) in [0, 1]; what lies outside is moved to the edge.
+        table: (E, F) entries of all planes, E = layout.num_entries.
+        layout: resolutions and offsets.
+        deferred: where the compiled kernel's backward pass leaves the table's gradient, autograd getting none.
+        known: (N, S * F) the result, where it was computed before without a gradient: only the backward pass is left.
+    Returns: (N, S * F), scale by scale. First derivatives only where compiled; see `planes_reference`.
+    Raises: ValueError where a shape does not fit the layout.
+    """
+    if positions.ndim != 2 or positions.shape[1] != layout.dims:
+        raise ValueError(f"planes: positions have shape {tuple(positions.shape)}, not (N, {layout.dims})")
+    if table.ndim != 2 or table.shape[0] != layout.num_entries:
+        raise ValueError(f"planes: the table has shape {tuple(table.shape)}, not ({layout.num_entries}, F)")
+    positions = positions.to(table.dtype)
+    if native.usable(positions, table):
+        return _Planes.apply(positions.contiguous(), table.contiguous(), layout, deferred, known)
+    return planes_reference(positions, table, layout)

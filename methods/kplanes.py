@@ -1,0 +1,169 @@
+"""K-Planes: products of feature planes in space and time, at several scales.
+
+Fridovich-Keil et al., "K-Planes: Explicit Radiance Fields in Space, Time, and Appearance", CVPR 2023.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from framework import Batch, Decision, Field, Method, Model, Rays, Rendered, Scene, TrainConfig
+from framework.encodings import FeaturePlanes
+from framework.fields.base import MLP
+from framework.fields.encoded import EncodedField
+from framework.kernels.math import truncated_exp
+from framework.kernels.planes import plane_band
+from framework.kernels.spherical_harmonics import spherical_harmonics
+from framework.renderers import render_field
+from framework.samplers.occupancy import OccupancySampler
+
+
+@dataclass(frozen=True)
+class KPlanesConfig(TrainConfig):
+    """Settings of kplanes."""
+
+    max_num_iterations: int = 30_000
+    samples_per_batch: int | None = 2**15
+    learning_rate: float = 1e-2
+    lr_schedule: Literal["constant", "exponential", "cosine", "hold-exponential"] = "hold-exponential"
+    lr_final: float = 0.02
+    adam_beta2: float = 0.99
+    adam_eps: float = 1e-12
+    decoder: Literal["hybrid", "explicit"] = "hybrid"
+    """hybrid: two small networks. explicit: linear density, and a learned basis of colours."""
+    base_resolution: int = 64
+    """Vertices along an axis of space at the coarsest scale; each scale doubles it."""
+    num_scales: int | None = None
+    """Scales. If not given: as many as the images' pixels can show."""
+    time_resolution: int = 25
+    """Vertices along time, at every scale."""
+    features_per_scale: int = 32
+    """Features of a plane's vertex."""
+    hidden_width: int = 64
+    """Features of a layer of the networks."""
+    space_tv: float = 1e-4
+    """Weight of the planes' total variation in space."""
+    time_smoothness: float = 1e-3
+    """Weight of the planes' second difference in time."""
+    time_sparsity: float = 1e-4
+    """Weight of what keeps the planes of time at one, where nothing moves."""
+    sparse_updates: bool = True
+    """Adam updates only the entries that a step used."""
+    grid_resolution: int = 128
+    """Cells along an axis of the occupancy grid."""
+    num_steps: int = 512
+    """Steps along the box's diagonal."""
+    early_stop: float = 1e-4
+    """Transmittance below which the rest of a ray is dropped: the largest error of a colour channel."""
+    train_early_stop: float = 1e-2
+    """The same while training."""
+
+
+BANDS = 16
+"""The regularisers look at one row in so many of each plane in a step, a random band: on average they see all."""
+
+
+class ExplicitField(Field):
+    """Linear density, and colour as features times a basis that a small network of the direction learns (section 3.4).
+
+    Args:
+        box: (2, 3) the part of space that is encoded.
+        planes: the encoding.
+        width: features of the basis network's hidden layers.
+    """
+
+    def __init__(self, box: Tensor, planes: FeaturePlanes, width: int) -> None:
+        super().__init__()
+        self.encoded = EncodedField(box, planes, width)
+        del self.encoded.density_head, self.encoded.color_head
+        self.density_head = torch.nn.Linear(planes.num_features, 1, bias=False)
+        self.basis = MLP(16, width, width, 3 * planes.num_features)
+
+    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        features = self.encoded.encode(positions, times)
+        return truncated_exp(self.density_head(features)[:, 0]), features
+
+    def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
+        basis = self.basis(spherical_harmonics(directions)).view(len(features), 3, -1)
+        return torch.sigmoid((basis * features[:, None]).sum(-1).float())
+
+
+class KPlanes(Model[KPlanesConfig]):
+    """Planes of features, marched through an occupancy grid. Without times, the planes of time are left out."""
+
+    learns_motion = True
+
+    def __init__(self, config: KPlanesConfig, scene: Scene) -> None:
+        super().__init__(config, scene)
+        time = (config.time_resolution,) if scene.moving else ()
+        resolutions = tuple((config.base_resolution << s,) * 3 + time for s in range(self.num_scales))
+        self.planes = FeaturePlanes(resolutions, config.features_per_scale, config.sparse_updates)
+        kind = EncodedField if config.decoder == "hybrid" else ExplicitField
+        self.field = kind(scene.box, self.planes, config.hidden_width)
+        self.sampler = OccupancySampler(
+            scene.box,
+            config.grid_resolution,
+            config.num_steps,
+            config.early_stop,
+            config.train_early_stop,
+            moving=scene.moving,
+        )
+
+    @property
+    def num_scales(self) -> int:
+        """As configured, else until a plane has a vertex a pixel or more."""
+        config, scales = self.config, 1
+        if config.num_scales is not None:
+            return config.num_scales
+        while config.base_resolution << (scales - 1) < self.scene.image_size:
+            scales += 1
+        return scales
+
+    def decisions(self) -> list[Decision]:
+        found = []
+        if not self.scene.moving:
+            found.append(Decision("planes of time", "left out", "the photographs have no times"))
+        if self.config.num_scales is None:
+            reason = f"the images have {self.scene.image_size} pixels"
+            found.append(Decision("scales", f"{self.num_scales}", reason))
+        return found
+
+    def render(self, rays: Rays, background: Tensor) -> Rendered:
+        return render_field(self.field, self.sampler, rays, background, self.training)
+
+    def before_step(self, step: int) -> None:
+        self.sampler.update(step, self.field.density)
+
+    def loss(self, rendered: Rendered, batch: Batch, step: int) -> dict[str, Tensor]:
+        losses = super().loss(rendered, batch, step)
+        variation, roughness, activity = self._regularisers(rendered.rgb.new_zeros(()))
+        losses["space_tv"] = self.config.space_tv * variation
+        if self.scene.moving:
+            losses["time_smoothness"] = self.config.time_smoothness * roughness
+            losses["time_sparsity"] = self.config.time_sparsity * activity
+        return losses
+
+    def _regularisers(self, zero: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Total variation in space, roughness in time, and distance of time's planes from one (equations 4 to 6)."""
+        planes, layout = self.planes, self.planes.layout
+        variation = roughness = activity = zero
+        for scale in range(layout.num_scales):
+            for index, (_, second) in enumerate(layout.axes):
+                height = layout.resolutions[scale][second]
+                rows = height if second == 3 else max(height // BANDS, 2)  # time's planes are small: all of them
+                first = int(torch.randint(height - rows + 1, ()))
+                band = plane_band(planes.table, layout, scale, index, first, rows, planes.deferred)
+                variation = variation + band.diff(dim=1).square().mean()
+                if second == 3:
+                    roughness = roughness + band.diff(n=2, dim=0).square().mean()
+                    activity = activity + (1 - band).abs().mean()
+                else:
+                    variation = variation + band.diff(dim=0).square().mean()
+        return variation, roughness, activity
+
+
+METHOD = Method(KPlanes, KPlanesConfig(), paper="arXiv:2301.10241")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
@@ -46,28 +48,79 @@ class HashGrid(nn.Module):
 
 
 class FeaturePlanes(nn.Module):
-    """Multiscale feature planes over [0, 1]^D (K-Planes, section 3); a fourth axis is time.
+    """Factorised features over [0, 1]^D (K-Planes, section 3; TensoRF, section 4); a fourth axis is time.
 
     Args:
-        resolutions: vertices along each axis, per scale.
-        features_per_scale: F.
+        resolutions: vertices along each axis, per group of factors.
+        features_per_group: F.
+        axes: each factor's axis or two axes, per group; a plane for every pair of axes if None.
         sparse: updates touch only the entries that a step used, as for `HashGrid`.
     """
 
-    def __init__(self, resolutions: tuple[tuple[int, ...], ...], features_per_scale: int, sparse: bool = False) -> None:
+    resolutions: Tensor
+
+    def __init__(
+        self,
+        resolutions: tuple[tuple[int, ...], ...],
+        features_per_group: int,
+        axes: tuple[tuple[tuple[int, ...], ...], ...] | None = None,
+        sparse: bool = False,
+    ) -> None:
         super().__init__()
-        self.layout = PlanesLayout.build(resolutions)
-        self.dims = self.layout.dims
-        # As in section 4.1's implementation: products start neither at zero nor at one; time changes nothing at first.
-        self.table = nn.Parameter(table(self.layout.num_entries, features_per_scale).uniform_(0.1, 0.5))
+        self.layout = PlanesLayout.build(resolutions, axes)
+        self.dims, self.num_features = self.layout.dims, self.layout.num_groups * features_per_group
+        self.register_buffer("resolutions", torch.tensor(resolutions))
+        # As in K-Planes' section 4.1: products start neither at zero nor at one; time changes nothing at first.
+        self.table = nn.Parameter(table(self.layout.num_entries, features_per_group).uniform_(0.1, 0.5))
         with torch.no_grad():
-            for scale in range(self.layout.num_scales):
-                for index, axes in enumerate(self.layout.axes):
-                    if 3 in axes:
-                        self.layout.plane(self.table, scale, index).fill_(1)
+            for group, factors in enumerate(self.layout.axes):
+                for index, along in enumerate(factors):
+                    if 3 in along:
+                        self.layout.factor(self.table, group, index).fill_(1)
         self.deferred = PlanesGradient(self.layout) if sparse else None
-        self.num_features = self.layout.num_scales * features_per_scale
 
     def forward(self, positions: Tensor, known: Tensor | None = None) -> Tensor:
-        """Positions (N, D) in [0, 1] to features (N, S * F), which may be `known` already (see `planes`)."""
+        """Positions (N, D) in [0, 1] to features (N, G * F), which may be `known` already (see `planes`)."""
         return planes(positions, self.table, self.layout, self.deferred, known)
+
+    @torch.no_grad()
+    def resample(self, resolutions: tuple[tuple[int, ...], ...], lower: Tensor, upper: Tensor) -> None:
+        """Other resolutions, over the part of space from `lower` to `upper` (D,), in units of the present one.
+
+        Factors are interpolated linearly, so that what is looked up stays as it was at the new vertices. The table
+        becomes larger or smaller; the optimiser begins anew with it.
+        """
+        before, old = self.layout, self.table.data
+        self._relayout(torch.tensor(resolutions))
+        for group, factors in enumerate(self.layout.axes):
+            for index, along in enumerate(factors):
+                values = before.factor(old, group, index)
+                for dim, axis in zip((1, 0), along, strict=False):
+                    ends = lower[axis].item(), upper[axis].item()
+                    values = _interpolated(values, dim, *ends, resolutions[group][axis])
+                self.layout.factor(self.table, group, index).copy_(values)
+
+    def _relayout(self, resolutions: Tensor) -> None:
+        sizes = tuple(tuple(group) for group in resolutions.tolist())
+        self.layout = PlanesLayout.build(sizes, self.layout.axes)
+        self.resolutions = resolutions.to(self.resolutions)
+        self.table.data = table(self.layout.num_entries, self.table.shape[1], like=self.table)
+        if self.deferred is not None:
+            self.deferred.relayout(self.layout)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
+        saved = state_dict.get(prefix + "resolutions")
+        if saved is not None and saved.shape == self.resolutions.shape and not torch.equal(saved, self.resolutions):
+            self._relayout(saved)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+
+def _interpolated(values: Tensor, dim: int, first: float, last: float, count: int) -> Tensor:
+    """`values` along `dim` at `count` places evenly from `first` to `last`, 0 being its start and 1 its end."""
+    size = values.shape[dim]
+    places = torch.linspace(first, last, count, device=values.device).clamp(0, 1) * (size - 1)
+    left = places.long().clamp(max=size - 2)
+    shape = [-1 if d == dim else 1 for d in range(values.ndim)]
+    return torch.lerp(
+        values.index_select(dim, left), values.index_select(dim, left + 1), (places - left).view(shape)
+    )

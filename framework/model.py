@@ -75,8 +75,8 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
         """The grids that the photographs' silhouettes can empty before the first step."""
         return [module for module in self.modules() if isinstance(module, OccupancySampler)]
 
-    def before_step(self, step: int) -> None:
-        """Schedules that are functions of `step`, and refreshing what samplers know."""
+    def before_step(self, step: int, progress: float) -> None:
+        """Schedules, as functions of the step and of the share of the budget spent, and refreshing of samplers."""
 
     @property
     def samples_per_batch(self) -> int | None:

@@ -135,7 +135,7 @@ class KPlanes(Model[KPlanesConfig]):
     def render(self, rays: Rays, background: Tensor) -> Rendered:
         return render_field(self.field, self.sampler, rays, background, self.training)
 
-    def before_step(self, step: int) -> None:
+    def before_step(self, step: int, progress: float) -> None:
         self.sampler.update(step, self.field.density)
 
     def loss(self, rendered: Rendered, batch: Batch, step: int) -> dict[str, Tensor]:

@@ -125,7 +125,7 @@ class VanillaNeRF(Model[VanillaNeRFConfig]):
             return OCCUPANCY_SAMPLES_PER_BATCH
         return self.config.samples_per_batch
 
-    def before_step(self, step: int) -> None:
+    def before_step(self, step: int, progress: float) -> None:
         if self.sampler is not None:
             self.sampler.update(step, self.fine.density)
 

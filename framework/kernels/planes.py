@@ -1,11 +1,14 @@
-"""Multiscale feature planes: K-Planes (Fridovich-Keil et al. 2023), section 3.
+"""Factorised features: K-Planes (Fridovich-Keil et al. 2023), section 3; TensoRF (Chen et al. 2022), section 4.
 
-Each pair of axes has a plane of features at every scale. A position's feature at a scale is the product, over the
-planes, of what bilinear interpolation finds at its projection (equation 2); the scales stand side by side.
+A group of factors, each a plane over two axes or a line along one, is looked up where a position falls on each, by
+bilinear or linear interpolation, and the features found are multiplied. Groups stand side by side. K-Planes' groups
+are its scales, with a plane for every pair of axes (equation 2). TensoRF's VM decomposition has three groups of a plane
+and the line across it, its CP decomposition one group of three lines (equations 4 and 3).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -23,31 +26,36 @@ class PlanesLayout:
     """Where each plane's entries stand in the one table (E, F) that all share."""
 
     resolutions: tuple[tuple[int, ...], ...]
-    """Vertices along each of D axes, per scale."""
-    axes: tuple[tuple[int, int], ...]
-    """The two axes of each plane. The first one's index runs fastest."""
+    """Vertices along each of D axes, per group."""
+    axes: tuple[tuple[tuple[int, ...], ...], ...]
+    """The axis or the two axes of each factor, per group. The first one's index runs fastest."""
     offsets: tuple[tuple[int, ...], ...]
-    """First entry of each plane, per scale."""
+    """First entry of each factor, per group."""
     num_entries: int
 
     @classmethod
-    def build(cls, resolutions: tuple[tuple[int, ...], ...]) -> PlanesLayout:
-        """A plane for every pair of axes at every scale.
+    def build(
+        cls, resolutions: tuple[tuple[int, ...], ...], axes: tuple[tuple[tuple[int, ...], ...], ...] | None = None
+    ) -> PlanesLayout:
+        """Factors along the given axes; a plane for every pair of axes in every group if not given.
 
-        Raises: ValueError where an axis has fewer than two vertices, or the scales differ in their number of axes.
+        Raises: ValueError where an axis has fewer than two vertices, or the groups differ in how many axes or factors
+            they have.
         """
         dims = {len(scale) for scale in resolutions}
         if len(dims) != 1 or not dims <= {2, 3, 4}:
             raise ValueError(f"planes need the same 2 to 4 axes at every scale, not {sorted(dims)}")
         if min(min(scale) for scale in resolutions) < 2:
             raise ValueError(f"planes need two vertices or more along each axis, not {resolutions}")
-        axes = tuple(combinations(range(dims.pop()), 2))
+        axes = axes or (tuple(combinations(range(dims.pop()), 2)),) * len(resolutions)
+        if len(axes) != len(resolutions) or len({len(group) for group in axes}) != 1:
+            raise ValueError(f"planes need as many factors in every group, not {axes}")
         offsets, total = [], 0
-        for scale in resolutions:
+        for sizes, group in zip(resolutions, axes, strict=True):
             firsts = []
-            for a, b in axes:
+            for along in group:
                 firsts.append(total)
-                total += scale[a] * scale[b]
+                total += math.prod(sizes[axis] for axis in along)
             offsets.append(tuple(firsts))
         return cls(resolutions, axes, tuple(offsets), total)
 
@@ -57,40 +65,49 @@ class PlanesLayout:
         return len(self.resolutions[0])
 
     @property
-    def num_scales(self) -> int:
+    def num_groups(self) -> int:
         return len(self.resolutions)
 
-    def plane(self, table: Tensor, scale: int, index: int) -> Tensor:
-        """A plane of a table (E, F) as a view (vertices along the second axis, along the first, F)."""
-        a, b = self.axes[index]
-        across, up = self.resolutions[scale][a], self.resolutions[scale][b]
-        first = self.offsets[scale][index]
+    def shape(self, group: int, index: int) -> tuple[int, int]:
+        """Vertices of a factor along its second axis (1 for a line), and along its first."""
+        sizes = [self.resolutions[group][axis] for axis in self.axes[group][index]]
+        return (sizes[1] if len(sizes) == 2 else 1), sizes[0]
+
+    def factor(self, table: Tensor, group: int, index: int) -> Tensor:
+        """A factor of a table (E, F) as a view (vertices along the second axis or 1, along the first, F)."""
+        up, across = self.shape(group, index)
+        first = self.offsets[group][index]
         return table[first : first + across * up].view(up, across, -1)
 
     @cached_property
     def arrays(self) -> tuple[Any, Any, Any]:
         """Axes, resolutions and offsets as C arrays."""
-        flat = (tuple(value for row in rows for value in row) for rows in (self.axes, self.resolutions, self.offsets))
-        axes, resolutions, offsets = (native.integers(values) for values in flat)
-        return axes, resolutions, offsets
+        axes = tuple(axis for group in self.axes for along in group for axis in (*along, -1)[:2])
+        flat = (tuple(value for row in rows for value in row) for rows in (self.resolutions, self.offsets))
+        resolutions, offsets = (native.integers(values) for values in flat)
+        return native.integers(axes), resolutions, offsets
 
 
 def planes_reference(positions: Tensor, table: Tensor, layout: PlanesLayout) -> Tensor:
     """The look-up as the paper writes it: the truth, in any float type, differentiable to any order."""
     clamped, features = positions.clamp(0, 1), []
-    for scale, resolution in enumerate(layout.resolutions):
+    for group, resolution in enumerate(layout.resolutions):
         vertices = torch.tensor(resolution, device=positions.device)
         scaled = clamped * (vertices - 1).to(positions)
         cell = torch.minimum(scaled.detach().nan_to_num().long(), vertices - 2)
         fraction = scaled - cell
         product: Tensor | None = None
-        for index, (a, b) in enumerate(layout.axes):
-            across = resolution[a]
-            first = layout.offsets[scale][index] + cell[:, b] * across + cell[:, a]
-            fa, fb = fraction[:, a, None], fraction[:, b, None]
-            low = table[first] * (1 - fa) + table[first + 1] * fa
-            high = table[first + across] * (1 - fa) + table[first + across + 1] * fa
-            value = low * (1 - fb) + high * fb
+        for index, (a, *b) in enumerate(layout.axes[group]):
+            first = layout.offsets[group][index] + cell[:, a]
+            fa = fraction[:, a, None]
+            if b:
+                across, fb = resolution[a], fraction[:, b[0], None]
+                first = first + cell[:, b[0]] * across
+                low = table[first] * (1 - fa) + table[first + 1] * fa
+                high = table[first + across] * (1 - fa) + table[first + across + 1] * fa
+                value = low * (1 - fb) + high * fb
+            else:
+                value = table[first] * (1 - fa) + table[first + 1] * fa
             product = value if product is None else product * value
         assert product is not None
         features.append(product)
@@ -112,7 +129,7 @@ class PlanesGradient:
     def __init__(self, layout: PlanesLayout) -> None:
         self.layout = layout
         self.parts: list[tuple[Tensor, Tensor]] = []
-        """Positions (N, D) and incoming gradient (N, S * F) of each look-up."""
+        """Positions (N, D) and incoming gradient (N, G * F) of each look-up."""
         self.bands: list[tuple[int, Tensor]] = []
         """First entry and gradient (B, F) of each band of entries that was read as it is."""
         self._sum: Tensor | None = None
@@ -130,6 +147,11 @@ class PlanesGradient:
         """Forget it."""
         self.parts.clear()
         self.bands.clear()
+
+    def relayout(self, layout: PlanesLayout) -> None:
+        """The entries are others from now on, and what waits is void."""
+        self.clear()
+        self.layout, self._sum = layout, None
 
     def adam(
         self, table: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
@@ -161,7 +183,7 @@ class _Planes(torch.autograd.Function):
         if known is not None:
             out = known.view_as(known)
         else:
-            out = positions.new_empty(len(positions), layout.num_scales * table.shape[1])
+            out = positions.new_empty(len(positions), layout.num_groups * table.shape[1])
             _forward(*_arguments(positions, table, layout), out.data_ptr(), native.threads())
         ctx.save_for_backward(positions, table)
         ctx.layout, ctx.deferred = layout, deferred
@@ -193,14 +215,14 @@ def _add_to(total: Tensor, positions: Tensor, table: Tensor, grad: Tensor, layou
 
 
 def _incoming(grad: Tensor, positions: Tensor, table: Tensor, layout: PlanesLayout) -> int:
-    return native.pointer(grad, "the gradient", (len(positions), layout.num_scales * table.shape[1]))
+    return native.pointer(grad, "the gradient", (len(positions), layout.num_groups * table.shape[1]))
 
 
 def _arguments(positions: Tensor, table: Tensor, layout: PlanesLayout) -> tuple[Any, ...]:
     count, features = len(positions), table.shape[1]
     points = native.pointer(positions, "positions", (count, layout.dims))
     entries = native.pointer(table, "the planes", (layout.num_entries, features))
-    sizes = layout.dims, features, layout.num_scales, len(layout.axes)
+    sizes = layout.dims, features, layout.num_groups, len(layout.axes[0])
     return points, count, entries, *sizes, *layout.arrays
 
 
@@ -224,20 +246,20 @@ class _Band(torch.autograd.Function):
 
 
 def plane_band(
-    table: Tensor, layout: PlanesLayout, scale: int, index: int, first_row: int, rows: int,
+    table: Tensor, layout: PlanesLayout, group: int, index: int, first_row: int, rows: int,
     deferred: PlanesGradient | None = None,
 ) -> Tensor:  # fmt: skip
     """Some rows of a plane, for regularisers that look at neighbours: a look at all of a large table is dear.
 
     Args:
         table: (E, F).
-        scale, index: which plane.
+        group, index: which plane.
         first_row, rows: along the plane's second axis.
         deferred: where the gradient is left on the processor, as for `planes`.
     Returns: (rows, vertices along the first axis, F).
     """
-    across = layout.resolutions[scale][layout.axes[index][0]]
-    first = layout.offsets[scale][index] + first_row * across
+    _, across = layout.shape(group, index)
+    first = layout.offsets[group][index] + first_row * across
     return _Band.apply(table, first, rows * across, deferred).view(rows, across, -1)
 
 
@@ -248,15 +270,15 @@ def planes(
     deferred: PlanesGradient | None = None,
     known: Tensor | None = None,
 ) -> Tensor:
-    """Multiscale plane features.
+    """Factorised features.
 
     Args:
         positions: (N, D) in [0, 1]; what lies outside is moved to the edge.
         table: (E, F) entries of all planes, E = layout.num_entries.
         layout: resolutions and offsets.
         deferred: where the compiled kernel's backward pass leaves the table's gradient, autograd getting none.
-        known: (N, S * F) the result, where it was computed before without a gradient: only the backward pass is left.
-    Returns: (N, S * F), scale by scale. First derivatives only where compiled; see `planes_reference`.
+        known: (N, G * F) the result, where it was computed before without a gradient: only the backward pass is left.
+    Returns: (N, G * F), group by group. First derivatives only where compiled; see `planes_reference`.
     Raises: ValueError where a shape does not fit the layout.
     """
     if positions.ndim != 2 or positions.shape[1] != layout.dims:

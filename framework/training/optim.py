@@ -42,12 +42,15 @@ class Adam(torch.optim.Optimizer):
         """Of sparse groups, over all steps."""
         for group in self.param_groups:
             for parameter in group["params"]:
-                state = self.state[parameter]
-                state["exp_avg"], state["exp_avg_sq"] = (table(*parameter.shape, like=parameter) for _ in range(2))
-                if group["sparse"]:
-                    state["seen"] = torch.zeros_like(parameter[:, 0])
-                else:
-                    state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
+                self._begin(parameter, group["sparse"])
+
+    def _begin(self, parameter: Tensor, sparse: bool) -> None:
+        state = self.state[parameter]
+        state["exp_avg"], state["exp_avg_sq"] = (table(*parameter.shape, like=parameter) for _ in range(2))
+        if sparse:
+            state["seen"] = torch.zeros_like(parameter[:, 0])
+        else:
+            state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
 
     def zero_grad(self, set_to_none: bool = True) -> None:
         """Forget gradients, those that wait included."""
@@ -67,8 +70,11 @@ class Adam(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
-        """One update of every parameter that has a gradient."""
+        """One update of every parameter that has a gradient. One that has another shape than before begins anew."""
         for group in self.param_groups:
+            for parameter in group["params"]:
+                if self.state[parameter]["exp_avg"].shape != parameter.shape:
+                    self._begin(parameter, group["sparse"])
             if group["sparse"]:
                 for parameter in group["params"]:
                     self._step_sparse(parameter, group)

@@ -248,7 +248,7 @@ class Trainer:
         set_learning_rate(self.optimizer, learning_rate_factor(self.config, state.step, self.progress))
         batch = draw_batch(self.train_set, self._batch_size(), self._background(), self.errors)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=use_bfloat16(self.model)):
-            self.model.before_step(state.step)
+            self.model.before_step(state.step, self.progress)
             rendered = self.model.render(batch.rays, batch.background)
             losses = self.model.loss(rendered, batch, state.step)
         loss = torch.stack(list(losses.values())).sum()

@@ -1,4 +1,4 @@
-// Multiscale feature planes: bilinear look-ups multiplied over planes (K-Planes, section 3). See ../planes.py.
+// Factorised features: look-ups in planes and lines, multiplied (K-Planes, TensoRF). See ../../planes.py.
 //
 // An entry is a row of features, so that a corner is one or two cache lines and every product a whole vector.
 #include "common.h"
@@ -24,14 +24,14 @@ constexpr int size_of() { return int(sizeof(V) / sizeof(float)); }
 
 struct Layout {
     int dims, features, scales, planes;
-    const int64_t* axes;         // (planes, 2) the two axes of each plane
+    const int64_t* axes;         // (scales, planes, 2) the two axes of each plane; of a line the second is -1
     const int64_t* resolutions;  // (scales, dims)
     const int64_t* offsets;      // (scales, planes) first entry
 };
 
 // Where a position falls on a plane: the entry of its cell's first corner, and the fractions along both axes.
 struct Place {
-    int64_t first, up;  // `up` entries further along the second axis; the next along the first axis follows at once
+    int64_t first, up;  // `up` entries further along the second axis, if any; the next along the first is next door
     float a, b;
     float inside_a, inside_b;  // cells along the axis, or 0 where the position was moved to the face
 };
@@ -48,12 +48,14 @@ inline void along(float x, int64_t resolution, int64_t& cell, float& fraction, f
 
 inline Place place(const Layout& layout, const float* x, int scale, int plane) {
     const int64_t* r = layout.resolutions + scale * layout.dims;
-    const int64_t one = layout.axes[plane * 2], two = layout.axes[plane * 2 + 1];
-    int64_t i, j;
-    Place at;
+    const int64_t *axes = layout.axes + (scale * layout.planes + plane) * 2, one = axes[0], two = axes[1];
+    int64_t i, j = 0;
+    Place at{};
     along(x[one], r[one], i, at.a, at.inside_a);
-    along(x[two], r[two], j, at.b, at.inside_b);
-    at.up = r[one];
+    if (two >= 0) {
+        along(x[two], r[two], j, at.b, at.inside_b);
+        at.up = r[one];
+    }
     at.first = layout.offsets[scale * layout.planes + plane] + j * at.up + i;
     return at;
 }
@@ -192,8 +194,9 @@ void backward_positions(const Layout& layout, const float* positions, int64_t co
                         a += along_a[i];
                         b += along_b[i];
                     }
-                    sums[layout.axes[p * 2]] += a * at[p].inside_a;
-                    sums[layout.axes[p * 2 + 1]] += b * at[p].inside_b;
+                    const int64_t* axes = layout.axes + (s * P + p) * 2;
+                    sums[axes[0]] += a * at[p].inside_a;
+                    if (axes[1] >= 0) sums[axes[1]] += b * at[p].inside_b;
                 }
             }
         }

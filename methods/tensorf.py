@@ -1,0 +1,234 @@
+"""TensoRF: density and appearance as sums of products of planes and lines (VM), or of lines alone (CP).
+
+Chen et al., "TensoRF: Tensorial Radiance Fields", ECCV 2022.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from framework import Batch, Field, Method, Model, Rays, Rendered, Scene, TrainConfig
+from framework.encodings import FeaturePlanes
+from framework.fields.base import MLP
+from framework.kernels.planes import plane_band
+from framework.kernels.spherical_harmonics import spherical_harmonics
+from framework.renderers import render_field
+from framework.samplers.occupancy import OccupancySampler
+
+VM = (((0, 1), (2,)), ((0, 2), (1,)), ((1, 2), (0,)))
+"""Three groups: a plane, and the line across it (equation 4)."""
+CP = (((0,), (1,), (2,)),)
+"""One group: a line along each axis (equation 3)."""
+DENSITY_SHIFT, DENSITY_SCALE = -10.0, 25.0
+"""Density is DENSITY_SCALE * softplus(sum of components + DENSITY_SHIFT): empty at first (section 4.4 and its code)."""
+MARGIN = 1
+"""Cells of the occupancy grid kept around what is occupied when the box shrinks."""
+
+
+@dataclass(frozen=True)
+class TensoRFConfig(TrainConfig):
+    """Settings of tensorf."""
+
+    max_num_iterations: int = 30_000
+    samples_per_batch: int | None = 2**15
+    learning_rate: float = 2e-2
+    lr_schedule: Literal["constant", "exponential", "cosine", "hold-exponential"] = "exponential"
+    lr_final: float = 0.1
+    adam_beta2: float = 0.99
+    network_learning_rate: float = 1e-3
+    """Of the basis and the colour network."""
+    decomposition: Literal["vm", "cp"] = "vm"
+    """vm: planes and lines. cp: lines alone, which is slower to learn and under 4 MB."""
+    density_components: int | None = None
+    """Of each group. If not given: 16 (vm) or 96 (cp)."""
+    appearance_components: int | None = None
+    """Of each group. If not given: 48 (vm) or 288 (cp)."""
+    first_voxels: int = 128**3
+    """Voxels that the vertices of the first grid make."""
+    last_voxels: int | None = None
+    """The same for the last grid. If not given: 300^3 (vm) or 500^3 (cp)."""
+    upsample_at: tuple[float, ...] = (0.07, 0.1, 0.13, 0.18, 0.23)
+    """Shares of the budget after which the grid grows, in equal ratios; the box shrinks to what is occupied before."""
+    sparsity: float = 8e-5
+    """Weight of the mean absolute value of density's components; half of it once the grid has grown."""
+    total_variation: float = 0.0
+    """Weight of the planes' total variation; for photographs of real scenes, 0.1 and more."""
+    hidden_width: int = 128
+    """Features of a layer of the colour network."""
+    sparse_updates: bool = True
+    """Adam updates only the entries that a step used."""
+    grid_resolution: int = 128
+    """Cells along an axis of the occupancy grid."""
+    num_steps: int = 512
+    """Steps along the box's diagonal."""
+    early_stop: float = 1e-4
+    """Transmittance below which the rest of a ray is dropped: the largest error of a colour channel."""
+    train_early_stop: float = 1e-2
+    """The same while training."""
+
+    def resolved(self) -> TensoRFConfig:
+        density, appearance, side = (16, 48, 300) if self.decomposition == "vm" else (96, 288, 500)
+        return replace(
+            self,
+            density_components=self.density_components or density,
+            appearance_components=self.appearance_components or appearance,
+            last_voxels=self.last_voxels or side**3,
+        )
+
+
+BANDS = 16
+"""The regularisers look at one row in so many of each plane in a step, a random band: on average they see all."""
+
+
+class TensorField(Field):
+    """Density as a sum of components; colour from components of its own by a basis and a small network (section 4.3).
+
+    Args:
+        box: (2, 3) the part of space that is encoded.
+        density, appearance: the factors.
+        width: features of the colour network's hidden layers.
+        num_features: of which the basis makes the appearance (27 in the paper).
+    """
+
+    box: Tensor
+
+    def __init__(
+        self, box: Tensor, density: FeaturePlanes, appearance: FeaturePlanes, width: int, num_features: int = 27
+    ) -> None:
+        super().__init__()
+        self.register_buffer("box", box.clone())
+        self.density_factors, self.appearance_factors = density, appearance
+        self.basis = torch.nn.Linear(appearance.num_features, num_features, bias=False)
+        self.color_head = MLP(num_features + 16, width, width, 3, activation="sigmoid")
+        with torch.no_grad():
+            for factors in (density, appearance):
+                factors.table.normal_(0, 0.1)
+
+    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        unit = self._unit(positions)
+        return _density(self.density_factors(unit)), unit
+
+    @torch.no_grad()
+    def trace(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        unit = self._unit(positions)
+        components = self.density_factors(unit)
+        return _density(components), unit, components
+
+    def retrace(
+        self, positions: Tensor, times: Tensor | None, features: Tensor, memory: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        return _density(self.density_factors(features, known=memory)), features
+
+    def _unit(self, positions: Tensor) -> Tensor:
+        return (positions - self.box[0]) / (self.box[1] - self.box[0])
+
+    def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
+        appearance = self.basis(self.appearance_factors(features))
+        return self.color_head(appearance.float(), spherical_harmonics(directions)).float()
+
+
+def _density(components: Tensor) -> Tensor:
+    return softplus(components.float().sum(-1) + DENSITY_SHIFT) * DENSITY_SCALE
+
+
+class TensoRF(Model[TensoRFConfig]):
+    """Factors that grow from coarse to fine while their box shrinks, marched through an occupancy grid."""
+
+    growths: Tensor
+    """Times the grid has grown."""
+
+    def __init__(self, config: TensoRFConfig, scene: Scene) -> None:
+        super().__init__(config, scene)
+        assert config.density_components is not None
+        assert config.appearance_components is not None
+        axes = VM if config.decomposition == "vm" else CP
+        vertices = (self._vertices(config.first_voxels, scene.box),) * len(axes)
+        density, appearance = (
+            FeaturePlanes(vertices, components, axes, config.sparse_updates)
+            for components in (config.density_components, config.appearance_components)
+        )
+        self.field = TensorField(scene.box, density, appearance, config.hidden_width)
+        self.sampler = OccupancySampler(
+            scene.box, config.grid_resolution, config.num_steps, config.early_stop, config.train_early_stop
+        )
+        self.register_buffer("growths", torch.zeros((), dtype=torch.int64))
+
+    @staticmethod
+    def _vertices(voxels: float, box: Tensor) -> tuple[int, ...]:
+        """Vertices along each axis of a grid of about so many cubes over the box."""
+        size = (box[1] - box[0]).double()
+        edge = (size.prod() / voxels) ** (1 / 3)
+        return tuple(max(round(n), 2) for n in (size / edge).tolist())
+
+    def render(self, rays: Rays, background: Tensor) -> Rendered:
+        return render_field(self.field, self.sampler, rays, background, self.training)
+
+    def param_groups(self) -> list[dict[str, Any]]:
+        rates = {"networks": self.config.network_learning_rate}
+        return [{"lr": rates.get(group["name"], self.config.learning_rate), **group} for group in super().param_groups()]
+
+    def before_step(self, step: int, progress: float) -> None:
+        self.sampler.update(step, self.field.density)
+        due = sum(progress >= share for share in self.config.upsample_at)
+        if due > int(self.growths):
+            self.growths.fill_(due)
+            self._grow(due / len(self.config.upsample_at))
+
+    @torch.no_grad()
+    def _grow(self, share: float) -> None:
+        """More voxels, over what of the box is occupied. Their number grows evenly in its logarithm."""
+        assert self.config.last_voxels is not None
+        voxels = self.config.first_voxels ** (1 - share) * self.config.last_voxels**share
+        box, field = self._occupied_box(), self.field
+        size = field.box[1] - field.box[0]
+        lower, upper = (box[0] - field.box[0]) / size, (box[1] - field.box[0]) / size
+        for factors in (field.density_factors, field.appearance_factors):
+            factors.resample((self._vertices(voxels, box),) * factors.layout.num_groups, lower, upper)
+        field.box.copy_(box)
+
+    def _occupied_box(self) -> Tensor:
+        """(2, 3) corners of what holds all occupied cells and a margin; the field's box where none is."""
+        sampler, n = self.sampler, self.sampler.resolution
+        cells = sampler.occupied.nonzero().squeeze(-1)
+        if len(cells) == 0:
+            return self.field.box.clone()
+        corners = torch.stack([cells // n**2, cells // n % n, cells % n], dim=-1)
+        ends = torch.stack([corners.min(0).values - MARGIN, corners.max(0).values + 1 + MARGIN]) / n
+        found = torch.lerp(sampler.box[0], sampler.box[1], ends)
+        return torch.stack([found[0].maximum(self.field.box[0]), found[1].minimum(self.field.box[1])])
+
+    def loss(self, rendered: Rendered, batch: Batch, step: int) -> dict[str, Tensor]:
+        losses = super().loss(rendered, batch, step)
+        if self.config.sparsity:
+            weight = self.config.sparsity * (0.5 if int(self.growths) else 1.0)
+            losses["sparsity"] = weight * _band_mean(self.field.density_factors, lambda band: band.abs().mean())
+        if self.config.total_variation and self.config.decomposition == "vm":
+            for name, factors in (("density", self.field.density_factors), ("appearance", self.field.appearance_factors)):
+                losses[f"{name}_tv"] = self.config.total_variation * _band_mean(factors, _variation)
+        return losses
+
+
+def _band_mean(factors: FeaturePlanes, measure: Callable[[Tensor], Tensor]) -> Tensor:
+    """The mean over all factors of what is measured on a random band of rows of each."""
+    layout, found = factors.layout, []
+    for group in range(layout.num_groups):
+        for index in range(len(layout.axes[group])):
+            height, _ = layout.shape(group, index)
+            rows = min(max(height // BANDS, 2), height)
+            first = int(torch.randint(height - rows + 1, ()))
+            found.append(measure(plane_band(factors.table, layout, group, index, first, rows, factors.deferred)))
+    return torch.stack(found).mean()
+
+
+def _variation(band: Tensor) -> Tensor:
+    """Mean squared difference of neighbours along both axes, where there are any."""
+    return sum((band.diff(dim=dim).square().mean() for dim in (0, 1) if band.shape[dim] > 1), band.new_zeros(()))
+
+
+METHOD = Method(TensoRF, TensoRFConfig(), paper="arXiv:2203.09517")

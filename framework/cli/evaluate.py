@@ -75,3 +75,7 @@ def _command(arguments: list[str]) -> None:
         say(f"--max-error {bound:.2g}: colours off by at most {worst:.2g} (measured), {faster:.2f} x as fast as exact")
     say(f"LPIPS {found.lpips_note}")
     say(f"written to {output}")
+
+
+if __name__ == "__main__":
+    main()

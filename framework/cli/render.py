@@ -91,3 +91,7 @@ def _orbit(flags: OrbitFlags) -> None:
             frames.append(render_rays(model, rays, shape, background).rgb)
     write_animation(flags.output_path, frames, flags.fps)
     say(f"animation: {flags.output_path}")
+
+
+if __name__ == "__main__":
+    main()

@@ -302,10 +302,8 @@ class Trainer:
         return min(max(wanted, SMALLEST_BATCH), LARGEST_BATCH)
 
     def _places_in_a_pixel(self) -> Tensor:
-        """Where rays go through: the centre at first, later several places, mirrored at every other step."""
-        if self.progress < self.config.train_rays_per_pixel_from:
-            return CENTRE
-        return subpixels(self.config.rays_per_pixel) * torch.tensor([-1.0 if self.state.step % 2 else 1.0, 1.0])
+        """Where rays go through: the centre at first, later the places that pictures are made from."""
+        return CENTRE if self.progress < self.config.train_rays_per_pixel_from else subpixels(self.config.rays_per_pixel)
 
     def _background(self) -> Background:
         if self.config.background != "auto":

@@ -303,7 +303,8 @@ class Trainer:
 
     def _places_in_a_pixel(self) -> Tensor:
         """Where rays go through: the centre at first, later the places that pictures are made from."""
-        return CENTRE if self.progress < self.config.train_rays_per_pixel_from else subpixels(self.config.rays_per_pixel)
+        late = self.progress >= self.config.train_rays_per_pixel_from
+        return subpixels(self.config.rays_per_pixel) if late else CENTRE
 
     def _background(self) -> Background:
         if self.config.background != "auto":

@@ -31,8 +31,9 @@ VARIANTS: dict[str, list[str]] = {
     "dense updates of the tables": ["--sparse-updates", "False"],
     "finest level not by the images' size, but 2048": ["--max-resolution", "2048"],
     "no view dependence": ["--view-dependence", "False"],
+    "one ray a pixel": ["--rays-per-pixel", "1"],
 }
-VIEWS = 8
+VIEWS = 4
 """Validation views of the learning curve."""
 
 

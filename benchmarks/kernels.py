@@ -161,7 +161,7 @@ def errors(row: Row) -> dict[str, float]:
     """Largest error of the value, and of all gradients, over the largest value of the truth in float64."""
     found = []
     for function, kind in ((row.compiled, torch.float32), (row.reference, torch.float64)):
-        leaves = [t.to(kind).requires_grad_(row.differentiable) for t in row.inputs]
+        leaves = [t.detach().to(kind, copy=True).requires_grad_(row.differentiable) for t in row.inputs]
         value = function(*leaves)
         if row.differentiable:
             (value * torch.linspace(-1, 1, value.numel()).view_as(value).to(kind)).sum().backward()

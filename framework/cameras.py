@@ -6,16 +6,21 @@ one and its centre lies at (0.5, 0.5); `camera_to_worlds` maps camera to scene c
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from framework.errors import DataError
+from framework.kernels import native
 from framework.rays import Rays
 
 ROTATION_TOLERANCE = 1e-3
+CENTRE = torch.zeros(1, 2)
+"""The one place in a pixel that is its centre, as columns and rows from there."""
 
 
 @dataclass(frozen=True)
@@ -99,13 +104,87 @@ class Cameras:
             camera_indices=camera_indices,
         )
 
+    @cached_property
+    def offsets(self) -> Tensor:
+        """(M + 1,) where each camera's pixels start when those of all are counted through, row by row."""
+        sizes = (self.widths * self.heights).cumsum(0)
+        return torch.cat([torch.zeros_like(sizes[:1]), sizes])
+
+    def pixel_rays(
+        self, flat: Tensor, near: float, far: float, times: Tensor | None = None, places: Tensor = CENTRE
+    ) -> Rays:
+        """Rays through pixels.
+
+        Args:
+            flat: (P,) int64 which pixels, counted through all images.
+            near, far: the distances between which the scene lies.
+            times: (M,) time of each camera.
+            places: (K, 2) where in a pixel, columns and rows from its centre.
+        Returns: P * K rays, those of a pixel together.
+        """
+        if self.model == "pinhole" and native.usable(self.camera_to_worlds, self.fx, places):
+            return self._pixel_rays_compiled(flat, near, far, times, places)
+        return self.pixel_rays_reference(flat, near, far, times, places)
+
+    def pixel_rays_reference(
+        self, flat: Tensor, near: float, far: float, times: Tensor | None = None, places: Tensor = CENTRE
+    ) -> Rays:
+        """As `pixel_rays`, in torch, for any camera and device."""
+        indices = torch.searchsorted(self.offsets, flat, right=True) - 1
+        within, widths = flat - self.offsets[indices], self.widths[indices]
+        places = places.to(self.fx)
+        columns = ((within % widths)[:, None] + places[:, 0]).reshape(-1)
+        rows = ((within // widths)[:, None] + places[:, 1]).reshape(-1)
+        return self.rays(indices.repeat_interleave(len(places)), columns, rows, near, far, times)
+
+    def _pixel_rays_compiled(self, flat: Tensor, near: float, far: float, times: Tensor | None, places: Tensor) -> Rays:
+        images, count = len(self), len(flat) * len(places)
+        origins, directions, radii = torch.empty(count, 3), torch.empty(count, 3), torch.empty(count)
+        indices = torch.empty(count, dtype=torch.int64)
+        poses, widths, places = self.camera_to_worlds.contiguous(), self.widths.contiguous(), places.contiguous()
+        numbers = {name: getattr(self, name).contiguous() for name in ("fx", "fy", "cx", "cy")}
+        _pinhole_rays(
+            native.pointer(flat, "pixel indices", (len(flat),), torch.int64), len(flat),
+            native.pointer(places, "places in a pixel", (len(places), 2)), len(places),
+            native.pointer(self.offsets, "offsets", (images + 1,), torch.int64), images,
+            native.pointer(widths, "widths", (images,), torch.int64),
+            native.pointer(poses, "poses", (images, 3, 4)),
+            *(native.pointer(values, name, (images,)) for name, values in numbers.items()),
+            origins.data_ptr(), directions.data_ptr(), radii.data_ptr(), indices.data_ptr(), native.threads(),
+        )  # fmt: skip
+        return Rays(
+            origins,
+            directions,
+            torch.full((count,), near),
+            torch.full((count,), far),
+            radii,
+            None if times is None else times[indices],
+            indices,
+        )
+
+    def image_pixels(self, index: int) -> Tensor:
+        """(H * W,) the pixels of one image, row by row, counted through all images."""
+        start, end = self.offsets[index : index + 2].tolist()
+        return torch.arange(start, end, device=self.fx.device)
+
     def image_rays(self, index: int, near: float, far: float, times: Tensor | None = None) -> Rays:
         """All rays of one image, row by row: R = height * width."""
-        device = self.fx.device
-        height, width = int(self.heights[index]), int(self.widths[index])
-        rows = torch.arange(height, device=device).repeat_interleave(width)
-        columns = torch.arange(width, device=device).repeat(height)
-        return self.rays(torch.full_like(rows, index), columns, rows, near, far, times)
+        return self.pixel_rays(self.image_pixels(index), near, far, times)
+
+
+def subpixels(count: int) -> Tensor:
+    """(count, 2) places in a pixel whose mean colour stands for the pixel's: columns and rows from its centre.
+
+    For count = n^2 a square grid, turned so that no two share a row or a column and edges near the axes are met as
+    evenly as slanted ones: the "rotated grid" of hardware antialiasing (Molnar 1991, for n = 2).
+    """
+    side = math.isqrt(count)
+    steps = torch.arange(count)
+    rows = (steps + 1) * side % (count + 1) - 1
+    return (torch.stack([steps, rows], dim=-1) + 0.5) / count - 0.5
+
+
+_pinhole_rays = native.function("pinhole_rays", "pqpqpqpppppp" + "ppppi")
 
 
 def pinhole(x: Tensor, y: Tensor) -> Tensor:

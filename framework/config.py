@@ -73,6 +73,10 @@ class TrainConfig:
     """Start from this checkpoint."""
     num_rays_per_batch: int = 4_096
     """Pixels in a training step."""
+    rays_per_pixel: Literal[1, 4, 9, 16] = 1
+    """Rays of which a pixel of a picture is the mean, as a camera sees areas, not points. More: closer, and slower."""
+    train_rays_per_pixel_from: float = 1.0
+    """Share of the budget after which training too averages that many rays; until then it uses one."""
     samples_per_batch: int | None = None
     """Let the number of pixels follow, so that a step evaluates about this many samples."""
     learning_rate: float = 5e-4
@@ -126,6 +130,8 @@ class TrainConfig:
             raise ConfigError(f"--adam-eps is {self.adam_eps}; it must be at least 0")
         if self.max_seconds is not None and not self.max_seconds > 0:
             raise ConfigError(f"--max-seconds is {self.max_seconds}; it must be more than 0")
+        if not 0 <= self.train_rays_per_pixel_from <= 1:
+            raise ConfigError(f"--train-rays-per-pixel-from is {self.train_rays_per_pixel_from}; it must be in [0, 1]")
         if not self.learning_rate > 0 or not 0 < self.lr_final <= 1:
             raise ConfigError("--learning-rate must be more than 0, and --lr-final in (0, 1]")
 

@@ -77,8 +77,6 @@ class Dataset:
 
     pixels: Tensor
     """(P, 3) or (P, 4) uint8, image after image, row by row; the fourth channel is straight alpha."""
-    offsets: Tensor
-    """(M + 1,) first pixel of each image."""
     cameras: Cameras
     """M cameras at the images' size."""
     times: Tensor | None
@@ -100,7 +98,7 @@ class Dataset:
     def image(self, index: int) -> Tensor:
         """Image `index` as (H, W, 3 or 4) uint8."""
         height, width = int(self.cameras.heights[index]), int(self.cameras.widths[index])
-        start = int(self.offsets[index])
+        start = int(self.cameras.offsets[index])
         return self.pixels[start : start + height * width].view(height, width, -1)
 
     def to(self, device: torch.device | str) -> Dataset:
@@ -108,7 +106,6 @@ class Dataset:
         return replace(
             self,
             pixels=self.pixels.to(device),
-            offsets=self.offsets.to(device),
             cameras=self.cameras.to(device),
             times=None if self.times is None else self.times.to(device),
             drawn=None if self.drawn is None else self.drawn.to(device),
@@ -177,7 +174,6 @@ def _assemble(parsed: ParsedScene, images: list[np.ndarray], cameras: Cameras) -
     has_alpha = any((image[..., 3] != 255).any() for image in images)
     channels = 4 if has_alpha else 3
     pixels = np.concatenate([image[..., :channels].reshape(-1, channels) for image in images])
-    counts = torch.tensor([0] + [image.shape[0] * image.shape[1] for image in images])
     scene = Scene(
         box=parsed.box,
         near=parsed.near,
@@ -189,9 +185,7 @@ def _assemble(parsed: ParsedScene, images: list[np.ndarray], cameras: Cameras) -
     )
     transform = torch.eye(4)[:3] if parsed.transform is None else parsed.transform
     names = tuple(path.name for path in parsed.image_paths)
-    return Dataset(
-        torch.from_numpy(pixels), counts.cumsum(0), cameras, parsed.times, names, scene, transform, parsed.scale
-    )
+    return Dataset(torch.from_numpy(pixels), cameras, parsed.times, names, scene, transform, parsed.scale)
 
 
 def _try_read(path: Path, factor: int) -> np.ndarray | DataError:

@@ -36,8 +36,8 @@ class ErrorMap:
     def squares(self, pixels: Tensor) -> Tensor:
         """The square of each of the pixels (R,), counted through all photographs."""
         dataset = self.dataset
-        images = torch.searchsorted(dataset.offsets, pixels, right=True) - 1
-        within, widths = pixels - dataset.offsets[images], dataset.cameras.widths[images]
+        images = torch.searchsorted(dataset.cameras.offsets, pixels, right=True) - 1
+        within, widths = pixels - dataset.cameras.offsets[images], dataset.cameras.widths[images]
         return self.first[images] + within // widths // TILE * self.columns[images] + within % widths // TILE
 
     def draw(self, candidates: Tensor, count: int) -> tuple[Tensor, Tensor]:

@@ -8,6 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from framework.cameras import CENTRE
 from framework.dataset import Dataset
 from framework.error_map import ErrorMap
 from framework.kernels import native
@@ -23,7 +24,7 @@ class Batch:
     pixels: Tensor
     """(R,) int64 which they are, counted through all images."""
     rays: Rays
-    """R rays through the pixels' centres."""
+    """R * K rays, those of a pixel together; through its centre where K is 1."""
     rgb: Tensor
     """(R, 3) colours over `background`."""
     background: Tensor
@@ -48,9 +49,6 @@ def composite(rgba: Tensor, background: Tensor) -> Tensor:
     return rgba[..., :3] * rgba[..., 3:] + background * (1 - rgba[..., 3:])
 
 
-_draw = native.function("draw_pinhole", "pqpqpppppp" + "pipppppppi")
-
-
 def draw_pixels(dataset: Dataset, count: int) -> Tensor:
     """`count` pixels, each of those worth drawing being equally likely, with replacement, by torch's generator."""
     device = dataset.pixels.device
@@ -59,59 +57,44 @@ def draw_pixels(dataset: Dataset, count: int) -> Tensor:
     return dataset.drawn[torch.randint(len(dataset.drawn), (count,), device=device)]
 
 
-def draw_batch(dataset: Dataset, count: int, background: Background, errors: ErrorMap | None = None) -> Batch:
-    """`count` pixels worth drawing with what they should show: evenly, or also where `errors` are large."""
+def draw_batch(
+    dataset: Dataset, count: int, background: Background, errors: ErrorMap | None = None, places: Tensor = CENTRE
+) -> Batch:
+    """`count` pixels worth drawing with what they should show: evenly, or also where `errors` are large.
+
+    A ray goes through each of the `places` (K, 2) in a pixel (`Cameras.pixel_rays`).
+    """
     behind = background_colors(background, count, dataset.pixels.device)
     if errors is None:
-        return gather_batch(dataset, draw_pixels(dataset, count), behind)
+        return gather_batch(dataset, draw_pixels(dataset, count), behind, places)
     flat, weights = errors.draw(draw_pixels(dataset, 2 * count), count)
-    return replace(gather_batch(dataset, flat, behind), weights=weights)
+    return replace(gather_batch(dataset, flat, behind, places), weights=weights)
 
 
-def gather_batch(dataset: Dataset, flat: Tensor, behind: Tensor) -> Batch:
+def gather_batch(dataset: Dataset, flat: Tensor, behind: Tensor, places: Tensor = CENTRE) -> Batch:
     """The pixels `flat` (R,), counted through all images, over the background `behind` (R, 3)."""
-    cameras = dataset.cameras
-    if cameras.model == "pinhole" and native.usable(cameras.camera_to_worlds, behind):
-        return _gather_compiled(dataset, flat, behind)
-    return gather_batch_reference(dataset, flat, behind)
-
-
-def gather_batch_reference(dataset: Dataset, flat: Tensor, behind: Tensor) -> Batch:
-    """As `gather_batch`, in torch, for any camera and device."""
-    images = torch.searchsorted(dataset.offsets, flat, right=True) - 1
-    within = flat - dataset.offsets[images]
-    widths = dataset.cameras.widths[images]
     scene = dataset.scene
-    rays = dataset.cameras.rays(images, within % widths, within // widths, scene.near, scene.far, dataset.times)
-    rgba = dataset.pixels[flat].float() / 255
-    alpha = rgba[:, 3] if rgba.shape[-1] == 4 else None
-    return Batch(flat, rays, composite(rgba, behind), behind, alpha)
+    rays = dataset.cameras.pixel_rays(flat, scene.near, scene.far, dataset.times, places)
+    gather = gather_colors if native.usable(behind) else gather_colors_reference
+    return Batch(flat, rays, *gather(dataset.pixels, flat, behind))
 
 
-def _gather_compiled(dataset: Dataset, flat: Tensor, behind: Tensor) -> Batch:
-    cameras, scene, count, images = dataset.cameras, dataset.scene, len(flat), len(dataset)
-    channels = dataset.pixels.shape[1]
-    origins, directions, rgb = (torch.empty(count, 3) for _ in range(3))
-    radii, alpha, indices = torch.empty(count), torch.empty(count), torch.empty(count, dtype=torch.int64)
-    poses, widths = cameras.camera_to_worlds.contiguous(), cameras.widths.contiguous()
-    numbers = {name: getattr(cameras, name).contiguous() for name in ("fx", "fy", "cx", "cy")}
-    intrinsics = [native.pointer(values, name, (images,)) for name, values in numbers.items()]
-    _draw(
+def gather_colors_reference(pixels: Tensor, flat: Tensor, behind: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Colours (R, 3) of the pixels `flat` (R,) over `behind` (R, 3), `behind` itself, and opacities (R,) if any."""
+    rgba = pixels[flat].float() / 255
+    return composite(rgba, behind), behind, rgba[:, 3] if rgba.shape[-1] == 4 else None
+
+
+def gather_colors(pixels: Tensor, flat: Tensor, behind: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+    """As `gather_colors_reference`, compiled."""
+    count, channels = len(flat), pixels.shape[1]
+    rgb, alpha = torch.empty(count, 3), torch.empty(count)
+    _gather_colors(
         native.pointer(flat, "pixel indices", (count,), torch.int64), count,
-        native.pointer(dataset.offsets, "offsets", (images + 1,), torch.int64), images,
-        native.pointer(widths, "widths", (images,), torch.int64),
-        native.pointer(poses, "poses", (images, 3, 4)), *intrinsics,
-        native.pointer(dataset.pixels, "pixels", (len(dataset.pixels), channels), torch.uint8), channels,
-        native.pointer(behind, "the background", (count, 3)), origins.data_ptr(), directions.data_ptr(),
-        radii.data_ptr(), indices.data_ptr(), rgb.data_ptr(), alpha.data_ptr(), native.threads(),
+        native.pointer(pixels, "pixels", (len(pixels), channels), torch.uint8), channels,
+        native.pointer(behind, "the background", (count, 3)), rgb.data_ptr(), alpha.data_ptr(), native.threads(),
     )  # fmt: skip
-    rays = Rays(
-        origins,
-        directions,
-        torch.full((count,), scene.near),
-        torch.full((count,), scene.far),
-        radii,
-        None if dataset.times is None else dataset.times[indices],
-        indices,
-    )
-    return Batch(flat, rays, rgb, behind, alpha if channels == 4 else None)
+    return rgb, behind, alpha if channels == 4 else None
+
+
+_gather_colors = native.function("gather_colors", "pqpippp" + "i")

@@ -38,6 +38,20 @@ class Rendered:
         """This picture with the coarse level it was refined from; the evaluations of both count."""
         return replace(self, coarse=coarse, num_samples=self.num_samples + coarse.num_samples)
 
+    def per_pixel(self, rays_per_pixel: int) -> Rendered:
+        """The picture of R / rays_per_pixel pixels, each the mean of as many successive rays."""
+        if rays_per_pixel == 1:
+            return self
+        shape = (-1, rays_per_pixel)
+        return replace(
+            self,
+            rgb=self.rgb.view(*shape, 3).mean(1),
+            depth=self.depth.view(shape).mean(1),
+            median_depth=self.median_depth.view(shape).median(1).values,
+            accumulation=self.accumulation.view(shape).mean(1),
+            coarse=None if self.coarse is None else self.coarse.per_pixel(rays_per_pixel),
+        )
+
 
 def volume_render(rays: Rays, samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor) -> Rendered:
     """Composite packed samples (NeRF, equation 3).

@@ -120,7 +120,7 @@ def pixels_near(silhouettes: Silhouettes, hull: Tensor, box: Tensor, resolution:
     chosen = []
     for image in range(len(silhouettes.sums)):
         near = _near(silhouettes, image, centers, radius) | _under_cut_cells(silhouettes, image, centers, radius)
-        chosen.append(near.reshape(-1).nonzero().squeeze(-1) + silhouettes.dataset.offsets[image])
+        chosen.append(near.reshape(-1).nonzero().squeeze(-1) + silhouettes.dataset.cameras.offsets[image])
     return torch.cat(chosen)
 
 

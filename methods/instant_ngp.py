@@ -32,11 +32,13 @@ class InstantNGPConfig(TrainConfig):
 
     max_num_iterations: int = 20_000
     num_rays_per_batch: int = 8_192
+    rays_per_pixel: Literal[1, 4, 9, 16] = 4
+    train_rays_per_pixel_from: float = 0.75
     samples_per_batch: int | None = None
     """Samples in a training step, the number of rays following. If not given: what suits the time (see `PLANS`)."""
     learning_rate: float = 1e-2
     lr_schedule: Literal["constant", "exponential", "cosine", "hold-exponential"] = "hold-exponential"
-    lr_final: float = 0.02
+    lr_final: float = 0.05
     adam_beta2: float = 0.95
     adam_eps: float = 1e-15
     num_levels: int = 16

@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 
-from framework.cameras import Cameras, check_pose
+from framework.cameras import Cameras, check_pose, subpixels
 from framework.errors import DataError
+from tests.kernels.compiled import needs_kernels
 
 
 def camera(pose: torch.Tensor | None = None) -> Cameras:
@@ -47,6 +48,50 @@ def test_image_rays_run_row_by_row() -> None:
     one = cameras.rays(torch.tensor([0]), torch.tensor([1]), torch.tensor([1]), 0.0, 1.0)
     torch.testing.assert_close(rays.directions[5:6], one.directions)
     torch.testing.assert_close(rays.directions.norm(dim=-1), torch.ones(8))
+
+
+@pytest.mark.parametrize("count", [1, 4, 9, 16])
+def test_subpixels_measure_edges(count: int) -> None:
+    """One place in each of `count` columns and rows: the area left of an upright edge is off by half a column at most.
+
+    The square grid's error, half of a wider column, is that of the root of the count.
+    """
+    places = subpixels(count)
+    middles = (torch.arange(count) + 0.5) / count - 0.5
+    for axis in (0, 1):
+        torch.testing.assert_close(places[:, axis].sort().values, middles)
+    edges = torch.linspace(-0.5, 0.5, 101)
+    area = (places[:, 0] < edges[:, None]).float().mean(1)
+    assert (area - (edges + 0.5)).abs().max() <= 0.5 / count + 1e-6
+    slanted = places @ torch.tensor([[0.8], [0.6]])  # half of the pixel lies on either side of a line by its centre
+    assert abs((slanted < 0).float().mean() - 0.5) <= 0.5 / count
+
+
+@needs_kernels
+@pytest.mark.parametrize("count", [1, 4])
+def test_compiled_rays_are_those_of_torch(count: int) -> None:
+    generator = torch.Generator().manual_seed(0)
+    cameras = Cameras(
+        torch.linalg.qr(torch.randn(3, 3, 3, generator=generator)).Q[:, :, [0, 1, 2, 2]],
+        fx=torch.tensor([5.0, 6.0, 7.0]),
+        fy=torch.tensor([6.0, 5.0, 8.0]),
+        cx=torch.tensor([2.0, 3.5, 1.0]),
+        cy=torch.tensor([3.0, 2.5, 1.0]),
+        widths=torch.tensor([4, 7, 3]),
+        heights=torch.tensor([6, 5, 2]),
+    )
+    flat = torch.arange(4 * 6 + 7 * 5 + 3 * 2)
+    times = torch.tensor([0.0, 0.5, 1.0])
+    assert cameras.image_pixels(1).tolist() == list(range(24, 59))
+    one = cameras.pixel_rays(flat, 0.1, 9.0, times, subpixels(count))
+    two = cameras.pixel_rays_reference(flat, 0.1, 9.0, times, subpixels(count))
+    assert len(one) == len(flat) * count
+    for name, value in vars(two).items():
+        torch.testing.assert_close(getattr(one, name), value)
+    middle = two.directions / -(cameras.camera_to_worlds[two.camera_indices][:, :, 2] * two.directions).sum(-1)[:, None]
+    centre = cameras.pixel_rays_reference(flat, 0.1, 9.0).directions
+    found = torch.nn.functional.normalize(middle.view(len(flat), count, 3).mean(1), dim=-1)
+    torch.testing.assert_close(found, centre)  # the middle of a pixel's rays, where they meet the image plane
 
 
 def test_scaled_cameras_see_the_same() -> None:

@@ -17,11 +17,10 @@ from framework.scene import Scene
 def dataset() -> Dataset:
     """Two photographs of unlike sizes, with alpha."""
     widths, heights, ones = torch.tensor([19, 33]), torch.tensor([21, 16]), torch.ones(2)
-    offsets = torch.tensor([0, 19 * 21, 19 * 21 + 33 * 16])
-    pixels = torch.randint(256, (int(offsets[-1]), 4), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
+    pixels = torch.randint(256, (19 * 21 + 33 * 16, 4), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
     cameras = Cameras(torch.eye(4)[:3].repeat(2, 1, 1), ones, ones, ones, ones, widths, heights)
     scene = Scene(torch.zeros(2, 3), 0, 1, 2, True, False, 33)
-    return Dataset(pixels, offsets, cameras, None, ("a", "b"), scene, torch.eye(4)[:3], 1.0)
+    return Dataset(pixels, cameras, None, ("a", "b"), scene, torch.eye(4)[:3], 1.0)
 
 
 def test_squares_are_counted_through_images_of_unlike_sizes(dataset: Dataset) -> None:

@@ -77,7 +77,7 @@ def test_a_camera_inside_the_box_says_nothing_of_what_is_behind_it(ball: Dataset
     empty[:, 3] = 0
     one = replace(ball, cameras=replace(ball.cameras, camera_to_worlds=poses), pixels=empty)
     index = torch.tensor([0])
-    single = replace(one, cameras=one.cameras[index], offsets=one.offsets[:2], pixels=one.pixels[:6400])
+    single = replace(one, cameras=one.cameras[index], pixels=one.pixels[:6400])
     silhouettes = Silhouettes.of(single)
     hull = visual_hull(silhouettes, BOX, 16)
     behind = silhouettes.depth(0, centers(16)) < 0

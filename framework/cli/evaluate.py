@@ -28,6 +28,8 @@ class EvalFlags:
     """Which images."""
     max_images: int | None = None
     """Evaluate at most this many images, evenly spread; all if not given."""
+    rays_per_pixel: Literal[1, 4, 9, 16] | None = None
+    """Rays of which a pixel is the mean: more are sharper, fewer faster. As the run says if not given."""
     max_error: str | None = None
     """Rays end where the rest cannot change a colour by more than this, such as 1/255; 1e-4 if not given."""
     round_to_uint8: bool = False
@@ -56,7 +58,9 @@ def _command(arguments: list[str]) -> None:
     from framework.training.report import write_evaluation
     from framework.training.trained import load_trained
 
-    trained = load_trained(flags.load_config, flags.load_checkpoint, flags.device_type, flags.data)
+    trained = load_trained(
+        flags.load_config, flags.load_checkpoint, flags.device_type, flags.data, flags.rays_per_pixel
+    )
     dataset = load_split(trained.run, flags.split).to(trained.model.device)
     bound = None if flags.max_error is None else parse_error(flags.max_error)
     with nullcontext() if bound is None else limited_error(trained.model, bound):
@@ -75,3 +79,7 @@ def _command(arguments: list[str]) -> None:
         say(f"--max-error {bound:.2g}: colours off by at most {worst:.2g} (measured), {faster:.2f} x as fast as exact")
     say(f"LPIPS {found.lpips_note}")
     say(f"written to {output}")
+
+
+if __name__ == "__main__":
+    main()

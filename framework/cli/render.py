@@ -33,6 +33,8 @@ class OrbitFlags:
     """Pictures per second."""
     downscale_factor: int = 1
     """Reduce the pictures by this whole number."""
+    rays_per_pixel: Literal[1, 4, 9, 16] | None = None
+    """Rays of which a pixel is the mean: more are sharper, fewer faster. As the run says if not given."""
     max_error: str | None = None
     """Rays end where the rest cannot change a colour by more than this, such as 1/255; 1e-4 if not given."""
     load_checkpoint: Path | None = None
@@ -70,12 +72,14 @@ def _orbit(flags: OrbitFlags) -> None:
 
     from framework.console import say, track
     from framework.evaluation.error_bound import limited_error, parse_error
-    from framework.evaluation.evaluator import evaluation_background, render_rays
+    from framework.evaluation.evaluator import evaluation_background, render_image
     from framework.evaluation.images import write_animation
     from framework.evaluation.paths import orbit
     from framework.training.trained import load_trained
 
-    trained = load_trained(flags.load_config, flags.load_checkpoint, flags.device_type, flags.data)
+    trained = load_trained(
+        flags.load_config, flags.load_checkpoint, flags.device_type, flags.data, flags.rays_per_pixel
+    )
     model, scene = trained.model, trained.model.scene
     parsed = trained.run.parser.parse(trained.run.config.data, "train")
     cameras = orbit(parsed.cameras, scene.box.mean(0), flags.num_frames)
@@ -86,8 +90,10 @@ def _orbit(flags: OrbitFlags) -> None:
     frames = []
     with nullcontext() if bound is None else limited_error(model, bound):
         for index in track(range(flags.num_frames), "Rendering", total=flags.num_frames):
-            rays = cameras.image_rays(index, scene.near, scene.far, times)
-            shape = (int(cameras.heights[index]), int(cameras.widths[index]))
-            frames.append(render_rays(model, rays, shape, background).rgb)
+            frames.append(render_image(model, cameras, index, background, times).rgb)
     write_animation(flags.output_path, frames, flags.fps)
     say(f"animation: {flags.output_path}")
+
+
+if __name__ == "__main__":
+    main()

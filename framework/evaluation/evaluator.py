@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean, stdev
@@ -12,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from framework.cameras import Cameras, subpixels
 from framework.console import track
 from framework.dataset import Dataset
 from framework.device import has_bfloat16, wait_for
@@ -19,7 +19,6 @@ from framework.evaluation.images import comparison, write_image
 from framework.evaluation.metrics import load_lpips, psnr, ssim
 from framework.model import Model
 from framework.pixels import composite
-from framework.rays import Rays
 
 
 @dataclass(frozen=True)
@@ -37,27 +36,33 @@ class RenderedImage:
 
 
 @torch.no_grad()
-def render_rays(model: Model, rays: Rays, shape: tuple[int, int], background: Tensor) -> RenderedImage:
-    """Render H * W rays as a picture, a chunk at a time.
+def render_image(
+    model: Model, cameras: Cameras, index: int, background: Tensor, times: Tensor | None = None
+) -> RenderedImage:
+    """What camera `index` sees, a chunk of pixels at a time, each the mean of `rays_per_pixel` rays.
 
     Args:
         model: in any mode; it is put into evaluation mode and back.
-        rays: H * W rays, row by row.
-        shape: (H, W).
+        cameras: on the model's device.
         background: (3,) colour behind what is not opaque.
+        times: (M,) time of each camera.
     """
-    was_training = model.training
+    was_training, scene, per_pixel = model.training, model.scene, model.config.rays_per_pixel
+    places = subpixels(per_pixel)
     model.eval()
     start = time.perf_counter()
     parts = []
     with torch.autocast(model.device.type, torch.bfloat16, enabled=use_bfloat16(model)):
-        for chunk in _chunks(rays, model.config.eval_num_rays_per_chunk):
-            out = model.render(chunk, background)
+        for pixels in cameras.image_pixels(index).split(max(model.config.eval_num_rays_per_chunk // per_pixel, 1)):
+            rays = cameras.pixel_rays(pixels, scene.near, scene.far, times, places)
+            # The number of a camera that is not a training camera must not be taken for one's.
+            out = model.render(replace(rays, camera_indices=None), background).per_pixel(per_pixel)
             parts.append((out.rgb.float(), out.median_depth.float(), out.accumulation.float()))
     wait_for(model.device)
     seconds = time.perf_counter() - start
     model.train(was_training)
     rgb, depth, accumulation = (torch.cat(column) for column in zip(*parts, strict=True))
+    shape = (int(cameras.heights[index]), int(cameras.widths[index]))
     return RenderedImage(rgb.view(*shape, 3), depth.view(shape), accumulation.view(shape), seconds)
 
 
@@ -67,17 +72,9 @@ def use_bfloat16(model: Model) -> bool:
     return has_bfloat16(model.device) if chosen is None else chosen
 
 
-def _chunks(rays: Rays, size: int) -> Iterator[Rays]:
-    return (rays[start : start + size] for start in range(0, len(rays), size))
-
-
 def render_view(model: Model, dataset: Dataset, index: int, background: Tensor) -> RenderedImage:
     """The model's picture of the data set's view `index`, with the appearance meant for evaluation."""
-    cameras, scene = dataset.cameras, model.scene
-    rays = cameras.image_rays(index, scene.near, scene.far, dataset.times)
-    shape = (int(cameras.heights[index]), int(cameras.widths[index]))
-    # An evaluation camera's number must not be taken for a training camera's.
-    return render_rays(model, replace(rays, camera_indices=None), shape, background)
+    return render_image(model, dataset.cameras, index, background, dataset.times)
 
 
 def evaluation_background(model: Model) -> Tensor:

@@ -32,7 +32,11 @@ class Trained:
 
 
 def load_trained(
-    config_path: Path, checkpoint: Path | None = None, device_type: Any = "auto", data: Path | None = None
+    config_path: Path,
+    checkpoint: Path | None = None,
+    device_type: Any = "auto",
+    data: Path | None = None,
+    rays_per_pixel: Any = None,
 ) -> Trained:
     """Load a run's model.
 
@@ -41,11 +45,15 @@ def load_trained(
         checkpoint: which one; the newest readable if None.
         device_type: auto, cpu, cuda or mps.
         data: where the data is now, if it has moved.
+        rays_per_pixel: of which pictures are made, if not as the run says.
     Raises: ConfigError or CheckpointError where something is missing or does not fit.
     """
     run = read_run(config_path)
     machine = dataclasses.replace(run.config.machine, device_type=device_type)
-    config = dataclasses.replace(run.config, machine=machine, data=data or run.config.data)
+    rays_per_pixel = rays_per_pixel or run.config.rays_per_pixel
+    config = dataclasses.replace(
+        run.config, machine=machine, data=data or run.config.data, rays_per_pixel=rays_per_pixel
+    )
     run = dataclasses.replace(run, config=config)
     device = choose_device(machine)
     content = load_checkpoint(checkpoint, device) if checkpoint else load_newest(run.folder / FOLDER, device)

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from framework.cameras import CENTRE, subpixels
 from framework.config import to_plain
 from framework.console import say
 from framework.dataset import Dataset
@@ -30,6 +29,7 @@ from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest, 
 from framework.training.optim import first_non_finite, learning_rate_factor, make_optimizer, set_learning_rate
 from framework.training.progress import ProgressBar, StepReport, TensorBoard
 from framework.training.run import Run, write_json
+from framework.training.signals import stop_signals
 from framework.training.trained import build_model, restore_model
 
 STEPS_PER_LOG = 25
@@ -161,7 +161,7 @@ class Trainer:
         """
         enabled = self.config.vis == "tensorboard"
         with (
-            _stop_signals() as stopped,
+            stop_signals() as stopped,
             closing(TensorBoard(self.run.folder, enabled)) as board,
             ProgressBar(self.run.method) as bar,
         ):
@@ -246,10 +246,13 @@ class Trainer:
         seed_step(self.config.machine.seed, state.step)
         self.model.train()
         set_learning_rate(self.optimizer, learning_rate_factor(self.config, state.step, self.progress))
-        batch = draw_batch(self.train_set, self._batch_size(), self._background(), self.errors)
+        places = self._places_in_a_pixel()
+        count = max(self._batch_size() // len(places), 1)
+        batch = draw_batch(self.train_set, count, self._background(), self.errors, places)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=use_bfloat16(self.model)):
             self.model.before_step(state.step, self.progress)
-            rendered = self.model.render(batch.rays, batch.background)
+            rendered = self.model.render(batch.rays, batch.background.repeat_interleave(len(places), 0))
+            rendered = rendered.per_pixel(len(places))
             losses = self.model.loss(rendered, batch, state.step)
         loss = torch.stack(list(losses.values())).sum()
         self._descend(loss)
@@ -297,6 +300,11 @@ class Trainer:
             return self.config.num_rays_per_batch
         wanted = round(samples / max(self.state.samples_per_ray, 0.1))
         return min(max(wanted, SMALLEST_BATCH), LARGEST_BATCH)
+
+    def _places_in_a_pixel(self) -> Tensor:
+        """Where rays go through: the centre at first, later the places that pictures are made from."""
+        late = self.progress >= self.config.train_rays_per_pixel_from
+        return subpixels(self.config.rays_per_pixel) if late else CENTRE
 
     def _background(self) -> Background:
         if self.config.background != "auto":
@@ -374,25 +382,3 @@ class Trainer:
             self.save()
         except CheckpointError as error:
             say(f"warning: {error}")
-
-
-@contextmanager
-def _stop_signals() -> Iterator[list[int]]:
-    """Ctrl-C and SIGTERM end the run after the step at hand; a second one ends it at once.
-
-    Yields the list of signals received.
-    """
-    received: list[int] = []
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        received.append(number)
-        signal.signal(number, previous[number])
-
-    previous: dict[int, Any] = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        for number in previous:
-            signal.signal(number, handle)
-        yield received
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)

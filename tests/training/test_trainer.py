@@ -21,7 +21,8 @@ from framework.errors import CheckpointError, ConfigError, DivergenceError
 from framework.evaluation.evaluator import evaluate, evaluation_background, render_view
 from framework.training.checkpoint import list_checkpoints, load_checkpoint
 from framework.training.run import create_folder
-from framework.training.trainer import Trainer, _stop_signals
+from framework.training.signals import stop_signals
+from framework.training.trainer import Trainer
 from methods.instant_ngp import InstantNGP, InstantNGPConfig
 from tests.training.helpers import TINY, assert_same_bits, tensors, tiny_run, tiny_trainer
 
@@ -300,7 +301,7 @@ def test_a_small_picture_has_no_ssim_and_no_lpips_and_says_so(tiny: Path, tmp_pa
 
 
 def test_a_second_ctrl_c_ends_at_once() -> None:
-    with pytest.raises(KeyboardInterrupt), _stop_signals() as received:  # noqa: PT012
+    with pytest.raises(KeyboardInterrupt), stop_signals() as received:  # noqa: PT012
         os.kill(os.getpid(), signal.SIGINT)
         assert received == [signal.SIGINT]
         os.kill(os.getpid(), signal.SIGINT)

@@ -1,34 +1,50 @@
-// A batch of training pixels: colours over a background, and rays through their centres. See ../pixels.py.
+// A batch of training pixels: rays through them, and their colours over a background. See ../../pixels.py.
 #include "common.h"
 
 #include <algorithm>
 #include <cmath>
 
-// flat (R): pixel indices into all images, which start at offsets (M + 1). poses (M, 3, 4); fx, fy, cx, cy (M);
-// widths (M). pixels (P, channels) uint8; background (R, 3).
-EXPORT void draw_pinhole(const int64_t* flat, int64_t rays, const int64_t* offsets, int64_t images,
-                         const int64_t* widths, const float* poses, const float* fx, const float* fy, const float* cx,
-                         const float* cy, const uint8_t* pixels, int channels, const float* background,
-                         float* origins, float* directions, float* radii, int64_t* cameras, float* rgb, float* alpha,
-                         int threads) {
+static int64_t image_of(int64_t pixel, const int64_t* offsets, int64_t images) {
+    return std::upper_bound(offsets, offsets + images + 1, pixel) - offsets - 1;
+}
+
+// flat (P): pixel indices into all images, which start at offsets (M + 1); subpixels (K, 2): column and row from a
+// pixel's centre. poses (M, 3, 4); fx, fy, cx, cy (M); widths (M). Writes P * K rays, those of a pixel together.
+EXPORT void pinhole_rays(const int64_t* flat, int64_t count, const float* subpixels, int64_t per_pixel,
+                         const int64_t* offsets, int64_t images, const int64_t* widths, const float* poses,
+                         const float* fx, const float* fy, const float* cx, const float* cy, float* origins,
+                         float* directions, float* radii, int64_t* cameras, int threads) {
     const float radius = 2 / std::sqrt(12.0f);
 #pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
-    for (int64_t r = 0; r < rays; r++) {
-        const int64_t image = std::upper_bound(offsets, offsets + images + 1, flat[r]) - offsets - 1;
-        const int64_t within = flat[r] - offsets[image], row = within / widths[image], column = within % widths[image];
-        const float x = (float(column) + 0.5f - cx[image]) / fx[image], y = (float(row) + 0.5f - cy[image]) / fy[image];
-        const float length = std::sqrt(x * x + y * y + 1), local[3] = {x / length, -y / length, -1 / length};
+    for (int64_t p = 0; p < count; p++) {
+        const int64_t image = image_of(flat[p], offsets, images), within = flat[p] - offsets[image];
+        const float column = float(within % widths[image]) + 0.5f - cx[image];
+        const float row = float(within / widths[image]) + 0.5f - cy[image];
         const float* pose = poses + image * 12;
-        for (int a = 0; a < 3; a++) {
-            origins[r * 3 + a] = pose[a * 4 + 3];
-            directions[r * 3 + a] = pose[a * 4] * local[0] + pose[a * 4 + 1] * local[1] + pose[a * 4 + 2] * local[2];
+        for (int64_t k = 0; k < per_pixel; k++) {
+            const int64_t r = p * per_pixel + k;
+            const float x = (column + subpixels[k * 2]) / fx[image], y = (row + subpixels[k * 2 + 1]) / fy[image];
+            const float length = std::sqrt(x * x + y * y + 1), local[3] = {x / length, -y / length, -1 / length};
+            for (int a = 0; a < 3; a++) {
+                origins[r * 3 + a] = pose[a * 4 + 3];
+                directions[r * 3 + a] =
+                    pose[a * 4] * local[0] + pose[a * 4 + 1] * local[1] + pose[a * 4 + 2] * local[2];
+            }
+            radii[r] = radius / (fx[image] * length);
+            cameras[r] = image;
         }
-        radii[r] = radius / (fx[image] * length);
-        cameras[r] = image;
-        const uint8_t* pixel = pixels + flat[r] * channels;
+    }
+}
+
+// pixels (all, channels) uint8; background (P, 3). Writes the colours over the background, and opacities.
+EXPORT void gather_colors(const int64_t* flat, int64_t count, const uint8_t* pixels, int channels,
+                          const float* background, float* rgb, float* alpha, int threads) {
+#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
+    for (int64_t p = 0; p < count; p++) {
+        const uint8_t* pixel = pixels + flat[p] * channels;
         const float cover = channels == 4 ? float(pixel[3]) / 255 : 1;
         for (int c = 0; c < 3; c++)
-            rgb[r * 3 + c] = float(pixel[c]) / 255 * cover + background[r * 3 + c] * (1 - cover);
-        if (alpha) alpha[r] = cover;
+            rgb[p * 3 + c] = float(pixel[c]) / 255 * cover + background[p * 3 + c] * (1 - cover);
+        alpha[p] = cover;
     }
 }

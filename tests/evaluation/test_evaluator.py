@@ -1,0 +1,103 @@
+"""Pictures: pixels as means over their area, whatever the chunks."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from framework.cameras import Cameras
+from framework.config import TrainConfig
+from framework.evaluation.evaluator import render_image
+from framework.model import Model
+from framework.rays import Rays
+from framework.renderers import Rendered
+from framework.scene import Scene
+from tests.training.helpers import tiny_trainer
+
+SIZE = 12
+
+
+def inside(x: Tensor, y: Tensor) -> Tensor:
+    """1 inside a circle at the picture's middle, 0 outside: an edge of every slope."""
+    return ((x - 0.01).square() + (y + 0.02).square() < 0.2**2).float()
+
+
+class Disc(Model[TrainConfig]):
+    """White where `inside`, and the background elsewhere."""
+
+    def __init__(self, config: TrainConfig) -> None:
+        super().__init__(config, Scene(torch.zeros(2, 3), 0, 9, 1, True, False, SIZE))
+        self.anything = torch.nn.Parameter(torch.zeros(1))
+        self.seen: list[int] = []
+
+    def render(self, rays: Rays, background: Tensor) -> Rendered:
+        assert rays.camera_indices is None
+        self.seen.append(len(rays))
+        x, y = (-rays.directions[:, i] / rays.directions[:, 2] for i in (0, 1))
+        white = inside(x, y)
+        rgb = white[:, None] + (1 - white[:, None]) * background
+        return Rendered(rgb, white, white, white, 0)
+
+
+def picture(rays_per_pixel: int, chunk: int = 8192) -> Tensor:
+    one = [torch.tensor([v]) for v in (20.0, 20.0, SIZE / 2, SIZE / 2)]
+    cameras = Cameras(torch.eye(4)[None, :3], *one, torch.tensor([SIZE]), torch.tensor([SIZE]))
+    config = replace(TrainConfig(), rays_per_pixel=rays_per_pixel, eval_num_rays_per_chunk=chunk)
+    model = Disc(config)
+    image = render_image(model, cameras, 0, torch.full((3,), 0.25))
+    assert sum(model.seen) == SIZE**2 * rays_per_pixel
+    assert max(model.seen) <= max(chunk, rays_per_pixel)
+    return image.rgb
+
+
+def test_a_pixel_is_the_mean_over_its_area() -> None:
+    """Against the disc's exact coverage, from 64 x 64 places a pixel: the error falls as the rays grow."""
+    step = (torch.arange(SIZE * 64) + 0.5) / 64 - SIZE / 2
+    x, y = step[None, :] / 20, -step[:, None] / 20
+    cover = inside(x, y).view(SIZE, 64, SIZE, 64).mean((1, 3))
+    exact = (cover + (1 - cover) * 0.25)[..., None].expand(-1, -1, 3)
+    errors = {count: float((picture(count) - exact).square().mean().sqrt()) for count in (1, 4, 9, 16)}
+    assert errors[4] < errors[1] / 2.5
+    assert errors[16] < errors[4] / 2
+
+
+@pytest.mark.parametrize("chunk", [1, 30, 100])
+def test_chunks_change_nothing(chunk: int) -> None:
+    torch.testing.assert_close(picture(4, chunk), picture(4), rtol=0, atol=0)
+
+
+def test_training_averages_the_same_rays_late_in_the_budget(shared_tiny: Path, tmp_path: Path) -> None:
+    settings = {"max_num_iterations": 8, "rays_per_pixel": 4, "train_rays_per_pixel_from": 0.5}
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", **settings)
+    seen: list[tuple[int, Tensor]] = []
+    render = trainer.model.render
+
+    def watched(rays: Rays, background: Tensor) -> Rendered:
+        seen.append((len(rays), background))
+        return render(rays, background)
+
+    trainer.model.render = watched
+    trainer.train()
+    assert trainer.state.step == 8
+    assert trainer.state.rays == sum(rays for rays, _ in seen)
+    for step, (rays, background) in enumerate(seen):
+        assert len(background) == rays
+        groups = background[: rays // 4 * 4].view(-1, 4, 3)
+        together = bool((groups == groups[:, :1]).all())
+        assert together == (step >= 4), "rays of a pixel lie over one background"
+
+
+def test_means_over_pixels_are_means() -> None:
+    values = torch.rand(12)
+    made = Rendered(torch.rand(12, 3), values, values, values, 5).over(Rendered(torch.rand(12, 3), *[values] * 3, 2))
+    pixels = made.per_pixel(4)
+    assert pixels.num_samples == 7
+    assert made.coarse is not None
+    assert pixels.coarse is not None
+    for one, two in ((pixels, made), (pixels.coarse, made.coarse)):
+        torch.testing.assert_close(one.rgb, torch.stack([two.rgb[i : i + 4].mean(0) for i in (0, 4, 8)]))
+        torch.testing.assert_close(one.accumulation, values.view(3, 4).mean(1))
+        assert all(depth in values for depth in one.median_depth)
+    assert made.per_pixel(1) is made

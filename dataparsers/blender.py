@@ -1,7 +1,4 @@
-"""NeRF-Synthetic and D-NeRF scenes: transforms_{train,val,test}.json written by Blender, RGBA images.
-
-Mildenhall et al. 2020; with `time` in each frame, Pumarola et al. 2021 (D-NeRF).
-"""
+"""NeRF-Synthetic scenes: transforms_{train,val,test}.json written by Blender, RGBA images (Mildenhall et al. 2020)."""
 
 from __future__ import annotations
 
@@ -18,6 +15,7 @@ from framework import Cameras, DataError, DataParser, ParsedScene
 from framework.cameras import check_pose
 from framework.dataset import Split, existing, image_size
 
+TRANSFORMS = "transforms_train.json"
 LONGEST_NAME = 250
 """Characters of a file's or folder's name; most systems allow 255 bytes."""
 SMALLEST_ANGLE = 1e-6
@@ -41,7 +39,8 @@ class Blender(DataParser):
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
-        return (path / "transforms_train.json").is_file()
+        file = path / TRANSFORMS
+        return file.is_file() and not has_times(file)
 
     def parse(self, path: Path | None, split: Split) -> ParsedScene:
         if path is None:
@@ -112,6 +111,15 @@ def read_pose(frame: Any, where: str) -> Tensor:
         raise DataError(f"{where}: 'transform_matrix' is not a 4x4 matrix of numbers") from error
     check_pose(pose, where)
     return pose if pose.shape[0] == 4 else torch.cat([pose, torch.tensor([[0.0, 0.0, 0.0, 1.0]])])
+
+
+def has_times(file: Path) -> bool:
+    """Whether the first frame of a transforms file has a time. Never raises."""
+    try:
+        frames = json.loads(file.read_text(encoding="utf-8")).get("frames")
+        return isinstance(frames, list) and bool(frames) and isinstance(frames[0], dict) and "time" in frames[0]
+    except (OSError, ValueError, RecursionError, AttributeError):
+        return False
 
 
 def _image_path(folder: Path, frame: Any, where: str) -> Path:

@@ -75,13 +75,17 @@ class Silhouettes:
 
 
 @torch.no_grad()
-def visual_hull(silhouettes: Silhouettes, box: Tensor, resolution: int) -> Tensor:
+def visual_hull(silhouettes: Silhouettes, box: Tensor, resolution: int, moving: bool = False) -> Tensor:
     """Cells of a box that no photograph shows to be empty, from coarse to fine.
+
+    Of a scene that moves, cells are dropped that every photograph shows to be empty, and whose neighbours are too: the
+    margin is for what moves between the times of the photographs.
 
     Args:
         silhouettes: of the training photographs.
         box: (2, 3).
         resolution: n, cells along each axis.
+        moving: what one photograph shows to be empty may be full at another's time.
     Returns: (n^3,) bool, the cell's index being (x n + y) n + z.
     """
     size = min(COARSEST, 1 << (resolution - 1).bit_length())
@@ -91,9 +95,13 @@ def visual_hull(silhouettes: Silhouettes, box: Tensor, resolution: int) -> Tenso
         low = box[0] + (box[1] - box[0]) * cubes / resolution
         edge = (box[1] - box[0]) * size / resolution
         centers, radius = low + edge / 2, float(edge.norm()) / 2
-        for image in range(len(silhouettes.sums)):
-            keep = silhouettes.may_hold(image, centers, radius)
+        if moving:
+            keep = _ever_held(silhouettes, centers, radius)
             centers, cubes = centers[keep], cubes[keep]
+        else:
+            for image in range(len(silhouettes.sums)):
+                keep = silhouettes.may_hold(image, centers, radius)
+                centers, cubes = centers[keep], cubes[keep]
         if size == 1:
             break
         size //= 2
@@ -102,7 +110,19 @@ def visual_hull(silhouettes: Silhouettes, box: Tensor, resolution: int) -> Tenso
         cubes = cubes[(cubes < resolution).all(-1)]
     hull = torch.zeros(resolution**3, dtype=torch.bool, device=box.device)
     hull[(cubes[:, 0] * resolution + cubes[:, 1]) * resolution + cubes[:, 2]] = True
+    if moving:
+        grid = hull.view(1, 1, resolution, resolution, resolution).float()
+        hull = functional.max_pool3d(grid, 3, stride=1, padding=1).view(-1) > 0
     return hull
+
+
+def _ever_held(silhouettes: Silhouettes, centers: Tensor, radius: float) -> Tensor:
+    """(N,) bool: balls that some photograph does not show to be empty."""
+    held = torch.zeros(len(centers), dtype=torch.bool, device=centers.device)
+    for image in range(len(silhouettes.sums)):
+        rest = (~held).nonzero().squeeze(-1)
+        held[rest] = silhouettes.may_hold(image, centers[rest], radius)
+    return held
 
 
 @torch.no_grad()

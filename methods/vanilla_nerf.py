@@ -13,7 +13,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from framework import Method, Model, Rays, Rendered, Scene, TrainConfig
+from framework import Field, Method, Model, Rays, Rendered, Scene, TrainConfig
 from framework.fields.nerf import NeRFField
 from framework.renderers import render_field, shade
 from framework.samplers.inverse_cdf import inverse_cdf, uniform_variates
@@ -94,26 +94,9 @@ class VanillaNeRF(Model[VanillaNeRFConfig]):
     def render(self, rays: Rays, background: Tensor) -> Rendered:
         if self.sampler is not None:
             return render_field(self.fine, self.sampler, rays, background, self.training)
-        return self._render_hierarchical(rays, background)
-
-    def _render_hierarchical(self, rays: Rays, background: Tensor) -> Rendered:
         assert self.coarse is not None
-        points = stratified_points(rays, self.config.num_coarse_samples, self.training)
-        coarse = self._render_points(self.coarse, rays, points, background)
-        assert coarse.weights is not None
-        weights = coarse.weights.view(points.shape).detach()
-        middles = (points[:, 1:] + points[:, :-1]) / 2
-        u = uniform_variates(len(rays), self.config.num_fine_samples, self.training, points.device)
-        drawn = inverse_cdf(middles, weights[:, 1:-1], u)
-        merged = torch.cat([points, drawn], dim=-1).sort(dim=-1).values
-        fine = self._render_points(self.fine, rays, merged, background)
-        return fine.over(coarse)
-
-    @staticmethod
-    def _render_points(field: NeRFField, rays: Rays, points: Tensor, background: Tensor) -> Rendered:
-        samples = samples_from_points(points)
-        samples = samples.evaluated(*field.density(samples.positions(rays), samples.times(rays)))
-        return shade(field, rays, samples, background)
+        counts = self.config.num_coarse_samples, self.config.num_fine_samples
+        return render_hierarchical(self.coarse, self.fine, rays, background, counts, self.training)
 
     def param_groups(self) -> list[dict[str, Any]]:
         faster = OCCUPANCY_RATE if self.sampler is not None else 1.0
@@ -128,6 +111,30 @@ class VanillaNeRF(Model[VanillaNeRFConfig]):
     def before_step(self, step: int, progress: float) -> None:
         if self.sampler is not None:
             self.sampler.update(step, self.fine.density)
+
+
+def render_hierarchical(
+    coarse: Field, fine: Field, rays: Rays, background: Tensor, counts: tuple[int, int], jitter: bool
+) -> Rendered:
+    """Stratified samples for one field; for another these and more, drawn where the first found something (section 5.2).
+
+    Args:
+        counts: of the stratified samples, and of those drawn.
+    """
+    points = stratified_points(rays, counts[0], jitter)
+    first = _render_points(coarse, rays, points, background)
+    assert first.weights is not None
+    weights = first.weights.view(points.shape).detach()
+    middles = (points[:, 1:] + points[:, :-1]) / 2
+    drawn = inverse_cdf(middles, weights[:, 1:-1], uniform_variates(len(rays), counts[1], jitter, points.device))
+    merged = torch.cat([points, drawn], dim=-1).sort(dim=-1).values
+    return _render_points(fine, rays, merged, background).over(first)
+
+
+def _render_points(field: Field, rays: Rays, points: Tensor, background: Tensor) -> Rendered:
+    samples = samples_from_points(points)
+    samples = samples.evaluated(*field.density(samples.positions(rays), samples.times(rays)))
+    return shade(field, rays, samples, background)
 
 
 METHOD = Method(VanillaNeRF, VanillaNeRFConfig(), paper="arXiv:2003.08934")

@@ -16,6 +16,8 @@ class NeRFField(Field):
         depth: hidden layers before density.
         skip: the layer that is fed the encoded position again.
         position_frequencies, direction_frequencies: L of the two encodings (10 and 4 in the paper).
+        time_frequencies: L of the time's encoding, which stands beside the position's: T-NeRF (Pumarola et al. 2021,
+            section 4); None for a field that does not change with time.
     """
 
     def __init__(
@@ -25,11 +27,13 @@ class NeRFField(Field):
         skip: int = 5,
         position_frequencies: int = 10,
         direction_frequencies: int = 4,
+        time_frequencies: int | None = None,
     ) -> None:
         super().__init__()
         self.position_frequencies = position_frequencies
         self.direction_frequencies = direction_frequencies
-        encoded = 3 + 6 * position_frequencies
+        self.time_frequencies = time_frequencies
+        encoded = 3 + 6 * position_frequencies + (0 if time_frequencies is None else 1 + 2 * time_frequencies)
         self.before_skip = MLP(encoded, *[width] * skip, activation="relu")
         self.after_skip = MLP(width + encoded, *[width] * (depth - skip), activation="relu")
         self.sigma_head = MLP(width, 1, activation="relu")
@@ -51,10 +55,22 @@ class NeRFField(Field):
                     nn.init.constant_(layer.bias, 0.1)
 
     def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        encoded = frequency_encoding(positions, self.position_frequencies)
-        hidden = self.after_skip(self.before_skip(encoded), encoded)
+        encoded = (frequency_encoding(positions, self.position_frequencies),)
+        if self.time_frequencies is not None:
+            encoded += (encoded_times(times, self.time_frequencies),)
+        hidden = self.after_skip(self.before_skip(*encoded), *encoded)
         return self.sigma_head(hidden).squeeze(-1).float(), hidden
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         encoded = frequency_encoding(directions, self.direction_frequencies)
         return self.color_head(self.feature_head(features), encoded).float()
+
+
+def encoded_times(times: Tensor | None, num_frequencies: int) -> Tensor:
+    """Times (N,) to (N, 1 + 2 L).
+
+    Raises: ValueError where there are none.
+    """
+    if times is None:
+        raise ValueError("this field changes with time: it needs the times of its positions")
+    return frequency_encoding(times[:, None], num_frequencies)

@@ -214,8 +214,6 @@ class Trainer:
         scene, camera = self.model.scene, self.train_set.cameras.model
         if not scene.has_alpha:
             return "no photograph has alpha"
-        if scene.moving:
-            return "what is empty at one time may not be at another"
         return None if camera == "pinhole" else f"the camera is {camera}, not pinhole"
 
     def _prepare(self) -> None:
@@ -226,7 +224,7 @@ class Trainer:
             return
         silhouettes = Silhouettes.of(self.train_set)
         if self.state.step == 0:
-            hulls = [visual_hull(silhouettes, sampler.box, sampler.resolution) for sampler in samplers]
+            hulls = [visual_hull(silhouettes, sampler.box, sampler.resolution, self.model.scene.moving) for sampler in samplers]
             if not all(bool(hull.any()) for hull in hulls):
                 say("warning: the photographs' alpha leaves no part of the box; it is not used to skip anything")
                 return

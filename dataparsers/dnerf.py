@@ -1,0 +1,28 @@
+"""D-NeRF scenes: as NeRF-Synthetic, with a `time` from 0 to 1 in every frame.
+
+Pumarola et al. 2021.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from dataparsers.blender import TRANSFORMS, Blender, has_times
+from framework import DataError, ParsedScene
+from framework.dataset import Split
+
+
+@dataclass(frozen=True)
+class DNeRF(Blender):
+    """Flags of the dnerf format."""
+
+    @classmethod
+    def recognizes(cls, path: Path) -> bool:
+        return has_times(path / TRANSFORMS)
+
+    def parse(self, path: Path | None, split: Split) -> ParsedScene:
+        scene = super().parse(path, split)
+        if scene.times is None:
+            raise DataError(f"{path}: no frame has a 'time'; for a scene that stands still use the blender format")
+        return scene

@@ -1,0 +1,164 @@
+"""D-NeRF: a canonical radiance field and a network that deforms it over time; T-NeRF as its option.
+
+Pumarola et al., "D-NeRF: Neural Radiance Fields for Dynamic Scenes", CVPR 2021.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from torch import Tensor
+
+from framework import Decision, Field, Method, Model, Rays, Rendered, Scene, TrainConfig
+from framework.encodings import HashGrid
+from framework.fields.deformed import DeformedField
+from framework.fields.encoded import EncodedField
+from framework.fields.nerf import NeRFField
+from framework.renderers import render_field
+from framework.samplers.occupancy import OccupancySampler
+from methods.vanilla_nerf import OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH, render_hierarchical
+
+HASH_SAMPLES_PER_BATCH = 2**14
+"""With a hash grid the networks are small, and a step can hold more samples."""
+
+
+@dataclass(frozen=True)
+class DNeRFConfig(TrainConfig):
+    """Settings of dnerf; the defaults are the paper's, with the rays of a larger batch."""
+
+    max_num_iterations: int = 800_000
+    num_rays_per_batch: int = 2_048
+    learning_rate: float = 5e-4
+    lr_final: float = 0.1
+    adam_eps: float = 1e-7
+    background: Literal["auto", "random", "white", "black"] = "white"
+    variant: Literal["d-nerf", "t-nerf"] = "d-nerf"
+    """d-nerf: a canonical field, deformed. t-nerf: one network of place and time."""
+    canonical: Literal["network", "hash-grid"] = "network"
+    """What d-nerf deforms: the paper's network, or a hash grid with small networks."""
+    sampler: Literal["hierarchical", "occupancy"] = "hierarchical"
+    """hierarchical: 64 coarse and 64 + 128 fine samples, two fields. occupancy: one field and an occupancy grid."""
+    num_coarse_samples: int = 64
+    """Stratified samples a ray for the coarse field."""
+    num_fine_samples: int = 128
+    """Further samples a ray for the fine field, drawn where the coarse one found something."""
+    num_layers: int = 8
+    """Layers of the canonical network before density."""
+    hidden_width: int = 256
+    """Features of a layer of the canonical network."""
+    deformation_layers: int | None = None
+    """Hidden layers of the deformation network. If not given: 8, or 4 with a hash grid."""
+    deformation_width: int | None = None
+    """Features of a layer of the deformation network. If not given: 256, or 64 with a hash grid."""
+    position_frequencies: int = 10
+    """L of the position's encoding."""
+    direction_frequencies: int = 4
+    """L of the direction's encoding."""
+    time_frequencies: int = 4
+    """L of the time's encoding."""
+    grid_learning_rate: float = 1e-2
+    """Of the hash grid and the two networks that read it."""
+    max_resolution: int = 512
+    """Cells along an axis at the hash grid's finest level."""
+    log2_table_size: int = 16
+    """Entries of a level's table at most, as a power of two."""
+    grid_resolution: int = 128
+    """Cells along an axis of the occupancy grid. A cell is occupied if it is at any time."""
+    num_steps: int = 192
+    """Steps along the box's diagonal with the occupancy grid."""
+    early_stop: float = 1e-4
+    """Transmittance below which the rest of a ray is dropped, with the occupancy grid."""
+    train_early_stop: float = 1e-2
+    """The same while training."""
+
+
+class DNeRF(Model[DNeRFConfig]):
+    """A deformed field, or one of place and time. Without times, the canonical field alone."""
+
+    learns_motion = True
+
+    def __init__(self, config: DNeRFConfig, scene: Scene) -> None:
+        super().__init__(config, scene)
+        self.fine = self._field()
+        self.coarse = self._field() if config.sampler == "hierarchical" else None
+        self.sampler = (
+            OccupancySampler(
+                scene.box,
+                config.grid_resolution,
+                config.num_steps,
+                config.early_stop,
+                config.train_early_stop,
+                moving=scene.moving,
+            )
+            if config.sampler == "occupancy"
+            else None
+        )
+
+    def _field(self) -> Field:
+        c, moving = self.config, self.scene.moving
+        small = c.canonical == "hash-grid"
+        if moving and c.variant == "t-nerf":
+            return self._network(c.time_frequencies)
+        if small:
+            grid = HashGrid(max_resolution=c.max_resolution, log2_table_size=c.log2_table_size, sparse=True)
+            canonical: Field = EncodedField(self.scene.box, grid)
+        else:
+            canonical = self._network(None)
+        if not moving:
+            return canonical
+        width, layers = (64, 4) if small else (256, 8)
+        return DeformedField(
+            canonical,
+            c.deformation_width or width,
+            c.deformation_layers or layers,
+            c.position_frequencies,
+            c.time_frequencies,
+        )
+
+    def _network(self, time_frequencies: int | None) -> NeRFField:
+        c = self.config
+        skip = c.num_layers // 2 + 1
+        frequencies = c.position_frequencies, c.direction_frequencies
+        return NeRFField(c.hidden_width, c.num_layers, skip, *frequencies, time_frequencies)
+
+    def decisions(self) -> list[Decision]:
+        if self.scene.moving:
+            return []
+        return [Decision("deformation", "left out", "the photographs have no times")]
+
+    def render(self, rays: Rays, background: Tensor) -> Rendered:
+        if self.sampler is not None:
+            return render_field(self.fine, self.sampler, rays, background, self.training)
+        assert self.coarse is not None
+        counts = self.config.num_coarse_samples, self.config.num_fine_samples
+        return render_hierarchical(self.coarse, self.fine, rays, background, counts, self.training)
+
+    def param_groups(self) -> list[dict[str, Any]]:
+        config = self.config
+        faster = OCCUPANCY_RATE if self.sampler is not None else 1.0
+        encoded = [module for module in self.modules() if isinstance(module, EncodedField)]
+        of_grids = {id(p) for module in encoded for p in module.parameters()}
+        rest = [p for p in self.parameters() if id(p) not in of_grids]
+        groups: list[dict[str, Any]] = [{"params": rest, "lr": config.learning_rate * faster, "name": "networks"}]
+        if encoded:
+            tables = [module.encoding.table for module in encoded]
+            heads = [p for m in encoded for p in m.parameters() if not any(p is table for table in tables)]
+            faithful = {"lr": config.grid_learning_rate, "betas": (0.9, 0.95), "eps": 1e-15}
+            groups += [{"params": heads, "name": "heads", **faithful}]
+            groups += [{"params": tables, "name": "tables", "sparse": True, **faithful}]
+        return [group for group in groups if group["params"]]
+
+    @property
+    def samples_per_batch(self) -> int | None:
+        if self.sampler is None or self.config.samples_per_batch is not None:
+            return self.config.samples_per_batch
+        small = self.config.canonical == "hash-grid" and self.config.variant == "d-nerf"
+        return HASH_SAMPLES_PER_BATCH if small else OCCUPANCY_SAMPLES_PER_BATCH
+
+    def before_step(self, step: int, progress: float) -> None:
+        if self.sampler is not None:
+            self.sampler.update(step, self.fine.density)
+
+
+METHOD = Method(DNeRF, DNeRFConfig(), paper="arXiv:2011.13961")

@@ -203,7 +203,8 @@ class Trainer:
             decisions.append(Decision("background", self._background(), reason))
         if self.model.occupancy_samplers and self.config.silhouette_cells:
             obstacle = self._no_silhouettes()
-            choice = "not used" if obstacle else "space outside them is skipped from the start"
+            outside = "what is outside all of them" if scene.moving else "space outside them"
+            choice = "not used" if obstacle else f"{outside} is skipped from the start"
             decisions.append(Decision("silhouettes", choice, obstacle or "alpha shows them"))
         if scene.moving and not self.model.learns_motion:
             decisions.append(Decision("times", "ignored", f"{self.run.method} learns a still scene: what moves blurs"))
@@ -230,7 +231,8 @@ class Trainer:
                 return
             for sampler, hull in zip(samplers, hulls, strict=True):
                 sampler.carve(hull)
-        if config.silhouette_pixels and all(sampler.any_carved for sampler in samplers):
+        still = not self.model.scene.moving  # else a pixel that is empty now teaches that a cell of another time is
+        if config.silhouette_pixels and still and all(sampler.any_carved for sampler in samplers):
             near = [pixels_near(silhouettes, ~s.carved, s.box, s.resolution) for s in samplers]
             self.train_set = replace(self.train_set, drawn=near[0] if len(near) == 1 else torch.cat(near).unique())
         if self.state.step == 0:

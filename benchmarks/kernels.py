@@ -21,6 +21,7 @@ from statistics import median
 
 import torch
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from framework.kernels import native
 from framework.kernels.adam import sparse_adam, sparse_adam_reference
@@ -29,6 +30,7 @@ from framework.kernels.frequency import frequency_encoding, frequency_encoding_r
 from framework.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
 from framework.kernels.march import March, Occupancy, ReferenceMarch
 from framework.kernels.mlp import mlp, mlp_reference
+from framework.kernels.planes import PlanesLayout, planes, planes_reference
 from framework.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
 from framework.rays import Rays, Samples
 
@@ -219,6 +221,74 @@ def updating(repeats: int) -> dict[str, object]:
     }
 
 
+def plane_lookup(name: str, layout: PlanesLayout, features: int, count: int, repeats: int) -> dict[str, object]:
+    """Factorised features against `grid_sample` on planes (1, F, H, W) of its own, as K-Planes' code has them."""
+    torch.manual_seed(0)
+    positions = torch.rand(count, layout.dims)
+    table = torch.rand(layout.num_entries, features) + 0.5
+    weight = torch.randn(count, layout.num_groups * features)
+
+    def sampled(x: Tensor, planes_: list[list[Tensor]]) -> Tensor:
+        groups = []
+        for factors, stored in zip(layout.axes, planes_, strict=True):
+            product: Tensor | None = None
+            for axes, plane in zip(factors, stored, strict=True):
+                where = x[:, list(axes)] if len(axes) == 2 else torch.cat([x[:, list(axes)], torch.zeros(len(x), 1)], 1)
+                found = grid_sample(plane, where[None, None] * 2 - 1, align_corners=True, padding_mode="border")
+                product = found[0, :, 0].t() if product is None else product * found[0, :, 0].t()
+            assert product is not None
+            groups.append(product)
+        return torch.cat(groups, dim=-1)
+
+    out: dict[str, object] = {"kernel": name, "samples": count}
+    for threads in sorted({1, native_threads}):
+        torch.set_num_threads(threads)
+        times: dict[str, list[float]] = {}
+        for repeat in range(repeats + 1):
+            leaf = table.clone().requires_grad_()
+            start = time.perf_counter()
+            value = planes(positions, leaf, layout)
+            middle = time.perf_counter()
+            value.backward(weight)
+            end = time.perf_counter()
+            stored = [
+                [
+                    layout.factor(table, g, i).permute(2, 0, 1)[None].contiguous().requires_grad_()
+                    for i in range(len(factors))
+                ]
+                for g, factors in enumerate(layout.axes)
+            ]
+            start2 = time.perf_counter()
+            other = sampled(positions, stored)
+            middle2 = time.perf_counter()
+            other.backward(weight)
+            end2 = time.perf_counter()
+            if repeat:
+                spent = (middle - start, end - middle, middle2 - start2, end2 - middle2)
+                names = ("compiled forward", "compiled backward", "grid_sample forward", "grid_sample backward")
+                for key, seconds in zip(names, spent, strict=True):
+                    times.setdefault(key, []).append(seconds)
+        for key, found in times.items():
+            out[f"{key}, ns per sample, {threads} threads"] = round(median(found) / count * 1e9, 1)
+        for way in ("forward", "backward"):
+            ratios = [b / a for a, b in zip(times[f"compiled {way}"], times[f"grid_sample {way}"], strict=True)]
+            out[f"speed-up {way}, {threads} threads"] = round(median(ratios), 1)
+    truth = table.double().requires_grad_()
+    exact = planes_reference(positions.double(), truth, layout)
+    exact.backward(weight.double())
+    assert leaf.grad is not None
+    assert truth.grad is not None
+    theirs = torch.cat([p.grad[0].permute(1, 2, 0).reshape(-1, features) for group in stored for p in group if p.grad is not None])
+    for key, result, right in (
+        ("error of the value", value, exact),
+        ("grid_sample's error of the value", other, exact),
+        ("error of the gradient", leaf.grad, truth.grad),
+        ("grid_sample's error of the gradient", theirs, truth.grad),
+    ):
+        out[key] = float((result.detach().double() - right.detach()).abs().max() / right.detach().abs().max())
+    return out
+
+
 def ceilings() -> dict[str, float]:
     """What this machine can do at all, measured now with torch, on all threads."""
     torch.set_num_threads(native_threads)
@@ -254,6 +324,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=2**15)
     parser.add_argument("--repeats", type=int, default=9)
     flags = parser.parse_args()
+    size = flags.samples, flags.repeats
     limits = ceilings()
     print(limits)
     table = []
@@ -261,9 +332,20 @@ def main() -> None:
         table.append(timed(row, flags.repeats))
         print(table[-1], flush=True)
     torch.set_num_threads(native_threads)
-    for extra in (marching(flags.repeats), updating(flags.repeats)):
-        table.append(extra)
-        print(extra, flush=True)
+    scales = tuple((64 << s,) * 3 for s in range(4))
+    moving = tuple((64 << s,) * 3 + (25,) for s in range(4))
+    across = (((0, 1), (2,)), ((0, 2), (1,)), ((1, 2), (0,)))
+    extras = [
+        lambda: marching(flags.repeats),
+        lambda: updating(flags.repeats),
+        lambda: plane_lookup("K-Planes, 4 scales to 512, 3 planes of 32", PlanesLayout.build(scales), 32, *size),
+        lambda: plane_lookup("K-Planes, 4 scales to 512, 6 planes of 32", PlanesLayout.build(moving), 32, *size),
+        lambda: plane_lookup("TensoRF VM, 300^3, 48", PlanesLayout.build(((300,) * 3,) * 3, across), 48, *size),
+    ]
+    for extra in extras:
+        torch.set_num_threads(native_threads)
+        table.append(extra())
+        print(table[-1], flush=True)
     machine = {
         "kernels": native.variant(),
         "processor": platform.processor() or platform.machine(),

@@ -11,10 +11,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from framework import Batch, Decision, Field, Method, Model, Rays, Rendered, Scene, TrainConfig
+from framework import Batch, Decision, Method, Model, Rays, Rendered, Scene, TrainConfig
 from framework.encodings import FeaturePlanes
 from framework.fields.base import MLP
-from framework.fields.encoded import EncodedField
+from framework.fields.encoded import BoxField, EncodedField
 from framework.kernels.math import truncated_exp
 from framework.kernels.planes import plane_band
 from framework.kernels.spherical_harmonics import spherical_harmonics
@@ -67,7 +67,7 @@ BANDS = 16
 """The regularisers look at one row in so many of each plane in a step, a random band: on average they see all."""
 
 
-class ExplicitField(Field):
+class ExplicitField(BoxField):
     """Linear density, and colour as features times a basis that a small network of the direction learns (section 3.4).
 
     Args:
@@ -77,14 +77,23 @@ class ExplicitField(Field):
     """
 
     def __init__(self, box: Tensor, planes: FeaturePlanes, width: int) -> None:
-        super().__init__()
-        self.encoded = EncodedField(box, planes, width)
-        del self.encoded.density_head, self.encoded.color_head
+        super().__init__(box, planes)
         self.density_head = torch.nn.Linear(planes.num_features, 1, bias=False)
         self.basis = MLP(16, width, width, 3 * planes.num_features)
 
     def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        features = self.encoded.encode(positions, times)
+        features = self.encode(positions, times)
+        return truncated_exp(self.density_head(features)[:, 0]), features
+
+    @torch.no_grad()
+    def trace(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        sigma, features = self.density(positions, times)
+        return sigma, features, features
+
+    def retrace(
+        self, positions: Tensor, times: Tensor | None, features: Tensor, memory: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        features = self.encode(positions, times, known=memory)
         return truncated_exp(self.density_head(features)[:, 0]), features
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
@@ -101,7 +110,7 @@ class KPlanes(Model[KPlanesConfig]):
         super().__init__(config, scene)
         time = (config.time_resolution,) if scene.moving else ()
         resolutions = tuple((config.base_resolution << s,) * 3 + time for s in range(self.num_scales))
-        self.planes = FeaturePlanes(resolutions, config.features_per_scale, config.sparse_updates)
+        self.planes = FeaturePlanes(resolutions, config.features_per_scale, sparse=config.sparse_updates)
         kind = EncodedField if config.decoder == "hybrid" else ExplicitField
         self.field = kind(scene.box, self.planes, config.hidden_width)
         self.sampler = OccupancySampler(
@@ -151,9 +160,9 @@ class KPlanes(Model[KPlanesConfig]):
         """Total variation in space, roughness in time, and distance of time's planes from one (equations 4 to 6)."""
         planes, layout = self.planes, self.planes.layout
         variation = roughness = activity = zero
-        for scale in range(layout.num_scales):
-            for index, (_, second) in enumerate(layout.axes):
-                height = layout.resolutions[scale][second]
+        for scale in range(layout.num_groups):
+            for index, (_, second) in enumerate(layout.axes[scale]):
+                height, _ = layout.shape(scale, index)
                 rows = height if second == 3 else max(height // BANDS, 2)  # time's planes are small: all of them
                 first = int(torch.randint(height - rows + 1, ()))
                 band = plane_band(planes.table, layout, scale, index, first, rows, planes.deferred)

@@ -83,3 +83,25 @@ def test_a_camera_inside_the_box_says_nothing_of_what_is_behind_it(ball: Dataset
     behind = silhouettes.depth(0, centers(16)) < 0
     assert bool(hull[behind].all())
     assert not bool(hull.all())
+
+
+def test_of_a_moving_scene_all_that_is_ever_seen_stays(ball: Dataset) -> None:
+    """Half of the photographs are empty: standing still nothing could be there, moving it was there for a while."""
+    pixels = ball.pixels.clone()
+    pixels[: 12 * 6400, 3] = 0
+    silhouettes = Silhouettes.of(replace(ball, pixels=pixels))
+    assert not bool(visual_hull(silhouettes, BOX / 2, 16).any())
+    hull = visual_hull(silhouettes, BOX, 16, moving=True)
+    assert bool(hull[centers(16).norm(dim=-1) < 1].all())
+    assert bool(visual_hull(silhouettes, BOX / 4, 4, moving=True).all())
+
+
+def test_of_a_moving_scene_what_all_photographs_show_empty_goes(ball: Dataset) -> None:
+    """Far cameras that see the whole box: all of them see the ball in the middle, and none anything by the corners."""
+    wide = replace(ball, cameras=replace(ball.cameras, fx=ball.cameras.fx / 3, fy=ball.cameras.fy / 3))
+    pixels = torch.zeros_like(wide.pixels).view(24, 80, 80, 4)
+    pixels[:, 38:42, 38:42, 3] = 255  # all that any of them shows is in the middle
+    hull = visual_hull(Silhouettes.of(replace(wide, pixels=pixels.view(-1, 4))), BOX, 16, moving=True)
+    assert bool(hull[centers(16).norm(dim=-1) < 0.2].all())
+    assert not bool(hull.all())
+    assert hull.float().mean() < 0.9

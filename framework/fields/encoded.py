@@ -11,7 +11,40 @@ from framework.kernels.math import split_density, truncated_exp
 from framework.kernels.spherical_harmonics import spherical_harmonics
 
 
-class EncodedField(Field):
+class BoxField(Field):
+    """A field whose features stand in a box.
+
+    Args:
+        box: (2, 3) the part of space that is encoded.
+        encoding: of positions in [0, 1]^3, or of those and time.
+    """
+
+    box: Tensor
+    scale: Tensor
+    shift: Tensor
+
+    def __init__(self, box: Tensor, encoding: HashGrid | FeaturePlanes) -> None:
+        super().__init__()
+        self.register_buffer("box", box.clone())
+        size = box[1] - box[0]
+        self.register_buffer("scale", 1 / size, persistent=False)
+        self.register_buffer("shift", -box[0] / size, persistent=False)
+        self.encoding = encoding
+
+    def encode(self, positions: Tensor, times: Tensor | None, known: Tensor | None = None) -> Tensor:
+        """Features (N, E) at positions (N, 3), which may be `known` already.
+
+        Raises: ValueError where the encoding wants times and there are none.
+        """
+        unit = torch.addcmul(self.shift, positions, self.scale)
+        if self.encoding.dims == 4:
+            if times is None:
+                raise ValueError("this field changes with time: it needs the times of its positions")
+            unit = torch.cat([unit, times[:, None].to(unit)], dim=-1)
+        return self.encoding(unit, known=known)
+
+
+class EncodedField(BoxField):
     """Density from the encoding's features, colour from 16 features and the view's spherical harmonics.
 
     Args:
@@ -22,19 +55,15 @@ class EncodedField(Field):
         direction_levels: bands of spherical harmonics (4 in the paper); 0 for colours that look alike from all sides.
     """
 
-    box: Tensor
-    scale: Tensor
-    shift: Tensor
-
     def __init__(
-        self, box: Tensor, encoding: HashGrid | FeaturePlanes, width: int = 64, num_features: int = 16, direction_levels: int = 4
+        self,
+        box: Tensor,
+        encoding: HashGrid | FeaturePlanes,
+        width: int = 64,
+        num_features: int = 16,
+        direction_levels: int = 4,
     ) -> None:
-        super().__init__()
-        self.register_buffer("box", box.clone())
-        size = box[1] - box[0]
-        self.register_buffer("scale", 1 / size, persistent=False)
-        self.register_buffer("shift", -box[0] / size, persistent=False)
-        self.encoding = encoding
+        super().__init__(box, encoding)
         self.direction_levels = direction_levels
         self.density_head = MLP(encoding.num_features, width, num_features, bias=False)
         self.color_head = MLP(num_features + direction_levels**2, width, width, 3, bias=False, activation="sigmoid")
@@ -51,19 +80,7 @@ class EncodedField(Field):
     def retrace(
         self, positions: Tensor, times: Tensor | None, features: Tensor, memory: Tensor
     ) -> tuple[Tensor, Tensor]:
-        return split_density(self.density_head(self.encoding(self._unit(positions, times), known=memory), known=features))
-
-    def encode(self, positions: Tensor, times: Tensor | None) -> Tensor:
-        """The encoding's features at positions (N, 3) in the box."""
-        return self.encoding(self._unit(positions, times))
-
-    def _unit(self, positions: Tensor, times: Tensor | None) -> Tensor:
-        unit = torch.addcmul(self.shift, positions, self.scale)
-        if self.encoding.dims == 3:
-            return unit
-        if times is None:
-            raise ValueError("this field changes with time: it needs the times of its positions")
-        return torch.cat([unit, times[:, None].to(unit)], dim=-1)
+        return split_density(self.density_head(self.encode(positions, times, known=memory), known=features))
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         if self.direction_levels == 0:

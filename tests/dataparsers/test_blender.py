@@ -51,14 +51,6 @@ def test_reduction_weighs_colour_by_alpha() -> None:
     assert reduce_image(image, 2)[0, 0].tolist() == expected
 
 
-def test_times_make_a_moving_scene(tiny: Path, edit_json: EditJson) -> None:
-    edit_json(lambda c: [frame.update(time=i / 9) for i, frame in enumerate(c["frames"])])
-    data = load_dataset(Blender().parse(tiny, "train"), "train")
-    assert data.scene.moving
-    assert data.times is not None
-    torch.testing.assert_close(data.times, torch.arange(10) / 9)
-
-
 def put(key: str, value: Any) -> Any:
     return lambda c: c.update({key: value})
 
@@ -203,10 +195,3 @@ def test_real_lego(real_data: Path, split: Split, count: int) -> None:
     assert len(data) == count
     assert {data.image(index).shape for index in range(count)} == {(400, 400, 4)}
     assert data.scene.has_alpha
-
-
-@pytest.mark.data
-def test_real_moving_scene(real_data: Path) -> None:
-    parsed = Blender().parse(real_data / "bouncingballs", "train")
-    assert parsed.times is not None
-    assert (parsed.times.min().item(), parsed.times.max().item()) == pytest.approx((0.0, 1.0))

@@ -9,6 +9,9 @@ from tests.kernels.compiled import needs_kernels, relative_error
 
 STILL = PlanesLayout.build(((8, 9, 10), (16, 5, 32)))
 MOVING = PlanesLayout.build(((8, 9, 10, 4), (16, 18, 20, 4)))
+VM = PlanesLayout.build(((8, 9, 10),) * 3, (((0, 1), (2,)), ((0, 2), (1,)), ((1, 2), (0,))))
+CP = PlanesLayout.build(((8, 9, 10),), (((0,), (1,), (2,)),))
+LAYOUTS = {"k-planes": STILL, "k-planes with time": MOVING, "vm": VM, "cp": CP}
 
 
 def inputs(layout: PlanesLayout, features: int, count: int = 301) -> tuple[torch.Tensor, torch.Tensor]:
@@ -22,24 +25,26 @@ def inputs(layout: PlanesLayout, features: int, count: int = 301) -> tuple[torch
 def sampled(positions: torch.Tensor, table: torch.Tensor, layout: PlanesLayout) -> torch.Tensor:
     """The same by grid_sample, plane by plane."""
     scales = []
-    for scale in range(layout.num_scales):
+    for group, factors in enumerate(layout.axes):
         product = torch.ones((), dtype=table.dtype)
-        for index, axes in enumerate(layout.axes):
-            plane = layout.plane(table, scale, index).permute(2, 0, 1)[None]
+        for index, axes in enumerate(factors):
+            plane = layout.factor(table, group, index).permute(2, 0, 1)[None]
             where = positions[None, None, :, list(axes)] * 2 - 1
+            if len(axes) == 1:  # a line is a plane of one row
+                where = torch.cat([where, torch.zeros_like(where)], dim=-1)
             product = product * grid_sample(plane, where, align_corners=True, padding_mode="border")[0, :, 0].t()
         scales.append(product)
     return torch.cat(scales, dim=-1)
 
 
-@pytest.mark.parametrize("layout", [STILL, MOVING])
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS.keys())
 def test_the_reference_is_what_grid_sample_finds(layout: PlanesLayout) -> None:
     positions, table = (x.double() for x in inputs(layout, 3))
     assert relative_error(planes_reference(positions, table, layout), sampled(positions, table, layout)) < 1e-14
 
 
 @needs_kernels
-@pytest.mark.parametrize("layout", [STILL, MOVING])
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS.keys())
 @pytest.mark.parametrize("features", [1, 3, 4, 8, 16, 32])
 def test_compiled_value_and_gradients(layout: PlanesLayout, features: int) -> None:
     positions, table = inputs(layout, features)

@@ -38,6 +38,35 @@ TINY: dict[str, dict[str, Any]] = {
         "samples_per_batch": 4096,
         "learning_rate": 5e-3,
     },
+    "kplanes": {
+        "base_resolution": 16,
+        "num_scales": 2,
+        "time_resolution": 5,
+        "features_per_scale": 8,
+        "grid_resolution": 16,
+        "num_steps": 64,
+        "samples_per_batch": 4096,
+    },
+    "tensorf": {
+        "density_components": 8,
+        "appearance_components": 8,
+        "first_voxels": 16**3,
+        "last_voxels": 32**3,
+        "grid_resolution": 16,
+        "num_steps": 64,
+        "hidden_width": 32,
+        "samples_per_batch": 4096,
+    },
+    "dnerf": {
+        "num_layers": 3,
+        "hidden_width": 32,
+        "deformation_layers": 2,
+        "deformation_width": 32,
+        "num_coarse_samples": 16,
+        "num_fine_samples": 16,
+        "num_rays_per_batch": 128,
+        "learning_rate": 5e-3,
+    },
 }
 
 

@@ -1,0 +1,68 @@
+"""Feature planes that are resampled: what is looked up stays, and everything that depends on their size follows."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from framework.encodings import FeaturePlanes
+from framework.training.checkpoint import load_checkpoint
+from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
+
+VM = (((0, 1), (2,)), ((0, 2), (1,)), ((1, 2), (0,)))
+FIRST, LATER = ((5, 6, 7),) * 3, ((9, 16, 19),) * 3
+
+
+@pytest.mark.parametrize("axes", [None, VM])
+def test_what_is_looked_up_stays(axes: tuple[tuple[tuple[int, ...], ...], ...] | None) -> None:
+    """Along each axis the new vertices hold all of the old ones, so linear interpolation is the same everywhere."""
+    torch.manual_seed(0)
+    planes = FeaturePlanes(FIRST, 4, axes)
+    positions = torch.rand(200, 3)
+    before = planes(positions)
+    finer = tuple(tuple(2 * (n - 1) + 1 for n in group) for group in FIRST)
+    planes.resample(finer, torch.zeros(3), torch.ones(3))
+    assert planes.table.shape[0] == planes.layout.num_entries
+    torch.testing.assert_close(planes(positions), before, atol=1e-5, rtol=1e-5)
+
+
+def test_a_part_of_the_box_is_cut_out() -> None:
+    torch.manual_seed(0)
+    planes = FeaturePlanes(FIRST, 4, VM)
+    lower, upper = torch.tensor([0.25, 0.0, 0.5]), torch.tensor([0.75, 1.0, 1.0])  # at vertices of 5, 6 and 7
+    inner = torch.rand(200, 3)
+    before = planes(lower + inner * (upper - lower))
+    planes.resample(((3, 6, 4),) * 3, lower, upper)
+    torch.testing.assert_close(planes(inner), before, atol=1e-5, rtol=1e-5)
+
+
+def test_another_size_is_loaded() -> None:
+    torch.manual_seed(0)
+    one, two = FeaturePlanes(FIRST, 4, VM, sparse=True), FeaturePlanes(FIRST, 4, VM, sparse=True)
+    one.resample(LATER, torch.zeros(3), torch.ones(3))
+    two.load_state_dict(one.state_dict())
+    assert two.layout == one.layout
+    assert two.deferred is not None
+    assert two.deferred.layout == one.layout
+    positions = torch.rand(50, 3)
+    torch.testing.assert_close(two(positions), one(positions), rtol=0, atol=0)
+
+
+def test_tensorf_grows_shrinks_and_resumes(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("tensorf", shared_tiny, tmp_path / "whole", max_num_iterations=60)
+    model, sizes, boxes = trainer.model, [], []
+    for _ in range(60):
+        trainer.train_step()
+        sizes.append(model.size())
+        boxes.append(model.field.box.clone())
+        if trainer.state.step == 8:
+            saved = trainer.save()  # in the middle of growing
+    assert trainer.state.skipped == 0
+    assert sizes[-1] > sizes[0] * 2
+    assert len(set(sizes)) > 3
+    assert bool((boxes[-1][1] - boxes[-1][0] < boxes[0][1] - boxes[0][0]).all())
+    again = tiny_trainer("tensorf", shared_tiny, tmp_path / "again", max_num_iterations=60)
+    again.restore(load_checkpoint(saved))
+    while again.state.step < 60:
+        again.train_step()
+    assert_same_bits(tensors(trainer), tensors(again))

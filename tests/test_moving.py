@@ -1,0 +1,100 @@
+"""Methods that learn motion: on scenes that move, and on scenes that do not."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from framework.dataset import Dataset
+from framework.evaluation.evaluator import render_image
+from framework.fields.deformed import DeformedField
+from framework.fields.nerf import NeRFField
+from framework.training.trainer import Trainer
+from tests.training.helpers import tiny_run, tiny_trainer
+
+VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
+    "kplanes hybrid": ("kplanes", {}),
+    "kplanes explicit": ("kplanes", {"decoder": "explicit"}),
+    "dnerf": ("dnerf", {}),
+    "dnerf occupancy": ("dnerf", {"sampler": "occupancy", "samples_per_batch": 4096}),
+    "t-nerf": ("dnerf", {"variant": "t-nerf", "sampler": "occupancy", "samples_per_batch": 4096}),
+    "dnerf hash": (
+        "dnerf",
+        {"sampler": "occupancy", "canonical": "hash-grid", "log2_table_size": 10, "samples_per_batch": 4096},
+    ),
+}
+
+
+def moving_trainer(name: str, data: Path, folder: Path, **changes: Any) -> Trainer:
+    """A trainer on the tiny data set, whose photographs get times from 0 to 1; its ball is red at first, then blue."""
+    method, settings = VARIANTS[name]
+    still = tiny_trainer("instant-ngp", data, folder / "still").train_set
+    times = torch.linspace(0, 1, len(still))
+    pixels = still.pixels.clone().view(len(still), -1, 4)
+    pixels[..., :3] = 0
+    pixels[..., 0] = (255 * (1 - times[:, None])).to(torch.uint8)
+    pixels[..., 2] = (255 * times[:, None]).to(torch.uint8)
+    moving = dataclasses.replace(
+        still, pixels=pixels.view(-1, 4), times=times, scene=dataclasses.replace(still.scene, moving=True)
+    )
+    (folder / "run").mkdir()
+    settings = {"max_num_iterations": 150, "max_eval_images": 0, **settings, **changes}
+    return Trainer(tiny_run(method, data, folder / "run", **settings), moving, None)
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_colours_follow_time(name: str, shared_tiny: Path, tmp_path: Path) -> None:
+    """The same camera at both ends of time: the ball is redder in the one and bluer in the other."""
+    trainer = moving_trainer(name, shared_tiny, tmp_path)
+    trainer.train()
+    assert trainer.state.skipped == 0
+    cameras, white = trainer.train_set.cameras, torch.ones(3)
+    found = []
+    for time in (0.05, 0.95):
+        image = render_image(trainer.model, cameras, 0, white, torch.full((len(cameras),), time))
+        ball = image.accumulation > 0.5
+        assert ball.float().mean() > 0.05
+        found.append(image.rgb[ball].mean(0))
+    learns_colour = not name.startswith("dnerf")  # what is only deformed keeps its colours, as in the paper
+    if learns_colour:
+        assert found[0][0] - found[0][2] > 0.3
+        assert found[1][2] - found[1][0] > 0.3
+    assert not torch.equal(found[0], found[1])
+
+
+@pytest.mark.parametrize(("name", "what"), [("kplanes hybrid", "planes of time"), ("dnerf", "deformation")])
+def test_without_times_what_they_need_is_left_out(name: str, what: str, shared_tiny: Path, tmp_path: Path) -> None:
+    method, settings = VARIANTS[name]
+    still = tiny_trainer(method, shared_tiny, tmp_path / "run", **settings)
+    moving = moving_trainer(name, shared_tiny, tmp_path)
+    said = {decision.option: decision.choice for decision in still.profile().decisions}
+    assert said[what] == "left out"
+    assert what not in {decision.option for decision in moving.profile().decisions}
+    assert still.model.size() < moving.model.size()
+
+
+def test_nothing_is_displaced_at_time_zero() -> None:
+    torch.manual_seed(0)
+    canonical = NeRFField(32, 3, 2)
+    field = DeformedField(canonical, 32, 3)
+    torch.nn.init.normal_(field.after_skip[-1].weight)  # type: ignore[arg-type]
+    positions = torch.rand(9, 3)
+    times = torch.tensor([0.0, 0.5, 1.0]).repeat(3)
+    moved = field.displacement(positions, times)
+    assert bool((moved[times == 0] == 0).all())
+    assert bool((moved[times > 0] != 0).all())
+    sigma, features = field.density(positions, times)
+    expected, known = canonical.density(positions + moved)
+    torch.testing.assert_close(sigma, expected)
+    torch.testing.assert_close(features, known)
+    with pytest.raises(ValueError, match="needs the times"):
+        field.density(positions)
+
+
+def test_a_moving_scene_keeps_its_pixels_and_its_union_of_cells(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = moving_trainer("kplanes hybrid", shared_tiny, tmp_path, max_num_iterations=1)
+    trainer.train()
+    assert isinstance(trainer.train_set, Dataset)
+    assert trainer.train_set.drawn is None

@@ -4,31 +4,35 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from framework.cli.common import run_command
 from framework.errors import ConfigError, nearest
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from framework.cameras import Cameras
+    from framework.dataset import ParsedScene
+    from framework.training.trained import Trained
+
 USAGE = """\
-usage: ns-render orbit --load-config RUN/config.yml --output-path FILE.gif [flags]
+usage: ns-render PATH --load-config RUN/config.yml --output-path FILE.gif [flags]
 
 paths:
   orbit           a horizontal circle around the scene, as high and far as the training cameras
+  time            one of the cameras, while time runs from 0 to 1
 
 ns-render PATH --help shows its flags.
 """
 
 
 @dataclass(frozen=True)
-class OrbitFlags:
-    """Render a horizontal circle around the scene, as high and far as the training cameras."""
+class RenderFlags:
+    """What every path can be told."""
 
     load_config: Path
     """The run's config.yml."""
-    output_path: Path = Path("orbit.gif")
-    """The animation; its ending (.gif, .webp, .png) chooses the format."""
-    num_frames: int = 48
-    """Pictures in the circle."""
     fps: float = 16.0
     """Pictures per second."""
     downscale_factor: int = 1
@@ -45,6 +49,35 @@ class OrbitFlags:
     """Device to render on."""
 
 
+@dataclass(frozen=True)
+class OrbitFlags(RenderFlags):
+    """Render a horizontal circle around the scene, as high and far as the training cameras."""
+
+    output_path: Path = Path("orbit.gif")
+    """The animation; its ending (.gif, .webp, .png) chooses the format."""
+    num_frames: int = 48
+    """Pictures in the circle."""
+    time: float | None = None
+    """Time of all pictures of a scene that moves, 0 to 1. If not given, it runs from 0 to 1 on the way."""
+
+
+@dataclass(frozen=True)
+class TimeFlags(RenderFlags):
+    """Render what one camera sees while time runs from 0 to 1."""
+
+    output_path: Path = Path("time.gif")
+    """An animation (.gif, .webp), or the pictures side by side (.png)."""
+    num_frames: int = 32
+    """Pictures from time 0 to 1."""
+    split: Literal["train", "val", "test"] = "test"
+    """The images whose cameras are counted."""
+    camera_index: int = 0
+    """Which camera, from 0."""
+
+
+PATHS: dict[str, type[OrbitFlags] | type[TimeFlags]] = {"orbit": OrbitFlags, "time": TimeFlags}
+
+
 def main() -> None:
     """The ns-render command."""
     run_command(_command)
@@ -54,14 +87,16 @@ def _command(arguments: list[str]) -> None:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE)
         return
-    if arguments[0] != "orbit":
-        raise ConfigError(f"unknown path '{arguments[0]}'. {nearest(arguments[0], ['orbit'])}")
+    path = PATHS.get(arguments[0])
+    if path is None:
+        raise ConfigError(f"unknown path '{arguments[0]}'. {nearest(arguments[0], list(PATHS))}")
     import tyro
 
-    _orbit(tyro.cli(OrbitFlags, prog="ns-render orbit", args=arguments[1:], config=(tyro.conf.FlagConversionOff,)))
+    prog = f"ns-render {arguments[0]}"
+    _render(tyro.cli(path, prog=prog, args=arguments[1:], config=(tyro.conf.FlagConversionOff,)))
 
 
-def _orbit(flags: OrbitFlags) -> None:
+def _render(flags: OrbitFlags | TimeFlags) -> None:
     if flags.num_frames < 1 or not flags.fps > 0 or flags.downscale_factor < 1:
         raise ConfigError("--num-frames and --downscale-factor must be at least 1, --fps more than 0")
     if flags.output_path.suffix.lower() not in (".gif", ".webp", ".png"):
@@ -73,26 +108,58 @@ def _orbit(flags: OrbitFlags) -> None:
     from framework.console import say, track
     from framework.evaluation.error_bound import limited_error, parse_error
     from framework.evaluation.evaluator import evaluation_background, render_image
-    from framework.evaluation.images import write_animation
-    from framework.evaluation.paths import orbit
+    from framework.evaluation.images import write_animation, write_image
     from framework.training.trained import load_trained
 
     trained = load_trained(
         flags.load_config, flags.load_checkpoint, flags.device_type, flags.data, flags.rays_per_pixel
     )
-    model, scene = trained.model, trained.model.scene
-    parsed = trained.run.parser.parse(trained.run.config.data, "train")
-    cameras = orbit(parsed.cameras, scene.box.mean(0), flags.num_frames)
+    model, config = trained.model, trained.run.config
+    parsed = trained.run.parser.parse(config.data, flags.split if isinstance(flags, TimeFlags) else "train")
+    follow = _one_camera if isinstance(flags, TimeFlags) else _circle
+    cameras, times = follow(flags, trained, parsed)  # type: ignore[arg-type]
     cameras = cameras.scaled(1 / (flags.downscale_factor * parsed.downscale_factor)).to(model.device)
-    times = torch.linspace(0, 1, flags.num_frames, device=model.device) if scene.moving else None
+    times = None if times is None else times.to(model.device)
     background = evaluation_background(model)
     bound = None if flags.max_error is None else parse_error(flags.max_error)
     frames = []
     with nullcontext() if bound is None else limited_error(model, bound):
         for index in track(range(flags.num_frames), "Rendering", total=flags.num_frames):
             frames.append(render_image(model, cameras, index, background, times).rgb)
-    write_animation(flags.output_path, frames, flags.fps)
-    say(f"animation: {flags.output_path}")
+    if isinstance(flags, TimeFlags) and flags.output_path.suffix.lower() == ".png":
+        write_image(flags.output_path, torch.cat(frames, dim=1))
+        say(f"pictures, side by side: {flags.output_path}")
+    else:
+        write_animation(flags.output_path, frames, flags.fps)
+        say(f"animation: {flags.output_path}")
+
+
+def _circle(flags: OrbitFlags, trained: Trained, parsed: ParsedScene) -> tuple[Cameras, Tensor | None]:
+    import torch
+
+    from framework.evaluation.paths import orbit
+
+    scene = trained.model.scene
+    cameras = orbit(parsed.cameras, scene.box.mean(0).cpu(), flags.num_frames)
+    if flags.time is None:
+        return cameras, torch.linspace(0, 1, flags.num_frames) if scene.moving else None
+    if not scene.moving:
+        raise ConfigError(f"--time {flags.time:g}: the photographs of this run have no times")
+    if not 0 <= flags.time <= 1:
+        raise ConfigError(f"--time is {flags.time:g}; it must be from 0 to 1")
+    return cameras, torch.full((flags.num_frames,), flags.time)
+
+
+def _one_camera(flags: TimeFlags, trained: Trained, parsed: ParsedScene) -> tuple[Cameras, Tensor | None]:
+    import torch
+
+    if not trained.model.scene.moving:
+        raise ConfigError("ns-render time: the photographs of this run have no times")
+    if not 0 <= flags.camera_index < len(parsed.cameras):
+        last = len(parsed.cameras) - 1
+        raise ConfigError(f"--camera-index is {flags.camera_index}; '{flags.split}' has cameras 0 to {last}")
+    chosen = torch.full((flags.num_frames,), flags.camera_index)
+    return parsed.cameras[chosen], torch.linspace(0, 1, flags.num_frames)
 
 
 if __name__ == "__main__":

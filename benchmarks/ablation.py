@@ -1,4 +1,4 @@
-"""What each rung of skipping is worth: instant-ngp trained with one of them off in turn.
+"""What each part of instant-ngp is worth: trained with one of them off, or on, in turn.
 
     python benchmarks/ablation.py --data DIR [--seconds 45] [--seeds 2] [--target 30]
 

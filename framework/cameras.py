@@ -19,7 +19,7 @@ from framework.kernels import native
 from framework.rays import Rays
 
 ROTATION_TOLERANCE = 1e-3
-CENTRE = torch.zeros(1, 2)
+CENTER = torch.zeros(1, 2)
 """The one place in a pixel that is its centre, as columns and rows from there."""
 
 
@@ -111,7 +111,7 @@ class Cameras:
         return torch.cat([torch.zeros_like(sizes[:1]), sizes])
 
     def pixel_rays(
-        self, flat: Tensor, near: float, far: float, times: Tensor | None = None, places: Tensor = CENTRE
+        self, flat: Tensor, near: float, far: float, times: Tensor | None = None, places: Tensor = CENTER
     ) -> Rays:
         """Rays through pixels.
 
@@ -127,7 +127,7 @@ class Cameras:
         return self.pixel_rays_reference(flat, near, far, times, places)
 
     def pixel_rays_reference(
-        self, flat: Tensor, near: float, far: float, times: Tensor | None = None, places: Tensor = CENTRE
+        self, flat: Tensor, near: float, far: float, times: Tensor | None = None, places: Tensor = CENTER
     ) -> Rays:
         """As `pixel_rays`, in torch, for any camera and device."""
         indices = torch.searchsorted(self.offsets, flat, right=True) - 1
@@ -167,18 +167,18 @@ class Cameras:
         start, end = self.offsets[index : index + 2].tolist()
         return torch.arange(start, end, device=self.fx.device)
 
-    def image_rays(self, index: int, near: float, far: float, times: Tensor | None = None) -> Rays:
-        """All rays of one image, row by row: R = height * width."""
-        return self.pixel_rays(self.image_pixels(index), near, far, times)
-
 
 def subpixels(count: int) -> Tensor:
     """(count, 2) places in a pixel whose mean colour stands for the pixel's: columns and rows from its centre.
 
-    For count = n^2 a square grid, turned so that no two share a row or a column and edges near the axes are met as
-    evenly as slanted ones: the "rotated grid" of hardware antialiasing (Molnar 1991, for n = 2).
+    For count = n^2 a square grid, turned so that no two share a row or a column: edges near the axes, where steps show
+    most, take count + 1 levels instead of n + 1. The "rotated grid" of graphics hardware is that of n = 2.
+
+    Raises: ValueError where the count is not a square.
     """
     side = math.isqrt(count)
+    if side * side != count or count < 1:
+        raise ValueError(f"{count} rays a pixel: it must be the square of a whole number")
     steps = torch.arange(count)
     rows = (steps + 1) * side % (count + 1) - 1
     return (torch.stack([steps, rows], dim=-1) + 0.5) / count - 0.5

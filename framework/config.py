@@ -17,6 +17,7 @@ import yaml
 from framework.errors import ConfigError, nearest
 
 T = TypeVar("T")
+RaysPerPixel = Literal[1, 4, 9, 16]
 
 
 @dataclass(frozen=True)
@@ -72,13 +73,13 @@ class TrainConfig:
     load_checkpoint: Path | None = None
     """Start from this checkpoint."""
     num_rays_per_batch: int = 4_096
-    """Pixels in a training step."""
-    rays_per_pixel: Literal[1, 4, 9, 16] = 1
+    """Rays in a training step."""
+    rays_per_pixel: RaysPerPixel = 1
     """Rays of which a pixel of a picture is the mean, as a camera sees areas, not points. More: closer, and slower."""
     train_rays_per_pixel_from: float = 1.0
     """Share of the budget after which training too averages that many rays; until then it uses one."""
     samples_per_batch: int | None = None
-    """Let the number of pixels follow, so that a step evaluates about this many samples."""
+    """Let the number of rays follow, so that a step evaluates about this many samples."""
     learning_rate: float = 5e-4
     """Adam's learning rate at the start."""
     lr_schedule: Literal["constant", "exponential", "cosine", "hold-exponential"] = "exponential"

@@ -48,7 +48,11 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
         """Colour, depth and opacity of R rays over `background`, (R, 3) or (3,). R may be 0."""
 
     def loss(self, rendered: Rendered, batch: Batch, step: int) -> dict[str, Tensor]:
-        """Named scalars; their sum is minimised. The mean squared error of every level by default."""
+        """Named scalars; their sum is minimised. The mean squared error of every level by default.
+
+        `rendered` and `batch.rgb` are of pixels. Of several rays a pixel there are as many `batch.rays`, and
+        `rendered.samples` and `.weights` are the rays'.
+        """
         losses = {"rgb": mean_squared_error(rendered.rgb, batch.rgb, batch.weights)}
         if rendered.coarse is not None:
             losses["rgb_coarse"] = mean_squared_error(rendered.coarse.rgb, batch.rgb, batch.weights)

@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from framework.cameras import CENTRE
+from framework.cameras import CENTER
 from framework.dataset import Dataset
 from framework.error_map import ErrorMap
 from framework.kernels import native
@@ -36,7 +36,7 @@ class Batch:
 
 
 def background_colors(kind: Background, count: int, device: torch.device) -> Tensor:
-    """(count, 3) colours in [0, 1]; "random" draws a new one for each ray, so that no fixed colour can be learnt."""
+    """(count, 3) colours in [0, 1]; "random" draws a new one for each pixel, so that no fixed colour can be learnt."""
     if kind == "random":
         return torch.rand(count, 3, device=device)
     return torch.full((count, 3), 1.0 if kind == "white" else 0.0, device=device)
@@ -58,7 +58,7 @@ def draw_pixels(dataset: Dataset, count: int) -> Tensor:
 
 
 def draw_batch(
-    dataset: Dataset, count: int, background: Background, errors: ErrorMap | None = None, places: Tensor = CENTRE
+    dataset: Dataset, count: int, background: Background, errors: ErrorMap | None = None, places: Tensor = CENTER
 ) -> Batch:
     """`count` pixels worth drawing with what they should show: evenly, or also where `errors` are large.
 
@@ -71,22 +71,27 @@ def draw_batch(
     return replace(gather_batch(dataset, flat, behind, places), weights=weights)
 
 
-def gather_batch(dataset: Dataset, flat: Tensor, behind: Tensor, places: Tensor = CENTRE) -> Batch:
+def gather_batch(dataset: Dataset, flat: Tensor, behind: Tensor, places: Tensor = CENTER) -> Batch:
     """The pixels `flat` (R,), counted through all images, over the background `behind` (R, 3)."""
     scene = dataset.scene
     rays = dataset.cameras.pixel_rays(flat, scene.near, scene.far, dataset.times, places)
-    gather = gather_colors if native.usable(behind) else gather_colors_reference
-    return Batch(flat, rays, *gather(dataset.pixels, flat, behind))
+    rgb, alpha = gather_colors(dataset.pixels, flat, behind)
+    return Batch(flat, rays, rgb, behind, alpha)
 
 
-def gather_colors_reference(pixels: Tensor, flat: Tensor, behind: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Colours (R, 3) of the pixels `flat` (R,) over `behind` (R, 3), `behind` itself, and opacities (R,) if any."""
+def gather_colors_reference(pixels: Tensor, flat: Tensor, behind: Tensor) -> tuple[Tensor, Tensor | None]:
+    """As `gather_colors`, in torch, on any device."""
     rgba = pixels[flat].float() / 255
-    return composite(rgba, behind), behind, rgba[:, 3] if rgba.shape[-1] == 4 else None
+    return composite(rgba, behind), rgba[:, 3] if rgba.shape[-1] == 4 else None
 
 
-def gather_colors(pixels: Tensor, flat: Tensor, behind: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-    """As `gather_colors_reference`, compiled."""
+def gather_colors(pixels: Tensor, flat: Tensor, behind: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Colours (R, 3) of the pixels `flat` (R,) over `behind` (R, 3), and opacities (R,) where there are any.
+
+    `pixels` (P, 3 or 4) are uint8, straight alpha.
+    """
+    if not native.usable(behind):
+        return gather_colors_reference(pixels, flat, behind)
     count, channels = len(flat), pixels.shape[1]
     rgb, alpha = torch.empty(count, 3), torch.empty(count)
     _gather_colors(
@@ -94,7 +99,7 @@ def gather_colors(pixels: Tensor, flat: Tensor, behind: Tensor) -> tuple[Tensor,
         native.pointer(pixels, "pixels", (len(pixels), channels), torch.uint8), channels,
         native.pointer(behind, "the background", (count, 3)), rgb.data_ptr(), alpha.data_ptr(), native.threads(),
     )  # fmt: skip
-    return rgb, behind, alpha if channels == 4 else None
+    return rgb, alpha if channels == 4 else None
 
 
 _gather_colors = native.function("gather_colors", "pqpippp" + "i")

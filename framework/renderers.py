@@ -28,9 +28,9 @@ class Rendered:
     num_samples: int
     """Field evaluations spent on these rays."""
     weights: Tensor | None = None
-    """(N,) weight of each sample."""
+    """(N,) weight of each sample, ray by ray, also after `per_pixel`."""
     samples: Samples | None = None
-    """The samples themselves."""
+    """The samples themselves, likewise."""
     coarse: Rendered | None = None
     """An earlier level's picture, for methods that supervise it."""
 
@@ -39,14 +39,21 @@ class Rendered:
         return replace(self, coarse=coarse, num_samples=self.num_samples + coarse.num_samples)
 
     def per_pixel(self, rays_per_pixel: int) -> Rendered:
-        """The picture of R / rays_per_pixel pixels, each the mean of as many successive rays."""
+        """The picture of R / rays_per_pixel pixels, each of as many successive rays; `weights`, `samples` stay theirs.
+
+        Colour and opacity are means, and so is the depth, over the rays as far as they are opaque; the median depth is
+        one ray's.
+        """
         if rays_per_pixel == 1:
             return self
         shape = (-1, rays_per_pixel)
+        share, depth = self.accumulation.detach().view(shape), self.depth.view(shape)
+        seen = share.sum(1) > 1e-6
+        share = torch.where(seen[:, None], share, torch.ones_like(share))
         return replace(
             self,
             rgb=self.rgb.view(*shape, 3).mean(1),
-            depth=self.depth.view(shape).mean(1),
+            depth=(depth * share).sum(1) / share.sum(1),
             median_depth=self.median_depth.view(shape).median(1).values,
             accumulation=self.accumulation.view(shape).mean(1),
             coarse=None if self.coarse is None else self.coarse.per_pixel(rays_per_pixel),

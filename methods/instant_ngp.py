@@ -12,6 +12,7 @@ from typing import Literal
 from torch import Tensor
 
 from framework import Decision, Method, Model, Rays, Rendered, Scene, TrainConfig
+from framework.config import RaysPerPixel
 from framework.encodings import HashGrid
 from framework.fields.encoded import EncodedField
 from framework.renderers import render_field
@@ -32,7 +33,7 @@ class InstantNGPConfig(TrainConfig):
 
     max_num_iterations: int = 20_000
     num_rays_per_batch: int = 8_192
-    rays_per_pixel: Literal[1, 4, 9, 16] = 4
+    rays_per_pixel: RaysPerPixel = 4
     train_rays_per_pixel_from: float = 0.75
     samples_per_batch: int | None = None
     """Samples in a training step, the number of rays following. If not given: what suits the time (see `PLANS`)."""

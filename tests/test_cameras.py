@@ -43,7 +43,7 @@ def test_a_turned_and_moved_camera() -> None:
 
 def test_image_rays_run_row_by_row() -> None:
     cameras = camera()
-    rays = cameras.image_rays(0, 0.0, 1.0)
+    rays = cameras.pixel_rays(cameras.image_pixels(0), 0.0, 1.0)
     assert len(rays) == 8
     one = cameras.rays(torch.tensor([0]), torch.tensor([1]), torch.tensor([1]), 0.0, 1.0)
     torch.testing.assert_close(rays.directions[5:6], one.directions)
@@ -51,20 +51,20 @@ def test_image_rays_run_row_by_row() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 4, 9, 16])
-def test_subpixels_measure_edges(count: int) -> None:
-    """One place in each of `count` columns and rows: the area left of an upright edge is off by half a column at most.
-
-    The square grid's error, half of a wider column, is that of the root of the count.
-    """
+def test_subpixels_are_a_turned_grid(count: int) -> None:
+    """One place in each of `count` columns and rows, as far from each other as a grid of that many can be."""
     places = subpixels(count)
     middles = (torch.arange(count) + 0.5) / count - 0.5
     for axis in (0, 1):
         torch.testing.assert_close(places[:, axis].sort().values, middles)
-    edges = torch.linspace(-0.5, 0.5, 101)
-    area = (places[:, 0] < edges[:, None]).float().mean(1)
-    assert (area - (edges + 0.5)).abs().max() <= 0.5 / count + 1e-6
-    slanted = places @ torch.tensor([[0.8], [0.6]])  # half of the pixel lies on either side of a line by its centre
-    assert abs((slanted < 0).float().mean() - 0.5) <= 0.5 / count
+    if count > 1:
+        assert float(torch.pdist(places).min()) == pytest.approx(math.sqrt(count + 1) / count)
+
+
+@pytest.mark.parametrize("count", [0, 2, 5, 15])
+def test_no_other_number_of_subpixels(count: int) -> None:
+    with pytest.raises(ValueError, match="the square of a whole number"):
+        subpixels(count)
 
 
 @needs_kernels
@@ -107,9 +107,9 @@ def test_autocast_does_not_round_rays() -> None:
     torch.manual_seed(0)
     rotation = torch.linalg.qr(torch.randn(3, 3)).Q
     pose = torch.cat([rotation * torch.linalg.det(rotation).sign(), torch.zeros(3, 1)], dim=1)
-    exact = camera(pose).image_rays(0, 0.0, 1.0).directions
+    exact = camera(pose).pixel_rays(torch.arange(8), 0.0, 1.0).directions
     with torch.autocast("cpu", torch.bfloat16):
-        cast = camera(pose).image_rays(0, 0.0, 1.0).directions
+        cast = camera(pose).pixel_rays(torch.arange(8), 0.0, 1.0).directions
     torch.testing.assert_close(cast, exact, rtol=0, atol=0)
 
 

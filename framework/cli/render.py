@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from framework.cli.common import run_command
+from framework.config import RaysPerPixel
 from framework.errors import ConfigError, nearest
 
 if TYPE_CHECKING:
@@ -37,8 +38,8 @@ class RenderFlags:
     """Pictures per second."""
     downscale_factor: int = 1
     """Reduce the pictures by this whole number."""
-    rays_per_pixel: Literal[1, 4, 9, 16] | None = None
-    """Rays of which a pixel is the mean: more are sharper, fewer faster. As the run says if not given."""
+    rays_per_pixel: RaysPerPixel | None = None
+    """Rays of which a pixel is the mean: more are closer to a photograph, fewer faster. As the run says if not given."""
     max_error: str | None = None
     """Rays end where the rest cannot change a colour by more than this, such as 1/255; 1e-4 if not given."""
     load_checkpoint: Path | None = None

@@ -146,7 +146,8 @@ def evaluate(
                 "seconds": view.seconds,
             }
         )
-        seconds, rays = seconds + view.seconds, rays + rgb.shape[0] * rgb.shape[1]
+        seconds += view.seconds
+        rays += rgb.shape[0] * rgb.shape[1] * model.config.rays_per_pixel
         if pictures is not None and (max_pictures is None or len(rows) <= max_pictures):
             stem = f"{index:04d}_{Path(dataset.names[index]).stem}"
             write_image(pictures / f"{stem}.png", rgb)

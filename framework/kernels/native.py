@@ -83,7 +83,7 @@ def _load() -> tuple[str, ctypes.CDLL | None]:
     if asked != "auto":
         raise ConfigError(f"NERFLOOM_KERNELS asks for '{asked}', but {FOLDER / asked}{SUFFIX} does not load: {problem}")
     say(
-        f"note: without its compiled kernels ({problem}) nerfloom trains about 20 times slower on this processor; "
+        f"note: without its compiled kernels ({problem}) nerfloom trains more than ten times slower on this processor; "
         f"install a C++ compiler ({_compiler_hint()}), then 'pip install --force-reinstall --no-deps nerfloom'"
     )
     return "reference", None

@@ -17,6 +17,7 @@ def write_evaluation(path: Path, run: Run, checkpoint: Path, found: Evaluation) 
             "experiment_name": run.folder.parent.parent.name,
             "method_name": run.method,
             "checkpoint": checkpoint.name,
+            "rays_per_pixel": run.config.resolved().rays_per_pixel,
             "results": found.results,
             "lpips": found.lpips_note,
             "per_image": found.per_image,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from framework.config import TrainConfig
+from framework.config import RaysPerPixel, TrainConfig
 from framework.device import choose_device
 from framework.errors import CheckpointError
 from framework.model import Model
@@ -36,7 +36,7 @@ def load_trained(
     checkpoint: Path | None = None,
     device_type: Any = "auto",
     data: Path | None = None,
-    rays_per_pixel: Any = None,
+    rays_per_pixel: RaysPerPixel | None = None,
 ) -> Trained:
     """Load a run's model.
 

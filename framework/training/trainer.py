@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.cameras import CENTRE, subpixels
+from framework.cameras import CENTER, subpixels
 from framework.config import to_plain
 from framework.console import say
 from framework.dataset import Dataset
@@ -304,7 +304,7 @@ class Trainer:
     def _places_in_a_pixel(self) -> Tensor:
         """Where rays go through: the centre at first, later the places that pictures are made from."""
         late = self.progress >= self.config.train_rays_per_pixel_from
-        return subpixels(self.config.rays_per_pixel) if late else CENTRE
+        return subpixels(self.config.rays_per_pixel) if late else CENTER
 
     def _background(self) -> Background:
         if self.config.background != "auto":

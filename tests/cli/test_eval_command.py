@@ -18,6 +18,8 @@ from framework.cli.evaluate import main
 from tests.cli.helpers import run, train
 from tests.conftest import Refused
 
+RAYS = ("--rays-per-pixel", 4)
+
 
 @pytest.fixture(scope="module")
 def trained(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -58,7 +60,14 @@ def test_the_file_has_nerfstudios_keys_and_its_means(finished: Path, monkeypatch
         assert found["results"][name] == pytest.approx(statistics.fmean(values))
         assert found["results"][f"{name}_std"] == pytest.approx(statistics.stdev(values))
     assert found["results"]["fps"] > 0
-    assert found["results"]["num_rays_per_sec"] == pytest.approx(found["results"]["fps"] * 400)
+    assert found["results"]["num_rays_per_sec"] == pytest.approx(found["results"]["fps"] * 400 * 4)  # rays a pixel
+
+
+def test_rays_per_pixel_are_as_the_run_says_or_as_asked(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usual, same, fewer = (evaluate(monkeypatch, finished, *flags) for flags in ((), RAYS, (RAYS[0], 1)))
+    assert [found["rays_per_pixel"] for found in (usual, same, fewer)] == [4, 4, 1]
+    assert usual["results"]["psnr"] == same["results"]["psnr"]
+    assert usual["results"]["psnr"] != fewer["results"]["psnr"]
 
 
 def test_lpips_that_is_absent_is_null_with_a_reason(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:

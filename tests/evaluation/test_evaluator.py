@@ -2,15 +2,17 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from framework.cameras import Cameras
+from framework.cameras import Cameras, subpixels
 from framework.config import TrainConfig
 from framework.evaluation.evaluator import render_image
 from framework.model import Model
+from framework.pixels import Batch, draw_batch
 from framework.rays import Rays
 from framework.renderers import Rendered
 from framework.scene import Scene
@@ -68,36 +70,53 @@ def test_chunks_change_nothing(chunk: int) -> None:
     torch.testing.assert_close(picture(4, chunk), picture(4), rtol=0, atol=0)
 
 
-def test_training_averages_the_same_rays_late_in_the_budget(shared_tiny: Path, tmp_path: Path) -> None:
+def test_training_averages_the_same_rays_late_in_the_budget(
+    shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     settings = {"max_num_iterations": 8, "rays_per_pixel": 4, "train_rays_per_pixel_from": 0.5}
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", **settings)
-    seen: list[tuple[int, Tensor]] = []
+    batches: list[Batch] = []
+
+    def recording(*arguments: Any) -> Batch:
+        batches.append(draw_batch(*arguments))
+        return batches[-1]
+
+    backgrounds: list[Tensor] = []
     render = trainer.model.render
 
     def watched(rays: Rays, background: Tensor) -> Rendered:
-        seen.append((len(rays), background))
+        backgrounds.append(background)
         return render(rays, background)
 
+    monkeypatch.setattr("framework.training.trainer.draw_batch", recording)
     trainer.model.render = watched
     trainer.train()
-    assert trainer.state.step == 8
-    assert trainer.state.rays == sum(rays for rays, _ in seen)
-    for step, (rays, background) in enumerate(seen):
-        assert len(background) == rays
-        groups = background[: rays // 4 * 4].view(-1, 4, 3)
-        together = bool((groups == groups[:, :1]).all())
-        assert together == (step >= 4), "rays of a pixel lie over one background"
+    scene = trainer.train_set.scene
+    for step, (batch, background) in enumerate(zip(batches, backgrounds, strict=True)):
+        places = subpixels(4 if step >= 4 else 1)
+        expected = trainer.train_set.cameras.pixel_rays(batch.pixels, scene.near, scene.far, None, places)
+        torch.testing.assert_close(batch.rays.directions, expected.directions)
+        torch.testing.assert_close(background, batch.background.repeat_interleave(len(places), 0))
+    assert len(batches) == 8
+    assert trainer.state.rays == sum(len(batch.rays) for batch in batches)
 
 
 def test_means_over_pixels_are_means() -> None:
-    values = torch.rand(12)
-    made = Rendered(torch.rand(12, 3), values, values, values, 5).over(Rendered(torch.rand(12, 3), *[values] * 3, 2))
-    pixels = made.per_pixel(4)
-    assert pixels.num_samples == 7
-    assert made.coarse is not None
+    def made() -> Rendered:
+        return Rendered(torch.rand(12, 3), torch.rand(12), torch.rand(12), torch.rand(12), 5)
+
+    rays = made().over(made())
+    rays.accumulation[4:7] = 0  # of the second pixel only the last ray meets anything
+    pixels = rays.per_pixel(4)
+    assert pixels.num_samples == 10
+    assert rays.coarse is not None
     assert pixels.coarse is not None
-    for one, two in ((pixels, made), (pixels.coarse, made.coarse)):
+    for one, two in ((pixels, rays), (pixels.coarse, rays.coarse)):
         torch.testing.assert_close(one.rgb, torch.stack([two.rgb[i : i + 4].mean(0) for i in (0, 4, 8)]))
-        torch.testing.assert_close(one.accumulation, values.view(3, 4).mean(1))
-        assert all(depth in values for depth in one.median_depth)
-    assert made.per_pixel(1) is made
+        torch.testing.assert_close(one.accumulation, two.accumulation.view(3, 4).mean(1))
+        torch.testing.assert_close(one.median_depth, two.median_depth.view(3, 4).sort(1).values[:, 1])
+        for pixel, group in enumerate((slice(0, 4), slice(4, 8), slice(8, 12))):
+            share, depth = two.accumulation[group], two.depth[group]
+            torch.testing.assert_close(one.depth[pixel], (share * depth).sum() / share.sum())
+    torch.testing.assert_close(pixels.depth[1], rays.depth[7])
+    assert rays.per_pixel(1) is rays

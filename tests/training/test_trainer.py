@@ -225,7 +225,8 @@ def test_an_empty_grid_is_harmless(shared_tiny: Path, tmp_path: Path) -> None:
     report = trainer.train_step()
     assert trainer.state.skipped == 0
     assert math.isfinite(sum(report.losses.values()))
-    rays = trainer.train_set.cameras.image_rays(0, 0.0, 10.0)
+    cameras = trainer.train_set.cameras
+    rays = cameras.pixel_rays(cameras.image_pixels(0), 0.0, 10.0)
     background = torch.tensor([0.1, 0.2, 0.3])
     for part in (rays, rays[:0]):
         out = trainer.model.render(part, background)

@@ -1,4 +1,4 @@
-// A batch of training pixels: rays through them, and their colours over a background. See ../../pixels.py.
+// A batch of training pixels: rays through them, and their colours over a background. See ../../cameras.py, ../../pixels.py.
 #include "common.h"
 
 #include <algorithm>
@@ -8,9 +8,9 @@ static int64_t image_of(int64_t pixel, const int64_t* offsets, int64_t images) {
     return std::upper_bound(offsets, offsets + images + 1, pixel) - offsets - 1;
 }
 
-// flat (P): pixel indices into all images, which start at offsets (M + 1); subpixels (K, 2): column and row from a
+// flat (P): pixel indices into all images, which start at offsets (M + 1); places (K, 2): column and row from a
 // pixel's centre. poses (M, 3, 4); fx, fy, cx, cy (M); widths (M). Writes P * K rays, those of a pixel together.
-EXPORT void pinhole_rays(const int64_t* flat, int64_t count, const float* subpixels, int64_t per_pixel,
+EXPORT void pinhole_rays(const int64_t* flat, int64_t count, const float* places, int64_t per_pixel,
                          const int64_t* offsets, int64_t images, const int64_t* widths, const float* poses,
                          const float* fx, const float* fy, const float* cx, const float* cy, float* origins,
                          float* directions, float* radii, int64_t* cameras, int threads) {
@@ -23,7 +23,7 @@ EXPORT void pinhole_rays(const int64_t* flat, int64_t count, const float* subpix
         const float* pose = poses + image * 12;
         for (int64_t k = 0; k < per_pixel; k++) {
             const int64_t r = p * per_pixel + k;
-            const float x = (column + subpixels[k * 2]) / fx[image], y = (row + subpixels[k * 2 + 1]) / fy[image];
+            const float x = (column + places[k * 2]) / fx[image], y = (row + places[k * 2 + 1]) / fy[image];
             const float length = std::sqrt(x * x + y * y + 1), local[3] = {x / length, -y / length, -1 / length};
             for (int a = 0; a < 3; a++) {
                 origins[r * 3 + a] = pose[a * 4 + 3];

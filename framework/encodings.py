@@ -9,7 +9,9 @@ from torch import Tensor, nn
 
 from framework.kernels.hash_grid import HashGridLayout, TableGradient, hash_grid
 from framework.kernels.memory import table
-from framework.kernels.planes import PlanesGradient, PlanesLayout, planes
+from framework.kernels.planes import PlanesGradient, PlanesLayout, plane_band, planes
+
+BANDS = 16
 
 
 class HashGrid(nn.Module):
@@ -55,6 +57,7 @@ class FeaturePlanes(nn.Module):
         features_per_group: F.
         axes: each factor's axis or two axes, per group; a plane for every pair of axes if None.
         sparse: updates touch only the entries that a step used, as for `HashGrid`.
+        resizable: `resample` will be called; a checkpoint may hold other resolutions.
     """
 
     resolutions: Tensor
@@ -65,8 +68,10 @@ class FeaturePlanes(nn.Module):
         features_per_group: int,
         axes: tuple[tuple[tuple[int, ...], ...], ...] | None = None,
         sparse: bool = False,
+        resizable: bool = False,
     ) -> None:
         super().__init__()
+        self.resizable = resizable
         self.layout = PlanesLayout.build(resolutions, axes)
         self.dims, self.num_features = self.layout.dims, self.layout.num_groups * features_per_group
         self.register_buffer("resolutions", torch.tensor(resolutions))
@@ -83,12 +88,24 @@ class FeaturePlanes(nn.Module):
         """Positions (N, D) in [0, 1] to features (N, G * F), which may be `known` already (see `planes`)."""
         return planes(positions, self.table, self.layout, self.deferred, known)
 
+    def random_band(self, group: int, index: int) -> Tensor:
+        """Some neighbouring rows (at most vertices / 16, along the first axis, F) of a factor, for regularisers.
+
+        A look at all of a large table would be dear. The band may stick out of the factor, where it is cut off, so that
+        every row is as likely as any other.
+        """
+        height, _ = self.layout.shape(group, index)
+        rows = max(height // BANDS, 2)
+        first = int(torch.randint(1 - rows, height, ()))
+        first, last = max(first, 0), min(first + rows, height)
+        return plane_band(self.table, self.layout, group, index, first, last - first, self.deferred)
+
     @torch.no_grad()
     def resample(self, resolutions: tuple[tuple[int, ...], ...], lower: Tensor, upper: Tensor) -> None:
         """Other resolutions, over the part of space from `lower` to `upper` (D,), in units of the present one.
 
         Factors are interpolated linearly, so that what is looked up stays as it was at the new vertices. The table
-        becomes larger or smaller; the optimiser begins anew with it.
+        becomes larger or smaller; the optimiser begins anew where its size changes.
         """
         before, old = self.layout, self.table.data
         self._relayout(torch.tensor(resolutions))
@@ -110,7 +127,7 @@ class FeaturePlanes(nn.Module):
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
         saved = state_dict.get(prefix + "resolutions")
-        if saved is not None and saved.shape == self.resolutions.shape and not torch.equal(saved, self.resolutions):
+        if self.resizable and saved is not None and saved.shape == self.resolutions.shape:
             self._relayout(saved)
         super()._load_from_state_dict(state_dict, prefix, *rest)
 

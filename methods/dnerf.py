@@ -25,7 +25,7 @@ HASH_SAMPLES_PER_BATCH = 2**14
 
 @dataclass(frozen=True)
 class DNeRFConfig(TrainConfig):
-    """Settings of dnerf; the defaults are the paper's, with the rays of a larger batch."""
+    """Settings of dnerf; networks, samples and learning rate are the paper's."""
 
     max_num_iterations: int = 800_000
     num_rays_per_batch: int = 2_048
@@ -63,6 +63,8 @@ class DNeRFConfig(TrainConfig):
     """Cells along an axis at the hash grid's finest level."""
     log2_table_size: int = 16
     """Entries of a level's table at most, as a power of two."""
+    sparse_updates: bool = True
+    """Adam updates only the entries of the hash grid that a step used."""
     grid_resolution: int = 128
     """Cells along an axis of the occupancy grid. A cell is occupied if it is at any time."""
     num_steps: int = 192
@@ -101,7 +103,7 @@ class DNeRF(Model[DNeRFConfig]):
         if moving and c.variant == "t-nerf":
             return self._network(c.time_frequencies)
         if small:
-            grid = HashGrid(max_resolution=c.max_resolution, log2_table_size=c.log2_table_size, sparse=True)
+            grid = HashGrid(max_resolution=c.max_resolution, log2_table_size=c.log2_table_size, sparse=c.sparse_updates)
             canonical: Field = EncodedField(self.scene.box, grid)
         else:
             canonical = self._network(None)
@@ -146,7 +148,7 @@ class DNeRF(Model[DNeRFConfig]):
             heads = [p for m in encoded for p in m.parameters() if not any(p is table for table in tables)]
             faithful = {"lr": config.grid_learning_rate, "betas": (0.9, 0.95), "eps": 1e-15}
             groups += [{"params": heads, "name": "heads", **faithful}]
-            groups += [{"params": tables, "name": "tables", "sparse": True, **faithful}]
+            groups += [{"params": tables, "name": "tables", "sparse": config.sparse_updates, **faithful}]
         return [group for group in groups if group["params"]]
 
     @property

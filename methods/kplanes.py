@@ -11,7 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from framework import Batch, Decision, Method, Model, Rays, Rendered, Scene, TrainConfig
+from framework import Batch, ConfigError, Decision, Method, Model, Rays, Rendered, Scene, TrainConfig
 from framework.encodings import FeaturePlanes
 from framework.fields.base import MLP
 from framework.fields.encoded import BoxField, EncodedField
@@ -20,6 +20,9 @@ from framework.kernels.planes import plane_band
 from framework.kernels.spherical_harmonics import spherical_harmonics
 from framework.renderers import render_field
 from framework.samplers.occupancy import OccupancySampler
+
+
+MAX_SCALES = 4
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ class KPlanesConfig(TrainConfig):
     base_resolution: int = 64
     """Vertices along an axis of space at the coarsest scale; each scale doubles it."""
     num_scales: int | None = None
-    """Scales. If not given: as many as the images' pixels can show."""
+    """Scales. If not given: as many as the images' pixels can show, 4 at most."""
     time_resolution: int = 25
     """Vertices along time, at every scale."""
     features_per_scale: int = 32
@@ -47,7 +50,7 @@ class KPlanesConfig(TrainConfig):
     """Features of a layer of the networks."""
     space_tv: float = 1e-4
     """Weight of the planes' total variation in space."""
-    time_smoothness: float = 1e-3
+    time_smoothness: float = 0.1
     """Weight of the planes' second difference in time."""
     time_sparsity: float = 1e-4
     """Weight of what keeps the planes of time at one, where nothing moves."""
@@ -62,9 +65,12 @@ class KPlanesConfig(TrainConfig):
     train_early_stop: float = 1e-2
     """The same while training."""
 
-
-BANDS = 16
-"""The regularisers look at one row in so many of each plane in a step, a random band: on average they see all."""
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.base_resolution < 2 or (self.num_scales is not None and self.num_scales < 1):
+            raise ConfigError("--base-resolution must be at least 2, and --num-scales at least 1")
+        if self.time_resolution < 3:
+            raise ConfigError(f"--time-resolution is {self.time_resolution}; a second difference needs at least 3")
 
 
 class ExplicitField(BoxField):
@@ -88,16 +94,16 @@ class ExplicitField(BoxField):
     @torch.no_grad()
     def trace(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         sigma, features = self.density(positions, times)
-        return sigma, features, features
+        return sigma, features, features[:, :0]
 
     def retrace(
         self, positions: Tensor, times: Tensor | None, features: Tensor, memory: Tensor
     ) -> tuple[Tensor, Tensor]:
-        features = self.encode(positions, times, known=memory)
+        features = self.encode(positions, times, known=features)
         return truncated_exp(self.density_head(features)[:, 0]), features
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
-        basis = self.basis(spherical_harmonics(directions)).view(len(features), 3, -1)
+        basis = self.basis(spherical_harmonics(directions)).view(len(features), 3, features.shape[1])
         return torch.sigmoid((basis * features[:, None]).sum(-1).float())
 
 
@@ -110,9 +116,9 @@ class KPlanes(Model[KPlanesConfig]):
         super().__init__(config, scene)
         time = (config.time_resolution,) if scene.moving else ()
         resolutions = tuple((config.base_resolution << s,) * 3 + time for s in range(self.num_scales))
-        self.planes = FeaturePlanes(resolutions, config.features_per_scale, sparse=config.sparse_updates)
+        planes = FeaturePlanes(resolutions, config.features_per_scale, sparse=config.sparse_updates)
         kind = EncodedField if config.decoder == "hybrid" else ExplicitField
-        self.field = kind(scene.box, self.planes, config.hidden_width)
+        self.field = kind(scene.box, planes, config.hidden_width)
         self.sampler = OccupancySampler(
             scene.box,
             config.grid_resolution,
@@ -124,11 +130,11 @@ class KPlanes(Model[KPlanesConfig]):
 
     @property
     def num_scales(self) -> int:
-        """As configured, else until a plane has a vertex a pixel or more."""
+        """As configured, else until a plane has a vertex a pixel or more, but no more than the paper's 4."""
         config, scales = self.config, 1
         if config.num_scales is not None:
             return config.num_scales
-        while config.base_resolution << (scales - 1) < self.scene.image_size:
+        while scales < MAX_SCALES and config.base_resolution << (scales - 1) < self.scene.image_size:
             scales += 1
         return scales
 
@@ -157,22 +163,31 @@ class KPlanes(Model[KPlanesConfig]):
         return losses
 
     def _regularisers(self, zero: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Total variation in space, roughness in time, and distance of time's planes from one (equations 4 to 6)."""
-        planes, layout = self.planes, self.planes.layout
-        variation = roughness = activity = zero
-        for scale in range(layout.num_groups):
-            for index, (_, second) in enumerate(layout.axes[scale]):
-                height, _ = layout.shape(scale, index)
-                rows = height if second == 3 else max(height // BANDS, 2)  # time's planes are small: all of them
-                first = int(torch.randint(height - rows + 1, ()))
-                band = plane_band(planes.table, layout, scale, index, first, rows, planes.deferred)
-                variation = variation + band.diff(dim=1).square().mean()
-                if second == 3:
-                    roughness = roughness + band.diff(n=2, dim=0).square().mean()
-                    activity = activity + (1 - band).abs().mean()
-                else:
-                    variation = variation + band.diff(dim=0).square().mean()
-        return variation, roughness, activity
+        """Total variation in space, roughness in time, distance of time's planes from one: means over planes.
+
+        Equations 4 to 6, on a random band of rows of each plane of space, and on time's small planes whole.
+        """
+        planes = self.field.encoding
+        assert isinstance(planes, FeaturePlanes)
+        variations, roughness, activity = [], [zero], [zero]
+        for scale in range(planes.layout.num_groups):
+            for index, axes in enumerate(planes.layout.axes[scale]):
+                if 3 not in axes:
+                    band = planes.random_band(scale, index)
+                    variations.append((_squared_steps(band, 0) + _squared_steps(band, 1)) / 2)
+                    continue
+                height, _ = planes.layout.shape(scale, index)
+                plane = plane_band(planes.table, planes.layout, scale, index, 0, height, planes.deferred)
+                variations.append(_squared_steps(plane, 1))
+                roughness.append(plane.diff(n=2, dim=0).square().mean())
+                activity.append((1 - plane).abs().mean())
+        count = max(len(roughness) - 1, 1)
+        return torch.stack(variations).mean(), torch.stack(roughness).sum() / count, torch.stack(activity).sum() / count
+
+
+def _squared_steps(plane: Tensor, dim: int) -> Tensor:
+    """Mean squared difference of neighbours; 0 where there are none."""
+    return plane.diff(dim=dim).square().mean() if plane.shape[dim] > 1 else plane.new_zeros(())
 
 
 METHOD = Method(KPlanes, KPlanesConfig(), paper="arXiv:2301.10241")

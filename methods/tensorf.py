@@ -16,7 +16,6 @@ from torch.nn.functional import softplus
 from framework import Batch, Field, Method, Model, Rays, Rendered, Scene, TrainConfig
 from framework.encodings import FeaturePlanes
 from framework.fields.base import MLP
-from framework.kernels.planes import plane_band
 from framework.kernels.spherical_harmonics import spherical_harmonics
 from framework.renderers import render_field
 from framework.samplers.occupancy import OccupancySampler
@@ -27,6 +26,8 @@ CP = (((0,), (1,), (2,)),)
 """One group: a line along each axis (equation 3)."""
 DENSITY_SHIFT, DENSITY_SCALE = -10.0, 25.0
 """Density is DENSITY_SCALE * softplus(sum of components + DENSITY_SHIFT): empty at first (section 4.4 and its code)."""
+BLIND_STEPS = 64
+"""The field is empty at first: until it has learnt something, its density says nothing of what cells to skip."""
 MARGIN = 1
 """Cells of the occupancy grid kept around what is occupied when the box shrinks."""
 
@@ -56,9 +57,9 @@ class TensoRFConfig(TrainConfig):
     upsample_at: tuple[float, ...] = (0.07, 0.1, 0.13, 0.18, 0.23)
     """Shares of the budget after which the grid grows, in equal ratios; the box shrinks to what is occupied before."""
     sparsity: float = 8e-5
-    """Weight of the mean absolute value of density's components; half of it once the grid has grown."""
+    """Weight of the mean absolute values of density's factors; half of it once the grid has grown."""
     total_variation: float = 0.0
-    """Weight of the planes' total variation; for photographs of real scenes, 0.1 and more."""
+    """Weight of the factors' total variation, of appearance a tenth; for photographs of real scenes, 0.01 and more."""
     hidden_width: int = 128
     """Features of a layer of the colour network."""
     sparse_updates: bool = True
@@ -82,10 +83,6 @@ class TensoRFConfig(TrainConfig):
         )
 
 
-BANDS = 16
-"""The regularisers look at one row in so many of each plane in a step, a random band: on average they see all."""
-
-
 class TensorField(Field):
     """Density as a sum of components; colour from components of its own by a basis and a small network (section 4.3).
 
@@ -106,24 +103,27 @@ class TensorField(Field):
         self.density_factors, self.appearance_factors = density, appearance
         self.basis = torch.nn.Linear(appearance.num_features, num_features, bias=False)
         self.color_head = MLP(num_features + 16, width, width, 3, activation="sigmoid")
-        with torch.no_grad():
-            for factors in (density, appearance):
-                factors.table.normal_(0, 0.1)
 
     def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
         unit = self._unit(positions)
-        return _density(self.density_factors(unit)), unit
+        return self._sigma(self.density_factors(unit), unit), unit
 
     @torch.no_grad()
     def trace(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         unit = self._unit(positions)
         components = self.density_factors(unit)
-        return _density(components), unit, components
+        return self._sigma(components, unit), unit, components
 
     def retrace(
         self, positions: Tensor, times: Tensor | None, features: Tensor, memory: Tensor
     ) -> tuple[Tensor, Tensor]:
-        return _density(self.density_factors(features, known=memory)), features
+        return self._sigma(self.density_factors(features, known=memory), features), features
+
+    @staticmethod
+    def _sigma(components: Tensor, unit: Tensor) -> Tensor:
+        """Density of summed components, and none outside the box, which may have shrunk."""
+        inside = ((unit >= 0) & (unit <= 1)).all(-1)
+        return softplus(components.float().sum(-1) + DENSITY_SHIFT) * DENSITY_SCALE * inside
 
     def _unit(self, positions: Tensor) -> Tensor:
         return (positions - self.box[0]) / (self.box[1] - self.box[0])
@@ -131,10 +131,6 @@ class TensorField(Field):
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         appearance = self.basis(self.appearance_factors(features))
         return self.color_head(appearance.float(), spherical_harmonics(directions)).float()
-
-
-def _density(components: Tensor) -> Tensor:
-    return softplus(components.float().sum(-1) + DENSITY_SHIFT) * DENSITY_SCALE
 
 
 class TensoRF(Model[TensoRFConfig]):
@@ -150,10 +146,13 @@ class TensoRF(Model[TensoRFConfig]):
         axes = VM if config.decomposition == "vm" else CP
         vertices = (self._vertices(config.first_voxels, scene.box),) * len(axes)
         density, appearance = (
-            FeaturePlanes(vertices, components, axes, config.sparse_updates)
+            FeaturePlanes(vertices, components, axes, config.sparse_updates, resizable=True)
             for components in (config.density_components, config.appearance_components)
         )
         self.field = TensorField(scene.box, density, appearance, config.hidden_width)
+        with torch.no_grad():  # of CP's triple products the factors are larger, as in the authors' code
+            for factors in (density, appearance):
+                factors.table.normal_(0, 0.1 if config.decomposition == "vm" else 0.2)
         self.sampler = OccupancySampler(
             scene.box, config.grid_resolution, config.num_steps, config.early_stop, config.train_early_stop
         )
@@ -170,11 +169,16 @@ class TensoRF(Model[TensoRFConfig]):
         return render_field(self.field, self.sampler, rays, background, self.training)
 
     def param_groups(self) -> list[dict[str, Any]]:
-        rates = {"networks": self.config.network_learning_rate}
-        return [{"lr": rates.get(group["name"], self.config.learning_rate), **group} for group in super().param_groups()]
+        tables = [self.field.density_factors.table, self.field.appearance_factors.table]
+        networks = [p for p in self.parameters() if not any(p is table for table in tables)]
+        return [
+            {"params": networks, "lr": self.config.network_learning_rate, "name": "networks"},
+            {"params": tables, "name": "tables", "sparse": self.config.sparse_updates},
+        ]
 
     def before_step(self, step: int, progress: float) -> None:
-        self.sampler.update(step, self.field.density)
+        if step >= BLIND_STEPS:
+            self.sampler.update(step, self.field.density)
         due = sum(progress >= share for share in self.config.upsample_at)
         if due > int(self.growths):
             self.growths.fill_(due)
@@ -204,31 +208,31 @@ class TensoRF(Model[TensoRFConfig]):
         return torch.stack([found[0].maximum(self.field.box[0]), found[1].minimum(self.field.box[1])])
 
     def loss(self, rendered: Rendered, batch: Batch, step: int) -> dict[str, Tensor]:
-        losses = super().loss(rendered, batch, step)
+        losses, field = super().loss(rendered, batch, step), self.field
         if self.config.sparsity:
             weight = self.config.sparsity * (0.5 if int(self.growths) else 1.0)
-            losses["sparsity"] = weight * _band_mean(self.field.density_factors, lambda band: band.abs().mean())
-        if self.config.total_variation and self.config.decomposition == "vm":
-            for name, factors in (("density", self.field.density_factors), ("appearance", self.field.appearance_factors)):
-                losses[f"{name}_tv"] = self.config.total_variation * _band_mean(factors, _variation)
+            losses["sparsity"] = weight * _sum_over_bands(field.density_factors, lambda band: band.abs().mean())
+        if self.config.total_variation:
+            variation = _sum_over_bands(field.density_factors, _variation)
+            variation = variation + 0.1 * _sum_over_bands(field.appearance_factors, _variation)
+            losses["total_variation"] = self.config.total_variation * variation
         return losses
 
 
-def _band_mean(factors: FeaturePlanes, measure: Callable[[Tensor], Tensor]) -> Tensor:
-    """The mean over all factors of what is measured on a random band of rows of each."""
-    layout, found = factors.layout, []
-    for group in range(layout.num_groups):
-        for index in range(len(layout.axes[group])):
-            height, _ = layout.shape(group, index)
-            rows = min(max(height // BANDS, 2), height)
-            first = int(torch.randint(height - rows + 1, ()))
-            found.append(measure(plane_band(factors.table, layout, group, index, first, rows, factors.deferred)))
-    return torch.stack(found).mean()
+def _sum_over_bands(factors: FeaturePlanes, measure: Callable[[Tensor], Tensor]) -> Tensor:
+    """What is measured on a random band of rows of each factor."""
+    axes = factors.layout.axes
+    bands = (factors.random_band(group, index) for group in range(len(axes)) for index in range(len(axes[group])))
+    return torch.stack([measure(band) for band in bands]).sum()
 
 
 def _variation(band: Tensor) -> Tensor:
-    """Mean squared difference of neighbours along both axes, where there are any."""
-    return sum((band.diff(dim=dim).square().mean() for dim in (0, 1) if band.shape[dim] > 1), band.new_zeros(()))
+    """Sum over both axes of the mean squared difference of neighbours, where there are any."""
+    found = band.new_zeros(())
+    for dim in (0, 1):
+        if band.shape[dim] > 1:
+            found = found + band.diff(dim=dim).square().mean()
+    return found
 
 
 METHOD = Method(TensoRF, TensoRFConfig(), paper="arXiv:2203.09517")

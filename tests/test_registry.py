@@ -10,12 +10,12 @@ import pytest
 from framework import registry
 from framework.errors import ConfigError, DataError
 
-BUILT_IN = {"instant-ngp", "vanilla-nerf"}
+BUILT_IN = {"dnerf", "instant-ngp", "kplanes", "tensorf", "vanilla-nerf"}
 
 
 def test_the_built_in_methods_are_registered_like_anybodys() -> None:
     assert set(registry.registered("methods")) >= BUILT_IN
-    assert set(registry.registered("dataparsers")) >= {"blender", "procedural"}
+    assert set(registry.registered("dataparsers")) >= {"blender", "dnerf", "procedural"}
     for name in BUILT_IN:
         assert registry.load_method(name).paper.startswith("arXiv:")
 

@@ -55,7 +55,7 @@ class Field(nn.Module, ABC):
 class MLP(nn.Sequential):
     """Linear layers with ReLU between them.
 
-    Up to 320 features wide it runs as one compiled kernel.
+    Up to 384 features wide it runs as one compiled kernel.
 
     Args:
         widths: features of the input, of each hidden layer, and of the output.

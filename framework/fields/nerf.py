@@ -55,7 +55,7 @@ class NeRFField(Field):
                     nn.init.constant_(layer.bias, 0.1)
 
     def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        encoded = (frequency_encoding(positions, self.position_frequencies),)
+        encoded: tuple[Tensor, ...] = (frequency_encoding(positions, self.position_frequencies),)
         if self.time_frequencies is not None:
             encoded += (encoded_times(times, self.time_frequencies),)
         hidden = self.after_skip(self.before_skip(*encoded), *encoded)

@@ -20,7 +20,7 @@ from framework.kernels import native
 T = TypeVar("T")
 Activation = Literal["none", "relu", "sigmoid"]
 CODES: dict[Activation, int] = {"none": 0, "relu": 1, "sigmoid": 2}
-MAX_WIDTH = 320
+MAX_WIDTH = 384
 MAX_LAYERS = 8
 
 

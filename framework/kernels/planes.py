@@ -47,9 +47,13 @@ class PlanesLayout:
             raise ValueError(f"planes need the same 2 to 4 axes at every scale, not {sorted(dims)}")
         if min(min(scale) for scale in resolutions) < 2:
             raise ValueError(f"planes need two vertices or more along each axis, not {resolutions}")
-        axes = axes or (tuple(combinations(range(dims.pop()), 2)),) * len(resolutions)
-        if len(axes) != len(resolutions) or len({len(group) for group in axes}) != 1:
-            raise ValueError(f"planes need as many factors in every group, not {axes}")
+        (count,) = dims
+        axes = axes or (tuple(combinations(range(count), 2)),) * len(resolutions)
+        if len(axes) != len(resolutions) or len({len(group) for group in axes}) != 1 or not 1 <= len(axes[0]) <= 6:
+            raise ValueError(f"planes need as many factors in every group, 1 to 6, not {axes}")
+        for along in (along for group in axes for along in group):
+            if len(along) not in (1, 2) or len(set(along)) != len(along) or not set(along) <= set(range(count)):
+                raise ValueError(f"planes need one or two of the axes 0 to {count - 1} for each factor, not {along}")
         offsets, total = [], 0
         for sizes, group in zip(resolutions, axes, strict=True):
             firsts = []

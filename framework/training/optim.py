@@ -40,6 +40,8 @@ class Adam(torch.optim.Optimizer):
         self.deferred = deferred
         self.entries_updated = 0
         """Of sparse groups, over all steps."""
+        self.entries_there = 0
+        """How many they were, added up over the same steps."""
         for group in self.param_groups:
             for parameter in group["params"]:
                 self._begin(parameter, group["sparse"])
@@ -85,6 +87,7 @@ class Adam(torch.optim.Optimizer):
         state, waiting = self.state[parameter], self.deferred.get(parameter)
         moments = state["exp_avg"], state["exp_avg_sq"], state["seen"]
         settings = group["lr"], group["betas"], group["eps"]
+        self.entries_there += len(parameter)
         if waiting is not None and waiting.pending:
             self.entries_updated += waiting.adam(parameter, *moments, *settings)
         if parameter.grad is not None:

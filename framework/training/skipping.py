@@ -48,10 +48,8 @@ def skip_report(trainer: Trainer) -> list[Rung]:
     samplers = model.occupancy_samplers
     if samplers:
         rungs += _sampling_rungs(trainer, samplers)
-    entries = sum(grid.table.shape[0] for grid in model.sparse_grids)
-    steps = trainer.state.step - trainer.first_step
-    if entries and steps:
-        share = trainer.optimizer.entries_updated / (entries * steps)
+    if trainer.optimizer.entries_there:
+        share = trainer.optimizer.entries_updated / trainer.optimizer.entries_there
         rungs.append(Rung("table entries in a step's update", 1 - share, None, "--sparse-updates False"))
     return rungs
 

@@ -4,8 +4,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from scipy.stats import chisquare
 
 from framework.encodings import FeaturePlanes
+from framework.kernels.adam import sparse_adam_reference
 from framework.training.checkpoint import load_checkpoint
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 
@@ -48,21 +50,64 @@ def test_another_size_is_loaded() -> None:
     torch.testing.assert_close(two(positions), one(positions), rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("axes", [None, VM])
+def test_every_row_is_as_likely_in_a_band(axes: tuple[tuple[tuple[int, ...], ...], ...] | None) -> None:
+    torch.manual_seed(0)
+    planes = FeaturePlanes(((40, 40, 40),) * 3, 1, axes)
+    height, across = planes.layout.shape(0, 0)
+    with torch.no_grad():
+        planes.layout.factor(planes.table, 0, 0).copy_(torch.arange(height)[:, None, None].expand(height, across, 1))
+    counts = torch.zeros(height)
+    for _ in range(4000):
+        band = planes.random_band(0, 0)
+        counts[band[:, 0, 0].long()] += 1
+        assert len(band) <= 2
+    assert chisquare(counts.numpy()).pvalue > 1e-3
+
+
+def loss(planes: FeaturePlanes, positions: torch.Tensor) -> torch.Tensor:
+    """A look-up and a band."""
+    torch.manual_seed(1)
+    return planes(positions).square().mean() + planes.random_band(0, 0).square().mean()
+
+
+@pytest.mark.parametrize("features", [3, 16, 32])
+def test_gradients_that_wait_move_the_table_as_those_that_do_not(features: int) -> None:
+    """One step of Adam from what the backward pass left in `deferred`, and from autograd's own gradient."""
+    tables = []
+    for sparse in (True, False):
+        torch.manual_seed(0)
+        planes = FeaturePlanes(FIRST, features, sparse=sparse)
+        loss(planes, torch.rand(30, 3)).backward()
+        state = [torch.zeros_like(planes.table), torch.zeros_like(planes.table), torch.zeros(len(planes.table))]
+        settings = 1e-2, (0.9, 0.95), 1e-12
+        with torch.no_grad():
+            if planes.deferred is not None and planes.deferred.pending:
+                assert planes.table.grad is None
+                planes.deferred.adam(planes.table, *state, *settings)
+            else:
+                assert planes.table.grad is not None
+                sparse_adam_reference(planes.table, planes.table.grad, *state, *settings)
+        tables.append(planes.table.detach())
+    torch.testing.assert_close(tables[0], tables[1], atol=1e-6, rtol=1e-5)
+
+
 def test_tensorf_grows_shrinks_and_resumes(shared_tiny: Path, tmp_path: Path) -> None:
-    trainer = tiny_trainer("tensorf", shared_tiny, tmp_path / "whole", max_num_iterations=60)
+    settings = {"max_num_iterations": 200, "upsample_at": (0.015, 0.025, 0.035, 0.8, 0.9)}
+    trainer = tiny_trainer("tensorf", shared_tiny, tmp_path / "whole", **settings)
     model, sizes, boxes = trainer.model, [], []
-    for _ in range(60):
+    for _ in range(200):
         trainer.train_step()
         sizes.append(model.size())
         boxes.append(model.field.box.clone())
-        if trainer.state.step == 8:
+        if trainer.state.step == 6:
             saved = trainer.save()  # in the middle of growing
     assert trainer.state.skipped == 0
     assert sizes[-1] > sizes[0] * 2
     assert len(set(sizes)) > 3
     assert bool((boxes[-1][1] - boxes[-1][0] < boxes[0][1] - boxes[0][0]).all())
-    again = tiny_trainer("tensorf", shared_tiny, tmp_path / "again", max_num_iterations=60)
+    again = tiny_trainer("tensorf", shared_tiny, tmp_path / "again", **settings)
     again.restore(load_checkpoint(saved))
-    while again.state.step < 60:
+    while again.state.step < 200:
         again.train_step()
     assert_same_bits(tensors(trainer), tensors(again))

@@ -25,7 +25,7 @@ def gradients(entries: int, features: int, step: int) -> torch.Tensor:
     return grad
 
 
-@pytest.mark.parametrize("features", [1, 2, 3, 4, 8])
+@pytest.mark.parametrize("features", [1, 2, 3, 4, 8, 16, 32, 48])
 @pytest.mark.parametrize("update", [sparse_adam, sparse_adam_reference])
 def test_each_entry_sees_adam_on_its_own_gradients(update, features: int) -> None:
     entries = 301
@@ -49,7 +49,7 @@ def test_each_entry_sees_adam_on_its_own_gradients(update, features: int) -> Non
 
 
 @needs_kernels
-@pytest.mark.parametrize("features", [1, 2, 4])
+@pytest.mark.parametrize("features", [1, 2, 4, 16, 48])
 def test_compiled_equals_reference_far_into_a_run(features: int) -> None:
     """Counts beyond the table of corrections, a size that is no multiple of a vector, tiny gradients, signed zeros."""
     mine, theirs = tables(1003, features), tables(1003, features)

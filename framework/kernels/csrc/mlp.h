@@ -7,7 +7,7 @@ namespace mlp {
 
 constexpr int BLOCK = 32;
 constexpr int MAX_LAYERS = 8;
-constexpr int MAX_WIDTH = 320;  // of NeRF's layer that is fed the encoded position again
+constexpr int MAX_WIDTH = 384;  // K-Planes' explicit basis; D-NeRF's layer that is fed the encoded position again: 328
 
 inline int padded(int width) { return (width + LANES - 1) / LANES * LANES; }
 

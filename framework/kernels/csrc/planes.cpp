@@ -3,7 +3,7 @@
 // An entry is a row of features, so that a corner is one or two cache lines and every product a whole vector.
 #include "common.h"
 
-#include <vector>
+#include <initializer_list>
 
 namespace {
 

@@ -116,7 +116,7 @@ class VanillaNeRF(Model[VanillaNeRFConfig]):
 def render_hierarchical(
     coarse: Field, fine: Field, rays: Rays, background: Tensor, counts: tuple[int, int], jitter: bool
 ) -> Rendered:
-    """Stratified samples for one field; for another these and more, drawn where the first found something (section 5.2).
+    """Stratified samples for one field; for another these, and more where the first found something (section 5.2).
 
     Args:
         counts: of the stratified samples, and of those drawn.

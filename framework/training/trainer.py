@@ -225,13 +225,14 @@ class Trainer:
             return
         silhouettes = Silhouettes.of(self.train_set)
         if self.state.step == 0:
-            hulls = [visual_hull(silhouettes, sampler.box, sampler.resolution, self.model.scene.moving) for sampler in samplers]
+            moving = self.model.scene.moving
+            hulls = [visual_hull(silhouettes, sampler.box, sampler.resolution, moving) for sampler in samplers]
             if not all(bool(hull.any()) for hull in hulls):
                 say("warning: the photographs' alpha leaves no part of the box; it is not used to skip anything")
                 return
             for sampler, hull in zip(samplers, hulls, strict=True):
                 sampler.carve(hull)
-        still = not self.model.scene.moving  # else a pixel that is empty now teaches that a cell of another time is
+        still = not self.model.scene.moving  # else a pixel that is empty at its time teaches about cells full at others
         if config.silhouette_pixels and still and all(sampler.any_carved for sampler in samplers):
             near = [pixels_near(silhouettes, ~s.carved, s.box, s.resolution) for s in samplers]
             self.train_set = replace(self.train_set, drawn=near[0] if len(near) == 1 else torch.cat(near).unique())

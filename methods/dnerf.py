@@ -65,7 +65,7 @@ class DNeRFConfig(TrainConfig):
     """Entries of a level's table at most, as a power of two."""
     sparse_updates: bool = True
     """Adam updates only the entries of the hash grid that a step used."""
-    grid_resolution: int = 128
+    grid_resolution: int = 64
     """Cells along an axis of the occupancy grid. A cell is occupied if it is at any time."""
     num_steps: int = 192
     """Steps along the box's diagonal with the occupancy grid."""

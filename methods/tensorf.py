@@ -26,7 +26,7 @@ CP = (((0,), (1,), (2,)),)
 """One group: a line along each axis (equation 3)."""
 DENSITY_SHIFT, DENSITY_SCALE = -10.0, 25.0
 """Density is DENSITY_SCALE * softplus(sum of components + DENSITY_SHIFT): empty at first (section 4.4 and its code)."""
-BLIND_STEPS = 64
+BLIND_STEPS = 128
 """The field is empty at first: until it has learnt something, its density says nothing of what cells to skip."""
 MARGIN = 1
 """Cells of the occupancy grid kept around what is occupied when the box shrinks."""

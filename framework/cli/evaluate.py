@@ -30,7 +30,7 @@ class EvalFlags:
     max_images: int | None = None
     """Evaluate at most this many images, evenly spread; all if not given."""
     rays_per_pixel: RaysPerPixel | None = None
-    """Rays of which a pixel is the mean: more are closer to a photograph, fewer faster. As the run says if not given."""
+    """Rays of which a pixel is the mean: more are closer to a photograph. As the run says if not given."""
     max_error: str | None = None
     """Rays end where the rest cannot change a colour by more than this, such as 1/255; 1e-4 if not given."""
     round_to_uint8: bool = False

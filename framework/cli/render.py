@@ -35,7 +35,7 @@ class OrbitFlags:
     downscale_factor: int = 1
     """Reduce the pictures by this whole number."""
     rays_per_pixel: RaysPerPixel | None = None
-    """Rays of which a pixel is the mean: more are closer to a photograph, fewer faster. As the run says if not given."""
+    """Rays of which a pixel is the mean: more are closer to a photograph. As the run says if not given."""
     max_error: str | None = None
     """Rays end where the rest cannot change a colour by more than this, such as 1/255; 1e-4 if not given."""
     load_checkpoint: Path | None = None

@@ -27,8 +27,8 @@ PLANS = (
 step, finest cells a pixel. Small tables and batches learn fastest; large ones get further."""
 
 SPARSE_FROM = 17
-"""log2 of the table size from which sparse updates pay. On Lego after 45 s, with 2^16 entries, dense ones were 0.06, 0.23
-and 0.25 dB better, as entries that are seldom used move further; after 300 s, with 2^18, sparse ones were 0.21 dB."""
+"""log2 of the table size from which sparse updates pay. On Lego after 45 s, with 2^16 entries, dense ones were 0.06,
+0.23 and 0.25 dB better, as seldom used entries move further; after 300 s, with 2^18, sparse ones were 0.21 dB."""
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ VARIANTS: dict[str, list[str]] = {
     "pixels drawn by error": ["--draw-by-error", "True"],
     "hidden samples evaluated": ["--train-early-stop", "0"],
     "early stop in training at 1e-4": ["--train-early-stop", "1e-4"],
+    "sparse updates of the tables": ["--sparse-updates", "True"],
     "dense updates of the tables": ["--sparse-updates", "False"],
     "finest level not by the images' size, but 2048": ["--max-resolution", "2048"],
     "no view dependence": ["--view-dependence", "False"],

@@ -17,6 +17,7 @@ TINY: dict[str, dict[str, Any]] = {
         "num_levels": 4,
         "max_resolution": 64,
         "log2_table_size": 12,
+        "sparse_updates": True,
         "grid_resolution": 16,
         "num_steps": 64,
         "samples_per_batch": 4096,

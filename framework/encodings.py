@@ -138,6 +138,4 @@ def _interpolated(values: Tensor, dim: int, first: float, last: float, count: in
     places = torch.linspace(first, last, count, device=values.device).clamp(0, 1) * (size - 1)
     left = places.long().clamp(max=size - 2)
     shape = [-1 if d == dim else 1 for d in range(values.ndim)]
-    return torch.lerp(
-        values.index_select(dim, left), values.index_select(dim, left + 1), (places - left).view(shape)
-    )
+    return torch.lerp(values.index_select(dim, left), values.index_select(dim, left + 1), (places - left).view(shape))

@@ -21,7 +21,6 @@ from framework.kernels.spherical_harmonics import spherical_harmonics
 from framework.renderers import render_field
 from framework.samplers.occupancy import OccupancySampler
 
-
 MAX_SCALES = 4
 
 

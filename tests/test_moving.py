@@ -28,16 +28,19 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 def moving_trainer(name: str, data: Path, folder: Path, **changes: Any) -> Trainer:
-    """A trainer on the tiny data set, whose photographs get times from 0 to 1; its ball is red at first, then blue."""
+    """A trainer on the tiny data set, each photograph of which is there twice: red at time 0, and blue at time 1."""
     method, settings = VARIANTS[name]
     still = tiny_trainer("instant-ngp", data, folder / "still").train_set
-    times = torch.linspace(0, 1, len(still))
-    pixels = still.pixels.clone().view(len(still), -1, 4)
-    pixels[..., :3] = 0
-    pixels[..., 0] = (255 * (1 - times[:, None])).to(torch.uint8)
-    pixels[..., 2] = (255 * times[:, None]).to(torch.uint8)
+    count = len(still)
+    red, blue = still.pixels.clone(), still.pixels.clone()
+    red[:, :3], blue[:, :3] = torch.tensor([255, 0, 0]), torch.tensor([0, 0, 255])
     moving = dataclasses.replace(
-        still, pixels=pixels.view(-1, 4), times=times, scene=dataclasses.replace(still.scene, moving=True)
+        still,
+        pixels=torch.cat([red, blue]),
+        cameras=still.cameras[torch.arange(count).repeat(2)],
+        times=torch.tensor([0.0, 1.0]).repeat_interleave(count),
+        names=still.names * 2,
+        scene=dataclasses.replace(still.scene, moving=True, num_cameras=2 * count),
     )
     (folder / "run").mkdir()
     settings = {"max_num_iterations": 150, "max_eval_images": 0, **settings, **changes}
@@ -52,9 +55,9 @@ def test_colours_follow_time(name: str, shared_tiny: Path, tmp_path: Path) -> No
     assert trainer.state.skipped == 0
     cameras, white = trainer.train_set.cameras, torch.ones(3)
     found = []
-    for time in (0.05, 0.95):
+    for time in (0.0, 1.0):
         image = render_image(trainer.model, cameras, 0, white, torch.full((len(cameras),), time))
-        ball = image.accumulation > 0.5
+        ball = image.accumulation > 0.9
         assert ball.float().mean() > 0.05
         found.append(image.rgb[ball].mean(0))
     assert found[0][0] - found[0][2] > 0.3
@@ -66,8 +69,8 @@ def test_what_is_deformed_learns_to_move(name: str, shared_tiny: Path, tmp_path:
     """What is only deformed keeps its colours, as in the paper: so a change of colour is learnt as displacement."""
     trainer = moving_trainer(name, shared_tiny, tmp_path, max_num_iterations=60)
     field, positions = trainer.model.fine, torch.rand(100, 3)
-    before = trainer.train_step().psnr
     small = field.displacement(positions, torch.ones(100)).abs().max()
+    before = trainer.train_step().psnr
     trainer.train()
     assert trainer.state.skipped == 0
     assert trainer.train_step().psnr > before + 1

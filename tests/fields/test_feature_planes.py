@@ -40,7 +40,7 @@ def test_a_part_of_the_box_is_cut_out() -> None:
 
 def test_another_size_is_loaded() -> None:
     torch.manual_seed(0)
-    one, two = FeaturePlanes(FIRST, 4, VM, sparse=True), FeaturePlanes(FIRST, 4, VM, sparse=True)
+    one, two = (FeaturePlanes(FIRST, 4, VM, sparse=True, resizable=True) for _ in range(2))
     one.resample(LATER, torch.zeros(3), torch.ones(3))
     two.load_state_dict(one.state_dict())
     assert two.layout == one.layout
@@ -93,10 +93,10 @@ def test_gradients_that_wait_move_the_table_as_those_that_do_not(features: int) 
 
 
 def test_tensorf_grows_shrinks_and_resumes(shared_tiny: Path, tmp_path: Path) -> None:
-    settings = {"max_num_iterations": 200, "upsample_at": (0.015, 0.025, 0.035, 0.8, 0.9)}
+    settings = {"max_num_iterations": 300, "upsample_at": (0.01, 0.02, 0.03, 0.85, 0.9)}
     trainer = tiny_trainer("tensorf", shared_tiny, tmp_path / "whole", **settings)
     model, sizes, boxes = trainer.model, [], []
-    for _ in range(200):
+    for _ in range(300):
         trainer.train_step()
         sizes.append(model.size())
         boxes.append(model.field.box.clone())
@@ -108,6 +108,6 @@ def test_tensorf_grows_shrinks_and_resumes(shared_tiny: Path, tmp_path: Path) ->
     assert bool((boxes[-1][1] - boxes[-1][0] < boxes[0][1] - boxes[0][0]).all())
     again = tiny_trainer("tensorf", shared_tiny, tmp_path / "again", **settings)
     again.restore(load_checkpoint(saved))
-    while again.state.step < 200:
+    while again.state.step < 300:
         again.train_step()
     assert_same_bits(tensors(trainer), tensors(again))

@@ -25,14 +25,17 @@ HASH_SAMPLES_PER_BATCH = 2**14
 
 @dataclass(frozen=True)
 class DNeRFConfig(TrainConfig):
-    """Settings of dnerf; networks, samples and learning rate are the paper's."""
+    """Settings of dnerf; networks, samples and learning rate are the paper's.
+
+    Unlike there, photographs with alpha are composited over random colours in training: over white, a scene with much
+    white in it is learnt as empty space, and stays so.
+    """
 
     max_num_iterations: int = 800_000
     num_rays_per_batch: int = 2_048
     learning_rate: float = 5e-4
     lr_final: float = 0.1
     adam_eps: float = 1e-7
-    background: Literal["auto", "random", "white", "black"] = "white"
     variant: Literal["d-nerf", "t-nerf"] = "d-nerf"
     """d-nerf: a canonical field, deformed. t-nerf: one network of place and time."""
     canonical: Literal["network", "hash-grid"] = "network"

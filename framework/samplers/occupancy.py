@@ -23,6 +23,8 @@ WARM_UP_STEPS = 256
 """Steps during which the grid is visited in a fixed shuffle."""
 WARM_UP_DECAY, DECAY = 0.7, 0.8
 """Of a cell's density at each visit, in the beginning and afterwards."""
+TIMES_PER_VISIT, MOVING_DECAY = 4, 0.95
+"""Of a scene that moves: times at which a cell is looked at, and its decay, as it may be full for a short while only."""
 SHUFFLE_STRIDE = 2654435761
 """A prime, so that its multiples visit every cell once a pass, far from one another."""
 WAVES = (8, 8, 16, 32, 64, 128)
@@ -158,11 +160,10 @@ class OccupancySampler(nn.Module):
         n = self.resolution
         corner = torch.stack([cells // n**2, cells // n % n, cells % n], dim=-1)
         unit = (corner + torch.rand(len(cells), 3, device=cells.device)) / n
-        times = torch.rand(len(cells), device=cells.device) if self.moving else None
         positions = torch.lerp(self.box[0], self.box[1], unit)
-        sigma = _in_chunks(density, positions, times)
+        sigma = _in_chunks(density, positions, None) if not self.moving else _over_time(density, positions)
         before = self.density_grid.index_select(0, cells)
-        before *= WARM_UP_DECAY if warming_up else DECAY
+        before *= WARM_UP_DECAY if warming_up else MOVING_DECAY if self.moving else DECAY
         seen = torch.isfinite(before)
         self.density_grid.index_copy_(0, cells, torch.where(seen, torch.maximum(before, sigma), sigma))
         refresh_occupancy(self.density_grid, self.occupied, 1.0, self.step_size, self.alpha_threshold)
@@ -183,7 +184,10 @@ class OccupancySampler(nn.Module):
         return cells[looked_at & ~self.carved[cells]]
 
     def _drawn(self) -> Tensor:
-        """Half anywhere, half among occupied cells. A cell drawn twice is evaluated twice, harmlessly."""
+        """Half anywhere, half among occupied cells, of a moving scene as many beside those.
+
+        A cell drawn twice is evaluated twice, harmlessly.
+        """
         num_cells = self.resolution**3
         half = max(num_cells // 64, 1)
         device = self.occupied.device
@@ -192,7 +196,27 @@ class OccupancySampler(nn.Module):
         anywhere = anywhere[~self.carved[anywhere]]
         if len(occupied) == 0:
             return anywhere
-        return torch.cat([anywhere, occupied[torch.randint(len(occupied), (half,), device=device)]])
+        known = occupied[torch.randint(len(occupied), (half,), device=device)]
+        if not self.moving:
+            return torch.cat([anywhere, known])
+        beside = self._beside(occupied[torch.randint(len(occupied), (half,), device=device)])
+        return torch.cat([anywhere, known, beside[~self.carved[beside]]])
+
+    def _beside(self, cells: Tensor) -> Tensor:
+        """A random neighbour of each cell: where something moves to that was not there when the grid was emptied."""
+        n = self.resolution
+        corner = torch.stack([cells // n**2, cells // n % n, cells % n], dim=-1)
+        corner = (corner + torch.randint(-1, 2, corner.shape, device=cells.device)).clamp(0, n - 1)
+        return (corner[:, 0] * n + corner[:, 1]) * n + corner[:, 2]
+
+
+def _over_time(density: DensityFunction, positions: Tensor) -> Tensor:
+    """The largest density (N,) at a few random times, one in each equal part: something may pass a cell quickly."""
+    found = []
+    for part in range(TIMES_PER_VISIT):
+        times = (part + torch.rand(len(positions), device=positions.device)) / TIMES_PER_VISIT
+        found.append(_in_chunks(density, positions, times))
+    return torch.stack(found).amax(0)
 
 
 def _in_chunks(density: DensityFunction, positions: Tensor, times: Tensor | None) -> Tensor:

@@ -198,3 +198,21 @@ def test_state_survives_a_checkpoint() -> None:
     assert isinstance(first, Samples)
     torch.testing.assert_close(first.t_starts, second.t_starts, rtol=0, atol=0)
     assert first.offsets.tolist() == second.offsets.tolist()
+
+
+def test_a_cell_that_is_full_for_a_short_while_stays() -> None:
+    """A ball that is there for a twentieth of the time: its cells are kept, and cells that are never full are not."""
+
+    def density(positions: torch.Tensor, times: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        assert times is not None
+        there = (positions.norm(dim=-1) < 0.6) & (times < 0.05)
+        return there.float() * 100, positions
+
+    box = torch.tensor([[-1.0] * 3, [1.0] * 3])
+    sampler = OccupancySampler(box, 16, 64, moving=True)
+    for step in range(1, 4000):
+        torch.manual_seed(step)
+        sampler.update(step, density)
+    centers = (torch.cartesian_prod(*[torch.arange(16)] * 3) + 0.5) / 8 - 1
+    assert sampler.occupied[centers.norm(dim=-1) < 0.5].float().mean() > 0.95
+    assert not bool(sampler.occupied[centers.norm(dim=-1) > 0.75].any())

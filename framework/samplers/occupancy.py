@@ -24,7 +24,7 @@ WARM_UP_STEPS = 256
 WARM_UP_DECAY, DECAY = 0.7, 0.8
 """Of a cell's density at each visit, in the beginning and afterwards."""
 TIMES_PER_VISIT, MOVING_DECAY = 4, 0.95
-"""Of a scene that moves: times at which a cell is looked at, and its decay, as it may be full for a short while only."""
+"""Of a scene that moves: times at which a cell is looked at, and its decay, for it may be full for a short while."""
 SHUFFLE_STRIDE = 2654435761
 """A prime, so that its multiples visit every cell once a pass, far from one another."""
 WAVES = (8, 8, 16, 32, 64, 128)

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,6 +20,15 @@ from framework.kernels import native
 from framework.rays import Rays
 
 ROTATION_TOLERANCE = 1e-3
+LENSES: dict[str, tuple[str, ...]] = {
+    "pinhole": (),
+    "opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "k7"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+    "equirectangular": (),
+    "orthographic": (),
+}
+"""Projection -> its distortion coefficients. opencv is OpenCV's rational model, k4 to k6 being the denominator's, and
+k7 the numerator's r^8, which transforms.json calls k4; fisheye is Kannala and Brandt's, as OpenCV has it."""
 CENTER = torch.zeros(1, 2)
 """The one place in a pixel that is its centre, as columns and rows from there."""
 
@@ -42,20 +52,25 @@ class Cameras:
     heights: Tensor
     """(M,) int64 image heights."""
     model: str = "pinhole"
-    """Name of the projection, a key of `PROJECTIONS`."""
+    """Name of the projection, a key of `LENSES`."""
+    lens: Tensor | None = None
+    """(M, K) distortion coefficients, in the order of `LENSES[model]`; None for all zero."""
 
     def __len__(self) -> int:
         return self.camera_to_worlds.shape[0]
 
     def __getitem__(self, index: Tensor | slice) -> Cameras:
         """The cameras chosen by a slice, a mask or an index tensor."""
-        chosen = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "model"}
-        return Cameras(**chosen, model=self.model)
+        return self._map(lambda values: values[index])
 
     def to(self, device: torch.device | str) -> Cameras:
         """The same cameras on `device`."""
-        moved = {f.name: getattr(self, f.name).to(device) for f in fields(self) if f.name != "model"}
-        return Cameras(**moved, model=self.model)
+        return self._map(lambda values: values.to(device))
+
+    def _map(self, change: Callable[[Tensor], Tensor]) -> Cameras:
+        """The same cameras with every tensor changed."""
+        known: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{name: change(value) for name, value in known.items() if isinstance(value, Tensor)})
 
     def scaled(self, factor: float) -> Cameras:
         """The cameras of images resized by `factor` (2.0 = twice as wide).
@@ -64,7 +79,7 @@ class Cameras:
         """
         intrinsics = {name: getattr(self, name) * factor for name in ("fx", "fy", "cx", "cy")}
         sizes = {name: (getattr(self, name) * factor + 1e-6).long() for name in ("widths", "heights")}
-        return Cameras(self.camera_to_worlds, **intrinsics, **sizes, model=self.model)
+        return replace(self, **intrinsics, **sizes)
 
     def rays(
         self,

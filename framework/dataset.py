@@ -44,12 +44,21 @@ class ParsedScene:
     """Scene units per unit of the input."""
     downscale_factor: int = 1
     """Images are reduced by this whole number when they are loaded."""
+    mask_paths: tuple[Path | None, ...] | None = None
+    """M images, white where a photograph is to be learnt from and black where it is not; None where there is none."""
+    points: Tensor | None = None
+    """(K, 3) sparse points on surfaces, scene coordinates."""
+    unbounded: bool = False
+    """There may be something to see outside `box`."""
+    exact_poses: bool = True
+    """The poses are known rather than estimated."""
 
     def __getitem__(self, index: Tensor) -> ParsedScene:
         """The images chosen by an index tensor."""
         paths = tuple(self.image_paths[i] for i in index.tolist())
         times = None if self.times is None else self.times[index]
-        return replace(self, image_paths=paths, cameras=self.cameras[index], times=times)
+        masks = None if self.mask_paths is None else tuple(self.mask_paths[i] for i in index.tolist())
+        return replace(self, image_paths=paths, cameras=self.cameras[index], times=times, mask_paths=masks)
 
 
 class DataParser(ABC):
@@ -182,6 +191,8 @@ def _assemble(parsed: ParsedScene, images: list[np.ndarray], cameras: Cameras) -
         has_alpha=has_alpha,
         moving=parsed.times is not None,
         image_size=max(max(image.shape[:2]) for image in images),
+        unbounded=parsed.unbounded,
+        exact_poses=parsed.exact_poses,
     )
     transform = torch.eye(4)[:3] if parsed.transform is None else parsed.transform
     names = tuple(path.name for path in parsed.image_paths)

@@ -25,3 +25,9 @@ class Scene:
     """The photographs have times."""
     image_size: int
     """The longer side of the largest training image, pixels."""
+    unbounded: bool = False
+    """There may be something to see outside `box`."""
+    exact_poses: bool = True
+    """The poses are known rather than estimated."""
+    appearance_varies: bool = False
+    """Light, exposure or camera differ between the photographs."""

@@ -57,6 +57,16 @@ static inline Floats exponential(Floats x) {
     return x == x ? value : x;  // NaN stays NaN
 }
 
+constexpr float MAX_OPTICAL_DEPTH = 1e3f;
+
+// Of an interval; see ../compositing.py.
+static inline float optical_depth(float sigma, float delta) {
+    constexpr float MAX_FLOAT = 3.402823466e38f;
+    const float finite = sigma > MAX_FLOAT ? MAX_FLOAT : sigma;  // infinity * 0 would be NaN
+    const float tau = finite * delta;
+    return tau > MAX_OPTICAL_DEPTH ? MAX_OPTICAL_DEPTH : tau;
+}
+
 // Threads: the caller says how many, and torch's own OpenMP runtime provides them (see native.py).
 #if defined(_OPENMP)
 extern "C" int omp_get_thread_num(void);

@@ -3,19 +3,6 @@
 
 #include <cmath>
 
-namespace {
-
-constexpr float MAX_OPTICAL_DEPTH = 1e3f;
-constexpr float MAX_FLOAT = 3.402823466e38f;
-
-inline float optical_depth(float sigma, float delta) {
-    const float finite = sigma > MAX_FLOAT ? MAX_FLOAT : sigma;  // infinity * 0 would be NaN
-    const float tau = finite * delta;
-    return tau > MAX_OPTICAL_DEPTH ? MAX_OPTICAL_DEPTH : tau;
-}
-
-}  // namespace
-
 // Per ray: colour over the background, opacity, the first moment of t, and the t at which half the light is gone (the
 // ray's far end where it never is). Per sample: the weight. points may be null: the middles.
 EXPORT void composite_forward(const float* sigma, const float* rgb, const float* starts, const float* ends,

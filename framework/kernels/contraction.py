@@ -1,0 +1,60 @@
+"""Contraction of unbounded space into the unit cube, where encodings stand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from framework.bounds import contract
+from framework.kernels import native
+
+
+def contract_to_unit_reference(positions: Tensor, box: Tensor) -> Tensor:
+    """As `contract_to_unit`, in torch, in any float type."""
+    centre, half = (box[0] + box[1]) / 2, (box[1] - box[0]) / 2
+    return contract((positions - centre) / half) / 4 + 0.5
+
+
+def contract_to_unit(positions: Tensor, box: Tensor) -> Tensor:
+    """All of space into [0, 1]^3, the ball inside `box` keeping half of its width.
+
+    mip-NeRF 360 (Barron et al. 2022), equation 10, see `framework.bounds.contract`; the ball of radius 2 just fits.
+
+    Args:
+        positions: (N, 3) scene coordinates.
+        box: (2, 3) corners of the part of space that is not contracted, but for its corners.
+    Returns: (N, 3).
+    """
+    if native.usable(positions, box):
+        return _Contract.apply(positions.contiguous(), (box[0] + box[1]) / 2, 2 / (box[1] - box[0]))
+    return contract_to_unit_reference(positions, box)
+
+
+LIMIT = torch.finfo(torch.float32).max ** 0.5 / 4
+_forward = native.function("contract_positions", "pppqfpi")
+_backward = native.function("contract_positions_backward", "ppppqfpi")
+
+
+class _Contract(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, positions: Tensor, centre: Tensor, scale: Tensor) -> Tensor:
+        count, out = len(positions), torch.empty_like(positions)
+        _forward(
+            native.pointer(positions, "positions", (count, 3)), native.pointer(centre, "the centre", (3,)),
+            native.pointer(scale, "the scale", (3,)), count, LIMIT, out.data_ptr(), native.threads(),
+        )  # fmt: skip
+        ctx.save_for_backward(positions, centre, scale)
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        positions, centre, scale = ctx.saved_tensors
+        out, grad = torch.empty_like(positions), grad.contiguous()
+        _backward(
+            positions.data_ptr(), centre.data_ptr(), scale.data_ptr(), native.pointer(grad, "gradient", grad.shape),
+            len(positions), LIMIT, out.data_ptr(), native.threads(),
+        )  # fmt: skip
+        return out, None, None

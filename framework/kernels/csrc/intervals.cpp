@@ -1,0 +1,147 @@
+// What proposal sampling does with the histograms of rays, and the contraction of space. See ../intervals.py and
+// ../contraction.py for the references and the equations.
+#include "common.h"
+
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+// Weights (rays, bins) of densities (rays, bins) between distances (rays, bins + 1).
+EXPORT void interval_weights(const float* sigma, const float* t, int64_t rays, int64_t bins, float* weights,
+                             int threads) {
+#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
+    for (int64_t r = 0; r < rays; r++) {
+        const float *s = sigma + r * bins, *edge = t + r * (bins + 1);
+        float depth = 0, in_front = 1;
+        for (int64_t i = 0; i < bins; i++) {
+            const float tau = optical_depth(s[i], edge[i + 1] - edge[i]);
+            weights[r * bins + i] = in_front * -std::expm1(-tau);
+            depth += tau;
+            in_front = std::exp(-depth);
+        }
+    }
+}
+
+// With g_i = dL/dw_i:  dL/dtau_i = g_i T_{i+1} - sum_{j > i} g_j w_j.
+EXPORT void interval_weights_backward(const float* sigma, const float* t, const float* weights, const float* grad,
+                                      int64_t rays, int64_t bins, float* sigma_grad, int threads) {
+#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
+    for (int64_t r = 0; r < rays; r++) {
+        const float *s = sigma + r * bins, *edge = t + r * (bins + 1), *w = weights + r * bins, *g = grad + r * bins;
+        float depth = 0, after = 0;
+        for (int64_t i = 0; i < bins; i++) after += g[i] * w[i];
+        for (int64_t i = 0; i < bins; i++) {
+            const float delta = edge[i + 1] - edge[i];
+            depth += optical_depth(s[i], delta);
+            after -= g[i] * w[i];
+            const float clipped = s[i] * delta > MAX_OPTICAL_DEPTH ? 0 : delta;
+            sigma_grad[r * bins + i] = clipped == 0 ? 0 : clipped * (g[i] * std::exp(-depth) - after);
+        }
+    }
+}
+
+// count + 1 new edges a ray, at the quantiles (j + shift) / (count + 1) of the histogram whose bins weigh
+// weight^power + padding.
+EXPORT void resample_intervals(const float* edges, const float* weights, const float* shift, int64_t rays, int64_t bins,
+                               int64_t count, float power, float padding, float* out, int threads) {
+#pragma omp parallel num_threads(threads) if (threads > 1)
+    {
+        std::vector<double> cdf(bins + 1);
+#pragma omp for schedule(static)
+        for (int64_t r = 0; r < rays; r++) {
+            const float *w = weights + r * bins, *edge = edges + r * (bins + 1);
+            cdf[0] = 0;
+            for (int64_t i = 0; i < bins; i++)
+                cdf[i + 1] = cdf[i] + (power == 1 ? w[i] : std::pow(w[i], power)) + padding;
+            const double total = cdf[bins];
+            int64_t bin = 0;
+            for (int64_t j = 0; j <= count; j++) {
+                const double u = total * (j + double(shift[r])) / (count + 1);
+                while (bin < bins - 1 && cdf[bin + 1] <= u) bin++;
+                const double width = cdf[bin + 1] - cdf[bin];
+                const double share = width > 0 ? std::min(std::max((u - cdf[bin]) / width, 0.0), 1.0) : 0.0;
+                out[r * (count + 1) + j] = float(edge[bin] + share * (double(edge[bin + 1]) - edge[bin]));
+            }
+        }
+    }
+}
+
+// Per ray sum_i max(0, w_i - bound_i)^2 / (w_i + eps), where bound_i is the weight of all proposed bins that touch
+// interval i; and its gradient with respect to the proposed weights.
+EXPORT void proposal_excess(const float* edges, const float* weights, int64_t bins, const float* proposed_edges,
+                            const float* proposed_weights, int64_t proposed_bins, int64_t rays, float eps, float* loss,
+                            float* grad, int threads) {
+#pragma omp parallel num_threads(threads) if (threads > 1)
+    {
+        std::vector<double> sum(proposed_bins + 1), change(proposed_bins + 1);
+#pragma omp for schedule(static)
+        for (int64_t r = 0; r < rays; r++) {
+            const float *edge = edges + r * (bins + 1), *w = weights + r * bins;
+            const float *p_edge = proposed_edges + r * (proposed_bins + 1), *p = proposed_weights + r * proposed_bins;
+            sum[0] = 0;
+            for (int64_t j = 0; j < proposed_bins; j++) sum[j + 1] = sum[j] + p[j];
+            std::fill(change.begin(), change.end(), 0.0);
+            int64_t first = 0, end = 0;
+            double total = 0;
+            for (int64_t i = 0; i < bins; i++) {
+                while (first < proposed_bins && p_edge[first + 1] < edge[i]) first++;
+                end = std::max(end, first);
+                while (end < proposed_bins && p_edge[end] <= edge[i + 1]) end++;
+                const double excess = w[i] - (sum[end] - sum[first]);
+                if (excess <= 0) continue;
+                const double scaled = excess / (double(w[i]) + eps);
+                total += excess * scaled;
+                change[first] -= 2 * scaled;
+                change[end] += 2 * scaled;
+            }
+            loss[r] = float(total);
+            double running = 0;
+            for (int64_t j = 0; j < proposed_bins; j++) {
+                running += change[j];
+                grad[r * proposed_bins + j] = float(running);
+            }
+        }
+    }
+}
+
+// Positions (count, 3) to [0, 1]^3: x = (position - centre) * scale, contracted into the ball of radius 2.
+EXPORT void contract_positions(const float* positions, const float* centre, const float* scale, int64_t count,
+                               float limit, float* out, int threads) {
+#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
+    for (int64_t n = 0; n < count; n++) {
+        float x[3], squared = 0;
+        for (int c = 0; c < 3; c++) {
+            x[c] = (positions[n * 3 + c] - centre[c]) * scale[c];
+            x[c] = x[c] > limit ? limit : x[c] < -limit ? -limit : x[c];
+            squared += x[c] * x[c];
+        }
+        squared = squared < 1 ? 1 : squared;
+        const float factor = (2 * std::sqrt(squared) - 1) / squared;
+        for (int c = 0; c < 3; c++) out[n * 3 + c] = 0.25f * x[c] * factor + 0.5f;
+    }
+}
+
+// With n = |x| > 1 and y = x s(n), s(n) = 2/n - 1/n^2:  J^T g = s g + x (x . g) s'(n) / n.
+EXPORT void contract_positions_backward(const float* positions, const float* centre, const float* scale,
+                                        const float* grad, int64_t count, float limit, float* out, int threads) {
+#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
+    for (int64_t n = 0; n < count; n++) {
+        float x[3], squared = 0, along = 0;
+        bool clipped[3];
+        for (int c = 0; c < 3; c++) {
+            x[c] = (positions[n * 3 + c] - centre[c]) * scale[c];
+            clipped[c] = !(x[c] <= limit && x[c] >= -limit);
+            x[c] = x[c] > limit ? limit : x[c] < -limit ? -limit : x[c];
+            squared += x[c] * x[c];
+            along += x[c] * grad[n * 3 + c];
+        }
+        float factor = 1, radial = 0;
+        if (squared > 1) {
+            const float norm = std::sqrt(squared);
+            factor = (2 * norm - 1) / squared;
+            radial = along / norm * ((2 / norm - 2) / squared);
+        }
+        for (int c = 0; c < 3; c++)
+            out[n * 3 + c] = clipped[c] ? 0 : 0.25f * scale[c] * (factor * grad[n * 3 + c] + radial * x[c]);
+    }
+}

@@ -1,0 +1,156 @@
+"""Histograms along rays: weights of intervals, new intervals where the weight is, and the loss of a proposal.
+
+Letters: R rays, B bins of a histogram, which has B + 1 edges on every ray, sorted.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from framework.kernels import native
+from framework.kernels.compositing import optical_depth
+
+EPS = 1e-7
+"""Keeps the loss of intervals without weight finite."""
+
+
+# -- weights ------------------------------------------------------------------------------------------------------
+
+
+def interval_weights_reference(sigma: Tensor, t: Tensor) -> Tensor:
+    """As `interval_weights`, in torch, in any float type."""
+    tau = optical_depth(sigma, t.diff(dim=-1))
+    in_front = torch.exp(-(tau.cumsum(-1) - tau).clamp(min=0))
+    return in_front * -torch.expm1(-tau)
+
+
+def interval_weights(sigma: Tensor, t: Tensor) -> Tensor:
+    """Weight (R, B) of intervals between distances t (R, B + 1) with densities sigma (R, B): NeRF, equation 3.
+
+    Without a gradient for `t`.
+    """
+    if native.usable(sigma, t):
+        return _Weights.apply(sigma.contiguous(), t.contiguous())
+    return interval_weights_reference(sigma, t.detach())
+
+
+_weights = native.function("interval_weights", "ppqqpi")
+_weights_backward = native.function("interval_weights_backward", "ppppqqpi")
+
+
+class _Weights(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, sigma: Tensor, t: Tensor) -> Tensor:
+        rays, bins = sigma.shape
+        out = torch.empty_like(sigma)
+        _weights(
+            native.pointer(sigma, "sigma", (rays, bins)), native.pointer(t, "t", (rays, bins + 1)), rays, bins,
+            out.data_ptr(), native.threads(),
+        )  # fmt: skip
+        ctx.save_for_backward(sigma, t, out)
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        sigma, t, weights = ctx.saved_tensors
+        out, grad = torch.empty_like(sigma), grad.contiguous()
+        _weights_backward(
+            sigma.data_ptr(), t.data_ptr(), weights.data_ptr(), native.pointer(grad, "gradient", sigma.shape),
+            *sigma.shape, out.data_ptr(), native.threads(),
+        )  # fmt: skip
+        return out, None
+
+
+# -- new intervals ------------------------------------------------------------------------------------------------
+
+
+def resample_reference(
+    edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float, padding: float
+) -> Tensor:
+    """As `resample`, in torch, in any float type."""
+    heavy = weights**power + padding
+    cdf = torch.cat([torch.zeros_like(heavy[:, :1]), heavy.cumsum(-1)], dim=-1)
+    steps = torch.arange(count + 1, device=edges.device)
+    u = cdf[:, -1:] * (steps + shift[:, None]) / (count + 1)
+    above = torch.searchsorted(cdf, u.contiguous(), right=True).clamp(1, heavy.shape[-1])
+    low, width = cdf.gather(-1, above - 1), heavy.gather(-1, above - 1)
+    empty = width <= 0
+    share = torch.where(empty, torch.zeros_like(u), (u - low) / torch.where(empty, torch.ones_like(u), width))
+    return torch.lerp(edges.gather(-1, above - 1), edges.gather(-1, above), share.clamp(0, 1))
+
+
+@torch.no_grad()
+def resample(edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float, padding: float) -> Tensor:
+    """Edges (R, count + 1) of new intervals, each of which holds an equal share of a histogram's weight.
+
+    Args:
+        edges, weights: (R, B + 1) and (R, B), the histogram.
+        shift: (R,) in [0, 1): the new edges are the quantiles (j + shift) / (count + 1).
+        power: which the weights are raised to first: less than 1 flattens them (mip-NeRF 360, section 3.1).
+        padding: added to each weight, so that no place is never looked at.
+    """
+    if not native.usable(edges, weights, shift):
+        return resample_reference(edges, weights, shift, count, power, padding)
+    rays, bins = weights.shape
+    out = edges.new_empty(rays, count + 1)
+    edges, weights = edges.contiguous(), weights.contiguous()
+    _resample(
+        native.pointer(edges, "edges", (rays, bins + 1)), native.pointer(weights, "weights", (rays, bins)),
+        native.pointer(shift, "shift", (rays,)), rays, bins, count, power, padding, out.data_ptr(), native.threads(),
+    )  # fmt: skip
+    return out
+
+
+_resample = native.function("resample_intervals", "pppqqqffpi")
+
+
+# -- the loss of a proposal ---------------------------------------------------------------------------------------
+
+
+def proposal_excess_reference(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor) -> Tensor:
+    """As `proposal_excess`, by comparing all pairs of intervals: the truth, in any float type."""
+    touches = (proposed[:, None, :-1] <= edges[:, 1:, None]) & (proposed[:, None, 1:] >= edges[:, :-1, None])
+    bound = (touches * proposed_weights[:, None, :]).sum(-1)
+    return ((weights - bound).clamp(min=0).square() / (weights + EPS)).sum(-1)
+
+
+def proposal_excess(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor) -> Tensor:
+    """Loss (R,) of a proposed histogram that should bound another from above: mip-NeRF 360, equation 13.
+
+    Args:
+        edges, weights: (R, B + 1) and (R, B) what was found; without a gradient.
+        proposed, proposed_weights: (R, P + 1) and (R, P) what was proposed.
+    """
+    edges, weights, proposed = edges.detach(), weights.detach(), proposed.detach()
+    if native.usable(edges, weights, proposed, proposed_weights):
+        inputs = (tensor.contiguous() for tensor in (edges, weights, proposed, proposed_weights))
+        return _Excess.apply(*inputs)
+    return proposal_excess_reference(edges, weights, proposed, proposed_weights)
+
+
+_excess = native.function("proposal_excess", "ppqppqqfppi")
+
+
+class _Excess(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor) -> Tensor:
+        (rays, bins), proposed_bins = weights.shape, proposed_weights.shape[1]
+        loss, grad = weights.new_empty(rays), torch.empty_like(proposed_weights)
+        _excess(
+            native.pointer(edges, "edges", (rays, bins + 1)), native.pointer(weights, "weights", (rays, bins)), bins,
+            native.pointer(proposed, "proposed edges", (rays, proposed_bins + 1)),
+            native.pointer(proposed_weights, "proposed weights", (rays, proposed_bins)), proposed_bins, rays, EPS,
+            loss.data_ptr(), grad.data_ptr(), native.threads(),
+        )  # fmt: skip
+        ctx.save_for_backward(grad)
+        return loss
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[None, None, None, Tensor]:
+        (of_weights,) = ctx.saved_tensors
+        return None, None, None, of_weights * grad[:, None]

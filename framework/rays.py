@@ -56,6 +56,16 @@ class Rays:
 
 
 @dataclass(frozen=True)
+class Histogram:
+    """What a proposal believed of R rays: B intervals each, and how much of the light each stops."""
+
+    edges: Tensor
+    """(R, B + 1) sorted, in a proposal sampler's normalised distance: 0 at the near and 1 at the far end."""
+    weights: Tensor
+    """(R, B)."""
+
+
+@dataclass(frozen=True)
 class Samples:
     """Packed intervals along R rays: ray r owns the samples [offsets[r], offsets[r + 1]), near to far.
 
@@ -82,6 +92,10 @@ class Samples:
     """(N,) density, where the sampler already evaluated it."""
     features: Tensor | None = None
     """(N, F) the field's features that came with `sigma`."""
+    edges: Tensor | None = None
+    """(R, S + 1) the intervals' ends in normalised distance, from a sampler that works in it."""
+    proposals: tuple[Histogram, ...] = ()
+    """What these were drawn by, where it is still being learnt: gradients attached."""
 
     @classmethod
     def regular(cls, t_starts: Tensor, t_ends: Tensor, points: Tensor | None = None) -> Samples:

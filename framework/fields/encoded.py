@@ -3,28 +3,31 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from framework.encodings import FeaturePlanes, HashGrid
 from framework.fields.base import MLP, Field
+from framework.kernels.contraction import contract_to_unit
 from framework.kernels.math import split_density, truncated_exp
 from framework.kernels.spherical_harmonics import spherical_harmonics
 
 
 class BoxField(Field):
-    """A field whose features stand in a box.
+    """A field whose features stand in a box, or in all of space contracted around it.
 
     Args:
         box: (2, 3) the part of space that is encoded.
         encoding: of positions in [0, 1]^3, or of those and time.
+        unbounded: encode all of space, contracted (see `contract_to_unit`).
     """
 
     box: Tensor
     scale: Tensor
     shift: Tensor
 
-    def __init__(self, box: Tensor, encoding: HashGrid | FeaturePlanes) -> None:
+    def __init__(self, box: Tensor, encoding: HashGrid | FeaturePlanes, unbounded: bool = False) -> None:
         super().__init__()
+        self.unbounded = unbounded
         self.register_buffer("box", box.clone())
         size = box[1] - box[0]
         self.register_buffer("scale", 1 / size, persistent=False)
@@ -36,12 +39,37 @@ class BoxField(Field):
 
         Raises: ValueError where the encoding wants times and there are none.
         """
-        unit = torch.addcmul(self.shift, positions, self.scale)
+        if self.unbounded:
+            unit = contract_to_unit(positions, self.box)
+        else:
+            unit = torch.addcmul(self.shift, positions, self.scale)
         if self.encoding.dims == 4:
             if times is None:
                 raise ValueError("this field changes with time: it needs the times of its positions")
             unit = torch.cat([unit, times[:, None].to(unit)], dim=-1)
         return self.encoding(unit, known=known)
+
+
+class DensityField(BoxField):
+    """Density alone, from the encoding's features: what proposals are made of (mip-NeRF 360, section 3).
+
+    Args:
+        box, encoding, unbounded: as for `BoxField`.
+        width: features of the hidden layer.
+    """
+
+    def __init__(
+        self, box: Tensor, encoding: HashGrid | FeaturePlanes, width: int = 16, unbounded: bool = False
+    ) -> None:
+        super().__init__(box, encoding, unbounded)
+        self.head = MLP(encoding.num_features, width, 1, bias=False)
+
+    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        features = self.encode(positions, times)
+        return truncated_exp(self.head(features)[:, 0]), features
+
+    def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
+        raise NotImplementedError("a density field has no colours")
 
 
 class EncodedField(BoxField):
@@ -53,6 +81,9 @@ class EncodedField(BoxField):
         width: features of a hidden layer (64 in the paper).
         num_features: features handed from density to colour (16 in the paper, the first being log-density).
         direction_levels: bands of spherical harmonics (4 in the paper); 0 for colours that look alike from all sides.
+        unbounded: encode all of space, contracted (see `contract_to_unit`).
+        appearance: features in which each photograph may differ from the others, and how many photographs there are
+            (NeRF-W, Martin-Brualla et al. 2021, section 4.1); None for a scene that looks alike in all of them.
     """
 
     def __init__(
@@ -62,11 +93,18 @@ class EncodedField(BoxField):
         width: int = 64,
         num_features: int = 16,
         direction_levels: int = 4,
+        unbounded: bool = False,
+        appearance: tuple[int, int] | None = None,
     ) -> None:
-        super().__init__(box, encoding)
+        super().__init__(box, encoding, unbounded)
         self.direction_levels = direction_levels
         self.density_head = MLP(encoding.num_features, width, num_features, bias=False)
-        self.color_head = MLP(num_features + direction_levels**2, width, width, 3, bias=False, activation="sigmoid")
+        inputs = num_features + direction_levels**2
+        self.appearance = None
+        if appearance is not None:
+            self.appearance = Appearance(*appearance)
+            inputs += appearance[0]
+        self.color_head = MLP(inputs, width, width, 3, bias=False, activation="sigmoid")
 
     def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
         return split_density(self.density_head(self.encode(positions, times)))
@@ -83,7 +121,30 @@ class EncodedField(BoxField):
         return split_density(self.density_head(self.encode(positions, times, known=memory), known=features))
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
-        if self.direction_levels == 0:
-            return self.color_head(features).float()
-        view = spherical_harmonics(directions, self.direction_levels)
-        return self.color_head(features, view.to(features.dtype)).float()
+        inputs = [features]
+        if self.direction_levels:
+            inputs.append(spherical_harmonics(directions, self.direction_levels).to(features.dtype))
+        if self.appearance is not None:
+            inputs.append(self.appearance(camera_indices, len(features)).to(features.dtype))
+        return self.color_head(*inputs).float()
+
+
+class Appearance(nn.Module):
+    """A learnt vector for each photograph.
+
+    Args:
+        size: D.
+        count: photographs.
+    """
+
+    def __init__(self, size: int, count: int) -> None:
+        super().__init__()
+        self.vectors = nn.Parameter(torch.zeros(count, size))
+        self.stand_in: Tensor | None = None
+
+    def forward(self, camera_indices: Tensor | None, count: int) -> Tensor:
+        """(N, D) of the photographs `camera_indices` (N,); of None, `stand_in` (D,) or the mean of all, N times."""
+        if camera_indices is not None:
+            return self.vectors[camera_indices]
+        vector = self.vectors.mean(0) if self.stand_in is None else self.stand_in
+        return vector.expand(count, -1)

@@ -58,6 +58,23 @@ def split_density(features: Tensor) -> tuple[Tensor, Tensor]:
     return _SplitDensity.apply(features if features.dtype == torch.float64 else features.float())
 
 
+class _ScaledGradient(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, factors: Tensor) -> Tensor:
+        ctx.save_for_backward(factors)
+        return values.view_as(values)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        (factors,) = ctx.saved_tensors
+        return grad * factors.view(-1, *[1] * (grad.ndim - 1)), None
+
+
+def scale_gradient(values: Tensor, factors: Tensor) -> Tensor:
+    """`values` (N, ...) as they are, their gradient multiplied by `factors` (N,)."""
+    return _ScaledGradient.apply(values, factors)
+
+
 def safe_normalize(v: Tensor, eps: float = 1e-12) -> Tensor:
     """v / |v| over the last dimension; 0, with a zero gradient, where |v| < eps."""
     squared = (v * v).sum(-1, keepdim=True)

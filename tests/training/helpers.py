@@ -58,6 +58,14 @@ TINY: dict[str, dict[str, Any]] = {
         "hidden_width": 32,
         "samples_per_batch": 4096,
     },
+    "nerfacto": {
+        "num_levels": 4,
+        "max_resolution": 64,
+        "log2_table_size": 12,
+        "num_proposal_samples": (24, 12),
+        "num_nerf_samples": 8,
+        "num_rays_per_batch": 256,
+    },
     "dnerf": {
         "num_layers": 3,
         "hidden_width": 32,

@@ -1,0 +1,135 @@
+"""Proposals: where samples go, and that they learn to bound what is there."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from framework.fields.base import Field
+from framework.rays import Rays
+from framework.renderers import render_field
+from framework.samplers.proposal import ProposalSampler, from_disparity, interlevel_loss, to_disparity
+
+BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
+
+
+class Wall(Field):
+    """Opaque in a slab of x; grey."""
+
+    def __init__(self, low: float, high: float) -> None:
+        super().__init__()
+        self.low, self.high = low, high
+
+    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        inside = (positions[:, 0] > self.low) & (positions[:, 0] < self.high)
+        return 200.0 * inside, positions
+
+    def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
+        return torch.full_like(features, 0.5)
+
+
+def rays_along_x(count: int, near: float = 0.05, far: float = 1000.0) -> Rays:
+    torch.manual_seed(0)
+    origins = torch.cat([torch.full((count, 1), -0.9), torch.rand(count, 2) - 0.5], dim=-1)
+    directions = torch.tensor([[1.0, 0.0, 0.0]]).expand(count, 3)
+    return Rays(origins, directions, torch.full((count,), near), torch.full((count,), far))
+
+
+def test_disparity_is_inverted_and_continuous() -> None:
+    t = torch.logspace(-6, 6, 200, dtype=torch.float64)
+    torch.testing.assert_close(from_disparity(to_disparity(t)), t)
+    assert to_disparity(torch.tensor(1.0)) == 0.5
+    assert bool(torch.isfinite(from_disparity(to_disparity(torch.tensor([0.0, torch.inf])))).all())
+
+
+@pytest.mark.parametrize("unbounded", [True, False])
+@pytest.mark.parametrize("jitter", [True, False])
+@pytest.mark.parametrize("count", [0, 17])
+def test_samples_are_sorted_and_between_the_ends(unbounded: bool, jitter: bool, count: int) -> None:
+    sampler = ProposalSampler(BOX, (24, 12, 8), unbounded=unbounded)
+    rays = rays_along_x(count)
+    samples = sampler.sample(rays, Wall(0, 1), jitter)
+    assert samples.per_ray == 8
+    assert len(samples) == 8 * count
+    t = samples.padded(samples.t)
+    assert bool((t.diff(dim=-1) >= 0).all())
+    far = 1000.0 if unbounded else 1.9
+    assert bool((t >= 0.05 - 1e-6).all())
+    assert bool((t <= far * (1 + 1e-4)).all())
+    assert samples.edges is not None
+    assert samples.edges.shape == (count, 9)
+
+
+def test_a_ray_that_misses_the_box_is_harmless() -> None:
+    rays = replace(rays_along_x(3), origins=torch.full((3, 3), 5.0))
+    samples = ProposalSampler(BOX, (8, 8, 4)).sample(rays, Wall(0, 1), False)
+    assert bool((samples.deltas == 0).all())
+    assert bool(torch.isfinite(samples.t).all())
+
+
+@pytest.mark.parametrize("unbounded", [True, False])
+def test_proposals_learn_where_the_wall_is(unbounded: bool) -> None:
+    """Samples move into the wall, and so the depth found becomes exact."""
+    torch.manual_seed(0)
+    wall, rays = Wall(0.3, 0.5), rays_along_x(256)
+    sampler = ProposalSampler(BOX, (48, 24, 12), unbounded=unbounded, log2_table_size=12, anneal_steps=20)
+    optimizer = torch.optim.Adam(sampler.parameters(), lr=1e-2, eps=1e-15)
+
+    def depth_error() -> float:
+        with torch.no_grad():
+            found = render_field(wall, sampler.eval(), rays, torch.zeros(3), False).median_depth
+        return (found - 1.2).abs().median().item()
+
+    def share_inside() -> float:
+        x = sampler.eval().sample(rays, wall, False).positions(rays)[:, 0]
+        return ((x > 0.25) & (x < 0.55)).float().mean().item()
+
+    before = share_inside()
+    losses = []
+    for step in range(150):
+        sampler.train().update(step, wall.density)
+        rendered = render_field(wall, sampler, rays, torch.zeros(3), True)
+        assert rendered.samples is not None
+        assert rendered.weights is not None
+        loss = interlevel_loss(rendered.samples, rendered.weights)
+        losses.append(loss.item())
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert losses[-1] < losses[5] / 3
+    assert share_inside() > max(0.6, 2 * before)
+    assert depth_error() < 0.02
+
+
+def test_proposals_rest_in_most_steps_later() -> None:
+    sampler, rays = ProposalSampler(BOX, (8, 8, 4)), rays_along_x(4)
+    learning = []
+    for step in range(1000, 1008):
+        sampler.update(step, Wall(0, 1).density)
+        learning.append(bool(sampler.sample(rays, Wall(0, 1), True).proposals))
+    assert learning == [True, False, False, False] * 2
+    with torch.no_grad():
+        sampler.update(1000, Wall(0, 1).density)
+        assert sampler.sample(rays, Wall(0, 1), False).proposals == ()
+
+
+def test_annealing_is_the_papers() -> None:
+    sampler = ProposalSampler(BOX, (8, 8, 4), anneal_steps=1000)
+    for step, expected in ((0, 0.0), (100, 1 / 1.9), (1000, 1.0), (5000, 1.0)):
+        sampler.update(step, Wall(0, 1).density)
+        assert math.isclose(sampler.power, expected)
+
+
+def test_light_that_no_wall_stops_ends_in_the_last_interval_of_an_unbounded_ray() -> None:
+    """The sky is learnt as matter far away: whatever density is there is opaque over an endless interval."""
+    rendered = render_field(
+        Wall(0.3, 1e9),
+        ProposalSampler(BOX, (16, 8, 4), unbounded=True, endless=True),
+        rays_along_x(5),
+        torch.ones(3),
+        False,
+    )
+    torch.testing.assert_close(rendered.accumulation, torch.ones(5))
+    torch.testing.assert_close(rendered.rgb, torch.full((5, 3), 0.5))

@@ -1,0 +1,96 @@
+"""Nerfacto: what the scene decides, and that each part does what it says."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from framework.fields.encoded import Appearance
+from framework.training.trainer import Trainer
+from tests.training.helpers import tiny_run, tiny_trainer
+
+
+def captured(data: Path, folder: Path, facts: dict[str, Any], **settings: Any) -> Trainer:
+    """A trainer on the tiny data set, of whose scene other things are said."""
+    still = tiny_trainer("nerfacto", data, folder / "still").train_set
+    (folder / "run").mkdir()
+    changed = dataclasses.replace(still, scene=dataclasses.replace(still.scene, **facts))
+    return Trainer(tiny_run("nerfacto", data, folder / "run", max_eval_images=0, **settings), changed, None)
+
+
+def chosen(trainer: Trainer) -> dict[str, str]:
+    return {d.option: d.choice for d in trainer.profile().decisions}
+
+
+def test_a_bounded_scene_with_exact_poses_needs_little(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = captured(shared_tiny, tmp_path, {})
+    found = chosen(trainer)
+    assert found["contraction"] == found["gradient scaling near cameras"] == found["pose refinement"] == "off"
+    assert found["distortion loss"] == found["appearance features"] == "0"
+    model = trainer.model
+    assert not model.field.unbounded
+    assert model.poses is None
+    assert model.field.appearance is None
+
+
+def test_a_capture_gets_what_it_needs(shared_tiny: Path, tmp_path: Path) -> None:
+    facts = {"unbounded": True, "exact_poses": False, "appearance_varies": True}
+    trainer = captured(shared_tiny, tmp_path, facts, max_num_iterations=4)
+    found = chosen(trainer)
+    assert found["contraction"] == found["gradient scaling near cameras"] == "on"
+    assert found["pose refinement"] == "SO3xR3"
+    assert found["appearance features"] == "16"
+    trainer.train()
+    model = trainer.model
+    assert bool((model.poses.tangents != 0).any())
+    assert bool((model.field.appearance.vectors != 0).any())
+    report = trainer.train_step()
+    assert {"rgb", "interlevel", "distortion"} <= report.losses.keys()
+
+
+def test_what_is_asked_for_is_done_and_not_called_a_decision(shared_tiny: Path, tmp_path: Path) -> None:
+    asked = {
+        "contraction": False, "distortion_loss_mult": 0.0, "appearance_embedding_dim": 0, "camera_optimizer": "off",
+        "gradient_scaling": False,
+    }  # fmt: skip
+    facts = {"unbounded": True, "exact_poses": False, "appearance_varies": True}
+    trainer = captured(shared_tiny, tmp_path, facts, **asked)
+    assert not {"contraction", "distortion loss", "appearance features", "pose refinement"} & chosen(trainer).keys()
+    assert trainer.model.poses is None
+    assert not trainer.model.unbounded
+
+
+@pytest.mark.parametrize("unbounded", [True, False])
+def test_it_learns(unbounded: bool, shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = captured(shared_tiny, tmp_path, {"unbounded": unbounded}, max_num_iterations=60)
+    first = trainer.train_step().losses["rgb"]
+    trainer.train()
+    assert trainer.state.skipped == 0
+    assert trainer.train_step().losses["rgb"] < first / 3
+
+
+def test_gradients_fade_towards_the_camera(shared_tiny: Path, tmp_path: Path) -> None:
+    """Moving a scene to a tenth of the distance scales its gradients by a hundredth, values being the same."""
+    trainer = captured(shared_tiny, tmp_path, {"unbounded": True})
+    model = trainer.model
+    assert model.scales_gradients
+    from framework.kernels.math import scale_gradient
+
+    values = torch.ones(3, 2, requires_grad=True)
+    out = scale_gradient(values, torch.tensor([0.01, 1.0, 0.25]))
+    assert torch.equal(out, values)
+    out.sum().backward()
+    assert values.grad is not None
+    assert values.grad[:, 0].tolist() == pytest.approx([0.01, 1.0, 0.25])
+
+
+def test_held_out_photographs_are_shown_in_the_mean_appearance() -> None:
+    appearance = Appearance(2, 3)
+    with torch.no_grad():
+        appearance.vectors.copy_(torch.tensor([[0.0, 3.0], [1.0, 0.0], [2.0, 0.0]]))
+    assert appearance(torch.tensor([2, 0]), 2).tolist() == [[2.0, 0.0], [0.0, 3.0]]
+    assert appearance(None, 2).tolist() == [[1.0, 1.0], [1.0, 1.0]]
+    appearance.stand_in = torch.tensor([5.0, 6.0])
+    assert appearance(None, 1).tolist() == [[5.0, 6.0]]

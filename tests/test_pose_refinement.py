@@ -1,0 +1,82 @@
+"""Learnt poses against rotations in closed form."""
+
+import math
+
+import pytest
+import torch
+
+from framework.cameras import Cameras
+from framework.pose_refinement import PoseRefinement
+from framework.rays import Rays
+
+
+def some_rays() -> Rays:
+    torch.manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(6, 3), dim=-1)
+    return Rays(
+        torch.randn(6, 3), directions, torch.zeros(6), torch.ones(6), camera_indices=torch.tensor([0, 0, 1, 1, 2, 2])
+    )
+
+
+@pytest.mark.parametrize("group", ["SO3xR3", "SE3"])
+def test_nothing_moves_at_first_and_everything_can_learn(group) -> None:
+    poses, rays = PoseRefinement(3, group), some_rays()
+    found = poses(rays)
+    torch.testing.assert_close(found.origins, rays.origins)
+    torch.testing.assert_close(found.directions, rays.directions)
+    (found.origins.square().sum() + (found.directions * torch.arange(3.0)).sum()).backward()
+    assert poses.tangents.grad is not None
+    assert bool((poses.tangents.grad != 0).all())
+    assert bool(torch.isfinite(poses.tangents.grad).all())
+
+
+def test_a_quarter_turn_and_a_move() -> None:
+    poses, rays = PoseRefinement(3, "SO3xR3"), some_rays()
+    with torch.no_grad():
+        poses.tangents[1] = torch.tensor([1.0, 2.0, 3.0, 0.0, 0.0, math.pi / 2])
+    found = poses(rays)
+    x, y, z = rays.directions[2:4].unbind(-1)
+    torch.testing.assert_close(found.directions[2:4], torch.stack([-y, x, z], -1))
+    torch.testing.assert_close(found.origins[2:4], rays.origins[2:4] + torch.tensor([1.0, 2.0, 3.0]))
+    torch.testing.assert_close(found.origins[4:], rays.origins[4:])
+
+
+def test_a_screw_turns_about_the_scenes_origin() -> None:
+    """Half a turn about z while moving along z: the helix's end."""
+    poses, rays = PoseRefinement(3, "SE3"), some_rays()
+    with torch.no_grad():
+        poses.tangents[0] = torch.tensor([0.0, 0.0, 0.7, 0.0, 0.0, math.pi])
+    found = poses(rays)
+    flipped = rays.origins[:2] * torch.tensor([-1.0, -1.0, 1.0]) + torch.tensor([0.0, 0.0, 0.7])
+    torch.testing.assert_close(found.origins[:2], flipped, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("group", ["SO3xR3", "SE3"])
+def test_refined_cameras_see_along_refined_rays(group) -> None:
+    torch.manual_seed(0)
+    rotations = torch.linalg.qr(torch.randn(3, 3, 3))[0]
+    rotations = rotations * torch.linalg.det(rotations)[:, None, None]
+    ones = torch.ones(3)
+    cameras = Cameras(
+        torch.cat([rotations, torch.randn(3, 3, 1)], -1),
+        20 * ones,
+        20 * ones,
+        8 * ones,
+        8 * ones,
+        *[16 * ones.long()] * 2,
+    )
+    poses = PoseRefinement(3, group)
+    torch.nn.init.normal_(poses.tangents, std=0.3)
+    flat = torch.randint(3 * 256, (40,))
+    through = poses(cameras.pixel_rays(flat, 0.0, 1.0))
+    of_refined = poses.refined(cameras).pixel_rays(flat, 0.0, 1.0)
+    torch.testing.assert_close(through.origins, of_refined.origins)
+    torch.testing.assert_close(through.directions, of_refined.directions)
+    assert bool((through.directions.norm(dim=-1) - 1).abs().max() < 1e-5)
+
+
+def test_held_out_cameras_are_left_alone() -> None:
+    poses, rays = PoseRefinement(3), some_rays()
+    torch.nn.init.normal_(poses.tangents)
+    alone = Rays(rays.origins, rays.directions, rays.nears, rays.fars)
+    assert poses(alone) is alone

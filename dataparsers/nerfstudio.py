@@ -10,8 +10,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from dataparsers.captured import ENDINGS, Captured, Division, Photographs, captured_scene, image_sizes
-from dataparsers.reading import file_name, number, read_json, read_pose, read_times, rigid, shown
+from dataparsers.captured import ENDINGS, Captured, Division, Photographs, captured_scene, from_original, image_sizes
+from dataparsers.reading import file_name, number, numbers, read_json, read_pose, read_times, rigid, shown
 from framework import DataError, ParsedScene
 from framework.console import say
 from framework.dataset import Split
@@ -31,7 +31,7 @@ CAMERA_MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     "ORTHOPHOTO": ("orthographic", ()),
 }
 """`camera_model` -> our projection, and under which name the file has each coefficient of `LENSES`; '' for none."""
-NGP_SCALE, NGP_OFFSET = 0.33, (0.5, 0.5, 0.5)
+NGP_SCALE, NGP_OFFSET = 0.33, [0.5, 0.5, 0.5]
 """instant-ngp's unit cube: it puts a position x of the file at `scale * x + offset` unless the file has its own."""
 
 
@@ -167,9 +167,7 @@ def _camera_model(file: Path, content: dict[str, Any], frames: list[dict[str, An
         raise DataError(f"{file}: unknown camera_model '{shown(name)[1:-1]}'. {nearest(name, CAMERA_MODELS)}")
     found = {CAMERA_MODELS[name] for name in named}
     if len(found) > 1:
-        raise DataError(
-            f"{file}: frames have the camera models {' and '.join(sorted(named))}; split them into one each"
-        )
+        raise DataError(f"{file} mixes the camera models {' and '.join(sorted(named))}; make a file of each")
     return found.pop()
 
 
@@ -178,10 +176,10 @@ def _intrinsics(
 ) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy in pixels of an image of `size`; the principal point is its centre where it is not given."""
     fx, fy = (_focal(frame, content, axis, length, where) for axis, length in zip("xy", size, strict=True))
-    if fx is None and fy is None:
-        if model != "equirectangular":
-            raise DataError(f"{where}: there is neither 'fl_x' nor 'camera_angle_x', and so no focal length")
-        fx, fy = size[0] / 2, float(size[1])
+    if model == "equirectangular":  # the file's focal length is half the width of a whole panorama, ours one radian
+        fx, fy = (fx or fy or size[0] / 2) / math.pi, (fy or fx or size[1]) / math.pi
+    elif fx is None and fy is None:
+        raise DataError(f"{where}: there is neither 'fl_x' nor 'camera_angle_x', and so no focal length")
     cx, cy = (_number(frame, content, key, where) for key in ("cx", "cy"))
     return (
         fx or fy or 0.0,
@@ -273,30 +271,18 @@ def _with_cube(scene: ParsedScene, content: dict[str, Any], file: Path, scene_sc
         return scene
     unit = number(content.get("scale", NGP_SCALE), "scale", str(file), positive=True)
     edge = number(content["aabb_scale"], "aabb_scale", str(file), positive=True) / unit
-    offset = content.get("offset", NGP_OFFSET)
-    if not isinstance(offset, (list, tuple)) or len(offset) != 3:
-        raise DataError(f"{file}: 'offset' is {shown(offset)}; it must be a list of three numbers")
-    center = torch.tensor([(0.5 - number(part, "offset", str(file))) / unit for part in offset])
+    offset = numbers(content.get("offset", NGP_OFFSET), 3, "offset", str(file))
+    center = (0.5 - torch.tensor(offset)) / unit
     center = scene.scale * (scene.transform[:, :3] @ center + scene.transform[:, 3])
     half = 0.5 * edge * scene.scale * scene_scale
     return replace(scene, box=torch.stack([center - half, center + half]))
 
 
 def _from_original(scene: ParsedScene, content: dict[str, Any], file: Path) -> ParsedScene:
-    """With a transform from what the file was made from, rather than from the file.
+    """With a transform from what the file was made from, rather than from the file, so that exports come out there.
 
-    The file's frame is `applied_scale * (applied_transform @ x)` of that, in which exports are to come out.
+    The file's frame is `applied_scale * (applied_transform @ x)` of that.
     """
-    if scene.transform is None:
-        return scene
-    transform, scale = scene.transform.double(), 1.0
-    if content.get("applied_scale") is not None:
-        scale = number(content["applied_scale"], "applied_scale", str(file), positive=True)
-    applied = torch.eye(4, dtype=torch.float64)
-    if content.get("applied_transform") is not None:
-        name = f"{file}: 'applied_transform'"
-        applied = rigid(content["applied_transform"], name, name)
-    # s (R (a A x) + t) = s a (R A x + t / a)
-    moved = transform[:, :3] @ applied[:3]
-    moved[:, 3] += transform[:, 3] / scale
-    return replace(scene, transform=moved.float(), scale=scene.scale * scale)
+    matrix, scale, name = content.get("applied_transform"), content.get("applied_scale"), f"{file}: 'applied_transform'"
+    applied = torch.eye(4, dtype=torch.float64) if matrix is None else rigid(matrix, name, name)
+    return from_original(scene, applied, 1.0 if scale is None else number(scale, "applied_scale", str(file), True))

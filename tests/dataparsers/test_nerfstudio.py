@@ -16,11 +16,14 @@ from dataparsers.nerfstudio import Nerfstudio
 from framework.dataset import Split, load_dataset
 from framework.errors import DataError
 from tests.dataparsers.captures import (
+    CX,
     CY,
     FX,
+    FY,
     HEIGHT,
     POINTS,
     WIDTH,
+    miss,
     poses,
     to_scene,
     worst_miss,
@@ -130,6 +133,46 @@ def test_lenses(capture: Path, name: str | None) -> None:
     assert cameras.lens is not None
     assert cameras.lens.shape == (9, len(expected))
     assert cameras.lens[5].tolist() == pytest.approx(expected)
+
+
+K1, K2, K3, K4, P1, P2 = 0.05, -0.02, 0.01, 0.004, 0.003, -0.002
+CURVED = {"k1": K1, "k2": K2, "k3": K3, "k4": K4, "p1": P1, "p2": P2}
+
+
+def seen_through(model: str, right: float, down: float, ahead: float) -> tuple[float, float]:
+    """Where on the image, in focal lengths from the principal point, a lens puts a point in front of the camera."""
+    if model == "OPENCV":
+        x, y = right / ahead, down / ahead
+        square = x * x + y * y
+        radial = 1 + K1 * square + K2 * square**2 + K3 * square**3 + K4 * square**4
+        return (
+            x * radial + 2 * P1 * x * y + P2 * (square + 2 * x * x),
+            y * radial + P1 * (square + 2 * y * y) + 2 * P2 * x * y,
+        )
+    if model == "OPENCV_FISHEYE":
+        off = math.hypot(right, down)
+        angle = math.atan2(off, ahead)
+        bent = angle * (1 + K1 * angle**2 + K2 * angle**4 + K3 * angle**6 + K4 * angle**8)
+        return bent * right / off, bent * down / off
+    if model == "EQUIRECTANGULAR":  # of which half the width of a whole panorama is nerfstudio's focal length
+        longitude = math.atan2(right, ahead)
+        return longitude / math.pi, math.asin(down / math.hypot(right, down, ahead)) / math.pi
+    return right, down
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE", "EQUIRECTANGULAR", "ORTHOPHOTO"])
+def test_rays_through_lenses_meet_the_points_that_are_seen(capture: Path, model: str) -> None:
+    pytest.importorskip("framework.lenses")
+    edit(capture, lambda c: c.update(camera_model=model, **CURVED))
+    scene = ALL.parse(capture, "train")
+    placed, worst = to_scene(scene, POINTS), 0.0
+    for camera, pose in enumerate(poses()):
+        for point, target in zip(POINTS, placed, strict=True):
+            right, up, back = pose[:3, :3].T @ (point - pose[:3, 3])
+            x, y = seen_through(model, right, -up, -back)
+            worst = max(worst, miss(scene.cameras, camera, CX + FX * x, CY + FY * y, target))
+    print(f"{model}: rays miss known points by {worst:.1e} of their distance")
+    assert worst < EXACT
 
 
 def test_a_lens_without_distortion_is_a_pinhole(capture: Path) -> None:

@@ -17,8 +17,12 @@ from framework.pixels import Batch
 from framework.rays import Rays
 from framework.renderers import Rendered
 from framework.samplers.occupancy import OccupancySampler
+from framework.samplers.proposal import ProposalSampler, interlevel_loss
 from framework.scene import Scene
 from framework.scene_profile import Decision
+
+PROPOSAL_ADAM = {"lr": 1e-2, "betas": (0.9, 0.99), "eps": 1e-15}
+"""Of proposals in any method."""
 
 ConfigT = TypeVar("ConfigT", bound=TrainConfig)
 
@@ -48,7 +52,7 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
         """Colour, depth and opacity of R rays over `background`, (R, 3) or (3,). R may be 0."""
 
     def loss(self, rendered: Rendered, batch: Batch, step: int) -> dict[str, Tensor]:
-        """Named scalars; their sum is minimised. The mean squared error of every level by default.
+        """Named scalars; their sum is minimised. By default the squared error of every level, and the proposals' loss.
 
         `rendered` and `batch.rgb` are of pixels. Of several rays a pixel there are as many `batch.rays`, and
         `rendered.samples` and `.weights` are the rays'.
@@ -56,6 +60,8 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
         losses = {"rgb": mean_squared_error(rendered.rgb, batch.rgb, batch.weights)}
         if rendered.coarse is not None:
             losses["rgb_coarse"] = mean_squared_error(rendered.coarse.rgb, batch.rgb, batch.weights)
+        if rendered.samples is not None and rendered.samples.proposals and rendered.weights is not None:
+            losses["interlevel"] = interlevel_loss(rendered.samples, rendered.weights)
         return losses
 
     def param_groups(self) -> list[dict[str, Any]]:
@@ -63,10 +69,17 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
 
         By default the tables of encodings that ask for it are a group that is updated sparsely.
         """
-        grids = self.sparse_grids
-        rest = [p for p in self.parameters() if not any(p is grid.table for grid in grids)]
-        groups: list[dict[str, Any]] = [{"params": rest, "name": "networks"}]
+        grids, groups = self.sparse_grids, self.proposal_groups()
+        apart = [grid.table for grid in grids] + [p for group in groups for p in group["params"]]
+        rest = [p for p in self.parameters() if not any(p is other for other in apart)]
+        groups.insert(0, {"params": rest, "name": "networks"})
         return groups + ([{"params": [g.table for g in grids], "name": "tables", "sparse": True}] if grids else [])
+
+    def proposal_groups(self) -> list[dict[str, Any]]:
+        """The group of the proposals' parameters, small hash grids whatever the method is; none without proposals."""
+        samplers = [module for module in self.modules() if isinstance(module, ProposalSampler)]
+        params = [p for sampler in samplers for p in sampler.parameters()]
+        return [{"params": params, "name": "proposals", **PROPOSAL_ADAM}] if params else []
 
     @cached_property
     def sparse_grids(self) -> list[HashGrid | FeaturePlanes]:

@@ -10,13 +10,13 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from framework import Decision, Field, Method, Model, Rays, Rendered, Scene, TrainConfig
+from framework import Decision, Field, Method, Model, Rays, Rendered, Scene
 from framework.encodings import HashGrid
 from framework.fields.deformed import DeformedField
 from framework.fields.encoded import EncodedField
 from framework.fields.nerf import NeRFField
 from framework.renderers import render_field
-from framework.samplers.occupancy import OccupancySampler
+from framework.samplers.choice import SamplingConfig, by_proposals, make_sampler, sampler_decisions
 from methods.vanilla_nerf import OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH, render_hierarchical
 
 HASH_SAMPLES_PER_BATCH = 2**14
@@ -24,7 +24,7 @@ HASH_SAMPLES_PER_BATCH = 2**14
 
 
 @dataclass(frozen=True)
-class DNeRFConfig(TrainConfig):
+class DNeRFConfig(SamplingConfig):
     """Settings of dnerf; networks, samples and learning rate are the paper's.
 
     Unlike there, photographs with alpha are composited over random colours in training: over white, a scene with much
@@ -40,8 +40,10 @@ class DNeRFConfig(TrainConfig):
     """d-nerf: a canonical field, deformed. t-nerf: one network of place and time."""
     canonical: Literal["network", "hash-grid"] = "network"
     """What d-nerf deforms: the paper's network, or a hash grid with small networks."""
-    sampler: Literal["hierarchical", "occupancy"] = "hierarchical"
-    """hierarchical: 64 coarse and 64 + 128 fine samples, two fields. occupancy: one field and an occupancy grid."""
+    sampler: Literal["auto", "hierarchical", "occupancy", "proposal"] = "auto"  # type: ignore[assignment]
+    """hierarchical: 64 coarse and 64 + 128 fine samples, two fields. occupancy: one field and an occupancy grid.
+    proposal: one field, and small density fields that say where to look, in all of space, contracted. auto:
+    hierarchical, or proposal where there may be something outside the box."""
     num_coarse_samples: int = 64
     """Stratified samples a ray for the coarse field."""
     num_fine_samples: int = 128
@@ -70,12 +72,8 @@ class DNeRFConfig(TrainConfig):
     """Adam updates only the entries of the hash grid that a step used."""
     grid_resolution: int = 64
     """Cells along an axis of the occupancy grid. A cell is occupied if it is at any time."""
-    num_steps: int = 192
+    num_steps: int | None = 192
     """Steps along the box's diagonal with the occupancy grid."""
-    early_stop: float = 1e-4
-    """Transmittance below which the rest of a ray is dropped, with the occupancy grid."""
-    train_early_stop: float = 1e-2
-    """The same while training."""
 
 
 class DNeRF(Model[DNeRFConfig]):
@@ -86,19 +84,19 @@ class DNeRF(Model[DNeRFConfig]):
     def __init__(self, config: DNeRFConfig, scene: Scene) -> None:
         super().__init__(config, scene)
         self.fine = self._field()
-        self.coarse = self._field() if config.sampler == "hierarchical" else None
-        self.sampler = (
-            OccupancySampler(
-                scene.box,
-                config.grid_resolution,
-                config.num_steps,
-                config.early_stop,
-                config.train_early_stop,
-                moving=scene.moving,
-            )
-            if config.sampler == "occupancy"
-            else None
-        )
+        self.coarse = self._field() if self.hierarchical else None
+        self.sampler = None if self.hierarchical else make_sampler(config, scene)
+
+    @property
+    def hierarchical(self) -> bool:
+        """Whether a coarse field says where the fine one is sampled."""
+        asked = self.config.sampler
+        return asked == "hierarchical" or (asked == "auto" and not self.scene.unbounded)
+
+    @property
+    def contracted_box(self) -> Tensor | None:
+        """Around which space is contracted, where it goes on outside."""
+        return self.scene.box if self.scene.unbounded and by_proposals(self.config, self.scene) else None
 
     def _field(self) -> Field:
         c, moving = self.config, self.scene.moving
@@ -107,7 +105,7 @@ class DNeRF(Model[DNeRFConfig]):
             return self._network(c.time_frequencies)
         if small:
             grid = HashGrid(max_resolution=c.max_resolution, log2_table_size=c.log2_table_size, sparse=c.sparse_updates)
-            canonical: Field = EncodedField(self.scene.box, grid)
+            canonical: Field = EncodedField(self.scene.box, grid, unbounded=self.contracted_box is not None)
         else:
             canonical = self._network(None)
         if not moving:
@@ -125,12 +123,13 @@ class DNeRF(Model[DNeRFConfig]):
         c = self.config
         skip = c.num_layers // 2 + 1
         frequencies = c.position_frequencies, c.direction_frequencies
-        return NeRFField(c.hidden_width, c.num_layers, skip, *frequencies, time_frequencies)
+        return NeRFField(c.hidden_width, c.num_layers, skip, *frequencies, time_frequencies, self.contracted_box)
 
     def decisions(self) -> list[Decision]:
-        if self.scene.moving:
-            return []
-        return [Decision("deformation", "left out", "the photographs have no times")]
+        found = [] if self.hierarchical else sampler_decisions(self.config, self.scene)
+        if not self.scene.moving:
+            found.append(Decision("deformation", "left out", "the photographs have no times"))
+        return found
 
     def render(self, rays: Rays, background: Tensor) -> Rendered:
         if self.sampler is not None:
@@ -143,8 +142,10 @@ class DNeRF(Model[DNeRFConfig]):
         config = self.config
         faster = OCCUPANCY_RATE if self.sampler is not None else 1.0
         encoded = [module for module in self.modules() if isinstance(module, EncodedField)]
-        of_grids = {id(p) for module in encoded for p in module.parameters()}
-        rest = [p for p in self.parameters() if id(p) not in of_grids]
+        proposals = self.proposal_groups()
+        apart = {id(p) for module in encoded for p in module.parameters()}
+        apart |= {id(p) for group in proposals for p in group["params"]}
+        rest = [p for p in self.parameters() if id(p) not in apart]
         groups: list[dict[str, Any]] = [{"params": rest, "lr": config.learning_rate * faster, "name": "networks"}]
         if encoded:
             tables = [module.encoding.table for module in encoded]
@@ -152,7 +153,7 @@ class DNeRF(Model[DNeRFConfig]):
             faithful = {"lr": config.grid_learning_rate, "betas": (0.9, 0.95), "eps": 1e-15}
             groups += [{"params": heads, "name": "heads", **faithful}]
             groups += [{"params": tables, "name": "tables", "sparse": config.sparse_updates, **faithful}]
-        return [group for group in groups if group["params"]]
+        return [group for group in groups if group["params"]] + proposals
 
     @property
     def samples_per_batch(self) -> int | None:

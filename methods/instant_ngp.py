@@ -11,12 +11,12 @@ from typing import Literal
 
 from torch import Tensor
 
-from framework import Decision, Method, Model, Rays, Rendered, Scene, TrainConfig
+from framework import Decision, Method, Model, Rays, Rendered, Scene
 from framework.config import RaysPerPixel
 from framework.encodings import HashGrid
 from framework.fields.encoded import EncodedField
 from framework.renderers import render_field
-from framework.samplers.occupancy import OccupancySampler
+from framework.samplers.choice import SamplingConfig, by_proposals, make_sampler, sampler_decisions
 
 PLANS = (
     (60.0, 16, 512, 2**15, 1),
@@ -32,7 +32,7 @@ SPARSE_FROM = 17
 
 
 @dataclass(frozen=True)
-class InstantNGPConfig(TrainConfig):
+class InstantNGPConfig(SamplingConfig):
     """Settings of instant-ngp."""
 
     max_num_iterations: int = 20_000
@@ -64,14 +64,8 @@ class InstantNGPConfig(TrainConfig):
     """Features of a layer of the two networks."""
     view_dependence: bool = True
     """Colours depend on where they are seen from. False saves a few per cent of the time, and most scenes need it."""
-    grid_resolution: int = 128
-    """Cells along an axis of the occupancy grid."""
     num_steps: int | None = None
     """Steps along the box's diagonal. If not given: what suits the time."""
-    early_stop: float = 1e-4
-    """Transmittance below which the rest of a ray is dropped: the largest error of a colour channel."""
-    train_early_stop: float = 1e-2
-    """The same while training, where less exact colours teach as well."""
 
     def resolved(self) -> InstantNGPConfig:
         seconds = math.inf if self.max_seconds is None else self.max_seconds
@@ -94,7 +88,6 @@ class InstantNGP(Model[InstantNGPConfig]):
     def __init__(self, config: InstantNGPConfig, scene: Scene) -> None:
         super().__init__(config, scene)
         assert config.log2_table_size is not None
-        assert config.num_steps is not None
         assert config.detail is not None
         finest = config.max_resolution or 2 ** (config.detail * scene.image_size - 1).bit_length()
         grid = HashGrid(
@@ -106,23 +99,22 @@ class InstantNGP(Model[InstantNGPConfig]):
             bool(config.sparse_updates),
         )
         self.field = EncodedField(
-            scene.box, grid, config.hidden_width, direction_levels=4 if config.view_dependence else 0
-        )
-        self.sampler = OccupancySampler(
             scene.box,
-            config.grid_resolution,
-            config.num_steps,
-            config.early_stop,
-            config.train_early_stop,
-            moving=scene.moving,
+            grid,
+            config.hidden_width,
+            direction_levels=4 if config.view_dependence else 0,
+            unbounded=scene.unbounded and by_proposals(config, scene),
         )
+        self.sampler = make_sampler(config, scene)
 
     def decisions(self) -> list[Decision]:
+        found = sampler_decisions(self.config, self.scene)
         if self.config.max_resolution is not None:
-            return []
+            return found
         size, detail = self.scene.image_size, self.config.detail
         reason = f"each of the images' {size} pixels gets {detail} or more"
-        return [Decision("finest cells along an axis", f"{self.field.encoding.layout.resolutions[-1]}", reason)]
+        finest = self.field.encoding.layout.resolutions[-1]
+        return [*found, Decision("finest cells along an axis", f"{finest}", reason)]
 
     def render(self, rays: Rays, background: Tensor) -> Rendered:
         return render_field(self.field, self.sampler, rays, background, self.training)

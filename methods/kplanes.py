@@ -11,7 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from framework import Batch, ConfigError, Decision, Method, Model, Rays, Rendered, Scene, TrainConfig
+from framework import Batch, ConfigError, Decision, Method, Model, Rays, Rendered, Scene
 from framework.encodings import FeaturePlanes
 from framework.fields.base import MLP
 from framework.fields.encoded import BoxField, EncodedField
@@ -19,13 +19,13 @@ from framework.kernels.math import truncated_exp
 from framework.kernels.planes import plane_band
 from framework.kernels.spherical_harmonics import spherical_harmonics
 from framework.renderers import render_field
-from framework.samplers.occupancy import OccupancySampler
+from framework.samplers.choice import SamplingConfig, by_proposals, make_sampler, sampler_decisions
 
 MAX_SCALES = 4
 
 
 @dataclass(frozen=True)
-class KPlanesConfig(TrainConfig):
+class KPlanesConfig(SamplingConfig):
     """Settings of kplanes."""
 
     max_num_iterations: int = 30_000
@@ -55,14 +55,6 @@ class KPlanesConfig(TrainConfig):
     """Weight of what keeps the planes of time at one, where nothing moves."""
     sparse_updates: bool = True
     """Adam updates only the entries that a step used."""
-    grid_resolution: int = 128
-    """Cells along an axis of the occupancy grid."""
-    num_steps: int = 512
-    """Steps along the box's diagonal."""
-    early_stop: float = 1e-4
-    """Transmittance below which the rest of a ray is dropped: the largest error of a colour channel."""
-    train_early_stop: float = 1e-2
-    """The same while training."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -79,10 +71,11 @@ class ExplicitField(BoxField):
         box: (2, 3) the part of space that is encoded.
         planes: the encoding.
         width: features of the basis network's hidden layers.
+        unbounded: encode all of space, contracted.
     """
 
-    def __init__(self, box: Tensor, planes: FeaturePlanes, width: int) -> None:
-        super().__init__(box, planes)
+    def __init__(self, box: Tensor, planes: FeaturePlanes, width: int, unbounded: bool = False) -> None:
+        super().__init__(box, planes, unbounded)
         self.density_head = torch.nn.Linear(planes.num_features, 1, bias=False)
         self.basis = MLP(16, width, width, 3 * planes.num_features)
 
@@ -117,15 +110,9 @@ class KPlanes(Model[KPlanesConfig]):
         resolutions = tuple((config.base_resolution << s,) * 3 + time for s in range(self.num_scales))
         planes = FeaturePlanes(resolutions, config.features_per_scale, sparse=config.sparse_updates)
         kind = EncodedField if config.decoder == "hybrid" else ExplicitField
-        self.field = kind(scene.box, planes, config.hidden_width)
-        self.sampler = OccupancySampler(
-            scene.box,
-            config.grid_resolution,
-            config.num_steps,
-            config.early_stop,
-            config.train_early_stop,
-            moving=scene.moving,
-        )
+        unbounded = scene.unbounded and by_proposals(config, scene)
+        self.field = kind(scene.box, planes, config.hidden_width, unbounded=unbounded)
+        self.sampler = make_sampler(config, scene)
 
     @property
     def num_scales(self) -> int:
@@ -138,7 +125,7 @@ class KPlanes(Model[KPlanesConfig]):
         return scales
 
     def decisions(self) -> list[Decision]:
-        found = []
+        found = sampler_decisions(self.config, self.scene)
         if not self.scene.moving:
             found.append(Decision("planes of time", "left out", "the photographs have no times"))
         if self.config.num_scales is None:

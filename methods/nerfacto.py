@@ -20,7 +20,7 @@ from framework.kernels.math import scale_gradient
 from framework.pose_refinement import PoseRefinement
 from framework.rays import Samples
 from framework.renderers import volume_render
-from framework.samplers.proposal import ProposalSampler, interlevel_loss
+from framework.samplers.proposal import ProposalSampler
 
 APPEARANCE_SIZE = 16
 DISTORTION = 2e-3
@@ -165,8 +165,8 @@ class Nerfacto(Model[NerfactoConfig]):
         assert samples is not None
         assert samples.edges is not None
         assert weights is not None
-        if samples.proposals:
-            losses["interlevel"] = self.config.interlevel_loss_mult * interlevel_loss(samples, weights)
+        if "interlevel" in losses:
+            losses["interlevel"] = self.config.interlevel_loss_mult * losses["interlevel"]
         if self.distortion_mult > 0 and samples.num_rays:
             normalised = Samples.regular(samples.edges[:, :-1], samples.edges[:, 1:])
             losses["distortion"] = self.distortion_mult * distortion(weights, normalised).mean()

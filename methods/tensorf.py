@@ -13,11 +13,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from framework import Batch, Field, Method, Model, Rays, Rendered, Scene, TrainConfig
+from framework import Batch, Decision, Field, Method, Model, Rays, Rendered, Scene
+from framework.bounds import to_unit_box
 from framework.encodings import FeaturePlanes
 from framework.fields.base import MLP
+from framework.kernels.contraction import contract_to_unit
 from framework.kernels.spherical_harmonics import spherical_harmonics
 from framework.renderers import render_field
+from framework.samplers.choice import SamplingConfig, by_proposals, make_sampler, sampler_decisions
 from framework.samplers.occupancy import OccupancySampler
 
 VM = (((0, 1), (2,)), ((0, 2), (1,)), ((1, 2), (0,)))
@@ -27,13 +30,13 @@ CP = (((0,), (1,), (2,)),)
 DENSITY_SHIFT, DENSITY_SCALE = -10.0, 25.0
 """Density is DENSITY_SCALE * softplus(sum of components + DENSITY_SHIFT): empty at first (section 4.4 and its code)."""
 BLIND_STEPS = 128
-"""The field is empty at first: until it has learnt something, its density says nothing of what cells to skip."""
+"""The field is empty at first: until it has learnt something, it does not say what cells to skip."""
 MARGIN = 1
 """Cells of the occupancy grid kept around what is occupied when the box shrinks."""
 
 
 @dataclass(frozen=True)
-class TensoRFConfig(TrainConfig):
+class TensoRFConfig(SamplingConfig):
     """Settings of tensorf."""
 
     max_num_iterations: int = 30_000
@@ -64,14 +67,6 @@ class TensoRFConfig(TrainConfig):
     """Features of a layer of the colour network."""
     sparse_updates: bool = True
     """Adam updates only the entries that a step used."""
-    grid_resolution: int = 128
-    """Cells along an axis of the occupancy grid."""
-    num_steps: int = 512
-    """Steps along the box's diagonal."""
-    early_stop: float = 1e-4
-    """Transmittance below which the rest of a ray is dropped: the largest error of a colour channel."""
-    train_early_stop: float = 1e-2
-    """The same while training."""
 
     def resolved(self) -> TensoRFConfig:
         density, appearance, side = (16, 48, 300) if self.decomposition == "vm" else (96, 288, 500)
@@ -91,14 +86,22 @@ class TensorField(Field):
         density, appearance: the factors.
         width: features of the colour network's hidden layers.
         num_features: of which the basis makes the appearance (27 in the paper).
+        unbounded: the factors stand in all of space, contracted.
     """
 
     box: Tensor
 
     def __init__(
-        self, box: Tensor, density: FeaturePlanes, appearance: FeaturePlanes, width: int, num_features: int = 27
+        self,
+        box: Tensor,
+        density: FeaturePlanes,
+        appearance: FeaturePlanes,
+        width: int,
+        num_features: int = 27,
+        unbounded: bool = False,
     ) -> None:
         super().__init__()
+        self.unbounded = unbounded
         self.register_buffer("box", box.clone())
         self.density_factors, self.appearance_factors = density, appearance
         self.basis = torch.nn.Linear(appearance.num_features, num_features, bias=False)
@@ -126,7 +129,7 @@ class TensorField(Field):
         return softplus(components.float().sum(-1) + DENSITY_SHIFT) * DENSITY_SCALE * inside
 
     def _unit(self, positions: Tensor) -> Tensor:
-        return (positions - self.box[0]) / (self.box[1] - self.box[0])
+        return contract_to_unit(positions, self.box) if self.unbounded else to_unit_box(positions, self.box)
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         appearance = self.basis(self.appearance_factors(features))
@@ -149,13 +152,12 @@ class TensoRF(Model[TensoRFConfig]):
             FeaturePlanes(vertices, components, axes, config.sparse_updates, resizable=True)
             for components in (config.density_components, config.appearance_components)
         )
-        self.field = TensorField(scene.box, density, appearance, config.hidden_width)
+        unbounded = scene.unbounded and by_proposals(config, scene)
+        self.field = TensorField(scene.box, density, appearance, config.hidden_width, unbounded=unbounded)
         with torch.no_grad():  # of CP's triple products the factors are larger, as in the authors' code
             for factors in (density, appearance):
                 factors.table.normal_(0, 0.1 if config.decomposition == "vm" else 0.2)
-        self.sampler = OccupancySampler(
-            scene.box, config.grid_resolution, config.num_steps, config.early_stop, config.train_early_stop
-        )
+        self.sampler = make_sampler(config, scene)
         self.register_buffer("growths", torch.zeros((), dtype=torch.int64))
 
     @staticmethod
@@ -170,14 +172,18 @@ class TensoRF(Model[TensoRFConfig]):
 
     def param_groups(self) -> list[dict[str, Any]]:
         tables = [self.field.density_factors.table, self.field.appearance_factors.table]
-        networks = [p for p in self.parameters() if not any(p is table for table in tables)]
+        networks = [*self.field.basis.parameters(), *self.field.color_head.parameters()]
         return [
+            *self.proposal_groups(),
             {"params": networks, "lr": self.config.network_learning_rate, "name": "networks"},
             {"params": tables, "name": "tables", "sparse": self.config.sparse_updates},
         ]
 
+    def decisions(self) -> list[Decision]:
+        return sampler_decisions(self.config, self.scene)
+
     def before_step(self, step: int, progress: float) -> None:
-        if step >= BLIND_STEPS:
+        if step >= BLIND_STEPS or not isinstance(self.sampler, OccupancySampler):
             self.sampler.update(step, self.field.density)
         due = sum(progress >= share for share in self.config.upsample_at)
         if due > int(self.growths):
@@ -198,7 +204,10 @@ class TensoRF(Model[TensoRFConfig]):
 
     def _occupied_box(self) -> Tensor:
         """(2, 3) corners of what holds all occupied cells and a margin; the field's box where none is."""
-        sampler, n = self.sampler, self.sampler.resolution
+        sampler = self.sampler
+        if not isinstance(sampler, OccupancySampler):
+            return self.field.box.clone()
+        n = sampler.resolution
         cells = sampler.occupied.nonzero().squeeze(-1)
         if len(cells) == 0:
             return self.field.box.clone()

@@ -13,11 +13,11 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from framework import Field, Method, Model, Rays, Rendered, Scene, TrainConfig
+from framework import Decision, Field, Method, Model, Rays, Rendered, Scene
 from framework.fields.nerf import NeRFField
 from framework.renderers import render_field, shade
+from framework.samplers.choice import SamplingConfig, by_proposals, make_sampler, sampler_decisions
 from framework.samplers.inverse_cdf import inverse_cdf, uniform_variates
-from framework.samplers.occupancy import OccupancySampler
 from framework.samplers.uniform import samples_from_points, stratified_points
 
 OCCUPANCY_SAMPLES_PER_BATCH = 2**12
@@ -28,7 +28,7 @@ reached 22.5 dB on Lego after 90 s on two cores, where 2^13 samples, 512 steps a
 
 
 @dataclass(frozen=True)
-class VanillaNeRFConfig(TrainConfig):
+class VanillaNeRFConfig(SamplingConfig):
     """Settings of vanilla-nerf; the defaults are the paper's."""
 
     max_num_iterations: int = 200_000
@@ -37,8 +37,10 @@ class VanillaNeRFConfig(TrainConfig):
     lr_final: float = 0.1
     adam_eps: float = 1e-7
     background: Literal["auto", "random", "white", "black"] = "white"
-    sampler: Literal["hierarchical", "occupancy"] = "hierarchical"
-    """hierarchical: 64 coarse and 64 + 128 fine samples, two networks. occupancy: one network and an occupancy grid."""
+    sampler: Literal["auto", "hierarchical", "occupancy", "proposal"] = "auto"  # type: ignore[assignment]
+    """hierarchical: 64 coarse and 64 + 128 fine samples, two networks. occupancy: one network and an occupancy grid.
+    proposal: one network, and small density fields that say where to look, in all of space, contracted. auto:
+    hierarchical, or proposal where there may be something outside the box."""
     num_coarse_samples: int = 64
     """Stratified samples a ray for the coarse network."""
     num_fine_samples: int = 128
@@ -51,14 +53,8 @@ class VanillaNeRFConfig(TrainConfig):
     """L of the position's encoding."""
     direction_frequencies: int = 4
     """L of the direction's encoding."""
-    grid_resolution: int = 128
-    """Cells along an axis of the occupancy grid."""
-    num_steps: int = 192
+    num_steps: int | None = 192
     """Steps along the box's diagonal with the occupancy grid."""
-    early_stop: float = 1e-4
-    """Transmittance below which the rest of a ray is dropped, with the occupancy grid."""
-    train_early_stop: float = 1e-2
-    """The same while training."""
 
 
 class VanillaNeRF(Model[VanillaNeRFConfig]):
@@ -67,19 +63,19 @@ class VanillaNeRF(Model[VanillaNeRFConfig]):
     def __init__(self, config: VanillaNeRFConfig, scene: Scene) -> None:
         super().__init__(config, scene)
         self.fine = self._field()
-        self.coarse = self._field() if config.sampler == "hierarchical" else None
-        self.sampler = (
-            OccupancySampler(
-                scene.box,
-                config.grid_resolution,
-                config.num_steps,
-                config.early_stop,
-                config.train_early_stop,
-                moving=scene.moving,
-            )
-            if config.sampler == "occupancy"
-            else None
-        )
+        self.coarse = self._field() if self.hierarchical else None
+        self.sampler = None if self.hierarchical else make_sampler(config, scene)
+
+    @property
+    def hierarchical(self) -> bool:
+        """Whether a coarse field says where the fine one is sampled."""
+        asked = self.config.sampler
+        return asked == "hierarchical" or (asked == "auto" and not self.scene.unbounded)
+
+    @property
+    def contracted_box(self) -> Tensor | None:
+        """Around which space is contracted, where it goes on outside."""
+        return self.scene.box if self.scene.unbounded and by_proposals(self.config, self.scene) else None
 
     def _field(self) -> NeRFField:
         c = self.config
@@ -89,7 +85,11 @@ class VanillaNeRF(Model[VanillaNeRFConfig]):
             skip=c.num_layers // 2 + 1,
             position_frequencies=c.position_frequencies,
             direction_frequencies=c.direction_frequencies,
+            contracted=self.contracted_box,
         )
+
+    def decisions(self) -> list[Decision]:
+        return [] if self.hierarchical else sampler_decisions(self.config, self.scene)
 
     def render(self, rays: Rays, background: Tensor) -> Rendered:
         if self.sampler is not None:
@@ -100,11 +100,15 @@ class VanillaNeRF(Model[VanillaNeRFConfig]):
 
     def param_groups(self) -> list[dict[str, Any]]:
         faster = OCCUPANCY_RATE if self.sampler is not None else 1.0
-        return [{"params": list(self.parameters()), "lr": self.config.learning_rate * faster}]
+        fields = [p for field in (self.fine, self.coarse) if field is not None for p in field.parameters()]
+        return [
+            {"params": fields, "lr": self.config.learning_rate * faster, "name": "networks"},
+            *self.proposal_groups(),
+        ]
 
     @property
     def samples_per_batch(self) -> int | None:
-        if self.config.sampler == "occupancy" and self.config.samples_per_batch is None:
+        if self.sampler is not None and self.config.samples_per_batch is None:
             return OCCUPANCY_SAMPLES_PER_BATCH
         return self.config.samples_per_batch
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from framework.fields.base import MLP, Field
+from framework.kernels.contraction import contract_to_unit
 from framework.kernels.frequency import frequency_encoding
 
 
@@ -18,7 +19,11 @@ class NeRFField(Field):
         position_frequencies, direction_frequencies: L of the two encodings (10 and 4 in the paper).
         time_frequencies: L of the time's encoding, which stands beside the position's: T-NeRF (Pumarola et al. 2021,
             section 4); None for a field that does not change with time.
+        contracted: (2, 3) the box around which all of space is contracted into [-1, 1]^3, so that frequencies fit;
+            None to take positions as they are.
     """
+
+    contracted: Tensor | None
 
     def __init__(
         self,
@@ -28,8 +33,10 @@ class NeRFField(Field):
         position_frequencies: int = 10,
         direction_frequencies: int = 4,
         time_frequencies: int | None = None,
+        contracted: Tensor | None = None,
     ) -> None:
         super().__init__()
+        self.register_buffer("contracted", None if contracted is None else contracted.clone())
         self.position_frequencies = position_frequencies
         self.direction_frequencies = direction_frequencies
         self.time_frequencies = time_frequencies
@@ -55,6 +62,8 @@ class NeRFField(Field):
                     nn.init.constant_(layer.bias, 0.1)
 
     def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        if self.contracted is not None:
+            positions = 2 * contract_to_unit(positions, self.contracted) - 1
         encoded: tuple[Tensor, ...] = (frequency_encoding(positions, self.position_frequencies),)
         if self.time_frequencies is not None:
             encoded += (encoded_times(times, self.time_frequencies),)

@@ -61,7 +61,13 @@ def test_without_alpha_the_background_is_black_and_no_silhouette_used(shared_tin
 
 def test_what_the_user_decided_is_not_called_a_decision(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer(
-        "instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=1, background="white", silhouette_cells=False
+        "instant-ngp",
+        shared_tiny,
+        tmp_path / "run",
+        max_num_iterations=1,
+        background="white",
+        silhouette_cells=False,
+        sampler="occupancy",
     )
     assert decisions(trainer) == {}
 

@@ -250,11 +250,14 @@ def join_cameras(parts: Sequence[Cameras]) -> Cameras:
 
     Raises: DataError where the models cannot be one.
     """
-    models = sorted({part.model for part in parts})
-    model = "opencv" if models == ["opencv", "pinhole"] else models[0]
-    if len(models) > 1 and model != "opencv":
+    models = {part.model for part in parts}
+    if models == {"opencv", "pinhole"}:
+        model = "opencv"
+    elif len(models) == 1:
+        model = parts[0].model
+    else:
         raise DataError(
-            f"the cameras are of different models ({', '.join(models)}), which one scene cannot mix; "
+            f"the cameras are of different models ({', '.join(sorted(models))}), which one scene cannot mix; "
             "convert the images to one model, for example with 'colmap image_undistorter'"
         )
     joined: dict[str, Any] = {

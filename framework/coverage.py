@@ -9,6 +9,7 @@ from torch import Tensor
 
 from framework.cameras import Cameras
 from framework.console import say
+from framework.errors import DataError
 
 BLOCK = 1 << 20
 """Pixels looked at together."""
@@ -20,16 +21,19 @@ SURE = 0.99
 def unreachable_pixels(cameras: Cameras) -> Tensor:
     """(K,) int64 pixels, counted through all images, whose centre no ray leads to. Their rays are finite, but wrong.
 
-    Only places are tried that a lens is not sure to have a ray for: mostly none.
+    Only places are tried that a lens is not sure to have a ray for, mostly none; and cameras that are alike, once.
     """
     none = torch.zeros(0, dtype=torch.int64, device=cameras.fx.device)
     if cameras.model in ("pinhole", "orthographic"):
         return none
     lost = [none]
-    for index in range(len(cameras)):
-        if _doubtful(cameras, index):
-            for pixels in cameras.image_pixels(index).split(BLOCK):
-                lost.append(pixels[~_reached(cameras, index, pixels)])
+    known: dict[tuple[float, ...], Tensor] = {}
+    for index, kind in enumerate(_kinds(cameras)):
+        if kind not in known:
+            parts = cameras.image_pixels(index).split(BLOCK) if _doubtful(cameras, index) else ()
+            found = [pixels[~_reached(cameras, index, pixels)] for pixels in parts]
+            known[kind] = torch.cat([none, *found]) - cameras.offsets[index]
+        lost.append(known[kind] + cameras.offsets[index])
     return torch.cat(lost)
 
 
@@ -39,11 +43,17 @@ def pixels_with_rays(cameras: Cameras, names: Sequence[str], split: str) -> Tens
     Args:
         names: the cameras' photographs.
         split: what to call them together.
+    Raises: DataError where no pixel is left.
     """
     lost = unreachable_pixels(cameras)
     if not len(lost):
         return None
     total = int(cameras.offsets[-1])
+    if len(lost) == total:
+        raise DataError(
+            f"split '{split}': the {cameras.model} lens has no ray for any pixel; its focal lengths, principal point "
+            "or distortion coefficients are wrong"
+        )
     counts = torch.bincount(torch.searchsorted(cameras.offsets, lost, right=True) - 1, minlength=len(cameras))
     worst = int(counts.argmax())
     say(
@@ -54,6 +64,13 @@ def pixels_with_rays(cameras: Cameras, names: Sequence[str], split: str) -> Tens
     reached = torch.ones(total, dtype=torch.bool, device=lost.device)
     reached[lost] = False
     return reached.nonzero().squeeze(-1)
+
+
+def _kinds(cameras: Cameras) -> list[tuple[float, ...]]:
+    """Of each camera all that tells which of its pixels have a ray."""
+    numbers = [cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.widths, cameras.heights]
+    lens = [] if cameras.lens is None else list(cameras.lens.unbind(-1))
+    return list(zip(*(values.tolist() for values in numbers + lens), strict=True))
 
 
 def _doubtful(cameras: Cameras, index: int) -> bool:
@@ -71,11 +88,12 @@ def _reached(cameras: Cameras, index: int, pixels: Tensor) -> Tensor:
     """(P,) bool: whether rays lead to pixels of a camera."""
     within, width = pixels - cameras.offsets[index], cameras.widths[index]
     columns, rows = within % width, within // width
-    reached = torch.ones_like(pixels, dtype=torch.bool)
-    doubtful = reached
-    if cameras.distortion is not None:
-        x = (columns + 0.5 - cameras.cx[index]) / cameras.fx[index]
-        y = (rows + 0.5 - cameras.cy[index]) / cameras.fy[index]
-        doubtful = torch.hypot(x, y) >= SURE * cameras.distortion.bounds[index, 0]
+    if cameras.distortion is None:
+        return cameras.look(torch.full_like(pixels, index), columns, rows)[2].found
+    x = (columns + 0.5 - cameras.cx[index]) / cameras.fx[index]
+    y = (rows + 0.5 - cameras.cy[index]) / cameras.fy[index]
+    distance, (inner, outer) = torch.hypot(x, y), cameras.distortion.bounds[index]
+    reached = distance < SURE * inner
+    doubtful = ~reached & (distance <= outer)
     found = cameras.look(torch.full_like(pixels, index)[doubtful], columns[doubtful], rows[doubtful])[2].found
     return reached.masked_scatter(doubtful, found)

@@ -63,7 +63,7 @@ class Seen(NamedTuple):
 
 @dataclass(frozen=True)
 class Distortion:
-    """The bending of M lenses, in float64 where the device has it: a float32 would be off by hundredths of a pixel."""
+    """The bending of M lenses, in float64 where the device has it: undoing it then adds nothing to a ray's rounding."""
 
     coefficients: Tensor
     """(M, 9) as `LENSES["opencv"]` names them, whichever the model."""

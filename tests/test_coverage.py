@@ -1,10 +1,13 @@
 """Pixels without a ray, against brute force."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from framework.cameras import Cameras, join_cameras
 from framework.coverage import pixels_with_rays, unreachable_pixels
+from framework.errors import DataError
 from tests.test_lenses import ALL, FISHEYE, GOPRO, HEIGHT, WIDTH, cameras
 
 BARREL = [-0.5] + [0.0] * 8
@@ -67,3 +70,9 @@ def test_the_user_is_told_where(capsys: pytest.CaptureFixture[str]) -> None:
 def test_nothing_is_said_where_all_is_well(capsys: pytest.CaptureFixture[str]) -> None:
     assert pixels_with_rays(cameras("fisheye", FISHEYE), ("a.png", "b.png"), "train") is None
     assert "".join(capsys.readouterr()) == ""
+
+
+def test_a_lens_that_sees_nothing_is_refused() -> None:
+    camera = cameras("opencv", BARREL)
+    with pytest.raises(DataError, match="no ray for any pixel"):
+        pixels_with_rays(replace(camera, cx=camera.cx + 1000), ("a.png", "b.png"), "train")

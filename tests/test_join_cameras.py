@@ -37,6 +37,9 @@ def test_fisheyes_with_and_without_coefficients() -> None:
     torch.testing.assert_close(joined.lens, torch.tensor([[0.0] * 4] * 2 + [FISHEYE] * 2))
 
 
-def test_other_mixtures_are_refused_by_name() -> None:
-    with pytest.raises(DataError, match=r"different models \(fisheye, opencv, pinhole\).*colmap image_undistorter"):
-        join_cameras([cameras("pinhole"), cameras("fisheye"), cameras("opencv")])
+@pytest.mark.parametrize(
+    "models", [("fisheye", "opencv", "pinhole"), ("opencv", "orthographic"), ("equirectangular", "pinhole")]
+)
+def test_other_mixtures_are_refused_by_name(models: tuple[str, ...]) -> None:
+    with pytest.raises(DataError, match=rf"different models \({', '.join(models)}\).*colmap image_undistorter"):
+        join_cameras([cameras(model) for model in reversed(models)])

@@ -254,6 +254,19 @@ def test_compiled_rays_are_those_of_torch(model: str, lens: list[float] | None, 
             torch.testing.assert_close(getattr(one, name), value, rtol=2e-5, atol=2e-6)
 
 
+@needs_kernels
+def test_compiled_rays_of_any_lens() -> None:
+    """400 lenses, most of which fold the picture over somewhere."""
+    coefficients = lenses(400).float()
+    camera = replace(cameras("opencv", count=400).scaled(1 / 8), lens=coefficients)
+    flat = torch.arange(int(camera.offsets[-1]))
+    one, two = camera.pixel_rays(flat, 0, 1), camera.pixel_rays_reference(flat, 0, 1)
+    assert one.pixel_radii is not None
+    assert one.pixel_radii.isfinite().all()
+    torch.testing.assert_close(one.directions, two.directions, rtol=0, atol=1e-6)
+    torch.testing.assert_close(one.pixel_radii, two.pixel_radii, rtol=1e-3, atol=0)
+
+
 @pytest.mark.parametrize(("model", "lens"), ALL)
 def test_cones_are_as_wide_as_pixels(model: str, lens: list[float] | None) -> None:
     """The radius, squared, against the cross product of the differences to the neighbours' rays."""

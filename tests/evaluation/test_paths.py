@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from framework.cameras import Cameras, check_pose
-from framework.evaluation.paths import look_at, orbit
+from framework.evaluation.paths import look_at, orbit, replace_poses
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 
@@ -38,3 +38,14 @@ def test_orbit_keeps_height_and_distance_and_looks_at_the_centre() -> None:
     torch.testing.assert_close(torch.linalg.cross(ahead, centers), torch.zeros(8, 3), atol=1e-5, rtol=0)
     for pose in path.camera_to_worlds:
         check_pose(pose, "orbit")
+
+
+def test_other_poses_keep_the_lens() -> None:
+    ones, lens = torch.ones(2), torch.tensor([[0.1, 0.2, 0.3, 0.4], [0, 0, 0, 0]])
+    cameras = Cameras(
+        torch.eye(4)[:3].repeat(2, 1, 1), ones, ones, ones, ones, ones.long(), ones.long(), "fisheye", lens
+    )
+    path = replace_poses(cameras, torch.eye(4)[:3].repeat(5, 1, 1))
+    assert path.model == "fisheye"
+    assert path.lens is not None
+    torch.testing.assert_close(path.lens, lens[:1].repeat(5, 1))

@@ -11,13 +11,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dataparsers.reading import file_name, read_json, read_pose, read_times
 from framework import Cameras, DataError, DataParser, ParsedScene
-from framework.cameras import check_pose
 from framework.dataset import Split, existing, image_size
 
 TRANSFORMS = "transforms_train.json"
-LONGEST_NAME = 250
-"""Characters of a file's or folder's name; most systems allow 255 bytes."""
 SMALLEST_ANGLE = 1e-6
 """Radians. Below, the focal length grows beyond what float32 can tell from infinity."""
 
@@ -63,7 +61,7 @@ class Blender(DataParser):
             box=torch.tensor([[-1.0], [1.0]]).expand(2, 3) * self.half_size * self.scale_factor,
             near=self.near * self.scale_factor,
             far=self.far * self.scale_factor,
-            times=_times(frames, where),
+            times=read_times(frames, where),
             scale=self.scale_factor,
             downscale_factor=self.downscale_factor,
         )
@@ -84,35 +82,6 @@ class Blender(DataParser):
         )
 
 
-def read_json(file: Path) -> dict[str, Any]:
-    """A JSON file that holds an object.
-
-    Raises: DataError where it is missing, not JSON, or something else.
-    """
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DataError(f"cannot read {file}: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{file} is not JSON: {error}") from error
-    if not isinstance(content, dict):
-        raise DataError(f"{file} must hold a JSON object with 'frames'")
-    return content
-
-
-def read_pose(frame: Any, where: str) -> Tensor:
-    """The frame's (4, 4) camera-to-world matrix, checked.
-
-    Raises: DataError where it is absent, of another shape, not finite or not rigid.
-    """
-    try:
-        pose = torch.tensor(frame["transform_matrix"], dtype=torch.float32)
-    except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise DataError(f"{where}: 'transform_matrix' is not a 4x4 matrix of numbers") from error
-    check_pose(pose, where)
-    return pose if pose.shape[0] == 4 else torch.cat([pose, torch.tensor([[0.0, 0.0, 0.0, 1.0]])])
-
-
 def has_times(file: Path) -> bool:
     """Whether the first frame of a transforms file has a time. Never raises."""
     try:
@@ -124,12 +93,7 @@ def has_times(file: Path) -> bool:
 
 def _image_path(folder: Path, frame: Any, where: str) -> Path:
     """Blender writes paths without an ending."""
-    name = frame.get("file_path") if isinstance(frame, dict) else None
-    if not isinstance(name, str) or not name:
-        raise DataError(f"{where}: 'file_path' is missing")
-    path = folder / name
-    if not path.name or "\0" in name or max(len(part) for part in path.parts) > LONGEST_NAME:
-        raise DataError(f"{where}: 'file_path' is not the name of a file")
+    path = folder / file_name(frame.get("file_path") if isinstance(frame, dict) else None, "file_path", where)
     return path if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".webp") else path.with_name(path.name + ".png")
 
 
@@ -139,14 +103,3 @@ def _focal_length(content: dict[str, Any], width: int, file: Path) -> float:
     if not isinstance(angle, (int, float)) or isinstance(angle, bool) or not SMALLEST_ANGLE < angle < math.pi:
         raise DataError(f"{file}: 'camera_angle_x' is {angle!r}; it must be an angle between 0 and pi radians")
     return 0.5 * width / math.tan(0.5 * angle)
-
-
-def _times(frames: list[Any], where: list[str]) -> Tensor | None:
-    """(M,) in [0, 1], or None where no frame has a time."""
-    if not any("time" in frame for frame in frames):
-        return None
-    for frame, place in zip(frames, where, strict=True):
-        time = frame.get("time")
-        if not isinstance(time, (int, float)) or isinstance(time, bool) or not 0 <= time <= 1:
-            raise DataError(f"{place}: 'time' is {time!r}; it must be a number from 0 to 1")
-    return torch.tensor([float(frame["time"]) for frame in frames])

@@ -69,8 +69,9 @@ class Cameras:
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> Cameras:
         """The same cameras with every tensor changed."""
-        known: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        return replace(self, **{name: change(value) for name, value in known.items() if isinstance(value, Tensor)})
+        known = {f.name: getattr(self, f.name) for f in fields(self)}
+        changed: dict[str, Any] = {name: change(value) for name, value in known.items() if isinstance(value, Tensor)}
+        return replace(self, **changed)
 
     def scaled(self, factor: float) -> Cameras:
         """The cameras of images resized by `factor` (2.0 = twice as wide).

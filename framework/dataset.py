@@ -52,13 +52,22 @@ class ParsedScene:
     """There may be something to see outside `box`."""
     exact_poses: bool = True
     """The poses are known rather than estimated."""
+    depth_paths: tuple[Path | None, ...] | None = None
+    """M images of depth along the camera's axis, 0 where it is unknown; None where there is none."""
+    depth_unit: float = 0.001
+    """Units of the input that a step of a depth image stands for: metres, of one in millimetres."""
 
     def __getitem__(self, index: Tensor) -> ParsedScene:
         """The images chosen by an index tensor."""
-        paths = tuple(self.image_paths[i] for i in index.tolist())
-        times = None if self.times is None else self.times[index]
-        masks = None if self.mask_paths is None else tuple(self.mask_paths[i] for i in index.tolist())
-        return replace(self, image_paths=paths, cameras=self.cameras[index], times=times, mask_paths=masks)
+        chosen = index.tolist()
+        return replace(
+            self,
+            image_paths=tuple(self.image_paths[i] for i in chosen),
+            cameras=self.cameras[index],
+            times=None if self.times is None else self.times[index],
+            mask_paths=None if self.mask_paths is None else tuple(self.mask_paths[i] for i in chosen),
+            depth_paths=None if self.depth_paths is None else tuple(self.depth_paths[i] for i in chosen),
+        )
 
 
 class DataParser(ABC):

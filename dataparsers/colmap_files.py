@@ -54,15 +54,16 @@ def _check_file(file: Path, walk: Walk, what: str) -> None:
             raise DataError(f"{file} is cut short: it has no room for a count of {what}; {advice}")
         with file.open("rb") as handle, mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ) as data:
             (count,) = struct.unpack_from("<Q", data, 0)
-            place, record = 8, 0
+            place, walked = 8, 0
             try:
-                for record in range(count):
+                while walked < count:
                     place = walk(data, place)
                     if place > len(data):
                         raise struct.error
+                    walked += 1
             except (struct.error, OverflowError) as error:
                 raise DataError(
-                    f"{file} is cut short or damaged: it promises {count} {what}, and number {record + 1} does not fit "
+                    f"{file} is cut short or damaged: it promises {count} {what}, and number {walked + 1} does not fit "
                     f"in its {len(data)} bytes; {advice}"
                 ) from error
     except OSError as error:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from dataparsers.colmap_files import check_binary, count_images
+from dataparsers.reading import file_name
 from framework import DataError
 from framework.cameras import check_pose
 from framework.console import say
@@ -21,8 +22,6 @@ from framework.dataset import one_line
 PLACES = ("sparse", "colmap/sparse")
 """Where reconstructions are looked for, each there itself or in a folder of its own below."""
 FILES = ("cameras", "images", "points3D")
-LONGEST_PART = 250
-"""Characters of a file's or folder's name; most systems allow 255 bytes."""
 SHORTEST_TRACK = 3
 """Images that must have seen a sparse point; two can agree on a wrong one."""
 LARGEST_ERROR = 2.0
@@ -61,9 +60,10 @@ def find_models(path: Path, places: tuple[str, ...] = PLACES) -> list[Path]:
     for place in places:
         try:
             folders = [path / place, *sorted(path.joinpath(place).iterdir())]
+            kinds = ("bin", "txt")
+            models = [folder for folder in folders if any((folder / f"images.{kind}").is_file() for kind in kinds)]
         except OSError:
             continue
-        models = [folder for folder in folders if any((folder / f"images.{kind}").is_file() for kind in ("bin", "txt"))]
         if models:
             return models
     return []
@@ -154,8 +154,7 @@ def _points(model: Any) -> Tensor:
 
 def _check(name: str, pose: Tensor, camera: SparseCamera, folder: Path) -> None:
     where = f"{folder}: image {name!r}"
-    if not Path(name).name or "\0" in name or max(len(part) for part in Path(name).parts) > LONGEST_PART:
-        raise DataError(f"{where}: that is not the name of a file")
+    file_name(name, "name", where)
     check_pose(pose, where)
     if camera.width < 1 or camera.height < 1:
         raise DataError(f"{where}: its camera's size is {camera.width}x{camera.height} pixels; it must be positive")

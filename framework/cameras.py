@@ -7,7 +7,7 @@ one and its centre lies at (0.5, 0.5); `camera_to_worlds` maps camera to scene c
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
@@ -17,25 +17,24 @@ from torch import Tensor
 
 from framework.errors import DataError
 from framework.kernels import native
+from framework.lenses import BENDING, Distortion, Seen, project, unproject
+from framework.lenses import LENSES as LENSES
 from framework.rays import Rays
 
 ROTATION_TOLERANCE = 1e-3
-LENSES: dict[str, tuple[str, ...]] = {
-    "pinhole": (),
-    "opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "k7"),
-    "fisheye": ("k1", "k2", "k3", "k4"),
-    "equirectangular": (),
-    "orthographic": (),
-}
-"""Projection -> its distortion coefficients. opencv is OpenCV's rational model, k4 to k6 being the denominator's, and
-k7 the numerator's r^8, which transforms.json calls k4; fisheye is Kannala and Brandt's, as OpenCV has it."""
 CENTER = torch.zeros(1, 2)
 """The one place in a pixel that is its centre, as columns and rows from there."""
+COMPILED = ("pinhole", *BENDING)
+"""The models whose rays are compiled, in the order of the kernel's numbers."""
 
 
 @dataclass(frozen=True)
 class Cameras:
-    """M cameras. Intrinsics are in pixels of the images they go with."""
+    """M cameras of one model. Intrinsics are in pixels of the images they go with.
+
+    What a focal length is per unit of depends on the model: pixels per tangent (pinhole, opencv), per radian (fisheye,
+    equirectangular: `lenses.panorama` gives those of a whole one), per scene unit (orthographic).
+    """
 
     camera_to_worlds: Tensor
     """(M, 3, 4) rigid transform from camera to scene."""
@@ -55,6 +54,13 @@ class Cameras:
     """Name of the projection, a key of `LENSES`."""
     lens: Tensor | None = None
     """(M, K) distortion coefficients, in the order of `LENSES[model]`; None for all zero."""
+
+    def __post_init__(self) -> None:
+        if self.model not in LENSES:
+            raise ValueError(f"there is no camera model '{self.model}'; there are {', '.join(LENSES)}")
+        names = LENSES[self.model]
+        if self.lens is not None and self.lens.shape[-1] != len(names):
+            raise ValueError(f"{self.model} takes {len(names)} distortion coefficients, not {self.lens.shape[-1]}")
 
     def __len__(self) -> int:
         return self.camera_to_worlds.shape[0]
@@ -100,18 +106,17 @@ class Cameras:
             times: (M,) time of each camera.
         Returns: R rays with unit directions, pixel radii, times and camera indices.
         """
-        project = PROJECTIONS[self.model]
-        x = (columns + 0.5 - self.cx[camera_indices]) / self.fx[camera_indices]
-        y = (rows + 0.5 - self.cy[camera_indices]) / self.fy[camera_indices]
-        local = project(x, y)
-        length = local.norm(dim=-1)
+        x, y, seen = self.look(camera_indices, columns, rows)
         poses = self.camera_to_worlds[camera_indices]
+        origins = poses[:, :, 3]
         # Products and sums rather than a matrix product, which autocast would round to bfloat16.
-        directions = (poses[:, :, :3] * (local / length[:, None])[:, None, :]).sum(-1)
-        # Mip-NeRF sets the radius to 2 / sqrt(12) pixels, at distance `length` along the unit direction.
-        pixel_radii = 2 / 12**0.5 / (self.fx[camera_indices] * length)
+        directions = (poses[:, :, :3] * seen.directions[:, None, :]).sum(-1)
+        if self.model == "orthographic":
+            origins = origins + poses[:, :, 0] * x[:, None] - poses[:, :, 1] * y[:, None]
+        # Mip-NeRF sets the radius to 2 / sqrt(12) pixels. That of parallel rays is the same at all distances.
+        pixel_radii = 2 / 12**0.5 / self.fx[camera_indices] * seen.spread
         return Rays(
-            origins=poses[:, :, 3],
+            origins=origins,
             directions=directions,
             nears=torch.full_like(x, near),
             fars=torch.full_like(x, far),
@@ -119,6 +124,41 @@ class Cameras:
             times=None if times is None else times[camera_indices],
             camera_indices=camera_indices,
         )
+
+    def look(self, camera_indices: Tensor, columns: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Seen]:
+        """What pixels (R,) show, in their camera's frame, and whether they show anything.
+
+        Returns: normalised image coordinates x and y (R,), and what is seen there.
+        """
+        x = (columns + 0.5 - self.cx[camera_indices]) / self.fx[camera_indices]
+        y = (rows + 0.5 - self.cy[camera_indices]) / self.fy[camera_indices]
+        lenses = None if self.distortion is None else self.distortion[camera_indices]
+        return x, y, unproject(self.model, x, y, lenses)
+
+    def project(self, points: Tensor, camera: int | Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Where cameras show points: the inverse of `rays`.
+
+        Args:
+            points: (N, 3) scene coordinates.
+            camera: index of the camera, or (N,) of one for each point.
+        Returns: columns, rows (N,) as `rays` takes them, whole numbers being pixels' centres, also outside the image;
+            and (N,) bool whether the point is in front of the camera and within its lens's reach. Elsewhere columns
+            and rows are finite, and mean nothing.
+        """
+        indices = torch.as_tensor(camera, device=points.device).expand(len(points))
+        poses = self.camera_to_worlds[indices]
+        local = (poses[:, :, :3] * (points - poses[:, :, 3])[:, :, None]).sum(1)
+        x, y, in_front = project(self.model, local, None if self.distortion is None else self.distortion[indices])
+        columns = x * self.fx[indices] + self.cx[indices] - 0.5
+        return columns, y * self.fy[indices] + self.cy[indices] - 0.5, in_front
+
+    @cached_property
+    def distortion(self) -> Distortion | None:
+        """How the lenses bend, where the model has it."""
+        if self.model not in BENDING:
+            return None
+        lens = self.fx.new_zeros(len(self), len(LENSES[self.model])) if self.lens is None else self.lens
+        return Distortion.of(self.model, lens)
 
     @cached_property
     def offsets(self) -> Tensor:
@@ -138,7 +178,7 @@ class Cameras:
             places: (K, 2) where in a pixel, columns and rows from its centre.
         Returns: P * K rays, those of a pixel together.
         """
-        if self.model == "pinhole" and native.usable(self.camera_to_worlds, self.fx, places):
+        if self.model in COMPILED and native.usable(self.camera_to_worlds, self.fx, places):
             return self._pixel_rays_compiled(flat, near, far, times, places)
         return self.pixel_rays_reference(flat, near, far, times, places)
 
@@ -159,13 +199,16 @@ class Cameras:
         indices = torch.empty(count, dtype=torch.int64)
         poses, widths, places = self.camera_to_worlds.contiguous(), self.widths.contiguous(), places.contiguous()
         numbers = {name: getattr(self, name).contiguous() for name in ("fx", "fy", "cx", "cy")}
-        _pinhole_rays(
+        distortion = None if self.distortion is None else self.distortion.table
+        _camera_rays(
+            COMPILED.index(self.model),
             native.pointer(flat, "pixel indices", (len(flat),), torch.int64), len(flat),
             native.pointer(places, "places in a pixel", (len(places), 2)), len(places),
             native.pointer(self.offsets, "offsets", (images + 1,), torch.int64), images,
             native.pointer(widths, "widths", (images,), torch.int64),
             native.pointer(poses, "poses", (images, 3, 4)),
             *(native.pointer(values, name, (images,)) for name, values in numbers.items()),
+            None if distortion is None else native.pointer(distortion, "lenses", (images, 11), torch.float64),
             origins.data_ptr(), directions.data_ptr(), radii.data_ptr(), indices.data_ptr(), native.threads(),
         )  # fmt: skip
         return Rays(
@@ -200,16 +243,36 @@ def subpixels(count: int) -> Tensor:
     return (torch.stack([steps, rows], dim=-1) + 0.5) / count - 0.5
 
 
-_pinhole_rays = native.function("pinhole_rays", "pqpqpqpppppp" + "ppppi")
+def join_cameras(parts: Sequence[Cameras]) -> Cameras:
+    """All cameras of one or more parts, in their order.
+
+    pinhole and opencv become opencv, pinhole being the one without distortion.
+
+    Raises: DataError where the models cannot be one.
+    """
+    models = sorted({part.model for part in parts})
+    model = "opencv" if models == ["opencv", "pinhole"] else models[0]
+    if len(models) > 1 and model != "opencv":
+        raise DataError(
+            f"the cameras are of different models ({', '.join(models)}), which one scene cannot mix; "
+            "convert the images to one model, for example with 'colmap image_undistorter'"
+        )
+    joined: dict[str, Any] = {
+        f.name: torch.cat([getattr(part, f.name) for part in parts])
+        for f in fields(Cameras)
+        if f.name not in ("model", "lens")
+    }
+    if all(part.lens is None for part in parts):
+        return Cameras(**joined, model=model)
+    straight = len(LENSES[model])
+    lenses = [
+        part.fx.new_zeros(len(part), straight) if part.model != model or part.lens is None else part.lens
+        for part in parts
+    ]
+    return Cameras(**joined, model=model, lens=torch.cat(lenses))
 
 
-def pinhole(x: Tensor, y: Tensor) -> Tensor:
-    """Direction (R, 3) in the camera's frame of normalised image coordinates; image y points down."""
-    return torch.stack([x, -y, -torch.ones_like(x)], dim=-1)
-
-
-PROJECTIONS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {"pinhole": pinhole}
-"""Projection name -> function from normalised image coordinates to a direction. Lens models are added here."""
+_camera_rays = native.function("camera_rays", "i" + "pqpqpqppppppp" + "ppppi")
 
 
 def check_pose(pose: Tensor, where: str) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -38,5 +40,4 @@ def orbit(cameras: Cameras, center: Tensor, num_frames: int) -> Cameras:
 
 def replace_poses(cameras: Cameras, poses: Tensor) -> Cameras:
     """Cameras at `poses` (K, 3, 4) with the intrinsics of the first of `cameras`."""
-    first = cameras[torch.zeros(len(poses), dtype=torch.long)]
-    return Cameras(poses, first.fx, first.fy, first.cx, first.cy, first.widths, first.heights, first.model)
+    return replace(cameras[torch.zeros(len(poses), dtype=torch.long)], camera_to_worlds=poses)

@@ -1,5 +1,6 @@
 // A batch of training pixels: rays through them, and their colours over a background. See ../../cameras.py, ../../pixels.py.
 #include "common.h"
+#include "lens.h"
 
 #include <algorithm>
 #include <cmath>
@@ -8,12 +9,30 @@ static int64_t image_of(int64_t pixel, const int64_t* offsets, int64_t images) {
     return std::upper_bound(offsets, offsets + images + 1, pixel) - offsets - 1;
 }
 
+enum Model { PINHOLE, OPENCV, FISHEYE };
+
+// What (x, y) in normalised image coordinates shows: a unit direction, and radians between rays a unit apart.
+static inline float look(int model, double x, double y, const double* lens, float* local) {
+    double area;
+    straighten(x, y, lens, x, y, area);
+    area = area > 1e-3 ? area : 1e-3;
+    if (model == FISHEYE) {
+        const double angle = std::sqrt(x * x + y * y), shorter = angle > 1e-9 ? std::sin(angle) / angle : 1;
+        local[0] = float(x * shorter), local[1] = float(-y * shorter), local[2] = float(-std::cos(angle));
+        return float(std::sqrt((shorter > 0 ? shorter : 0) / area));
+    }
+    const double length = std::sqrt(x * x + y * y + 1);
+    local[0] = float(x / length), local[1] = float(-y / length), local[2] = float(-1 / length);
+    return float(1 / (length * std::sqrt(area)));
+}
+
 // flat (P): pixel indices into all images, which start at offsets (M + 1); places (K, 2): column and row from a
-// pixel's centre. poses (M, 3, 4); fx, fy, cx, cy (M); widths (M). Writes P * K rays, those of a pixel together.
-EXPORT void pinhole_rays(const int64_t* flat, int64_t count, const float* places, int64_t per_pixel,
-                         const int64_t* offsets, int64_t images, const int64_t* widths, const float* poses,
-                         const float* fx, const float* fy, const float* cx, const float* cy, float* origins,
-                         float* directions, float* radii, int64_t* cameras, int threads) {
+// pixel's centre. poses (M, 3, 4); fx, fy, cx, cy (M); widths (M); lenses (M, LENS_SIZE), null for pinholes.
+// Writes P * K rays, those of a pixel together.
+EXPORT void camera_rays(int model, const int64_t* flat, int64_t count, const float* places, int64_t per_pixel,
+                        const int64_t* offsets, int64_t images, const int64_t* widths, const float* poses,
+                        const float* fx, const float* fy, const float* cx, const float* cy, const double* lenses,
+                        float* origins, float* directions, float* radii, int64_t* cameras, int threads) {
     const float radius = 2 / std::sqrt(12.0f);
 #pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
     for (int64_t p = 0; p < count; p++) {
@@ -24,13 +43,19 @@ EXPORT void pinhole_rays(const int64_t* flat, int64_t count, const float* places
         for (int64_t k = 0; k < per_pixel; k++) {
             const int64_t r = p * per_pixel + k;
             const float x = (column + places[k * 2]) / fx[image], y = (row + places[k * 2 + 1]) / fy[image];
-            const float length = std::sqrt(x * x + y * y + 1), local[3] = {x / length, -y / length, -1 / length};
+            float local[3];
+            if (model == PINHOLE) {
+                const float length = std::sqrt(x * x + y * y + 1);
+                local[0] = x / length, local[1] = -y / length, local[2] = -1 / length;
+                radii[r] = radius / (fx[image] * length);
+            } else {
+                radii[r] = radius / fx[image] * look(model, x, y, lenses + image * LENS_SIZE, local);
+            }
             for (int a = 0; a < 3; a++) {
                 origins[r * 3 + a] = pose[a * 4 + 3];
                 directions[r * 3 + a] =
                     pose[a * 4] * local[0] + pose[a * 4 + 1] * local[1] + pose[a * 4 + 2] * local[2];
             }
-            radii[r] = radius / (fx[image] * length);
             cameras[r] = image;
         }
     }

@@ -144,6 +144,20 @@ def captured_scene(
     )
 
 
+def from_original(scene: ParsedScene, applied: Tensor, scale: float = 1.0) -> ParsedScene:
+    """The scene with `transform` and `scale` that start one step earlier.
+
+    Args:
+        applied, scale: (4, 4) rigid; a point x of the original is `scale * (applied @ x)` in the frame that the
+            scene's transform has started from so far.
+    """
+    transform = torch.eye(4)[:3] if scene.transform is None else scene.transform
+    # s (R (a A x) + t) = s a (R A x + t / a)
+    moved = transform[:, :3].double() @ applied[:3].double()
+    moved[:, 3] += transform[:, 3] / scale
+    return replace(scene, transform=moved.float(), scale=scene.scale * scale)
+
+
 def image_sizes(paths: Sequence[Path]) -> Tensor:
     """(M, 2) int64 width and height of images, from their headers; of unreadable ones that of the first readable.
 
@@ -221,8 +235,9 @@ def _reduced(path: Path, root: Path | None, step: int) -> Path:
         return path
     if root is None:
         return path / "there is none"
-    file = root.with_name(f"{root.name}_{step}") / path.relative_to(root)
-    others = [file.with_suffix(ending) for ending in ENDINGS]
+    folder = root.with_name(f"{root.name}_{step}")
+    file = folder / path.relative_to(root)
+    others = [file.with_suffix(ending) for ending in ENDINGS if folder.is_dir()]
     return next((other for other in (file, *others) if other.is_file()), file)
 
 

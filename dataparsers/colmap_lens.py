@@ -11,15 +11,7 @@ from torch import Tensor
 from dataparsers.colmap_model import SparseCamera
 from framework import DataError
 from framework.cameras import LENSES
-
-MODELS: dict[str, tuple[str, str]] = {
-    "SIMPLE_PINHOLE": ("f", ""),
-    "PINHOLE": ("fx fy", ""),
-    "SIMPLE_RADIAL": ("f", "k1"),
-    "RADIAL": ("f", "k1 k2"),
-    "OPENCV": ("fx fy", "k1 k2 p1 p2"),
-}
-"""COLMAP's model -> its focal lengths, and its coefficients; cx and cy stand between."""
+from framework.colmap_cameras import Intrinsics, from_colmap
 
 
 @dataclass(frozen=True)
@@ -37,23 +29,30 @@ class Lenses:
 
 
 def lenses_of(cameras: Sequence[SparseCamera], names: Sequence[str], where: str) -> Lenses:
-    """The cameras (M) of images called `names`.
+    """The cameras (M) of images called `names`, of a reconstruction in the folder `where`.
 
-    Raises: DataError that names an image with a model that is not known.
+    Raises: DataError that names an image whose camera model is not known, or cannot be mixed with another's.
     """
-    intrinsics = torch.zeros(len(cameras), 4, dtype=torch.float64)
-    lens = torch.zeros(len(cameras), len(LENSES["opencv"]))
-    for row, (camera, name) in enumerate(zip(cameras, names, strict=True)):
-        if camera.model not in MODELS:
+    found: list[Intrinsics] = []
+    for camera, name in zip(cameras, names, strict=True):
+        try:
+            found.append(from_colmap(camera.model, camera.params, camera.width, camera.height))
+        except DataError as error:
+            raise DataError(f"{where}: image {name!r}: {error}, as in: {_command(where)}") from error
+    models = [camera.model for camera in found]
+    # Without distortion an opencv camera is a pinhole, and the other way round.
+    model = next((kind for kind in models if kind != "pinhole"), "pinhole")
+    lens = torch.zeros(len(found), len(LENSES[model]))
+    for row, own in enumerate(found):
+        if own.model not in (model, "pinhole") or (model == "fisheye" and own.model == "pinhole"):
             raise DataError(
-                f"{where}: image {name!r} has the camera model {camera.model}, which is not known; convert with "
-                f"`colmap image_undistorter --image_path IMAGES --input_path {where} --output_path DIR`"
+                f"{where}: image {names[row]!r} has a {own.model} camera and image {names[models.index(model)]!r} a "
+                f"{model} one, which one scene cannot mix; convert the images: {_command(where)}"
             )
-        focal, coefficients = (part.split() for part in MODELS[camera.model])
-        fx, fy = camera.params[0], camera.params[len(focal) - 1]
-        cx, cy = camera.params[len(focal) : len(focal) + 2]
-        intrinsics[row] = torch.tensor([fx, fy, cx, cy], dtype=torch.float64)
-        for coefficient, value in zip(coefficients, camera.params[len(focal) + 2 :], strict=True):
-            lens[row, LENSES["opencv"].index(coefficient)] = value
-    sizes = torch.tensor([[camera.width, camera.height] for camera in cameras])
-    return Lenses(intrinsics, sizes, "opencv", lens)
+        lens[row, : len(own.lens)] = torch.tensor(own.lens)
+    intrinsics = torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in found], dtype=torch.float64)
+    return Lenses(intrinsics, torch.tensor([[c.width, c.height] for c in cameras]), model, lens)
+
+
+def _command(where: str) -> str:
+    return f"colmap image_undistorter --image_path IMAGES --input_path {where} --output_path UNDISTORTED"

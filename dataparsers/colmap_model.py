@@ -119,8 +119,8 @@ def read_model(folder: Path) -> SparseModel:
         raise DataError(f"{folder} cannot be read: its files are damaged or do not fit ({one_line(error)})") from error
     if not images:
         raise DataError(f"{folder} has no image with a pose; COLMAP did not succeed in registering any")
-    for name, pose, camera in zip(names, poses, cameras, strict=True):
-        _check(name, pose, camera, folder)
+    for name, pose in zip(names, poses, strict=True):
+        _check(name, pose, folder)
     return SparseModel(names, torch.stack(poses), cameras, points)
 
 
@@ -152,9 +152,7 @@ def _points(model: Any) -> Tensor:
     return points[torch.isfinite(points).all(-1)]
 
 
-def _check(name: str, pose: Tensor, camera: SparseCamera, folder: Path) -> None:
+def _check(name: str, pose: Tensor, folder: Path) -> None:
     where = f"{folder}: image {name!r}"
     file_name(name, "name", where)
     check_pose(pose, where)
-    if camera.width < 1 or camera.height < 1:
-        raise DataError(f"{where}: its camera's size is {camera.width}x{camera.height} pixels; it must be positive")

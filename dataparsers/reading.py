@@ -91,6 +91,16 @@ def number(value: Any, name: str, where: str, positive: bool = False) -> float:
     return result
 
 
+def numbers(value: Any, count: int, name: str, where: str) -> list[float]:
+    """A list of that many finite numbers.
+
+    Raises: DataError where it is anything else.
+    """
+    if not isinstance(value, list) or len(value) != count:
+        raise DataError(f"{where}: '{name}' is {shown(value)}; it must be a list of {count} numbers")
+    return [number(part, name, where) for part in value]
+
+
 def shown(value: Any) -> str:
     """A value for a message: one short line whatever it holds."""
     text = repr(value) if not isinstance(value, int) or abs(value) < 10**30 else "a huge whole number"

@@ -13,7 +13,7 @@ from dataparsers.colmap_model import read_model
 from dataparsers.llff import Llff
 from framework.dataset import load_dataset
 from framework.errors import DataError
-from tests.dataparsers.captures import Capture, make_capture, misses, write_colmap, write_images
+from tests.dataparsers.sparse_models import Capture, make_capture, misses, write_colmap, write_images
 
 pycolmap = pytest.importorskip("pycolmap")
 FX, FY, CX, CY = 50.0, 48.0, 31.0, 19.0
@@ -59,7 +59,8 @@ def test_rays_through_keypoints_meet_the_points(tmp_path: Path, capture: Capture
 @pytest.mark.parametrize(
     ("camera", "model"),
     [("SIMPLE_PINHOLE 60 40 50 31 19", "pinhole"), (RADIAL, "opencv"), ("RADIAL 60 40 50 31 19 0.1 -0.02", "opencv"),
-     ("OPENCV 60 40 50 48 31 19 0.1 -0.02 0.003 -0.001", "opencv")],
+     ("OPENCV 60 40 50 48 31 19 0.1 -0.02 0.003 -0.001", "opencv"), ("SIMPLE_RADIAL 60 40 50 31 19 0", "pinhole"),
+     ("OPENCV_FISHEYE 60 40 50 48 31 19 0.1 -0.02 0.003 -0.001", "fisheye")],
 )  # fmt: skip
 def test_camera_models(tmp_path: Path, capture: Capture, camera: str, model: str) -> None:
     """Against COLMAP's own projection."""
@@ -155,6 +156,30 @@ def test_a_camera_that_is_not_known_is_refused_by_image(tmp_path: Path, capture:
     with pytest.raises(DataError, match=r"'p00\.png'.*FOV.*colmap image_undistorter") as error:
         Colmap().parse(tmp_path, "train")
     assert "\n" not in str(error.value)
+
+
+def test_cameras_of_several_models(folder: Path, capture: Capture) -> None:
+    """A pinhole is an opencv camera without distortion; a fisheye is not."""
+    cameras = folder / "sparse" / "0" / "cameras.txt"
+    text = cameras.read_text()
+    cameras.write_text(text.replace("8 PINHOLE 60 40 50 48 31 19", "8 OPENCV 60 40 50 48 31 19 0.1 0 0 0", 1))
+    scene = Colmap(eval_interval=0).parse(folder, "train")
+    assert scene.cameras.model == "opencv"
+    assert scene.cameras.lens is not None
+    assert [bool(row.any()) for row in scene.cameras.lens] == [False, True] + [False] * 8
+    x, y = capture.seen(5).T
+    assert misses(scene, 5, FX * x + CX, FY * y + CY, capture.points).max() < 1e-3
+    cameras.write_text(text.replace("8 PINHOLE 60 40 50 48 31 19", "8 OPENCV_FISHEYE 60 40 50 48 31 19 0.1 0 0 0", 1))
+    with pytest.raises(DataError, match=r"'p00\.png' has a pinhole camera and image 'p01\.png' a fisheye"):
+        Colmap().parse(folder, "train")
+
+
+@pytest.mark.parametrize("camera", ["PINHOLE 0 40 50 48 31 19", "PINHOLE 60 40 -50 48 31 19"])
+def test_cameras_that_see_nothing(tmp_path: Path, capture: Capture, camera: str) -> None:
+    write_images(tmp_path / "images", capture.names)
+    write_colmap(tmp_path / "sparse", capture, camera)
+    with pytest.raises(DataError, match=r"'p00\.png'.*cannot be"):
+        Colmap().parse(tmp_path, "train")
 
 
 def test_without_pycolmap_one_line_says_how_to_get_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

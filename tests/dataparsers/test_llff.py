@@ -12,7 +12,7 @@ from dataparsers.colmap import Colmap
 from dataparsers.llff import Llff
 from framework.dataset import load_dataset
 from framework.errors import DataError
-from tests.dataparsers.captures import Capture, make_capture, misses, write_images
+from tests.dataparsers.sparse_models import Capture, make_capture, misses, write_images
 
 FOCAL = 55.0
 

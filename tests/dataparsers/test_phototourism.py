@@ -9,7 +9,7 @@ from dataparsers.llff import Llff
 from dataparsers.phototourism import Phototourism
 from framework.dataset import load_dataset
 from framework.errors import DataError
-from tests.dataparsers.captures import Capture, make_capture, misses, write_colmap, write_images
+from tests.dataparsers.sparse_models import Capture, make_capture, misses, write_colmap, write_images
 
 pytest.importorskip("pycolmap")
 

@@ -1,0 +1,80 @@
+"""Polycam's raw exports: keyframes/corrected_images, or images, and a JSON of the same name for each camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from dataparsers.captured import ENDINGS, Captured, Photographs, captured_scene, from_original, has_transforms
+from dataparsers.reading import number, read_json, rigid
+from framework import DataError, ParsedScene
+from framework.dataset import Split
+
+CAMERAS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
+"""Folders in `keyframes` of cameras and their images, the better first: those that Polycam has refined."""
+Z_UP = torch.tensor([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+"""From Polycam's axes, y being up, to ours, z being up: as nerfstudio turns them."""
+
+
+@dataclass(frozen=True)
+class Polycam(Captured):
+    """Flags of the polycam format."""
+
+    depth_unit_scale_factor: float = 0.001
+    """Metres that a step of a depth image stands for."""
+
+    @classmethod
+    def recognizes(cls, path: Path) -> bool:
+        return any(_is_pair(path, *pair) for pair in CAMERAS) and not has_transforms(path)
+
+    def parse(self, path: Path | None, split: Split) -> ParsedScene:
+        if path is None:
+            raise DataError("the polycam format needs a folder: --data DIR")
+        if not self.depth_unit_scale_factor > 0:
+            raise DataError(f"--depth-unit-scale-factor is {self.depth_unit_scale_factor}; it must be above zero")
+        pairs = [pair for pair in CAMERAS if _is_pair(path, *pair)]
+        if not pairs:
+            raise DataError(f"{path} has no keyframes/cameras with keyframes/images; export Polycam's raw data")
+        photographs = _photographs(path / "keyframes", *pairs[0])
+        scene = captured_scene(self, photographs, split)
+        return replace(from_original(scene, Z_UP), depth_unit=self.depth_unit_scale_factor)
+
+
+def _is_pair(path: Path, cameras: str, images: str) -> bool:
+    return (path / "keyframes" / cameras).is_dir() and (path / "keyframes" / images).is_dir()
+
+
+def _photographs(folder: Path, cameras: str, images: str) -> Photographs:
+    files = sorted((folder / cameras).glob("*.json"))
+    if not files:
+        raise DataError(f"{folder / cameras} holds no .json of a camera")
+    poses, intrinsics, sizes = [], [], []
+    for file in files:
+        content = read_json(file)
+        rows = [[number(content.get(f"t_{r}{c}"), f"t_{r}{c}", str(file)) for c in range(4)] for r in range(3)]
+        poses.append(Z_UP.double() @ rigid(rows, str(file), str(file)))
+        focal = [number(content.get(key), key, str(file), positive=True) for key in ("fx", "fy")]
+        intrinsics.append(focal + [number(content.get(key), key, str(file)) for key in ("cx", "cy")])
+        sizes.append([round(number(content.get(key), key, str(file), positive=True)) for key in ("width", "height")])
+    depths = tuple(_depth(folder / "depth" / f"{file.stem}.png") for file in files)
+    return Photographs(
+        folder=folder,
+        paths=tuple(_image(folder / images, file.stem) for file in files),
+        names=tuple(file.stem for file in files),
+        poses=torch.stack(poses),
+        intrinsics=torch.tensor(intrinsics, dtype=torch.float64),
+        sizes=torch.tensor(sizes),
+        depths=depths if any(depths) else None,
+    )
+
+
+def _image(folder: Path, stem: str) -> Path:
+    usual = folder / f"{stem}.jpg"
+    others = (folder / f"{stem}{ending}" for ending in ENDINGS)
+    return usual if usual.is_file() else next((file for file in others if file.is_file()), usual)
+
+
+def _depth(file: Path) -> Path | None:
+    return file if file.is_file() else None

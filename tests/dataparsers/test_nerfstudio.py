@@ -1,0 +1,412 @@
+"""The nerfstudio format: rays go where the file's cameras look, and what makes no sense is refused in one line."""
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+
+from dataparsers.nerfstudio import Nerfstudio
+from framework.dataset import Split, load_dataset
+from framework.errors import DataError
+from tests.dataparsers.captures import (
+    CY,
+    FX,
+    HEIGHT,
+    POINTS,
+    WIDTH,
+    poses,
+    to_scene,
+    worst_miss,
+    write_capture,
+    write_images,
+)
+
+EXACT = 2e-6
+"""What float32 leaves of a ray's direction."""
+ALL = Nerfstudio(eval_mode="all")
+
+
+def edit(folder: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+    content = json.loads((folder / "transforms.json").read_text())
+    change(content)
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    return write_capture(tmp_path / "scene")
+
+
+@pytest.mark.parametrize("orientation", ["up", "pca", "none"])
+@pytest.mark.parametrize("center", ["poses", "focus", "none"])
+@pytest.mark.parametrize("auto_scale", [True, False])
+def test_rays_meet_the_points_that_the_files_cameras_see(
+    capture: Path, orientation: Any, center: Any, auto_scale: bool
+) -> None:
+    flags = Nerfstudio(
+        eval_mode="all",
+        orientation_method=orientation,
+        center_method=center,
+        auto_scale_poses=auto_scale,
+        scale_factor=1.5,
+    )
+    scene = flags.parse(capture, "train")
+    worst = worst_miss(scene, poses())
+    print(f"rays miss known points by {worst:.1e} of their distance")
+    assert worst < EXACT
+    largest = scene.cameras.camera_to_worlds[:, :, 3].abs().max().item()
+    assert largest == pytest.approx(1.5) if auto_scale else largest > 1.5
+    assert scene.unbounded
+    assert not scene.exact_poses
+    assert (scene.near, scene.far) == (0.05, 1000.0)
+    assert scene.box.tolist() == [[-1] * 3, [1] * 3]
+
+
+def test_places_far_from_the_origin_keep_their_precision(capture: Path) -> None:
+    """Positions of a survey: metres, millions of them from the origin."""
+    away = np.array([5e5, 4e6, 100.0])
+
+    def move(content: dict[str, Any]) -> None:
+        for frame in content["frames"]:
+            for axis in range(3):
+                frame["transform_matrix"][axis][3] += away[axis]
+
+    near = ALL.parse(capture, "train").cameras.camera_to_worlds
+    edit(capture, move)
+    far = ALL.parse(capture, "train").cameras.camera_to_worlds
+    apart = (near[:, :, 3] - near[:1, :, 3]) - (far[:, :, 3] - far[:1, :, 3])
+    assert apart.abs().max() < 1e-5
+
+
+def test_instant_ngp_gives_angles(capture: Path) -> None:
+    def angles(content: dict[str, Any]) -> None:
+        for key in ("camera_model", "fl_x", "fl_y", "cx", "cy", "w", "h"):
+            del content[key]
+        content.update(camera_angle_x=0.8, camera_angle_y=0.6)
+
+    edit(capture, angles)
+    cameras = ALL.parse(capture, "train").cameras
+    assert cameras.fx[0].item() == pytest.approx(WIDTH / 2 / math.tan(0.4))
+    assert cameras.fy[0].item() == pytest.approx(HEIGHT / 2 / math.tan(0.3))
+    assert (cameras.cx[0].item(), cameras.cy[0].item()) == (WIDTH / 2, HEIGHT / 2)
+    edit(capture, lambda c: c.pop("camera_angle_y"))
+    cameras = ALL.parse(capture, "train").cameras
+    assert torch.equal(cameras.fx, cameras.fy)
+
+
+def test_a_frames_own_intrinsics_go_before_those_of_all(capture: Path) -> None:
+    edit(capture, lambda c: c["frames"][2].update(fl_x=77.0, cy=3.0, k1=0.1))
+    edit(capture, lambda c: c["frames"][3].update(camera_angle_x=1.0))
+    cameras = ALL.parse(capture, "train").cameras
+    assert cameras.fx[:4].tolist() == pytest.approx([FX, FX, 77, WIDTH / 2 / math.tan(0.5)])
+    assert cameras.cy[:4].tolist() == [CY, CY, 3, CY]
+    assert cameras.lens is not None
+    assert cameras.lens[:4, 0].tolist() == pytest.approx([0, 0, 0.1, 0])
+
+
+COEFFICIENTS = {"k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4, "k5": 0.5, "k6": 0.6, "p1": 0.01, "p2": 0.02}
+LENSED = {
+    None: ("opencv", [0.1, 0.2, 0.01, 0.02, 0.3, 0, 0, 0, 0.4]),
+    "OPENCV": ("opencv", [0.1, 0.2, 0.01, 0.02, 0.3, 0, 0, 0, 0.4]),
+    "SIMPLE_RADIAL": ("opencv", [0.1, 0.2, 0.01, 0.02, 0.3, 0, 0, 0, 0.4]),
+    "FULL_OPENCV": ("opencv", [0.1, 0.2, 0.01, 0.02, 0.3, 0.4, 0.5, 0.6, 0]),
+    "OPENCV_FISHEYE": ("fisheye", [0.1, 0.2, 0.3, 0.4]),
+}
+
+
+@pytest.mark.parametrize("name", LENSED)
+def test_lenses(capture: Path, name: str | None) -> None:
+    edit(capture, lambda c: c.update(camera_model=name, **COEFFICIENTS))
+    cameras = ALL.parse(capture, "train").cameras
+    model, expected = LENSED[name]
+    assert cameras.model == model
+    assert cameras.lens is not None
+    assert cameras.lens.shape == (9, len(expected))
+    assert cameras.lens[5].tolist() == pytest.approx(expected)
+
+
+def test_a_lens_without_distortion_is_a_pinhole(capture: Path) -> None:
+    edit(capture, lambda c: c.update(camera_model="OPENCV", k1=0.0))
+    cameras = ALL.parse(capture, "train").cameras
+    assert (cameras.model, cameras.lens) == ("pinhole", None)
+
+
+def test_panoramas_and_orthographic_pictures(capture: Path) -> None:
+    """A whole panorama's width is 2 pi radians. Orthographic focal lengths are per unit, and units are scaled."""
+    edit(capture, lambda c: c.update(camera_model="EQUIRECTANGULAR"))
+    edit(capture, lambda c: [c.pop(key) for key in ("fl_x", "fl_y", "cx", "cy")])
+    cameras = ALL.parse(capture, "train").cameras
+    assert cameras.model == "equirectangular"
+    assert cameras.fx[0].item() == pytest.approx(WIDTH / (2 * math.pi))
+    assert cameras.fy[0].item() == pytest.approx(HEIGHT / math.pi)
+    edit(capture, lambda c: c.update(camera_model="ORTHOPHOTO", fl_x=10.0))
+    scene = ALL.parse(capture, "train")
+    assert scene.cameras.model == "orthographic"
+    assert scene.cameras.fx[0].item() == pytest.approx(10 / scene.scale)
+
+
+def test_the_way_back_leads_to_the_frame_that_the_file_was_made_from(capture: Path) -> None:
+    """The file's frame is 3 * (A x), A being half a turn about x with a shift; points seen are known in x."""
+    applied = [[1, 0, 0, 0.5], [0, -1, 0, 0.25], [0, 0, -1, 2.0]]
+    edit(capture, lambda c: c.update(applied_transform=applied, applied_scale=3.0))
+    scene = ALL.parse(capture, "train")
+    matrix = np.array(applied)
+    original = (POINTS / 3 - matrix[:, 3]) @ matrix[:, :3]
+    plain = write_capture(capture.parent / "plain")
+    torch.testing.assert_close(
+        to_scene(scene, original), to_scene(ALL.parse(plain, "train"), POINTS), rtol=0, atol=1e-6
+    )
+
+
+def test_sparse_points_lie_where_cameras_see_them(capture: Path) -> None:
+    lines = "\n".join(" ".join(map(str, point)) for point in POINTS)
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(POINTS)}\n" + "".join(f"property float {a}\n" for a in "xyz")
+    (capture / "points.ply").write_text(f"{head}end_header\n{lines}\n")
+    edit(capture, lambda c: c.update(ply_file_path="points.ply", applied_scale=2.0))
+    scene = ALL.parse(capture, "train")
+    edit(capture, lambda c: c.pop("applied_scale"))
+    assert scene.points is not None
+    expected = to_scene(ALL.parse(capture, "train"), POINTS).float()
+    torch.testing.assert_close(scene.points, expected, rtol=0, atol=1e-6)
+
+
+def test_missing_sparse_points_are_done_without(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    edit(capture, lambda c: c.update(ply_file_path="points.ply"))
+    assert ALL.parse(capture, "train").points is None
+    assert "points.ply is missing" in capsys.readouterr().err
+
+
+def test_instant_ngps_cube(capture: Path) -> None:
+    """aabb_scale 4 at scale 0.5: edges of 8 units. Offset (0.5, 0.5, 1) puts the cube's centre at z = -1."""
+    edit(capture, lambda c: c.update(aabb_scale=4, scale=0.5, offset=[0.5, 0.5, 1.0]))
+    scene = Nerfstudio(orientation_method="none").parse(capture, "train")
+    corners = to_scene(scene, np.array([[-4.0, -4, -5], [4, 4, 3]]))
+    torch.testing.assert_close(scene.box, corners.float())
+    turned = Nerfstudio(orientation_method="pca").parse(capture, "train")
+    torch.testing.assert_close(turned.box.mean(0), to_scene(turned, np.array([[0.0, 0, -1]]))[0].float())
+    torch.testing.assert_close(turned.box[1] - turned.box[0], torch.full((3,), 8 * turned.scale))
+
+
+@pytest.mark.parametrize(
+    ("flags", "train", "held"),
+    [
+        (Nerfstudio(), [1, 2, 3, 4, 5, 6, 7], [0, 8]),
+        (Nerfstudio(eval_interval=4), [1, 2, 3, 5, 6, 7], [0, 4, 8]),
+        (Nerfstudio(eval_interval=0), list(range(9)), list(range(9))),
+        (Nerfstudio(eval_mode="fraction", train_split_fraction=0.5), [0, 2, 4, 6, 8], [1, 3, 5, 7]),
+        (ALL, list(range(9)), list(range(9))),
+    ],
+)
+def test_splits(capture: Path, flags: Nerfstudio, train: list[int], held: list[int]) -> None:
+    edit(capture, lambda c: c["frames"].reverse())  # by sorted name, whatever the file's order
+
+    def names(split: Split) -> list[int]:
+        return [int(path.stem) for path in flags.parse(capture, split).image_paths]
+
+    assert names("train") == train
+    assert names("val") == held
+    assert names("test") == held
+
+
+def test_a_files_own_lists(capture: Path) -> None:
+    edit(capture, lambda c: c.update(test_filenames=["./images/003.png", "images/001.png"]))
+    edit(capture, lambda c: c.update(train_filenames=["images/000.png"]))
+    for split, expected in (("train", ["000"]), ("test", ["001", "003"]), ("val", ["001", "003"])):
+        assert [path.stem for path in Nerfstudio().parse(capture, split).image_paths] == expected  # type: ignore[arg-type]
+    edit(capture, lambda c: c.pop("train_filenames"))
+    assert len(Nerfstudio().parse(capture, "train").image_paths) == 7
+    edit(capture, lambda c: c.update(test_filenames=["images/no.png"]))
+    with pytest.raises(DataError, match=r"'test_filenames' lists 'images/no\.png', which is no frame's file_path"):
+        Nerfstudio().parse(capture, "train")
+
+
+def test_split_by_name(capture: Path) -> None:
+    for index in (2, 5):
+        (capture / "images" / f"{index:03d}.png").rename(capture / "images" / f"eval_{index}.png")
+        edit(capture, lambda c, i=index: c["frames"][i].update(file_path=f"images/eval_{i}.png"))
+    flags = Nerfstudio(eval_mode="filename")
+    assert [path.stem for path in flags.parse(capture, "test").image_paths] == ["eval_2", "eval_5"]
+    assert len(flags.parse(capture, "train").image_paths) == 7
+
+
+def test_masks_depths_and_times(capture: Path) -> None:
+    write_images(capture / "masks", ["000.png", "001.png"])
+    edit(capture, lambda c: c["frames"][0].update(mask_path="masks/000.png", depth_file_path="depths/000.png"))
+    edit(capture, lambda c: c["frames"][1].update(mask_path="masks/001.png"))
+    edit(capture, lambda c: [frame.update(time=i / 8) for i, frame in enumerate(c["frames"])])
+    scene = Nerfstudio(depth_unit_scale_factor=0.01).parse(capture, "val")
+    assert scene.mask_paths == (capture / "masks" / "000.png", None)
+    assert scene.depth_paths == (capture / "depths" / "000.png", None)
+    assert scene.depth_unit == 0.01
+    assert scene.times is not None
+    assert scene.times.tolist() == [0, 1]
+    (capture / "masks" / "001.png").unlink()
+    assert Nerfstudio().parse(capture, "val").mask_paths is not None
+    with pytest.raises(DataError, match=r"masks/001\.png: this mask is missing, and 0 more"):
+        Nerfstudio().parse(capture, "train")
+
+
+def test_missing_images_are_skipped_and_reported_once(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for index in (3, 4):
+        (capture / "images" / f"{index:03d}.png").unlink()
+    scene = ALL.parse(capture, "train")
+    assert len(scene.image_paths) == 7
+    assert worst_miss(scene, np.delete(poses(), [3, 4], axis=0)) < EXACT
+    said = capsys.readouterr().err
+    assert said.count("2 of 9 images are missing and skipped") == 1
+    assert "003.png" in said
+
+
+@pytest.mark.parametrize("written", ["./images/004.png", "images/004", "absolute", "../scene/images/004.png"])
+def test_ways_to_name_an_image(capture: Path, written: str) -> None:
+    name = str(capture / "images" / "004.png") if written == "absolute" else written
+    edit(capture, lambda c: c["frames"][4].update(file_path=name))
+    scene = ALL.parse(capture, "train")
+    assert sum(path.resolve() == (capture / "images" / "004.png").resolve() for path in scene.image_paths) == 1
+    assert len(load_dataset(scene, "train")) == 9
+
+
+def test_a_file_may_be_named_instead_of_its_folder(capture: Path) -> None:
+    (capture / "transforms.json").rename(capture / "other.json")
+    assert len(ALL.parse(capture / "other.json", "train").image_paths) == 9
+
+
+def frame(**changes: Any) -> Any:
+    return lambda c: c["frames"][4].update(changes)
+
+
+def put(**changes: Any) -> Any:
+    return lambda c: c.update(changes)
+
+
+def cell(row: int, column: int, value: Any) -> Any:
+    return lambda c: c["frames"][4]["transform_matrix"][row].__setitem__(column, value)
+
+
+BAD = {
+    "no frames": (put(frames=[]), "lists no frames"),
+    "frames is an object": (put(frames={"a": 1}), "lists no frames"),
+    "frame is a number": (lambda c: c["frames"].__setitem__(4, 7), "frame 4 is 7; it must be an object"),
+    "no file": (lambda c: c["frames"][4].pop("file_path"), "frame 4: 'file_path' is missing"),
+    "file name with a zero": (frame(file_path="a\0b"), "frame 4: 'file_path' is not the name of a file"),
+    "endless file name": (frame(file_path="a" * 10_000), "frame 4: 'file_path' is not the name of a file"),
+    "no pose": (lambda c: c["frames"][4].pop("transform_matrix"), "frame 4: 'transform_matrix' is not a 4x4 matrix"),
+    "nan pose": (cell(0, 3, math.nan), "frame 4: the pose holds a value that is not finite"),
+    "text pose": (cell(0, 3, "x"), "frame 4: 'transform_matrix' is not a 4x4 matrix"),
+    "mirrored pose": (
+        lambda c: [row.__setitem__(0, -row[0]) for row in c["frames"][4]["transform_matrix"][:3]],
+        "frame 4: the pose is not rigid",
+    ),
+    "zero focal length": (put(fl_x=0.0), "frame 0: 'fl_x' is 0.0; it must be a number above zero"),
+    "negative focal length": (frame(fl_y=-5), "frame 4: 'fl_y' is -5; it must be a number above zero"),
+    "nan focal length": (put(fl_x=math.nan), "frame 0: 'fl_x' is nan"),
+    "huge focal length": (put(fl_x=10**400), "frame 0: 'fl_x' is a huge whole number"),
+    "text focal length": (put(fl_x="long"), "frame 0: 'fl_x' is 'long'"),
+    "no focal length": (lambda c: [c.pop("fl_x"), c.pop("fl_y")], "frame 0: there is neither 'fl_x' nor 'camera_ang"),
+    "flat angle": (lambda c: [c.pop("fl_x"), c.update(camera_angle_x=4.0)], "'camera_angle_x' is 4.0"),
+    "nan centre": (put(cx=math.nan), "frame 0: 'cx' is nan"),
+    "text coefficient": (put(k1="a"), "frame 0: 'k1' is 'a'"),
+    "zero width": (put(w=0), "frame 0: 'w' is 0; it must be a number above zero"),
+    "other shape": (put(w=30, h=40), r"001\.png is 40x30 pixels, but its camera is for the shape of 30x40"),
+    "unknown camera": (put(camera_model="OPENCVV"), "unknown camera_model 'OPENCVV'. Did you mean 'OPENCV'"),
+    "camera is a list": (put(camera_model=[1]), "unknown camera_model"),
+    "mixed cameras": (frame(camera_model="OPENCV_FISHEYE"), "mixes the camera models OPENCV_FISHEYE and PINHOLE"),
+    "mask is a number": (frame(mask_path=3), "frame 4: 'mask_path' is missing"),
+    "missing mask": (frame(mask_path="masks/no.png"), r"masks/no\.png: this mask is missing"),
+    "one time": (frame(time=0.5), "frame 0: 'time' is None"),
+    "late time": (lambda c: [f.update(time=2) for f in c["frames"]], "frame 0: 'time' is 2"),
+    "list is a text": (put(train_filenames="a"), "'train_filenames' is 'a'; it must be a list of names"),
+    "list of numbers": (put(train_filenames=[3]), "'train_filenames' is missing"),
+    "applied transform is none": (put(applied_transform=3), "'applied_transform': the pose has shape"),
+    "applied transform mirrors": (
+        put(applied_transform=[[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]),
+        "'applied_transform': the pose is not rigid",
+    ),
+    "applied scale is zero": (put(applied_scale=0), "'applied_scale' is 0; it must be a number above zero"),
+    "cube is nothing": (put(aabb_scale=-1), "'aabb_scale' is -1"),
+    "offset is a number": (put(aabb_scale=1, offset=0.5), "'offset' is 0.5; it must be a list of 3 numbers"),
+    "sparse points are a number": (put(ply_file_path=5), "'ply_file_path' is missing"),
+    "sparse points are no points": (put(ply_file_path="transforms.json"), "transforms.json is not a PLY file"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_content_is_refused_by_name(capture: Path, name: str) -> None:
+    change, words = BAD[name]
+    edit(capture, change)
+    with pytest.raises(DataError, match=words) as error:
+        Nerfstudio().parse(capture, "train")
+    assert "\n" not in str(error.value)
+    assert str(capture) in str(error.value)
+    assert len(str(error.value)) < 300 + len(str(capture)) + 2 * (name == "endless file name")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1, 2]", '"text"', "\x00\xff", "[" * 100_000])
+def test_json_that_is_not_an_object(capture: Path, text: str) -> None:
+    (capture / "transforms.json").write_text(text, encoding="latin-1")
+    with pytest.raises(DataError, match=r"transforms\.json"):
+        Nerfstudio().parse(capture, "train")
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        ({"downscale_factor": 0}, "--downscale-factor is 0"),
+        ({"eval_interval": -1}, "--eval-interval is -1"),
+        ({"scale_factor": 0.0}, "--scale-factor is 0.0"),
+        ({"scene_scale": math.inf}, "--scene-scale is inf"),
+        ({"near": 2.0, "far": 1.0}, "--near 2.0 and --far 1.0"),
+        ({"train_split_fraction": 1.5}, "--train-split-fraction is 1.5"),
+        ({"depth_unit_scale_factor": 0.0}, "--depth-unit-scale-factor is 0.0"),
+        ({"eval_interval": 1}, "split 'train' has none of the 9 images; --eval-interval 0"),
+    ],
+)
+def test_bad_flags(capture: Path, flags: dict[str, Any], words: str) -> None:
+    with pytest.raises(DataError, match=words):
+        dataclasses.replace(Nerfstudio(), **flags).parse(capture, "train")
+
+
+def test_no_folder() -> None:
+    with pytest.raises(DataError, match="--data"):
+        Nerfstudio().parse(None, "train")
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("split", "count"), [("train", 43), ("val", 7)])
+def test_real_fox(real_data: Path, split: Split, count: int) -> None:
+    """instant-ngp's: 1080x1920, reduced to fit 1600; its cube is around what the cameras look at."""
+    scene = Nerfstudio().parse(real_data / "fox", split)
+    data = load_dataset(scene[torch.arange(2)], split)
+    assert len(scene.image_paths) == count
+    assert data.image(0).shape == (960, 540, 3)
+    assert data.cameras.fx[0].item() == pytest.approx(1375.52 / 2)
+    assert scene.cameras.lens is not None
+    assert scene.cameras.lens[0, :4].tolist() == pytest.approx([0.0578421, -0.0805099, -0.000980296, 0.00015575])
+    positions = scene.cameras.camera_to_worlds[:, :, 3]
+    assert positions.abs().max() <= 1
+    assert ((positions > scene.box[0]) & (positions < scene.box[1])).all()
+
+
+@pytest.mark.data
+def test_real_fox_with_images_missing(real_data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = Nerfstudio().parse(real_data / "fox" / "transforms_original_67frames.json", "train")
+    assert len(scene.image_paths) == 43
+    assert "17 of 67 images are missing" in capsys.readouterr().err
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("split", "count"), [("train", 84), ("test", 13)])
+def test_real_plush_toy(real_data: Path, split: Split, count: int) -> None:
+    scene = Nerfstudio().parse(real_data / "snowmiku", split)
+    assert len(scene.image_paths) == count
+    assert scene.cameras.model == "opencv"
+    sizes = {iio.improps(path).shape for path in scene.image_paths}
+    assert sizes == {(378, 504, 3)}
+    assert scene.cameras.cx[0].item() == 252

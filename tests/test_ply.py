@@ -1,0 +1,81 @@
+"""PLY files: every kind of number, whatever comes with it; and no trust in what a header claims."""
+
+import struct
+from pathlib import Path
+
+import pytest
+import torch
+
+from framework.errors import DataError
+from framework.ply import read_points
+
+POINTS = [(1.0, 2.0, 3.0), (-0.5, 0.25, 1e3)]
+EXPECTED = torch.tensor(POINTS, dtype=torch.float64)
+
+
+def header(kind: str, count: int = 2, properties: str = "float x,float y,float z", more: str = "") -> bytes:
+    lines = ["ply", f"format {kind} 1.0", "comment by hand", f"element vertex {count}"]
+    lines += [f"property {part}" for part in properties.split(",")]
+    return ("\n".join([*lines, *filter(None, [more]), "end_header"]) + "\n").encode()
+
+
+def write(folder: Path, content: bytes) -> Path:
+    file = folder / "points.ply"
+    file.write_bytes(content)
+    return file
+
+
+def test_ascii(tmp_path: Path) -> None:
+    body = "\n".join(" ".join(map(str, point)) for point in POINTS).encode()
+    assert torch.equal(read_points(write(tmp_path, header("ascii") + body)), EXPECTED)
+
+
+@pytest.mark.parametrize(("kind", "order"), [("binary_little_endian", "<"), ("binary_big_endian", ">")])
+def test_binary_with_colours_between_and_faces_after(tmp_path: Path, kind: str, order: str) -> None:
+    properties = "uchar red,double z,float32 y,int16 label,double x"
+    body = b"".join(struct.pack(f"{order}Bdfhd", 7, z, y, -3, x) for x, y, z in POINTS)
+    head = header(kind, 2, properties, "element face 1\nproperty list uchar int vertex_indices")
+    assert torch.equal(read_points(write(tmp_path, head + body + b"\x03" + 12 * b"\0")), EXPECTED)
+
+
+def test_points_that_are_nowhere_are_left_out(tmp_path: Path) -> None:
+    assert torch.equal(read_points(write(tmp_path, header("ascii", 3) + b"1 2 3\nnan 0 0\n-0.5 0.25 1e3")), EXPECTED)
+
+
+def test_no_points(tmp_path: Path) -> None:
+    assert read_points(write(tmp_path, header("ascii", 0))).shape == (0, 3)
+
+
+BAD = {
+    "empty": (b"", "not a PLY file"),
+    "an image": (b"\x89PNG\r\n\x1a\n" + 100 * b"\0", "not a PLY file"),
+    "no end": (b"ply\nformat ascii 1.0\n", "its header has no end"),
+    "endless line": (b"ply\nformat ascii 1.0\ncomment " + 5000 * b"a", "its header has no end"),
+    "unknown format": (header("middle_endian"), "its format is 'middle_endian'"),
+    "no z": (header("ascii", 2, "float x,float y"), "with the properties x, y and z"),
+    "x twice": (header("ascii", 2, "float x,float x,float y,float z"), "with the properties x, y and z, each once"),
+    "a list": (header("ascii", 2, "list uchar int x"), "lists are not read"),
+    "unknown type": (header("ascii", 2, "quad x"), "the property 'quad x'"),
+    "negative count": (header("ascii", -2), "'vertex' comes first"),
+    "faces first": (header("ascii").replace(b"element v", b"element face 3\nelement v"), "'face' comes first"),
+    "more than there is": (header("binary_little_endian", 10**12) + 24 * b"\0", "is cut off"),
+    "more than there is, ascii": (header("ascii", 10**12) + b"1 2 3\n", "is cut off"),
+    "cut off": (header("binary_little_endian", 3) + 24 * b"\0", "is cut off"),
+    "short line": (header("ascii") + b"1 2 3\n1 2\n   \n", "point 1 has 2 values instead of 3"),
+    "words": (header("ascii") + b"1 2 3\nx y z\n", "point 1 is not made of numbers"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_files_are_refused_in_one_line(tmp_path: Path, name: str) -> None:
+    content, words = BAD[name]
+    file = write(tmp_path, content)
+    with pytest.raises(DataError, match=words) as error:
+        read_points(file)
+    assert str(file) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_no_file(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="cannot read"):
+        read_points(tmp_path / "none.ply")

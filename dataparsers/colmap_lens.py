@@ -11,7 +11,7 @@ from torch import Tensor
 from dataparsers.colmap_model import SparseCamera
 from framework import DataError
 from framework.cameras import LENSES
-from framework.colmap_cameras import Intrinsics, from_colmap
+from framework.colmap_cameras import PARAMETERS, Intrinsics, from_colmap
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,8 @@ def lenses_of(cameras: Sequence[SparseCamera], names: Sequence[str], where: str)
         try:
             found.append(from_colmap(camera.model, camera.params, camera.width, camera.height))
         except DataError as error:
-            raise DataError(f"{where}: image {name!r}: {error}, as in: {_command(where)}") from error
+            command = "" if camera.model in PARAMETERS else f", as in: {_command(where)}"
+            raise DataError(f"{where}: image {name!r}: {error}{command}") from error
     models = [camera.model for camera in found]
     # Without distortion an opencv camera is a pinhole, and the other way round.
     model = next((kind for kind in models if kind != "pinhole"), "pinhole")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from dataparsers.masks import find_masks
 from framework import DataError, ParsedScene
 from framework.cameras import check_pose
 from framework.dataset import Split, one_line
+from framework.ndc import NdcCameras, find_ndc, ndc_box
 from framework.poses import Placement
 
 POSES = "poses_bounds.npy"
@@ -35,6 +36,9 @@ class Llff(Captured):
     use_bounds: bool = True
     """Take from the file's depth bounds where rays start, unless `near` is farther, and of a scene that is seen from
     one side the box: all that lies between the bounds, times `scene_scale`."""
+    ndc: bool = False
+    """Learn in normalised device coordinates, for scenes that are seen from one side: all out to infinity is in the
+    box, and near, far and scene_scale count for nothing. Depths are then such coordinates' too."""
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
@@ -55,18 +59,30 @@ class Llff(Captured):
             masks=find_masks(path / self.masks_path, names),
         )
         scene = captured_scene(self, photographs, split)
-        if not self.use_bounds:
-            return scene
-        near = max(self.near, NEAR_SHARE * float(bounds[:, 0].min()) * scene.scale)
+        placed = Placement(_transform(scene).double(), scene.scale).poses(poses)
+        corners, bounds = corner_directions(placed, intrinsics, sizes), bounds * scene.scale
+        if self.ndc:
+            return _in_ndc(scene, placed, corners, NEAR_SHARE * bounds[:, 0])
+        return self._bounded(scene, placed, corners, bounds) if self.use_bounds else scene
+
+    def _bounded(self, scene: ParsedScene, poses: Tensor, corners: Tensor, bounds: Tensor) -> ParsedScene:
+        """A scene whose near, and whose box if it is seen from one side, are those of the file.
+
+        Args:
+            poses: (M, 3, 4) of all photographs, scene coordinates.
+            corners: (M, 4, 3) as `corner_directions` gives them.
+            bounds: (M, 2) scene units.
+        """
+        near = max(self.near, NEAR_SHARE * float(bounds[:, 0].min()))
         if near >= self.far:
             raise DataError(
-                f"--far {self.far} is nearer than the bounds in {path / POSES}; raise it, or --use-bounds False"
+                f"--far {self.far} is nearer than what {POSES} says to be near; raise it, or --use-bounds False"
             )
         scene = replace(scene, near=near)
-        if scene.transform is None or not faces_forward(poses):
+        if not faces_forward(poses):
             return scene
-        placed = Placement(scene.transform.double(), scene.scale).poses(poses)
-        box = seen_box(placed, intrinsics, sizes, bounds * scene.scale).float()
+        ends = poses[:, None, None, :, 3] + bounds[:, :, None, None] * corners[:, None]
+        box = torch.stack([ends.amin((0, 1, 2)), ends.amax((0, 1, 2))]).float()
         centre = box.mean(0)
         return replace(scene, box=centre + (box - centre) * self.scene_scale)
 
@@ -116,28 +132,36 @@ def read_poses_bounds(file: Path, count: int) -> tuple[Tensor, Tensor, Tensor, T
 
 
 def faces_forward(poses: Tensor) -> bool:
-    """Whether cameras (M, 4, 4) look the same way, more or less."""
-    back = poses[:, :3, 2]
+    """Whether cameras (M, 3, 4) look the same way, more or less."""
+    back = poses[:, :, 2]
     mean = back.mean(0)
     return bool(((back @ mean) >= FORWARD * mean.norm()).all()) and bool(mean.norm() > 0)
 
 
-def seen_box(poses: Tensor, intrinsics: Tensor, sizes: Tensor, bounds: Tensor) -> Tensor:
-    """(2, 3) the smallest box that holds what M pinhole cameras see between their bounds.
+def corner_directions(poses: Tensor, intrinsics: Tensor, sizes: Tensor) -> Tensor:
+    """(M, 4, 3) directions through the corners of M pinhole cameras' images, 1 long along their axes.
 
     Args:
         poses: (M, 3, 4) camera-to-world.
         intrinsics: (M, 4) fx, fy, cx, cy in pixels.
         sizes: (M, 2) width and height in pixels.
-        bounds: (M, 2) least and greatest depth along each camera's axis.
     """
-    corners = []
-    for side in ([0, 0], [1, 0], [0, 1], [1, 1]):
-        x, y = ((torch.tensor(side) * sizes - intrinsics[:, 2:]) / intrinsics[:, :2]).unbind(-1)
-        ahead = (poses[:, :, :3] @ torch.stack([x, -y, -torch.ones_like(x)], dim=-1)[..., None])[..., 0]
-        corners += [poses[:, :, 3] + depth[:, None] * ahead for depth in bounds.unbind(-1)]
-    points = torch.cat(corners)
-    return torch.stack([points.amin(0), points.amax(0)])
+    sides = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]])
+    x, y = ((sides * sizes[:, None] - intrinsics[:, None, 2:]) / intrinsics[:, None, :2]).unbind(-1)
+    return torch.stack([x, -y, -torch.ones_like(x)], dim=-1) @ poses[:, :, :3].transpose(1, 2)
+
+
+def _in_ndc(scene: ParsedScene, poses: Tensor, corners: Tensor, nears: Tensor) -> ParsedScene:
+    """A scene in normalised device coordinates: all that is seen is in its box, so nothing is outside."""
+    ndc = find_ndc(poses, corners, nears)
+    box = ndc_box(ndc, poses, corners).float()
+    cameras = NdcCameras(**{f.name: getattr(scene.cameras, f.name) for f in fields(scene.cameras)}, ndc=ndc)
+    # No ray is longer than the box's diagonal.
+    return replace(scene, cameras=cameras, box=box, near=0.0, far=float((box[1] - box[0]).norm()), unbounded=False)
+
+
+def _transform(scene: ParsedScene) -> Tensor:
+    return torch.eye(4)[:3] if scene.transform is None else scene.transform
 
 
 def _image_names(root: Path) -> list[str]:

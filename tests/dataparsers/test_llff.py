@@ -88,6 +88,24 @@ def test_cameras_all_around_keep_the_box_around_them(tmp_path: Path) -> None:
     assert Llff().parse(tmp_path, "train").box.tolist() == [[-1, -1, -1], [1, 1, 1]]
 
 
+def test_normalised_device_coordinates(folder: Path, capture: Capture) -> None:
+    """The pictures' pixels stay, and splits share one box; captures from all around are refused."""
+    train, val = (Llff(ndc=True).parse(folder, split) for split in ("train", "val"))
+    torch.testing.assert_close(train.box, val.box)
+    assert not train.unbounded
+    assert train.box[:, 2].tolist() == pytest.approx([-1, 1])
+    data = load_dataset(train, "train")
+    rays = data.cameras.pixel_rays(data.cameras.image_pixels(3), data.scene.near, data.scene.far)
+    assert len(rays) == 60 * 40
+    ends = rays.origins + rays.fars[:, None] * rays.directions
+    assert bool(((ends >= train.box[0] - 1e-4) & (ends <= train.box[1] + 1e-4)).all())
+    assert ends[:, 2].min().item() == pytest.approx(1, abs=1e-4)
+    around = make_capture()
+    np.save(folder / "poses_bounds.npy", poses_bounds(around))
+    with pytest.raises(DataError, match="look the same way"):
+        Llff(ndc=True).parse(folder, "train")
+
+
 def test_masks_and_held_out_images(folder: Path, capture: Capture) -> None:
     write_images(folder / "masks", capture.names)
     val = Llff().parse(folder, "val")

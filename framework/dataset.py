@@ -52,6 +52,8 @@ class ParsedScene:
     """There may be something to see outside `box`."""
     exact_poses: bool = True
     """The poses are known rather than estimated."""
+    appearance_varies: bool = False
+    """Light, exposure or camera differ between the photographs."""
     depth_paths: tuple[Path | None, ...] | None = None
     """M images of depth along the camera's axis, 0 where it is unknown; None where there is none."""
     depth_unit: float = 0.001
@@ -202,6 +204,7 @@ def _assemble(parsed: ParsedScene, images: list[np.ndarray], cameras: Cameras) -
         image_size=max(max(image.shape[:2]) for image in images),
         unbounded=parsed.unbounded,
         exact_poses=parsed.exact_poses,
+        appearance_varies=parsed.appearance_varies,
     )
     transform = torch.eye(4)[:3] if parsed.transform is None else parsed.transform
     names = tuple(path.name for path in parsed.image_paths)

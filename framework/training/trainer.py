@@ -22,6 +22,7 @@ from framework.errors import CheckpointError, DivergenceError
 from framework.evaluation.evaluator import evaluate, evaluation_background, render_view, use_bfloat16
 from framework.evaluation.images import comparison
 from framework.evaluation.metrics import MAX_PSNR
+from framework.ndc import NdcCameras
 from framework.pixels import Background, Batch, composite, draw_batch
 from framework.scene_profile import Decision, SceneProfile
 from framework.silhouettes import Silhouettes, pixels_near, visual_hull
@@ -215,6 +216,8 @@ class Trainer:
         scene, camera = self.model.scene, self.train_set.cameras.model
         if not scene.has_alpha:
             return "no photograph has alpha"
+        if isinstance(self.train_set.cameras, NdcCameras):
+            return "the box is in normalised device coordinates"
         return None if camera == "pinhole" else f"the camera is {camera}, not pinhole"
 
     def _prepare(self) -> None:

@@ -1,0 +1,273 @@
+"""The COLMAP format: models are read as COLMAP means them, and damaged ones are refused in one line."""
+
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dataparsers.colmap import Colmap
+from dataparsers.colmap_model import read_model
+from dataparsers.llff import Llff
+from framework.dataset import load_dataset
+from framework.errors import DataError
+from tests.dataparsers.sparse_models import Capture, make_capture, misses, write_colmap, write_images
+
+pycolmap = pytest.importorskip("pycolmap")
+FX, FY, CX, CY = 50.0, 48.0, 31.0, 19.0
+RADIAL = "SIMPLE_RADIAL 60 40 50 31 19 0.1"
+
+
+@pytest.fixture
+def capture() -> Capture:
+    return make_capture()
+
+
+@pytest.fixture
+def folder(tmp_path: Path, capture: Capture) -> Path:
+    write_images(tmp_path / "images", capture.names)
+    write_colmap(tmp_path / "sparse" / "0", capture)
+    return tmp_path
+
+
+def as_binary(model: Path) -> None:
+    """Replace a text model by a binary one."""
+    pycolmap.Reconstruction(str(model)).write_binary(str(model))
+    for file in model.glob("*.txt"):
+        file.unlink()
+
+
+@pytest.mark.parametrize("kind", ["text", "binary"])
+@pytest.mark.parametrize("place", ["sparse/0", "colmap/sparse/0", "sparse"])
+def test_rays_through_keypoints_meet_the_points(tmp_path: Path, capture: Capture, kind: str, place: str) -> None:
+    write_images(tmp_path / "images", capture.names)
+    model = write_colmap(tmp_path / place, capture)
+    if kind == "binary":
+        as_binary(model)
+    assert Colmap.recognizes(tmp_path)
+    scene = Colmap(eval_interval=0).parse(tmp_path, "train")
+    assert [path.name for path in scene.image_paths] == capture.names
+    assert scene.unbounded
+    assert not scene.exact_poses
+    for image in range(len(capture.names)):
+        x, y = capture.seen(image).T
+        assert misses(scene, image, FX * x + CX, FY * y + CY, capture.points).max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("camera", "model"),
+    [("SIMPLE_PINHOLE 60 40 50 31 19", "pinhole"), (RADIAL, "opencv"), ("RADIAL 60 40 50 31 19 0.1 -0.02", "opencv"),
+     ("OPENCV 60 40 50 48 31 19 0.1 -0.02 0.003 -0.001", "opencv"), ("SIMPLE_RADIAL 60 40 50 31 19 0", "pinhole"),
+     ("OPENCV_FISHEYE 60 40 50 48 31 19 0.1 -0.02 0.003 -0.001", "fisheye")],
+)  # fmt: skip
+def test_camera_models(tmp_path: Path, capture: Capture, camera: str, model: str) -> None:
+    """Against COLMAP's own projection."""
+    write_images(tmp_path / "images", capture.names)
+    write_colmap(tmp_path / "sparse", capture, camera)
+    scene = Colmap(eval_interval=0).parse(tmp_path, "train")
+    assert scene.cameras.model == model
+    name, width, height, *params = camera.split()
+    own = pycolmap.Camera(model=name, width=int(width), height=int(height), params=[float(p) for p in params])
+    local = capture.points @ capture.rotations[4].T + capture.translations[4]
+    at = np.array([np.ravel(own.img_from_cam(point)) for point in local])
+    assert misses(scene, 4, at[:, 0], at[:, 1], capture.points).max() < 2e-3
+
+
+def test_reduced_images_scale_intrinsics_by_their_own_size(folder: Path, capture: Capture) -> None:
+    """61 pixels reduced by 2 are 30, so one folder's name does not say by how much."""
+    for file in (folder / "images").iterdir():
+        file.unlink()
+    write_images(folder / "images_2", capture.names, (29, 20))
+    scene = Colmap(eval_interval=0).parse(folder, "train")
+    assert scene.image_paths[0].parent.name == "images_2"
+    assert scene.cameras.fx[0].item() == pytest.approx(FX * 29 / 60)
+    assert scene.cameras.cy[0].item() == pytest.approx(CY * 20 / 40)
+    x, y = capture.seen(3).T
+    assert misses(scene, 3, (FX * x + CX) * 29 / 60, (FY * y + CY) / 2, capture.points).max() < 1e-3
+    assert len(load_dataset(scene, "train")) == 10
+
+
+def test_every_eighth_by_sorted_name_is_held_out(folder: Path) -> None:
+    train, val, test = (Colmap().parse(folder, split) for split in ("train", "val", "test"))
+    assert [path.name for path in val.image_paths] == ["p00.png", "p08.png"] == [p.name for p in test.image_paths]
+    assert len(train.image_paths) == 8
+    assert train.transform is not None
+    assert val.transform is not None
+    torch.testing.assert_close(train.transform, val.transform)
+    assert train.scale == val.scale
+
+
+@pytest.mark.parametrize(("tracks", "error", "count"), [(3, 0.5, 30), (2, 0.5, None), (3, 5.0, None)])
+def test_only_points_that_images_agree_on(
+    tmp_path: Path, capture: Capture, tracks: int, error: float, count: int | None
+) -> None:
+    write_images(tmp_path / "images", capture.names)
+    write_colmap(tmp_path / "sparse", capture, tracks=tracks, error=error)
+    scene = Colmap().parse(tmp_path, "train")
+    assert (None if scene.points is None else len(scene.points)) == count
+    if scene.points is not None and scene.transform is not None:
+        expected = scene.scale * (capture.points @ scene.transform[:, :3].T.numpy() + scene.transform[:, 3].numpy())
+        found = np.array(sorted(scene.points.tolist()))
+        np.testing.assert_allclose(found, np.array(sorted(expected.tolist())), atol=1e-5)
+
+
+def test_the_largest_of_several_models_is_taken(
+    folder: Path, capture: Capture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few = Capture(capture.names[:4], capture.rotations[:4], capture.translations[:4], capture.points)
+    for file in (folder / "sparse" / "0").iterdir():
+        file.unlink()
+    (folder / "sparse" / "0").rmdir()
+    write_colmap(folder / "sparse" / "0", few)
+    as_binary(write_colmap(folder / "sparse" / "1", capture))
+    assert len(Colmap(eval_interval=0).parse(folder, "train").image_paths) == 10
+    said = " ".join(capsys.readouterr().err.split())
+    assert "2 COLMAP reconstructions" in said
+    assert "sparse/1 has the most images (10)" in said
+    assert len(Colmap(eval_interval=0, colmap_path="sparse/0").parse(folder, "train").image_paths) == 4
+
+
+@pytest.mark.parametrize("form", ["{stem}.png", "{name}.png"])
+@pytest.mark.parametrize("place", ["masks", "masks_2"])
+def test_masks_are_found_by_the_images_name(tmp_path: Path, place: str, form: str) -> None:
+    capture = make_capture()
+    capture.names = [f"cam1/p{index:02d}.jpg" for index in range(10)]
+    write_colmap(tmp_path / "sparse", capture)
+    images, size = (tmp_path / "images", (60, 40)) if place == "masks" else (tmp_path / "images_2", (30, 20))
+    write_images(images, capture.names, size)
+    masks = [form.format(stem=name[:-4], name=name) for name in capture.names]
+    write_images(tmp_path / place, masks[:-1], size)
+    scene = Colmap(eval_interval=0).parse(tmp_path, "train")
+    assert scene.mask_paths == (*(tmp_path / place / mask for mask in masks[:-1]), None)
+
+
+def test_missing_images_are_counted_and_skipped(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "images" / "p03.png").unlink()
+    scene = Colmap(eval_interval=0).parse(folder, "train")
+    assert len(scene.image_paths) == 9
+    assert "1 of 10 images are missing and skipped" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_camera_that_is_not_known_is_refused_by_image(tmp_path: Path, capture: Capture) -> None:
+    write_images(tmp_path / "images", capture.names)
+    write_colmap(tmp_path / "sparse", capture, "FOV 60 40 50 48 31 19 0.9")
+    with pytest.raises(DataError, match=r"'p00\.png'.*FOV.*colmap image_undistorter") as error:
+        Colmap().parse(tmp_path, "train")
+    assert "\n" not in str(error.value)
+
+
+def test_cameras_of_several_models(folder: Path, capture: Capture) -> None:
+    """A pinhole is an opencv camera without distortion; a fisheye is not."""
+    cameras = folder / "sparse" / "0" / "cameras.txt"
+    text = cameras.read_text()
+    cameras.write_text(text.replace("8 PINHOLE 60 40 50 48 31 19", "8 OPENCV 60 40 50 48 31 19 0.1 0 0 0", 1))
+    scene = Colmap(eval_interval=0).parse(folder, "train")
+    assert scene.cameras.model == "opencv"
+    assert scene.cameras.lens is not None
+    assert [bool(row.any()) for row in scene.cameras.lens] == [False, True] + [False] * 8
+    x, y = capture.seen(5).T
+    assert misses(scene, 5, FX * x + CX, FY * y + CY, capture.points).max() < 1e-3
+    cameras.write_text(text.replace("8 PINHOLE 60 40 50 48 31 19", "8 OPENCV_FISHEYE 60 40 50 48 31 19 0.1 0 0 0", 1))
+    with pytest.raises(DataError, match=r"'p00\.png' has a pinhole camera and image 'p01\.png' a fisheye"):
+        Colmap().parse(folder, "train")
+
+
+@pytest.mark.parametrize("camera", ["PINHOLE 0 40 50 48 31 19", "PINHOLE 60 40 -50 48 31 19"])
+def test_cameras_that_see_nothing(tmp_path: Path, capture: Capture, camera: str) -> None:
+    write_images(tmp_path / "images", capture.names)
+    write_colmap(tmp_path / "sparse", capture, camera)
+    with pytest.raises(DataError, match=r"'p00\.png'.*cannot be"):
+        Colmap().parse(tmp_path, "train")
+
+
+def test_without_pycolmap_one_line_says_how_to_get_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(DataError, match="pip install pycolmap"):
+        Colmap().parse(folder, "train")
+
+
+def test_formats_do_not_dispute_a_folder(folder: Path) -> None:
+    (folder / "poses_bounds.npy").touch()
+    assert Colmap.recognizes(folder)
+    assert not Llff.recognizes(folder)
+    (folder / "transforms.json").touch()
+    assert not Colmap.recognizes(folder)
+    assert not Llff.recognizes(folder)
+    assert not Colmap.recognizes(folder / "nowhere")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.7, 0.999])
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_binary_files_cut_short_are_refused_by_name(folder: Path, name: str, share: float) -> None:
+    """pycolmap hangs on some of them."""
+    model = folder / "sparse" / "0"
+    as_binary(model)
+    whole = (model / name).read_bytes()
+    (model / name).write_bytes(whole[: int(len(whole) * share)])
+    with pytest.raises(DataError, match=rf"{name} is cut short") as error:
+        Colmap().parse(folder, "train")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("content", [b"\xff" * 64, b"no model at all, just text", bytes(range(256)) * 20])
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+def test_garbage_is_refused(folder: Path, name: str, content: bytes, kind: str) -> None:
+    model = folder / "sparse" / "0"
+    if kind == "bin":
+        as_binary(model)
+    (model / f"{name}.{kind}").write_bytes(content)
+    with pytest.raises(DataError, match=r"damaged|no image with a pose") as error:
+        Colmap().parse(folder, "train")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_a_model_without_one_of_its_files(folder: Path, name: str) -> None:
+    model = folder / "sparse" / "0"
+    (model / f"{name}.txt").unlink()
+    with pytest.raises(DataError, match=r"not a whole COLMAP model|has no COLMAP reconstruction"):
+        Colmap().parse(folder, "train")
+
+
+def test_poses_and_names_that_are_none(folder: Path) -> None:
+    images = folder / "sparse" / "0" / "images.txt"
+    text = images.read_text()
+    first = next(line for line in text.splitlines() if line.endswith("p02.png"))
+    number, *_, camera, name = first.split()
+    images.write_text(text.replace(first, f"{number} 1 0 0 0 nan 0 0 {camera} {name}"))
+    with pytest.raises(DataError, match=r"p02\.png|damaged"):
+        read_model(images.parent)
+    images.write_text(text.replace("p02.png", "p" * 300))
+    with pytest.raises(DataError, match="not the name of a file"):
+        read_model(images.parent)
+
+
+def test_no_folder_and_no_model(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"--data"):
+        Colmap().parse(None, "train")
+    with pytest.raises(DataError, match=r"no COLMAP reconstruction.*--colmap-path"):
+        Colmap().parse(tmp_path, "train")
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("scene_name", ["colmap_can", "colmap_cup", "colmap_desk"])
+def test_real_points_are_seen_where_their_keypoints_are(real_data: Path, scene_name: str) -> None:
+    """Pixels at the size of the images that are read."""
+    folder = real_data / scene_name
+    scene = Colmap(eval_interval=0).parse(folder, "train")
+    model = pycolmap.Reconstruction(os.fspath(folder / "sparse" / "0"))
+    by_name = {image.name: image for image in model.images.values()}
+    errors = []
+    for index, path in enumerate(scene.image_paths):
+        image = by_name[path.name]
+        camera = model.cameras[image.camera_id]
+        width, height = int(scene.cameras.widths[index]), int(scene.cameras.heights[index])
+        found = [point for point in image.points2D if point.has_point3D()]
+        at = np.stack([point.xy for point in found]) * [width / camera.width, height / camera.height]
+        points = np.stack([model.points3D[point.point3D_id].xyz for point in found])
+        errors.append(misses(scene, index, at[:, 0], at[:, 1], points))
+    assert np.median(np.concatenate(errors)) < 1.5
+    assert max(np.median(each) for each in errors) < 3

@@ -138,6 +138,13 @@ class Dataset:
         start, end = self.cameras.offsets[index : index + 2].tolist()
         return self.kept.mask(start, end).view(int(self.cameras.heights[index]), -1)
 
+    def drawing(self, pixels: PixelSet) -> Dataset:
+        """The same data, of which only these pixels are drawn, less those that masks ignore."""
+        pixels = pixels.to(self.pixels.device)
+        if self.kept is not None:
+            pixels = PixelSet.shared([pixels, self.kept.to(self.pixels.device)], 2)
+        return replace(self, drawn=pixels if len(pixels) else self.kept)
+
     def to(self, device: torch.device | str) -> Dataset:
         """The same data on `device`."""
         return replace(

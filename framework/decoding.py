@@ -126,8 +126,8 @@ def _fill(files: ImageFiles, store: PixelStore, channels: int) -> dict[str, np.n
         images = list(track(pool.map(put, range(len(counts))), f"Loading {files.split} images", total=len(counts)))
     failures = [image for image in images if isinstance(image, DataError)]
     if len(failures) == len(images):
-        nothing = f"split '{files.split}' has no readable image: {failures[0]}" if failures else f"'{files.split}' is empty"
-        raise DataError(nothing)
+        reason = f"has no readable image: {failures[0]}" if failures else "is empty"
+        raise DataError(f"split '{files.split}' {reason}")
     left = {index: image for index, image in enumerate(images) if not isinstance(image, DataError)}
     total = 0
     for index in left:
@@ -153,7 +153,8 @@ def _kept_runs(files: ImageFiles, left: dict[int, _Image], total: int) -> dict[s
     starts, lengths, first = [], [], 0
     for index, image in left.items():
         count = files.sizes[index][0] * files.sizes[index][1]
-        kept = image.kept or PixelSet.of_runs(torch.tensor([0]), torch.tensor([count]))
+        whole = PixelSet.of_runs(torch.tensor([0]), torch.tensor([count]))
+        kept = whole if image.kept is None else image.kept
         starts.append(kept.starts + first)
         lengths.append(kept.before.diff())
         first += count

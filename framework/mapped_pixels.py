@@ -18,9 +18,9 @@ SMALLEST_SLICE = 2**20
 class MappedPixels:
     """The pixels of a file.
 
-    Pages of a file that were read count as the process's memory until they are dropped, or until the system needs them.
-    So whoever reads goes through the file in order, and drops what lies behind. Dropping takes nothing away: a page that
-    is read again comes from the system's cache, or from the disk.
+    Pages of a file that were read count as the process's memory until they are dropped, or until the system needs
+    them. So whoever reads goes through the file in order, and drops what lies behind. Dropping takes nothing away: a
+    page that is read again comes from the system's cache, or from the disk.
 
     Args:
         path: a file that begins with the pixels.

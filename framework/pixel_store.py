@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import threading
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
@@ -70,7 +71,7 @@ class FileStore:
         """As `PixelStore.write`. Raises: OSError."""
         with self._lock:
             self._file.seek(start)
-            self._file.write(memoryview(np.ascontiguousarray(values)))
+            self._file.write(np.ascontiguousarray(values).data)
 
     def read(self, start: int, count: int) -> np.ndarray:
         """As `PixelStore.read`."""
@@ -91,10 +92,8 @@ class FileStore:
 
     def discard(self) -> None:
         """Remove the file."""
-        try:
-            self._file.close()  # which writes what is left, and may find no room for it
-        except OSError:
-            pass
+        with suppress(OSError):  # closing writes what is left, and may find no room for it
+            self._file.close()
         self.path.unlink(missing_ok=True)
 
 

@@ -19,7 +19,7 @@ FEWEST = 64
 """Pixels, below which a photograph is left out."""
 APPEARANCE_STOPS = 0.13
 """From here on the light is said to vary. Of seven captures, five in steady light were at 0.02 to 0.09; one whose
-lights were dimmed was at 0.20, and one gathered from many cameras and days at 0.30."""
+lights were dimmed was at 0.20, and one gathered from many cameras and days at 0.29."""
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 

@@ -143,7 +143,9 @@ class Dataset:
         pixels = pixels.to(self.pixels.device)
         if self.kept is not None:
             pixels = PixelSet.shared([pixels, self.kept.to(self.pixels.device)], 2)
-        return replace(self, drawn=pixels if len(pixels) else self.kept)
+        if not len(pixels):
+            return self
+        return replace(self, drawn=pixels if self.mapped is not None else pixels.listed())
 
     def to(self, device: torch.device | str) -> Dataset:
         """The same data on `device`."""
@@ -202,6 +204,7 @@ def load_dataset(parsed: ParsedScene, split: str, memory: PixelMemory | None = N
         # Of an object cut out of its surroundings, each side has a light of its own.
         appearance_varies=not has_alpha and light_spread(decoded.light) > APPEARANCE_STOPS,
     )
+    kept = decoded.kept
     return Dataset(
         pixels=decoded.pixels,
         cameras=cameras,
@@ -210,8 +213,8 @@ def load_dataset(parsed: ParsedScene, split: str, memory: PixelMemory | None = N
         scene=scene,
         transform=torch.eye(4)[:3] if parsed.transform is None else parsed.transform,
         scale=parsed.scale,
-        drawn=decoded.kept,
-        kept=decoded.kept,
+        drawn=kept if kept is None or decoded.mapped is not None else kept.listed(),
+        kept=kept,
         light=decoded.light,
         mapped=decoded.mapped,
     )

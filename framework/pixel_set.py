@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -19,6 +19,8 @@ class PixelSet:
     """(N,) int64 first pixel of each run, ascending."""
     before: Tensor
     """(N + 1,) int64 how many pixels lie in the runs before each; the last is K."""
+    every: Tensor | None = None
+    """(K,) the pixels one by one, where there is memory for them: four times as fast to draw from."""
 
     @classmethod
     def of_runs(cls, starts: Tensor, lengths: Tensor) -> PixelSet:
@@ -71,10 +73,19 @@ class PixelSet:
 
     def to(self, device: torch.device | str) -> PixelSet:
         """The same pixels on `device`."""
-        return PixelSet(*(getattr(self, f.name).to(device) for f in fields(self)))
+        known = (getattr(self, f.name) for f in fields(self))
+        return PixelSet(*(None if values is None else values.to(device) for values in known))  # type: ignore[arg-type]
+
+    def listed(self) -> PixelSet:
+        """The same pixels, which are also kept one by one."""
+        every = self.pixels()
+        small = len(every) == 0 or int(every[-1]) < 2**31
+        return replace(self, every=every.to(torch.int32) if small else every)
 
     def at(self, ranks: Tensor) -> Tensor:
         """(R,) int64 the pixels that are the `ranks`-th (R,) of the set, from 0."""
+        if self.every is not None:
+            return self.every[ranks].long()
         if ranks.device.type == "cpu":  # numpy takes one thread: a background thread must not wake torch's
             return torch.from_numpy(self._at(ranks.numpy()))
         runs = torch.searchsorted(self.before, ranks, right=True) - 1

@@ -1,10 +1,13 @@
 """How much light differs: told from what is seen, in stops that can be computed by hand."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 from framework.appearance import APPEARANCE_STOPS, GRID, light_of, light_spread
+from framework.image_files import read_image
 
 
 def scene(seed: int, shape: tuple[int, int] = (90, 120)) -> np.ndarray:
@@ -77,3 +80,22 @@ def test_photographs_of_which_nothing_is_left_are_passed_over() -> None:
     nothing = np.full((3, 5), np.nan, np.float32)
     light = np.stack([light_of(stored(scene(0))), nothing, light_of(stored(scene(0) * 2))])
     assert light_spread(torch.from_numpy(light)) == pytest.approx(0.5, rel=0.1)
+
+
+CAPTURES = {
+    "fern/images_8": False,
+    "fox/images": False,
+    "colmap_cup/images": False,
+    "colmap_desk/images_2": True,
+    "statue_of_liberty/images_2": True,
+}
+
+
+@pytest.mark.data
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CAPTURES)
+def test_captures_whose_light_varies_are_told_from_others(name: str, real_data: Path) -> None:
+    images = [read_image(path) for path in sorted((real_data / name).iterdir()) if path.suffix in (".jpg", ".png")]
+    found = spread(images)
+    print(f"{name}: {found:.3f} stops")
+    assert (found > APPEARANCE_STOPS) is CAPTURES[name]

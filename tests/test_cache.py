@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 import torch
 
+from framework.config import TrainConfig
 from framework.dataset import Dataset, ParsedScene, load_dataset, read_image
-from framework.errors import DataError
+from framework.device import machine_memory
+from framework.errors import ConfigError, DataError
 from framework.pixel_cache import PixelMemory
 from framework.pixel_store import FileStore
 from tests.images import noise, parsed, write_noise
@@ -246,3 +248,17 @@ def test_reading_in_bands_reduces_as_before(tmp_path: Path) -> None:
     alpha = blocks[..., 3:].sum((1, 3))
     color = (blocks[..., :3] * blocks[..., 3:]).sum((1, 3)) / np.maximum(alpha, 1)
     assert np.array_equal(found, np.concatenate([color, alpha / 9], -1).round().astype(np.uint8))
+
+
+@pytest.mark.parametrize("limit", [-1.0, float("nan")])
+def test_a_limit_below_nothing_is_refused(limit: float) -> None:
+    with pytest.raises(ConfigError, match=r"--cache-limit is .*; it must be at least 0 MB"):
+        TrainConfig(cache_limit=limit)
+
+
+def test_without_a_limit_half_of_the_memory_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert 0 < PixelMemory.of().limit == machine_memory() / 2
+    assert PixelMemory.of(3.0, tmp_path) == PixelMemory(3e6, tmp_path)
+    monkeypatch.delenv("NERFLOOM_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert PixelMemory.of().folder == tmp_path / "nerfloom"

@@ -20,6 +20,7 @@ def test_ranks_masks_and_pixels_against_a_boolean_array(smooth: int) -> None:
     assert torch.equal(chosen.pixels(), expected)
     ranks = torch.randint(len(expected), (300,))
     assert torch.equal(chosen.at(ranks), expected[ranks])
+    assert torch.equal(chosen.listed().to("cpu").at(ranks), expected[ranks])
     for first, last in ((50, 1047), (60, 61), (0, 2000), (333, 700)):
         padded = torch.zeros(3000, dtype=torch.bool)
         padded[50:1047] = mask

@@ -77,7 +77,7 @@ def _sampling_rungs(trainer: Trainer, samplers: list[OccupancySampler]) -> list[
     ]
     if carved:
         rungs.append(Rung("cells, outside the visual hull", carved, None, "--silhouette-cells False"))
-    if drawn is not None and drawn is not kept:
+    if drawn is not None and (kept is None or len(drawn) < len(kept)):  # else masks alone say what is drawn
         share = 1 - len(drawn) / len(trainer.train_set.pixels if kept is None else kept)
         rungs.append(Rung("pixels, which see background alone", share, None, "--silhouette-pixels False"))
     return rungs

@@ -139,10 +139,10 @@ class Dataset:
         return self.kept.mask(start, end).view(int(self.cameras.heights[index]), -1)
 
     def drawing(self, pixels: PixelSet) -> Dataset:
-        """The same data, of which only these pixels are drawn, less those that masks ignore."""
+        """The same data, of which only these pixels are drawn, as far as they were until now; all of those if none."""
         pixels = pixels.to(self.pixels.device)
-        if self.kept is not None:
-            pixels = PixelSet.shared([pixels, self.kept.to(self.pixels.device)], 2)
+        if self.drawn is not None:
+            pixels = PixelSet.shared([pixels, self.drawn], 2)
         if not len(pixels):
             return self
         return replace(self, drawn=pixels if self.mapped is not None else pixels.listed())

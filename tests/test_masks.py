@@ -64,6 +64,8 @@ def test_silhouettes_and_masks_are_combined(masked: Dataset) -> None:
     assert drawn is not None
     assert masked.kept is not None
     assert torch.equal(drawn.mask(0, len(some)), masked.kept.mask(0, len(some)) & some)
+    nothing = PixelSet.of_mask(torch.zeros_like(some))
+    assert masked.drawing(nothing).drawn is masked.drawn  # rather than to draw from nothing
 
 
 def test_grey_is_split_in_the_middle_and_colour_modes_do_not_matter(tmp_path: Path) -> None:

@@ -38,6 +38,10 @@ class TrainConfig:
 
     data: Path | None = None
     """Folder of the data set. The embedded scene if not given."""
+    cache_limit: float | None = None
+    """MB (1e6 bytes) of a split's decoded pixels that memory may hold; more goes to disk. If None, half of memory."""
+    cache_dir: Path | None = None
+    """Folder of decoded pixels that memory may not hold; nerfloom in the user's cache folder if not given."""
     output_dir: Path = Path("outputs")
     """Folder under which the run's folder is made."""
     experiment_name: str | None = None
@@ -124,6 +128,8 @@ class TrainConfig:
                 raise ConfigError(f"{_flag(name)} is {getattr(self, name)}; it must be at least 1")
         if self.max_eval_images is not None and self.max_eval_images < 0:
             raise ConfigError(f"--max-eval-images is {self.max_eval_images}; it must be at least 0")
+        if self.cache_limit is not None and not self.cache_limit >= 0:
+            raise ConfigError(f"--cache-limit is {self.cache_limit}; it must be at least 0 MB")
         for name in ("adam_beta1", "adam_beta2"):
             if not 0 <= getattr(self, name) < 1:
                 raise ConfigError(f"{_flag(name)} is {getattr(self, name)}; it must be at least 0 and less than 1")

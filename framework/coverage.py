@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -10,6 +11,7 @@ from torch import Tensor
 from framework.cameras import Cameras
 from framework.console import say
 from framework.errors import DataError
+from framework.pixel_set import PixelSet
 
 BLOCK = 1 << 20
 """Pixels looked at together."""
@@ -37,8 +39,8 @@ def unreachable_pixels(cameras: Cameras) -> Tensor:
     return torch.cat(lost)
 
 
-def pixels_with_rays(cameras: Cameras, names: Sequence[str], split: str) -> Tensor | None:
-    """The pixels (K,) int64 that a ray leads to, for `Dataset.drawn`; None for all. How many it does not is said.
+def pixels_with_rays(cameras: Cameras, names: Sequence[str], split: str) -> PixelSet | None:
+    """The pixels that a ray leads to; None for all. To how many none leads is said.
 
     Args:
         names: the cameras' photographs.
@@ -61,9 +63,12 @@ def pixels_with_rays(cameras: Cameras, names: Sequence[str], split: str) -> Tens
         f"({100 * len(lost) / total:.2g} %), on {int((counts > 0).sum())} of {len(cameras)} images, most on "
         f"{names[worst]} ({int(counts[worst])}); they are not trained on"
     )
-    reached = torch.ones(total, dtype=torch.bool, device=lost.device)
-    reached[lost] = False
-    return reached.nonzero().squeeze(-1)
+    sets = []
+    for first, last in pairwise(cameras.offsets.tolist()):
+        reached = torch.ones(last - first, dtype=torch.bool, device=lost.device)
+        reached[lost[(lost >= first) & (lost < last)] - first] = False
+        sets.append(PixelSet.of_mask(reached, first))
+    return PixelSet.joined(sets)
 
 
 def _kinds(cameras: Cameras) -> list[tuple[float, ...]]:

@@ -1,22 +1,29 @@
-"""Images with poses: what a data parser delivers, and how it is kept in memory."""
+"""Images with poses: what a data parser delivers, and what batches are drawn from."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-import imageio.v3 as iio
-import numpy as np
 import torch
 from torch import Tensor
 
+from framework.appearance import APPEARANCE_STOPS, light_spread
 from framework.cameras import Cameras
-from framework.console import say, track
+from framework.console import say
+from framework.coverage import pixels_with_rays
+from framework.decoding import ImageFiles, decode
 from framework.errors import DataError
+from framework.image_files import image_size as image_size
+from framework.image_files import one_line as one_line
+from framework.image_files import read_image as read_image
+from framework.image_files import reduce_image as reduce_image
+from framework.mapped_pixels import MappedPixels
+from framework.pixel_cache import PixelMemory
+from framework.pixel_set import PixelSet
 from framework.scene import Scene
 
 Split = Literal["train", "val", "test"]
@@ -93,7 +100,7 @@ class DataParser(ABC):
 
 @dataclass(frozen=True)
 class Dataset:
-    """M decoded images: uint8 until a batch is made."""
+    """M decoded images: uint8 until a batch is made, in memory or in a file."""
 
     pixels: Tensor
     """(P, 3) or (P, 4) uint8, image after image, row by row; the fourth channel is straight alpha."""
@@ -109,26 +116,58 @@ class Dataset:
     """(3, 4) from the input's frame to the scene's."""
     scale: float
     """Scene units per unit of the input."""
-    drawn: Tensor | None = None
-    """(K,) int64 pixels that are worth drawing, counted through all images; None for all."""
+    drawn: PixelSet | None = None
+    """Pixels that are worth drawing, counted through all images; None for all."""
+    kept: PixelSet | None = None
+    """Pixels that no mask ignores and a ray leads to; None for all."""
+    light: Tensor | None = None
+    """(M, 3, Q) `appearance.light_of` each image, where it is known."""
+    mapped: MappedPixels | None = None
+    """The file that `pixels` lie in, where they are too many for memory; they then stay on the processor."""
 
     def __len__(self) -> int:
         return len(self.cameras)
 
+    @property
+    def device(self) -> torch.device:
+        """Where batches are made."""
+        return self.cameras.fx.device
+
     def image(self, index: int) -> Tensor:
         """Image `index` as (H, W, 3 or 4) uint8."""
         height, width = int(self.cameras.heights[index]), int(self.cameras.widths[index])
-        start = int(self.cameras.offsets[index])
-        return self.pixels[start : start + height * width].view(height, width, -1)
+        start, end = self.cameras.offsets[index : index + 2].tolist()
+        pixels = self.pixels[start:end]
+        if self.mapped is not None:
+            pixels = pixels.clone()
+            self.mapped.drop(start, end)
+        return pixels.to(self.device).view(height, width, -1)
+
+    def kept_of(self, index: int) -> Tensor | None:
+        """(H, W) bool: which pixels of image `index` no mask ignores; None where no image has ignored ones."""
+        if self.kept is None:
+            return None
+        start, end = self.cameras.offsets[index : index + 2].tolist()
+        return self.kept.mask(start, end).view(int(self.cameras.heights[index]), -1)
+
+    def drawing(self, pixels: PixelSet) -> Dataset:
+        """The same data, of which only these pixels are drawn, as far as they were until now; all of those if none."""
+        pixels = pixels.to(self.pixels.device)
+        if self.drawn is not None:
+            pixels = PixelSet.shared([pixels, self.drawn], 2)
+        if not len(pixels):
+            return self
+        return replace(self, drawn=pixels if self.mapped is not None else pixels.listed())
 
     def to(self, device: torch.device | str) -> Dataset:
         """The same data on `device`."""
         return replace(
             self,
-            pixels=self.pixels.to(device),
+            pixels=self.pixels if self.mapped is not None else self.pixels.to(device),
             cameras=self.cameras.to(device),
             times=None if self.times is None else self.times.to(device),
-            drawn=None if self.drawn is None else self.drawn.to(device),
+            drawn=self.drawn if self.drawn is None or self.mapped is not None else self.drawn.to(device),
+            kept=None if self.kept is None else self.kept.to(device),
         )
 
 
@@ -146,117 +185,52 @@ def existing(paths: Sequence[Path], split: str) -> Tensor:
     return torch.tensor([index for index, path in enumerate(paths) if path.is_file()])
 
 
-def image_size(paths: Sequence[Path]) -> tuple[int, int]:
-    """Width and height of the first of some image files that can be read, from its header.
-
-    Raises: DataError where none can be read.
-    """
-    reason = ""
-    for path in paths:
-        try:
-            height, width = iio.improps(path, plugin="pillow").shape[:2]
-            return width, height
-        except Exception as error:  # whatever the decoder raises, as in `read_image`
-            reason = reason or f"{path} is not a readable image: {one_line(error)}"
-    raise DataError(reason or "there is no image to read a size from")
-
-
-def load_dataset(parsed: ParsedScene, split: str) -> Dataset:
+def load_dataset(parsed: ParsedScene, split: str, memory: PixelMemory | None = None) -> Dataset:
     """Decode the images of a split.
 
     Unreadable images are skipped and reported; an image whose size is not its camera's is an error.
 
+    Args:
+        memory: how much may be held in memory; half of the machine's if None.
     Raises: DataError for a size that does not fit, or where no image is left.
     """
     factor = parsed.downscale_factor
-    with ThreadPoolExecutor() as pool:
-        jobs = pool.map(lambda path: _try_read(path, factor), parsed.image_paths)
-        images = list(track(jobs, f"Loading {split} images", total=len(parsed.image_paths)))
-    failures = [image for image in images if isinstance(image, DataError)]
-    if len(failures) == len(images):
-        raise DataError(f"split '{split}' has no readable image: {failures[0]}" if failures else f"'{split}' is empty")
-    if failures:
-        say(f"split '{split}': {len(failures)} of {len(images)} images are unreadable and skipped: {failures[0]}")
-        parsed = parsed[torch.tensor([i for i, image in enumerate(images) if not isinstance(image, DataError)])]
-    decoded = [image for image in images if not isinstance(image, DataError)]
-
     cameras = parsed.cameras if factor == 1 else parsed.cameras.scaled(1 / factor)
-    for image, path, width, height in zip(
-        decoded, parsed.image_paths, cameras.widths.tolist(), cameras.heights.tolist(), strict=True
-    ):
-        if image.shape[:2] != (height, width):
-            found = f"{image.shape[1] * factor}x{image.shape[0] * factor}"
-            raise DataError(f"{path} is {found} pixels, but its camera is for {width * factor}x{height * factor}")
-    return _assemble(parsed, decoded, cameras)
-
-
-def _assemble(parsed: ParsedScene, images: list[np.ndarray], cameras: Cameras) -> Dataset:
-    has_alpha = any((image[..., 3] != 255).any() for image in images)
-    channels = 4 if has_alpha else 3
-    pixels = np.concatenate([image[..., :channels].reshape(-1, channels) for image in images])
+    sizes = tuple(zip(cameras.widths.tolist(), cameras.heights.tolist(), strict=True))
+    masks = parsed.mask_paths or (None,) * len(parsed.image_paths)
+    files = ImageFiles(split, parsed.image_paths, masks, sizes, factor)
+    decoded = decode(files, memory or PixelMemory.of())
+    if len(decoded.left) < len(sizes):
+        parsed, cameras = parsed[decoded.left], cameras[decoded.left]
+    has_alpha = decoded.pixels.shape[1] == 4
     scene = Scene(
         box=parsed.box,
         near=parsed.near,
         far=parsed.far,
-        num_cameras=len(images),
+        num_cameras=len(cameras),
         has_alpha=has_alpha,
         moving=parsed.times is not None,
-        image_size=max(max(image.shape[:2]) for image in images),
+        image_size=int(torch.maximum(cameras.widths, cameras.heights).max()),
         unbounded=parsed.unbounded,
         exact_poses=parsed.exact_poses,
-        appearance_varies=parsed.appearance_varies,
+        # Of an object cut out of its surroundings, each side has a light of its own.
+        appearance_varies=parsed.appearance_varies
+        or (not has_alpha and light_spread(decoded.light) > APPEARANCE_STOPS),
     )
-    transform = torch.eye(4)[:3] if parsed.transform is None else parsed.transform
-    names = tuple(path.name for path in parsed.image_paths)
-    return Dataset(torch.from_numpy(pixels), cameras, parsed.times, names, scene, transform, parsed.scale)
-
-
-def _try_read(path: Path, factor: int) -> np.ndarray | DataError:
-    try:
-        return read_image(path, factor)
-    except DataError as error:
-        return error
-
-
-def read_image(path: Path, factor: int = 1) -> np.ndarray:
-    """An 8-bit image as (H, W, 4) uint8 with straight alpha, reduced by a whole number.
-
-    Raises: DataError where it cannot be decoded or has more than 8 bits a channel.
-    """
-    try:
-        mode = str(iio.immeta(path, plugin="pillow").get("mode", ""))
-        if mode.startswith(("I", "F")) or _is_deep_png(path):
-            raise DataError(f"{path} has more than 8 bits a channel; convert it to an 8-bit PNG")
-        image = np.asarray(iio.imread(path, plugin="pillow", mode="RGBA"))
-    except DataError:
-        raise
-    except Exception as error:  # Pillow raises OSError, SyntaxError, struct.error, DecompressionBombError and more
-        raise DataError(f"{path} is not a readable image: {one_line(error)}") from error
-    return image if factor == 1 else reduce_image(image, factor)
-
-
-def _is_deep_png(path: Path) -> bool:
-    """Whether a PNG has 16 bits a channel, which Pillow would cut to 8 without a word (bit depth: byte 24)."""
-    with path.open("rb") as file:
-        head = file.read(25)
-    return head[:8] == b"\x89PNG\r\n\x1a\n" and head[24:] == b"\x10"
-
-
-def reduce_image(image: np.ndarray, factor: int) -> np.ndarray:
-    """Box filter by a whole number: (H, W, 4) uint8 to (H // factor, W // factor, 4).
-
-    Colours are averaged weighted by alpha, so that transparent pixels lend none of theirs.
-    """
-    height, width = image.shape[0] // factor, image.shape[1] // factor
-    if height == 0 or width == 0:
-        size = f"{image.shape[1]}x{image.shape[0]}"
-        raise DataError(f"an image of {size} pixels has none left at --downscale-factor {factor}")
-    blocks = image[: height * factor, : width * factor].reshape(height, factor, width, factor, 4).astype(np.float64)
-    alpha = blocks[..., 3:].sum((1, 3))
-    color = (blocks[..., :3] * blocks[..., 3:]).sum((1, 3)) / np.maximum(alpha, 1)
-    return np.concatenate([color, alpha / factor**2], axis=-1).round().astype(np.uint8)
-
-
-def one_line(error: BaseException) -> str:
-    """The first line of an error's message, or its type's name."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+    names, kept = tuple(path.name for path in parsed.image_paths), decoded.kept
+    reached = pixels_with_rays(cameras, names, split)
+    if reached is not None:
+        kept = reached if kept is None else PixelSet.shared([kept, reached], 2)
+    return Dataset(
+        pixels=decoded.pixels,
+        cameras=cameras,
+        times=parsed.times,
+        names=names,
+        scene=scene,
+        transform=torch.eye(4)[:3] if parsed.transform is None else parsed.transform,
+        scale=parsed.scale,
+        drawn=kept if kept is None or decoded.mapped is not None else kept.listed(),
+        kept=kept,
+        light=decoded.light,
+        mapped=decoded.mapped,
+    )

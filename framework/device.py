@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 import platform
 from functools import cache
 from pathlib import Path
@@ -86,3 +88,17 @@ def wait_for(device: torch.device) -> None:
     """Let pending work end, so that a clock can be read."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
+
+
+def machine_memory() -> float:
+    """Bytes of memory that this machine, or the container around this process, has; infinity where neither is told."""
+    try:
+        found = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, ValueError, OSError):  # Windows
+        found = math.inf
+    for file in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        try:
+            found = min(found, float(Path(file).read_text()))
+        except (OSError, ValueError):  # "max"
+            continue
+    return found

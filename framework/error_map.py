@@ -30,7 +30,7 @@ class ErrorMap:
         counts = self.columns * ((cameras.heights + TILE - 1) // TILE)
         self.first = counts.cumsum(0) - counts
         """(M,) each photograph's first square."""
-        self.errors = torch.ones(int(counts.sum()), device=dataset.pixels.device)
+        self.errors = torch.ones(int(counts.sum()), device=dataset.device)
         """Mean over a pixel's channels. What was never seen counts as entirely wrong."""
 
     def squares(self, pixels: Tensor) -> Tensor:
@@ -41,7 +41,12 @@ class ErrorMap:
         return self.first[images] + within // widths // TILE * self.columns[images] + within % widths // TILE
 
     def draw(self, candidates: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        """`count` of the candidates, and what to multiply their losses by.
+        """`count` of the candidates (M,), and what to multiply their losses by: see `choose`."""
+        taken, weights = self.choose(candidates, count)
+        return candidates[taken], weights
+
+    def choose(self, candidates: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        """Which `count` of the candidates to take, and what to multiply their losses by.
 
         Systematic resampling: a candidate is taken count / M times its share on average, its share being 1 in the
         mean; its weight is 1 over that share. So the weighted mean of any function over those taken is, in
@@ -49,14 +54,14 @@ class ErrorMap:
 
         Args:
             candidates: (M,) pixels, drawn evenly.
-        Returns: pixels (count,) and weights (count,), at most 1 / EVENLY.
+        Returns: places among the candidates (count,) and weights (count,), at most 1 / EVENLY.
         """
         errors = self.errors[self.squares(candidates)]
         share = EVENLY + (1 - EVENLY) * errors / errors.mean().clamp(min=1e-12)
         ends = share.double().cumsum(0) * (count / len(candidates))
         places = torch.arange(count, device=ends.device) + torch.rand((), device=ends.device, dtype=torch.float64)
         taken = torch.searchsorted(ends, places, right=True).clamp(max=len(candidates) - 1)
-        return candidates[taken], 1 / share[taken]
+        return taken, 1 / share[taken]
 
     def learn(self, pixels: Tensor, errors: Tensor) -> None:
         """Remember the squared errors (R,) that the pixels (R,) had; what is not finite is left out."""

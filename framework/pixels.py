@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -15,6 +16,8 @@ from framework.kernels import native
 from framework.rays import Rays
 
 Background = Literal["random", "white", "black"]
+LookUp = Callable[[Tensor], Tensor]
+"""From pixels (R,) int64 to their stored colours (R, 3 or 4) uint8."""
 
 
 @dataclass(frozen=True)
@@ -54,28 +57,50 @@ def draw_pixels(dataset: Dataset, count: int) -> Tensor:
     device = dataset.pixels.device
     if dataset.drawn is None:
         return torch.randint(len(dataset.pixels), (count,), device=device)
-    return dataset.drawn[torch.randint(len(dataset.drawn), (count,), device=device)]
+    return dataset.drawn.at(torch.randint(len(dataset.drawn), (count,), device=device))
 
 
 def draw_batch(
-    dataset: Dataset, count: int, background: Background, errors: ErrorMap | None = None, places: Tensor = CENTER
+    dataset: Dataset,
+    count: int,
+    background: Background,
+    errors: ErrorMap | None = None,
+    places: Tensor = CENTER,
+    look_up: LookUp | None = None,
 ) -> Batch:
     """`count` pixels worth drawing with what they should show: evenly, or also where `errors` are large.
 
-    A ray goes through each of the `places` (K, 2) in a pixel (`Cameras.pixel_rays`).
+    A ray goes through each of the `places` (K, 2) in a pixel (`Cameras.pixel_rays`). Pixels that lie in a file are
+    asked for by `look_up`, all that are drawn and in the order of drawing (`PixelStream.look_up`).
     """
-    behind = background_colors(background, count, dataset.pixels.device)
+    # Drawn before anything else is: what is drawn from is then known to who only knows the seed.
+    flat, stored = draw_pixels(dataset, count if errors is None else 2 * count), None
+    if dataset.mapped is not None:
+        stored = (look_up or dataset.mapped.look_up)(flat).to(dataset.device)
+        flat = flat.to(dataset.device)
+    behind = background_colors(background, count, dataset.device)
     if errors is None:
-        return gather_batch(dataset, draw_pixels(dataset, count), behind, places)
-    flat, weights = errors.draw(draw_pixels(dataset, 2 * count), count)
-    return replace(gather_batch(dataset, flat, behind, places), weights=weights)
+        return gather_batch(dataset, flat, behind, places, stored)
+    taken, weights = errors.choose(flat, count)
+    stored = None if stored is None else stored[taken]
+    return replace(gather_batch(dataset, flat[taken], behind, places, stored), weights=weights)
 
 
-def gather_batch(dataset: Dataset, flat: Tensor, behind: Tensor, places: Tensor = CENTER) -> Batch:
-    """The pixels `flat` (R,), counted through all images, over the background `behind` (R, 3)."""
+def gather_batch(
+    dataset: Dataset, flat: Tensor, behind: Tensor, places: Tensor = CENTER, stored: Tensor | None = None
+) -> Batch:
+    """The pixels `flat` (R,), counted through all images, over the background `behind` (R, 3).
+
+    Their stored colours (R, 3 or 4) are looked up where `stored` does not give them.
+    """
     scene = dataset.scene
     rays = dataset.cameras.pixel_rays(flat, scene.near, scene.far, dataset.times, places)
-    rgb, alpha = gather_colors(dataset.pixels, flat, behind)
+    if stored is None and dataset.mapped is not None:
+        stored = dataset.mapped.look_up(flat.cpu()).to(dataset.device)
+    if stored is None:
+        rgb, alpha = gather_colors(dataset.pixels, flat, behind)
+    else:
+        rgb, alpha = gather_colors(stored, torch.arange(len(flat), device=flat.device), behind)
     return Batch(flat, rays, rgb, behind, alpha)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from framework.appearance import light_spread
 from framework.dataset import Dataset
 
 
@@ -34,6 +35,10 @@ class SceneProfile:
     """The photographs have times."""
     transparent: float | None
     """Share of pixels that are fully transparent; None where no photograph has alpha."""
+    ignored: float | None
+    """Share of pixels that masks ignore; None where they ignore none."""
+    light: float | None
+    """By how many stops light differs between the photographs (`appearance.light_spread`); None of cut-out objects."""
     camera: str
     """The cameras' model."""
     decisions: tuple[Decision, ...]
@@ -42,12 +47,16 @@ class SceneProfile:
     def of(cls, dataset: Dataset, decisions: list[Decision]) -> SceneProfile:
         """Look at the data."""
         cameras, alpha = dataset.cameras, dataset.scene.has_alpha
+        kept, total = dataset.kept, int(dataset.cameras.offsets[-1])
+        transparent = sum(int((dataset.image(index)[..., 3] == 0).sum()) for index in range(len(dataset) * alpha))
         return cls(
             images=len(dataset),
             width=int(cameras.widths.max()),
             height=int(cameras.heights.max()),
             moving=dataset.scene.moving,
-            transparent=(dataset.pixels[:, 3] == 0).float().mean().item() if alpha else None,
+            transparent=transparent / total if alpha else None,
+            ignored=None if kept is None else 1 - len(kept) / total,
+            light=None if alpha or dataset.light is None else light_spread(dataset.light),
             camera=cameras.model,
             decisions=tuple(decisions),
         )
@@ -57,6 +66,10 @@ class SceneProfile:
         alpha = "no alpha" if self.transparent is None else f"alpha ({self.transparent:.0%} of pixels transparent)"
         motion = "moving" if self.moving else "still"
         facts = f"scene: {self.images} images of {self.width} x {self.height}, {self.camera} camera, {alpha}, {motion}"
+        if self.ignored is not None:
+            facts += f", masks ignore {self.ignored:.0%} of pixels"
+        if self.light is not None:
+            facts += f", light differs by {self.light:.2f} stops"
         return [facts, *(decision.line() for decision in self.decisions)]
 
     def as_plain(self) -> dict[str, Any]:

@@ -6,16 +6,40 @@ photograph holds no opaque pixel can be skipped for good, and so can the pixels 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from framework.dataset import Dataset
+from framework.pixel_set import PixelSet
 
 COARSEST = 8
 """Cells along an edge of the cubes that are looked at first."""
+
+
+class _Counts(Sequence[Tensor]):
+    """The sums of a data set's photographs, of which only the last that was asked for is remembered."""
+
+    def __init__(self, dataset: Dataset) -> None:
+        self._dataset, self._last = dataset, (-1, torch.empty(0))
+
+    def __len__(self) -> int:
+        return len(self._dataset)
+
+    def __getitem__(self, image: Any) -> Any:
+        if not 0 <= image < len(self):
+            raise IndexError(image)
+        if self._last[0] != image:
+            seen, kept = self._dataset.image(image)[..., 3] > 0, self._dataset.kept_of(image)
+            if kept is not None:
+                seen |= ~kept  # who knows what is there
+            sums = seen.to(torch.int32).cumsum(0, dtype=torch.int32).cumsum(1, dtype=torch.int32)
+            self._last = image, functional.pad(sums, (1, 0, 1, 0))
+        return self._last[1]
 
 
 @dataclass(frozen=True)
@@ -24,17 +48,17 @@ class Silhouettes:
 
     dataset: Dataset
     """Photographs with alpha, through pinhole cameras."""
-    sums: tuple[Tensor, ...]
+    sums: Sequence[Tensor]
     """M tensors (H + 1, W + 1) int32: how many such pixels lie above and left of a pixel's corner."""
 
     @classmethod
     def of(cls, dataset: Dataset) -> Silhouettes:
-        """Count every photograph once, so that any square of pixels is four look-ups."""
-        sums = []
-        for index in range(len(dataset)):
-            opaque = (dataset.image(index)[..., 3] > 0).to(torch.int32)
-            sums.append(functional.pad(opaque.cumsum(0, dtype=torch.int32).cumsum(1, dtype=torch.int32), (1, 0, 1, 0)))
-        return cls(dataset, tuple(sums))
+        """Count every photograph once, so that any square of pixels is four look-ups.
+
+        Where the photographs are too many for memory, so are the counts: each is then made when it is asked for.
+        """
+        counts = _Counts(dataset)
+        return cls(dataset, counts if dataset.mapped is not None else tuple(counts))
 
     def depth(self, image: int, points: Tensor) -> Tensor:
         """Distance (N,) of points (N, 3) along the camera's axis."""
@@ -126,8 +150,8 @@ def _ever_held(silhouettes: Silhouettes, centers: Tensor, radius: float) -> Tens
 
 
 @torch.no_grad()
-def pixels_near(silhouettes: Silhouettes, hull: Tensor, box: Tensor, resolution: int) -> Tensor:
-    """Pixels (K,) int64, counted through all photographs, that may see a cell of the hull.
+def pixels_near(silhouettes: Silhouettes, hull: Tensor, box: Tensor, resolution: int) -> PixelSet:
+    """Pixels, counted through all photographs, that may see a cell of the hull.
 
     A cell of the hull that a photograph shows whole has an opaque pixel within the reach of its image, and a ray that
     meets the cell lies within that reach too: so twice the largest reach around a silhouette is enough. Of cells that
@@ -140,8 +164,8 @@ def pixels_near(silhouettes: Silhouettes, hull: Tensor, box: Tensor, resolution:
     chosen = []
     for image in range(len(silhouettes.sums)):
         near = _near(silhouettes, image, centers, radius) | _under_cut_cells(silhouettes, image, centers, radius)
-        chosen.append(near.reshape(-1).nonzero().squeeze(-1) + silhouettes.dataset.cameras.offsets[image])
-    return torch.cat(chosen)
+        chosen.append(PixelSet.of_mask(near, int(silhouettes.dataset.cameras.offsets[image])))
+    return PixelSet.joined(chosen)
 
 
 def _near(silhouettes: Silhouettes, image: int, centers: Tensor, radius: float) -> Tensor:

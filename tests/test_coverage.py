@@ -60,7 +60,7 @@ def test_the_user_is_told_where(capsys: pytest.CaptureFixture[str]) -> None:
     assert kept is not None
     lost = unreachable_pixels(camera)
     assert len(kept) + len(lost) == 3 * WIDTH * HEIGHT
-    assert not set(kept.tolist()) & set(lost.tolist())
+    assert not set(kept.pixels().tolist()) & set(lost.tolist())
     assert ((lost >= WIDTH * HEIGHT) & (lost < 2 * WIDTH * HEIGHT)).all()
     out = " ".join("".join(capsys.readouterr()).split())
     assert f"no ray for {len(lost)} of {3 * WIDTH * HEIGHT} pixels" in out

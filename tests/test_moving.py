@@ -69,7 +69,7 @@ def test_colours_follow_time(name: str, shared_tiny: Path, tmp_path: Path) -> No
     found = []
     for time in (0.0, 1.0):
         image = render_image(trainer.model, cameras, 0, white, torch.full((len(cameras),), time))
-        ball = image.accumulation > 0.9
+        ball = image.accumulation > 0.5  # over white, what shines through changes neither difference
         assert ball.float().mean() > 0.05
         found.append(image.rgb[ball].mean(0))
     assert found[0][0] - found[0][2] > 0.3

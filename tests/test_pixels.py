@@ -9,6 +9,7 @@ from scipy import stats
 
 from dataparsers.blender import Blender
 from framework.dataset import Dataset, load_dataset
+from framework.pixel_set import PixelSet
 from framework.pixels import composite, draw_batch, gather_colors, gather_colors_reference
 from tests.kernels.compiled import needs_kernels
 
@@ -88,7 +89,7 @@ def test_compiled_and_torch_gather_the_same_colours(dataset: Dataset, channels: 
 
 
 def test_only_pixels_worth_drawing_are_drawn(dataset: Dataset) -> None:
-    few = replace(dataset, drawn=torch.tensor([5, 401, 402]))
+    few = replace(dataset, drawn=PixelSet.of_pixels(torch.tensor([5, 401, 402])))
     batch = draw_batch(few, 300, "white")
     assert batch.rays.camera_indices is not None
     assert set(batch.rays.camera_indices.tolist()) == {0, 1}

@@ -6,7 +6,6 @@ It is written once, in the blender format, to the user's cache folder (NERFLOOM_
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from dataparsers.blender import Blender
 from framework import DataError, DataParser, ParsedScene
 from framework.console import say, track
 from framework.dataset import Split
+from framework.user_cache import cache_folder
 
 VERSION = 1
 """Raised whenever the scene's look changes, so that old caches are not read."""
@@ -61,10 +61,3 @@ class Procedural(DataParser):
                     f"cannot write {folder}: {error.strerror}; set NERFLOOM_CACHE to a writable folder"
                 ) from error
         return folder
-
-
-def cache_folder() -> Path:
-    """Where generated data is kept between runs."""
-    if "NERFLOOM_CACHE" in os.environ:
-        return Path(os.environ["NERFLOOM_CACHE"])
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nerfloom"

@@ -9,6 +9,7 @@ from framework.dataset import Dataset, Split, load_dataset
 from framework.device import choose_device, peak_memory
 from framework.errors import DataError
 from framework.evaluation.evaluator import evaluate
+from framework.pixel_cache import PixelMemory
 from framework.training.checkpoint import FOLDER, load_newest
 from framework.training.report import write_evaluation
 from framework.training.run import Run, create_folder, write_json, write_transforms
@@ -89,7 +90,8 @@ def _finish(run: Run, trainer: Trainer) -> None:
 
 def load_split(run: Run, split: Split) -> Dataset:
     """Parse and decode a split of the run's data."""
-    return load_dataset(run.parser.parse(run.config.data, split), split)
+    memory = PixelMemory.of(run.config.cache_limit, run.config.cache_dir)
+    return load_dataset(run.parser.parse(run.config.data, split), split, memory)
 
 
 def first_split(run: Run, splits: tuple[Split, ...]) -> Dataset | None:

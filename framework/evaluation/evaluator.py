@@ -116,6 +116,10 @@ def evaluate(
 ) -> Evaluation:
     """Render views and compare them with their photographs.
 
+    What masks ignore does not count: PSNR is that of the other pixels, and for SSIM and LPIPS, which look at
+    surroundings, the picture takes the photograph's own colours there. A photograph of which nothing is left is passed
+    over.
+
     Args:
         model: the trained model.
         dataset: views with photographs, on the model's device.
@@ -125,7 +129,7 @@ def evaluate(
         round_to_uint8: measure the picture as it would be stored.
     Raises: ValueError where there is nothing to evaluate.
     """
-    chosen = spread(len(dataset), max_images)
+    chosen = [index for index in spread(len(dataset), max_images) if _shows_something(dataset, index)]
     if not chosen:
         raise ValueError("there is no image to evaluate")
     lpips, lpips_note = load_lpips()
@@ -137,12 +141,14 @@ def evaluate(
         rgb = view.rgb.clamp(0, 1)
         if round_to_uint8:
             rgb = (rgb * 255).round() / 255
+        kept = dataset.kept_of(index)
+        judged = rgb if kept is None else torch.where(kept[..., None], rgb, target)
         rows.append(
             {
                 "name": dataset.names[index],
-                "psnr": psnr(rgb, target),
-                "ssim": ssim(rgb, target) if min(rgb.shape[:2]) >= 11 else None,
-                "lpips": None if lpips is None else lpips(rgb, target),
+                "psnr": psnr(rgb, target) if kept is None else psnr(rgb[kept], target[kept]),
+                "ssim": ssim(judged, target) if min(rgb.shape[:2]) >= 11 else None,
+                "lpips": None if lpips is None else lpips(judged, target),
                 "seconds": view.seconds,
             }
         )
@@ -154,6 +160,12 @@ def evaluate(
             write_image(pictures / f"{stem}_comparison.png", comparison(rgb, target))
     results = {**_statistics(rows), "num_rays_per_sec": rays / seconds, "fps": len(rows) / seconds}
     return Evaluation(rows, {**results, "num_images": len(rows)}, lpips_note)
+
+
+def _shows_something(dataset: Dataset, index: int) -> bool:
+    """Whether masks leave any of an image."""
+    kept = dataset.kept_of(index)
+    return kept is None or bool(kept.any())
 
 
 def spread(total: int, limit: int | None) -> list[int]:

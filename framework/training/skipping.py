@@ -56,7 +56,7 @@ def skip_report(trainer: Trainer) -> list[Rung]:
 
 def _sampling_rungs(trainer: Trainer, samplers: list[OccupancySampler]) -> list[Rung]:
     cells = sum(s.occupied.numel() for s in samplers)
-    pixels, drawn = len(trainer.train_set.pixels), trainer.train_set.drawn
+    kept, drawn = trainer.train_set.kept, trainer.train_set.drawn
     carved = sum(int(s.carved.sum()) for s in samplers) / cells
     empty = 1 - sum(int(s.occupied.sum()) for s in samplers) / cells
     rays = draw_batch(trainer.train_set, PROBE_RAYS, "black").rays
@@ -77,8 +77,8 @@ def _sampling_rungs(trainer: Trainer, samplers: list[OccupancySampler]) -> list[
     ]
     if carved:
         rungs.append(Rung("cells, outside the visual hull", carved, None, "--silhouette-cells False"))
-    if drawn is not None:
-        share = 1 - len(drawn) / pixels
+    if drawn is not None and (kept is None or len(drawn) < len(kept)):  # else masks alone say what is drawn
+        share = 1 - len(drawn) / len(trainer.train_set.pixels if kept is None else kept)
         rungs.append(Rung("pixels, which see background alone", share, None, "--silhouette-pixels False"))
     return rungs
 

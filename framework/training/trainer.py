@@ -5,7 +5,8 @@ from __future__ import annotations
 import signal
 import time
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,9 @@ from framework.evaluation.evaluator import evaluate, evaluation_background, rend
 from framework.evaluation.images import comparison
 from framework.evaluation.metrics import MAX_PSNR
 from framework.ndc import NdcCameras
-from framework.pixels import Background, Batch, composite, draw_batch
+from framework.pixel_set import PixelSet
+from framework.pixel_stream import PixelStream
+from framework.pixels import Background, Batch, LookUp, composite, draw_batch
 from framework.scene_profile import Decision, SceneProfile
 from framework.silhouettes import Silhouettes, pixels_near, visual_hull
 from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest, save_checkpoint
@@ -88,11 +91,12 @@ class Trainer:
     def __init__(self, run: Run, train_set: Dataset, eval_set: Dataset | None) -> None:
         self.run, self.config = run, run.config.resolved()
         self.train_set, self.eval_set = train_set, eval_set
-        self.device = train_set.pixels.device
+        self.device = train_set.device
         torch.manual_seed(self.config.machine.seed)
         self.model = build_model(run.method, self.config, train_set.scene).to(self.device)
         self.optimizer = make_optimizer(self.model, self.config)
         self.errors = ErrorMap(train_set) if self.config.draw_by_error else None
+        self.stream: PixelStream | None = None
         self.state = State()
         self.first_step = 0
         self._bad_in_a_row = 0
@@ -238,7 +242,7 @@ class Trainer:
         still = not self.model.scene.moving  # else a pixel that is empty at its time teaches about cells full at others
         if config.silhouette_pixels and still and all(sampler.any_carved for sampler in samplers):
             near = [pixels_near(silhouettes, ~s.carved, s.box, s.resolution) for s in samplers]
-            self.train_set = replace(self.train_set, drawn=near[0] if len(near) == 1 else torch.cat(near).unique())
+            self.train_set = self.train_set.drawing(PixelSet.shared(near, 1))
         if self.state.step == 0:
             self.state.seconds += time.perf_counter() - start
 
@@ -252,7 +256,7 @@ class Trainer:
         set_learning_rate(self.optimizer, learning_rate_factor(self.config, state.step, self.progress))
         places = self._places_in_a_pixel()
         count = max(self._batch_size() // len(places), 1)
-        batch = draw_batch(self.train_set, count, self._background(), self.errors, places)
+        batch = draw_batch(self.train_set, count, self._background(), self.errors, places, self._look_up())
         with torch.autocast(self.device.type, torch.bfloat16, enabled=use_bfloat16(self.model)):
             self.model.before_step(state.step, self.progress)
             rendered = self.model.render(batch.rays, batch.background.repeat_interleave(len(places), 0))
@@ -276,6 +280,13 @@ class Trainer:
             rays_per_second=len(batch.rays) / seconds,
             samples_per_ray=state.samples_per_ray,
         )
+
+    def _look_up(self) -> LookUp | None:
+        """Where this step's colours come from, if they lie in a file."""
+        if self.train_set.mapped is None:
+            return None
+        self.stream = self.stream or PixelStream(self.train_set, self.config.machine.seed)
+        return partial(self.stream.look_up, self.state.step)
 
     def _descend(self, loss: Tensor) -> None:
         """Backward and step, unless something is not finite: then the step is dropped and counted.

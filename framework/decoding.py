@@ -1,0 +1,193 @@
+"""From image files to pixels: each image is decoded straight into its place, in memory or in the cache's file.
+
+So loading takes the memory of the set, or of nothing where it goes to a file, and of the few images being decoded.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import accumulate
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from framework.appearance import light_of
+from framework.console import say, track
+from framework.errors import DataError
+from framework.image_files import may_be_transparent, read_image
+from framework.mapped_pixels import MappedPixels
+from framework.masks import read_mask
+from framework.pixel_cache import MB, PixelMemory, cache_path, no_room, pack, temporary_store, unpack
+from framework.pixel_set import PixelSet
+from framework.pixel_store import MemoryStore, PixelStore, drop_fourth, move
+
+WORKERS = min(os.cpu_count() or 1, 8)
+"""Images that are decoded at once: each holds several times its pixels meanwhile."""
+
+
+@dataclass(frozen=True)
+class ImageFiles:
+    """The M images of a split, to be decoded."""
+
+    split: str
+    images: tuple[Path, ...]
+    masks: tuple[Path | None, ...]
+    """M masks; None where a photograph has none."""
+    sizes: tuple[tuple[int, int], ...]
+    """M widths and heights after reduction."""
+    factor: int
+    """Images are reduced by this whole number."""
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """The images that could be read."""
+
+    pixels: Tensor
+    """(P, 3 or 4) uint8; four where a pixel is not opaque."""
+    left: Tensor
+    """(M',) int64 which images of the split they are."""
+    light: Tensor
+    """(M', 3, Q) `light_of` each."""
+    kept: PixelSet | None
+    """What masks do not ignore; None where they ignore nothing."""
+    mapped: MappedPixels | None
+    """The file that `pixels` lie in; None where they are in memory."""
+
+
+def decode(files: ImageFiles, memory: PixelMemory) -> Decoded:
+    """Decode images into memory, or into a file where they take more than `memory` allows and none has them already.
+
+    Unreadable images are skipped and reported.
+
+    Raises: DataError for an image whose size is not as stated, a mask that cannot be used, no image left, a full disk.
+    """
+    with ThreadPoolExecutor(WORKERS) as pool:
+        channels = 4 if any(pool.map(may_be_transparent, files.images)) else 3
+    size = channels * sum(width * height for width, height in files.sizes)
+    if size <= memory.limit:
+        store = MemoryStore(size)
+        facts = _fill(files, store, channels)
+        shape = int(facts["pixels"]), int(facts["channels"])
+        return _decoded(files, facts, torch.from_numpy(store.finish(shape[0] * shape[1])).view(shape), None)
+    numbers = [files.factor, *(side for sides in files.sizes for side in sides)]
+    path = cache_path(memory.folder, [*files.images, *files.masks], numbers)
+    found = unpack(path)
+    if found is None:
+        say(
+            f"split '{files.split}': {size / MB:,.0f} MB of pixels are more than the {memory.limit / MB:,.0f} MB that "
+            f"may be in memory (--cache-limit): decoding them once into {path}"
+        )
+        found = _write(files, path, size, channels)
+    else:
+        say(f"split '{files.split}': pixels decoded by an earlier run are read from {path}")
+    mapped = MappedPixels(path, int(found["pixels"]), int(found["channels"]), memory.limit)
+    return _decoded(files, found, mapped.pixels, mapped)
+
+
+def _write(files: ImageFiles, path: Path, size: int, channels: int) -> dict[str, np.ndarray]:
+    """Decode into a file, which gets its name only when it is whole."""
+    store = temporary_store(path, size)
+    try:
+        facts = _fill(files, store, channels)
+        store.finish(int(facts["pixels"]) * int(facts["channels"]), pack(facts), path)
+    except OSError as error:
+        store.discard()
+        raise no_room(path.parent, size, error) from error
+    except BaseException:
+        store.discard()
+        raise
+    return facts
+
+
+@dataclass(frozen=True)
+class _Image:
+    """What is remembered of an image besides its pixels."""
+
+    opaque: bool
+    light: np.ndarray
+    kept: PixelSet | None
+    """Counted from its own first pixel."""
+
+
+def _fill(files: ImageFiles, store: PixelStore, channels: int) -> dict[str, np.ndarray]:
+    """Decode all images into a store, those that can be read one after the other; returns what was found."""
+    counts = [width * height for width, height in files.sizes]
+    starts = [0, *accumulate(counts)]
+
+    def put(index: int) -> _Image | DataError:
+        return _decode_one(files, index, store, starts[index], channels)
+
+    with ThreadPoolExecutor(WORKERS) as pool:
+        images = list(track(pool.map(put, range(len(counts))), f"Loading {files.split} images", total=len(counts)))
+    failures = [image for image in images if isinstance(image, DataError)]
+    if len(failures) == len(images):
+        reason = f"has no readable image: {failures[0]}" if failures else "is empty"
+        raise DataError(f"split '{files.split}' {reason}")
+    left = {index: image for index, image in enumerate(images) if not isinstance(image, DataError)}
+    total = 0
+    for index in left:
+        move(store, starts[index] * channels, total * channels, counts[index] * channels)
+        total += counts[index]
+    if channels == 4 and all(image.opaque for image in left.values()):
+        drop_fourth(store, total)
+        channels = 3
+    facts = {
+        "pixels": np.array(total),
+        "channels": np.array(channels),
+        "left": np.array(list(left)),
+        "light": np.stack([image.light for image in left.values()]),
+        "failure": np.array(str(failures[0]) if failures else ""),
+    }
+    return facts | _kept_runs(files, left, total)
+
+
+def _kept_runs(files: ImageFiles, left: dict[int, _Image], total: int) -> dict[str, np.ndarray]:
+    """What the masks leave of all images, as runs; nothing where they leave everything."""
+    if not any(image.kept is not None for image in left.values()):
+        return {}
+    starts, lengths, first = [], [], 0
+    for index, image in left.items():
+        count = files.sizes[index][0] * files.sizes[index][1]
+        whole = PixelSet.of_runs(torch.tensor([0]), torch.tensor([count]))
+        kept = whole if image.kept is None else image.kept
+        starts.append(kept.starts + first)
+        lengths.append(kept.before.diff())
+        first += count
+    runs = {"kept_starts": torch.cat(starts).numpy(), "kept_lengths": torch.cat(lengths).numpy()}
+    used = runs["kept_lengths"].sum()
+    if used == 0:
+        raise DataError(f"the masks of split '{files.split}' leave no pixel; they must be white where to learn from")
+    return runs if used < total else {}
+
+
+def _decode_one(files: ImageFiles, index: int, store: PixelStore, start: int, channels: int) -> _Image | DataError:
+    """Put an image into its place; the error where it cannot be read."""
+    path, mask_path, (width, height) = files.images[index], files.masks[index], files.sizes[index]
+    try:
+        image = read_image(path, files.factor)
+    except DataError as error:
+        return error
+    if image.shape[:2] != (height, width):
+        found = f"{image.shape[1] * files.factor}x{image.shape[0] * files.factor}"
+        expected = f"{width * files.factor}x{height * files.factor}"
+        raise DataError(f"{path} is {found} pixels, but its camera is for {expected}")
+    mask = None if mask_path is None else read_mask(mask_path, width, height)
+    store.write(start * channels, np.ascontiguousarray(image[..., :channels]).reshape(-1))
+    opaque = channels == 3 or bool((image[..., 3] == 255).all())
+    return _Image(opaque, light_of(image, mask), None if mask is None else PixelSet.of_mask(torch.from_numpy(mask)))
+
+
+def _decoded(files: ImageFiles, facts: dict[str, np.ndarray], pixels: Tensor, mapped: MappedPixels | None) -> Decoded:
+    left, total = torch.from_numpy(facts["left"]), len(files.images)
+    if len(left) < total:
+        missing = f"{total - len(left)} of {total} images are unreadable and skipped"
+        say(f"split '{files.split}': {missing}: {facts['failure']}")
+    kept = None
+    if "kept_starts" in facts:
+        kept = PixelSet.of_runs(torch.from_numpy(facts["kept_starts"]), torch.from_numpy(facts["kept_lengths"]))
+    return Decoded(pixels, left, torch.from_numpy(facts["light"]), kept, mapped)

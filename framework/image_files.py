@@ -1,0 +1,86 @@
+"""Image files: what is in their headers, and their pixels, reduced by a whole number."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+
+from framework.errors import DataError
+
+BAND = 64
+"""Rows of a reduced image that are made at once: float64 takes eight times the memory of the pixels it is made from."""
+
+
+def image_size(paths: Sequence[Path]) -> tuple[int, int]:
+    """Width and height of the first of some image files that can be read, from its header.
+
+    Raises: DataError where none can be read.
+    """
+    reason = ""
+    for path in paths:
+        try:
+            height, width = iio.improps(path, plugin="pillow").shape[:2]
+            return width, height
+        except Exception as error:  # whatever the decoder raises, as in `read_image`
+            reason = reason or f"{path} is not a readable image: {one_line(error)}"
+    raise DataError(reason or "there is no image to read a size from")
+
+
+def read_image(path: Path, factor: int = 1) -> np.ndarray:
+    """An 8-bit image as (H, W, 4) uint8 with straight alpha, reduced by a whole number.
+
+    Raises: DataError where it cannot be decoded or has more than 8 bits a channel.
+    """
+    try:
+        mode = str(iio.immeta(path, plugin="pillow").get("mode", ""))
+        if mode.startswith(("I", "F")) or _is_deep_png(path):
+            raise DataError(f"{path} has more than 8 bits a channel; convert it to an 8-bit PNG")
+        image = np.asarray(iio.imread(path, plugin="pillow", mode="RGBA"))
+    except DataError:
+        raise
+    except Exception as error:  # Pillow raises OSError, SyntaxError, struct.error, DecompressionBombError and more
+        raise DataError(f"{path} is not a readable image: {one_line(error)}") from error
+    return image if factor == 1 else reduce_image(image, factor)
+
+
+def _is_deep_png(path: Path) -> bool:
+    """Whether a PNG has 16 bits a channel, which Pillow would cut to 8 without a word (bit depth: byte 24)."""
+    with path.open("rb") as file:
+        head = file.read(25)
+    return head[:8] == b"\x89PNG\r\n\x1a\n" and head[24:] == b"\x10"
+
+
+def reduce_image(image: np.ndarray, factor: int) -> np.ndarray:
+    """Box filter by a whole number: (H, W, 4) uint8 to (H // factor, W // factor, 4).
+
+    Colours are averaged weighted by alpha, so that transparent pixels lend none of theirs.
+    """
+    height, width = image.shape[0] // factor, image.shape[1] // factor
+    if height == 0 or width == 0:
+        size = f"{image.shape[1]}x{image.shape[0]}"
+        raise DataError(f"an image of {size} pixels has none left at --downscale-factor {factor}")
+    out = np.empty((height, width, 4), np.uint8)
+    for top in range(0, height, BAND):
+        band = image[top * factor : min(top + BAND, height) * factor, : width * factor]
+        blocks = band.reshape(-1, factor, width, factor, 4).astype(np.float64)
+        alpha = blocks[..., 3:].sum((1, 3))
+        color = (blocks[..., :3] * blocks[..., 3:]).sum((1, 3)) / np.maximum(alpha, 1)
+        out[top : top + BAND, :, :3], out[top : top + BAND, :, 3:] = color.round(), (alpha / factor**2).round()
+    return out
+
+
+def may_be_transparent(path: Path) -> bool:
+    """Whether a file's header leaves room for alpha. A file whose header cannot be read has none."""
+    try:
+        meta = iio.immeta(path, plugin="pillow")
+    except Exception:  # whatever the decoder raises; the file is reported when it is decoded
+        return False
+    return "A" in str(meta.get("mode", "")).upper() or "transparency" in meta
+
+
+def one_line(error: BaseException) -> str:
+    """The first line of an error's message, or its type's name."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -1,0 +1,48 @@
+"""Masks of photographs: white where they are to be learnt from, black where they are not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+
+from framework.errors import DataError
+from framework.image_files import one_line
+
+THRESHOLD = 128
+"""The least grey that counts as white."""
+
+
+def read_mask(path: Path, width: int, height: int) -> np.ndarray:
+    """Which pixels of a photograph of width x height are to be used, (H, W) bool.
+
+    A mask may be larger or smaller than its photograph by a whole number, but for the rest that is cut off when images
+    are reduced; then a pixel has the value of the nearest.
+
+    Raises: DataError that names the file, where it is missing, unreadable or of another size.
+    """
+    if not path.is_file():
+        raise DataError(f"the mask {path} does not exist")
+    try:
+        grey = np.asarray(iio.imread(path, plugin="pillow", mode="L"))
+    except Exception as error:  # as in `read_image`
+        raise DataError(f"the mask {path} is not a readable image: {one_line(error)}") from error
+    used = grey >= THRESHOLD
+    down, up = round(used.shape[1] / width), round(width / used.shape[1])
+    if _times(used.shape, (height, width), down):
+        places = [np.arange(n) * down + down // 2 for n in (height, width)]
+    elif _times((height, width), used.shape, up):
+        places = [np.arange(n) // up for n in (height, width)]
+    else:
+        raise DataError(
+            f"the mask {path} is {used.shape[1]}x{used.shape[0]} pixels, but its photograph is {width}x{height}; "
+            "the one must be a whole number of times the other"
+        )
+    rows, columns = (np.minimum(at, size - 1) for at, size in zip(places, used.shape, strict=True))
+    return used[np.ix_(rows, columns)]
+
+
+def _times(large: tuple[int, ...], small: tuple[int, ...], factor: int) -> bool:
+    """Whether a size is `factor` times another, but for a rest."""
+    return all(abs(a - b * factor) < factor for a, b in zip(large, small, strict=True))

@@ -1,0 +1,160 @@
+"""Masks: what they ignore is neither drawn, nor judged, nor taken for empty."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+
+from dataparsers.blender import Blender
+from framework.dataset import Dataset, load_dataset
+from framework.errors import DataError
+from framework.evaluation.evaluator import evaluate, evaluation_background, render_view
+from framework.evaluation.metrics import psnr, ssim
+from framework.masks import read_mask
+from framework.pixel_cache import PixelMemory
+from framework.pixel_set import PixelSet
+from framework.pixels import composite, draw_batch
+from framework.scene_profile import SceneProfile
+from framework.silhouettes import Silhouettes
+from framework.training.trainer import Trainer
+from tests.images import parsed, write_mask, write_noise
+from tests.training.helpers import tiny_run, tiny_trainer
+
+SIZES = [(30, 20), (12, 40), (25, 25)]
+
+
+@pytest.fixture
+def used() -> list[np.ndarray]:
+    """(H, W) bool of two of the three images; the other has no mask."""
+    generator = np.random.default_rng(0)
+    return [generator.random((height, width)) < 0.6 for width, height in SIZES[:2]]
+
+
+@pytest.fixture(params=[0.0, 1e9], ids=["file", "memory"])
+def masked(tmp_path: Path, used: list[np.ndarray], request: pytest.FixtureRequest) -> Dataset:
+    scene = write_noise(tmp_path / "images", SIZES)
+    masks = [write_mask(tmp_path / f"{index}.png", mask) for index, mask in enumerate(used)]
+    scene = parsed(list(scene.image_paths), SIZES, [*masks, None])
+    memory = PixelMemory(request.param, tmp_path / "cache")
+    load_dataset(scene, "train", memory)
+    return load_dataset(scene, "train", memory)  # where it is cached, masks come from the file
+
+
+def test_only_what_masks_leave_is_drawn(masked: Dataset, used: list[np.ndarray]) -> None:
+    expected = torch.from_numpy(np.concatenate([mask.reshape(-1) for mask in used] + [np.ones(625, bool)]))
+    assert masked.kept is not None
+    assert torch.equal(masked.kept.mask(0, len(expected)), expected)
+    drawn = draw_batch(masked, 20_000, "black").pixels
+    assert bool(expected[drawn].all())
+    assert len(drawn.unique()) == expected.sum()
+    kept = masked.kept_of(1)
+    assert kept is not None
+    assert np.array_equal(kept.numpy(), used[1])
+    profile = SceneProfile.of(masked, [])
+    assert profile.ignored == pytest.approx(1 - expected.float().mean().item(), abs=1e-6)
+    assert f"masks ignore {profile.ignored:.0%} of pixels" in profile.lines()[0]
+
+
+def test_silhouettes_and_masks_are_combined(masked: Dataset) -> None:
+    some = torch.arange(len(masked.pixels)) % 3 == 0
+    drawn = masked.drawing(PixelSet.of_mask(some)).drawn
+    assert drawn is not None
+    assert masked.kept is not None
+    assert torch.equal(drawn.mask(0, len(some)), masked.kept.mask(0, len(some)) & some)
+    nothing = PixelSet.of_mask(torch.zeros_like(some))
+    assert masked.drawing(nothing).drawn is masked.drawn  # rather than to draw from nothing
+
+
+def test_grey_is_split_in_the_middle_and_colour_modes_do_not_matter(tmp_path: Path) -> None:
+    grey = np.array([[0, 127, 128, 255]], np.uint8)
+    iio.imwrite(tmp_path / "grey.png", grey)
+    iio.imwrite(tmp_path / "rgb.png", np.repeat(grey[..., None], 3, -1))
+    for name in ("grey.png", "rgb.png"):
+        assert read_mask(tmp_path / name, 4, 1).tolist() == [[False, False, True, True]]
+
+
+@pytest.mark.parametrize("factor", [2, 3])
+def test_masks_of_other_sizes_take_the_nearest(tmp_path: Path, factor: int) -> None:
+    small = np.random.default_rng(1).random((11, 7)) < 0.5
+    large = small.repeat(factor, 0).repeat(factor, 1)
+    assert np.array_equal(read_mask(write_mask(tmp_path / "large.png", large), 7, 11), small)
+    assert np.array_equal(read_mask(write_mask(tmp_path / "small.png", small), 7 * factor, 11 * factor), large)
+    rest = np.pad(large, ((0, factor - 1), (0, 1)))  # cut off when the photograph was reduced
+    assert np.array_equal(read_mask(write_mask(tmp_path / "rest.png", rest), 7, 11), small)
+
+
+def test_a_mask_that_cannot_be_used_is_named(tmp_path: Path) -> None:
+    scene = write_noise(tmp_path / "images", SIZES)
+    (tmp_path / "broken.png").write_bytes(b"no image")
+    wide = write_mask(tmp_path / "wide.png", np.ones((20, 45), bool))
+    black = [write_mask(tmp_path / f"black{i}.png", np.zeros((h, w), bool)) for i, (w, h) in enumerate(SIZES)]
+    for masks, message in (
+        ([tmp_path / "none.png", None, None], r"mask .*none\.png does not exist"),
+        ([tmp_path / "broken.png", None, None], r"mask .*broken\.png is not a readable image"),
+        ([wide, None, None], r"mask .*wide\.png is 45x20 pixels, but its photograph is 30x20"),
+        (black, "masks of split 'train' leave no pixel"),
+    ):
+        with pytest.raises(DataError, match=message):
+            load_dataset(parsed(list(scene.image_paths), SIZES, masks), "train")
+
+
+def test_masks_that_ignore_nothing_change_nothing(tmp_path: Path) -> None:
+    scene = write_noise(tmp_path / "images", SIZES[:1])
+    mask = write_mask(tmp_path / "white.png", np.ones((20, 30), bool))
+    data = load_dataset(parsed(list(scene.image_paths), SIZES[:1], [mask]), "train")
+    assert data.kept is None
+    assert data.drawn is None
+
+
+def test_an_image_without_mask_that_is_skipped_takes_its_mask_along(tmp_path: Path) -> None:
+    scene = write_noise(tmp_path / "images", SIZES)
+    used = [np.random.default_rng(i).random((h, w)) < 0.5 for i, (w, h) in enumerate(SIZES)]
+    masks = [write_mask(tmp_path / f"{i}.png", mask) for i, mask in enumerate(used)]
+    scene.image_paths[1].write_bytes(b"no image")
+    data = load_dataset(parsed(list(scene.image_paths), SIZES, list(masks)), "train")
+    kept = data.kept_of(1)
+    assert kept is not None
+    assert np.array_equal(kept.numpy(), used[2])
+
+
+def test_ignored_pixels_do_not_count_in_evaluation(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", evaluated=True)
+    data, model = trainer.eval_set, trainer.model
+    assert data is not None
+    plain = evaluate(model, data)
+    mask = torch.rand(len(data.pixels)) < 0.7
+    mask[: len(mask) // len(data)] = False  # of the first photograph nothing is left
+    some = replace(data, kept=PixelSet.of_mask(mask))
+    changed = some.pixels.clone()
+    changed[~mask] = 77  # whatever stands there
+    found, same = evaluate(model, some), evaluate(model, replace(some, pixels=changed))
+    assert [row["name"] for row in found.per_image] == list(data.names[1:])
+    assert found.results["psnr"] == same.results["psnr"]
+    assert found.results["psnr"] != plain.results["psnr"]
+    background = evaluation_background(model)
+    target = composite(data.image(1).float() / 255, background)
+    rgb = render_view(model, data, 1, background).rgb.clamp(0, 1)
+    kept = some.kept_of(1)
+    assert kept is not None
+    assert found.per_image[0]["psnr"] == pytest.approx(psnr(rgb[kept], target[kept]), abs=1e-4)
+    replaced = torch.where(kept[..., None], rgb, target)
+    assert found.per_image[0]["ssim"] == pytest.approx(ssim(replaced, target), abs=1e-6)
+
+
+def test_what_is_ignored_is_not_taken_for_empty(shared_tiny: Path, tmp_path: Path) -> None:
+    data = load_dataset(Blender().parse(shared_tiny, "train"), "train")
+    height, width = int(data.cameras.heights[0]), int(data.cameras.widths[0])
+    half = torch.zeros(len(data), height, width, dtype=torch.bool)
+    half[:, :, : width // 2] = True
+    masked = replace(data, kept=PixelSet.of_mask(half), drawn=PixelSet.of_mask(half))
+    sums = Silhouettes.of(masked).sums[0]
+    opaque = (data.image(0)[..., 3] > 0) | ~half[0]
+    assert int(sums[-1, -1]) == int(opaque.sum())
+    trainer = Trainer(tiny_run("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=3), masked, None)
+    trainer.train_step()
+    drawn = trainer.train_set.drawn
+    assert drawn is not None
+    assert not bool((drawn.mask(0, half.numel()) & ~half.reshape(-1)).any())

@@ -106,6 +106,9 @@ class TrainConfig:
     """Draw half of the pixels where the error was large lately, with weights that keep the mean loss as it is."""
     background: Literal["auto", "random", "white", "black"] = "auto"
     """Behind transparent pixels in training; auto: random if images have alpha. Evaluation is over white, or black."""
+    eval_appearance: Literal["mean", "half"] = "mean"
+    """Appearance of held-out photographs, of methods that have one: the mean of all, or optimised on the left half, the
+    right half being judged (NeRF-W's protocol)."""
     eval_num_rays_per_chunk: int = 8_192
     """Rays rendered at once in evaluation. It changes memory and speed, never the picture."""
     machine: MachineConfig = field(default_factory=MachineConfig)

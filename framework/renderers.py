@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -33,6 +33,10 @@ class Rendered:
     """The samples themselves, likewise."""
     coarse: Rendered | None = None
     """An earlier level's picture, for methods that supervise it."""
+    normals: Tensor | None = None
+    """(R, 3) mean of the samples' normals under the weights, of a method that has them."""
+    penalties: dict[str, Tensor] = field(default_factory=dict)
+    """Named (R,) terms of the loss that only the samples' own values tell, also after `per_pixel`."""
 
     def over(self, coarse: Rendered) -> Rendered:
         """This picture with the coarse level it was refined from; the evaluations of both count."""
@@ -56,6 +60,7 @@ class Rendered:
             depth=(depth * share).sum(1) / share.sum(1),
             median_depth=self.median_depth.view(shape).median(1).values,
             accumulation=self.accumulation.view(shape).mean(1),
+            normals=None if self.normals is None else self.normals.view(*shape, 3).mean(1),
             coarse=None if self.coarse is None else self.coarse.per_pixel(rays_per_pixel),
         )
 

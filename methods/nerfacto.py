@@ -7,7 +7,7 @@ vectors (Martin-Brualla et al. 2021); gradients scaled near cameras (Philip and 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from torch import Tensor
@@ -15,7 +15,8 @@ from torch import Tensor
 from framework import Batch, Decision, Method, Model, Rays, Rendered, Scene, TrainConfig
 from framework.encodings import HashGrid
 from framework.fields.encoded import EncodedField
-from framework.kernels.compositing import distortion
+from framework.fields.normals import NormalHead, density_normals, normal_penalties
+from framework.kernels.compositing import distortion, ray_sum
 from framework.kernels.math import scale_gradient
 from framework.pose_refinement import PoseRefinement
 from framework.rays import Samples
@@ -54,6 +55,12 @@ class NerfactoConfig(TrainConfig):
     """Refine the training cameras' poses; auto: SO3xR3 where they were not estimated from the photographs."""
     camera_learning_rate: float = 1e-3
     """Of the poses."""
+    predict_normals: bool = False
+    """Learn normals too, as the density's gradient has them but smoother."""
+    normal_loss_mult: float = 1e-3
+    """Weight of the predicted normals' distance from the density's."""
+    orientation_loss_mult: float = 1e-4
+    """Weight of predicted normals that face away from where they are seen."""
     gradient_scaling: bool | None = None
     """Gradients grow with squared distance up to 1, against floaters at cameras. If not given: for unbounded scenes."""
     num_levels: int = 16
@@ -97,6 +104,7 @@ class Nerfacto(Model[NerfactoConfig]):
         resolutions = tuple(128 << level for level in range(len(config.num_proposal_samples)))
         endless = self.unbounded and not scene.has_alpha
         self.sampler = ProposalSampler(scene.box, counts, resolutions, self.unbounded, endless)
+        self.normals = NormalHead(self.field.num_features, config.hidden_width) if config.predict_normals else None
         self.poses = None if self.pose_group == "off" else PoseRefinement(scene.num_cameras, self.pose_group)
 
     # -- what the scene decides -------------------------------------------------------------------------------
@@ -147,14 +155,26 @@ class Nerfacto(Model[NerfactoConfig]):
         if self.poses is not None:
             rays = self.poses(rays)
         samples = self.sampler.sample(rays, self.field, self.training)
-        sigma, features = self.field.density(samples.positions(rays), samples.times(rays))
+        positions, times = samples.positions(rays), samples.times(rays)
+        sigma, features = self.field.density(positions, times)
         owners = samples.ray_indices
+        directions = rays.directions.index_select(0, owners)
         cameras = None if rays.camera_indices is None else rays.camera_indices[owners]
-        rgb = self.field.color(features, rays.directions.index_select(0, owners), cameras)
+        rgb = self.field.color(features, directions, cameras)
         if self.training and self.scales_gradients:
             factors = samples.t.square().clamp(max=1)
             sigma, rgb = scale_gradient(sigma, factors), scale_gradient(rgb, factors)
-        return volume_render(rays, samples, sigma, rgb, background)
+        rendered = volume_render(rays, samples, sigma, rgb, background)
+        if self.normals is None or rendered.weights is None:
+            return rendered
+        unit = self.field.unit(positions.detach())
+        predicted, weights = self.normals(features.detach(), 2 * unit - 1), rendered.weights
+        facing = ray_sum(weights.detach()[:, None] * predicted, samples)
+        if not self.training:
+            return replace(rendered, normals=facing)
+        found = density_normals(self.field, positions, times)
+        penalties = normal_penalties(predicted, found, directions.detach(), weights, samples)
+        return replace(rendered, normals=facing, penalties=penalties)
 
     def before_step(self, step: int, progress: float) -> None:
         self.sampler.update(step, self.field.density)
@@ -170,6 +190,9 @@ class Nerfacto(Model[NerfactoConfig]):
         if self.distortion_mult > 0 and samples.num_rays:
             normalised = Samples.regular(samples.edges[:, :-1], samples.edges[:, 1:])
             losses["distortion"] = self.distortion_mult * distortion(weights, normalised).mean()
+        factors = {"normals": self.config.normal_loss_mult, "orientation": self.config.orientation_loss_mult}
+        if samples.num_rays:
+            losses |= {name: factors[name] * found.mean() for name, found in rendered.penalties.items()}
         return losses
 
     def param_groups(self) -> list[dict[str, Any]]:

@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 import torch
 
-from framework.fields.encoded import Appearance
+from framework.evaluation.evaluator import evaluate, render_image
+from framework.fields.appearance import Appearance
 from framework.training.trainer import Trainer
 from tests.training.helpers import tiny_run, tiny_trainer
 
@@ -92,5 +93,41 @@ def test_held_out_photographs_are_shown_in_the_mean_appearance() -> None:
         appearance.vectors.copy_(torch.tensor([[0.0, 3.0], [1.0, 0.0], [2.0, 0.0]]))
     assert appearance(torch.tensor([2, 0]), 2).tolist() == [[2.0, 0.0], [0.0, 3.0]]
     assert appearance(None, 2).tolist() == [[1.0, 1.0], [1.0, 1.0]]
-    appearance.stand_in = torch.tensor([5.0, 6.0])
-    assert appearance(None, 1).tolist() == [[5.0, 6.0]]
+    with appearance.shown(torch.tensor([5.0, 6.0])):
+        assert appearance(None, 1).tolist() == [[5.0, 6.0]]
+    assert appearance(None, 1).tolist() == [[1.0, 1.0]]
+
+
+def test_half_of_a_held_out_photograph_tells_the_others_appearance(shared_tiny: Path, tmp_path: Path) -> None:
+    """Trained on darker and lighter copies, a held-out dark photograph is found to be dark from its left half."""
+    still = tiny_trainer("nerfacto", shared_tiny, tmp_path / "still").train_set
+    factors = torch.linspace(0.3, 1.0, len(still))
+    sizes = still.cameras.widths * still.cameras.heights
+    dimmed = still.pixels.clone()
+    dimmed[:, :3] = (still.pixels[:, :3] * factors.repeat_interleave(sizes)[:, None]).round().to(torch.uint8)
+    varied = dataclasses.replace(still, pixels=dimmed, scene=dataclasses.replace(still.scene, appearance_varies=True))
+    (tmp_path / "run").mkdir()
+    run = tiny_run("nerfacto", shared_tiny, tmp_path / "run", max_eval_images=0, max_num_iterations=150)
+    trainer = Trainer(run, varied, None)
+    trainer.train()
+    model = trainer.model
+    dark = dataclasses.replace(varied, pixels=dimmed)
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    found = {}
+    for choice in ("mean", "half"):
+        model.config = dataclasses.replace(model.config, eval_appearance=choice)
+        found[choice] = evaluate(model, dark, max_images=2).per_image[0]["psnr"]
+    assert found["half"] > found["mean"] + 2
+    assert all(torch.equal(before[name], value) for name, value in model.state_dict().items())
+
+
+def test_normals_are_learnt_and_shown(shared_tiny: Path, tmp_path: Path) -> None:
+    """Of the ball, whose colours are its normals: pictures of the two agree."""
+    trainer = captured(shared_tiny, tmp_path, {}, predict_normals=True, max_num_iterations=150)
+    trainer.train()
+    assert {"normals", "orientation"} <= trainer.train_step().losses.keys()
+    image = render_image(trainer.model, trainer.train_set.cameras, 0, torch.ones(3))
+    assert image.normals is not None
+    middle = image.accumulation > 0.95
+    agreement = (image.normals * (2 * image.rgb - 1)).sum(-1)[middle]
+    assert agreement.mean() > 0.7

@@ -31,6 +31,9 @@ class EvalFlags:
     """Evaluate at most this many images, evenly spread; all if not given."""
     rays_per_pixel: RaysPerPixel | None = None
     """Rays of which a pixel is the mean: more are closer to a photograph. As the run says if not given."""
+    eval_appearance: Literal["mean", "half"] | None = None
+    """Appearance of held-out photographs: the mean, or optimised on the left half, the right half being judged
+    (NeRF-W's protocol). As the run says if not given."""
     max_error: str | None = None
     """Rays end where the rest cannot change a colour by more than this, such as 1/255; 1e-4 if not given."""
     round_to_uint8: bool = False
@@ -60,7 +63,12 @@ def _command(arguments: list[str]) -> None:
     from framework.training.trained import load_trained
 
     trained = load_trained(
-        flags.load_config, flags.load_checkpoint, flags.device_type, flags.data, flags.rays_per_pixel
+        flags.load_config,
+        flags.load_checkpoint,
+        flags.device_type,
+        flags.data,
+        flags.rays_per_pixel,
+        flags.eval_appearance,
     )
     dataset = load_split(trained.run, flags.split).to(trained.model.device)
     bound = None if flags.max_error is None else parse_error(flags.max_error)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean, stdev
@@ -15,8 +16,10 @@ from framework.cameras import Cameras, subpixels
 from framework.console import track
 from framework.dataset import Dataset
 from framework.device import has_bfloat16, wait_for
+from framework.evaluation.appearance import appearances, fitted_appearance, right_half
 from framework.evaluation.images import comparison, write_image
 from framework.evaluation.metrics import load_lpips, psnr, ssim
+from framework.kernels.math import safe_normalize
 from framework.model import Model
 from framework.pixels import composite
 
@@ -33,6 +36,8 @@ class RenderedImage:
     """(H, W) opacity."""
     seconds: float
     """Time it took."""
+    normals: Tensor | None = None
+    """(H, W, 3) unit directions away from surfaces, scene coordinates, of a method that has them."""
 
 
 @torch.no_grad()
@@ -51,19 +56,21 @@ def render_image(
     places = subpixels(per_pixel)
     model.eval()
     start = time.perf_counter()
-    parts = []
+    parts, normals = [], []
     with torch.autocast(model.device.type, torch.bfloat16, enabled=use_bfloat16(model)):
         for pixels in cameras.image_pixels(index).split(max(model.config.eval_num_rays_per_chunk // per_pixel, 1)):
             rays = cameras.pixel_rays(pixels, scene.near, scene.far, times, places)
             # The number of a camera that is not a training camera must not be taken for one's.
             out = model.render(replace(rays, camera_indices=None), background).per_pixel(per_pixel)
             parts.append((out.rgb.float(), out.median_depth.float(), out.accumulation.float()))
+            normals += [] if out.normals is None else [safe_normalize(out.normals.float())]
     wait_for(model.device)
     seconds = time.perf_counter() - start
     model.train(was_training)
     rgb, depth, accumulation = (torch.cat(column) for column in zip(*parts, strict=True))
     shape = (int(cameras.heights[index]), int(cameras.widths[index]))
-    return RenderedImage(rgb.view(*shape, 3), depth.view(shape), accumulation.view(shape), seconds)
+    facing = torch.cat(normals).view(*shape, 3) if normals else None
+    return RenderedImage(rgb.view(*shape, 3), depth.view(shape), accumulation.view(shape), seconds, facing)
 
 
 def use_bfloat16(model: Model) -> bool:
@@ -118,7 +125,7 @@ def evaluate(
 
     What masks ignore does not count: PSNR is that of the other pixels, and for SSIM and LPIPS, which look at
     surroundings, the picture takes the photograph's own colours there. A photograph of which nothing is left is passed
-    over.
+    over. Where a method has appearance vectors and `eval_appearance` says so, only the right half counts.
 
     Args:
         model: the trained model.
@@ -135,13 +142,18 @@ def evaluate(
     lpips, lpips_note = load_lpips()
     background = evaluation_background(model)
     rows, seconds, rays = [], 0.0, 0
+    half = model.config.eval_appearance == "half" and bool(appearances(model))
     for index in track(chosen, title, total=len(chosen)):
         target = composite(dataset.image(index).float() / 255, background)
-        view = render_view(model, dataset, index, background)
+        with fitted_appearance(model, dataset, index, background) if half else nullcontext():
+            view = render_view(model, dataset, index, background)
         rgb = view.rgb.clamp(0, 1)
         if round_to_uint8:
             rgb = (rgb * 255).round() / 255
         kept = dataset.kept_of(index)
+        if half:
+            right = right_half(rgb.shape[0], rgb.shape[1], rgb.device)
+            kept = right if kept is None else kept & right
         judged = rgb if kept is None else torch.where(kept[..., None], rgb, target)
         rows.append(
             {

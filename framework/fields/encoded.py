@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from framework.encodings import FeaturePlanes, HashGrid
+from framework.fields.appearance import Appearance
 from framework.fields.base import MLP, Field
 from framework.kernels.contraction import contract_to_unit
 from framework.kernels.math import split_density, truncated_exp
@@ -34,15 +35,18 @@ class BoxField(Field):
         self.register_buffer("shift", -box[0] / size, persistent=False)
         self.encoding = encoding
 
+    def unit(self, positions: Tensor) -> Tensor:
+        """Positions (N, 3) in the encoding's [0, 1]^3."""
+        if self.unbounded:
+            return contract_to_unit(positions, self.box)
+        return torch.addcmul(self.shift, positions, self.scale)
+
     def encode(self, positions: Tensor, times: Tensor | None, known: Tensor | None = None) -> Tensor:
         """Features (N, E) at positions (N, 3), which may be `known` already.
 
         Raises: ValueError where the encoding wants times and there are none.
         """
-        if self.unbounded:
-            unit = contract_to_unit(positions, self.box)
-        else:
-            unit = torch.addcmul(self.shift, positions, self.scale)
+        unit = self.unit(positions)
         if self.encoding.dims == 4:
             if times is None:
                 raise ValueError("this field changes with time: it needs the times of its positions")
@@ -97,7 +101,7 @@ class EncodedField(BoxField):
         appearance: tuple[int, int] | None = None,
     ) -> None:
         super().__init__(box, encoding, unbounded)
-        self.direction_levels = direction_levels
+        self.direction_levels, self.num_features = direction_levels, num_features
         self.density_head = MLP(encoding.num_features, width, num_features, bias=False)
         inputs = num_features + direction_levels**2
         self.appearance = None
@@ -127,24 +131,3 @@ class EncodedField(BoxField):
         if self.appearance is not None:
             inputs.append(self.appearance(camera_indices, len(features)).to(features.dtype))
         return self.color_head(*inputs).float()
-
-
-class Appearance(nn.Module):
-    """A learnt vector for each photograph.
-
-    Args:
-        size: D.
-        count: photographs.
-    """
-
-    def __init__(self, size: int, count: int) -> None:
-        super().__init__()
-        self.vectors = nn.Parameter(torch.zeros(count, size))
-        self.stand_in: Tensor | None = None
-
-    def forward(self, camera_indices: Tensor | None, count: int) -> Tensor:
-        """(N, D) of the photographs `camera_indices` (N,); of None, `stand_in` (D,) or the mean of all, N times."""
-        if camera_indices is not None:
-            return self.vectors[camera_indices]
-        vector = self.vectors.mean(0) if self.stand_in is None else self.stand_in
-        return vector.expand(count, -1)

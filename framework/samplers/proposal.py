@@ -82,7 +82,7 @@ class ProposalSampler(nn.Module):
         if jitter:  # the inner edges move together by up to half an interval either way
             moved = edges + (torch.rand(count, 1, device=device) - 0.5) / self.counts[0]
             edges = torch.cat([edges[:, :1], moved[:, 1:-1], edges[:, -1:]], dim=-1)
-        learning = self.learning and torch.is_grad_enabled()
+        learning = self.learning and self.training and torch.is_grad_enabled()
         proposals: list[Histogram] = []
         power = self.power if self.training else 1.0
         for (here, following), proposal in zip(pairwise(self.counts), self.proposals, strict=True):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from framework.config import RaysPerPixel, TrainConfig
 from framework.device import choose_device
@@ -37,6 +37,7 @@ def load_trained(
     device_type: Any = "auto",
     data: Path | None = None,
     rays_per_pixel: RaysPerPixel | None = None,
+    eval_appearance: Literal["mean", "half"] | None = None,
 ) -> Trained:
     """Load a run's model.
 
@@ -46,13 +47,17 @@ def load_trained(
         device_type: auto, cpu, cuda or mps.
         data: where the data is now, if it has moved.
         rays_per_pixel: of which pictures are made, if not as the run says.
+        eval_appearance: of held-out photographs, likewise.
     Raises: ConfigError or CheckpointError where something is missing or does not fit.
     """
     run = read_run(config_path)
     machine = dataclasses.replace(run.config.machine, device_type=device_type)
-    rays_per_pixel = rays_per_pixel or run.config.rays_per_pixel
     config = dataclasses.replace(
-        run.config, machine=machine, data=data or run.config.data, rays_per_pixel=rays_per_pixel
+        run.config,
+        machine=machine,
+        data=data or run.config.data,
+        rays_per_pixel=rays_per_pixel or run.config.rays_per_pixel,
+        eval_appearance=eval_appearance or run.config.eval_appearance,
     )
     run = dataclasses.replace(run, config=config)
     device = choose_device(machine)

@@ -1,0 +1,77 @@
+"""The appearance of a held-out photograph, found on its left half: NeRF-W's protocol.
+
+Martin-Brualla et al., "NeRF in the Wild", CVPR 2021, section 5: a photograph that was not trained on has no appearance
+vector; one is optimised on its left half, all else being fixed, and the picture is judged on its right half.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from framework.dataset import Dataset
+from framework.fields.appearance import Appearance
+from framework.losses import mean_squared_error
+from framework.model import Model
+from framework.pixels import gather_batch
+
+STEPS, PIXELS, RATE = 60, 1024, 0.05
+"""Of Adam: steps, pixels in each, learning rate."""
+
+
+def appearances(model: Model) -> list[Appearance]:
+    """The model's appearance vectors; empty for a method that has none."""
+    return [module for module in model.modules() if isinstance(module, Appearance)]
+
+
+def right_half(height: int, width: int, device: torch.device) -> Tensor:
+    """(H, W) bool: what is judged."""
+    return (torch.arange(width, device=device) >= width // 2).expand(height, width)
+
+
+@contextmanager
+def fitted_appearance(model: Model, dataset: Dataset, index: int, background: Tensor) -> Iterator[None]:
+    """Show photograph `index` in the appearance found on its left half.
+
+    Args:
+        background: (3,) colour behind what is not opaque.
+    """
+    modules = appearances(model)
+    vectors = [module.vectors.detach().mean(0).clone().requires_grad_() for module in modules]
+    pixels = _left_pixels(dataset, index)
+    with ExitStack() as stack:
+        for module, vector in zip(modules, vectors, strict=True):
+            stack.enter_context(module.shown(vector))
+        if vectors and len(pixels):
+            _fit(model, dataset, pixels, vectors, background)
+        yield
+
+
+def _left_pixels(dataset: Dataset, index: int) -> Tensor:
+    """(P,) those of the photograph's left half that no mask ignores, counted through all images."""
+    use = ~right_half(int(dataset.cameras.heights[index]), int(dataset.cameras.widths[index]), dataset.device)
+    kept = dataset.kept_of(index)
+    if kept is not None:
+        use = use & kept.to(use.device)
+    return dataset.cameras.image_pixels(index)[use.reshape(-1)]
+
+
+def _fit(model: Model, dataset: Dataset, pixels: Tensor, vectors: list[Tensor], background: Tensor) -> None:
+    was_training = model.training
+    model.eval()
+    optimizer = torch.optim.Adam(vectors, lr=RATE)
+    draws = torch.Generator().manual_seed(0)
+    with torch.enable_grad(), torch.autocast(model.device.type, torch.bfloat16, enabled=False):
+        for _ in range(STEPS):
+            chosen = pixels[torch.randint(len(pixels), (PIXELS,), generator=draws).to(pixels.device)]
+            batch = gather_batch(dataset, chosen, background.repeat(len(chosen), 1))
+            rendered = model.render(replace(batch.rays, camera_indices=None), batch.background)
+            loss = mean_squared_error(rendered.rgb, batch.rgb)
+            for vector, grad in zip(vectors, torch.autograd.grad(loss, vectors), strict=True):
+                vector.grad = grad
+            optimizer.step()
+    model.train(was_training)

@@ -14,7 +14,8 @@ class DeformedField(Field):
     """A canonical field, seen through a displacement that a network learns for every place and time.
 
     Args:
-        canonical: the scene as it is at time 0, where the displacement is zero (equation 2).
+        canonical: the scene as it is at time 0, where the displacement is zero (equation 2). Here it grows with time
+            from there; the paper's is cut off at 0, so that only photographs taken just then show what is there.
         width, depth: features of a hidden layer, and hidden layers (256 and 8 in the paper).
         position_frequencies, time_frequencies: L of the two encodings (10 and 4 in the paper).
     """
@@ -47,7 +48,7 @@ class DeformedField(Field):
         )
         found = self.after_skip(self.before_skip(*encoded), *encoded).float()
         assert times is not None
-        return torch.where(times[:, None] == 0, torch.zeros_like(found), found)
+        return times[:, None] * found
 
     def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
         return self.canonical.density(positions + self.displacement(positions, times))

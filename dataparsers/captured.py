@@ -14,6 +14,7 @@ from framework import Cameras, DataError, DataParser, ParsedScene
 from framework.cameras import LENSES
 from framework.dataset import Split, existing, image_size
 from framework.poses import Center, Orientation, Placement, held_out, place
+from framework.scene import PoseSource
 
 LARGEST_SIDE = 1600
 """Pixels of an image's longer side above which images are reduced unless the user says by how much."""
@@ -48,6 +49,9 @@ class Captured(DataParser):
     """Distance from a camera at which the scene may start, scene units."""
     far: float = 1000.0
     """Distance from a camera at which the scene ends, scene units."""
+    poses: PoseSource = "photographs"
+    """Where the poses come from: exact, found in the photographs (structure from motion), or tracked by the device;
+    methods may refine them accordingly."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +143,7 @@ def captured_scene(
         mask_paths=photographs.masks,
         points=points,
         unbounded=True,
-        exact_poses=False,
+        poses=flags.poses,
         depth_paths=photographs.depths,
     )
 

@@ -11,6 +11,7 @@ from dataparsers.captured import ENDINGS, Captured, Photographs, captured_scene,
 from dataparsers.reading import number, read_json, rigid
 from framework import DataError, ParsedScene
 from framework.dataset import Split
+from framework.scene import PoseSource
 
 CAMERAS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
 """Folders in `keyframes` of cameras and their images, the better first: those that Polycam has refined."""
@@ -22,6 +23,7 @@ Z_UP = torch.tensor([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0,
 class Polycam(Captured):
     """Flags of the polycam format."""
 
+    poses: PoseSource = "device"
     depth_unit_scale_factor: float = 0.001
     """Metres that a step of a depth image stands for."""
 

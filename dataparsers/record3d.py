@@ -13,6 +13,7 @@ from dataparsers.captured import Captured, Photographs, captured_scene, has_tran
 from dataparsers.reading import number, numbers, read_json
 from framework import DataError, ParsedScene
 from framework.dataset import Split, existing
+from framework.scene import PoseSource
 
 METADATA, EXPORT = "metadata.json", "EXR_RGBD"
 NORM_TOLERANCE = 0.01
@@ -23,6 +24,7 @@ NORM_TOLERANCE = 0.01
 class Record3D(Captured):
     """Flags of the record3d format."""
 
+    poses: PoseSource = "device"
     max_images: int = 300
     """Take no more images than these, evenly spread over the recording; 0 takes all."""
 

@@ -24,7 +24,7 @@ from framework.image_files import reduce_image as reduce_image
 from framework.mapped_pixels import MappedPixels
 from framework.pixel_cache import PixelMemory
 from framework.pixel_set import PixelSet
-from framework.scene import Scene
+from framework.scene import PoseSource, Scene
 
 Split = Literal["train", "val", "test"]
 
@@ -57,8 +57,8 @@ class ParsedScene:
     """(K, 3) sparse points on surfaces, scene coordinates."""
     unbounded: bool = False
     """There may be something to see outside `box`."""
-    exact_poses: bool = True
-    """The poses are known rather than estimated."""
+    poses: PoseSource = "exact"
+    """Where the cameras' poses come from."""
     appearance_varies: bool = False
     """Light, exposure or camera differ between the photographs."""
     depth_paths: tuple[Path | None, ...] | None = None
@@ -212,7 +212,7 @@ def load_dataset(parsed: ParsedScene, split: str, memory: PixelMemory | None = N
         moving=parsed.times is not None,
         image_size=int(torch.maximum(cameras.widths, cameras.heights).max()),
         unbounded=parsed.unbounded,
-        exact_poses=parsed.exact_poses,
+        poses=parsed.poses,
         # Of an object cut out of its surroundings, each side has a light of its own.
         appearance_varies=parsed.appearance_varies
         or (not has_alpha and light_spread(decoded.light) > APPEARANCE_STOPS),

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from torch import Tensor
+
+PoseSource = Literal["exact", "photographs", "device"]
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,7 @@ class Scene:
     """The longer side of the largest training image, pixels."""
     unbounded: bool = False
     """There may be something to see outside `box`."""
-    exact_poses: bool = True
-    """The poses are known rather than estimated."""
+    poses: PoseSource = "exact"
+    """Where the cameras' poses come from: known; found in the photographs; or tracked by the device that took them."""
     appearance_varies: bool = False
     """Light, exposure or camera differ between the photographs."""

@@ -25,6 +25,11 @@ from framework.samplers.proposal import ProposalSampler
 
 APPEARANCE_SIZE = 16
 DISTORTION = 2e-3
+POSE_REASONS = {
+    "exact": "the poses are exact",
+    "photographs": "the poses were found in the photographs themselves",
+    "device": "the poses are those that the device tracked",
+}
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,7 @@ class NerfactoConfig(TrainConfig):
     appearance_embedding_dim: int | None = None
     """Features in which each photograph may differ. If not given: 16 where light differs between them, else none."""
     camera_optimizer: Literal["auto", "off", "SO3xR3", "SE3"] = "auto"
-    """Refine the training cameras' poses; auto: SO3xR3 where they were not estimated from the photographs."""
+    """Refine the training cameras' poses; auto: SO3xR3 where a device tracked them."""
     camera_learning_rate: float = 1e-3
     """Of the poses."""
     predict_normals: bool = False
@@ -117,7 +122,7 @@ class Nerfacto(Model[NerfactoConfig]):
     @property
     def pose_group(self) -> Literal["off", "SO3xR3", "SE3"]:
         asked = self.config.camera_optimizer
-        return ("off" if self.scene.exact_poses else "SO3xR3") if asked == "auto" else asked
+        return ("SO3xR3" if self.scene.poses == "device" else "off") if asked == "auto" else asked
 
     @property
     def distortion_mult(self) -> float:
@@ -145,8 +150,7 @@ class Nerfacto(Model[NerfactoConfig]):
             reason = "light differs between the photographs" if varies else "the photographs are lit alike"
             found.append(Decision("appearance features", f"{self.appearance_size}", reason))
         if config.camera_optimizer == "auto":
-            reason = "the poses are exact enough" if self.scene.exact_poses else "the poses are a device's own"
-            found.append(Decision("pose refinement", self.pose_group, reason))
+            found.append(Decision("pose refinement", self.pose_group, POSE_REASONS[self.scene.poses]))
         return found
 
     # -- rendering and learning -------------------------------------------------------------------------------

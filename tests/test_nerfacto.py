@@ -37,7 +37,7 @@ def test_a_bounded_scene_with_exact_poses_needs_little(shared_tiny: Path, tmp_pa
 
 
 def test_a_capture_gets_what_it_needs(shared_tiny: Path, tmp_path: Path) -> None:
-    facts = {"unbounded": True, "exact_poses": False, "appearance_varies": True}
+    facts = {"unbounded": True, "poses": "device", "appearance_varies": True}
     trainer = captured(shared_tiny, tmp_path, facts, max_num_iterations=4)
     found = chosen(trainer)
     assert found["contraction"] == found["gradient scaling near cameras"] == "on"
@@ -56,7 +56,7 @@ def test_what_is_asked_for_is_done_and_not_called_a_decision(shared_tiny: Path, 
         "contraction": False, "distortion_loss_mult": 0.0, "appearance_embedding_dim": 0, "camera_optimizer": "off",
         "gradient_scaling": False,
     }  # fmt: skip
-    facts = {"unbounded": True, "exact_poses": False, "appearance_varies": True}
+    facts = {"unbounded": True, "poses": "device", "appearance_varies": True}
     trainer = captured(shared_tiny, tmp_path, facts, **asked)
     assert not {"contraction", "distortion loss", "appearance features", "pose refinement"} & chosen(trainer).keys()
     assert trainer.model.poses is None

@@ -50,7 +50,7 @@ def test_rays_through_keypoints_meet_the_points(tmp_path: Path, capture: Capture
     scene = Colmap(eval_interval=0).parse(tmp_path, "train")
     assert [path.name for path in scene.image_paths] == capture.names
     assert scene.unbounded
-    assert not scene.exact_poses
+    assert scene.poses == "photographs"
     for image in range(len(capture.names)):
         x, y = capture.seen(image).T
         assert misses(scene, image, FX * x + CX, FY * y + CY, capture.points).max() < 1e-3

@@ -62,7 +62,7 @@ def test_bounds_tell_where_a_scene_seen_from_one_side_is(folder: Path) -> None:
     """Everything that a camera sees between near and far is in the box, and rays start a bit before."""
     scene = Llff().parse(folder, "train")
     assert scene.unbounded
-    assert not scene.exact_poses
+    assert scene.poses == "photographs"
     assert scene.near == pytest.approx(0.9 * 2 * scene.scale)
     cameras = scene.cameras
     for image in range(len(cameras)):

@@ -67,7 +67,7 @@ def test_rays_meet_the_points_that_the_files_cameras_see(
     largest = scene.cameras.camera_to_worlds[:, :, 3].abs().max().item()
     assert largest == pytest.approx(1.5) if auto_scale else largest > 1.5
     assert scene.unbounded
-    assert not scene.exact_poses
+    assert scene.poses == "photographs"
     assert (scene.near, scene.far) == (0.05, 1000.0)
     assert scene.box.tolist() == [[-1] * 3, [1] * 3]
 

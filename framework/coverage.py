@@ -64,9 +64,10 @@ def pixels_with_rays(cameras: Cameras, names: Sequence[str], split: str) -> Pixe
         f"{names[worst]} ({int(counts[worst])}); they are not trained on"
     )
     sets = []
-    for first, last in pairwise(cameras.offsets.tolist()):
+    ends = torch.searchsorted(lost, cameras.offsets).tolist()
+    for (first, last), (low, high) in zip(pairwise(cameras.offsets.tolist()), pairwise(ends), strict=True):
         reached = torch.ones(last - first, dtype=torch.bool, device=lost.device)
-        reached[lost[(lost >= first) & (lost < last)] - first] = False
+        reached[lost[low:high] - first] = False
         sets.append(PixelSet.of_mask(reached, first))
     return PixelSet.joined(sets)
 

@@ -65,7 +65,7 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
         return losses
 
     def param_groups(self) -> list[dict[str, Any]]:
-        """Adam's parameter groups. Each has `params` and may set `lr`, `betas`, `eps`, `sparse`.
+        """Adam's parameter groups. Each has `params` and may set `lr`, `betas`, `eps`, `sparse`, `schedule`.
 
         By default the tables of encodings that ask for it are a group that is updated sparsely.
         """

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from framework.fields.base import Field
 from framework.kernels.compositing import composite
+from framework.kernels.math import scale_gradient
 from framework.rays import Rays, Samples
 from framework.samplers.base import Sampler
 
@@ -26,7 +27,7 @@ class Rendered:
     accumulation: Tensor
     """(R,) opacity, the sum of the weights."""
     num_samples: int
-    """Field evaluations spent on these rays."""
+    """Evaluations of the field on these rays; a proposal's are not counted."""
     weights: Tensor | None = None
     """(N,) weight of each sample, ray by ray, also after `per_pixel`."""
     samples: Samples | None = None
@@ -98,11 +99,18 @@ def render_field(field: Field, sampler: Sampler, rays: Rays, background: Tensor,
     return shade(field, rays, samples, background)
 
 
-def shade(field: Field, rays: Rays, samples: Samples, background: Tensor) -> Rendered:
-    """Colour and composite samples whose density and features are attached."""
+def shade(
+    field: Field, rays: Rays, samples: Samples, background: Tensor, gradient_factors: Tensor | None = None
+) -> Rendered:
+    """Colour and composite samples whose density and features are attached.
+
+    `gradient_factors` (N,) multiply the gradients of density and colour; None for 1.
+    """
     if samples.sigma is None or samples.features is None:
         raise ValueError("shade() needs samples whose density and features are attached")
     owners = samples.ray_indices
     cameras = None if rays.camera_indices is None else rays.camera_indices[owners]
-    rgb = field.color(samples.features, rays.directions.index_select(0, owners), cameras)
-    return volume_render(rays, samples, samples.sigma, rgb, background)
+    sigma, rgb = samples.sigma, field.color(samples.features, rays.directions.index_select(0, owners), cameras)
+    if gradient_factors is not None:
+        sigma, rgb = scale_gradient(sigma, gradient_factors), scale_gradient(rgb, gradient_factors)
+    return volume_render(rays, samples, sigma, rgb, background)

@@ -36,7 +36,7 @@ class SceneProfile:
     transparent: float | None
     """Share of pixels that are fully transparent; None where no photograph has alpha."""
     ignored: float | None
-    """Share of pixels that masks ignore; None where they ignore none."""
+    """Share of pixels that are not learnt from: masks ignore them, or no ray leads there; None for none."""
     light: float | None
     """By how many stops light differs between the photographs (`appearance.light_spread`); None of cut-out objects."""
     camera: str
@@ -67,7 +67,7 @@ class SceneProfile:
         motion = "moving" if self.moving else "still"
         facts = f"scene: {self.images} images of {self.width} x {self.height}, {self.camera} camera, {alpha}, {motion}"
         if self.ignored is not None:
-            facts += f", masks ignore {self.ignored:.0%} of pixels"
+            facts += f", {self.ignored:.0%} of pixels ignored (masks, or no ray)"
         if self.light is not None:
             facts += f", light differs by {self.light:.2f} stops"
         return [facts, *(decision.line() for decision in self.decisions)]

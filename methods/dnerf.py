@@ -16,7 +16,14 @@ from framework.fields.deformed import DeformedField
 from framework.fields.encoded import EncodedField
 from framework.fields.nerf import NeRFField
 from framework.renderers import render_field
-from framework.samplers.choice import SamplingConfig, by_proposals, make_sampler, sampler_decisions
+from framework.samplers.choice import (
+    HierarchicalConfig,
+    chosen_sampler,
+    contracted_box,
+    make_sampler,
+    sampler_decisions,
+)
+from framework.samplers.occupancy import OccupancySampler
 from methods.vanilla_nerf import OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH, render_hierarchical
 
 HASH_SAMPLES_PER_BATCH = 2**14
@@ -24,7 +31,7 @@ HASH_SAMPLES_PER_BATCH = 2**14
 
 
 @dataclass(frozen=True)
-class DNeRFConfig(SamplingConfig):
+class DNeRFConfig(HierarchicalConfig):
     """Settings of dnerf; networks, samples and learning rate are the paper's.
 
     Unlike there, photographs with alpha are composited over random colours in training: over white, a scene with much
@@ -40,14 +47,6 @@ class DNeRFConfig(SamplingConfig):
     """d-nerf: a canonical field, deformed. t-nerf: one network of place and time."""
     canonical: Literal["network", "hash-grid"] = "network"
     """What d-nerf deforms: the paper's network, or a hash grid with small networks."""
-    sampler: Literal["auto", "hierarchical", "occupancy", "proposal"] = "auto"  # type: ignore[assignment]
-    """hierarchical: 64 coarse and 64 + 128 fine samples, two fields. occupancy: one field and an occupancy grid.
-    proposal: one field, and small density fields that say where to look, in all of space, contracted. auto:
-    hierarchical, or proposal where there may be something outside the box."""
-    num_coarse_samples: int = 64
-    """Stratified samples a ray for the coarse field."""
-    num_fine_samples: int = 128
-    """Further samples a ray for the fine field, drawn where the coarse one found something."""
     num_layers: int = 8
     """Layers of the canonical network before density."""
     hidden_width: int = 256
@@ -83,20 +82,11 @@ class DNeRF(Model[DNeRFConfig]):
 
     def __init__(self, config: DNeRFConfig, scene: Scene) -> None:
         super().__init__(config, scene)
+        self.contracted_box = contracted_box(config, scene)
+        hierarchical = chosen_sampler(config, scene) == "hierarchical"
         self.fine = self._field()
-        self.coarse = self._field() if self.hierarchical else None
-        self.sampler = None if self.hierarchical else make_sampler(config, scene)
-
-    @property
-    def hierarchical(self) -> bool:
-        """Whether a coarse field says where the fine one is sampled."""
-        asked = self.config.sampler
-        return asked == "hierarchical" or (asked == "auto" and not self.scene.unbounded)
-
-    @property
-    def contracted_box(self) -> Tensor | None:
-        """Around which space is contracted, where it goes on outside."""
-        return self.scene.box if self.scene.unbounded and by_proposals(self.config, self.scene) else None
+        self.coarse = self._field() if hierarchical else None
+        self.sampler = None if hierarchical else make_sampler(config, scene)
 
     def _field(self) -> Field:
         c, moving = self.config, self.scene.moving
@@ -117,6 +107,7 @@ class DNeRF(Model[DNeRFConfig]):
             c.deformation_layers or layers,
             c.position_frequencies,
             c.time_frequencies,
+            self.contracted_box,
         )
 
     def _network(self, time_frequencies: int | None) -> NeRFField:
@@ -126,7 +117,7 @@ class DNeRF(Model[DNeRFConfig]):
         return NeRFField(c.hidden_width, c.num_layers, skip, *frequencies, time_frequencies, self.contracted_box)
 
     def decisions(self) -> list[Decision]:
-        found = [] if self.hierarchical else sampler_decisions(self.config, self.scene)
+        found = sampler_decisions(self.config, self.scene)
         if not self.scene.moving:
             found.append(Decision("deformation", "left out", "the photographs have no times"))
         return found
@@ -140,7 +131,7 @@ class DNeRF(Model[DNeRFConfig]):
 
     def param_groups(self) -> list[dict[str, Any]]:
         config = self.config
-        faster = OCCUPANCY_RATE if self.sampler is not None else 1.0
+        faster = OCCUPANCY_RATE if isinstance(self.sampler, OccupancySampler) else 1.0
         encoded = [module for module in self.modules() if isinstance(module, EncodedField)]
         proposals = self.proposal_groups()
         apart = {id(p) for module in encoded for p in module.parameters()}
@@ -157,7 +148,7 @@ class DNeRF(Model[DNeRFConfig]):
 
     @property
     def samples_per_batch(self) -> int | None:
-        if self.sampler is None or self.config.samples_per_batch is not None:
+        if not isinstance(self.sampler, OccupancySampler) or self.config.samples_per_batch is not None:
             return self.config.samples_per_batch
         small = self.config.canonical == "hash-grid" and self.config.variant == "d-nerf"
         return HASH_SAMPLES_PER_BATCH if small else OCCUPANCY_SAMPLES_PER_BATCH

@@ -16,7 +16,7 @@ from framework.config import RaysPerPixel
 from framework.encodings import HashGrid
 from framework.fields.encoded import EncodedField
 from framework.renderers import render_field
-from framework.samplers.choice import SamplingConfig, by_proposals, make_sampler, sampler_decisions
+from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_decisions
 
 PLANS = (
     (60.0, 16, 512, 2**15, 1),
@@ -83,7 +83,7 @@ class InstantNGPConfig(SamplingConfig):
 
 
 class InstantNGP(Model[InstantNGPConfig]):
-    """One hash field marched through an occupancy grid."""
+    """One hash field, marched through an occupancy grid or sampled by proposals."""
 
     def __init__(self, config: InstantNGPConfig, scene: Scene) -> None:
         super().__init__(config, scene)
@@ -103,7 +103,7 @@ class InstantNGP(Model[InstantNGPConfig]):
             grid,
             config.hidden_width,
             direction_levels=4 if config.view_dependence else 0,
-            unbounded=scene.unbounded and by_proposals(config, scene),
+            unbounded=contracted_box(config, scene) is not None,
         )
         self.sampler = make_sampler(config, scene)
 

@@ -19,7 +19,7 @@ from framework.kernels.math import truncated_exp
 from framework.kernels.planes import plane_band
 from framework.kernels.spherical_harmonics import spherical_harmonics
 from framework.renderers import render_field
-from framework.samplers.choice import SamplingConfig, by_proposals, make_sampler, sampler_decisions
+from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_decisions
 
 MAX_SCALES = 4
 
@@ -100,7 +100,7 @@ class ExplicitField(BoxField):
 
 
 class KPlanes(Model[KPlanesConfig]):
-    """Planes of features, marched through an occupancy grid. Without times, the planes of time are left out."""
+    """Planes of features, by an occupancy grid or proposals. Without times, the planes of time are left out."""
 
     learns_motion = True
 
@@ -110,7 +110,7 @@ class KPlanes(Model[KPlanesConfig]):
         resolutions = tuple((config.base_resolution << s,) * 3 + time for s in range(self.num_scales))
         planes = FeaturePlanes(resolutions, config.features_per_scale, sparse=config.sparse_updates)
         kind = EncodedField if config.decoder == "hybrid" else ExplicitField
-        unbounded = scene.unbounded and by_proposals(config, scene)
+        unbounded = contracted_box(config, scene) is not None
         self.field = kind(scene.box, planes, config.hidden_width, unbounded=unbounded)
         self.sampler = make_sampler(config, scene)
 

@@ -12,16 +12,16 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from framework import Batch, Decision, Method, Model, Rays, Rendered, Scene, TrainConfig
+from framework import Batch, ConfigError, Decision, Method, Model, Rays, Rendered, Scene
 from framework.encodings import HashGrid
 from framework.fields.encoded import EncodedField
 from framework.fields.normals import NormalHead, density_normals, normal_penalties
 from framework.kernels.compositing import distortion, ray_sum
-from framework.kernels.math import scale_gradient
 from framework.pose_refinement import PoseRefinement
 from framework.rays import Samples
-from framework.renderers import volume_render
-from framework.samplers.proposal import ProposalSampler
+from framework.renderers import shade
+from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_decisions
+from framework.samplers.proposal import ProposalSampler, half_edge
 
 APPEARANCE_SIZE = 16
 DISTORTION = 2e-3
@@ -33,7 +33,7 @@ POSE_REASONS = {
 
 
 @dataclass(frozen=True)
-class NerfactoConfig(TrainConfig):
+class NerfactoConfig(SamplingConfig):
     """Settings of nerfacto. What is not given is decided by the scene."""
 
     max_num_iterations: int = 30_000
@@ -44,14 +44,9 @@ class NerfactoConfig(TrainConfig):
     adam_beta2: float = 0.99
     adam_eps: float = 1e-15
     eval_num_rays_per_chunk: int = 4_096
+    sampler: Literal["auto", "occupancy", "proposal"] = "proposal"
     contraction: bool | None = None
     """Contract all of space around the box. If not given: where there may be something outside it."""
-    num_proposal_samples: tuple[int, ...] = (128, 64)
-    """Intervals of each proposal."""
-    num_nerf_samples: int = 32
-    """Samples a ray of the field itself."""
-    interlevel_loss_mult: float = 1.0
-    """Weight of what teaches the proposals."""
     distortion_loss_mult: float | None = None
     """Weight of the distortion loss. If not given: 0.002 for unbounded scenes, else none."""
     appearance_embedding_dim: int | None = None
@@ -62,12 +57,12 @@ class NerfactoConfig(TrainConfig):
     """Of the poses."""
     predict_normals: bool = False
     """Learn normals too, as the density's gradient has them but smoother."""
-    normal_loss_mult: float = 1e-3
-    """Weight of the predicted normals' distance from the density's."""
-    orientation_loss_mult: float = 1e-4
-    """Weight of predicted normals that face away from where they are seen."""
+    orientation_loss_mult: float = 0.1
+    """Weight of predicted normals that face away from where they are seen, relative to their distance from the
+    density's."""
     gradient_scaling: bool | None = None
-    """Gradients grow with squared distance up to 1, against floaters at cameras. If not given: for unbounded scenes."""
+    """Gradients grow with squared distance up to half of the box's edge, against floaters at cameras. If not given: for
+    unbounded scenes."""
     num_levels: int = 16
     """Resolutions of the hash grid."""
     features_per_level: int = 2
@@ -88,8 +83,10 @@ class Nerfacto(Model[NerfactoConfig]):
     """One hash field, sampled where proposals say."""
 
     def __init__(self, config: NerfactoConfig, scene: Scene) -> None:
+        if config.contraction is not None:
+            scene = replace(scene, unbounded=config.contraction)
         super().__init__(config, scene)
-        self.unbounded = scene.unbounded if config.contraction is None else config.contraction
+        self.unbounded = contracted_box(config, scene) is not None
         grid = HashGrid(
             config.num_levels,
             config.features_per_level,
@@ -105,12 +102,12 @@ class Nerfacto(Model[NerfactoConfig]):
             unbounded=self.unbounded,
             appearance=(self.appearance_size, scene.num_cameras) if self.appearance_size else None,
         )
-        counts = (*config.num_proposal_samples, config.num_nerf_samples)
-        resolutions = tuple(128 << level for level in range(len(config.num_proposal_samples)))
-        endless = self.unbounded and not scene.has_alpha
-        self.sampler = ProposalSampler(scene.box, counts, resolutions, self.unbounded, endless)
+        self.sampler = make_sampler(config, scene)
+        self.unit_length = half_edge(scene.box)
         self.normals = NormalHead(self.field.num_features, config.hidden_width) if config.predict_normals else None
         self.poses = None if self.pose_group == "off" else PoseRefinement(scene.num_cameras, self.pose_group)
+        if self.poses is not None and not isinstance(self.sampler, ProposalSampler):
+            raise ConfigError("--camera-optimizer needs --sampler proposal: marched samples carry no gradient to rays")
 
     # -- what the scene decides -------------------------------------------------------------------------------
 
@@ -135,16 +132,15 @@ class Nerfacto(Model[NerfactoConfig]):
         return self.unbounded if asked is None else asked
 
     def decisions(self) -> list[Decision]:
-        config, outside = self.config, "the scene goes on outside its box"
-        inside = "the scene ends at its box"
-        found = []
+        config, found = self.config, sampler_decisions(self.config, self.scene)
         if config.contraction is None:
-            found.append(Decision("contraction", _on(self.unbounded), outside if self.unbounded else inside))
-        where = outside if self.unbounded else inside
+            reason = "there may be something outside the box" if self.unbounded else "the scene ends at its box"
+            found.append(Decision("contraction", _on(self.unbounded), reason))
+        reason = f"contraction is {_on(self.unbounded)}"
         if config.distortion_loss_mult is None:
-            found.append(Decision("distortion loss", f"{self.distortion_mult:g}", where))
+            found.append(Decision("distortion loss", f"{self.distortion_mult:g}", reason))
         if config.gradient_scaling is None:
-            found.append(Decision("gradient scaling near cameras", _on(self.scales_gradients), where))
+            found.append(Decision("gradient scaling near cameras", _on(self.scales_gradients), reason))
         if config.appearance_embedding_dim is None:
             varies = self.scene.appearance_varies
             reason = "light differs between the photographs" if varies else "the photographs are lit alike"
@@ -159,25 +155,28 @@ class Nerfacto(Model[NerfactoConfig]):
         if self.poses is not None:
             rays = self.poses(rays)
         samples = self.sampler.sample(rays, self.field, self.training)
-        positions, times = samples.positions(rays), samples.times(rays)
-        sigma, features = self.field.density(positions, times)
-        owners = samples.ray_indices
-        directions = rays.directions.index_select(0, owners)
-        cameras = None if rays.camera_indices is None else rays.camera_indices[owners]
-        rgb = self.field.color(features, directions, cameras)
+        if samples.sigma is None or samples.features is None:
+            samples = samples.evaluated(*self.field.density(samples.positions(rays), samples.times(rays)))
+        factors = None
         if self.training and self.scales_gradients:
-            factors = samples.t.square().clamp(max=1)
-            sigma, rgb = scale_gradient(sigma, factors), scale_gradient(rgb, factors)
-        rendered = volume_render(rays, samples, sigma, rgb, background)
-        if self.normals is None or rendered.weights is None:
-            return rendered
-        unit = self.field.unit(positions.detach())
-        predicted, weights = self.normals(features.detach(), 2 * unit - 1), rendered.weights
+            factors = (samples.t / self.unit_length).square().clamp(max=1)
+        rendered = shade(self.field, rays, samples, background, factors)
+        return rendered if self.normals is None else self._with_normals(self.normals, rays, rendered)
+
+    def _with_normals(self, head: NormalHead, rays: Rays, rendered: Rendered) -> Rendered:
+        """Normals in the picture, and in training what is wrong with them."""
+        samples, weights = rendered.samples, rendered.weights
+        assert samples is not None
+        assert samples.features is not None
+        assert weights is not None
+        positions = samples.positions(rays).detach()
+        predicted = head(samples.features.detach(), 2 * self.field.unit(positions) - 1)
         facing = ray_sum(weights.detach()[:, None] * predicted, samples)
         if not self.training:
             return replace(rendered, normals=facing)
-        found = density_normals(self.field, positions, times)
-        penalties = normal_penalties(predicted, found, directions.detach(), weights, samples)
+        found = density_normals(self.field, positions, samples.times(rays))
+        directions = rays.directions.detach().index_select(0, samples.ray_indices)
+        penalties = normal_penalties(predicted, found, directions, weights, samples)
         return replace(rendered, normals=facing, penalties=penalties)
 
     def before_step(self, step: int, progress: float) -> None:
@@ -186,17 +185,13 @@ class Nerfacto(Model[NerfactoConfig]):
     def loss(self, rendered: Rendered, batch: Batch, step: int) -> dict[str, Tensor]:
         losses = super().loss(rendered, batch, step)
         samples, weights = rendered.samples, rendered.weights
-        assert samples is not None
-        assert samples.edges is not None
-        assert weights is not None
-        if "interlevel" in losses:
-            losses["interlevel"] = self.config.interlevel_loss_mult * losses["interlevel"]
-        if self.distortion_mult > 0 and samples.num_rays:
+        if samples is None or weights is None or not samples.num_rays:
+            return losses
+        if self.distortion_mult > 0 and samples.edges is not None:
             normalised = Samples.regular(samples.edges[:, :-1], samples.edges[:, 1:])
             losses["distortion"] = self.distortion_mult * distortion(weights, normalised).mean()
-        factors = {"normals": self.config.normal_loss_mult, "orientation": self.config.orientation_loss_mult}
-        if samples.num_rays:
-            losses |= {name: factors[name] * found.mean() for name, found in rendered.penalties.items()}
+        for name, found in rendered.penalties.items():
+            losses[name] = (self.config.orientation_loss_mult if name == "orientation" else 1.0) * found.mean()
         return losses
 
     def param_groups(self) -> list[dict[str, Any]]:
@@ -205,7 +200,10 @@ class Nerfacto(Model[NerfactoConfig]):
             return groups
         tangents = self.poses.tangents
         groups[0]["params"] = [p for p in groups[0]["params"] if p is not tangents]
-        return [*groups, {"params": [tangents], "lr": self.config.camera_learning_rate, "name": "poses"}]
+        return [
+            *groups,
+            {"params": [tangents], "lr": self.config.camera_learning_rate, "schedule": "exponential", "name": "poses"},
+        ]
 
 
 def _on(choice: bool) -> str:

@@ -20,7 +20,7 @@ from framework.fields.base import MLP
 from framework.kernels.contraction import contract_to_unit
 from framework.kernels.spherical_harmonics import spherical_harmonics
 from framework.renderers import render_field
-from framework.samplers.choice import SamplingConfig, by_proposals, make_sampler, sampler_decisions
+from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_decisions
 from framework.samplers.occupancy import OccupancySampler
 
 VM = (((0, 1), (2,)), ((0, 2), (1,)), ((1, 2), (0,)))
@@ -137,7 +137,7 @@ class TensorField(Field):
 
 
 class TensoRF(Model[TensoRFConfig]):
-    """Factors that grow from coarse to fine while their box shrinks, marched through an occupancy grid."""
+    """Factors that grow from coarse to fine, while their box shrinks to what an occupancy grid, if used, has found."""
 
     growths: Tensor
     """Times the grid has grown."""
@@ -152,7 +152,7 @@ class TensoRF(Model[TensoRFConfig]):
             FeaturePlanes(vertices, components, axes, config.sparse_updates, resizable=True)
             for components in (config.density_components, config.appearance_components)
         )
-        unbounded = scene.unbounded and by_proposals(config, scene)
+        unbounded = contracted_box(config, scene) is not None
         self.field = TensorField(scene.box, density, appearance, config.hidden_width, unbounded=unbounded)
         with torch.no_grad():  # of CP's triple products the factors are larger, as in the authors' code
             for factors in (density, appearance):

@@ -16,8 +16,15 @@ from torch import Tensor
 from framework import Decision, Field, Method, Model, Rays, Rendered, Scene
 from framework.fields.nerf import NeRFField
 from framework.renderers import render_field, shade
-from framework.samplers.choice import SamplingConfig, by_proposals, make_sampler, sampler_decisions
+from framework.samplers.choice import (
+    HierarchicalConfig,
+    chosen_sampler,
+    contracted_box,
+    make_sampler,
+    sampler_decisions,
+)
 from framework.samplers.inverse_cdf import inverse_cdf, uniform_variates
+from framework.samplers.occupancy import OccupancySampler
 from framework.samplers.uniform import samples_from_points, stratified_points
 
 OCCUPANCY_SAMPLES_PER_BATCH = 2**12
@@ -28,7 +35,7 @@ reached 22.5 dB on Lego after 90 s on two cores, where 2^13 samples, 512 steps a
 
 
 @dataclass(frozen=True)
-class VanillaNeRFConfig(SamplingConfig):
+class VanillaNeRFConfig(HierarchicalConfig):
     """Settings of vanilla-nerf; the defaults are the paper's."""
 
     max_num_iterations: int = 200_000
@@ -37,14 +44,6 @@ class VanillaNeRFConfig(SamplingConfig):
     lr_final: float = 0.1
     adam_eps: float = 1e-7
     background: Literal["auto", "random", "white", "black"] = "white"
-    sampler: Literal["auto", "hierarchical", "occupancy", "proposal"] = "auto"  # type: ignore[assignment]
-    """hierarchical: 64 coarse and 64 + 128 fine samples, two networks. occupancy: one network and an occupancy grid.
-    proposal: one network, and small density fields that say where to look, in all of space, contracted. auto:
-    hierarchical, or proposal where there may be something outside the box."""
-    num_coarse_samples: int = 64
-    """Stratified samples a ray for the coarse network."""
-    num_fine_samples: int = 128
-    """Further samples a ray for the fine network, drawn where the coarse one found something."""
     num_layers: int = 8
     """Layers before density."""
     hidden_width: int = 256
@@ -58,24 +57,15 @@ class VanillaNeRFConfig(SamplingConfig):
 
 
 class VanillaNeRF(Model[VanillaNeRFConfig]):
-    """Two networks trained together (equations 5 and 6), or one with an occupancy grid."""
+    """Two networks trained together (equations 5 and 6), or one with an occupancy grid or proposals."""
 
     def __init__(self, config: VanillaNeRFConfig, scene: Scene) -> None:
         super().__init__(config, scene)
+        self.contracted_box = contracted_box(config, scene)
+        hierarchical = chosen_sampler(config, scene) == "hierarchical"
         self.fine = self._field()
-        self.coarse = self._field() if self.hierarchical else None
-        self.sampler = None if self.hierarchical else make_sampler(config, scene)
-
-    @property
-    def hierarchical(self) -> bool:
-        """Whether a coarse field says where the fine one is sampled."""
-        asked = self.config.sampler
-        return asked == "hierarchical" or (asked == "auto" and not self.scene.unbounded)
-
-    @property
-    def contracted_box(self) -> Tensor | None:
-        """Around which space is contracted, where it goes on outside."""
-        return self.scene.box if self.scene.unbounded and by_proposals(self.config, self.scene) else None
+        self.coarse = self._field() if hierarchical else None
+        self.sampler = None if hierarchical else make_sampler(config, scene)
 
     def _field(self) -> NeRFField:
         c = self.config
@@ -89,7 +79,7 @@ class VanillaNeRF(Model[VanillaNeRFConfig]):
         )
 
     def decisions(self) -> list[Decision]:
-        return [] if self.hierarchical else sampler_decisions(self.config, self.scene)
+        return sampler_decisions(self.config, self.scene)
 
     def render(self, rays: Rays, background: Tensor) -> Rendered:
         if self.sampler is not None:
@@ -99,7 +89,7 @@ class VanillaNeRF(Model[VanillaNeRFConfig]):
         return render_hierarchical(self.coarse, self.fine, rays, background, counts, self.training)
 
     def param_groups(self) -> list[dict[str, Any]]:
-        faster = OCCUPANCY_RATE if self.sampler is not None else 1.0
+        faster = OCCUPANCY_RATE if isinstance(self.sampler, OccupancySampler) else 1.0
         fields = [p for field in (self.fine, self.coarse) if field is not None for p in field.parameters()]
         return [
             {"params": fields, "lr": self.config.learning_rate * faster, "name": "networks"},
@@ -108,7 +98,7 @@ class VanillaNeRF(Model[VanillaNeRFConfig]):
 
     @property
     def samples_per_batch(self) -> int | None:
-        if self.sampler is not None and self.config.samples_per_batch is None:
+        if isinstance(self.sampler, OccupancySampler) and self.config.samples_per_batch is None:
             return OCCUPANCY_SAMPLES_PER_BATCH
         return self.config.samples_per_batch
 

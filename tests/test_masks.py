@@ -55,7 +55,7 @@ def test_only_what_masks_leave_is_drawn(masked: Dataset, used: list[np.ndarray])
     assert np.array_equal(kept.numpy(), used[1])
     profile = SceneProfile.of(masked, [])
     assert profile.ignored == pytest.approx(1 - expected.float().mean().item(), abs=1e-6)
-    assert f"masks ignore {profile.ignored:.0%} of pixels" in profile.lines()[0]
+    assert f"{profile.ignored:.0%} of pixels ignored" in profile.lines()[0]
 
 
 def test_silhouettes_and_masks_are_combined(masked: Dataset) -> None:

@@ -86,6 +86,8 @@ def _command(arguments: list[str]) -> None:
     if bound is not None:
         worst, faster = measured_error(trained.model, dataset, bound)
         say(f"--max-error {bound:.2g}: colours off by at most {worst:.2g} (measured), {faster:.2f} x as fast as exact")
+    if flags.eval_appearance == "half" and found.eval_appearance is None:
+        say("--eval-appearance half: this run has no appearance vectors; whole photographs were judged")
     say(f"LPIPS {found.lpips_note}")
     say(f"written to {output}")
 

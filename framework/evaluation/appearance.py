@@ -28,9 +28,9 @@ def appearances(model: Model) -> list[Appearance]:
     return [module for module in model.modules() if isinstance(module, Appearance)]
 
 
-def right_half(height: int, width: int, device: torch.device) -> Tensor:
-    """(H, W) bool: what is judged."""
-    return (torch.arange(width, device=device) >= width // 2).expand(height, width)
+def right_half(image: Tensor) -> Tensor:
+    """(H, W - W // 2, ...) what is judged of an image (H, W, ...)."""
+    return image[:, image.shape[1] // 2 :]
 
 
 @contextmanager
@@ -53,11 +53,10 @@ def fitted_appearance(model: Model, dataset: Dataset, index: int, background: Te
 
 def _left_pixels(dataset: Dataset, index: int) -> Tensor:
     """(P,) those of the photograph's left half that no mask ignores, counted through all images."""
-    use = ~right_half(int(dataset.cameras.heights[index]), int(dataset.cameras.widths[index]), dataset.device)
+    width = int(dataset.cameras.widths[index])
+    pixels = dataset.cameras.image_pixels(index).view(-1, width)[:, : width // 2]
     kept = dataset.kept_of(index)
-    if kept is not None:
-        use = use & kept.to(use.device)
-    return dataset.cameras.image_pixels(index)[use.reshape(-1)]
+    return pixels.reshape(-1) if kept is None else pixels[kept[:, : width // 2]]
 
 
 def _fit(model: Model, dataset: Dataset, pixels: Tensor, vectors: list[Tensor], background: Tensor) -> None:

@@ -7,7 +7,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean, stdev
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -100,6 +100,8 @@ class Evaluation:
     """Means, standard deviations and speed, under nerfstudio's keys."""
     lpips_note: str
     """Which LPIPS was used, or why none."""
+    eval_appearance: Literal["mean", "half"] | None = None
+    """How held-out photographs were given an appearance; None for a method without."""
 
     def line(self) -> str:
         """The results in a line."""
@@ -136,13 +138,13 @@ def evaluate(
         round_to_uint8: measure the picture as it would be stored.
     Raises: ValueError where there is nothing to evaluate.
     """
-    chosen = [index for index in spread(len(dataset), max_images) if _shows_something(dataset, index)]
+    half = model.config.eval_appearance == "half" and bool(appearances(model))
+    chosen = [index for index in spread(len(dataset), max_images) if _shows_something(dataset, index, half)]
     if not chosen:
         raise ValueError("there is no image to evaluate")
     lpips, lpips_note = load_lpips()
     background = evaluation_background(model)
     rows, seconds, rays = [], 0.0, 0
-    half = model.config.eval_appearance == "half" and bool(appearances(model))
     for index in track(chosen, title, total=len(chosen)):
         target = composite(dataset.image(index).float() / 255, background)
         with fitted_appearance(model, dataset, index, background) if half else nullcontext():
@@ -150,17 +152,13 @@ def evaluate(
         rgb = view.rgb.clamp(0, 1)
         if round_to_uint8:
             rgb = (rgb * 255).round() / 255
-        kept = dataset.kept_of(index)
-        if half:
-            right = right_half(rgb.shape[0], rgb.shape[1], rgb.device)
-            kept = right if kept is None else kept & right
-        judged = rgb if kept is None else torch.where(kept[..., None], rgb, target)
+        found, kept = _judged(rgb, target, dataset.kept_of(index), half)
         rows.append(
             {
                 "name": dataset.names[index],
-                "psnr": psnr(rgb, target) if kept is None else psnr(rgb[kept], target[kept]),
-                "ssim": ssim(judged, target) if min(rgb.shape[:2]) >= 11 else None,
-                "lpips": None if lpips is None else lpips(judged, target),
+                "psnr": psnr(*found) if kept is None else psnr(found[0][kept], found[1][kept]),
+                "ssim": ssim(*found) if min(found[0].shape[:2]) >= 11 else None,
+                "lpips": None if lpips is None else lpips(*found),
                 "seconds": view.seconds,
             }
         )
@@ -171,13 +169,24 @@ def evaluate(
             write_image(pictures / f"{stem}.png", rgb)
             write_image(pictures / f"{stem}_comparison.png", comparison(rgb, target))
     results = {**_statistics(rows), "num_rays_per_sec": rays / seconds, "fps": len(rows) / seconds}
-    return Evaluation(rows, {**results, "num_images": len(rows)}, lpips_note)
+    protocol: Literal["mean", "half"] | None = ("half" if half else "mean") if appearances(model) else None
+    return Evaluation(rows, {**results, "num_images": len(rows)}, lpips_note, protocol)
 
 
-def _shows_something(dataset: Dataset, index: int) -> bool:
-    """Whether masks leave any of an image."""
+def _judged(
+    rgb: Tensor, target: Tensor, kept: Tensor | None, half: bool
+) -> tuple[tuple[Tensor, Tensor], Tensor | None]:
+    """Picture and photograph as metrics see them, and which of their pixels count (None for all)."""
+    if half:
+        rgb, target = right_half(rgb), right_half(target)
+        kept = None if kept is None else right_half(kept)
+    return (rgb if kept is None else torch.where(kept[..., None], rgb, target), target), kept
+
+
+def _shows_something(dataset: Dataset, index: int, half: bool) -> bool:
+    """Whether masks leave any of what is judged of an image."""
     kept = dataset.kept_of(index)
-    return kept is None or bool(kept.any())
+    return kept is None or bool((right_half(kept) if half else kept).any())
 
 
 def spread(total: int, limit: int | None) -> list[int]:

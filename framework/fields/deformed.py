@@ -6,6 +6,7 @@ from torch import Tensor, nn
 
 from framework.fields.base import MLP, Field
 from framework.fields.nerf import encoded_times
+from framework.kernels.contraction import contract_to_unit
 from framework.kernels.frequency import frequency_encoding
 
 
@@ -17,7 +18,11 @@ class DeformedField(Field):
             from there; the paper's is cut off at 0, so that only photographs taken just then show what is there.
         width, depth: features of a hidden layer, and hidden layers (256 and 8 in the paper).
         position_frequencies, time_frequencies: L of the two encodings (10 and 4 in the paper).
+        contracted: (2, 3) the box around which all of space is contracted into [-1, 1]^3, so that frequencies fit;
+            None to take positions as they are.
     """
+
+    contracted: Tensor | None
 
     def __init__(
         self,
@@ -26,8 +31,10 @@ class DeformedField(Field):
         depth: int = 8,
         position_frequencies: int = 10,
         time_frequencies: int = 4,
+        contracted: Tensor | None = None,
     ) -> None:
         super().__init__()
+        self.register_buffer("contracted", None if contracted is None else contracted.clone())
         self.canonical = canonical
         self.position_frequencies, self.time_frequencies = position_frequencies, time_frequencies
         encoded = 3 + 6 * position_frequencies + 1 + 2 * time_frequencies
@@ -41,6 +48,8 @@ class DeformedField(Field):
 
     def displacement(self, positions: Tensor, times: Tensor | None) -> Tensor:
         """(N, 3) from where something is at its time to where it is at time 0, scene units."""
+        if self.contracted is not None:
+            positions = 2 * contract_to_unit(positions, self.contracted) - 1
         encoded = (
             frequency_encoding(positions, self.position_frequencies),
             encoded_times(times, self.time_frequencies),

@@ -5,11 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from torch import Tensor
+
 from framework.config import TrainConfig
+from framework.errors import ConfigError
 from framework.samplers.occupancy import OccupancySampler
 from framework.samplers.proposal import ProposalSampler
 from framework.scene import Scene
 from framework.scene_profile import Decision
+
+COARSEST_PROPOSAL = 128
+"""Cells along an axis at the finest level of the first proposal; each further one has twice as many."""
 
 
 @dataclass(frozen=True)
@@ -20,30 +26,65 @@ class SamplingConfig(TrainConfig):
     """occupancy: march through the box where it is not empty. proposal: small density fields say where to look, in all
     of space, contracted. auto: proposal where there may be something outside the box."""
     grid_resolution: int = 128
-    """Cells along an axis of the occupancy grid."""
+    """Cells along an axis of the occupancy grid (occupancy)."""
     num_steps: int | None = 512
-    """Steps along the box's diagonal, with the occupancy grid."""
+    """Steps along the box's diagonal (occupancy)."""
     early_stop: float = 1e-4
     """Transmittance below which the rest of a ray is dropped: the largest error of a colour channel (occupancy)."""
     train_early_stop: float = 1e-2
-    """The same while training, where less exact colours teach as well."""
+    """The same while training, where less exact colours teach as well (occupancy)."""
     num_proposal_samples: tuple[int, ...] = (128, 64)
-    """Intervals a ray of each proposal."""
+    """Intervals a ray of each proposal (proposal)."""
     num_nerf_samples: int = 32
-    """Samples a ray where the proposals say."""
+    """Samples a ray where the proposals say (proposal)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if min((*self.num_proposal_samples, self.num_nerf_samples)) < 1:
+            raise ConfigError("--num-proposal-samples and --num-nerf-samples must be at least 1")
+        if not self.num_proposal_samples:
+            raise ConfigError("--num-proposal-samples must name one proposal or more, as in 128 64")
 
 
-def by_proposals(config: SamplingConfig, scene: Scene) -> bool:
-    """Whether proposals are used rather than an occupancy grid; the field is then contracted if there is an outside."""
-    return config.sampler == "proposal" or (config.sampler == "auto" and scene.unbounded)
+@dataclass(frozen=True)
+class HierarchicalConfig(SamplingConfig):
+    """Settings of a method that can also be sampled as NeRF is, by a coarse field for a fine one."""
+
+    sampler: Literal["auto", "hierarchical", "occupancy", "proposal"] = "auto"  # type: ignore[assignment]
+    """hierarchical: a coarse and a fine field. occupancy: one field and an occupancy grid. proposal: one field, and
+    small density fields that say where to look, in all of space, contracted. auto: hierarchical, or proposal where
+    there may be something outside the box."""
+    num_coarse_samples: int = 64
+    """Stratified samples a ray for the coarse field (hierarchical)."""
+    num_fine_samples: int = 128
+    """Further samples a ray for the fine field, drawn where the coarse one found something (hierarchical)."""
+
+
+def chosen_sampler(config: SamplingConfig, scene: Scene) -> Literal["hierarchical", "occupancy", "proposal"]:
+    """What `auto` becomes."""
+    if config.sampler != "auto":
+        return config.sampler
+    if scene.unbounded:
+        return "proposal"
+    return "hierarchical" if isinstance(config, HierarchicalConfig) else "occupancy"
+
+
+def contracted_box(config: SamplingConfig, scene: Scene) -> Tensor | None:
+    """(2, 3) the box around which a method's field contracts all of space; None where it ends at its box."""
+    return scene.box if scene.unbounded and chosen_sampler(config, scene) == "proposal" else None
 
 
 def make_sampler(config: SamplingConfig, scene: Scene) -> OccupancySampler | ProposalSampler:
-    """The sampler that the settings and the scene ask for."""
-    if by_proposals(config, scene):
-        counts = (*config.num_proposal_samples, config.num_nerf_samples)
-        resolutions = tuple(128 << level for level in range(len(config.num_proposal_samples)))
-        return ProposalSampler(scene.box, counts, resolutions, scene.unbounded, scene.unbounded and not scene.has_alpha)
+    """The sampler that the settings and the scene ask for, where that is not hierarchical."""
+    if chosen_sampler(config, scene) == "proposal":
+        resolutions = tuple(COARSEST_PROPOSAL << level for level in range(len(config.num_proposal_samples)))
+        return ProposalSampler(
+            scene.box,
+            (*config.num_proposal_samples, config.num_nerf_samples),
+            resolutions,
+            scene.unbounded,
+            endless=scene.unbounded and not scene.has_alpha,
+        )
     assert config.num_steps is not None
     return OccupancySampler(
         scene.box,
@@ -59,6 +100,5 @@ def sampler_decisions(config: SamplingConfig, scene: Scene) -> list[Decision]:
     """What became of `--sampler auto`."""
     if config.sampler != "auto":
         return []
-    if scene.unbounded:
-        return [Decision("sampler", "proposals in contracted space", "there may be something outside the box")]
-    return [Decision("sampler", "occupancy grid", "the scene ends at its box")]
+    reason = "there may be something outside the box" if scene.unbounded else "the scene ends at its box"
+    return [Decision("sampler", chosen_sampler(config, scene), reason)]

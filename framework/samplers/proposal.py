@@ -2,8 +2,8 @@
 
 A proposal looks at many intervals of a ray cheaply, and the next level's intervals are drawn by the light that it
 believes them to stop. What the last level finds teaches the proposals to bound it from above (`interlevel_loss`).
-Distance is normalised: s in [0, 1] from a ray's near to its far end, evenly up to the distance 1 and in disparity
-beyond for an unbounded scene, evenly throughout for a bounded one.
+Distance is normalised: s in [0, 1] from a ray's near to its far end, evenly up to half of the box's edge and in
+disparity beyond for an unbounded scene, evenly throughout for a bounded one.
 """
 
 from __future__ import annotations
@@ -41,7 +41,6 @@ class ProposalSampler(nn.Module):
         endless: the last interval has no end, so that a ray always ends in matter: for photographs without alpha.
         log2_table_size, num_levels: of the proposals' hash grids.
         anneal_steps: over which the proposals come to be believed.
-        scale: length in scene units of the distance up to which an unbounded ray is divided evenly.
     """
 
     box: Tensor
@@ -56,13 +55,13 @@ class ProposalSampler(nn.Module):
         log2_table_size: int = 16,
         num_levels: int = 5,
         anneal_steps: int = 1000,
-        scale: float = 1.0,
     ) -> None:
         super().__init__()
         if len(counts) != len(resolutions) + 1:
             raise ValueError(f"{len(counts)} counts for {len(resolutions)} proposals: one more is needed")
         self.endless = endless
-        self.counts, self.unbounded, self.anneal_steps, self.scale = counts, unbounded, anneal_steps, scale
+        self.counts, self.unbounded, self.anneal_steps = counts, unbounded, anneal_steps
+        self.scale = half_edge(box)
         self.register_buffer("box", box.clone())
         grids = [HashGrid(num_levels, 2, 16, finest, log2_table_size) for finest in resolutions]
         self.fields = nn.ModuleList(DensityField(box, grid, unbounded=unbounded) for grid in grids)
@@ -134,6 +133,11 @@ class ProposalSampler(nn.Module):
             return torch.lerp(nears[:, None], fars[:, None], edges)
         near, far = (to_disparity(t / self.scale)[:, None] for t in (nears, fars))
         return self.scale * from_disparity(torch.lerp(near, far, edges))
+
+
+def half_edge(box: Tensor) -> float:
+    """Half of the edge of the cube that is as large as `box` (2, 3): the unit of an unbounded scene's distances."""
+    return float((box[1] - box[0]).double().prod() ** (1 / 3) / 2)
 
 
 def to_disparity(t: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -149,9 +150,12 @@ def _decay(schedule: str, final: float, progress: float) -> float:
     return final + (1 - final) * 0.5 * (1 + float(torch.tensor(progress * torch.pi).cos()))
 
 
-def set_learning_rate(optimizer: torch.optim.Optimizer, factor: float) -> None:
-    """Every group at its first rate times `factor`."""
+def set_learning_rate(optimizer: torch.optim.Optimizer, config: TrainConfig, step: int, progress: float) -> None:
+    """Every group at its first rate times its schedule's factor: the run's, or that which the group names."""
+    usual = learning_rate_factor(config, step, progress)
     for group in optimizer.param_groups:
+        own = group.get("schedule")
+        factor = usual if own is None else learning_rate_factor(replace(config, lr_schedule=own), step, progress)
         group["lr"] = group["initial_lr"] * factor
 
 

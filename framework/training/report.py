@@ -18,6 +18,7 @@ def write_evaluation(path: Path, run: Run, checkpoint: Path, found: Evaluation) 
             "method_name": run.method,
             "checkpoint": checkpoint.name,
             "rays_per_pixel": run.config.resolved().rays_per_pixel,
+            "eval_appearance": found.eval_appearance,
             "results": found.results,
             "lpips": found.lpips_note,
             "per_image": found.per_image,

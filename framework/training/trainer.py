@@ -30,7 +30,7 @@ from framework.pixels import Background, Batch, LookUp, composite, draw_batch
 from framework.scene_profile import Decision, SceneProfile
 from framework.silhouettes import Silhouettes, pixels_near, visual_hull
 from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest, save_checkpoint
-from framework.training.optim import first_non_finite, learning_rate_factor, make_optimizer, set_learning_rate
+from framework.training.optim import first_non_finite, make_optimizer, set_learning_rate
 from framework.training.progress import ProgressBar, StepReport, TensorBoard
 from framework.training.run import Run, write_json
 from framework.training.signals import stop_signals
@@ -253,7 +253,7 @@ class Trainer:
         state, start = self.state, time.perf_counter()
         seed_step(self.config.machine.seed, state.step)
         self.model.train()
-        set_learning_rate(self.optimizer, learning_rate_factor(self.config, state.step, self.progress))
+        set_learning_rate(self.optimizer, self.config, state.step, self.progress)
         places = self._places_in_a_pixel()
         count = max(self._batch_size() // len(places), 1)
         batch = draw_batch(self.train_set, count, self._background(), self.errors, places, self._look_up())

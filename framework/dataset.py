@@ -22,6 +22,7 @@ from framework.image_files import one_line as one_line
 from framework.image_files import read_image as read_image
 from framework.image_files import reduce_image as reduce_image
 from framework.mapped_pixels import MappedPixels
+from framework.ndc import NdcCameras
 from framework.pixel_cache import PixelMemory
 from framework.pixel_set import PixelSet
 from framework.scene import PoseSource, Scene
@@ -213,6 +214,7 @@ def load_dataset(parsed: ParsedScene, split: str, memory: PixelMemory | None = N
         image_size=int(torch.maximum(cameras.widths, cameras.heights).max()),
         unbounded=parsed.unbounded,
         poses=parsed.poses,
+        warped=isinstance(cameras, NdcCameras),
         # Of an object cut out of its surroundings, each side has a light of its own.
         appearance_varies=parsed.appearance_varies
         or (not has_alpha and light_spread(decoded.light) > APPEARANCE_STOPS),

@@ -42,6 +42,10 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
 
     learns_motion: ClassVar[bool] = False
     """Whether it uses the photographs' times."""
+    learns_appearance: ClassVar[bool] = False
+    """Whether it can learn that light differs between photographs."""
+    refines_poses: ClassVar[bool] = False
+    """Whether it can refine the cameras' poses."""
 
     def decisions(self) -> list[Decision]:
         """What became of the method's options that were left to the data."""

@@ -32,5 +32,7 @@ class Scene:
     """There may be something to see outside `box`."""
     poses: PoseSource = "exact"
     """Where the cameras' poses come from: known; found in the photographs; or tracked by the device that took them."""
+    warped: bool = False
+    """Rays are those of normalised device coordinates, whose lengths and angles are not the scene's."""
     appearance_varies: bool = False
     """Light, exposure or camera differ between the photographs."""

@@ -82,6 +82,8 @@ class NerfactoConfig(SamplingConfig):
 class Nerfacto(Model[NerfactoConfig]):
     """One hash field, sampled where proposals say."""
 
+    learns_appearance = refines_poses = True
+
     def __init__(self, config: NerfactoConfig, scene: Scene) -> None:
         if config.contraction is not None:
             scene = replace(scene, unbounded=config.contraction)
@@ -106,6 +108,8 @@ class Nerfacto(Model[NerfactoConfig]):
         self.unit_length = half_edge(scene.box)
         self.normals = NormalHead(self.field.num_features, config.hidden_width) if config.predict_normals else None
         self.poses = None if self.pose_group == "off" else PoseRefinement(scene.num_cameras, self.pose_group)
+        if self.poses is not None and scene.warped:
+            raise ConfigError("--camera-optimizer: poses cannot be refined in normalised device coordinates")
         if self.poses is not None and not isinstance(self.sampler, ProposalSampler):
             raise ConfigError("--camera-optimizer needs --sampler proposal: marched samples carry no gradient to rays")
 
@@ -119,7 +123,9 @@ class Nerfacto(Model[NerfactoConfig]):
     @property
     def pose_group(self) -> Literal["off", "SO3xR3", "SE3"]:
         asked = self.config.camera_optimizer
-        return ("SO3xR3" if self.scene.poses == "device" else "off") if asked == "auto" else asked
+        if asked == "auto":
+            return "SO3xR3" if self.scene.poses == "device" and not self.scene.warped else "off"
+        return asked
 
     @property
     def distortion_mult(self) -> float:

@@ -141,6 +141,8 @@ def _circle(flags: OrbitFlags, trained: Trained, parsed: ParsedScene) -> tuple[C
     from framework.evaluation.paths import orbit
 
     scene = trained.model.scene
+    if scene.warped:
+        raise ConfigError("ns-render orbit: this run knows what its cameras look at from the front only (--ndc)")
     cameras = orbit(parsed.cameras, scene.box.mean(0).cpu(), flags.num_frames)
     if flags.time is None:
         return cameras, torch.linspace(0, 1, flags.num_frames) if scene.moving else None

@@ -37,7 +37,7 @@ def limited_error(model: Model[Any], bound: float) -> Iterator[None]:
     """
     samplers = model.occupancy_samplers
     if not samplers:
-        raise ConfigError("--max-error: this method has no occupancy grid to stop its rays early")
+        raise ConfigError("--max-error: this run has no occupancy grid to stop its rays early; leave it out")
     before = [sampler.early_stop for sampler in samplers]
     try:
         for sampler in samplers:

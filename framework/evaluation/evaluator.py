@@ -133,7 +133,8 @@ def evaluate(
         model: the trained model.
         dataset: views with photographs, on the model's device.
         max_images: at most this many views, evenly spread; all if None.
-        pictures: folder for renders and comparisons (photograph | render | error); none if None.
+        pictures: folder for renders, comparisons (photograph | render | error), and normals where there are any, red,
+            green and blue being x, y and z from -1 to 1; none if None.
         max_pictures: write only the first so many.
         round_to_uint8: measure the picture as it would be stored.
     Raises: ValueError where there is nothing to evaluate.
@@ -168,6 +169,8 @@ def evaluate(
             stem = f"{index:04d}_{Path(dataset.names[index]).stem}"
             write_image(pictures / f"{stem}.png", rgb)
             write_image(pictures / f"{stem}_comparison.png", comparison(rgb, target))
+            if view.normals is not None:
+                write_image(pictures / f"{stem}_normals.png", (view.normals + 1) / 2)
     results = {**_statistics(rows), "num_rays_per_sec": rays / seconds, "fps": len(rows) / seconds}
     protocol: Literal["mean", "half"] | None = ("half" if half else "mean") if appearances(model) else None
     return Evaluation(rows, {**results, "num_images": len(rows)}, lpips_note, protocol)

@@ -23,14 +23,12 @@ from framework.errors import CheckpointError, DivergenceError
 from framework.evaluation.evaluator import evaluate, evaluation_background, render_view, use_bfloat16
 from framework.evaluation.images import comparison
 from framework.evaluation.metrics import MAX_PSNR
-from framework.ndc import NdcCameras
-from framework.pixel_set import PixelSet
 from framework.pixel_stream import PixelStream
 from framework.pixels import Background, Batch, LookUp, composite, draw_batch
-from framework.scene_profile import Decision, SceneProfile
-from framework.silhouettes import Silhouettes, pixels_near, visual_hull
+from framework.scene_profile import SceneProfile
 from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest, save_checkpoint
 from framework.training.optim import first_non_finite, make_optimizer, set_learning_rate
+from framework.training.preparation import profile_of, skip_by_silhouettes
 from framework.training.progress import ProgressBar, StepReport, TensorBoard
 from framework.training.run import Run, write_json
 from framework.training.signals import stop_signals
@@ -202,48 +200,14 @@ class Trainer:
 
     def profile(self) -> SceneProfile:
         """What the scene needs, and why."""
-        scene, decisions = self.model.scene, []
-        if self.config.background == "auto":
-            reason = f"{'the photographs have' if scene.has_alpha else 'no photograph has'} alpha"
-            decisions.append(Decision("background", self._background(), reason))
-        if self.model.occupancy_samplers and self.config.silhouette_cells:
-            obstacle = self._no_silhouettes()
-            outside = "what is outside all of them" if scene.moving else "space outside them"
-            choice = "not used" if obstacle else f"{outside} is skipped from the start"
-            decisions.append(Decision("silhouettes", choice, obstacle or "alpha shows them"))
-        if scene.moving and not self.model.learns_motion:
-            decisions.append(Decision("times", "ignored", f"{self.run.method} learns a still scene: what moves blurs"))
-        return SceneProfile.of(self.train_set, decisions + self.model.decisions())
-
-    def _no_silhouettes(self) -> str | None:
-        """Why the photographs' alpha cannot tell what is empty; None where it can."""
-        scene, camera = self.model.scene, self.train_set.cameras.model
-        if not scene.has_alpha:
-            return "no photograph has alpha"
-        if isinstance(self.train_set.cameras, NdcCameras):
-            return "the box is in normalised device coordinates"
-        return None if camera == "pinhole" else f"the camera is {camera}, not pinhole"
+        return profile_of(self.run.method, self.config, self.model, self.train_set, self._background())
 
     def _prepare(self) -> None:
         """What the photographs' silhouettes save. It counts as training time."""
         self._prepared = True
-        start, samplers, config = time.perf_counter(), self.model.occupancy_samplers, self.config
-        if not samplers or not config.silhouette_cells or self._no_silhouettes():
-            return
-        silhouettes = Silhouettes.of(self.train_set)
-        if self.state.step == 0:
-            moving = self.model.scene.moving
-            hulls = [visual_hull(silhouettes, sampler.box, sampler.resolution, moving) for sampler in samplers]
-            if not all(bool(hull.any()) for hull in hulls):
-                say("warning: the photographs' alpha leaves no part of the box; it is not used to skip anything")
-                return
-            for sampler, hull in zip(samplers, hulls, strict=True):
-                sampler.carve(hull)
-        still = not self.model.scene.moving  # else a pixel that is empty at its time teaches about cells full at others
-        if config.silhouette_pixels and still and all(sampler.any_carved for sampler in samplers):
-            near = [pixels_near(silhouettes, ~s.carved, s.box, s.resolution) for s in samplers]
-            self.train_set = self.train_set.drawing(PixelSet.shared(near, 1))
-        if self.state.step == 0:
+        start, fresh = time.perf_counter(), self.state.step == 0
+        self.train_set = skip_by_silhouettes(self.config, self.model, self.train_set, fresh)
+        if fresh:
             self.state.seconds += time.perf_counter() - start
 
     def train_step(self) -> StepReport:

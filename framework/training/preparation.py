@@ -1,0 +1,75 @@
+"""Before the first step: what the scene's profile says, and what the photographs' silhouettes save."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from framework.config import TrainConfig
+from framework.console import say
+from framework.dataset import Dataset
+from framework.model import Model
+from framework.ndc import NdcCameras
+from framework.pixel_set import PixelSet
+from framework.pixels import Background
+from framework.scene_profile import Decision, SceneProfile
+from framework.silhouettes import Silhouettes, pixels_near, visual_hull
+
+
+def profile_of(
+    method: str, config: TrainConfig, model: Model[Any], dataset: Dataset, background: Background
+) -> SceneProfile:
+    """What the scene needs, and why.
+
+    Args:
+        background: behind transparent pixels in training, as decided.
+    """
+    scene, decisions = model.scene, []
+    if config.background == "auto":
+        reason = f"{'the photographs have' if scene.has_alpha else 'no photograph has'} alpha"
+        decisions.append(Decision("background", background, reason))
+    if model.occupancy_samplers and config.silhouette_cells:
+        obstacle = _no_silhouettes(dataset)
+        outside = "what is outside all of them" if scene.moving else "space outside them"
+        choice = "not used" if obstacle else f"{outside} is skipped from the start"
+        decisions.append(Decision("silhouettes", choice, obstacle or "alpha shows them"))
+    if scene.moving and not model.learns_motion:
+        decisions.append(Decision("times", "ignored", f"{method} learns a still scene: what moves blurs"))
+    if scene.appearance_varies and not model.learns_appearance:
+        decisions.append(Decision("light that differs", "ignored", f"{method} learns one light for all photographs"))
+    if scene.poses == "device" and not model.refines_poses:
+        decisions.append(Decision("the device's poses", "not refined", f"{method} takes poses as they are"))
+    return SceneProfile.of(dataset, decisions + model.decisions())
+
+
+def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: bool) -> Dataset:
+    """Empty the occupancy grids by the photographs' silhouettes; the data set without pixels that see nothing else.
+
+    Args:
+        fresh: the run begins; else the grids come from a checkpoint and are left as they are.
+    """
+    samplers = model.occupancy_samplers
+    if not samplers or not config.silhouette_cells or _no_silhouettes(dataset):
+        return dataset
+    silhouettes, moving = Silhouettes.of(dataset), model.scene.moving
+    if fresh:
+        hulls = [visual_hull(silhouettes, sampler.box, sampler.resolution, moving) for sampler in samplers]
+        if not all(bool(hull.any()) for hull in hulls):
+            say("warning: the photographs' alpha leaves no part of the box; it is not used to skip anything")
+            return dataset
+        for sampler, hull in zip(samplers, hulls, strict=True):
+            sampler.carve(hull)
+    # Of a scene that moves, a pixel that is empty at its time teaches about cells that are full at others.
+    if not config.silhouette_pixels or moving or not all(sampler.any_carved for sampler in samplers):
+        return dataset
+    near = [pixels_near(silhouettes, ~s.carved, s.box, s.resolution) for s in samplers]
+    return dataset.drawing(PixelSet.shared(near, 1))
+
+
+def _no_silhouettes(dataset: Dataset) -> str | None:
+    """Why the photographs' alpha cannot tell what is empty; None where it can."""
+    if not dataset.scene.has_alpha:
+        return "no photograph has alpha"
+    if isinstance(dataset.cameras, NdcCameras):
+        return "the box is in normalised device coordinates"
+    camera = dataset.cameras.model
+    return None if camera == "pinhole" else f"the camera is {camera}, not pinhole"

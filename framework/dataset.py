@@ -16,6 +16,7 @@ from framework.cameras import Cameras
 from framework.console import say
 from framework.coverage import pixels_with_rays
 from framework.decoding import ImageFiles, decode
+from framework.depths import read_depths
 from framework.errors import DataError
 from framework.image_files import image_size as image_size
 from framework.image_files import one_line as one_line
@@ -123,6 +124,8 @@ class Dataset:
     """Pixels that no mask ignores and a ray leads to; None for all."""
     light: Tensor | None = None
     """(M, 3, Q) `appearance.light_of` each image, where it is known."""
+    depths: Tensor | None = None
+    """(P,) float16 depth of each pixel along its camera's axis, scene units, 0 where unknown; None for all."""
     mapped: MappedPixels | None = None
     """The file that `pixels` lie in, where they are too many for memory; they then stay on the processor."""
 
@@ -169,6 +172,7 @@ class Dataset:
             times=None if self.times is None else self.times.to(device),
             drawn=self.drawn if self.drawn is None or self.mapped is not None else self.drawn.to(device),
             kept=None if self.kept is None else self.kept.to(device),
+            depths=None if self.depths is None else self.depths.to(device),
         )
 
 
@@ -215,10 +219,12 @@ def load_dataset(parsed: ParsedScene, split: str, memory: PixelMemory | None = N
         unbounded=parsed.unbounded,
         poses=parsed.poses,
         warped=isinstance(cameras, NdcCameras),
+        has_depth=parsed.depth_paths is not None and decoded.mapped is None,
         # Of an object cut out of its surroundings, each side has a light of its own.
         appearance_varies=parsed.appearance_varies
         or (not has_alpha and light_spread(decoded.light) > APPEARANCE_STOPS),
     )
+    depths = _depths(parsed, cameras, decoded.mapped is not None)
     names, kept = tuple(path.name for path in parsed.image_paths), decoded.kept
     reached = pixels_with_rays(cameras, names, split)
     if reached is not None:
@@ -234,5 +240,15 @@ def load_dataset(parsed: ParsedScene, split: str, memory: PixelMemory | None = N
         drawn=kept if kept is None or decoded.mapped is not None else kept.listed(),
         kept=kept,
         light=decoded.light,
+        depths=depths,
         mapped=decoded.mapped,
     )
+
+
+def _depths(parsed: ParsedScene, cameras: Cameras, in_file: bool) -> Tensor | None:
+    if parsed.depth_paths is None:
+        return None
+    if in_file:
+        say("the depth images are not used, as the photographs are too many for memory")
+        return None
+    return read_depths(parsed.depth_paths, cameras, parsed.depth_unit * parsed.scale)

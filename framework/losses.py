@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
+
+from framework.kernels.compositing import ray_sum
+from framework.rays import Samples
 
 
 def mean_squared_error(prediction: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
@@ -16,3 +20,22 @@ def mean_squared_error(prediction: Tensor, target: Tensor, weights: Tensor | Non
         return prediction.sum()
     squares = (prediction - target).square()
     return squares.mean() if weights is None else (squares * weights[:, None]).mean()
+
+
+def depth_error(weights: Tensor, samples: Samples, known: Tensor) -> Tensor:
+    """How far light comes from, relative to how far it is known to: mean of sum_i w_i |t_i - d| / d.
+
+    Unlike the error of the mean distance, it is only small where all of the light comes from there.
+
+    Args:
+        weights: (N,) of the samples of R rays.
+        samples: their intervals.
+        known: (R,) distances d; 0 where unknown, and the ray does not count.
+    """
+    there = known > 0
+    if not bool(there.any()):
+        return weights.sum() * 0
+    wanted = torch.where(there, known, torch.ones_like(known))[samples.ray_indices]
+    # Light from beyond twice the distance counts as from there: disparity's tail would drown all else.
+    apart = ((samples.t - wanted).abs() / wanted).clamp(max=1)
+    return ray_sum(weights * apart, samples)[there].mean()

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from framework.cameras import CENTER
 from framework.dataset import Dataset
+from framework.depths import ray_distances
 from framework.error_map import ErrorMap
 from framework.kernels import native
 from framework.rays import Rays
@@ -34,6 +35,8 @@ class Batch:
     """(R, 3) what shows where a photograph is transparent."""
     alpha: Tensor | None
     """(R,) opacity, where the photographs have it."""
+    distances: Tensor | None = None
+    """(R,) along the pixel's ray to what a depth image shows, 0 where unknown, where there are such images."""
     weights: Tensor | None = None
     """(R,) what each pixel's loss is multiplied by, where they were not drawn evenly; 1 in the mean."""
 
@@ -101,7 +104,17 @@ def gather_batch(
         rgb, alpha = gather_colors(dataset.pixels, flat, behind)
     else:
         rgb, alpha = gather_colors(stored, torch.arange(len(flat), device=flat.device), behind)
-    return Batch(flat, rays, rgb, behind, alpha)
+    return Batch(flat, rays, rgb, behind, alpha, _distances(dataset, flat, rays))
+
+
+def _distances(dataset: Dataset, flat: Tensor, rays: Rays) -> Tensor | None:
+    if dataset.depths is None or rays.camera_indices is None:
+        return None
+    per_pixel = len(rays) // max(len(flat), 1)
+    cameras = rays.camera_indices[::per_pixel] if len(flat) else rays.camera_indices
+    directions = rays.directions.view(len(flat), per_pixel, 3).mean(1)
+    poses = dataset.cameras.camera_to_worlds[cameras]
+    return ray_distances(dataset.depths[flat], torch.nn.functional.normalize(directions, dim=-1), poses)
 
 
 def gather_colors_reference(pixels: Tensor, flat: Tensor, behind: Tensor) -> tuple[Tensor, Tensor | None]:

@@ -34,5 +34,7 @@ class Scene:
     """Where the cameras' poses come from: known; found in the photographs; or tracked by the device that took them."""
     warped: bool = False
     """Rays are those of normalised device coordinates, whose lengths and angles are not the scene's."""
+    has_depth: bool = False
+    """The photographs come with depth images."""
     appearance_varies: bool = False
     """Light, exposure or camera differ between the photographs."""

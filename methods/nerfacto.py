@@ -17,6 +17,7 @@ from framework.encodings import HashGrid
 from framework.fields.encoded import EncodedField
 from framework.fields.normals import NormalHead, density_normals, normal_penalties
 from framework.kernels.compositing import distortion, ray_sum
+from framework.losses import depth_error
 from framework.pose_refinement import PoseRefinement
 from framework.rays import Samples
 from framework.renderers import shade
@@ -25,6 +26,7 @@ from framework.samplers.proposal import ProposalSampler, half_edge
 
 APPEARANCE_SIZE = 16
 DISTORTION = 2e-3
+DEPTH = 0.1
 POSE_REASONS = {
     "exact": "the poses are exact",
     "photographs": "the poses were found in the photographs themselves",
@@ -55,6 +57,8 @@ class NerfactoConfig(SamplingConfig):
     """Refine the training cameras' poses; auto: SO3xR3 where a device tracked them."""
     camera_learning_rate: float = 1e-3
     """Of the poses."""
+    depth_loss_mult: float | None = None
+    """Weight of how far light comes from, against depth images. If not given: 0.1 where there are any, else none."""
     predict_normals: bool = False
     """Learn normals too, as the density's gradient has them but smoother."""
     orientation_loss_mult: float = 0.1
@@ -133,6 +137,11 @@ class Nerfacto(Model[NerfactoConfig]):
         return (DISTORTION if self.unbounded else 0.0) if asked is None else asked
 
     @property
+    def depth_mult(self) -> float:
+        asked = self.config.depth_loss_mult
+        return (DEPTH if self.scene.has_depth else 0.0) if asked is None else asked
+
+    @property
     def scales_gradients(self) -> bool:
         asked = self.config.gradient_scaling
         return self.unbounded if asked is None else asked
@@ -151,6 +160,8 @@ class Nerfacto(Model[NerfactoConfig]):
             varies = self.scene.appearance_varies
             reason = "light differs between the photographs" if varies else "the photographs are lit alike"
             found.append(Decision("appearance features", f"{self.appearance_size}", reason))
+        if config.depth_loss_mult is None and self.scene.has_depth:
+            found.append(Decision("depth loss", f"{self.depth_mult:g}", "there are depth images"))
         if config.camera_optimizer == "auto":
             found.append(Decision("pose refinement", self.pose_group, POSE_REASONS[self.scene.poses]))
         return found
@@ -196,6 +207,9 @@ class Nerfacto(Model[NerfactoConfig]):
         if self.distortion_mult > 0 and samples.edges is not None:
             normalised = Samples.regular(samples.edges[:, :-1], samples.edges[:, 1:])
             losses["distortion"] = self.distortion_mult * distortion(weights, normalised).mean()
+        if self.depth_mult > 0 and batch.distances is not None:
+            known = batch.distances.repeat_interleave(samples.num_rays // len(batch.distances))
+            losses["depth"] = self.depth_mult * depth_error(weights, samples, known)
         for name, found in rendered.penalties.items():
             losses[name] = (self.config.orientation_loss_mult if name == "orientation" else 1.0) * found.mean()
         return losses

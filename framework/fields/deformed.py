@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor, nn
 
 from framework.fields.base import MLP, Field
@@ -14,8 +15,7 @@ class DeformedField(Field):
     """A canonical field, seen through a displacement that a network learns for every place and time.
 
     Args:
-        canonical: the scene as it is at time 0, where the displacement is zero (equation 2). Here it grows with time
-            from there; the paper's is cut off at 0, so that only photographs taken just then show what is there.
+        canonical: the scene as it is at time 0, where the displacement is zero (equation 2).
         width, depth: features of a hidden layer, and hidden layers (256 and 8 in the paper).
         position_frequencies, time_frequencies: L of the two encodings (10 and 4 in the paper).
         contracted: (2, 3) the box around which all of space is contracted into [-1, 1]^3, so that frequencies fit;
@@ -56,7 +56,7 @@ class DeformedField(Field):
         )
         found = self.after_skip(self.before_skip(*encoded), *encoded).float()
         assert times is not None
-        return times[:, None] * found
+        return torch.where(times[:, None] == 0, torch.zeros_like(found), found)
 
     def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
         return self.canonical.density(positions + self.displacement(positions, times))

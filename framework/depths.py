@@ -1,0 +1,67 @@
+"""Depth images: how far away what a photograph shows was measured to be."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import torch
+from torch import Tensor
+
+from framework.cameras import Cameras
+from framework.errors import DataError
+from framework.image_files import one_line
+
+
+def read_depth(path: Path, width: int, height: int) -> np.ndarray:
+    """A depth image as (H, W) float32 in its own steps, for a photograph of width x height.
+
+    Each pixel takes the nearest of the depth image's, which is mostly smaller: depths are never mixed.
+
+    Raises: DataError that names the file, where it is missing, unreadable or has several channels.
+    """
+    if not path.is_file():
+        raise DataError(f"the depth image {path} does not exist")
+    try:
+        depth = np.load(path, allow_pickle=False) if path.suffix == ".npy" else iio.imread(path, plugin="pillow")
+        depth = np.asarray(depth).astype(np.float32)
+    except Exception as error:  # as in `read_image`
+        raise DataError(f"the depth image {path} cannot be read: {one_line(error)}") from error
+    if depth.ndim != 2 or not depth.size:
+        raise DataError(f"the depth image {path} has the shape {depth.shape}; it must have rows and columns alone")
+    rows, columns = (
+        np.minimum((np.arange(count) + 0.5) * size / count, size - 1).astype(np.int64)
+        for count, size in zip((height, width), depth.shape, strict=True)
+    )
+    return depth[np.ix_(rows, columns)]
+
+
+def read_depths(paths: Sequence[Path | None], cameras: Cameras, unit: float) -> Tensor:
+    """(P,) float16 depths along the cameras' axes of all their pixels, scene units; 0 where unknown.
+
+    float16 tells depths apart to a two thousandth, which no depth camera does.
+
+    Args:
+        paths: M depth images.
+        cameras: M cameras at the photographs' size.
+        unit: scene units that a step of a depth image stands for.
+    """
+    parts = []
+    for path, width, height in zip(paths, cameras.widths.tolist(), cameras.heights.tolist(), strict=True):
+        depth = np.zeros((height, width), np.float32) if path is None else read_depth(path, width, height) * unit
+        known = np.isfinite(depth) & (depth > 0)
+        parts.append(torch.from_numpy(np.where(known, depth, 0).astype(np.float16).reshape(-1)))
+    return torch.cat(parts)
+
+
+def ray_distances(depths: Tensor, directions: Tensor, poses: Tensor) -> Tensor:
+    """Distances (R,) along rays of depths (R,) along their cameras' axes; 0 where unknown.
+
+    Args:
+        directions: (R, 3) unit.
+        poses: (R, 3, 4) camera-to-world, OpenGL axes: the axis is the third column, backwards.
+    """
+    cosines = -(directions * poses[:, :, 2]).sum(-1)
+    return torch.where(cosines > 1e-3, depths.float() / cosines.clamp(min=1e-3), torch.zeros_like(cosines))

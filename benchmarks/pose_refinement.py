@@ -27,6 +27,7 @@ from framework.alignment import align, pose_errors
 from framework.cameras import Cameras
 from framework.dataset import Dataset, load_dataset
 from framework.evaluation.evaluator import evaluate
+from framework.kernels.math import cross_matrix
 from framework.pose_refinement import PoseRefinement
 from framework.registry import load_method
 from framework.training.run import Run, create_folder
@@ -62,10 +63,7 @@ def disturb(cameras: Cameras, degrees: float, share: float) -> Cameras:
     draws = torch.Generator().manual_seed(0)
     count, angle = len(cameras), math.radians(degrees)
     axes, steps = (torch.nn.functional.normalize(torch.randn(count, 3, generator=draws), dim=-1) for _ in range(2))
-    x, y, z = (angle * axes).unbind(-1)
-    zero = torch.zeros_like(x)
-    rows = [torch.stack(row, dim=-1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
-    turns = torch.linalg.matrix_exp(torch.stack(rows, dim=1))
+    turns = torch.linalg.matrix_exp(cross_matrix(angle * axes))
     centres = cameras.camera_to_worlds[:, :, 3]
     moved = centres + share * centres.norm(dim=-1, keepdim=True) * steps
     turned = turns @ cameras.camera_to_worlds[:, :, :3]

@@ -13,6 +13,7 @@ from dataparsers.captured import Captured, Photographs, captured_scene, has_tran
 from dataparsers.reading import number, numbers, read_json
 from framework import DataError, ParsedScene
 from framework.dataset import Split, existing
+from framework.kernels.math import cross_matrix
 from framework.scene import PoseSource
 
 METADATA, EXPORT = "metadata.json", "EXR_RGBD"
@@ -92,9 +93,7 @@ def _poses(content: dict[str, Any], file: Path) -> Tensor:
 def rotations(quaternions: Tensor) -> Tensor:
     """(M, 3, 3) rotation matrices of unit quaternions (M, 4) x, y, z, w."""
     vector, scalar = quaternions[:, :3], quaternions[:, 3]
-    x, y, z = vector.unbind(-1)
-    zero = torch.zeros_like(x)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).view(-1, 3, 3)
+    cross = cross_matrix(vector)
     # Rodrigues' formula in half angles: v -> v + 2 w (u x v) + 2 u x (u x v).
     return torch.eye(3, dtype=quaternions.dtype) + 2 * (scalar[:, None, None] * cross + cross @ cross)
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from framework.cameras import Cameras
+from framework.kernels.math import cross_matrix
 from framework.rays import Rays
 
 Group = Literal["SO3xR3", "SE3"]
@@ -31,10 +32,7 @@ class PoseRefinement(nn.Module):
     def motions(self) -> Tensor:
         """(M, 3, 4) rotations and translations: the exponentials of (M, 6) translations and rotation vectors."""
         move, turn = self.tangents[:, :3], self.tangents[:, 3:]
-        zero = torch.zeros_like(turn[:, 0])
-        x, y, z = turn.unbind(-1)
-        rows = [torch.stack(row, dim=-1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
-        generator = torch.cat([torch.stack(rows, dim=1), move[:, :, None]], dim=-1)
+        generator = torch.cat([cross_matrix(turn), move[:, :, None]], dim=-1)
         if self.group == "SO3xR3":
             # The matrix exponential has a value and a gradient at zero, where Rodrigues' formula has 0 / 0.
             return torch.cat([torch.linalg.matrix_exp(generator[:, :, :3]), move[:, :, None]], dim=-1)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from framework.dataset import Split
+from framework.kernels.math import cross_matrix
 
 Orientation = Literal["up", "pca", "none"]
 Center = Literal["poses", "focus", "none"]
@@ -75,13 +76,7 @@ def rotation_between(start: Tensor, end: Tensor) -> Tensor:
         perpendicular = torch.linalg.cross(a, identity[int(a.abs().argmin())])
         perpendicular = perpendicular / perpendicular.norm()
         return 2 * torch.outer(perpendicular, perpendicular) - identity
-    cross = torch.stack(
-        [
-            torch.stack([torch.zeros_like(cosine), -axis[2], axis[1]]),
-            torch.stack([axis[2], torch.zeros_like(cosine), -axis[0]]),
-            torch.stack([-axis[1], axis[0], torch.zeros_like(cosine)]),
-        ]
-    )
+    cross = cross_matrix(axis)
     return identity + cross + cross @ cross / (1 + cosine)
 
 

@@ -80,3 +80,11 @@ def safe_normalize(v: Tensor, eps: float = 1e-12) -> Tensor:
     squared = (v * v).sum(-1, keepdim=True)
     usable = squared > eps * eps
     return torch.where(usable, v / torch.where(usable, squared, torch.ones_like(squared)).sqrt(), torch.zeros_like(v))
+
+
+def cross_matrix(v: Tensor) -> Tensor:
+    """(..., 3, 3) the matrices that take x to the cross product v x x, for vectors v (..., 3)."""
+    x, y, z = v.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1)
+    return rows.unflatten(-1, (3, 3))

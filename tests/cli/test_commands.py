@@ -32,7 +32,12 @@ def test_help_is_quick_and_lists_every_method() -> None:
 def test_method_help_shows_its_flags_without_prefix() -> None:
     done = run("ns-train", "vanilla-nerf", "--help")
     assert done.returncode == 0
-    for flag in ("--sampler {auto,hierarchical,occupancy,proposal}", "--max-seconds", "--machine.seed", "--position-frequencies"):
+    for flag in (
+        "--sampler {auto,hierarchical,occupancy,proposal}",
+        "--max-seconds",
+        "--machine.seed",
+        "--position-frequencies",
+    ):
         assert flag in done.stdout
     assert "(default: 200000)" in done.stdout
 

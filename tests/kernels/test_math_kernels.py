@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from framework.kernels.math import safe_normalize, truncated_exp
+from framework.kernels.math import cross_matrix, safe_normalize, truncated_exp
 
 
 @pytest.mark.parametrize("x", [-1e30, -100.0, 0.0, 3.0, 14.9])
@@ -40,3 +40,8 @@ def test_safe_normalize() -> None:
     assert v.grad is not None
     assert bool(torch.isfinite(v.grad).all())
     assert torch.autograd.gradcheck(safe_normalize, torch.randn(4, 3, dtype=torch.float64, requires_grad=True))
+
+
+def test_cross_matrix_is_the_cross_product() -> None:
+    a, b = torch.randn(2, 5, 3, generator=torch.Generator().manual_seed(0)).unbind(0)
+    torch.testing.assert_close((cross_matrix(a) @ b[..., None])[..., 0], torch.linalg.cross(a, b))

@@ -22,6 +22,7 @@ usage: ns-render PATH --load-config RUN/config.yml --output-path FILE.gif [flags
 
 paths:
   orbit           a horizontal circle around the scene, as high and far as the training cameras
+  interpolate     a smooth walk past the training cameras, in the order of their photographs' names
   time            one of the cameras, while time runs from 0 to 1
 
 ns-render PATH --help shows its flags.
@@ -76,7 +77,18 @@ class TimeFlags(RenderFlags):
     """Which camera, from 0."""
 
 
-PATHS: dict[str, type[OrbitFlags] | type[TimeFlags]] = {"orbit": OrbitFlags, "time": TimeFlags}
+@dataclass(frozen=True)
+class InterpolateFlags(RenderFlags):
+    """Render a smooth walk past the training cameras, in the order of their photographs' names."""
+
+    output_path: Path = Path("interpolate.gif")
+    """The animation; its ending (.gif, .webp, .png) chooses the format."""
+    num_frames: int = 96
+    """Pictures on the way."""
+
+
+Flags = OrbitFlags | InterpolateFlags | TimeFlags
+PATHS: dict[str, type[Flags]] = {"orbit": OrbitFlags, "interpolate": InterpolateFlags, "time": TimeFlags}
 
 
 def main() -> None:
@@ -97,7 +109,7 @@ def _command(arguments: list[str]) -> None:
     _render(tyro.cli(path, prog=prog, args=arguments[1:], config=(tyro.conf.FlagConversionOff,)))
 
 
-def _render(flags: OrbitFlags | TimeFlags) -> None:
+def _render(flags: Flags) -> None:
     if flags.num_frames < 1 or not flags.fps > 0 or flags.downscale_factor < 1:
         raise ConfigError("--num-frames and --downscale-factor must be at least 1, --fps more than 0")
     if flags.output_path.suffix.lower() not in (".gif", ".webp", ".png"):
@@ -117,8 +129,7 @@ def _render(flags: OrbitFlags | TimeFlags) -> None:
     )
     model, config = trained.model, trained.run.config
     parsed = trained.run.parser.parse(config.data, flags.split if isinstance(flags, TimeFlags) else "train")
-    follow = _one_camera if isinstance(flags, TimeFlags) else _circle
-    cameras, times = follow(flags, trained, parsed)  # type: ignore[arg-type]
+    cameras, times = _path(flags, trained, parsed)
     cameras = cameras.scaled(1 / (flags.downscale_factor * parsed.downscale_factor)).to(model.device)
     times = None if times is None else times.to(model.device)
     background = evaluation_background(model)
@@ -133,6 +144,20 @@ def _render(flags: OrbitFlags | TimeFlags) -> None:
     else:
         write_animation(flags.output_path, frames, flags.fps)
         say(f"animation: {flags.output_path}")
+
+
+def _path(flags: Flags, trained: Trained, parsed: ParsedScene) -> tuple[Cameras, Tensor | None]:
+    """The cameras and, of a scene that moves, their times."""
+    import torch
+
+    from framework.evaluation.paths import interpolate
+
+    if isinstance(flags, TimeFlags):
+        return _one_camera(flags, trained, parsed)
+    if isinstance(flags, OrbitFlags):
+        return _circle(flags, trained, parsed)
+    times = torch.linspace(0, 1, flags.num_frames) if trained.model.scene.moving else None
+    return interpolate(parsed.cameras, flags.num_frames), times
 
 
 def _circle(flags: OrbitFlags, trained: Trained, parsed: ParsedScene) -> tuple[Cameras, Tensor | None]:

@@ -10,6 +10,9 @@ from torch import Tensor
 from framework.cameras import Cameras
 from framework.kernels.math import safe_normalize
 
+STOPS = 24
+"""Of an interpolated path's cameras, the share that is averaged with each is one in so many either way."""
+
 
 def look_at(position: Tensor, target: Tensor, up: Tensor) -> Tensor:
     """Camera-to-world (3, 4) of a camera at `position` (3,) that looks at `target` (3,), with `up` (3,) upwards.
@@ -36,6 +39,25 @@ def orbit(cameras: Cameras, center: Tensor, num_frames: int) -> Cameras:
     up = torch.tensor([0.0, 0.0, 1.0])
     poses = torch.stack([look_at(center + offset, center, up) for offset in circle])
     return replace_poses(cameras, poses)
+
+
+def interpolate(cameras: Cameras, num_frames: int) -> Cameras:
+    """Cameras along a smooth path past M cameras, in their order: a walk without the hand's shaking.
+
+    A pose is the mean of those nearby in that order, weighted by a Gaussian; of rotations, the one closest to the mean
+    of their matrices. Intrinsics are the first one's.
+    """
+    count = len(cameras)
+    width = max(count / STOPS, 0.5)
+    places = torch.linspace(0, count - 1, num_frames, dtype=torch.float64)
+    weights = torch.exp(-0.5 * ((places[:, None] - torch.arange(count)) / width).square())
+    weights = weights / weights.sum(-1, keepdim=True)
+    means = torch.einsum("fm,mij->fij", weights, cameras.camera_to_worlds.double())
+    u, _, vh = torch.linalg.svd(means[:, :, :3])
+    flips = torch.ones(num_frames, 3, dtype=torch.float64)
+    flips[:, 2] = torch.linalg.det(u @ vh)
+    rotations = (u * flips[:, None]) @ vh
+    return replace_poses(cameras, torch.cat([rotations, means[:, :, 3:]], dim=-1).float())
 
 
 def replace_poses(cameras: Cameras, poses: Tensor) -> Cameras:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from framework.cameras import Cameras, check_pose
-from framework.evaluation.paths import look_at, orbit, replace_poses
+from framework.evaluation.paths import interpolate, look_at, orbit, replace_poses
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 
@@ -49,3 +49,26 @@ def test_other_poses_keep_the_lens() -> None:
     assert path.model == "fisheye"
     assert path.lens is not None
     torch.testing.assert_close(path.lens, lens[:1].repeat(5, 1))
+
+
+def test_an_interpolated_path_is_a_walk_without_the_shaking() -> None:
+    """Cameras that turn about z along a circle, each shaken: the path is rigid, near and steadier."""
+    draws = torch.Generator().manual_seed(0)
+    angles = torch.linspace(0, 3, 72) + 0.02 * torch.randn(72, generator=draws)
+    zero, one = torch.zeros(72), torch.ones(72)
+    rotations = torch.stack([angles.cos(), -angles.sin(), zero, angles.sin(), angles.cos(), zero, zero, zero, one], -1)
+    centres = torch.stack([4 * angles.cos(), 4 * angles.sin(), zero], dim=-1)
+    poses = torch.cat([rotations.view(72, 3, 3), centres[..., None]], dim=-1)
+    path = interpolate(Cameras(poses, one, one, one, one, one.long(), one.long()), 72).camera_to_worlds
+    for pose in path:
+        check_pose(pose, "path")
+    found = torch.atan2(path[:, 1, 0], path[:, 0, 0])
+    assert (found - torch.linspace(0, 3, 72)).abs()[8:-8].max() < 0.03
+    assert found.diff().std() < 0.25 * angles.diff().std()
+    assert (path[:, :, 3].norm(dim=-1) - 4).abs().max() < 0.1
+
+
+def test_a_path_past_one_camera_stands_still() -> None:
+    one = torch.ones(1)
+    cameras = Cameras(torch.eye(4)[None, :3], one, one, one, one, one.long(), one.long())
+    torch.testing.assert_close(interpolate(cameras, 3).camera_to_worlds, torch.eye(4)[:3].repeat(3, 1, 1))

@@ -1,0 +1,195 @@
+"""ns-process-data: photographs, a video or a phone's capture become a data folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import get_type_hints
+
+from framework.cli.common import run_command
+from framework.console import say
+from framework.errors import ConfigError, DataError, nearest
+from framework.processing.settings import ColmapFlags, OutputFlags
+
+USAGE = """\
+usage: ns-process-data KIND --data IN --output-dir OUT [flags]
+
+kinds:
+  images          a folder of photographs; COLMAP finds their poses
+  video           a video; its sharpest frames become photographs
+  polycam         Polycam's raw export, with the phone's poses
+  record3d        Record3D's export with EXR and RGBD, with the phone's poses
+
+ns-process-data KIND --help shows its flags.
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImagesFlags(ColmapFlags):
+    """Find the poses of the photographs in a folder and those below it."""
+
+    masks_dir: Path | None = None
+    """Masks under the photographs' names: black is neither used for poses nor learnt from."""
+
+    def check(self) -> None:
+        super().check()
+        if self.masks_dir is not None and self.undistort:
+            raise ConfigError("--masks-dir with --undistort: masks are not undistorted; leave one of them out")
+        if self.masks_dir is not None and not self.masks_dir.is_dir():
+            raise ConfigError(f"--masks-dir {self.masks_dir}: there is no such folder")
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoFlags(ColmapFlags):
+    """Find the poses of the sharpest frames of a video."""
+
+    num_frames_target: int = 300
+    """Frames to take: the sharpest of each of so many equal intervals."""
+
+    def check(self) -> None:
+        super().check()
+        if self.num_frames_target < 3:
+            raise ConfigError(f"--num-frames-target is {self.num_frames_target}; it must be at least 3")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhoneFlags(OutputFlags):
+    """What captures with poses can be told."""
+
+    max_dataset_size: int = 300
+    """The most images to take, evenly chosen; -1 for all."""
+
+    def check(self) -> None:
+        super().check()
+        if self.max_dataset_size < 2 and self.max_dataset_size != -1:
+            raise ConfigError(f"--max-dataset-size is {self.max_dataset_size}; it must be at least 2, or -1 for all")
+
+    @property
+    def most(self) -> int:
+        """The most images to take."""
+        return sys.maxsize if self.max_dataset_size == -1 else self.max_dataset_size
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolycamFlags(PhoneFlags):
+    """Convert Polycam's raw export."""
+
+    min_blur_score: float = 25.0
+    """Leave out images that Polycam gives a lower score."""
+    crop_border_pixels: int = 15
+    """Pixels to cut off at each side, where Polycam's images may have a black border."""
+
+    def check(self) -> None:
+        super().check()
+        if self.crop_border_pixels < 0:
+            raise ConfigError(f"--crop-border-pixels is {self.crop_border_pixels}; it must be at least 0")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record3DFlags(PhoneFlags):
+    """Convert Record3D's export with EXR and RGBD."""
+
+
+KINDS: dict[str, type[OutputFlags]] = {
+    "images": ImagesFlags,
+    "video": VideoFlags,
+    "polycam": PolycamFlags,
+    "record3d": Record3DFlags,
+}
+
+
+def main() -> None:
+    """The ns-process-data command."""
+    run_command(_command)
+
+
+def _command(arguments: list[str]) -> None:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(USAGE)
+        return
+    kind = KINDS.get(arguments[0])
+    if kind is None:
+        raise ConfigError(f"unknown kind '{arguments[0]}'. {nearest(arguments[0], list(KINDS))}")
+    import tyro
+
+    flags = tyro.cli(
+        kind,
+        prog=f"ns-process-data {arguments[0]}",
+        args=_spelt_out(arguments[1:], kind),
+        config=(tyro.conf.FlagConversionOff,),
+    )
+    flags.check()
+    try:
+        _process(flags)
+    except KeyboardInterrupt:
+        say(f"interrupted; {flags.output_dir} is unfinished, --overwrite begins again")
+        sys.exit(130)
+
+
+def _spelt_out(arguments: list[str], kind: type[OutputFlags]) -> list[str]:
+    """`--overwrite` alone means `--overwrite True`."""
+    hints = get_type_hints(kind)
+    switches = {f.name for f in dataclasses.fields(kind) if hints[f.name] is bool}
+    words = []
+    for index, word in enumerate(arguments):
+        words.append(word)
+        last = index + 1 == len(arguments)
+        if word[2:].replace("-", "_") in switches and (last or arguments[index + 1] not in ("True", "False")):
+            words.append("True")
+    return words
+
+
+def _process(flags: OutputFlags) -> None:
+    if not flags.data.exists():
+        raise DataError(f"--data {flags.data}: there is no such file or folder")
+    if isinstance(flags, ColmapFlags):
+        _find_poses(flags)
+    else:
+        _convert(flags)
+
+
+def _find_poses(flags: ColmapFlags) -> None:
+    from framework.processing import colmap
+    from framework.processing.output import claim
+    from framework.processing.photographs import find_photographs
+    from framework.processing.pipeline import process
+    from framework.processing.video import open_video, write_frames
+
+    colmap.require()
+    seconds: dict[str, float] = {}
+    masks = flags.masks_dir if isinstance(flags, ImagesFlags) else None
+    if isinstance(flags, VideoFlags):
+        open_video(flags.data)  # nothing is removed for a video that cannot be read
+        claim(flags.output_dir, flags.data, flags.overwrite)
+        start = time.perf_counter()
+        folder = flags.output_dir / "colmap" / "unfinished" / "frames"
+        sources = write_frames(flags.data, folder, flags.num_frames_target)
+        seconds["reading the video"] = time.perf_counter() - start
+        say(f"video: {len(sources)} frames taken, in {seconds['reading the video']:.1f} s")
+    else:
+        folder = flags.data
+        sources = find_photographs(folder, [flags.output_dir, *([] if masks is None else [masks])])
+        claim(flags.output_dir, flags.data, flags.overwrite)
+    process(folder, sources, flags, masks, isinstance(flags, VideoFlags), seconds)
+
+
+def _convert(flags: OutputFlags) -> None:
+    from framework.processing import polycam, record3d
+    from framework.processing.output import claim
+
+    if isinstance(flags, PolycamFlags):
+        polycam.check(flags.data)
+        claim(flags.output_dir, flags.data, flags.overwrite)
+        crop = flags.crop_border_pixels
+        polycam.convert(flags.data, flags.output_dir, flags.num_downscales, flags.most, flags.min_blur_score, crop)
+    elif isinstance(flags, Record3DFlags):
+        record3d.find_root(flags.data)
+        claim(flags.output_dir, flags.data, flags.overwrite)
+        record3d.convert(flags.data, flags.output_dir, flags.num_downscales, flags.most)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,4 +1,4 @@
-"""The folder that is written: refused where it would destroy something, and unfinished until transforms.json is there."""
+"""The folder that is written: refused where something would be lost, and unfinished until transforms.json is there."""
 
 from __future__ import annotations
 

@@ -171,7 +171,7 @@ def eight_bits(image: Image.Image) -> Image.Image:
         return Image.fromarray((deep / 257).round().clip(0, 255).astype(np.uint8)).convert("RGB")
     if image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info:
         rgba = image.convert("RGBA")
-        return rgba if rgba.getextrema()[3][0] < 255 else rgba.convert("RGB")  # type: ignore[index]
+        return rgba if (np.asarray(rgba)[..., 3] < 255).any() else rgba.convert("RGB")
     return image.convert("RGB")
 
 
@@ -194,7 +194,7 @@ def write_masks(folder: Path, photographs: list[Photograph], masks: Path, crop: 
     found = {}
     for photograph in photographs:
         source = PurePosixPath(photograph.source)
-        candidates = [source, source.with_suffix(".png"), source.with_suffix(".PNG"), f"{source}.png"]
+        candidates = [source, source.with_suffix(".png"), source.with_suffix(".PNG"), PurePosixPath(f"{source}.png")]
         path = next((folder / one for one in candidates if (folder / one).is_file()), None)
         if path is None:
             continue

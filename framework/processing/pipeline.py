@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-
 from framework.console import say
 from framework.errors import DataError
 from framework.processing import colmap, retrieval, transforms

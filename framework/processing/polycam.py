@@ -17,9 +17,7 @@ Z_UP = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0]])
 """(3, 4) from the phone's frame, y up, to one with z up, as nerfstudio turns it."""
 
 
-def convert(
-    export: Path, output: Path, num_downscales: int, most: int, min_blur_score: float, crop: int
-) -> None:
+def convert(export: Path, output: Path, num_downscales: int, most: int, min_blur_score: float, crop: int) -> None:
     """Write the data folder `output`, which has been claimed.
 
     Args:

@@ -80,7 +80,7 @@ def vocabulary(descriptors: np.ndarray, words: int, random: np.random.Generator,
 
 
 def aggregate(descriptors: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """(W D,) what descriptors (K, D) differ from their nearest centres (W, D) by, summed; unit length a word, and all."""
+    """(W D,) sums of descriptors' (K, D) differences to their nearest centres (W, D); of unit length, each and all."""
     sums = np.zeros_like(centres, dtype=np.float32)
     if len(descriptors):
         nearest = _nearest(descriptors, centres)

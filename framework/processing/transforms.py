@@ -64,8 +64,9 @@ def lens_of(model: str, width: int, height: int, parameters: Sequence[float]) ->
     focal = named.pop("f", None)
     if focal is not None:
         named = {"fl_x": focal, "fl_y": focal, **named}
+    distortion: tuple[str, ...] = ()
     if model.endswith("PINHOLE"):
-        kind, distortion = "PINHOLE", ()
+        kind = "PINHOLE"
     elif model == "OPENCV_FISHEYE":
         kind, distortion = model, ("k1", "k2", "k3", "k4")
     else:

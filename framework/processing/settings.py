@@ -40,7 +40,7 @@ class ColmapFlags(OutputFlags):
     camera_sharing: Literal["auto", "single", "per-image"] = "auto"
     """Which photographs share a camera. auto: those of a folder with equal size, device and focal length."""
     matching_method: Matching = "auto"
-    """Which photographs are compared. auto: all pairs up to --exhaustive-limit, then retrieval; a video's neighbours."""
+    """Which photographs are compared. auto: all pairs up to --exhaustive-limit, then retrieval; a video: neighbours."""
     exhaustive_limit: int = 150
     """The most photographs of which auto compares all pairs."""
     num_neighbors: int = 30

@@ -1,0 +1,66 @@
+"""Photographs as they come: names, orientation, depth of colour, damage."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from framework.errors import DataError
+from framework.processing.photographs import find_photographs, output_names, prepare, prepare_all
+
+
+def write(path: Path, size: tuple[int, int] = (6, 4), mode: str = "RGB", orientation: int | None = None) -> np.ndarray:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draws = np.random.default_rng(0)
+    pixels = draws.integers(0, 255, (size[1], size[0], 3)).astype(np.uint8)
+    image = Image.fromarray(pixels).convert(mode)
+    exif = image.getexif()
+    if orientation is not None:
+        exif[0x0112] = orientation
+    image.save(path, exif=exif)
+    return np.asarray(image)
+
+
+def test_photographs_are_found_below_and_sorted_as_people_count(tmp_path: Path) -> None:
+    for name in ("b/img10.png", "b/img2.png", "a 1.PNG", ".hidden/x.png", "notes.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"") if name.endswith("txt") else write(tmp_path / name)
+    assert [p.as_posix() for p in find_photographs(tmp_path)] == ["a 1.PNG", "b/img2.png", "b/img10.png"]
+    with pytest.raises(DataError, match="has no image"):
+        find_photographs(tmp_path / "b" / "..", leave_out=[tmp_path])
+
+
+def test_names_are_safe_and_different() -> None:
+    names = output_names([Path("a b.JPG"), Path("a_b.jpg"), Path("sub dir/x.tif"), Path("A_B.jpg")])
+    assert names == ["a_b.jpg", "a_b_2.jpg", "sub_dir/x.png", "A_B_3.jpg"]
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_photographs_are_turned_upright(orientation: int, tmp_path: Path) -> None:
+    stored = write(tmp_path / "in" / "x.png", orientation=orientation)
+    found = prepare(tmp_path / "in", Path("x.png"), tmp_path / "out", "x.png")
+    turned = {1: stored, 3: stored[::-1, ::-1], 6: np.rot90(stored, -1), 8: np.rot90(stored)}[orientation]
+    with Image.open(tmp_path / "out" / "x.png") as image:
+        assert (image.width, image.height) == (found.width, found.height) == turned.shape[1::-1]
+        assert image.getexif().get(0x0112, 1) == 1
+        assert np.array_equal(np.asarray(image.convert("RGB")), turned)
+
+
+def test_sixteen_bits_of_grey_become_eight(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    Image.fromarray(np.array([[0, 257 * 100, 65535]], np.uint16)).save(tmp_path / "in" / "x.png")
+    prepare(tmp_path / "in", Path("x.png"), tmp_path / "out", "x.png")
+    with Image.open(tmp_path / "out" / "x.png") as image:
+        assert np.asarray(image)[0, :, 0].tolist() == [0, 100, 255]
+
+
+def test_damaged_photographs_are_left_out_and_named(tmp_path: Path) -> None:
+    write(tmp_path / "good.png")
+    (tmp_path / "bad.png").write_bytes((tmp_path / "good.png").read_bytes()[:60])
+    (tmp_path / "worse.jpg").write_text("no image")
+    sources = find_photographs(tmp_path)
+    photographs, unreadable = prepare_all(tmp_path, sources, tmp_path / "out")
+    assert [p.source for p in photographs] == ["good.png"]
+    assert len(unreadable) == 2
+    assert "bad.png" in unreadable[0]

@@ -73,7 +73,7 @@ class Llff(Captured):
             corners: (M, 4, 3) as `corner_directions` gives them.
             bounds: (M, 2) scene units.
         """
-        near = max(self.near, NEAR_SHARE * float(bounds[:, 0].min()))
+        near = max(self.near or 0.0, NEAR_SHARE * float(bounds[:, 0].min()))
         if near >= self.far:
             raise DataError(
                 f"--far {self.far} is nearer than what {POSES} says to be near; raise it, or --use-bounds False"

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from dataparsers.captured import NEAR, nearest_shown
 from dataparsers.colmap import Colmap
 from dataparsers.colmap_model import read_model
 from dataparsers.llff import Llff
+from framework.cameras import Cameras
 from framework.dataset import load_dataset
 from framework.errors import DataError
 from tests.dataparsers.sparse_models import Capture, make_capture, misses, write_colmap, write_images
@@ -271,3 +273,17 @@ def test_real_points_are_seen_where_their_keypoints_are(real_data: Path, scene_n
         errors.append(misses(scene, index, at[:, 0], at[:, 1], points))
     assert np.median(np.concatenate(errors)) < 1.5
     assert max(np.median(each) for each in errors) < 3
+
+
+def test_rays_start_well_before_the_nearest_points() -> None:
+    """Cameras in a row look at a wall of points 4 away, and one wrong point is right before a camera."""
+    ones = torch.ones(5)
+    poses = torch.eye(4)[:3].repeat(5, 1, 1)
+    poses[:, 0, 3] = torch.linspace(-1, 1, 5)
+    cameras = Cameras(poses, 50 * ones, 50 * ones, 32 * ones, 32 * ones, *[torch.full((5,), 64)] * 2)
+    draws = torch.Generator().manual_seed(0)
+    wall = torch.cat([2 * torch.rand(999, 2, generator=draws) - 1, torch.full((999, 1), -4.0)], dim=-1)
+    points = torch.cat([wall, torch.tensor([[0.0, 0.0, -0.01]])])
+    assert nearest_shown(cameras, points) == pytest.approx(2.0, rel=0.05)
+    assert nearest_shown(cameras, points + torch.tensor([0.0, 0.0, 50.0])) == NEAR  # all of them are behind
+    assert nearest_shown(cameras, None) == nearest_shown(cameras, points[:0]) == NEAR

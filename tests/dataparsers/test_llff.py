@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from dataparsers.captured import NEAR
 from dataparsers.colmap import Colmap
 from dataparsers.llff import Llff
 from framework.dataset import load_dataset
@@ -76,7 +77,7 @@ def test_bounds_tell_where_a_scene_seen_from_one_side_is(folder: Path) -> None:
     torch.testing.assert_close(wider[1] - wider[0], 2 * (scene.box[1] - scene.box[0]))
     torch.testing.assert_close(Llff().parse(folder, "val").box, scene.box)
     plain = Llff(use_bounds=False).parse(folder, "train")
-    assert plain.near == Llff.near
+    assert plain.near == NEAR
     assert plain.box.tolist() == [[-1, -1, -1], [1, 1, 1]]
     assert Llff(near=3.0).parse(folder, "train").near == 3.0
 

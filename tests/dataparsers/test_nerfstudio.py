@@ -357,7 +357,7 @@ BAD = {
     "nan centre": (put(cx=math.nan), "frame 0: 'cx' is nan"),
     "text coefficient": (put(k1="a"), "frame 0: 'k1' is 'a'"),
     "zero width": (put(w=0), "frame 0: 'w' is 0; it must be a number above zero"),
-    "other shape": (put(w=30, h=40), r"001\.png is 40x30 pixels, but its camera is for the shape of 30x40"),
+    "other shape": (put(w=30, h=40), r"000\.png is 40x30 pixels, but its camera is for the shape of 30x40"),
     "unknown camera": (put(camera_model="OPENCVV"), "unknown camera_model 'OPENCVV'. Did you mean 'OPENCV'"),
     "camera is a list": (put(camera_model=[1]), "unknown camera_model"),
     "mixed cameras": (frame(camera_model="OPENCV_FISHEYE"), "mixes the camera models OPENCV_FISHEYE and PINHOLE"),

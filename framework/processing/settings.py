@@ -51,8 +51,9 @@ class ColmapFlags(OutputFlags):
     """Longest side, in pixels, at which features are looked for."""
     max_num_features: int = 8192
     """The most features of a photograph."""
-    refine_intrinsics: bool = True
-    """Adjust everything once more at the end with the principal point free, for cameras of 10 photographs or more."""
+    refine_intrinsics: bool = False
+    """Adjust everything once more at the end with the principal point free, for cameras of 10 photographs or more. A
+    turn of the camera looks much like a move of that point: only for captures that determine it well."""
     undistort: bool = False
     """Write images without lens distortion (camera model PINHOLE), of the registered photographs alone."""
     device_type: Literal["cpu", "cuda"] = "cpu"

@@ -104,6 +104,9 @@ class TrainConfig:
     """Pixels whose ray meets only such cells are never drawn."""
     draw_by_error: bool = False
     """Draw half of the pixels where the error was large lately, with weights that keep the mean loss as it is."""
+    masks: Literal["auto", "ignored", "empty"] = "auto"
+    """What masks say in training of pixels that they do not keep: nothing, or that nothing is there, as around an
+    object that was cut out. auto: the latter if they take away over half of all pixels, not the same of each image."""
     background: Literal["auto", "random", "white", "black"] = "auto"
     """Behind transparent pixels in training; auto: random if images have alpha. Evaluation is over white, or black."""
     eval_appearance: Literal["mean", "half"] = "mean"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -29,6 +30,8 @@ from framework.pixel_set import PixelSet
 from framework.scene import PoseSource, Scene
 
 Split = Literal["train", "val", "test"]
+Masks = Literal["auto", "ignored", "empty"]
+"""What masks say of the pixels that they do not keep: nothing, or that nothing is there."""
 
 
 @dataclass(frozen=True)
@@ -122,8 +125,10 @@ class Dataset:
     """Pixels that are worth drawing, counted through all images; None for all."""
     kept: PixelSet | None = None
     """Pixels that no mask ignores and a ray leads to; None for all."""
+    opaque: PixelSet | None = None
+    """What masks leave, where all that they cut away is empty: pixels that show nothing else have alpha 0."""
     light: Tensor | None = None
-    """(M, 3, Q) `appearance.light_of` each image, where it is known."""
+    """(M, 3, Q) `appearance.light_of` each image, where it is known; None of images with alpha of their own."""
     depths: Tensor | None = None
     """(P,) float16 depth of each pixel along its camera's axis, scene units, 0 where unknown; None for all."""
     mapped: MappedPixels | None = None
@@ -138,14 +143,19 @@ class Dataset:
         return self.cameras.fx.device
 
     def image(self, index: int) -> Tensor:
-        """Image `index` as (H, W, 3 or 4) uint8."""
+        """Image `index` as (H, W, 3 or 4) uint8, the fourth where the scene has alpha."""
         height, width = int(self.cameras.heights[index]), int(self.cameras.widths[index])
         start, end = self.cameras.offsets[index : index + 2].tolist()
         pixels = self.pixels[start:end]
         if self.mapped is not None:
             pixels = pixels.clone()
             self.mapped.drop(start, end)
-        return pixels.to(self.device).view(height, width, -1)
+        pixels = pixels.to(self.device)
+        if self.opaque is not None:
+            shown = self.opaque.mask(start, end)
+            alpha = pixels[:, 3] * shown if pixels.shape[1] == 4 else shown * pixels.new_tensor(255)
+            pixels = torch.cat([pixels[:, :3], alpha[:, None].to(torch.uint8)], dim=-1)
+        return pixels.view(height, width, -1)
 
     def kept_of(self, index: int) -> Tensor | None:
         """(H, W) bool: which pixels of image `index` no mask ignores; None where no image has ignored ones."""
@@ -172,6 +182,7 @@ class Dataset:
             times=None if self.times is None else self.times.to(device),
             drawn=self.drawn if self.drawn is None or self.mapped is not None else self.drawn.to(device),
             kept=None if self.kept is None else self.kept.to(device),
+            opaque=None if self.opaque is None else self.opaque.to(device),
             depths=None if self.depths is None else self.depths.to(device),
         )
 
@@ -190,30 +201,35 @@ def existing(paths: Sequence[Path], split: str) -> Tensor:
     return torch.tensor([index for index, path in enumerate(paths) if path.is_file()])
 
 
-def load_dataset(parsed: ParsedScene, split: str, memory: PixelMemory | None = None) -> Dataset:
+def load_dataset(
+    parsed: ParsedScene, split: str, memory: PixelMemory | None = None, masks: Masks = "ignored"
+) -> Dataset:
     """Decode the images of a split.
 
     Unreadable images are skipped and reported; an image whose size is not its camera's is an error.
 
     Args:
         memory: how much may be held in memory; half of the machine's if None.
+        masks: what they say of the pixels that they do not keep; auto: as `cuts_out` finds.
     Raises: DataError for a size that does not fit, or where no image is left.
     """
     factor = parsed.downscale_factor
     cameras = parsed.cameras if factor == 1 else parsed.cameras.scaled(1 / factor)
     sizes = tuple(zip(cameras.widths.tolist(), cameras.heights.tolist(), strict=True))
-    masks = parsed.mask_paths or (None,) * len(parsed.image_paths)
-    files = ImageFiles(split, parsed.image_paths, masks, sizes, factor)
+    mask_paths = parsed.mask_paths or (None,) * len(parsed.image_paths)
+    files = ImageFiles(split, parsed.image_paths, mask_paths, sizes, factor)
     decoded = decode(files, memory or PixelMemory.of())
     if len(decoded.left) < len(sizes):
         parsed, cameras = parsed[decoded.left], cameras[decoded.left]
-    has_alpha = decoded.pixels.shape[1] == 4
+    kept, opaque, light = decoded.kept, None, None if decoded.pixels.shape[1] == 4 else decoded.light
+    if kept is not None and (masks == "empty" or (masks == "auto" and cuts_out(kept, cameras))):
+        kept, opaque = None, kept
     scene = Scene(
         box=parsed.box,
         near=parsed.near,
         far=parsed.far,
         num_cameras=len(cameras),
-        has_alpha=has_alpha,
+        has_alpha=opaque is not None or decoded.pixels.shape[1] == 4,
         moving=parsed.times is not None,
         image_size=int(torch.maximum(cameras.widths, cameras.heights).max()),
         unbounded=parsed.unbounded,
@@ -221,11 +237,10 @@ def load_dataset(parsed: ParsedScene, split: str, memory: PixelMemory | None = N
         warped=isinstance(cameras, NdcCameras),
         has_depth=parsed.depth_paths is not None and decoded.mapped is None,
         # Of an object cut out of its surroundings, each side has a light of its own.
-        appearance_varies=parsed.appearance_varies
-        or (not has_alpha and light_spread(decoded.light) > APPEARANCE_STOPS),
+        appearance_varies=parsed.appearance_varies or (light is not None and light_spread(light) > APPEARANCE_STOPS),
     )
     depths = _depths(parsed, cameras, decoded.mapped is not None)
-    names, kept = tuple(path.name for path in parsed.image_paths), decoded.kept
+    names = tuple(path.name for path in parsed.image_paths)
     reached = pixels_with_rays(cameras, names, split)
     if reached is not None:
         kept = reached if kept is None else PixelSet.shared([kept, reached], 2)
@@ -239,10 +254,23 @@ def load_dataset(parsed: ParsedScene, split: str, memory: PixelMemory | None = N
         scale=parsed.scale,
         drawn=kept if kept is None or decoded.mapped is not None else kept.listed(),
         kept=kept,
-        light=decoded.light,
+        opaque=opaque,
+        light=light,
         depths=depths,
         mapped=decoded.mapped,
     )
+
+
+def cuts_out(kept: PixelSet, cameras: Cameras) -> bool:
+    """Whether masks look as if they cut an object out of its surroundings, rather than hide what disturbs.
+
+    They ignore more than half of all pixels, and not the same ones of every photograph, as the rim of a lens would be.
+    """
+    ends = cameras.offsets.tolist()
+    if len(kept) > ends[-1] / 2:
+        return False
+    first = kept.mask(0, ends[1])
+    return any(not torch.equal(kept.mask(start, end), first) for start, end in pairwise(ends))
 
 
 def _depths(parsed: ParsedScene, cameras: Cameras, in_file: bool) -> Tensor | None:

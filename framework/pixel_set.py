@@ -71,6 +71,11 @@ class PixelSet:
     def _count(self) -> int:
         return int(self.before[-1])
 
+    @cached_property
+    def _ends(self) -> Tensor:
+        """(N + 1,) where the run before each begins to be over; 0 before the first."""
+        return torch.cat([torch.zeros_like(self.before[:1]), self.starts + self.before.diff()])
+
     def to(self, device: torch.device | str) -> PixelSet:
         """The same pixels on `device`."""
         known = (getattr(self, f.name) for f in fields(self))
@@ -95,6 +100,10 @@ class PixelSet:
         starts, before = self.starts.numpy(), self.before.numpy()
         runs = np.searchsorted(before, ranks, side="right") - 1
         return starts[runs] + (ranks - before[runs])
+
+    def contains(self, pixels: Tensor) -> Tensor:
+        """(R,) bool: which of the pixels (R,) int64 are in the set."""
+        return pixels < self._ends[torch.searchsorted(self.starts, pixels, right=True)]
 
     def pixels(self) -> Tensor:
         """(K,) int64 all of them."""

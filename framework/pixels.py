@@ -104,6 +104,9 @@ def gather_batch(
         rgb, alpha = gather_colors(dataset.pixels, flat, behind)
     else:
         rgb, alpha = gather_colors(stored, torch.arange(len(flat), device=flat.device), behind)
+    if dataset.opaque is not None:
+        shown = dataset.opaque.contains(flat)
+        rgb, alpha = torch.where(shown[:, None], rgb, behind), shown * (1.0 if alpha is None else alpha)
     return Batch(flat, rays, rgb, behind, alpha, _distances(dataset, flat, rays))
 
 

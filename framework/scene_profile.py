@@ -38,7 +38,7 @@ class SceneProfile:
     ignored: float | None
     """Share of pixels that are not learnt from: masks ignore them, or no ray leads there; None for none."""
     light: float | None
-    """By how many stops light differs between the photographs (`appearance.light_spread`); None of cut-out objects."""
+    """By how many stops light differs between the photographs (`appearance.light_spread`); None of images with alpha."""
     camera: str
     """The cameras' model."""
     decisions: tuple[Decision, ...]
@@ -56,7 +56,7 @@ class SceneProfile:
             moving=dataset.scene.moving,
             transparent=transparent / total if alpha else None,
             ignored=None if kept is None else 1 - len(kept) / total,
-            light=None if alpha or dataset.light is None else light_spread(dataset.light),
+            light=None if dataset.light is None else light_spread(dataset.light),
             camera=cameras.model,
             decisions=tuple(decisions),
         )

@@ -91,7 +91,9 @@ def _finish(run: Run, trainer: Trainer) -> None:
 def load_split(run: Run, split: Split) -> Dataset:
     """Parse and decode a split of the run's data."""
     memory = PixelMemory.of(run.config.cache_limit, run.config.cache_dir)
-    return load_dataset(run.parser.parse(run.config.data, split), split, memory)
+    # Masks tell what counts in an evaluation, whatever they mean in training: its figures stay comparable.
+    masks = run.config.masks if split == "train" else "ignored"
+    return load_dataset(run.parser.parse(run.config.data, split), split, memory, masks)
 
 
 def first_split(run: Run, splits: tuple[Split, ...]) -> Dataset | None:

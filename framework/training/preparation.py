@@ -24,6 +24,9 @@ def profile_of(
         background: behind transparent pixels in training, as decided.
     """
     scene, decisions = model.scene, []
+    if dataset.opaque is not None and config.masks == "auto":
+        reason = "they cut away over half of the pixels, of each photograph others"
+        decisions.append(Decision("masks", "what they do not keep is empty", f"{reason} (else: --masks ignored)"))
     if config.background == "auto":
         reason = f"{'the photographs have' if scene.has_alpha else 'no photograph has'} alpha"
         decisions.append(Decision("background", background, reason))

@@ -41,6 +41,26 @@ def align(estimated: Tensor, given: Tensor) -> tuple[float, Tensor, Tensor]:
     return scale, rotation, target_mean - scale * (rotation @ source_mean)
 
 
+def align_cameras(estimated: Tensor, given: Tensor) -> tuple[float, Tensor, Tensor]:
+    """The similarity that takes cameras to others: the mean turn between them, then scale and move of their centres.
+
+    Orientations tell the rotation better than centres whose errors are large beside their spread, and also where all
+    centres lie on a line.
+
+    Args:
+        estimated, given: (M, 3, 4) camera-to-world, M >= 1, in corresponding order.
+    Returns: as `align`; the scale is 1 where all centres are one point.
+    """
+    source, target = estimated.double(), given.double()
+    u, _, vh = torch.linalg.svd((target[:, :, :3] @ source[:, :, :3].transpose(1, 2)).mean(0))
+    rotation = u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.linalg.det(u @ vh))]).double()) @ vh
+    turned, centres = source[:, :, 3] @ rotation.T, target[:, :, 3]
+    middle, centre = turned.mean(0), centres.mean(0)
+    spread = float((turned - middle).square().sum())
+    scale = float(((turned - middle) * (centres - centre)).sum()) / spread if spread > 0 else 1.0
+    return scale, rotation, centre - scale * middle
+
+
 @dataclass(frozen=True)
 class PoseErrors:
     """How far M poses are from given ones after the best similarity."""

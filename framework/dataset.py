@@ -238,6 +238,7 @@ def load_dataset(
         has_depth=parsed.depth_paths is not None and decoded.mapped is None,
         # Of an object cut out of its surroundings, each side has a light of its own.
         appearance_varies=parsed.appearance_varies or (light is not None and light_spread(light) > APPEARANCE_STOPS),
+        camera_to_worlds=cameras.camera_to_worlds,
     )
     depths = _depths(parsed, cameras, decoded.mapped is not None)
     names = tuple(path.name for path in parsed.image_paths)

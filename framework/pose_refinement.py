@@ -8,6 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from framework.alignment import align_cameras
 from framework.cameras import Cameras
 from framework.kernels.math import cross_matrix
 from framework.rays import Rays
@@ -22,11 +23,17 @@ class PoseRefinement(nn.Module):
         count: cameras.
         group: SO3xR3: the camera turns about its own centre, and its centre is moved. SE3: one screw motion about the
             scene's origin.
+        given: (count, 3, 4) the poses that are refined. Together they may drift, along with all that is learnt; other
+            cameras then follow by the similarity that takes the given ones to the refined ones. Without them, other
+            cameras are left where they are.
     """
 
-    def __init__(self, count: int, group: Group = "SO3xR3") -> None:
+    given: Tensor | None
+
+    def __init__(self, count: int, group: Group = "SO3xR3", given: Tensor | None = None) -> None:
         super().__init__()
         self.group = group
+        self.register_buffer("given", given, persistent=False)
         self.tangents = nn.Parameter(torch.zeros(count, 6))
 
     def motions(self) -> Tensor:
@@ -39,9 +46,9 @@ class PoseRefinement(nn.Module):
         return torch.linalg.matrix_exp(nn.functional.pad(generator, (0, 0, 0, 1)))[:, :3]
 
     def forward(self, rays: Rays) -> Rays:
-        """The rays of training cameras as they are believed to be; others as they are."""
+        """The rays of training cameras as they are believed to be; those of others where they then are."""
         if rays.camera_indices is None:
-            return rays
+            return self.carried(rays)
         motions = self.motions()[rays.camera_indices]
         turned = (motions[:, :, :3] * rays.directions[:, None]).sum(-1)
         origins = rays.origins
@@ -50,10 +57,29 @@ class PoseRefinement(nn.Module):
         return replace(rays, origins=origins + motions[:, :, 3], directions=turned)
 
     @torch.no_grad()
+    def carried(self, rays: Rays) -> Rays:
+        """Rays of the given poses' frame as rays of the refined poses'; lengths change with the scale between them."""
+        if self.given is None:
+            return rays
+        refined = self._moved(self.given)
+        scale, rotation, translation = align_cameras(self.given.cpu(), refined.cpu())
+        rotation, translation = rotation.to(rays.origins), translation.to(rays.origins)
+        return replace(
+            rays,
+            origins=scale * (rotation * rays.origins[:, None]).sum(-1) + translation,
+            directions=(rotation * rays.directions[:, None]).sum(-1),
+            nears=scale * rays.nears,
+            fars=scale * rays.fars,
+        )
+
+    @torch.no_grad()
     def refined(self, cameras: Cameras) -> Cameras:
         """The training cameras (M) where they are believed to be."""
-        motions, poses = self.motions(), cameras.camera_to_worlds
-        turned, centres = motions[:, :, :3] @ poses[:, :, :3], poses[:, :, 3:]
-        if self.group == "SE3":
-            centres = motions[:, :, :3] @ centres
-        return replace(cameras, camera_to_worlds=torch.cat([turned, centres + motions[:, :, 3:]], dim=-1))
+        return replace(cameras, camera_to_worlds=self._moved(cameras.camera_to_worlds))
+
+    def _moved(self, poses: Tensor) -> Tensor:
+        motions = self.motions()
+        # Products and sums rather than a matrix product, which autocast would round to bfloat16.
+        moved = (motions[:, :, :3, None] * poses[:, None]).sum(2)
+        centres = moved[:, :, 3:] if self.group == "SE3" else poses[:, :, 3:]
+        return torch.cat([moved[:, :, :3], centres + motions[:, :, 3:]], dim=-1)

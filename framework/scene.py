@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
+import torch
 from torch import Tensor
 
 PoseSource = Literal["exact", "photographs", "device"]
@@ -38,3 +39,10 @@ class Scene:
     """The photographs come with depth images."""
     appearance_varies: bool = False
     """Light, exposure or camera differ between the photographs."""
+    camera_to_worlds: Tensor | None = None
+    """(num_cameras, 3, 4) the training cameras' poses as they are given."""
+
+    def to(self, device: torch.device | str) -> Scene:
+        """The same facts on `device`."""
+        given = None if self.camera_to_worlds is None else self.camera_to_worlds.to(device)
+        return replace(self, box=self.box.to(device), camera_to_worlds=given)

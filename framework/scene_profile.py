@@ -38,7 +38,7 @@ class SceneProfile:
     ignored: float | None
     """Share of pixels that are not learnt from: masks ignore them, or no ray leads there; None for none."""
     light: float | None
-    """By how many stops light differs between the photographs (`appearance.light_spread`); None of images with alpha."""
+    """By how many stops light differs between the photographs (`appearance.light_spread`); None with alpha."""
     camera: str
     """The cameras' model."""
     decisions: tuple[Decision, ...]

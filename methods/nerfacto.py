@@ -111,7 +111,8 @@ class Nerfacto(Model[NerfactoConfig]):
         self.sampler = make_sampler(config, scene)
         self.unit_length = half_edge(scene.box)
         self.normals = NormalHead(self.field.num_features, config.hidden_width) if config.predict_normals else None
-        self.poses = None if self.pose_group == "off" else PoseRefinement(scene.num_cameras, self.pose_group)
+        group, given = self.pose_group, scene.camera_to_worlds
+        self.poses = None if group == "off" else PoseRefinement(scene.num_cameras, group, given)
         if self.poses is not None and scene.warped:
             raise ConfigError("--camera-optimizer: poses cannot be refined in normalised device coordinates")
         if self.poses is not None and not isinstance(self.sampler, ProposalSampler):

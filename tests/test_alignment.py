@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from framework.alignment import align, pose_errors
+from framework.alignment import align, align_cameras, pose_errors
 from framework.errors import DataError
 
 
@@ -36,6 +36,17 @@ def test_a_similarity_is_found() -> None:
     errors = pose_errors(poses, target)
     assert errors.median_angle < 1e-5
     assert errors.median_distance < 1e-9
+
+
+def test_cameras_on_a_line_or_in_one_place_are_aligned() -> None:
+    poses = some_poses(12)
+    poses[:, 1:, 3] = 0
+    for squeezed in (poses, torch.cat([poses[:, :, :3], torch.ones_like(poses[:, :, 3:])], dim=-1)):
+        target, scale, turn, _ = moved(squeezed)
+        found = align_cameras(squeezed, target)
+        assert math.isclose(found[0], scale) or (found[0] == 1 and squeezed is not poses)
+        torch.testing.assert_close(found[1], turn)
+        torch.testing.assert_close(found[0] * squeezed[:, :, 3] @ found[1].T + found[2], target[:, :, 3])
 
 
 def test_mirrored_points_are_not_mirrored_back() -> None:

@@ -158,3 +158,52 @@ def test_what_is_ignored_is_not_taken_for_empty(shared_tiny: Path, tmp_path: Pat
     drawn = trainer.train_set.drawn
     assert drawn is not None
     assert not bool((drawn.mask(0, half.numel()) & ~half.reshape(-1)).any())
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_masks_that_cut_out_are_alpha(tmp_path: Path, used: list[np.ndarray], channels: int) -> None:
+    """The same as images whose fourth channel holds the masks, in whole images and in batches."""
+    scene = write_noise(tmp_path / "images", SIZES, channels, ".png")
+    masks = [write_mask(tmp_path / f"{index}.png", mask) for index, mask in enumerate(used)]
+    scene = parsed(list(scene.image_paths), SIZES, [*masks, None])
+    with_alpha = []
+    for path, mask in zip(scene.image_paths, [*used, np.ones((25, 25), bool)], strict=True):
+        image = iio.imread(path)
+        alpha = np.where(mask, image[..., 3] if channels == 4 else 255, 0).astype(np.uint8)
+        iio.imwrite(tmp_path / path.name, np.dstack([image[..., :3], alpha]))
+        with_alpha.append(tmp_path / path.name)
+    found = load_dataset(scene, "train", masks="empty")
+    expected = load_dataset(parsed(with_alpha, SIZES), "train")
+    assert found.scene.has_alpha
+    assert found.kept is None
+    assert found.drawn is None
+    assert SceneProfile.of(found, []).transparent == SceneProfile.of(expected, []).transparent
+    for index in range(3):
+        assert torch.equal(found.image(index), expected.image(index))
+    batches = []
+    for dataset in (found, expected):
+        torch.manual_seed(0)
+        batches.append(draw_batch(dataset, 5_000, "random"))
+    assert torch.equal(batches[0].pixels, batches[1].pixels)
+    torch.testing.assert_close(batches[0].rgb, batches[1].rgb)
+    assert batches[0].alpha is not None
+    torch.testing.assert_close(batches[0].alpha, batches[1].alpha)
+
+
+def test_masks_cut_out_if_they_take_most_and_from_each_photograph_other_pixels(tmp_path: Path) -> None:
+    size = (20, 20)
+    scene = write_noise(tmp_path / "images", [size] * 3)
+    rim = np.zeros((20, 20), bool)
+    rim[5:15, 5:15] = True
+    moved, most = np.roll(rim, 2, axis=1), np.ones((20, 20), bool)
+    most[:5] = False
+
+    def opaque(name: str, used: list[np.ndarray]) -> bool:
+        masks = [write_mask(tmp_path / f"{name}{index}.png", mask) for index, mask in enumerate(used)]
+        dataset = load_dataset(parsed(list(scene.image_paths), [size] * 3, list(masks)), "train", masks="auto")
+        assert (dataset.opaque is None) != (dataset.kept is None)
+        return dataset.opaque is not None
+
+    assert opaque("object", [rim, moved, rim])
+    assert not opaque("lens", [rim, rim, rim])
+    assert not opaque("people", [most, most, np.roll(most, 5, axis=0)])

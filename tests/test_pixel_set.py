@@ -25,6 +25,8 @@ def test_ranks_masks_and_pixels_against_a_boolean_array(smooth: int) -> None:
         padded = torch.zeros(3000, dtype=torch.bool)
         padded[50:1047] = mask
         assert torch.equal(chosen.mask(first, last), padded[first:last])
+        some = torch.randint(first, last, (200,))
+        assert torch.equal(chosen.contains(some), padded[some])
     again = PixelSet.of_pixels(expected)
     assert torch.equal(again.starts, chosen.starts)
     assert torch.equal(again.before, chosen.before)
@@ -47,6 +49,7 @@ def test_sets_that_follow_each_other_and_empty_ones() -> None:
     empty = PixelSet.of_mask(torch.zeros(9, dtype=torch.bool))
     assert len(empty) == 0
     assert not bool(empty.mask(0, 9).any())
+    assert not bool(empty.contains(torch.arange(9)).any())
     joined = PixelSet.joined([PixelSet.of_mask(torch.ones(3)), empty, PixelSet.of_mask(torch.ones(2), 7)])
     assert joined.pixels().tolist() == [0, 1, 2, 7, 8]
     assert len(PixelSet.shared([joined, empty], 2)) == 0

@@ -1,11 +1,13 @@
 """Learnt poses against rotations in closed form."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from framework.cameras import Cameras
+from framework.kernels.math import cross_matrix
 from framework.pose_refinement import PoseRefinement
 from framework.rays import Rays
 
@@ -75,8 +77,42 @@ def test_refined_cameras_see_along_refined_rays(group) -> None:
     assert bool((through.directions.norm(dim=-1) - 1).abs().max() < 1e-5)
 
 
-def test_held_out_cameras_are_left_alone() -> None:
+def test_held_out_cameras_are_left_alone_where_no_pose_is_given() -> None:
     poses, rays = PoseRefinement(3), some_rays()
     torch.nn.init.normal_(poses.tangents)
     alone = Rays(rays.origins, rays.directions, rays.nears, rays.fars)
     assert poses(alone) is alone
+
+
+@pytest.mark.parametrize("group", ["SO3xR3", "SE3"])
+def test_held_out_cameras_follow_when_all_poses_drift_together(group) -> None:
+    """All training cameras are turned, moved and scaled by one similarity: whatever a ray sees stays where it is."""
+    torch.manual_seed(0)
+    turn, scale, move = torch.tensor([0.2, -0.1, 0.3]), 1.2, torch.tensor([0.5, -0.2, 0.1])
+    rotation = torch.linalg.matrix_exp(cross_matrix(turn))
+    given = torch.cat([torch.eye(3).expand(5, 3, 3), torch.randn(5, 3, 1)], -1)
+    poses, rays = PoseRefinement(5, group, given), some_rays()
+    target = scale * given[:, :, 3] @ rotation.T + move
+    with torch.no_grad():
+        poses.tangents[:, 3:] = turn
+        poses.tangents[:, :3] = target - given[:, :, 3]
+        if group == "SE3":  # the same end of a screw motion, by its logarithm
+            left_jacobian = sum(
+                torch.linalg.matrix_power(cross_matrix(turn), k) / math.factorial(k + 1) for k in range(12)
+            )
+            poses.tangents[:, :3] = (target - given[:, :, 3] @ rotation.T) @ torch.linalg.inv(left_jacobian).T
+    held_out = replace(rays, camera_indices=None)
+    found = poses(held_out)
+    torch.testing.assert_close(found.origins, scale * rays.origins @ rotation.T + move, atol=5e-5, rtol=1e-5)
+    torch.testing.assert_close(found.directions, rays.directions @ rotation.T, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(found.fars, scale * rays.fars, atol=1e-5, rtol=1e-5)
+    with torch.autocast("cpu", torch.bfloat16):
+        torch.testing.assert_close(poses(held_out).origins, found.origins)
+
+
+def test_without_refinement_other_cameras_stay_though_all_are_in_one_place() -> None:
+    given = torch.cat([torch.eye(3).expand(3, 3, 3), torch.ones(3, 3, 1)], -1)
+    rays = replace(some_rays(), camera_indices=None)
+    found = PoseRefinement(3, "SO3xR3", given)(rays)
+    torch.testing.assert_close(found.origins, rays.origins)
+    torch.testing.assert_close(found.directions, rays.directions)

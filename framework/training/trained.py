@@ -65,7 +65,7 @@ def load_trained(
     if content is None:
         raise CheckpointError(f"{run.folder / FOLDER} holds no checkpoint")
     try:
-        scene = Scene(**{**content["scene"], "box": content["scene"]["box"].cpu()})
+        scene = Scene(**content["scene"]).to("cpu")
     except (KeyError, TypeError, AttributeError) as error:
         raise CheckpointError(f"the checkpoint of {run.folder} lacks the scene: {error}") from error
     model = build_model(run.method, config, scene).to(device).eval()

@@ -114,7 +114,7 @@ class Trainer:
         content = {
             "method": self.run.method,
             "config": to_plain(self.config),
-            "scene": {**vars(scene), "box": scene.box.cpu()},
+            "scene": vars(scene.to("cpu")),
             "transform": self.train_set.transform,
             "scale": self.train_set.scale,
             "model": self.model.state_dict(),

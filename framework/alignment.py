@@ -57,7 +57,8 @@ def align_cameras(estimated: Tensor, given: Tensor) -> tuple[float, Tensor, Tens
     turned, centres = source[:, :, 3] @ rotation.T, target[:, :, 3]
     middle, centre = turned.mean(0), centres.mean(0)
     spread = float((turned - middle).square().sum())
-    scale = float(((turned - middle) * (centres - centre)).sum()) / spread if spread > 0 else 1.0
+    apart = spread > 1e-20 * float(turned.square().sum())  # more than rounding
+    scale = float(((turned - middle) * (centres - centre)).sum()) / spread if apart else 1.0
     return scale, rotation, centre - scale * middle
 
 

@@ -44,7 +44,7 @@ def test_cameras_on_a_line_or_in_one_place_are_aligned() -> None:
     for squeezed in (poses, torch.cat([poses[:, :, :3], torch.ones_like(poses[:, :, 3:])], dim=-1)):
         target, scale, turn, _ = moved(squeezed)
         found = align_cameras(squeezed, target)
-        assert math.isclose(found[0], scale) or (found[0] == 1 and squeezed is not poses)
+        assert math.isclose(found[0], scale if squeezed is poses else 1.0)
         torch.testing.assert_close(found[1], turn)
         torch.testing.assert_close(found[0] * squeezed[:, :, 3] @ found[1].T + found[2], target[:, :, 3])
 

@@ -10,6 +10,7 @@ import torch
 
 def ceilings() -> dict[str, float]:
     """What this machine can do at all, measured now with torch, on all threads."""
+
     def best(run: Callable[[], object]) -> float:
         spent = []
         for _ in range(8):

@@ -85,7 +85,9 @@ def _sampled(positions: Tensor, stored: list[list[Tensor]], layout: PlanesLayout
             where = positions[:, list(axes)]
             if len(axes) == 1:
                 where = torch.cat([where, torch.zeros(len(positions), 1)], dim=1)
-            found = grid_sample(image, where[None, None] * 2 - 1, align_corners=True, padding_mode="border")[0, :, 0].t()
+            found = grid_sample(image, where[None, None] * 2 - 1, align_corners=True, padding_mode="border")[
+                0, :, 0
+            ].t()
             product = found if product is None else product * found
         assert product is not None
         groups.append(product)

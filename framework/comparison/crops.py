@@ -49,7 +49,8 @@ def views(folders: Sequence[tuple[str, Path]], count: int = VIEWS) -> list[View]
     """
     names = [{file.name for file in folder.glob("*_comparison.png")} for _, folder in folders]
     shared = sorted(set.intersection(*names)) if names else []
-    chosen = [shared[index * len(shared) // count] for index in range(min(count, len(shared)))]
+    count = min(count, len(shared))
+    chosen = [shared[index * len(shared) // count] for index in range(count)]
     return [view for view in (_view(name, folders) for name in chosen) if view is not None]
 
 

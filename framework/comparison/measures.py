@@ -69,7 +69,10 @@ def measure(job: Job, conditions: Conditions) -> Measured | None:
     results = evaluation["results"]
     points = read_json(job.folder / "learning_curve.json") or []
     curve = tuple((float(point["seconds"]), float(point["psnr"])) for point in points)
-    profile, rungs = read_json(job.folder / "scene_profile.json") or {}, read_json(job.folder / "skip_report.json") or []
+    profile, rungs = (
+        read_json(job.folder / "scene_profile.json") or {},
+        read_json(job.folder / "skip_report.json") or [],
+    )
     return Measured(
         label=job.contender.label,
         method=job.contender.method,
@@ -149,7 +152,7 @@ class Row:
         return None if len(values) < 2 or None in values else stdev(values)
 
     def seconds_to(self, level: int) -> float | None:
-        """Mean seconds to a whole dB; None where a run did not reach it, or had passed it before it was first judged."""
+        """Mean seconds to a whole dB; None where a run did not reach it, or had passed it when it was first judged."""
         values = [run.seconds_to.get(level) for run in self.runs]
         found = [value for value in values if value is not None]
         return fmean(found) if found and len(found) == len(values) else None

@@ -188,7 +188,8 @@ class Plan:
             differing = _differences(_read(path), wanted)
             if differing:
                 raise ConfigError(
-                    f"{self.folder} holds a comparison under other conditions ({differing}); choose another --output-dir"
+                    f"{self.folder} holds a comparison under other conditions ({differing}); "
+                    "choose another --output-dir"
                 )
             return
         try:

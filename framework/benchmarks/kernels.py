@@ -215,12 +215,12 @@ def updating(repeats: int) -> dict[str, object]:
     times: dict[str, list[float]] = {"compiled": [], "reference": []}
     updated = 0
     for name, update in (("compiled", sparse_adam), ("reference", sparse_adam_reference)):
-        state: Any = [torch.zeros(entries, 2), torch.zeros(entries, 2), torch.zeros(entries)]
+        mean, square, uses = torch.zeros(entries, 2), torch.zeros(entries, 2), torch.zeros(entries)
         values = torch.randn(entries, 2)
         for repeat in range(repeats + 1):
             mine = grad.clone()
             start = time.perf_counter()
-            updated = update(values, mine, *state, 1e-2, (0.9, 0.95), 1e-15)
+            updated = update(values, mine, mean, square, uses, 1e-2, (0.9, 0.95), 1e-15)
             if repeat:
                 times[name].append(time.perf_counter() - start)
     return {
@@ -233,8 +233,9 @@ def updating(repeats: int) -> dict[str, object]:
 def ray_generation(model: str, lens: list[float], repeats: int) -> dict[str, object]:
     """Rays through 8192 pixels of photographs of 1600 x 1200 by a lens of the usual strength, ns per ray."""
     torch.manual_seed(0)
-    numbers: Any = [torch.tensor([value]) for value in (1100.0, 1100.0, 800.0, 600.0, 1600, 1200)]
-    cameras = Cameras(torch.eye(4)[None, :3], *numbers, model, torch.tensor([lens]) if lens else None)
+    focal, cx, cy, width, height = (torch.tensor([value]) for value in (1100.0, 800.0, 600.0, 1600, 1200))
+    bent = torch.tensor([lens]) if lens else None
+    cameras = Cameras(torch.eye(4)[None, :3], focal, focal, cx, cy, width, height, model, bent)
     flat = torch.randint(1600 * 1200, (8192,))
     times: dict[str, list[float]] = {"compiled": [], "reference": []}
     for repeat in range(repeats + 1):

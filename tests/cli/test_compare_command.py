@@ -61,7 +61,9 @@ def test_what_cannot_be_compared(flags: tuple[object, ...], reason: str, tmp_pat
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize("recipe", sorted((Path(__file__).parents[2] / "configs").glob("compare-*.yml")), ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    "recipe", sorted((Path(__file__).parents[2] / "configs").glob("compare-*.yml")), ids=lambda path: path.name
+)
 def test_the_standard_comparisons_are_readable(recipe: Path) -> None:
     from framework.cli.compare import CompareFlags, plan_of
     from framework.config import from_plain, read_yaml

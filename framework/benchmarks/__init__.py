@@ -1,1 +1,1 @@
-"""Benchmarks that need nothing but the framework: what its parts are worth where the truth is known."""
+"""Measurements that anybody can repeat: `ns-bench`."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import json
 import math
-import platform
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
@@ -36,7 +35,7 @@ from framework.benchmarks.sampling import (
 )
 from framework.console import console, say
 from framework.device import seed_step, stream_seed
-from framework.kernels import native
+from framework.machine import machine
 from framework.rays import Rays
 from framework.samplers.occupancy import OccupancySampler
 from framework.samplers.proposal import ProposalSampler
@@ -148,17 +147,6 @@ def main(output: Path, plots: Path | None = None, quick: bool = False, seed: int
         for path in draw(curves(rows), plots):
             say(f"drawn: {path}")
     return content
-
-
-def machine() -> dict[str, Any]:
-    """What the figures depend on beside the seed."""
-    return {
-        "kernels": native.variant(),
-        "processor": platform.processor() or platform.machine(),
-        "threads": torch.get_num_threads(),
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-    }
 
 
 # -- the sweep ----------------------------------------------------------------------------------------------------

@@ -12,6 +12,8 @@ from framework.kernels.compositing import composite
 from framework.kernels.math import scale_gradient
 from framework.rays import Rays, Samples
 from framework.samplers.base import Sampler
+from framework.samplers.inverse_cdf import inverse_cdf, uniform_variates
+from framework.samplers.uniform import samples_from_points, stratified_points
 
 
 @dataclass(frozen=True)
@@ -114,3 +116,27 @@ def shade(
     if gradient_factors is not None:
         sigma, rgb = scale_gradient(sigma, gradient_factors), scale_gradient(rgb, gradient_factors)
     return volume_render(rays, samples, sigma, rgb, background)
+
+
+def render_hierarchical(
+    coarse: Field, fine: Field, rays: Rays, background: Tensor, counts: tuple[int, int], jitter: bool
+) -> Rendered:
+    """Stratified samples for one field; for another these, and more where the first found light (NeRF, section 5.2).
+
+    Args:
+        counts: of the stratified samples, and of those drawn.
+    """
+    points = stratified_points(rays, counts[0], jitter)
+    first = _render_points(coarse, rays, points, background)
+    assert first.weights is not None
+    weights = first.weights.view(points.shape).detach()
+    middles = (points[:, 1:] + points[:, :-1]) / 2
+    drawn = inverse_cdf(middles, weights[:, 1:-1], uniform_variates(len(rays), counts[1], jitter, points.device))
+    merged = torch.cat([points, drawn], dim=-1).sort(dim=-1).values
+    return _render_points(fine, rays, merged, background).over(first)
+
+
+def _render_points(field: Field, rays: Rays, points: Tensor, background: Tensor) -> Rendered:
+    samples = samples_from_points(points)
+    samples = samples.evaluated(*field.density(samples.positions(rays), samples.times(rays)))
+    return shade(field, rays, samples, background)

@@ -15,7 +15,7 @@ from framework.encodings import HashGrid
 from framework.fields.deformed import DeformedField
 from framework.fields.encoded import EncodedField
 from framework.fields.nerf import NeRFField
-from framework.renderers import render_field
+from framework.renderers import render_field, render_hierarchical
 from framework.samplers.choice import (
     HierarchicalConfig,
     chosen_sampler,
@@ -24,7 +24,7 @@ from framework.samplers.choice import (
     sampler_decisions,
 )
 from framework.samplers.occupancy import OccupancySampler
-from methods.vanilla_nerf import OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH, render_hierarchical
+from methods.vanilla_nerf import OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH
 
 HASH_SAMPLES_PER_BATCH = 2**14
 """With a hash grid the networks are small, and a step can hold more samples."""

@@ -10,12 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import torch
 from torch import Tensor
 
-from framework import Decision, Field, Method, Model, Rays, Rendered, Scene
+from framework import Decision, Method, Model, Rays, Rendered, Scene
 from framework.fields.nerf import NeRFField
-from framework.renderers import render_field, shade
+from framework.renderers import render_field, render_hierarchical
 from framework.samplers.choice import (
     HierarchicalConfig,
     chosen_sampler,
@@ -23,9 +22,7 @@ from framework.samplers.choice import (
     make_sampler,
     sampler_decisions,
 )
-from framework.samplers.inverse_cdf import inverse_cdf, uniform_variates
 from framework.samplers.occupancy import OccupancySampler
-from framework.samplers.uniform import samples_from_points, stratified_points
 
 OCCUPANCY_SAMPLES_PER_BATCH = 2**12
 """With the occupancy grid the number of samples a ray varies a hundredfold, so the number of rays follows it."""
@@ -105,30 +102,6 @@ class VanillaNeRF(Model[VanillaNeRFConfig]):
     def before_step(self, step: int, progress: float) -> None:
         if self.sampler is not None:
             self.sampler.update(step, self.fine.density)
-
-
-def render_hierarchical(
-    coarse: Field, fine: Field, rays: Rays, background: Tensor, counts: tuple[int, int], jitter: bool
-) -> Rendered:
-    """Stratified samples for one field; for another these, and more where the first found something (section 5.2).
-
-    Args:
-        counts: of the stratified samples, and of those drawn.
-    """
-    points = stratified_points(rays, counts[0], jitter)
-    first = _render_points(coarse, rays, points, background)
-    assert first.weights is not None
-    weights = first.weights.view(points.shape).detach()
-    middles = (points[:, 1:] + points[:, :-1]) / 2
-    drawn = inverse_cdf(middles, weights[:, 1:-1], uniform_variates(len(rays), counts[1], jitter, points.device))
-    merged = torch.cat([points, drawn], dim=-1).sort(dim=-1).values
-    return _render_points(fine, rays, merged, background).over(first)
-
-
-def _render_points(field: Field, rays: Rays, points: Tensor, background: Tensor) -> Rendered:
-    samples = samples_from_points(points)
-    samples = samples.evaluated(*field.density(samples.positions(rays), samples.times(rays)))
-    return shade(field, rays, samples, background)
 
 
 METHOD = Method(VanillaNeRF, VanillaNeRFConfig(), paper="arXiv:2003.08934")

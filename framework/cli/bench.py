@@ -1,4 +1,4 @@
-"""ns-bench: measurements that anybody can repeat, of kernels and of methods."""
+"""ns-bench: measurements that anybody can repeat, of kernels, of sampling, of methods."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ USAGE = """\
 usage: ns-bench WHAT [flags]
 
   kernels       time and error of every compiled kernel against torch, beside what the machine can do at all
+  quadrature    error against field evaluations of every sampler, on scenes whose integral is known
   methods       time to each PSNR of every built-in method, on the embedded scene or on --data
 
 ns-bench WHAT --help shows its flags. Results are JSON, in benchmarks/results unless --output-dir says otherwise.
@@ -35,6 +36,20 @@ class KernelFlags:
     """Instruction sets, each measured in a process of its own, as in avx2 avx512; the fastest if not given."""
     output_dir: Path = RESULTS
     """Where kernels-VARIANT.json goes."""
+
+
+@dataclass(frozen=True)
+class QuadratureFlags:
+    """Error of the rendered colour against field evaluations a ray, for every sampler, where the truth is known."""
+
+    quick: bool = False
+    """Fewer rays and counts: a minute instead of ten."""
+    seed: int = 0
+    """Of rays, jitter and proposals."""
+    output_dir: Path = RESULTS
+    """Where quadrature.json goes."""
+    plot_dir: Path | None = None
+    """Where pictures of the curves go; none if not given."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +102,13 @@ def _kernels(flags: KernelFlags) -> None:
         _write(flags.output_dir / f"kernels-{native.variant()}.json", measure(flags.samples, flags.repeats))
 
 
+def _quadrature(flags: QuadratureFlags) -> None:
+    from framework.benchmarks.quadrature import main as quadrature
+
+    flags.output_dir.mkdir(parents=True, exist_ok=True)
+    quadrature(flags.output_dir / "quadrature.json", flags.plot_dir, flags.quick, flags.seed)
+
+
 def _methods(flags: MethodFlags) -> None:
     from framework.benchmarks.methods import published, standard_plan
     from framework.cli.compare import compare
@@ -102,6 +124,7 @@ def _methods(flags: MethodFlags) -> None:
 
 KINDS: dict[str, tuple[type, Any]] = {
     "kernels": (KernelFlags, _kernels),
+    "quadrature": (QuadratureFlags, _quadrature),
     "methods": (MethodFlags, _methods),
 }
 

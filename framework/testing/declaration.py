@@ -26,10 +26,10 @@ def check_config(subject: Subject) -> str:
         written = yaml.safe_dump(to_plain(before))
         after = from_plain(subject.method.config, yaml.safe_load(written), "config.yml")
         if after != before:
-            lost = [f.name for f in fields(before) if getattr(after, f.name, None) != getattr(before, f.name)]
+            lost = [f.name for f in fields(before) if getattr(after, f.name) != getattr(before, f.name)]
             raise Fault(
-                f"{what} do not survive config.yml ({', '.join(lost) or type(before).__name__}); a setting is a number, "
-                "a string, a bool, a Path, a Literal, a tuple of those, or a dataclass of those"
+                f"{what} do not survive config.yml ({', '.join(lost) or type(before).__name__}); a setting is a bool, "
+                "a number, a string, a Path, a Literal, a tuple of those, or a dataclass of those"
             )
     return f"{len(fields(config))} settings survive config.yml"
 

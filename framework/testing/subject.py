@@ -18,7 +18,7 @@ from framework.config import TrainConfig
 from framework.dataset import Dataset
 from framework.device import seed_step
 from framework.model import Method, Model
-from framework.pixels import Batch, background_colors, draw_batch, gather_batch
+from framework.pixels import Background, Batch, background_colors, draw_batch, gather_batch
 from framework.rays import Rays
 from framework.renderers import Rendered
 from framework.testing.finding import Fault
@@ -54,6 +54,7 @@ class Learner:
         """Steps taken."""
         self.history: list[float] = []
         """The loss before each."""
+        self.moves = False
 
     @cached_property
     def optimizer(self) -> Adam:
@@ -65,9 +66,13 @@ class Learner:
     def batch(self, places: Tensor = CENTER) -> Batch:
         """The pixels of the next step, each seen through `places` (K, 2)."""
         seed_step(SEED, self.done)
-        alpha, chosen = self.dataset.scene.has_alpha, self.config.background
-        background = ("random" if alpha else "black") if chosen == "auto" else chosen
-        return draw_batch(self.dataset, min(self.config.num_rays_per_batch, RAYS), background, places=places)
+        count = min(self.config.num_rays_per_batch, RAYS)
+        return draw_batch(self.dataset, count, self._background(), places=places)
+
+    def _background(self) -> Background:
+        if self.config.background != "auto":
+            return self.config.background
+        return "random" if self.dataset.scene.has_alpha else "black"
 
     def rendered(self, rays: Rays, background: Tensor) -> Rendered:
         """The picture of rays as the next step sees it."""
@@ -94,14 +99,16 @@ class Learner:
         """Leave the gradients of the losses' sum where the optimiser finds them."""
         loss = total(losses)
         self.optimizer.zero_grad()
-        if loss.requires_grad:
+        self.moves = loss.requires_grad  # not where every ray meets nothing
+        if self.moves:
             loss.backward()
         self.history.append(float(loss.detach()))
 
     def descend(self) -> None:
-        """The optimiser's step, by the gradients that are there."""
+        """The second half: the optimiser's step, where there are gradients."""
         set_learning_rate(self.optimizer, self.config, self.done, self.done / BUDGET)
-        self.optimizer.step()
+        if self.moves:
+            self.optimizer.step()
         self.done += 1
 
     # -- looking ----------------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ class Check:
     name: str
     """What findings call it."""
     run: Callable[[Subject], str]
-    """Says in a line what it found. Raises: Fault, or whatever the method raises, where that is wrong."""
+    """Says in a line what it found; raises Fault, or lets through what the method raises, where that is wrong."""
     needs: tuple[str, ...] = ()
     """Checks without which it would only find again what they have found."""
 
@@ -83,4 +83,5 @@ def assert_method(method: Method, name: str = "the method", config: TrainConfig 
     Raises: AssertionError that lists all that is wrong.
     """
     failed = [finding for finding in check_method(method, name, config) if not finding.ok]
-    assert not failed, "\n".join([f"{name} fails {len(failed)} checks:", *(finding.line() for finding in failed)])
+    if failed:
+        raise AssertionError("\n".join([f"{name} fails {len(failed)} checks:", *(f.line() for f in failed)]))

@@ -24,9 +24,11 @@ CHUNK = 100
 def check_build(subject: Subject) -> str:
     """`model(config, scene)` makes a Model with something to learn, whatever the scene."""
 
+    model = subject.method.model
+    if not (isinstance(model, type) and issubclass(model, Model)):
+        raise Fault(f"{model!r} does not derive from framework.Model")
+
     def look(learner: Learner) -> None:
-        if not isinstance(learner.model, Model):
-            raise Fault(f"{type(learner.model).__name__} does not derive from framework.Model")
         if not any(parameter.requires_grad for parameter in learner.model.parameters()):
             raise Fault(f"{subject.name} has nothing to learn: no torch.nn.Parameter, and no module with any")
 
@@ -48,7 +50,8 @@ def check_render(subject: Subject) -> str:
 
 def require_rendered(rendered: Rendered, count: int, when: str) -> None:
     """Raises: Fault where a picture of `count` rays lacks something."""
-    shapes = {"rgb": (count, 3), "depth": (count,), "median_depth": (count,), "accumulation": (count,)}
+    shapes: dict[str, tuple[int, ...]] = {"rgb": (count, 3)}
+    shapes |= {name: (count,) for name in ("depth", "median_depth", "accumulation")}
     values = {name: getattr(rendered, name) for name in shapes}
     if rendered.normals is not None:
         shapes["normals"], values["normals"] = (count, 3), rendered.normals

@@ -1,0 +1,96 @@
+"""ns-new-method: what it writes is a method, and what it refuses."""
+
+import ast
+import dataclasses
+import importlib
+from pathlib import Path
+
+import pytest
+
+from framework.cli.new_method import TEMPLATES, check_name, main, package_of
+from framework.errors import ConfigError
+from framework.testing import assert_method
+from tests.conftest import Refused
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "examples" / "plugin-method"
+IGNORED = {"__pycache__", ".pytest_cache", "build"}
+
+
+def files(folder: Path) -> dict[str, str]:
+    """What a folder holds, less what Python leaves there."""
+    found = (path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
+    kept = (path for path in found if not any(p in IGNORED or p.endswith(".egg-info") for p in path.parts))
+    return {path.as_posix(): (folder / path).read_text(encoding="utf-8") for path in kept}
+
+
+def test_the_example_is_what_the_command_writes() -> None:
+    """To renew it: rm -r examples/plugin-method; ns-new-method dense-grid --dir examples/plugin-method"""
+    assert files(EXAMPLE) == package_of("dense-grid")
+
+
+def test_it_writes_a_package_and_says_how_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["ns-new-method", "my-3d-grid"])
+    main()
+    said = capsys.readouterr().out
+    for command in ("pip install -e my-3d-grid", "ns-train my-3d-grid ", "pytest my-3d-grid"):
+        assert command in said
+    written = files(tmp_path / "my-3d-grid")
+    assert set(written) == {"README.md", "pyproject.toml", "src/my_3d_grid.py", "tests/test_method.py"}
+    assert not any("$" in content for content in written.values())
+    project = written["pyproject.toml"]
+    assert 'name = "nerfloom-my-3d-grid"' in project
+    assert '[project.entry-points."nerfloom.methods"]\nmy-3d-grid = "my_3d_grid:METHOD"' in project
+    source = written["src/my_3d_grid.py"]
+    assert len(source.splitlines()) <= 150
+    assert {"My3dGridConfig", "My3dGridField", "My3dGridModel"} == {
+        node.name for node in ast.parse(source).body if isinstance(node, ast.ClassDef)
+    }
+
+
+def test_no_class_hides_what_it_imports() -> None:
+    """Whatever the name: what the file defines ends in what it does not import."""
+    (template,) = (TEMPLATES / "src").iterdir()
+    tree = ast.parse(template.read_text(encoding="utf-8").replace("${Class}", "Any").replace("$", ""))
+    imported = {alias.name for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names}
+    defined = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
+    assert len(defined) == 3
+    for name in defined:
+        ending = name.removeprefix("Any")
+        assert not [other for other in imported if other.endswith(ending) and other != ending]
+
+
+def test_what_it_writes_keeps_what_every_method_must(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(EXAMPLE / "src"))
+    method = importlib.import_module("dense_grid").METHOD
+    small = dataclasses.replace(method.config, max_resolution=32, grid_resolution=32, num_steps=64)
+    assert_method(method, "dense-grid", small)
+
+
+@pytest.mark.parametrize("name", ["My-Method", "my_method", "3d", "-x", "x-", "x--y", "", "grid.py", "../x", "ünder"])
+def test_names_that_are_none(name: str) -> None:
+    with pytest.raises(ConfigError, match="is no method's name"):
+        check_name(name)
+
+
+def test_names_that_are_taken() -> None:
+    with pytest.raises(ConfigError, match="there is a method 'instant-ngp' already"):
+        check_name("instant-ngp")
+    for name in ("lambda", "torch", "framework", "json"):
+        with pytest.raises(ConfigError, match=f"the method's module would be '{name}'"):
+            check_name(name)
+    check_name("my-method-2")
+
+
+def test_nothing_is_overwritten(tmp_path: Path, refused: Refused) -> None:
+    (tmp_path / "file").write_text("mine")
+    for folder in (tmp_path, tmp_path / "file"):
+        assert "is there already, and nothing is overwritten" in refused(main, "my-method", "--dir", folder)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    assert (tmp_path / "file").read_text() == "mine"
+    below = tmp_path / "file" / "deeper"
+    assert "cannot write" in refused(main, "my-method", "--dir", below)
+    assert "the method's name comes first" in refused(main, "--dir", tmp_path / "new")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -86,6 +86,9 @@ class ParsedScene:
 
 class DataParser(ABC):
     """A data format. Subclasses are frozen dataclasses whose fields are the format's flags."""
+
+    interface: ClassVar[int] = 1
+    """The version of the plugin interface it was written for (`registry.INTERFACE`)."""
 
     @classmethod
     @abstractmethod

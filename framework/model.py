@@ -123,3 +123,5 @@ class Method:
     """Default settings."""
     paper: str
     """Where it was published."""
+    interface: int = 1
+    """The version of the plugin interface it was written for (`registry.INTERFACE`)."""

@@ -7,17 +7,27 @@ Built-in and third-party ones are registered alike, by entry points of the insta
 
     [project.entry-points."nerfloom.dataparsers"]
     my-format = "my_package.my_format:MyFormat"    # a framework.DataParser
+
+What is not installed is registered by the environment, for a shell's or a script's lifetime:
+
+    NERFLOOM_METHODS="my-method=my_file:METHOD,other=..."  NERFLOOM_DATAPARSERS="my-format=my_file:MyFormat"
 """
 
 from __future__ import annotations
 
 import ast
 import importlib.util
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib import import_module
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from framework.console import say
+from framework.elsewhere import ELSEWHERE
 from framework.errors import ConfigError, DataError, nearest
 
 if TYPE_CHECKING:
@@ -25,32 +35,69 @@ if TYPE_CHECKING:
     from framework.model import Method
 
 Kind = Literal["methods", "dataparsers"]
+INTERFACE = 1
+"""Version of what plugins rely on (docs/plugins.md). A change that breaks them raises it."""
+OLDEST_INTERFACE = 1
+"""The oldest version that still works."""
+VARIABLES = {"methods": "NERFLOOM_METHODS", "dataparsers": "NERFLOOM_DATAPARSERS"}
+CALLED = {"methods": "method", "dataparsers": "data format"}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What stands behind a name."""
+
+    name: str
+    module: str
+    attribute: str
+    package: str
+    """The distribution that registers it, or the environment variable."""
+    problem: str | None = None
+    """Why it cannot be used, where that is known before it is imported."""
 
 
 @cache
-def registered(kind: Kind) -> dict[str, EntryPoint]:
-    """Entry points by name.
+def registered(kind: Kind) -> dict[str, Entry]:
+    """Entries by name. One that two packages register for different things stays, with a `problem`.
 
-    Raises: ConfigError where two packages register the same name for different things.
+    Raises: ConfigError where the environment variable cannot be read.
     """
-    found: dict[str, EntryPoint] = {}
-    for entry in entry_points(group=f"nerfloom.{kind}"):
+    found: dict[str, Entry] = {}
+    for entry in (*_installed(kind), *_of_environment(kind)):
         other = found.setdefault(entry.name, entry)
-        if other.value != entry.value:
-            packages = " and ".join(e.dist.name if e.dist else e.value for e in (other, entry))
-            raise ConfigError(f"'{entry.name}' is registered by both {packages}; uninstall one of them")
+        if (other.module, other.attribute) != (entry.module, entry.attribute):
+            both = f"it is registered by both {other.package} and {entry.package}; uninstall or rename one of them"
+            found[entry.name] = replace(other, problem=both)
     return dict(sorted(found.items()))
 
 
-def summary(entry: EntryPoint) -> str:
-    """The first line of the docstring of the module behind an entry point, read without importing it."""
+def _installed(kind: Kind) -> Iterator[Entry]:
+    for point in entry_points(group=f"nerfloom.{kind}"):
+        package = point.dist.name if point.dist else point.module
+        yield Entry(point.name, point.module, point.attr or "", package)
+
+
+def _of_environment(kind: Kind) -> Iterator[Entry]:
+    variable = VARIABLES[kind]
+    for item in filter(None, (part.strip() for part in os.environ.get(variable, "").split(","))):
+        name, _, value = (part.strip() for part in item.partition("="))
+        module, _, attribute = value.partition(":")
+        if not (name and module and attribute):
+            raise ConfigError(f"{variable} holds '{item}'; it must be name=module:attribute, several with commas")
+        yield Entry(name, module, attribute, variable)
+
+
+def summary(entry: Entry) -> str:
+    """The first line of the docstring of the module behind an entry, read without importing it; or what is wrong."""
+    if entry.problem is not None:
+        return f"({entry.problem})"
     path = _source(entry.module)
     if path is None:
-        return "(its module was not found)"
+        return f"(its module {entry.module} was not found; it comes with {entry.package})"
     try:
         docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
-    except (OSError, SyntaxError, ValueError):
-        return "(its module cannot be read)"
+    except (OSError, SyntaxError, ValueError) as error:
+        return f"(its module {path} cannot be read: {type(error).__name__}; it comes with {entry.package})"
     return (docstring or "").split("\n")[0]
 
 
@@ -73,41 +120,73 @@ def _source(module: str) -> Path | None:
     return None
 
 
-def _load(kind: Kind, name: str) -> Any:
+def entry_of(kind: Kind, name: str) -> Entry:
+    """What a name is registered for.
+
+    Raises: ConfigError for an unknown name, with the nearest, or with where a known method lives that is not ours.
+    """
     known = registered(kind)
-    singular = "method" if kind == "methods" else "data format"
-    if name not in known:
-        raise ConfigError(f"unknown {singular} '{name}'. {nearest(name, known)}")
-    entry = known[name]
+    if name in known:
+        return known[name]
+    if kind == "methods" and name in ELSEWHERE:
+        raise ConfigError(f"Nerfloom has no method '{name}': {ELSEWHERE[name]}")
+    raise ConfigError(f"unknown {CALLED[kind]} '{name}'. {nearest(name, known)}")
+
+
+def _load(kind: Kind, name: str) -> Any:
+    entry = entry_of(kind, name)
+    what = f"{CALLED[kind]} '{name}' of {entry.package}"
+    if entry.problem is not None:
+        raise ConfigError(f"{CALLED[kind]} '{name}' cannot be used: {entry.problem}")
     try:
-        return entry.load()
-    except Exception as error:
-        package = entry.dist.name if entry.dist else entry.module
-        raise ConfigError(
-            f"{singular} '{name}' of package {package} cannot be loaded: {type(error).__name__}: {error}"
-        ) from error
+        loaded = import_module(entry.module)
+        for part in entry.attribute.split("."):
+            loaded = getattr(loaded, part)
+    except (Exception, SystemExit) as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise ConfigError(f"{what} cannot be loaded: {reason}") from error
+    interface = getattr(loaded, "interface", INTERFACE)
+    if not isinstance(interface, int) or not OLDEST_INTERFACE <= interface <= INTERFACE:
+        newer = isinstance(interface, int) and interface > INTERFACE
+        remedy = "upgrade nerfloom" if newer else f"upgrade {entry.package}"
+        raise ConfigError(f"{what} was written for plugin interface {interface}, and this is {INTERFACE}; {remedy}")
+    return loaded
 
 
 def load_method(name: str) -> Method:
     """Import a method by name.
 
-    Raises: ConfigError for an unknown name, or where its module cannot be imported.
+    Raises: ConfigError for an unknown name, where its module cannot be imported, or where it is no method of this
+        plugin interface.
     """
-    method: Method = _load("methods", name)
+    from framework.model import Method
+
+    method = _load("methods", name)
+    if not isinstance(method, Method):
+        entry = entry_of("methods", name)
+        raise ConfigError(f"method '{name}': {entry.module}:{entry.attribute} is no framework.Method")
     return method
 
 
 def load_dataparser(name: str) -> type[DataParser]:
     """Import a data format by name.
 
-    Raises: ConfigError for an unknown name, or where its module cannot be imported.
+    Raises: ConfigError for an unknown name, where its module cannot be imported, or where it is no data format of this
+        plugin interface.
     """
-    parser: type[DataParser] = _load("dataparsers", name)
+    from framework.dataset import DataParser
+
+    parser = _load("dataparsers", name)
+    if not (isinstance(parser, type) and issubclass(parser, DataParser)):
+        entry = entry_of("dataparsers", name)
+        raise ConfigError(f"data format '{name}': {entry.module}:{entry.attribute} is no framework.DataParser")
     return parser
 
 
 def recognize(path: Path | None) -> str:
     """The name of the data format of a folder; the embedded scene for None.
+
+    Formats that cannot be loaded are reported and left out.
 
     Raises: DataError where the folder is missing, or none or several formats recognise it.
     """
@@ -115,10 +194,23 @@ def recognize(path: Path | None) -> str:
         return "procedural"
     if not path.is_dir():
         raise DataError(f"--data {path}: there is no such folder")
-    matches = [name for name in registered("dataparsers") if load_dataparser(name).recognizes(path)]
+    matches = [name for name in registered("dataparsers") if _recognizes(name, path)]
     if len(matches) == 1:
         return matches[0]
     known = ", ".join(registered("dataparsers"))
     if not matches:
         raise DataError(f"--data {path}: no known data format is found there. Known: {known}")
     raise DataError(f"--data {path}: could be {' or '.join(matches)}; name one after the flags, as in '{matches[0]}'")
+
+
+def _recognizes(name: str, path: Path) -> bool:
+    try:
+        parser = load_dataparser(name)
+    except ConfigError as error:
+        say(f"warning: {error}; it is left out")
+        return False
+    try:
+        return parser.recognizes(path)
+    except Exception as error:  # it should not raise, but another's mistake must not stop everyone
+        say(f"warning: data format '{name}' failed to look at {path}: {type(error).__name__}: {error}; it is left out")
+        return False

@@ -1,13 +1,15 @@
 """Names of methods and formats: lazy, and honest about what is broken."""
 
+import re
 import subprocess
 import sys
-from importlib.metadata import EntryPoint
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from framework import registry
+from framework.elsewhere import ELSEWHERE
 from framework.errors import ConfigError, DataError
 
 BUILT_IN = {"dnerf", "instant-ngp", "kplanes", "tensorf", "vanilla-nerf"}
@@ -44,30 +46,116 @@ def test_unknown_names_get_the_nearest() -> None:
         registry.load_dataparser("xyz")
 
 
-def entry(name: str, value: str) -> EntryPoint:
-    return EntryPoint(name, value, "nerfloom.methods")
+@pytest.fixture
+def environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Callable[..., Path]]:
+    """Write modules into a folder of the path, and register what the variables say."""
 
-
-def test_a_broken_plugin_is_named_and_the_rest_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    (tmp_path / "broken_plugin.py").write_text('"""Never loads."""\nraise RuntimeError("no such luck")\n')
-    monkeypatch.syspath_prepend(str(tmp_path))
-    known = {**registry.registered("methods"), "broken": entry("broken", "broken_plugin:METHOD")}
-    monkeypatch.setattr(registry, "registered", lambda kind: known)
-    assert registry.summary(known["broken"]) == "Never loads."
-    with pytest.raises(ConfigError, match="'broken' of package broken_plugin cannot be loaded: RuntimeError: no such"):
-        registry.load_method("broken")
-    assert registry.load_method("instant-ngp").paper
-    assert registry.summary(entry("gone", "no_such_module_at_all:X")) == "(its module was not found)"
-
-
-def test_two_packages_with_one_name_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "entry_points", lambda group: [entry("a", "one:X"), entry("a", "two:X")])
-    registry.registered.cache_clear()
-    try:
-        with pytest.raises(ConfigError, match="'a' is registered by both one:X and two:X"):
-            registry.registered("methods")
-    finally:
+    def register(modules: dict[str, str] | None = None, **variables: str) -> Path:
+        for name, text in (modules or {}).items():
+            (tmp_path / f"{name}.py").write_text(text)
+        monkeypatch.syspath_prepend(str(tmp_path))
+        for name, value in variables.items():
+            monkeypatch.setenv(f"NERFLOOM_{name.upper()}", value)
         registry.registered.cache_clear()
+        return tmp_path
+
+    yield register
+    registry.registered.cache_clear()
+
+
+def test_a_broken_plugin_is_named_and_the_rest_goes_on(environment: Callable[..., Path]) -> None:
+    modules = {
+        "broken_plugin": '"""Never loads."""\nraise RuntimeError("no such luck")\n',
+        "leaving_plugin": '"""Leaves."""\nimport sys\nsys.exit(3)\n',
+        "unreadable_plugin": "def (:\n",
+        "wrong_plugin": '"""A number."""\nMETHOD = 3\n',
+    }
+    names = ["broken", "leaving", "unreadable", "wrong"]
+    listed = ", ".join(f"{name}={name}_plugin:METHOD" for name in names) + ",gone=no_such_module_at_all:X"
+    environment(modules, methods=listed)
+    known = registry.registered("methods")
+    assert registry.summary(known["broken"]) == "Never loads."
+    assert "no_such_module_at_all was not found; it comes with NERFLOOM_METHODS" in registry.summary(known["gone"])
+    assert "cannot be read: SyntaxError" in registry.summary(known["unreadable"])
+    for name, reason in (
+        ("broken", "method 'broken' of NERFLOOM_METHODS cannot be loaded: RuntimeError: no such luck"),
+        ("leaving", "cannot be loaded: SystemExit: 3"),
+        ("unreadable", "cannot be loaded: SyntaxError"),
+        ("gone", "cannot be loaded: ModuleNotFoundError"),
+        ("wrong", "wrong_plugin:METHOD is no framework.Method"),
+    ):
+        with pytest.raises(ConfigError, match=re.escape(reason)):
+            registry.load_method(name)
+    assert registry.load_method("instant-ngp").paper
+
+
+METHOD_FILE = '''"""A method of the environment."""
+from dataclasses import replace
+from methods.instant_ngp import METHOD as NGP
+METHOD = replace(NGP, paper="none", interface={interface})
+'''
+
+
+def test_methods_of_the_environment_and_their_interface(environment: Callable[..., Path]) -> None:
+    modules = {
+        "env_plugin": METHOD_FILE.format(interface=registry.INTERFACE),
+        "newer_plugin": METHOD_FILE.format(interface=registry.INTERFACE + 1),
+        "older_plugin": METHOD_FILE.format(interface=registry.OLDEST_INTERFACE - 1),
+    }
+    environment(modules, methods="mine = env_plugin:METHOD ,newer=newer_plugin:METHOD,older=older_plugin:METHOD,")
+    assert registry.load_method("mine").paper == "none"
+    assert registry.summary(registry.registered("methods")["mine"]) == "A method of the environment."
+    with pytest.raises(ConfigError, match=r"'newer' .* plugin interface 2, and this is 1; upgrade nerfloom"):
+        registry.load_method("newer")
+    with pytest.raises(ConfigError, match=r"'older' .* plugin interface 0, and this is 1; upgrade NERFLOOM_METHODS"):
+        registry.load_method("older")
+
+
+@pytest.mark.parametrize("value", ["nonsense", "a=b", "=b:c", "a=:c", "a=b:"])
+def test_an_unreadable_variable_is_told(environment: Callable[..., Path], value: str) -> None:
+    environment(methods=value)
+    with pytest.raises(ConfigError, match=f"NERFLOOM_METHODS holds '{value}'; it must be name=module:attribute"):
+        registry.registered("methods")
+
+
+def test_two_packages_with_one_name_are_refused_and_the_rest_goes_on(
+    environment: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    environment(methods="instant-ngp=other_module:METHOD,kplanes=methods.kplanes:METHOD")
+    both = "it is registered by both nerfloom and NERFLOOM_METHODS; uninstall or rename one of them"
+    assert registry.summary(registry.registered("methods")["instant-ngp"]) == f"({both})"
+    with pytest.raises(ConfigError, match=f"method 'instant-ngp' cannot be used: {both}"):
+        registry.load_method("instant-ngp")
+    assert registry.load_method("kplanes").paper  # named twice, but for the same thing
+
+
+def test_methods_that_live_elsewhere(environment: Callable[..., Path]) -> None:
+    with pytest.raises(ConfigError, match=r"no method 'splatfacto': .*pip install nerfstudio, ns-train splatfacto"):
+        registry.load_method("splatfacto")
+    assert not set(ELSEWHERE) & set(registry.registered("methods"))
+    environment({"env_plugin": METHOD_FILE.format(interface=1)}, methods="splatfacto=env_plugin:METHOD")
+    assert registry.load_method("splatfacto").paper == "none"
+
+
+FORMAT_FILE = '''"""A data format that looks at nothing without failing."""
+from dataparsers.procedural import Procedural
+class Format(Procedural):
+    @classmethod
+    def recognizes(cls, path):
+        raise OSError("the disk is on fire")
+'''
+
+
+def test_formats_that_fail_do_not_stop_others(
+    environment: Callable[..., Path], shared_tiny: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    modules = {"burning": FORMAT_FILE, "broken_format": "raise RuntimeError('never')\n"}
+    environment(modules, dataparsers="burning=burning:Format,never=broken_format:X")
+    assert registry.recognize(shared_tiny) == "blender"
+    printed = capsys.readouterr()
+    assert "data format 'burning' failed to look at" in printed.out + printed.err
+    assert "the disk is on fire; it is left out" in (printed.out + printed.err).replace("\n", " ")
+    assert "data format 'never' of NERFLOOM_DATAPARSERS cannot be loaded" in (printed.out + printed.err)
 
 
 def test_recognition(shared_tiny: Path, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from framework.errors import DataError
 from framework.evaluation.evaluator import evaluate
 from framework.pixel_cache import PixelMemory
 from framework.training.checkpoint import FOLDER, load_newest
-from framework.training.report import write_evaluation
+from framework.training.report import write_evaluation, write_summary
 from framework.training.run import Run, create_folder, write_json, write_transforms
 from framework.training.skipping import as_plain, skip_report
 from framework.training.trainer import Trainer
@@ -68,6 +68,7 @@ def _finish(run: Run, trainer: Trainer) -> None:
     for rung in rungs:
         say(rung.line())
     write_json(run.folder / "skip_report.json", as_plain(rungs))
+    write_summary(trainer, outcome)
     say(f"checkpoint: {outcome.checkpoint}")
     if outcome.interrupted:
         say(f"continue with: ns-train --resume {run.folder}")

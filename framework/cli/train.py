@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from framework.cli.common import run_command
-from framework.errors import ConfigError, nearest
-from framework.registry import registered, summary
+from framework.errors import ConfigError
+from framework.registry import entry_of, registered, summary
 
 if TYPE_CHECKING:
     from framework.training.run import Run
@@ -74,8 +74,7 @@ def _default_run(method: str) -> Run:
     """A method with its default settings, its data not known yet."""
     if method.startswith("-"):
         raise ConfigError(f"the method comes first, before {method}; ns-train --help lists them")
-    if method not in registered("methods"):
-        raise ConfigError(f"unknown method '{method}'. {nearest(method, registered('methods'))}")
+    entry_of("methods", method)  # a name that is unknown is told before anything heavy is imported
     from framework.registry import load_dataparser, load_method
     from framework.training.run import Run
 
@@ -108,8 +107,7 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
         return_unknown_args=True,
     )
     if (word := _stray_word(unknown)) is not None:
-        if word not in registered("dataparsers"):
-            raise ConfigError(f"unknown data format '{word}'. {nearest(word, registered('dataparsers'))}")
+        entry_of("dataparsers", word)
         named, flags = word, _without(flags, word)
     elif not run.dataparser or looked.data != run.config.data:
         named = recognize(looked.data)

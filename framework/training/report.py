@@ -1,11 +1,16 @@
-"""The evaluation's file, with nerfstudio's keys."""
+"""A run's files about how it went: the evaluation's, with nerfstudio's keys, and the training's."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from framework.device import peak_memory
 from framework.evaluation.evaluator import Evaluation
+from framework.machine import machine
 from framework.training.run import Run, write_json
+from framework.training.trainer import Outcome, Trainer
+
+SUMMARY = "summary.json"
 
 
 def write_evaluation(path: Path, run: Run, checkpoint: Path, found: Evaluation) -> None:
@@ -22,5 +27,26 @@ def write_evaluation(path: Path, run: Run, checkpoint: Path, found: Evaluation) 
             "results": found.results,
             "lpips": found.lpips_note,
             "per_image": found.per_image,
+        },
+    )
+
+
+def write_summary(trainer: Trainer, outcome: Outcome) -> None:
+    """summary.json: how long training took, what it used, and on which machine."""
+    state = trainer.state
+    write_json(
+        trainer.run.folder / SUMMARY,
+        {
+            "method": trainer.run.method,
+            "stopped": outcome.reason,
+            "interrupted": outcome.interrupted,
+            "steps": state.step,
+            "seconds": state.seconds,
+            "rays": state.rays,
+            "rays_per_second": state.rays / max(state.seconds, 1e-9),
+            "skipped_steps": state.skipped,
+            "peak_memory_bytes": peak_memory(trainer.device),
+            "parameters": trainer.model.size(),
+            "machine": machine(trainer.device),
         },
     )

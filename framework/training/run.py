@@ -7,6 +7,7 @@ outputs/{experiment}/{method}/{YYYY-mm-dd_HHMMSS}/
     scene_profile.json            what the scene needs and what was decided by it
     learning_curve.json           seconds, step, PSNR
     skip_report.json              what was skipped, and what that saved
+    summary.json                  steps, seconds, rays, memory, parameters, and the machine
     eval.json, pictures/          the final evaluation
     events.out.tfevents.*         TensorBoard
 """

@@ -7,7 +7,6 @@ import os
 import signal
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
@@ -191,7 +190,7 @@ METHOD = Method(Sick, SickConfig(), paper="none")
 
 @pytest.fixture
 def sick(monkeypatch: pytest.MonkeyPatch) -> None:
-    entry = EntryPoint("sick", "tests.training.test_trainer:METHOD", "nerfloom.methods")
+    entry = registry.Entry("sick", "tests.training.test_trainer", "METHOD", "the tests")
     known = {**registry.registered("methods"), "sick": entry}
     monkeypatch.setattr(registry, "registered", lambda kind: known)
 

@@ -1,29 +1,26 @@
 """Time per sample and error of each compiled kernel against its torch reference, in one process, in alternating runs.
 
-    python benchmarks/kernels.py [--samples N] [--repeats K]
-
-writes benchmarks/results/kernels-VARIANT.json with the machine, its measured ceilings and versions. Times are medians;
-the speed-up is the median of the ratios of neighbouring runs, which a machine whose speed drifts disturbs least.
-NERFLOOM_KERNELS=avx2 in the environment forces that variant.
+Times are medians; the speed-up is the median of the ratios of neighbouring runs, which a machine whose speed drifts
+disturbs least. NERFLOOM_KERNELS=avx2 in the environment forces that variant.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import platform
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 from statistics import median
+from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
+from framework.benchmarks.ceilings import ceilings
+from framework.benchmarks.plane_lookups import layouts, plane_lookup
 from framework.cameras import Cameras
+from framework.console import say
+from framework.errors import ConfigError
 from framework.kernels import native
 from framework.kernels.adam import sparse_adam, sparse_adam_reference
 from framework.kernels.compositing import composite, composite_reference
@@ -31,11 +28,10 @@ from framework.kernels.frequency import frequency_encoding, frequency_encoding_r
 from framework.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
 from framework.kernels.march import March, Occupancy, ReferenceMarch
 from framework.kernels.mlp import mlp, mlp_reference
-from framework.kernels.planes import PlanesLayout, planes, planes_reference
 from framework.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
+from framework.machine import machine
 from framework.rays import Rays, Samples
 
-RESULTS = Path(__file__).parent / "results"
 BOX = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
 
 
@@ -132,10 +128,10 @@ def _like(samples: Samples, values: Tensor) -> Samples:
     return Samples(samples.t_starts.to(values), samples.t_ends.to(values), samples.offsets)
 
 
-def timed(row: Row, repeats: int) -> dict[str, object]:
+def timed(row: Row, repeats: int, all_threads: int) -> dict[str, object]:
     """Forward alone and forward with backward, compiled and reference in turn, on 1 thread and on all."""
     out: dict[str, object] = {"kernel": row.name, "samples": row.samples}
-    for threads in sorted({1, native_threads}):
+    for threads in sorted({1, all_threads}):
         torch.set_num_threads(threads)
         times: dict[str, list[float]] = {}
         for repeat in range(repeats + 1):
@@ -219,12 +215,12 @@ def updating(repeats: int) -> dict[str, object]:
     times: dict[str, list[float]] = {"compiled": [], "reference": []}
     updated = 0
     for name, update in (("compiled", sparse_adam), ("reference", sparse_adam_reference)):
-        state = [torch.zeros(entries, 2), torch.zeros(entries, 2), torch.zeros(entries)]
+        mean, square, uses = torch.zeros(entries, 2), torch.zeros(entries, 2), torch.zeros(entries)
         values = torch.randn(entries, 2)
         for repeat in range(repeats + 1):
             mine = grad.clone()
             start = time.perf_counter()
-            updated = update(values, mine, *state, 1e-2, (0.9, 0.95), 1e-15)
+            updated = update(values, mine, mean, square, uses, 1e-2, (0.9, 0.95), 1e-15)
             if repeat:
                 times[name].append(time.perf_counter() - start)
     return {
@@ -237,8 +233,9 @@ def updating(repeats: int) -> dict[str, object]:
 def ray_generation(model: str, lens: list[float], repeats: int) -> dict[str, object]:
     """Rays through 8192 pixels of photographs of 1600 x 1200 by a lens of the usual strength, ns per ray."""
     torch.manual_seed(0)
-    numbers = [torch.tensor([value]) for value in (1100.0, 1100.0, 800.0, 600.0, 1600, 1200)]
-    cameras = Cameras(torch.eye(4)[None, :3], *numbers, model, torch.tensor([lens]) if lens else None)
+    focal, cx, cy, width, height = (torch.tensor([value]) for value in (1100.0, 800.0, 600.0, 1600, 1200))
+    bent = torch.tensor([lens]) if lens else None
+    cameras = Cameras(torch.eye(4)[None, :3], focal, focal, cx, cy, width, height, model, bent)
     flat = torch.randint(1600 * 1200, (8192,))
     times: dict[str, list[float]] = {"compiled": [], "reference": []}
     for repeat in range(repeats + 1):
@@ -254,147 +251,40 @@ def ray_generation(model: str, lens: list[float], repeats: int) -> dict[str, obj
     }
 
 
-def plane_lookup(name: str, layout: PlanesLayout, features: int, count: int, repeats: int) -> dict[str, object]:
-    """Factorised features against `grid_sample` on planes (1, F, H, W) of its own, as K-Planes' code has them."""
-    torch.manual_seed(0)
-    positions = torch.rand(count, layout.dims)
-    table = torch.rand(layout.num_entries, features) + 0.5
-    weight = torch.randn(count, layout.num_groups * features)
-
-    def sampled(x: Tensor, planes_: list[list[Tensor]]) -> Tensor:
-        groups = []
-        for factors, stored in zip(layout.axes, planes_, strict=True):
-            product: Tensor | None = None
-            for axes, plane in zip(factors, stored, strict=True):
-                where = x[:, list(axes)] if len(axes) == 2 else torch.cat([x[:, list(axes)], torch.zeros(len(x), 1)], 1)
-                found = grid_sample(plane, where[None, None] * 2 - 1, align_corners=True, padding_mode="border")
-                product = found[0, :, 0].t() if product is None else product * found[0, :, 0].t()
-            assert product is not None
-            groups.append(product)
-        return torch.cat(groups, dim=-1)
-
-    out: dict[str, object] = {"kernel": name, "samples": count}
-    for threads in sorted({1, native_threads}):
-        torch.set_num_threads(threads)
-        times: dict[str, list[float]] = {}
-        for repeat in range(repeats + 1):
-            leaf = table.clone().requires_grad_()
-            start = time.perf_counter()
-            value = planes(positions, leaf, layout)
-            middle = time.perf_counter()
-            value.backward(weight)
-            end = time.perf_counter()
-            stored = [
-                [
-                    layout.factor(table, g, i).permute(2, 0, 1)[None].contiguous().requires_grad_()
-                    for i in range(len(factors))
-                ]
-                for g, factors in enumerate(layout.axes)
-            ]
-            start2 = time.perf_counter()
-            other = sampled(positions, stored)
-            middle2 = time.perf_counter()
-            other.backward(weight)
-            end2 = time.perf_counter()
-            if repeat:
-                spent = (middle - start, end - middle, middle2 - start2, end2 - middle2)
-                names = ("compiled forward", "compiled backward", "grid_sample forward", "grid_sample backward")
-                for key, seconds in zip(names, spent, strict=True):
-                    times.setdefault(key, []).append(seconds)
-        for key, found in times.items():
-            out[f"{key}, ns per sample, {threads} threads"] = round(median(found) / count * 1e9, 1)
-        for way in ("forward", "backward"):
-            ratios = [b / a for a, b in zip(times[f"compiled {way}"], times[f"grid_sample {way}"], strict=True)]
-            out[f"speed-up {way}, {threads} threads"] = round(median(ratios), 1)
-    truth = table.double().requires_grad_()
-    exact = planes_reference(positions.double(), truth, layout)
-    exact.backward(weight.double())
-    assert leaf.grad is not None
-    assert truth.grad is not None
-    grads = [plane.grad for group in stored for plane in group if plane.grad is not None]
-    theirs = torch.cat([grad[0].permute(1, 2, 0).reshape(-1, features) for grad in grads])
-    for key, result, right in (
-        ("error of the value", value, exact),
-        ("grid_sample's error of the value", other, exact),
-        ("error of the gradient", leaf.grad, truth.grad),
-        ("grid_sample's error of the gradient", theirs, truth.grad),
-    ):
-        out[key] = float((result.detach().double() - right.detach()).abs().max() / right.detach().abs().max())
-    return out
+LENSES: tuple[tuple[str, list[float]], ...] = (
+    ("pinhole", []),
+    ("opencv", [-0.28, 0.09, 6e-4, -9e-4, 0, 0, 0, 0, 0]),
+    ("fisheye", [0.04, -0.01, 3e-3, -6e-4]),
+)
+"""Models, and coefficients of the usual strength."""
 
 
-def ceilings() -> dict[str, float]:
-    """What this machine can do at all, measured now with torch, on all threads."""
-    torch.set_num_threads(native_threads)
+def measure(samples: int, repeats: int) -> dict[str, Any]:
+    """Every kernel's times and errors, the machine, and its ceilings, measured now; rows are printed as they come.
 
-    def best(run: Callable[[], object]) -> float:
-        spent = []
-        for _ in range(8):
-            start = time.perf_counter()
-            run()
-            spent.append(time.perf_counter() - start)
-        return min(spent)
-
-    source = torch.rand(2**25)
-    target = torch.empty_like(source)
-    a, b = torch.rand(1024, 1024), torch.rand(1024, 1024)
-    out = {
-        "copy, GB/s": 2 * source.numel() * 4 / best(lambda: target.copy_(source)) / 1e9,
-        "float32 matrix product, GFLOP/s": 2 * 1024**3 / best(lambda: a @ b) / 1e9,
-    }
-    half_a, half_b = a.bfloat16(), b.bfloat16()
-    out["bfloat16 matrix product, GFLOP/s"] = 2 * 1024**3 / best(lambda: half_a @ half_b) / 1e9
-    for megabytes in (1, 8, 64):
-        table = torch.rand(megabytes * 2**17, 2)
-        index = torch.randint(len(table), (2**20,))
-        seconds = best(lambda table=table, index=index: table.index_select(0, index))  # type: ignore[misc]
-        out[f"gather of 8 bytes from {megabytes} MB, G/s"] = 2**20 / seconds / 1e9
-    return {name: round(value, 3) for name, value in out.items()}
-
-
-def main() -> None:
-    """Run every row, print it and write them all."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--samples", type=int, default=2**15)
-    parser.add_argument("--repeats", type=int, default=9)
-    flags = parser.parse_args()
-    size = flags.samples, flags.repeats
-    limits = ceilings()
-    print(limits)
-    table = []
-    for row in rows(flags.samples):
-        table.append(timed(row, flags.repeats))
-        print(table[-1], flush=True)
-    torch.set_num_threads(native_threads)
-    scales = tuple((64 << s,) * 3 for s in range(4))
-    moving = tuple((64 << s,) * 3 + (25,) for s in range(4))
-    across = (((0, 1), (2,)), ((0, 2), (1,)), ((1, 2), (0,)))
-    extras = [
-        lambda: marching(flags.repeats),
-        lambda: updating(flags.repeats),
-        lambda: ray_generation("pinhole", [], flags.repeats),
-        lambda: ray_generation("opencv", [-0.28, 0.09, 6e-4, -9e-4, 0, 0, 0, 0, 0], flags.repeats),
-        lambda: ray_generation("fisheye", [0.04, -0.01, 3e-3, -6e-4], flags.repeats),
-        lambda: plane_lookup("K-Planes, 4 scales to 512, 3 planes of 32", PlanesLayout.build(scales), 32, *size),
-        lambda: plane_lookup("K-Planes, 4 scales to 512, 6 planes of 32", PlanesLayout.build(moving), 32, *size),
-        lambda: plane_lookup("TensoRF VM, 300^3, 48", PlanesLayout.build(((300,) * 3,) * 3, across), 48, *size),
+    Args:
+        samples: in a batch.
+        repeats: of which medians are taken.
+    Raises: ConfigError where there are no compiled kernels.
+    """
+    if not native.available():
+        raise ConfigError("there are no compiled kernels to measure; reinstall nerfloom with a C++ compiler at hand")
+    threads = torch.get_num_threads()
+    jobs: list[Callable[[], dict[str, object]]] = [
+        lambda row=row: timed(row, repeats, threads)  # type: ignore[misc]
+        for row in rows(samples)
     ]
-    for extra in extras:
-        torch.set_num_threads(native_threads)
-        table.append(extra())
-        print(table[-1], flush=True)
-    machine = {
-        "kernels": native.variant(),
-        "processor": platform.processor() or platform.machine(),
-        "threads": native_threads,
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-    }
-    content = {"machine": machine, "ceilings": limits, "rows": table}
-    (RESULTS / f"kernels-{native.variant()}.json").write_text(json.dumps(content, indent=2) + "\n")
-
-
-native_threads = torch.get_num_threads()
-
-if __name__ == "__main__":
-    main()
+    jobs += [lambda: marching(repeats), lambda: updating(repeats)]
+    jobs += [lambda m=model, c=lens: ray_generation(m, c, repeats) for model, lens in LENSES]  # type: ignore[misc]
+    jobs += [
+        lambda n=name, p=layout, f=features: plane_lookup(n, p, f, samples, repeats, threads)  # type: ignore[misc]
+        for name, layout, features in layouts()
+    ]
+    limits, table = ceilings(), []
+    say(str(limits))
+    for job in jobs:
+        torch.set_num_threads(threads)
+        table.append(job())
+        say(str(table[-1]))
+    torch.set_num_threads(threads)
+    return {"machine": machine(), "ceilings": limits, "rows": table}

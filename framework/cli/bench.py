@@ -1,0 +1,119 @@
+"""ns-bench: measurements that anybody can repeat, of kernels and of methods."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from framework.cli.common import run_command
+from framework.errors import ConfigError, nearest
+
+USAGE = """\
+usage: ns-bench WHAT [flags]
+
+  kernels       time and error of every compiled kernel against torch, beside what the machine can do at all
+  methods       time to each PSNR of every built-in method, on the embedded scene or on --data
+
+ns-bench WHAT --help shows its flags. Results are JSON, in benchmarks/results unless --output-dir says otherwise.
+"""
+RESULTS = Path("benchmarks/results")
+
+
+@dataclass(frozen=True)
+class KernelFlags:
+    """Time per sample and error of each compiled kernel against its torch reference, in alternating runs."""
+
+    samples: int = 2**15
+    """Samples in a batch."""
+    repeats: int = 9
+    """Runs of which medians are taken."""
+    variants: tuple[str, ...] = ()
+    """Instruction sets, each measured in a process of its own, as in avx2 avx512; the fastest if not given."""
+    output_dir: Path = RESULTS
+    """Where kernels-VARIANT.json goes."""
+
+
+@dataclass(frozen=True)
+class MethodFlags:
+    """Train every built-in method on one data set for the same time; a comparison as by ns-compare."""
+
+    data: Path | None = None
+    """Folder of the data set. The embedded scene if not given."""
+    max_seconds: float = 120.0
+    """Seconds of training of each method."""
+    repeats: int = 1
+    """Seeds."""
+    run_dir: Path | None = None
+    """Where runs and report go; outputs/bench-DATA if not given."""
+    output_dir: Path = RESULTS
+    """Where methods-DATA.json goes."""
+
+
+def main() -> None:
+    """The ns-bench command."""
+    run_command(_command)
+
+
+def _command(arguments: list[str]) -> None:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(USAGE)
+        return
+    import tyro
+
+    if arguments[0] not in KINDS:
+        raise ConfigError(f"there is no benchmark '{arguments[0]}'. {nearest(arguments[0], KINDS)}")
+    flags, run = KINDS[arguments[0]]
+    prog = f"ns-bench {arguments[0]}"
+    run(tyro.cli(flags, prog=prog, args=arguments[1:], config=(tyro.conf.FlagConversionOff,)))
+
+
+def _kernels(flags: KernelFlags) -> None:
+    from framework.kernels import native
+
+    for name in flags.variants:
+        if name not in native.NEEDS:
+            raise ConfigError(f"--variants: there is no '{name}'. {nearest(name, native.NEEDS)}")
+        command = [sys.executable, "-m", "framework.cli.bench", "kernels", "--output-dir", str(flags.output_dir)]
+        command += ["--samples", str(flags.samples), "--repeats", str(flags.repeats)]
+        if subprocess.run(command, env={**os.environ, "NERFLOOM_KERNELS": name}).returncode:
+            raise ConfigError(f"measuring the kernels' variant {name} failed; the lines above say why")
+    if not flags.variants:
+        from framework.benchmarks.kernels import measure
+
+        _write(flags.output_dir / f"kernels-{native.variant()}.json", measure(flags.samples, flags.repeats))
+
+
+def _methods(flags: MethodFlags) -> None:
+    from framework.benchmarks.methods import published, standard_plan
+    from framework.cli.compare import compare
+
+    name = "procedural" if flags.data is None else flags.data.resolve().name
+    folder = flags.run_dir or Path("outputs") / f"bench-{name}"
+    rows = compare(standard_plan(flags.data, flags.max_seconds, flags.repeats, folder))
+    _write(flags.output_dir / f"methods-{name}.json", published(folder))
+    failed = [row.label for row in rows if row.failures]
+    if failed:
+        raise ConfigError(f"these methods failed: {', '.join(failed)}; {folder / 'report.html'} says why")
+
+
+KINDS: dict[str, tuple[type, Any]] = {
+    "kernels": (KernelFlags, _kernels),
+    "methods": (MethodFlags, _methods),
+}
+
+
+def _write(path: Path, content: dict[str, Any]) -> None:
+    from framework.console import say
+    from framework.training.run import write_json
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, content)
+    say(f"written to {path}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,138 @@
+"""ns-compare: several methods on one data set, under the same conditions, and a report."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from framework.cli.common import run_command
+from framework.errors import ConfigError
+
+if TYPE_CHECKING:
+    from framework.comparison.measures import Row
+    from framework.comparison.plan import Plan
+
+
+@dataclass(frozen=True)
+class CompareFlags:
+    """Compare methods on one data set: each is trained and judged under the same conditions, in a process of its own.
+
+    Writes report.html, report.md, results.json and results.csv. Run again, it goes on where it was stopped."""
+
+    methods: tuple[str, ...] = ()
+    """Methods, each with flags of its own if need be, in quotes: instant-ngp "vanilla-nerf --sampler occupancy"."""
+    data: Path | None = None
+    """Folder of the data set. The embedded scene if not given."""
+    data_flags: str = ""
+    """Flags of the data format, for all methods, in quotes: "--downscale-factor 2"."""
+    max_seconds: float | None = None
+    """Seconds of training of each method; evaluation and saving do not count."""
+    max_num_iterations: int | None = None
+    """Steps of each method."""
+    target_psnr: float | None = None
+    """Stop a method once it reaches this PSNR on the validation views, dB."""
+    repeats: int = 1
+    """Runs of each method, with different seeds."""
+    output_dir: Path | None = None
+    """Where everything goes; outputs/compare-DATA if not given."""
+    max_eval_images: int | None = None
+    """Judge the final models on at most this many held-out views, evenly spread; all if not given."""
+    curve_images: int = 4
+    """Views on which a method is judged while it learns."""
+    num_threads: int | None = None
+    """Processor threads of each run; all cores if not given."""
+    device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
+    """Device to train on."""
+    jobs: int = 1
+    """Runs side by side, each on a CUDA device of its own."""
+
+
+def main() -> None:
+    """The ns-compare command."""
+    run_command(_command)
+
+
+def _command(arguments: list[str]) -> None:
+    import tyro
+
+    from framework.config import from_plain, read_yaml
+
+    recipe, arguments = _recipe(arguments)
+    default = CompareFlags() if recipe is None else from_plain(CompareFlags(), read_yaml(recipe), str(recipe))
+    options = (tyro.conf.FlagConversionOff,)
+    flags = tyro.cli(CompareFlags, prog="ns-compare", args=arguments, default=default, config=options)
+    plan = plan_of(flags)
+    from framework.console import say
+
+    rows = compare(plan, flags.jobs)
+    failed = [row.label for row in rows if row.failures]
+    say(f"report: {plan.folder / 'report.html'} (also report.md, results.json, results.csv)")
+    if failed:
+        raise ConfigError(f"{len(failed)} of {len(rows)} methods failed: {', '.join(failed)}; the report says why")
+
+
+def _recipe(arguments: list[str]) -> tuple[Path | None, list[str]]:
+    """The file that --load-config names, and the other arguments."""
+    if "--load-config" not in arguments:
+        return None, arguments
+    at = arguments.index("--load-config")
+    if at + 1 == len(arguments):
+        raise ConfigError("--load-config needs a file, such as configs/compare-lego.yml")
+    return Path(arguments[at + 1]), arguments[:at] + arguments[at + 2 :]
+
+
+def plan_of(flags: CompareFlags) -> Plan:
+    """What the flags ask for.
+
+    Raises: ConfigError for what makes no sense.
+    """
+    from framework.comparison.plan import Conditions, Contender, Plan
+
+    if flags.data is not None and not flags.data.is_dir():
+        raise ConfigError(f"--data {flags.data}: there is no such folder")
+    conditions = Conditions(
+        data=None if flags.data is None else str(flags.data.resolve()),
+        data_flags=tuple(shlex.split(flags.data_flags)),
+        max_seconds=flags.max_seconds,
+        max_num_iterations=flags.max_num_iterations,
+        target_psnr=flags.target_psnr,
+        num_threads=flags.num_threads,
+        device_type=flags.device_type,
+        curve_images=flags.curve_images,
+        max_eval_images=flags.max_eval_images,
+    )
+    name = "procedural" if flags.data is None else flags.data.resolve().name
+    folder = flags.output_dir or Path("outputs") / f"compare-{name}"
+    return Plan(tuple(Contender.of(text) for text in flags.methods), conditions, flags.repeats, folder.resolve())
+
+
+def compare(plan: Plan, jobs_at_once: int = 1) -> list[Row]:
+    """Run what is missing of a comparison and write its report; print its table."""
+    from rich.table import Table
+
+    from framework.comparison import plots
+    from framework.comparison.measures import measure, rows_of
+    from framework.comparison.report import COLUMNS, table, write_report
+    from framework.comparison.runner import run_jobs
+    from framework.console import console, say
+
+    if not plots.available():
+        say(f"the report will be {plots.MISSING}")
+    plan.claim_folder()
+    failures: dict[str, list[str]] = {}
+    for job, failure in run_jobs(plan, jobs_at_once).items():
+        failures.setdefault(job.contender.label, []).append(f"seed {job.seed}: {failure.reason} ({failure.log})")
+    runs = [run for run in (measure(job, plan.conditions) for job in plan.jobs()) if run is not None]
+    rows = rows_of([contender.label for contender in plan.contenders], runs, failures)
+    write_report(plan, rows)
+    shown = Table("method", *(column.title for column in COLUMNS))
+    for row in table(rows):
+        shown.add_row(row["label"], *(cell.text for cell in row["cells"]))
+    console.print(shown)
+    return rows
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,59 @@
+"""Finished runs, made up."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from framework.comparison.plan import Conditions, Contender, Job, Plan
+from framework.evaluation.images import comparison, write_image
+
+CONDITIONS = Conditions(None, (), 60.0, None, None, None, "cpu", 4, None)
+MACHINE = {"processor": "abacus", "threads": 2, "commit": None}
+
+
+def plan(folder: Path, *labels: str, repeats: int = 1) -> Plan:
+    """A comparison of methods on the embedded scene."""
+    return Plan(tuple(Contender.of(label) for label in labels), CONDITIONS, repeats, folder)
+
+
+def finish(job: Job, psnr: float, seconds: float = 60.0, **changes: Any) -> None:
+    """Write what a finished run leaves."""
+    job.folder.mkdir(parents=True)
+    summary = {
+        "method": job.contender.method,
+        "stopped": "60 s of training spent",
+        "interrupted": False,
+        "steps": 1000,
+        "seconds": seconds,
+        "rays": 1_000_000,
+        "rays_per_second": 1_000_000 / seconds,
+        "skipped_steps": 0,
+        "peak_memory_bytes": 2**30,
+        "parameters": 12345,
+        "machine": MACHINE,
+    }
+    results = {"psnr": psnr, "ssim": 0.9, "lpips": None, "fps": 4.0, "num_images": 16, "num_rays_per_sec": 1e6}
+    evaluation = {"results": results, "lpips": "absent: pip install it", "per_image": []}
+    points = [{"seconds": s, "step": int(s), "psnr": psnr - 4 + s / 15} for s in (15.0, 30.0, 45.0, 60.0)]
+    decisions = [{"option": "background", "choice": "random", "reason": "there is <alpha>"}]
+    for name, content in (
+        ("summary.json", {**summary, **changes}),
+        ("eval_all.json", evaluation),
+        ("learning_curve.json", points),
+        ("scene_profile.json", {"decisions": decisions}),
+        ("skip_report.json", [{"name": "cells", "skipped": 0.5, "rendering_saved": None, "switch": "--x"}]),
+    ):
+        (job.folder / name).write_text(json.dumps(content))
+
+
+def draw(job: Job, seed: int, names: tuple[str, ...] = ("0000_r_0", "0001_r_1"), size: int = 64) -> None:
+    """Write comparisons whose upper left quarter is worst."""
+    import torch
+
+    noise = torch.from_numpy(np.random.default_rng(0).random((size, size, 3))).float()
+    wrong = torch.from_numpy(np.random.default_rng(seed).random((size, size, 3))).float() * 0.05
+    wrong[: size // 2, : size // 2] *= 10
+    for name in names:
+        write_image(job.pictures / f"{name}_comparison.png", comparison((noise + wrong).clamp(0, 1), noise))

@@ -1,0 +1,57 @@
+"""Figures of runs, and of several seeds together."""
+
+import math
+from pathlib import Path
+from statistics import stdev
+
+import pytest
+
+from framework.comparison.measures import measure, pareto, rows_of, whole_levels
+from tests.comparison.runs import CONDITIONS, finish, plan
+
+
+def test_levels_are_met_on_straight_lines_between_evaluations() -> None:
+    found = whole_levels(((10.0, 20.5), (20.0, 22.5), (30.0, 22.0), (40.0, 24.0)))
+    assert found == {20: 10.0, 21: 12.5, 22: 17.5, 23: 35.0, 24: 40.0}
+    assert whole_levels(()) == {}
+    assert whole_levels(((5.0, 9.99),)) == {9: 5.0}
+
+
+def test_figures_come_from_the_runs_files(tmp_path: Path) -> None:
+    job = plan(tmp_path, "kplanes --num-scales 2").jobs()[0]
+    assert measure(job, CONDITIONS) is None
+    finish(job, 30.0)
+    found = measure(job, CONDITIONS)
+    assert found is not None
+    assert (found.psnr, found.ssim, found.lpips, found.views) == (30.0, 0.9, None, 16)
+    assert found.render_seconds == 0.25
+    assert found.curve == ((15.0, 27.0), (30.0, 28.0), (45.0, 29.0), (60.0, 30.0))
+    assert found.seconds_to == {27: 15.0, 28: 30.0, 29: 45.0, 30: 60.0}
+    assert found.command == "ns-train kplanes --num-scales 2 --machine.seed 42 --max-seconds 60.0"
+    assert found.decisions == ("background: random, as there is <alpha>",)
+    (job.folder / "summary.json").write_text("{")
+    assert measure(job, CONDITIONS) is None
+
+
+def test_seeds_are_put_together(tmp_path: Path) -> None:
+    comparison = plan(tmp_path, "kplanes", "tensorf", repeats=3)
+    values = {"kplanes": (30.0, 31.0, 32.5), "tensorf": (28.0,)}
+    for job in comparison.jobs():
+        number = job.seed - 42
+        if number < len(values[job.contender.label]):
+            finish(job, values[job.contender.label][number])
+    runs = [run for run in (measure(job, CONDITIONS) for job in comparison.jobs()) if run is not None]
+    first, second, third = rows_of(["kplanes", "tensorf", "lost"], runs, {"tensorf": ["out of memory"]})
+    assert first.mean("psnr") == pytest.approx(sum(values["kplanes"]) / 3)
+    assert first.deviation("psnr") == pytest.approx(stdev(values["kplanes"]))
+    assert first.seconds_to(28) is None  # one of the three had passed it when it was first judged
+    assert first.seconds_to(30) == pytest.approx((60 + 45 + 22.5) / 3)
+    assert (second.deviation("psnr"), second.failures) == (None, ("out of memory",))
+    assert second.mean("lpips") is None
+    assert third.mean("psnr") is None
+
+
+def test_the_front_against_its_definition() -> None:
+    points = [(1.0, 20.0), (2.0, 25.0), (2.0, 24.0), (3.0, 25.0), (4.0, 30.0), (1.0, 20.0), (math.inf, 31.0)]
+    assert pareto(points) == [True, True, False, False, True, True, True]
+    assert pareto([]) == []

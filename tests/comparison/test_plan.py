@@ -1,0 +1,101 @@
+"""What is compared, under which conditions, by which commands."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from framework.comparison.plan import Conditions, Contender, Job, Plan
+from framework.errors import ConfigError
+
+CONDITIONS = Conditions("/data/lego", ("--downscale-factor", "2"), 120.0, None, None, 2, "cpu", 4, None)
+
+
+def test_a_contender_is_a_method_and_its_flags() -> None:
+    plain = Contender.of("instant-ngp")
+    assert (plain.method, plain.flags, plain.slug) == ("instant-ngp", (), "instant-ngp")
+    other = Contender.of('vanilla-nerf  --sampler occupancy --note "two words"')
+    assert other.flags == ("--sampler", "occupancy", "--note", "two words")
+    assert other.label == 'vanilla-nerf --sampler occupancy --note "two words"'
+    assert other.slug.startswith("vanilla-nerf-sampler-occupancy-note-two-words-")
+
+
+def test_labels_that_differ_have_folders_that_differ() -> None:
+    labels = ["kplanes --num-scales 2", "kplanes --num-scales=2", "kplanes --num-scales -2", "kplanes"]
+    labels.append("kplanes " + "--learning-rate 1 " * 20)
+    labels.append("kplanes " + "--learning-rate 1 " * 21)
+    slugs = {Contender.of(label).slug for label in labels}
+    assert len(slugs) == len(labels)
+    assert all(len(slug) < 80 for slug in slugs)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [("", "an empty name"), ("kplane", "Did you mean 'kplanes'"), ('kplanes "open', "cannot be read: No closing")],
+)
+def test_what_is_no_contender(text: str, reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        Contender.of(text)
+
+
+def test_conditions_must_end_somewhere() -> None:
+    with pytest.raises(ConfigError, match="say how long each method trains"):
+        replace(CONDITIONS, max_seconds=None)
+    assert CONDITIONS.budget() == "120 s of training"
+    assert replace(CONDITIONS, target_psnr=30.0).budget() == "120 s of training, until 30.0 dB on the validation views"
+
+
+def test_commands_say_all_that_is_the_same_and_the_contenders_flags_count_last(tmp_path: Path) -> None:
+    job = Job(Contender.of("vanilla-nerf --machine.seed 7"), 43, tmp_path / "runs")
+    words = job.train_command(CONDITIONS)[3:]
+    assert words[0] == "vanilla-nerf"
+    assert words[-4:] == ["--machine.seed", "7", "--downscale-factor", "2"]
+    given = dict(zip(words[1::2], words[2::2], strict=False))
+    assert given["--data"] == "/data/lego"
+    assert given["--max-seconds"] == "120.0"
+    assert given["--machine.num-threads"] == "2"
+    assert float(given["--seconds-per-eval-all-images"]) == 10
+    assert "--max-num-iterations" not in given
+    folder = Path(given["--output-dir"]) / given["--experiment-name"] / "vanilla-nerf" / given["--timestamp"]
+    assert folder == job.folder
+    job.folder.mkdir(parents=True)
+    (job.folder / "config.yml").write_text("")
+    assert job.train_command(CONDITIONS)[3:] == ["--resume", str(job.folder)]
+    steps = replace(CONDITIONS, max_seconds=None, max_num_iterations=100)
+    command = Job(Contender.of("kplanes"), 43, tmp_path / "runs").train_command(steps)
+    assert command[command.index("--steps-per-eval-all-images") + 1] == "8"
+    assert job.eval_command(replace(CONDITIONS, max_eval_images=5))[-2:] == ["--max-images", "5"]
+
+
+def test_jobs_go_seed_by_seed(tmp_path: Path) -> None:
+    plan = Plan((Contender.of("kplanes"), Contender.of("tensorf")), CONDITIONS, 2, tmp_path)
+    assert [(job.contender.label, job.seed) for job in plan.jobs()] == [
+        ("kplanes", 42),
+        ("tensorf", 42),
+        ("kplanes", 43),
+        ("tensorf", 43),
+    ]
+    with pytest.raises(ConfigError, match="'kplanes' twice"):
+        Plan((Contender.of("kplanes"), Contender.of("kplanes")), CONDITIONS, 1, tmp_path)
+    with pytest.raises(ConfigError, match="names no method"):
+        Plan((), CONDITIONS, 1, tmp_path)
+    with pytest.raises(ConfigError, match="--repeats is 0"):
+        Plan((Contender.of("kplanes"),), CONDITIONS, 0, tmp_path)
+
+
+def test_a_folder_belongs_to_its_conditions(tmp_path: Path) -> None:
+    plan = Plan((Contender.of("kplanes"),), CONDITIONS, 1, tmp_path / "new")
+    plan.claim_folder()
+    plan.claim_folder()
+    more = replace(plan, contenders=(Contender.of("tensorf"),), repeats=3)
+    more.claim_folder()
+    with pytest.raises(ConfigError, match=r"other conditions \(max_seconds 120.0, not 60.0\)"):
+        replace(plan, conditions=replace(CONDITIONS, max_seconds=60.0)).claim_folder()
+    assert json.loads((tmp_path / "new" / "conditions.json").read_text())["data_flags"] == ["--downscale-factor", "2"]
+    (tmp_path / "new" / "conditions.json").write_text("{")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        plan.claim_folder()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="cannot write"):
+        replace(plan, folder=tmp_path / "file" / "below").claim_folder()

@@ -1,0 +1,88 @@
+"""The report: complete, self-contained, and honest about what is missing."""
+
+import base64
+import csv
+import io
+import json
+import re
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+from framework.comparison import plots
+from framework.comparison.crops import data_uri, views, worst_square
+from framework.comparison.measures import measure, rows_of
+from framework.comparison.plan import Plan
+from framework.comparison.report import write_report
+from tests.comparison.runs import CONDITIONS, draw, finish, plan
+
+LABELS = ("instant-ngp", "kplanes --num-scales 2", "tensorf")
+
+
+@pytest.fixture
+def compared(tmp_path: Path) -> Plan:
+    """Two methods that worked, one that failed."""
+    comparison = plan(tmp_path, *LABELS)
+    for number, job in enumerate(comparison.jobs()[:2]):
+        finish(job, 30.0 + number, 60.0 + number)
+        draw(job, number)
+    runs = [run for run in (measure(job, CONDITIONS) for job in comparison.jobs()) if run is not None]
+    write_report(comparison, rows_of(LABELS, runs, {"tensorf": ["seed 42: <out> of memory (x.log)"]}))
+    return comparison
+
+
+def test_the_page_holds_everything_and_needs_nothing(compared: Plan) -> None:
+    page = (compared.folder / "report.html").read_text()
+    assert not re.findall(r'(?:src|href)="(?!data:image/png;base64,|#)', page)
+    assert "&lt;out&gt; of memory" in page
+    assert "there is &lt;alpha&gt;" in page
+    assert page.count("kplanes --num-scales 2") >= 4
+    assert "31.00" in page
+    assert "abacus" in page
+    assert page.count('<img class="crop"') == 2 * (1 + 2 + 2)
+    if plots.available():
+        assert "<svg" in page
+    assert "{{" not in page
+
+
+def test_tables_in_markdown_and_csv_and_json(compared: Plan) -> None:
+    text = (compared.folder / "report.md").read_text()
+    row = next(line for line in text.splitlines() if line.startswith("| kplanes"))
+    assert "**31.00**" in row
+    assert next(line for line in text.splitlines() if line.startswith("| instant-ngp")).startswith("| instant-ngp* |")
+    assert "| tensorf | failed |" in text
+    assert "**tensorf failed**: seed 42" in text
+    rows = list(csv.DictReader(io.StringIO((compared.folder / "results.csv").read_text())))
+    assert [row["label"] for row in rows] == list(LABELS[:2])
+    assert float(rows[1]["seconds to 31 dB"]) == 60.0
+    assert rows[0]["seconds to 31 dB"] == ""
+    content = json.loads((compared.folder / "results.json").read_text())
+    assert content["runs"][0]["seconds_to"] == {"27": 15.0, "28": 30.0, "29": 45.0, "30": 60.0}
+    assert content["runs"][1]["curve"][-1] == [60.0, 31.0]
+    assert content["failures"] == {"tensorf": ["seed 42: <out> of memory (x.log)"]}
+
+
+def test_all_may_have_failed(tmp_path: Path) -> None:
+    comparison = plan(tmp_path, "tensorf")
+    page = write_report(comparison, rows_of(["tensorf"], [], {"tensorf": ["no luck"]})).read_text()
+    assert "no luck" in page
+    assert "<svg" not in page
+
+
+def test_crops_are_where_the_methods_are_wrong(tmp_path: Path) -> None:
+    wrong = np.zeros((60, 90))
+    wrong[20:40, 50:70] = 1
+    top, left, edge = worst_square(wrong)
+    assert edge == 32
+    assert wrong[top : top + edge, left : left + edge].sum() == wrong.sum()
+    assert worst_square(np.ones((5, 7))) == (0, 0, 5)
+    jobs = plan(tmp_path, "kplanes", "tensorf").jobs()
+    draw(jobs[0], 0, ("a", "b", "c"))
+    draw(jobs[1], 1, ("b", "c", "d"))
+    found = views([(job.contender.label, job.pictures) for job in jobs])
+    assert [view.name for view in found] == ["b", "c"]
+    assert views([("x", tmp_path / "nowhere")]) == []
+    image = np.random.default_rng(0).integers(0, 256, (3, 4, 3), dtype=np.uint8)
+    assert np.array_equal(iio.imread(base64.b64decode(data_uri(image).split(",")[1])), image)

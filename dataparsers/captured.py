@@ -13,15 +13,13 @@ from torch import Tensor
 from framework import Cameras, DataError, DataParser, ParsedScene
 from framework.cameras import LENSES
 from framework.dataset import Split, existing, image_size
-from framework.poses import Center, Orientation, Placement, held_out, place
+from framework.poses import Center, Orientation, Placement, held_out, nearest_shown, place
 from framework.scene import PoseSource
 
 LARGEST_SIDE = 1600
 """Pixels of an image's longer side above which images are reduced unless the user says by how much."""
 REDUCED = (1, 2, 4, 8)
 """Whole numbers by which images are customarily reduced beforehand: those of `images` by 2 are in `images_2`."""
-NEAR, NEAR_SHARE, MOST_POINTS = 0.05, 0.5, 2000
-"""Where rays start without sparse points; as a share of the distance of the nearest; and how many are looked at."""
 ENDINGS = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp")
 """Endings that a reduced image may have instead of its original's."""
 ASPECT_TOLERANCE = 0.03
@@ -151,25 +149,6 @@ def captured_scene(
         poses=flags.poses,
         depth_paths=photographs.depths,
     )
-
-
-def nearest_shown(cameras: Cameras, points: Tensor | None) -> float:
-    """A distance before which no photograph shows anything, scene units, judging by sparse points (K, 3).
-
-    Matter right before cameras is what a few photographs explain best: on a can photographed from 62 places, held-out
-    ones were 3 dB better when rays started at 0.3 rather than 0.05.
-    """
-    if points is None or not len(points):
-        return NEAR
-    points = points[torch.linspace(0, len(points) - 1, min(len(points), MOST_POINTS)).long()]
-    shown = []
-    for index in range(len(cameras)):
-        columns, rows, ahead = cameras.project(points, index)
-        inside = (columns >= 0) & (columns < cameras.widths[index]) & (rows >= 0) & (rows < cameras.heights[index])
-        shown.append((points - cameras.camera_to_worlds[index, :, 3]).norm(dim=-1)[ahead & inside])
-    distances = torch.cat(shown).sort().values
-    # Not the very nearest, for a few points are always wrong.
-    return NEAR if not len(distances) else NEAR_SHARE * float(distances[len(distances) // 100])
 
 
 def from_original(scene: ParsedScene, applied: Tensor, scale: float = 1.0) -> ParsedScene:

@@ -16,7 +16,7 @@ from framework.appearance import APPEARANCE_STOPS, light_spread
 from framework.cameras import Cameras
 from framework.console import say
 from framework.coverage import pixels_with_rays
-from framework.decoding import ImageFiles, decode
+from framework.decoding import Decoded, ImageFiles, decode
 from framework.depths import read_depths
 from framework.errors import DataError
 from framework.image_files import image_size as image_size
@@ -222,8 +222,22 @@ def load_dataset(
     mask_paths = parsed.mask_paths or (None,) * len(parsed.image_paths)
     files = ImageFiles(split, parsed.image_paths, mask_paths, sizes, factor)
     decoded = decode(files, memory or PixelMemory.of())
-    if len(decoded.left) < len(sizes):
-        parsed, cameras = parsed[decoded.left], cameras[decoded.left]
+    parsed = replace(parsed, cameras=cameras, downscale_factor=1)
+    return assemble(parsed if len(decoded.left) == len(sizes) else parsed[decoded.left], decoded, split, masks)
+
+
+def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "ignored") -> Dataset:
+    """A data set of images whose pixels are there already (`decoding.from_arrays`).
+
+    Args:
+        parsed: what else is known of those images, the cameras being at their size. Of its files only depth images are
+            read; of the others, which need not exist, the names are kept.
+        decoded: their pixels.
+        split: what to call them in messages.
+        masks: what they say of the pixels that they do not keep; auto: as `cuts_out` finds.
+    Raises: DataError where a lens has no ray for any pixel, or a depth image cannot be used.
+    """
+    cameras = parsed.cameras
     kept, opaque, light = decoded.kept, None, None if decoded.pixels.shape[1] == 4 else decoded.light
     if kept is not None and (masks == "empty" or (masks == "auto" and cuts_out(kept, cameras))):
         kept, opaque = None, kept

@@ -6,6 +6,7 @@ So loading takes the memory of the set, or of nothing where it goes to a file, a
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import accumulate
@@ -87,6 +88,37 @@ def decode(files: ImageFiles, memory: PixelMemory) -> Decoded:
         say(f"split '{files.split}': pixels decoded by an earlier run are read from {path}")
     mapped = MappedPixels(path, int(found["pixels"]), int(found["channels"]), memory.limit)
     return _decoded(files, found, mapped.pixels, mapped)
+
+
+def from_arrays(images: Sequence[np.ndarray], masks: Sequence[np.ndarray] | None = None) -> Decoded:
+    """Images that are in memory already, as if they had been decoded.
+
+    Args:
+        images: M arrays (H, W, 3 or 4) uint8, the fourth channel being straight alpha.
+        masks: M arrays (H, W) bool, true where to learn from; None where that is everywhere.
+    Raises: DataError for an array of another kind, or where the masks leave no pixel.
+    """
+    for index, image in enumerate(images):
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4):
+            raise DataError(f"image {index} is {image.dtype} {image.shape}; it must be uint8 (height, width, 3 or 4)")
+    channels = 4 if any(image.shape[2] == 4 and (image[..., 3] < 255).any() for image in images) else 3
+    pixels = torch.from_numpy(np.concatenate([_channels(image, channels).reshape(-1, channels) for image in images]))
+    kept = None
+    if masks is not None:
+        kept = PixelSet.of_mask(torch.from_numpy(np.concatenate([mask.reshape(-1) for mask in masks])))
+        if not len(kept):
+            raise DataError("the masks leave no pixel; they must be true where to learn from")
+        kept = None if len(kept) == len(pixels) else kept
+    used: Sequence[np.ndarray | None] = [None] * len(images) if masks is None else masks
+    light = np.stack([light_of(image, mask) for image, mask in zip(images, used, strict=True)])
+    return Decoded(pixels, torch.arange(len(images)), torch.from_numpy(light), kept, None)
+
+
+def _channels(image: np.ndarray, count: int) -> np.ndarray:
+    """An image (H, W, 3 or 4) with three or four channels; it is opaque where it does not say."""
+    if image.shape[2] >= count:
+        return image[..., :count]
+    return np.concatenate([image, np.full((*image.shape[:2], 1), 255, np.uint8)], axis=-1)
 
 
 def _write(files: ImageFiles, path: Path, size: int, channels: int) -> dict[str, np.ndarray]:

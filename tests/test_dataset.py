@@ -11,9 +11,11 @@ import torch
 from PIL import Image
 
 from dataparsers.blender import Blender
-from framework.dataset import existing, image_size, load_dataset, read_image
+from framework.dataset import assemble, existing, image_size, load_dataset, read_image
+from framework.decoding import from_arrays
 from framework.errors import DataError
 from framework.pixels import background_colors, composite
+from tests.images import noise, parsed, write_mask
 
 
 def write_deep_png(path: Path, channels: int, size: int = 20) -> None:
@@ -122,3 +124,44 @@ def test_moving_a_set_to_a_device_keeps_everything(shared_tiny: Path) -> None:
     assert torch.equal(moved.pixels, data.pixels)
     assert moved.names == data.names
     assert torch.equal(moved.image(1), data.image(1))
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_arrays_make_the_data_set_that_their_files_make(tmp_path: Path, channels: int) -> None:
+    sizes = [(30, 20), (12, 40), (25, 25)]
+    images = [noise(*size, index, channels) for index, size in enumerate(sizes)]
+    used = [np.random.default_rng(index).random((height, width)) < 0.6 for index, (width, height) in enumerate(sizes)]
+    paths = [tmp_path / f"{index}.png" for index in range(3)]
+    for path, image in zip(paths, images, strict=True):
+        iio.imwrite(path, image)
+    masks = [write_mask(tmp_path / f"mask_{index}.png", mask) for index, mask in enumerate(used)]
+    there = load_dataset(parsed(paths, sizes, list(masks)), "train")
+    here = assemble(parsed(paths, sizes), from_arrays(images, used), "train")
+    assert torch.equal(here.pixels, there.pixels)
+    assert here.kept is not None
+    assert there.kept is not None
+    assert torch.equal(here.kept.pixels(), there.kept.pixels())
+    assert here.scene.has_alpha == there.scene.has_alpha == (channels == 4)
+    assert here.scene.appearance_varies == there.scene.appearance_varies
+    assert here.names == there.names == ("0.png", "1.png", "2.png")
+    assert (here.light is None) == (there.light is None) == (channels == 4)
+    if here.light is not None and there.light is not None:
+        assert torch.equal(here.light, there.light)
+
+
+def test_arrays_of_both_kinds_become_one_and_an_opaque_alpha_is_dropped() -> None:
+    opaque = np.dstack([noise(4, 3, 0), np.full((3, 4), 255, np.uint8)])
+    assert from_arrays([opaque, noise(4, 3, 1)]).pixels.shape == (24, 3)
+    opaque[1, 2, 3] = 7
+    pixels = from_arrays([opaque, noise(4, 3, 1)]).pixels
+    assert torch.equal(pixels[:12], torch.from_numpy(opaque).view(12, 4))
+    assert torch.equal(pixels[12:, :3], torch.from_numpy(noise(4, 3, 1)).view(12, 3))
+    assert bool((pixels[12:, 3] == 255).all())
+
+
+def test_arrays_that_are_no_images_and_masks_that_leave_nothing_are_refused() -> None:
+    with pytest.raises(DataError, match=r"image 1 is float64 \(3, 4, 3\); it must be uint8"):
+        from_arrays([noise(4, 3, 0), noise(4, 3, 1) / 255])
+    with pytest.raises(DataError, match="the masks leave no pixel"):
+        from_arrays([noise(4, 3, 0)], [np.zeros((3, 4), bool)])
+    assert from_arrays([noise(4, 3, 0)], [np.ones((3, 4), bool)]).kept is None

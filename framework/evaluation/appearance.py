@@ -6,7 +6,7 @@ vector; one is optimised on its left half, all else being fixed, and the picture
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
@@ -40,15 +40,36 @@ def fitted_appearance(model: Model, dataset: Dataset, index: int, background: Te
     Args:
         background: (3,) colour behind what is not opaque.
     """
-    modules = appearances(model)
-    vectors = [module.vectors.detach().mean(0).clone().requires_grad_() for module in modules]
-    pixels = _left_pixels(dataset, index)
-    with ExitStack() as stack:
-        for module, vector in zip(modules, vectors, strict=True):
-            stack.enter_context(module.shown(vector))
-        if vectors and len(pixels):
-            _fit(model, dataset, pixels, vectors, background)
+    with shown_appearance(model, fit_appearance(model, dataset, _left_pixels(dataset, index), background)):
         yield
+
+
+@contextmanager
+def shown_appearance(model: Model, vectors: Sequence[Tensor]) -> Iterator[None]:
+    """Show what is not a training photograph in an appearance: a vector (D,) for each of the model's `appearances`."""
+    with ExitStack() as stack:
+        for module, vector in zip(appearances(model), vectors, strict=True):
+            stack.enter_context(module.shown(vector))
+        yield
+
+
+def fit_appearance(
+    model: Model, dataset: Dataset, pixels: Tensor, background: Tensor, start: Sequence[Tensor] | None = None
+) -> list[Tensor]:
+    """The appearance in which the model's picture comes nearest to a photograph, all else being fixed.
+
+    Args:
+        pixels: (P,) which to look at, counted through all images; P may be 0.
+        background: (3,) colour behind what is not opaque.
+        start: the vectors to start from; the mean of the training photographs' if None.
+    Returns: a vector (D,) for each of the model's `appearances`.
+    """
+    first = [module.vectors.mean(0) for module in appearances(model)] if start is None else start
+    vectors = [vector.detach().clone().requires_grad_() for vector in first]
+    if vectors and len(pixels):
+        with shown_appearance(model, vectors):
+            _fit(model, dataset, pixels, vectors, background)
+    return [vector.detach() for vector in vectors]
 
 
 def _left_pixels(dataset: Dataset, index: int) -> Tensor:

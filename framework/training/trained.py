@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
+
 from framework.config import RaysPerPixel, TrainConfig
 from framework.device import choose_device
 from framework.errors import CheckpointError
@@ -64,12 +66,7 @@ def load_trained(
     content = load_checkpoint(checkpoint, device) if checkpoint else load_newest(run.folder / FOLDER, device)
     if content is None:
         raise CheckpointError(f"{run.folder / FOLDER} holds no checkpoint")
-    try:
-        scene = Scene(**content["scene"]).to("cpu")
-    except (KeyError, TypeError, AttributeError) as error:
-        raise CheckpointError(f"the checkpoint of {run.folder} lacks the scene: {error}") from error
-    model = build_model(run.method, config, scene).to(device).eval()
-    restore_model(model, content)
+    model = restored_model(run.method, config, content, device)
     path = checkpoint or run.folder / FOLDER / f"step-{content['state']['step']:09d}.ckpt"
     return Trained(run, model, path, content)
 
@@ -77,6 +74,22 @@ def load_trained(
 def build_model(method: str, config: TrainConfig, scene: Scene) -> Model[Any]:
     """A method's model with fresh parameters."""
     return load_method(method).model(config.resolved(), scene)
+
+
+def restored_model(method: str, config: TrainConfig, checkpoint: dict[str, Any], device: torch.device) -> Model[Any]:
+    """A checkpoint's model on `device`, in evaluation mode.
+
+    Args:
+        checkpoint: its content; the model is made for the scene in it.
+    Raises: CheckpointError where that lacks the scene, or has parameters of other names or sizes.
+    """
+    try:
+        scene = Scene(**checkpoint["scene"]).to("cpu")
+    except (KeyError, TypeError, AttributeError) as error:
+        raise CheckpointError(f"the checkpoint lacks the scene: {error}") from error
+    model = build_model(method, config, scene).to(device).eval()
+    restore_model(model, checkpoint)
+    return model
 
 
 def restore_model(model: Model[Any], checkpoint: dict[str, Any]) -> None:

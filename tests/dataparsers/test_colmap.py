@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from dataparsers.captured import NEAR, nearest_shown
 from dataparsers.colmap import Colmap
 from dataparsers.colmap_model import read_model
 from dataparsers.llff import Llff
 from framework.cameras import Cameras
 from framework.dataset import load_dataset
 from framework.errors import DataError
+from framework.poses import NEAR, nearest_shown
 from tests.dataparsers.sparse_models import Capture, make_capture, misses, write_colmap, write_images
 
 pycolmap = pytest.importorskip("pycolmap")

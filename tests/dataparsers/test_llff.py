@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from dataparsers.captured import NEAR
 from dataparsers.colmap import Colmap
 from dataparsers.llff import Llff
 from framework.dataset import load_dataset
 from framework.errors import DataError
+from framework.poses import NEAR
 from tests.dataparsers.sparse_models import Capture, make_capture, misses, write_images
 
 FOCAL = 55.0

@@ -1,0 +1,1 @@
+"""Nerfloom's methods in other people's programs: one file a program, which none of the framework knows of."""

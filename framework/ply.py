@@ -100,3 +100,24 @@ def _ascii_axes(stream: BinaryIO, file: Path, count: int, names: list[str]) -> l
         except ValueError as error:
             raise DataError(f"{file}: point {index} is not made of numbers") from error
     return list(points)
+
+
+def write_points(file: Path, positions: Tensor, colors: Tensor, normals: Tensor | None = None) -> None:
+    """Write a binary PLY file of points (K, 3), colours (K, 3) in [0, 1] and, where there are any, normals (K, 3).
+
+    Raises: OSError where it cannot be written.
+    """
+    columns: list[tuple[str, str, str, np.ndarray]] = []
+    for names, values in (("xyz", positions), (("nx", "ny", "nz"), normals)):
+        if values is not None:
+            columns += [(n, "float", "<f4", v) for n, v in zip(names, values.numpy().T, strict=True)]
+    stored = (colors.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    columns += [(n, "uchar", "u1", v) for n, v in zip(("red", "green", "blue"), stored.T, strict=True)]
+    table = np.empty(len(positions), [(name, kind) for name, _, kind, _ in columns])
+    for name, _, _, values in columns:
+        table[name] = values
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
+    header += [f"property {called} {name}" for name, called, _, _ in columns]
+    with file.open("wb") as stream:
+        stream.write(("\n".join([*header, "end_header"]) + "\n").encode())
+        stream.write(table.tobytes())

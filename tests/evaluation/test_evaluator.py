@@ -10,7 +10,7 @@ from torch import Tensor
 
 from framework.cameras import Cameras, subpixels
 from framework.config import TrainConfig
-from framework.evaluation.evaluator import render_image
+from framework.evaluation.evaluator import evaluation_background, render_image
 from framework.model import Model
 from framework.pixels import Batch, draw_batch
 from framework.rays import Rays
@@ -120,3 +120,22 @@ def test_means_over_pixels_are_means() -> None:
             torch.testing.assert_close(one.depth[pixel], (share * depth).sum() / share.sum())
     torch.testing.assert_close(pixels.depth[1], rays.depth[7])
     assert rays.per_pixel(1) is rays
+
+
+@pytest.mark.parametrize(
+    ("asked", "alpha", "expected"),
+    [
+        ("auto", True, 1.0),
+        ("random", True, 1.0),
+        ("white", True, 1.0),
+        ("black", True, 0.0),
+        ("auto", False, 0.0),
+        ("random", False, 0.0),
+        ("white", False, 1.0),  # what is white may have been learnt as empty
+        ("black", False, 0.0),
+    ],
+)
+def test_pictures_are_over_what_training_was_over(asked: Any, alpha: bool, expected: float) -> None:
+    model = Disc(TrainConfig(background=asked))
+    model.scene = replace(model.scene, has_alpha=alpha)
+    assert evaluation_background(model).tolist() == [expected] * 3

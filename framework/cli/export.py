@@ -1,0 +1,130 @@
+"""ns-export: what a trained run has found, for other programs, in the frame and units of its input."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from framework.cli.common import run_command
+from framework.errors import ConfigError, nearest
+
+if TYPE_CHECKING:
+    from framework.poses import Placement
+    from framework.training.trained import Trained
+
+USAGE = """\
+usage: ns-export WHAT --load-config RUN/config.yml --output-dir DIR [flags]
+
+  pointcloud      point_cloud.ply: points on surfaces, with colours, and normals where the method has them
+  cameras         transforms_train.json: the training cameras, refined where the run has refined them
+
+ns-export WHAT --help shows its flags. Everything is written in the frame and units of the run's input.
+"""
+
+
+@dataclass(frozen=True)
+class ExportFlags:
+    """What every export can be told."""
+
+    load_config: Path
+    """The run's config.yml."""
+    output_dir: Path
+    """Where files go."""
+    load_checkpoint: Path | None = None
+    """A checkpoint other than the run's newest."""
+    data: Path | None = None
+    """The data's folder, where it has moved since training."""
+    device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
+    """Device to render on."""
+
+
+@dataclass(frozen=True)
+class PointFlags(ExportFlags):
+    """Write point_cloud.ply: where half of the light of random training rays is gone."""
+
+    num_points: int = 1_000_000
+    """Rays; those that end in nothing or too far away give no point."""
+    reach: float = 2.0
+    """Leave out points farther from the middle of the scene's box than this many of its half edges; 0 for none."""
+
+
+@dataclass(frozen=True)
+class CameraFlags(ExportFlags):
+    """Write transforms_train.json: names and camera-to-world matrices of the training photographs."""
+
+
+def main() -> None:
+    """The ns-export command."""
+    run_command(_command)
+
+
+def _command(arguments: list[str]) -> None:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(USAGE)
+        return
+    if arguments[0] not in KINDS:
+        raise ConfigError(f"nothing is exported as '{arguments[0]}'. {nearest(arguments[0], KINDS)}")
+    import tyro
+
+    kind, run = KINDS[arguments[0]]
+    prog = f"ns-export {arguments[0]}"
+    flags = tyro.cli(kind, prog=prog, args=arguments[1:], config=(tyro.conf.FlagConversionOff,))
+    from framework.training.trained import load_trained
+
+    trained = load_trained(flags.load_config, flags.load_checkpoint, flags.device_type, flags.data)
+    if trained.model.scene.warped:
+        raise ConfigError("this run lives in normalised device coordinates (--ndc), which have no scale to export")
+    flags.output_dir.mkdir(parents=True, exist_ok=True)
+    run(flags, trained, _placement(trained))
+
+
+def _placement(trained: Trained) -> Placement:
+    """Of the input in the run's scene."""
+    from framework.poses import Placement
+
+    return Placement(trained.content["transform"].double().cpu(), float(trained.content["scale"]))
+
+
+def _points(flags: PointFlags, trained: Trained, placement: Placement) -> None:
+    if flags.num_points < 1 or not flags.reach >= 0:
+        raise ConfigError("--num-points must be at least 1, and --reach at least 0")
+    from framework.cli.session import load_split
+    from framework.console import say, track
+    from framework.device import seed_step
+    from framework.export.points import joined, surface_points
+    from framework.ply import write_points
+
+    model = trained.model
+    dataset = load_split(trained.run, "train").to(model.device)
+    seed_step(trained.run.config.machine.seed, 0)
+    chunks = -(-flags.num_points // model.config.eval_num_rays_per_chunk)
+    parts = surface_points(model, dataset, flags.num_points, flags.reach or None)
+    found = joined(track(parts, "Looking for surfaces", total=chunks))
+    if not len(found.positions):
+        raise ConfigError("no training ray ends in a surface inside --reach; is the run trained? --reach 0 keeps all")
+    positions = placement.original_points(found.positions.double()).float()
+    normals = None if found.normals is None else found.normals @ placement.transform[:, :3].float()
+    path = flags.output_dir / "point_cloud.ply"
+    write_points(path, positions, found.colors, normals)
+    say(f"{len(positions):,} points: {path}")
+
+
+def _cameras(flags: CameraFlags, trained: Trained, placement: Placement) -> None:
+    from framework.cli.session import load_split
+    from framework.console import say
+    from framework.export.cameras import believed, camera_list
+    from framework.training.run import write_json
+
+    # With its images: one that could not be read has no camera in the model.
+    dataset = load_split(trained.run, "train").to(trained.model.device)
+    cameras = believed(trained.model, dataset.cameras)
+    path = flags.output_dir / "transforms_train.json"
+    write_json(path, camera_list(cameras, dataset.names, placement))
+    say(f"{len(cameras)} cameras: {path}")
+
+
+KINDS: dict[str, tuple[type[Any], Any]] = {"pointcloud": (PointFlags, _points), "cameras": (CameraFlags, _cameras)}
+
+if __name__ == "__main__":
+    main()

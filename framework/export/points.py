@@ -1,0 +1,68 @@
+"""A point cloud of what the training cameras see: where half of each ray's light is gone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from framework.dataset import Dataset
+from framework.evaluation.evaluator import evaluation_background, use_bfloat16
+from framework.kernels.math import safe_normalize
+from framework.model import Model
+from framework.pixels import draw_pixels
+
+OPAQUE = 0.5
+"""Rays less opaque than this end in no surface."""
+
+
+@dataclass(frozen=True)
+class Points:
+    """K points on surfaces, scene coordinates."""
+
+    positions: Tensor
+    """(K, 3)."""
+    colors: Tensor
+    """(K, 3) in [0, 1], as seen from where they were found."""
+    normals: Tensor | None
+    """(K, 3) unit, of a method that has them."""
+
+
+@torch.no_grad()
+def surface_points(model: Model[Any], dataset: Dataset, count: int, reach: float | None) -> Iterator[Points]:
+    """Points that random training pixels show, chunk by chunk; fewer than `count` where rays end in nothing.
+
+    Args:
+        model: in evaluation mode.
+        dataset: the training split, on the model's device.
+        count: rays.
+        reach: points farther from the box's middle than this many of its half edges, along any axis, are left out;
+            None keeps all.
+    """
+    background, scene, box = evaluation_background(model), model.scene, model.scene.box.to(model.device)
+    middle, half = box.mean(0), (box[1] - box[0]) / 2
+    chunk = model.config.eval_num_rays_per_chunk
+    for start in range(0, count, chunk):
+        pixels = draw_pixels(dataset, min(chunk, count - start)).to(model.device)
+        rays = dataset.cameras.pixel_rays(pixels, scene.near, scene.far, dataset.times)
+        with torch.autocast(model.device.type, torch.bfloat16, enabled=use_bfloat16(model)):
+            out = model.render(rays, background)
+        depth = out.median_depth.float()
+        positions = rays.origins + depth[:, None] * rays.directions
+        kept = (out.accumulation >= OPAQUE) & (depth < rays.fars) & positions.isfinite().all(-1)
+        if reach is not None:
+            kept &= ((positions - middle).abs() <= reach * half).all(-1)
+        normals = None if out.normals is None else safe_normalize(out.normals.float())[kept].cpu()
+        yield Points(positions[kept].cpu(), out.rgb.float().clamp(0, 1)[kept].cpu(), normals)
+
+
+def joined(parts: Iterator[Points]) -> Points:
+    """All points of some parts."""
+    found = list(parts)
+    whole = Points(torch.cat([p.positions for p in found]), torch.cat([p.colors for p in found]), None)
+    if any(part.normals is None for part in found):
+        return whole
+    return replace(whole, normals=torch.cat([p.normals for p in found if p.normals is not None]))

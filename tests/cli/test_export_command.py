@@ -1,0 +1,108 @@
+"""ns-export: in the frame and units of the input."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from framework.cli.export import main
+from framework.export.cameras import believed, camera_list
+from framework.ply import read_points, write_points
+from framework.pose_refinement import PoseRefinement
+from framework.poses import Placement
+from tests.conftest import Refused
+from tests.training.helpers import tiny_trainer
+
+
+@pytest.fixture(scope="module")
+def ball(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The config of a run that has learnt the ball of radius 1."""
+    folder = tmp_path_factory.mktemp("run") / "run"
+    trainer = tiny_trainer("instant-ngp", shared_tiny, folder, max_num_iterations=200)
+    trainer.train()
+    return trainer.run.config_path
+
+
+def export(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
+    monkeypatch.setattr("sys.argv", ["ns-export", *map(str, arguments)])
+    main()
+
+
+def test_points_lie_on_the_ball(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    export(monkeypatch, "pointcloud", "--load-config", ball, "--output-dir", tmp_path, "--num-points", 20_000)
+    points = read_points(tmp_path / "point_cloud.ply")
+    assert 1_000 < len(points) < 20_000  # the rays beside the ball give none
+    distances = points.norm(dim=-1)
+    assert float((distances - 1).abs().median()) < 0.1
+    assert float((distances - 1).abs().quantile(0.9)) < 0.3
+
+
+def test_cameras_are_those_of_the_input(
+    ball: Path, shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    export(monkeypatch, "cameras", "--load-config", ball, "--output-dir", tmp_path)
+    found = {row["file_path"]: row["transform"] for row in json.loads((tmp_path / "transforms_train.json").read_text())}
+    given = json.loads((shared_tiny / "transforms_train.json").read_text())["frames"]
+    assert len(found) == len(given)
+    for frame in given:
+        name = Path(frame["file_path"]).name + ".png"
+        torch.testing.assert_close(torch.tensor(found[name]), torch.tensor(frame["transform_matrix"])[:3])
+
+
+def test_placement_is_undone_and_refinement_kept() -> None:
+    torch.manual_seed(0)
+    turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.3, 0.1], [0.3, 0, 0.2], [-0.1, -0.2, 0]]).double())
+    placement = Placement(torch.cat([turn, torch.tensor([[1.0], [-2.0], [0.5]]).double()], -1), 0.25)
+    points = torch.randn(7, 3).double()
+    torch.testing.assert_close(placement.original_points(placement.points(points)), points)
+    rotations = torch.linalg.qr(torch.randn(3, 3, 3).double())[0]
+    poses = torch.cat([rotations, torch.randn(3, 3, 1).double()], -1)
+    torch.testing.assert_close(placement.original_poses(placement.poses(poses)), poses)
+
+    from framework.cameras import Cameras
+
+    numbers = torch.ones(3)
+    cameras = Cameras(placement.poses(poses).float(), *[numbers] * 4, *[numbers.long()] * 2)  # type: ignore[arg-type]
+    refinement = PoseRefinement(3)
+    torch.nn.init.constant_(refinement.tangents, 0.1)
+    listed = camera_list(believed(torch.nn.Sequential(refinement), cameras), ["a", "b", "c"], placement)
+    moved = torch.tensor([row["transform"] for row in listed])
+    # Each camera's centre is moved by 0.1 along each axis of the scene, which is 4 times as much in the input.
+    shift = (moved[:, :, 3] - poses[:, :, 3].float()).norm(dim=-1)
+    torch.testing.assert_close(shift, torch.full((3,), 4 * 0.1 * math.sqrt(3)), rtol=1e-4, atol=1e-4)
+    same = camera_list(believed(torch.nn.Linear(1, 1), cameras), ["a", "b", "c"], placement)
+    torch.testing.assert_close(torch.tensor([row["transform"] for row in same]), poses.float(), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("with_normals", [True, False])
+def test_written_points_are_read_back(tmp_path: Path, with_normals: bool) -> None:
+    positions, colors = torch.randn(50, 3), torch.rand(50, 3)
+    write_points(tmp_path / "p.ply", positions, colors, torch.randn(50, 3) if with_normals else None)
+    assert torch.equal(read_points(tmp_path / "p.ply"), positions.double())
+    size = 50 * (27 if with_normals else 15)
+    raw = (tmp_path / "p.ply").read_bytes()
+    header = raw[: raw.index(b"end_header\n") + 11]
+    assert len(raw) - len(header) == size
+    assert (b"property float nx" in header) == with_normals
+    last = torch.tensor(list(raw[-3:])).float() / 255
+    torch.testing.assert_close(last, colors[-1], atol=0.5 / 255 + 1e-6, rtol=0)
+
+
+def test_what_cannot_be_exported_is_refused(ball: Path, tmp_path: Path, refused: Refused) -> None:
+    given = ("--load-config", ball, "--output-dir", tmp_path)
+    assert "nothing is exported as 'poincloud'. Did you mean 'pointcloud'" in refused(main, "poincloud", *given)
+    assert "--num-points must be at least 1" in refused(main, "pointcloud", *given, "--num-points", 0)
+    assert "no training ray ends in a surface" in refused(main, "pointcloud", *given, "--reach", 1e-6)
+
+
+def test_normals_are_turned_and_not_moved() -> None:
+    """A wall x = 2 of the scene, of which the input is a quarter turn about z away."""
+    quarter = torch.tensor([[0.0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7]]).double()
+    placement = replace(Placement(quarter, 2.0))
+    normal = torch.tensor([[1.0, 0, 0]]).double() @ placement.transform[:, :3]
+    wall = torch.tensor([[2.0, 0, 0], [2.0, 3, 1]]).double()
+    along = placement.original_points(wall).diff(dim=0)
+    assert float((along @ normal.T).abs().max()) < 1e-12

@@ -220,7 +220,7 @@ class Trainer:
         set_learning_rate(self.optimizer, self.config, state.step, self.progress)
         places = self._places_in_a_pixel()
         count = max(self._batch_size() // len(places), 1)
-        batch = draw_batch(self.train_set, count, self._background(), self.errors, places, self._look_up())
+        batch = self._draw(count, places)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=use_bfloat16(self.model)):
             self.model.before_step(state.step, self.progress)
             rendered = self.model.render(batch.rays, batch.background.repeat_interleave(len(places), 0))
@@ -244,6 +244,10 @@ class Trainer:
             rays_per_second=len(batch.rays) / seconds,
             samples_per_ray=state.samples_per_ray,
         )
+
+    def _draw(self, count: int, places: Tensor) -> Batch:
+        """`count` pixels to learn from, with a ray through each of the places (K, 2) in them."""
+        return draw_batch(self.train_set, count, self._background(), self.errors, places, self._look_up())
 
     def _look_up(self) -> LookUp | None:
         """Where this step's colours come from, if they lie in a file."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import time
 from contextlib import closing
@@ -300,8 +301,8 @@ class Trainer:
         state.seconds += seconds
         state.rays += len(batch.rays)
         state.samples_per_ray += 0.2 * (num_samples / max(len(batch.rays), 1) - state.samples_per_ray)
-        weight = max(0.02, 1 / state.step)
-        state.train_mse += weight * (mse - state.train_mse)
+        if math.isfinite(mse):  # a dropped step's may not be, and a running mean never forgets a NaN
+            state.train_mse += max(0.02, 1 / state.step) * (mse - state.train_mse)
 
     def _train_psnr(self) -> float:
         return min(-10 * float(torch.tensor(max(self.state.train_mse, 1e-12)).log10()), MAX_PSNR)

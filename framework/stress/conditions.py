@@ -108,7 +108,7 @@ CONDITIONS = (
         "pictures 170 degrees wide, from inside: from outside, hardly a pixel would see the ball",
         lambda _: ball_views(170.0, RADIUS / 2),
         allowed=ALLOWED_OF_OTHER_PICTURES,
-        reason="a pixel in the middle spans 50 degrees",
+        reason="a pixel in the middle spans over 40 degrees",
         ball_only=True,
     ),
     Condition(

@@ -81,6 +81,11 @@ def _default_run(method: str) -> Run:
     return Run(method, load_method(method).config, "", load_dataparser("procedural")(), Path())
 
 
+def run_of(method: str, flags: list[str]) -> Run:
+    """The run that `ns-train METHOD` with these flags would start."""
+    return _parse_flags(_default_run(method), flags, fresh=True)
+
+
 def _read_run(path: Path) -> Run:
     from framework.training.run import read_run
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import time
 from contextlib import closing
@@ -220,7 +221,7 @@ class Trainer:
         set_learning_rate(self.optimizer, self.config, state.step, self.progress)
         places = self._places_in_a_pixel()
         count = max(self._batch_size() // len(places), 1)
-        batch = draw_batch(self.train_set, count, self._background(), self.errors, places, self._look_up())
+        batch = self._draw(count, places)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=use_bfloat16(self.model)):
             self.model.before_step(state.step, self.progress)
             rendered = self.model.render(batch.rays, batch.background.repeat_interleave(len(places), 0))
@@ -244,6 +245,10 @@ class Trainer:
             rays_per_second=len(batch.rays) / seconds,
             samples_per_ray=state.samples_per_ray,
         )
+
+    def _draw(self, count: int, places: Tensor) -> Batch:
+        """`count` pixels to learn from, with a ray through each of the places (K, 2) in them."""
+        return draw_batch(self.train_set, count, self._background(), self.errors, places, self._look_up())
 
     def _look_up(self) -> LookUp | None:
         """Where this step's colours come from, if they lie in a file."""
@@ -296,8 +301,8 @@ class Trainer:
         state.seconds += seconds
         state.rays += len(batch.rays)
         state.samples_per_ray += 0.2 * (num_samples / max(len(batch.rays), 1) - state.samples_per_ray)
-        weight = max(0.02, 1 / state.step)
-        state.train_mse += weight * (mse - state.train_mse)
+        if math.isfinite(mse):  # a dropped step's may not be, and a running mean never forgets a NaN
+            state.train_mse += max(0.02, 1 / state.step) * (mse - state.train_mse)
 
     def _train_psnr(self) -> float:
         return min(-10 * float(torch.tensor(max(self.state.train_mse, 1e-12)).log10()), MAX_PSNR)

@@ -1,0 +1,32 @@
+"""instant-ngp that shows NaN in batches of few rays: what a broken plugin does."""
+
+import math
+from dataclasses import dataclass, replace
+
+from torch import Tensor
+
+from framework import Method, Rays, Rendered
+from methods.instant_ngp import InstantNGP, InstantNGPConfig
+
+
+@dataclass(frozen=True)
+class SickConfig(InstantNGPConfig):
+    """Settings of instant-ngp, and when it is sick."""
+
+    sick_rays: int = 1
+    """In training, colours of batches of at most so many rays are NaN."""
+
+
+class Sick(InstantNGP):
+    """Sick in small batches."""
+
+    config: SickConfig
+
+    def render(self, rays: Rays, background: Tensor) -> Rendered:
+        rendered = super().render(rays, background)
+        if self.training and len(rays) <= self.config.sick_rays:
+            return replace(rendered, rgb=rendered.rgb * math.nan)
+        return rendered
+
+
+METHOD = Method(Sick, SickConfig(), paper="none")

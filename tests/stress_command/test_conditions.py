@@ -1,0 +1,94 @@
+"""The list of conditions: complete, selectable, and each a scene and settings that hang together."""
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from framework.cli.stress import USAGE
+from framework.config import from_plain
+from framework.errors import ConfigError
+from framework.registry import load_method
+from framework.stress.conditions import CONDITIONS, PLAIN, Condition, select
+from framework.stress.scenes import ball_views
+from framework.stress.trial import MOST_RAYS, MOST_SAMPLES, Budget, StressedTrainer, shortened
+from framework.training.run import create_folder
+from tests.training.helpers import tiny_run
+
+BALL = ball_views()
+BY_NAME = {condition.name: condition for condition in CONDITIONS}
+
+
+def test_names_are_unique_and_the_help_lists_them_all() -> None:
+    assert len(BY_NAME) == len(CONDITIONS)
+    words = USAGE.replace(",", " ").split()
+    assert [name for name in BY_NAME if name not in words and name != "plain"] == []
+
+
+def test_the_plain_run_comes_first_whatever_is_asked_for() -> None:
+    assert select([]) == list(CONDITIONS)
+    assert [c.name for c in select(["inside", "all-white"])] == ["plain", "all-white", "inside"]
+    assert select(["plain"]) == [PLAIN]
+    with pytest.raises(ConfigError, match="--only: there is no condition 'all-whit'. Did you mean 'all-white'"):
+        select(["all-whit"])
+
+
+@pytest.mark.parametrize("condition", CONDITIONS, ids=lambda condition: condition.name)
+def test_each_makes_a_scene_that_hangs_together(condition: Condition) -> None:
+    views = condition.change(BALL)
+    for dataset in (views.train, views.test):
+        assert len(dataset.pixels) == int(dataset.cameras.offsets[-1])
+        assert len(dataset.names) == dataset.scene.num_cameras == len(dataset)
+        assert dataset.scene.has_alpha == (dataset.pixels.shape[1] == 4)
+        assert 0 < dataset.scene.near < dataset.scene.far
+        assert bool((dataset.scene.box[1] > dataset.scene.box[0]).all())
+    finite = bool(torch.isfinite(views.train.cameras.camera_to_worlds).all())
+    assert finite == (condition.name != "nan-pose")
+    assert bool(torch.isfinite(views.test.cameras.camera_to_worlds).all())
+
+
+@pytest.mark.parametrize("condition", CONDITIONS, ids=lambda condition: condition.name)
+def test_each_has_settings_that_are_accepted_or_refused(condition: Condition) -> None:
+    config = load_method("instant-ngp").config
+    if condition.name == "float16":
+        with pytest.raises(ConfigError, match="'mixed_precision' is 'float16'; it must be bool"):
+            from_plain(config, condition.settings(config), condition.name)
+        return
+    changed = from_plain(config, condition.settings(config), condition.name)
+    if condition.name == "learning-rate-x10":
+        assert changed.learning_rate == pytest.approx(10 * config.learning_rate)
+    elif condition.name == "bfloat16":
+        assert changed.mixed_precision is True
+    elif condition.name == "float32":
+        assert changed.mixed_precision is False
+    else:
+        assert changed == config
+
+
+def test_short_runs_take_small_steps() -> None:
+    for method in ("vanilla-nerf", "instant-ngp"):
+        config = shortened(load_method(method).config, Budget(7, 1.5))
+        assert (config.max_num_iterations, config.max_seconds, config.vis) == (7, 1.5, "none")
+        assert config.num_rays_per_batch == MOST_RAYS
+        assert config.samples_per_batch == (None if method == "vanilla-nerf" else MOST_SAMPLES)
+
+
+@pytest.mark.parametrize(("name", "rays"), [("1-ray", 1), ("8192-rays", 8192)])
+def test_a_step_has_so_many_rays(name: str, rays: int, tmp_path: Path) -> None:
+    """Also of a method whose rays follow its samples."""
+    run = tiny_run("instant-ngp", Path("none"), tmp_path)
+    create_folder(run)
+    trainer = StressedTrainer(run, BALL.train, BY_NAME[name])
+    trainer.train_step()
+    assert trainer.state.rays == rays
+
+
+def test_spoiled_batches_are_dropped_and_counted(tmp_path: Path) -> None:
+    run = tiny_run("instant-ngp", Path("none"), tmp_path)
+    create_folder(run)
+    trainer = StressedTrainer(run, BALL.train, BY_NAME["nan-pixels"])
+    for _ in range(6):
+        trainer.train_step()
+    assert trainer.state.skipped == 2
+    assert math.isfinite(trainer.state.train_mse)

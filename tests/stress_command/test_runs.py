@@ -1,0 +1,162 @@
+"""Whole runs under conditions: a small instant-ngp, a plugin that breaks, and the command."""
+
+import json
+import math
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+from framework import registry
+from framework.cli.stress import main
+from framework.stress.conditions import CONDITIONS, PLAIN, select
+from framework.stress.scenes import ball_views
+from framework.stress.trial import Budget, attempt, unsound
+from framework.stress.verdict import verdicts
+from tests.cli.helpers import TINY_NGP
+from tests.conftest import Refused
+from tests.training.helpers import TINY, tiny_run, tiny_trainer
+
+BALL = ball_views()
+BUDGET = Budget(steps=150, seconds=None)
+SICK = " ".join(["sick", *TINY_NGP])
+
+
+def test_a_small_method_in_easy_hard_scenes(tmp_path: Path) -> None:
+    run = tiny_run("instant-ngp", Path("none"), tmp_path)
+    found = {v.name: v for v in verdicts(run, BALL, select(["all-black", "duplicate-cameras", "nan-pixels"]), BUDGET)}
+    for verdict in found.values():
+        print(verdict.name, verdict.line())
+    assert list(found) == ["plain", "all-black", "duplicate-cameras", "nan-pixels"]
+    assert found["plain"].outcome == "pass"
+    assert found["plain"].lost == 0
+    assert {v.outcome for v in found.values()} <= {"pass", "degraded"}
+    assert all(v.psnr is not None and v.psnr > 10 for v in found.values())
+    assert all(v.steps == 150 for v in found.values())
+    assert found["nan-pixels"].skipped == 50
+    assert found["duplicate-cameras"].skipped == 0
+    assert list(tmp_path.iterdir()) == []  # the run's own folder is not used
+
+
+def test_what_the_framework_does_not_offer_is_refused(tmp_path: Path) -> None:
+    run = tiny_run("instant-ngp", Path("none"), tmp_path)
+    _, verdict = verdicts(run, BALL, select(["float16"]), Budget(1, None))
+    assert verdict.outcome == "refused"
+    assert verdict.error == "float16: 'mixed_precision' is 'float16'; it must be bool"
+
+
+def test_the_same_run_twice_is_the_same(tmp_path: Path) -> None:
+    run = tiny_run("instant-ngp", Path("none"), tmp_path)
+    first, second = (attempt(PLAIN, run, BALL, Budget(20, None)) for _ in range(2))
+    assert first.psnr == second.psnr
+    assert first.error is None
+
+
+def test_what_is_not_finite_is_named(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run")
+    trainer.train_step()
+    assert unsound(trainer, BALL.test) is None
+    kept, trainer.state.train_mse = trainer.state.train_mse, math.nan
+    assert unsound(trainer, BALL.test) == "the running mean of the training error is not finite"
+    trainer.state.train_mse = kept
+    with torch.no_grad():
+        trainer.model.field.color_head[0].weight[0, 0] = math.inf
+    assert unsound(trainer, BALL.test) == "the parameter field.color_head.0.weight is not finite"
+
+
+# -- a plugin that breaks, and the command ------------------------------------------------------------------------
+
+
+@pytest.fixture
+def sick(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Registered as a plugin: instant-ngp that shows NaN in batches of few rays."""
+    monkeypatch.setenv("NERFLOOM_METHODS", "sick=tests.stress_command.sick:METHOD")
+    registry.registered.cache_clear()
+    yield
+    registry.registered.cache_clear()
+
+
+def stress(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
+    monkeypatch.setattr(sys, "argv", ["ns-stress", *map(str, arguments)])
+    main()
+
+
+@pytest.mark.usefixtures("sick")
+def test_a_plugin_that_is_sick_once_fails_there_and_the_rest_goes_on(tmp_path: Path, refused: Refused) -> None:
+    path = tmp_path / "out" / "sick.json"
+    flags = ("--only", "1-ray", "duplicate-cameras", "nan-pixels", "--max-num-iterations", 40, "--output-path", path)
+    assert "1 of 4 conditions failed: 1-ray" in refused(main, SICK, *flags)
+    content = json.loads(path.read_text())
+    assert content["method"] == SICK
+    assert content["data"] == "ball"
+    assert content["machine"]["torch"]
+    outcomes = {verdict["name"]: verdict for verdict in content["verdicts"]}
+    assert list(outcomes) == ["plain", "duplicate-cameras", "1-ray", "nan-pixels"]
+    assert "10 steps in a row were not finite" in outcomes["1-ray"]["error"]
+    assert "/" not in outcomes["1-ray"]["error"].replace("the run's folder/nerfstudio_models", "")
+    for name in ("plain", "duplicate-cameras", "nan-pixels"):
+        assert outcomes[name]["outcome"] in ("pass", "degraded")
+        assert outcomes[name]["psnr"] is not None
+
+
+@pytest.mark.usefixtures("sick")
+def test_a_plugin_that_is_always_sick_fails_everywhere(tmp_path: Path, refused: Refused) -> None:
+    path = tmp_path / "sick.json"
+    flags = ("--only", "all-white", "--max-num-iterations", 20, "--output-path", path)
+    assert "2 of 2 conditions failed: plain, all-white" in refused(main, f"{SICK} --sick-rays 999999999", *flags)
+    for verdict in json.loads(path.read_text())["verdicts"]:
+        assert verdict["outcome"] == "fail"
+        assert verdict["psnr"] is None
+        assert verdict["lost"] is None
+
+
+def test_on_somebodys_data(
+    shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "ball.json"
+    only = ("--only", "inside", "one-image")
+    method = " ".join(["instant-ngp", *TINY_NGP])
+    stress(monkeypatch, method, "--data", shared_tiny, *only, "--max-num-iterations", 15, "--output-path", path)
+    said = capsys.readouterr().err
+    assert "left out, for they need pictures that only the ball has: inside" in said
+    content = json.loads(path.read_text())
+    assert content["data"] == "ball"  # the folder's name
+    assert [verdict["name"] for verdict in content["verdicts"]] == ["plain", "one-image"]
+    assert str(shared_tiny) not in path.read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("instant-npg",), "unknown method 'instant-npg'. Did you mean 'instant-ngp'"),
+        (("instant-ngp", "--only", "all-whit"), "Did you mean 'all-white'"),
+        (("instant-ngp", "--data", "/no/such/folder"), "there is no such folder"),
+        (("instant-ngp 'open",), "METHOD: \"instant-ngp 'open\" cannot be read"),
+        (("instant-ngp", "--max-num-iterations", 0), "--max-num-iterations must be at least 1"),
+        (("--data",), "the method comes first"),
+        (("",), "the method is missing"),
+    ],
+)
+def test_what_cannot_be_begun_is_one_line(
+    arguments: tuple[object, ...], words: str, refused: Refused, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert words in refused(main, *arguments)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_help_is_quick_and_complete(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    stress(monkeypatch, "--help")
+    assert "usage: ns-stress METHOD" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [kind for kind in TINY if "+" not in kind])
+def test_no_built_in_method_fails_under_any_condition(kind: str, tmp_path: Path) -> None:
+    run = tiny_run(kind, Path("none"), tmp_path)
+    found = list(verdicts(run, BALL, CONDITIONS, Budget(200, 30.0)))
+    for verdict in found:
+        print(f"{kind:14}{verdict.name:20}{verdict.line()}")
+    assert [f"{verdict.name}: {verdict.error}" for verdict in found if verdict.outcome == "fail"] == []

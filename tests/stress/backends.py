@@ -1,0 +1,54 @@
+"""What the stress tests share: which implementations a test runs on, and how much hypothesis may try.
+
+A backend is a way to compute the kernels. `reference` is torch alone: kernels are then their `*_reference` functions.
+`compiled` is the C++ library, through the public functions. A further one is a name in `BACKENDS`, what it needs in
+`MARKS`, and a branch in `switch_to`.
+"""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+from framework.kernels import native
+from tests.kernels.compiled import needs_kernels
+
+REFERENCE, COMPILED = "reference", "compiled"
+BACKENDS = (REFERENCE, COMPILED)
+MARKS = {COMPILED: (needs_kernels,)}
+
+FEW = settings(
+    max_examples=40,
+    derandomize=True,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],  # a backend is switched to once for all examples
+)
+"""The same few examples in every run."""
+
+
+def switch_to(backend: str, patch: pytest.MonkeyPatch) -> None:
+    """Until `patch` is undone, everything is computed on a backend: fields, samplers and renderers too."""
+    if backend == REFERENCE:
+        patch.setattr(native, "available", lambda: False)
+        patch.setattr(native, "usable", lambda *tensors: False)
+        patch.setattr(native, "has", lambda name: False)
+
+
+def backends(**broken: str) -> pytest.MarkDecorator:
+    """Run a test, which takes a `backend`, on each of them.
+
+    Args:
+        broken: backends on which it is known to fail, and why.
+    """
+    params = []
+    for name in BACKENDS:
+        marks = [*MARKS.get(name, ())]
+        if name in broken:
+            marks.append(pytest.mark.xfail(strict=True, reason=broken[name]))
+        params.append(pytest.param(name, marks=marks))
+    return pytest.mark.parametrize("backend", params, indirect=True)
+
+
+def known_on_all(reason: str) -> pytest.MarkDecorator:
+    """As `backends`, of a test that is known to fail on each of them."""
+    return backends(**dict.fromkeys(BACKENDS, reason))

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from framework import DataError
 from framework.cameras import check_pose
+from framework.errors import shown as shown
 
 LONGEST_NAME = 250
 """Characters of a file's or folder's name; most systems allow 255 bytes."""
@@ -68,7 +69,7 @@ def read_times(frames: list[Any], where: list[str]) -> Tensor | None:
     for frame, place in zip(frames, where, strict=True):
         time = frame.get("time")
         if not isinstance(time, (int, float)) or isinstance(time, bool) or not 0 <= time <= 1:
-            raise DataError(f"{place}: 'time' is {time!r}; it must be a number from 0 to 1")
+            raise DataError(f"{place}: 'time' is {shown(time)}; it must be a number from 0 to 1")
     return torch.tensor([float(frame["time"]) for frame in frames])
 
 
@@ -99,12 +100,6 @@ def numbers(value: Any, count: int, name: str, where: str) -> list[float]:
     if not isinstance(value, list) or len(value) != count:
         raise DataError(f"{where}: '{name}' is {shown(value)}; it must be a list of {count} numbers")
     return [number(part, name, where) for part in value]
-
-
-def shown(value: Any) -> str:
-    """A value for a message: one short line whatever it holds."""
-    text = repr(value) if not isinstance(value, int) or abs(value) < 10**30 else "a huge whole number"
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def file_name(value: Any, name: str, where: str) -> str:

@@ -74,9 +74,10 @@ def unpack(path: Path) -> dict[str, np.ndarray] | None:
             file.seek(size - length)
             with np.load(io.BytesIO(file.read(length)), allow_pickle=False) as content:
                 facts = {name: content[name] for name in content.files}
-    except (OSError, ValueError, EOFError, KeyError):
+        whole = size - length == int(facts["pixels"]) * int(facts["channels"])
+    except Exception:  # numpy, zipfile and zlib raise ValueError, EOFError, KeyError, BadZipFile, zlib.error and more
         return None
-    return facts if size - length == int(facts["pixels"]) * int(facts["channels"]) else None
+    return facts if whole else None
 
 
 def temporary_store(path: Path, size: int) -> FileStore:

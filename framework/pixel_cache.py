@@ -113,7 +113,7 @@ def _host() -> str:
 
 def _alive(process: str) -> bool:
     """Whether this machine runs a process of that number; taken for granted where it cannot be asked harmlessly."""
-    if os.name != "posix" or not process.isdigit():
+    if os.name != "posix" or not process.isdecimal():
         return True
     try:
         os.kill(int(process), 0)

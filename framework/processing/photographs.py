@@ -76,7 +76,7 @@ def find_photographs(folder: Path, leave_out: Iterable[Path] = ()) -> list[Path]
 def natural_order(path: Path) -> list[tuple[int, int, str]]:
     """A sorting key by which numbers in a name count as numbers."""
     parts = re.split(r"(\d+)", path.as_posix().lower())
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts if part]
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts if part]
 
 
 def output_names(sources: Iterable[Path]) -> list[str]:

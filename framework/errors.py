@@ -68,7 +68,7 @@ def shown(value: Any) -> str:
     if isinstance(value, int) and abs(value) >= 10**30:
         return "a huge whole number"
     try:
-        text = _BRIEF.repr(value)
+        text = printable(_BRIEF.repr(value))
     except ValueError:  # Python writes no whole number of thousands of digits
         text = f"a {type(value).__name__} that cannot be written"
     return text if len(text) <= 60 else f"{text[:57]}..."

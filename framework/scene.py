@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from framework.checked import checked
+from framework.errors import shown
+
 PoseSource = Literal["exact", "photographs", "device"]
+MOST_CAMERAS = 10**7
+"""What claims to have more is not believed: methods may have parameters for each."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,20 @@ class Scene:
     """Light, exposure or camera differ between the photographs."""
     camera_to_worlds: Tensor | None = None
     """(num_cameras, 3, 4) the training cameras' poses as they are given."""
+
+    @classmethod
+    def of(cls, facts: Any) -> Scene:
+        """From facts out of a file.
+
+        Raises: ValueError where they are none that a scene can have.
+        """
+        scene = checked(cls, facts)
+        if scene.box.shape != (2, 3) or scene.box.dtype != torch.float32 or scene.box.layout != torch.strided:
+            raise ValueError(f"the scene's box has the shape {tuple(scene.box.shape)}; it must be two corners")
+        poses, count = scene.camera_to_worlds, scene.num_cameras
+        if not 1 <= count <= MOST_CAMERAS or (poses is not None and poses.shape != (count, 3, 4)):
+            raise ValueError(f"the scene has {shown(count)} cameras, which do not fit its poses")
+        return scene
 
     def to(self, device: torch.device | str) -> Scene:
         """The same facts on `device`."""

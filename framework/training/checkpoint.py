@@ -134,7 +134,13 @@ def _is_sealed(path: Path) -> bool:
 
 
 def load_newest(folder: Path, device: torch.device | str = "cpu") -> dict[str, Any] | None:
-    """The newest readable checkpoint of a folder, or None where the folder has none.
+    """The newest readable checkpoint of a folder, or None where the folder has none: see `find_newest`."""
+    found = find_newest(folder, device)
+    return None if found is None else found[1]
+
+
+def find_newest(folder: Path, device: torch.device | str = "cpu") -> tuple[Path, dict[str, Any]] | None:
+    """The newest readable checkpoint of a folder and its content, or None where the folder has none.
 
     A damaged one is reported and the one before it is taken.
 
@@ -143,7 +149,7 @@ def load_newest(folder: Path, device: torch.device | str = "cpu") -> dict[str, A
     paths = list_checkpoints(folder)
     for path in reversed(paths):
         try:
-            return load_checkpoint(path, device)
+            return path, load_checkpoint(path, device)
         except CheckpointError as error:
             say(f"{error}; trying the one before")
     if paths:

@@ -13,7 +13,7 @@ from framework.errors import CheckpointError
 from framework.model import Model
 from framework.registry import load_method
 from framework.scene import Scene
-from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest
+from framework.training.checkpoint import FOLDER, find_newest, load_checkpoint
 from framework.training.run import Run, read_run
 
 
@@ -61,16 +61,19 @@ def load_trained(
     )
     run = dataclasses.replace(run, config=config)
     device = choose_device(machine)
-    content = load_checkpoint(checkpoint, device) if checkpoint else load_newest(run.folder / FOLDER, device)
-    if content is None:
-        raise CheckpointError(f"{run.folder / FOLDER} holds no checkpoint")
+    if checkpoint is None:
+        found = find_newest(run.folder / FOLDER, device)
+        if found is None:
+            raise CheckpointError(f"{run.folder / FOLDER} holds no checkpoint")
+        path, content = found
+    else:
+        path, content = checkpoint, load_checkpoint(checkpoint, device)
     try:
-        scene = Scene(**content["scene"]).to("cpu")
-    except (KeyError, TypeError, AttributeError) as error:
-        raise CheckpointError(f"the checkpoint of {run.folder} lacks the scene: {error}") from error
+        scene = Scene.of(content.get("scene")).to("cpu")
+    except ValueError as error:
+        raise CheckpointError(f"{path} lacks the scene: {error}") from error
     model = build_model(run.method, config, scene).to(device).eval()
     restore_model(model, content)
-    path = checkpoint or run.folder / FOLDER / f"step-{content['state']['step']:09d}.ckpt"
     return Trained(run, model, path, content)
 
 
@@ -86,6 +89,6 @@ def restore_model(model: Model[Any], checkpoint: dict[str, Any]) -> None:
     """
     try:
         model.load_state_dict(checkpoint["model"])
-    except (RuntimeError, TypeError, AttributeError, ValueError) as error:
+    except (RuntimeError, TypeError, AttributeError, ValueError, LookupError) as error:
         reason = " ".join(str(error).split())[:300]
         raise CheckpointError(f"the checkpoint does not fit the model's settings: {reason}") from error

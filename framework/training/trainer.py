@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from framework.cameras import CENTER, subpixels
+from framework.checked import checked
 from framework.config import to_plain
 from framework.console import say
 from framework.dataset import Dataset
@@ -137,11 +138,11 @@ class Trainer:
             self.optimizer.load_state_dict(checkpoint["optimizer"])
             for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
                 group["initial_lr"] = rate  # a rate given on the command line counts
-            self.state = State(**checkpoint["state"])
+            self.state = checked(State, checkpoint["state"])
             if self.errors is not None and checkpoint.get("errors") is not None:
                 self.errors.errors.copy_(checkpoint["errors"])
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise CheckpointError(f"the checkpoint's optimiser does not fit: {error}") from error
+        except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+            raise CheckpointError(f"the checkpoint's optimiser or state does not fit: {error}") from error
         self.first_step = self.state.step
         self._last_save = self._last_eval = self.state.seconds
 

@@ -25,8 +25,6 @@ def start(run: Run) -> None:
     trainer = _prepare(run)
     trainer.restore_as_configured()
     create_folder(run)
-    write_transforms(run, trainer.train_set)
-    write_json(run.folder / "scene_profile.json", trainer.profile().as_plain())
     _finish(run, trainer)
 
 
@@ -56,6 +54,9 @@ def _prepare(run: Run) -> Trainer:
 
 
 def _finish(run: Run, trainer: Trainer) -> None:
+    # Also of a run that goes on: it may have been killed before it came to this.
+    write_transforms(run, trainer.train_set)
+    write_json(run.folder / "scene_profile.json", trainer.profile().as_plain())
     outcome = trainer.train()
     state = trainer.state
     say(

@@ -144,7 +144,8 @@ class Trainer:
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise CheckpointError(f"the checkpoint's optimiser or state does not fit: {error}") from error
         self.first_step = self.state.step
-        self._last_save = self._last_eval = self.state.seconds
+        self._last_save = self.state.seconds
+        self._last_eval = self.state.curve[-1][0] if self.state.curve else 0.0
 
     def restore_as_configured(self) -> None:
         """Start from --load-checkpoint or --load-dir, where given."""
@@ -173,9 +174,9 @@ class Trainer:
                 report = self.train_step()
                 bar.show(report)
                 self._log(report, board)
+                self._evaluate_if_due(board)  # before saving: a run that goes on from here does not come back to it
                 if self._due_to_save():
                     self._try_to_save()
-                self._evaluate_if_due(board)
         self._write_curve()
         return Outcome(reason, bool(stopped), self.save())
 

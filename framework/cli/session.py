@@ -12,7 +12,7 @@ from framework.evaluation.evaluator import evaluate
 from framework.pixel_cache import PixelMemory
 from framework.training.checkpoint import FOLDER, load_newest
 from framework.training.report import write_evaluation, write_summary
-from framework.training.run import Run, create_folder, write_json, write_transforms
+from framework.training.run import Run, create_folder, write_report, write_transforms
 from framework.training.skipping import as_plain, skip_report
 from framework.training.trainer import Trainer
 
@@ -56,7 +56,7 @@ def _prepare(run: Run) -> Trainer:
 def _finish(run: Run, trainer: Trainer) -> None:
     # Also of a run that goes on: it may have been killed before it came to this.
     write_transforms(run, trainer.train_set)
-    write_json(run.folder / "scene_profile.json", trainer.profile().as_plain())
+    write_report(run.folder / "scene_profile.json", trainer.profile().as_plain())
     outcome = trainer.train()
     state = trainer.state
     say(
@@ -68,7 +68,7 @@ def _finish(run: Run, trainer: Trainer) -> None:
     rungs = skip_report(trainer)
     for rung in rungs:
         say(rung.line())
-    write_json(run.folder / "skip_report.json", as_plain(rungs))
+    write_report(run.folder / "skip_report.json", as_plain(rungs))
     write_summary(trainer, outcome)
     say(f"checkpoint: {outcome.checkpoint}")
     if outcome.interrupted:
@@ -84,9 +84,12 @@ def _finish(run: Run, trainer: Trainer) -> None:
         pictures=run.folder / "pictures",
         max_pictures=PICTURES,
     )
+    say(f"test: {found.line()}")  # first of all, for what follows needs room on the disk
+    if found.pictures_note is None:
+        say(f"pictures (photograph | render | error): {run.folder / 'pictures'}")
+    else:
+        say(f"warning: {found.pictures_note}")
     write_evaluation(run.folder / "eval.json", run, outcome.checkpoint, found)
-    say(f"test: {found.line()}")
-    say(f"pictures (photograph | render | error): {run.folder / 'pictures'}")
     say(f"evaluate again with: ns-eval --load-config {run.config_path}")
 
 

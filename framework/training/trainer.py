@@ -31,7 +31,7 @@ from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest, 
 from framework.training.optim import first_non_finite, make_optimizer, set_learning_rate
 from framework.training.preparation import profile_of, skip_by_silhouettes
 from framework.training.progress import ProgressBar, StepReport, TensorBoard
-from framework.training.run import Run, write_json
+from framework.training.run import Run, write_report
 from framework.training.signals import stop_signals
 from framework.training.trained import build_model, restore_model
 
@@ -346,10 +346,7 @@ class Trainer:
 
     def _write_curve(self) -> None:
         rows = [{"seconds": s, "step": n, "psnr": p} for s, n, p in self.state.curve]
-        try:
-            write_json(self.run.folder / "learning_curve.json", rows)
-        except OSError as error:
-            say(f"warning: cannot write learning_curve.json: {error.strerror}; the checkpoint holds the curve too")
+        write_report(self.run.folder / "learning_curve.json", rows)
 
     def _due_to_save(self) -> bool:
         if self._bad_in_a_row:  # what is saved now might be ruined, and would push out what is not

@@ -11,6 +11,7 @@ from framework.errors import DataError
 from framework.evaluation.evaluator import evaluate
 from framework.pixel_cache import PixelMemory
 from framework.training.checkpoint import FOLDER, load_newest
+from framework.training.lock import sole_user
 from framework.training.report import write_evaluation, write_summary
 from framework.training.run import Run, create_folder, write_report, write_transforms
 from framework.training.skipping import as_plain, skip_report
@@ -24,21 +25,23 @@ def start(run: Run) -> None:
     run = replace(run, config=run.config.resolved())
     trainer = _prepare(run)
     trainer.restore_as_configured()
-    create_folder(run)
-    _finish(run, trainer)
+    with sole_user(run.folder):
+        create_folder(run)
+        _finish(run, trainer)
 
 
 def resume(run: Run) -> None:
     """Go on with a run from its newest checkpoint; from the beginning where it has none."""
-    trainer = _prepare(run)
-    checkpoint = load_newest(run.folder / FOLDER, trainer.device)
-    if checkpoint is None:
-        trainer.restore_as_configured()
-        say(f"{run.folder} has no checkpoint: starting from the beginning")
-    else:
-        trainer.restore(checkpoint)
-        say(f"resuming {run.folder} at step {trainer.state.step:,}")
-    _finish(run, trainer)
+    with sole_user(run.folder):
+        trainer = _prepare(run)
+        checkpoint = load_newest(run.folder / FOLDER, trainer.device)
+        if checkpoint is None:
+            trainer.restore_as_configured()
+            say(f"{run.folder} has no checkpoint: starting from the beginning")
+        else:
+            trainer.restore(checkpoint)
+            say(f"resuming {run.folder} at step {trainer.state.step:,}")
+        _finish(run, trainer)
 
 
 def _prepare(run: Run) -> Trainer:

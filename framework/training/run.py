@@ -10,6 +10,7 @@ outputs/{experiment}/{method}/{YYYY-mm-dd_HHMMSS}/
     summary.json                  steps, seconds, rays, memory, parameters, and the machine
     eval.json, pictures/          the final evaluation
     events.out.tfevents.*         TensorBoard
+    .lock                         held while a process trains
 """
 
 from __future__ import annotations

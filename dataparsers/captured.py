@@ -25,7 +25,8 @@ NEAR, NEAR_SHARE, MOST_POINTS = 0.05, 0.5, 2000
 ENDINGS = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp")
 """Endings that a reduced image may have instead of its original's."""
 EXTREME = 1e9
-"""Pixels of a focal length or to a principal point beyond which float32 overflows, and below whose inverse too."""
+"""Pixels of a focal length, and to a principal point, and scene units of a box from which on float32 is in danger of
+overflowing; focal lengths below its inverse are, too."""
 ASPECT_TOLERANCE = 0.03
 """Relative difference between the shapes of an image and of its camera that rounding sizes can explain."""
 
@@ -284,6 +285,18 @@ def _check_masks(masks: tuple[Path | None, ...] | None) -> None:
     missing = [path for path in masks or () if path is not None and not path.is_file()]
     if missing:
         raise DataError(f"{missing[0]}: this mask is missing, and {len(missing) - 1} more; restore or unname them")
+
+
+def checked_box(box: Tensor, source: str) -> Tensor:
+    """A box (2, 3) that something can be in.
+
+    Args:
+        source: what it is made from, as a subject.
+    Raises: DataError where it is none.
+    """
+    if not bool((box.abs() < EXTREME).all()) or not bool((box[0] < box[1]).all()):
+        raise DataError(f"{source} make a box of no size or beyond measure")
+    return box
 
 
 def _placed(points: Tensor, placement: Placement) -> Tensor:

@@ -10,7 +10,16 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from dataparsers.captured import ENDINGS, Captured, Division, Photographs, captured_scene, from_original, image_sizes
+from dataparsers.captured import (
+    ENDINGS,
+    Captured,
+    Division,
+    Photographs,
+    captured_scene,
+    checked_box,
+    from_original,
+    image_sizes,
+)
 from dataparsers.reading import file_name, number, numbers, read_json, read_pose, read_times, rigid, shown, side
 from framework import DataError, ParsedScene
 from framework.console import say
@@ -277,9 +286,7 @@ def _with_cube(scene: ParsedScene, content: dict[str, Any], file: Path, scene_sc
     center = scene.scale * (scene.transform[:, :3] @ center + scene.transform[:, 3])
     half = 0.5 * edge * scene.scale * scene_scale
     box = torch.stack([center - half, center + half])
-    if not bool(box.isfinite().all()) or not bool((box[0] < box[1]).all()):
-        raise DataError(f"{file}: 'aabb_scale', 'scale' and 'offset' make a cube of no size or beyond measure")
-    return replace(scene, box=box)
+    return replace(scene, box=checked_box(box, f"{file}: 'aabb_scale', 'scale' and 'offset'"))
 
 
 def _from_original(scene: ParsedScene, content: dict[str, Any], file: Path) -> ParsedScene:

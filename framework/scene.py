@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -12,8 +13,8 @@ from framework.checked import checked
 from framework.errors import shown
 
 PoseSource = Literal["exact", "photographs", "device"]
-MOST_CAMERAS = 10**7
-"""What claims to have more is not believed: methods may have parameters for each."""
+MOST_CAMERAS, LARGEST_SIZE, FARTHEST = 10**7, 10**9, 1e9
+"""Cameras, pixels of an image's side and scene units of what is believed of a scene that comes out of a file."""
 
 
 @dataclass(frozen=True)
@@ -54,11 +55,15 @@ class Scene:
         Raises: ValueError where they are none that a scene can have.
         """
         scene = checked(cls, facts)
-        if scene.box.shape != (2, 3) or scene.box.dtype != torch.float32 or scene.box.layout != torch.strided:
-            raise ValueError(f"the scene's box has the shape {tuple(scene.box.shape)}; it must be two corners")
-        poses, count = scene.camera_to_worlds, scene.num_cameras
+        box, poses, count = scene.box, scene.camera_to_worlds, scene.num_cameras
+        if box.shape != (2, 3) or box.dtype != torch.float32 or box.layout != torch.strided:
+            raise ValueError(f"the scene's box has the shape {tuple(box.shape)}; it must be two corners")
+        if not bool((box.abs() < FARTHEST).all()) or not bool((box[0] < box[1]).all()):
+            raise ValueError("the scene's box has no size, or is beyond measure")
         if not 1 <= count <= MOST_CAMERAS or (poses is not None and poses.shape != (count, 3, 4)):
             raise ValueError(f"the scene has {shown(count)} cameras, which do not fit its poses")
+        if not 0 <= scene.near < scene.far < math.inf or not 1 <= scene.image_size <= LARGEST_SIZE:
+            raise ValueError(f"near {scene.near}, far {scene.far}, images of {shown(scene.image_size)} pixels")
         return scene
 
     def to(self, device: torch.device | str) -> Scene:

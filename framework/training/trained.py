@@ -89,6 +89,6 @@ def restore_model(model: Model[Any], checkpoint: dict[str, Any]) -> None:
     """
     try:
         model.load_state_dict(checkpoint["model"])
-    except (RuntimeError, TypeError, AttributeError, ValueError, LookupError) as error:
+    except (RuntimeError, TypeError, AttributeError, ValueError, LookupError, ArithmeticError, MemoryError) as error:
         reason = " ".join(str(error).split())[:300]
         raise CheckpointError(f"the checkpoint does not fit the model's settings: {reason}") from error

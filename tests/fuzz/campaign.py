@@ -42,7 +42,7 @@ def run(
     report = base / "report.jsonl"
     stop = None if count is None else count * len(readers)
     task = Task(module, list(readers), str(base), str(report), first_seed, 0, stop, seconds, patience, memory)
-    base.mkdir(parents=True, exist_ok=True)
+    (base / "temporary").mkdir(parents=True, exist_ok=True)
     report.unlink(missing_ok=True)
     for _ in range(MOST_DEATHS):
         code, said = _work(task, base)
@@ -74,6 +74,9 @@ def _work(task: Task, base: Path) -> tuple[int, str]:
         "PYTHONDONTWRITEBYTECODE": "1",
         "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")])),
         "MALLOC_ARENA_MAX": "2",  # what threads reserve of the address space is not what they use
+        "TMPDIR": str(base / "temporary"),
+        "HOME": str(base / "home"),
+        "NERFLOOM_CACHE": str(base / "cache"),
     }
     with (base / "said.txt").open("w+b") as said:
         command = [sys.executable, "-m", "tests.fuzz.worker", json.dumps(asdict(task))]

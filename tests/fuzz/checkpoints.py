@@ -12,7 +12,7 @@ from framework.training.checkpoint import SEAL
 from tests.fuzz.payload import Payload
 from tests.fuzz.raw import RAW
 from tests.fuzz.trees import damaged_tree
-from tests.fuzz.values import PLAIN
+from tests.fuzz.values import DEEP, PLAIN
 
 LENGTH = len(SEAL) + 64
 TENSORS = (
@@ -21,7 +21,7 @@ TENSORS = (
     torch.zeros(2, dtype=torch.complex64), torch.ones(3, dtype=torch.bool), torch.zeros(4, 4, 4, 4),
 )  # fmt: skip
 WORDS = ("format", "model", "state", "scene", "optimizer", "errors", "step")
-VALUES = (*(value for value in PLAIN if value != "@deep@"), *TENSORS, (), (1, 2), b"bytes", {1: 2})
+VALUES = (*(value for value in PLAIN if value is not DEEP), *TENSORS, (), (1, 2), b"bytes", {1: 2})
 
 
 def sealed(content: bytes) -> bytes:

@@ -56,11 +56,10 @@ class Place:
     def __init__(self, base: Path) -> None:
         self.data, self.scratch, self.outside = base / "data", base / "scratch", base / "outside"
         self.here, self.temporary = base / "here", base / "temporary"
-        for folder in (self.outside, self.here, self.temporary):
+        for folder in (self.outside, self.here):
             folder.mkdir(parents=True, exist_ok=True)
         (self.outside / "secret").write_text("nobody reads this, and nobody writes here")
         os.chdir(self.here)
-        os.environ.update(TMPDIR=str(self.temporary), HOME=str(base / "home"), NERFLOOM_CACHE=str(base / "cache"))
 
     def fill(self, files: Files) -> None:
         """Make the data folder anew, and the one that readers may write to empty."""

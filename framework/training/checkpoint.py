@@ -59,7 +59,9 @@ def _flush_folder(folder: Path) -> None:
 
 
 def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bool) -> Path:
-    """Write `state` as step-%09d.ckpt; then, unless `keep_all`, remove all but the two newest.
+    """Write `state` as step-%09d.ckpt; then, unless `keep_all`, remove all before it but the last.
+
+    Later ones stay: they were damaged, or the run would not have gone on from an earlier one, and push nothing out.
 
     Raises: CheckpointError where it cannot be written; older checkpoints are untouched then.
     """
@@ -76,7 +78,7 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bo
     for remnant in folder.glob(".step-*.ckpt.*.tmp"):  # of a process that was killed while writing
         remnant.unlink(missing_ok=True)
     if not keep_all:
-        for old in list_checkpoints(folder)[:-2]:
+        for old in [other for other in list_checkpoints(folder) if other.name < path.name][:-1]:
             old.unlink(missing_ok=True)
     return path
 

@@ -25,6 +25,22 @@ def test_the_two_newest_are_kept(tmp_path: Path) -> None:
     assert len(list_checkpoints(tmp_path)) == 3
 
 
+def test_a_damaged_later_one_pushes_nothing_out(tmp_path: Path) -> None:
+    """A run that went on from step 2, as what came after it cannot be read."""
+    paths = [save(tmp_path, step, keep_all=True) for step in (1, 2, 8, 9)]
+    for path in paths[2:]:
+        path.write_bytes(b"damaged")
+    for step in (3, 4):
+        save(tmp_path, step)
+        state = load_newest(tmp_path)
+        assert state is not None
+        assert state["model"]["w"][0] == step
+    names = [int(path.stem[5:]) for path in list_checkpoints(tmp_path)]
+    assert names == [3, 4, 8, 9]
+    save(tmp_path, 9)
+    assert [int(path.stem[5:]) for path in list_checkpoints(tmp_path)] == [8, 9]
+
+
 @pytest.mark.parametrize("keep", [0.0, 0.3, 0.99])
 def test_one_cut_short_falls_back_to_the_one_before(
     tmp_path: Path, keep: float, capsys: pytest.CaptureFixture[str]

@@ -3,7 +3,6 @@
 import ast
 import os
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from datetime import datetime, tzinfo
 from itertools import cycle
@@ -22,11 +21,10 @@ DAY = 86_400.0
 
 
 @pytest.fixture
-def jumps(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def jumps(monkeypatch: pytest.MonkeyPatch) -> None:
     """A wall clock that somebody sets a day back, two days on, and so forth, each time that it is looked at."""
     true_time, days = time.time, cycle((-DAY, DAY, -400 * DAY, 0.0))
     monkeypatch.setattr(time, "time", lambda: true_time() + next(days))
-    yield
 
 
 @pytest.mark.usefixtures("jumps")

@@ -46,11 +46,11 @@ def run(
     report.unlink(missing_ok=True)
     for _ in range(MOST_DEATHS):
         code, said = _work(task, base)
-        outcomes, unfinished = read_report(report)
-        if unfinished is None:
-            if code != 0:
-                raise RuntimeError(f"the worker ended with {code} between inputs: {said}")
+        outcomes, unfinished, ended = read_report(report)
+        if ended:
             return outcomes
+        if unfinished is None:
+            raise RuntimeError(f"the worker ended with {code} before its first input, or between two: {said}")
         death = Outcome(unfinished["reader"], unfinished["seed"], "escaped", _death(code), said)
         with report.open("a", encoding="utf-8") as lines:
             lines.write(json.dumps({"index": unfinished["index"], "outcome": asdict(death)}) + "\n")
@@ -85,18 +85,20 @@ def _work(task: Task, base: Path) -> tuple[int, str]:
         return code, said.read().decode("utf-8", "replace")
 
 
-def read_report(report: Path) -> tuple[list[Outcome], dict | None]:
-    """What became of inputs, and the one that was begun last where nothing became of it."""
-    outcomes, begun = [], None
+def read_report(report: Path) -> tuple[list[Outcome], dict | None, bool]:
+    """What became of inputs; the one that was begun last where nothing became of it; whether there are no more."""
+    outcomes, begun, ended = [], None, False
     for line in report.read_text(encoding="utf-8").splitlines() if report.exists() else ():
         entry = json.loads(line)
         if "outcome" in entry:
             found = entry["outcome"]
             outcomes.append(Outcome(**{**found, "damage": tuple(found["damage"])}))
             begun = None
+        elif "ended" in entry:
+            ended = True
         else:
             begun = entry
-    return outcomes, begun
+    return outcomes, begun, ended
 
 
 def _death(code: int) -> str:

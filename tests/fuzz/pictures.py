@@ -80,8 +80,8 @@ def other_chunks(random: Random, content: bytes) -> bytes:
     changed: dict[str, Callable[[], list[Chunk]]] = {
         "missing": lambda: parts[:index] + parts[index + 1 :],
         "twice": lambda: parts[:index] + parts[index : index + 1] + parts[index:],
-        "more": lambda: parts[:index] + [more] + parts[index:],
-        "in its place": lambda: parts[:index] + [more] + parts[index + 1 :],
+        "more": lambda: [*parts[:index], more, *parts[index:]],
+        "in its place": lambda: [*parts[:index], more, *parts[index + 1 :]],
     }
     return joined(changed[random.choice(sorted(changed))]())
 

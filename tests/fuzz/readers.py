@@ -189,7 +189,7 @@ def convert_polycam(folder: Path, scratch: Path) -> None:
 def write_record3d_whole(folder: Path) -> None:
     """Images of the size that the recording says."""
     write_record3d(folder)
-    edit(folder / "EXR_RGBD" / "metadata.json", lambda c: c.update(w=20, h=15, K=[k / 2 for k in c["K"][:8]] + [1]))
+    edit(folder / "EXR_RGBD" / "metadata.json", lambda c: c.update(w=20, h=15, K=[*(k / 2 for k in c["K"][:8]), 1]))
 
 
 def convert_record3d(folder: Path, scratch: Path) -> None:

@@ -62,7 +62,10 @@ class Watch:
         """Whether a path is allowed, or is none: a file that is open already, a mode."""
         if not isinstance(path, (str, bytes, os.PathLike)) or os.fspath(path) in ("/dev/null", b"/dev/null"):
             return True
-        place = os.path.realpath(os.fsdecode(path))
+        try:
+            place = os.path.realpath(os.fsdecode(path))
+        except ValueError:  # a name that no file can have
+            return True
         return any(place == folder or place.startswith(folder + os.sep) for folder in self.allowed)
 
 

@@ -121,7 +121,8 @@ def work(task: Task, report: TextIO) -> None:
     begun = time.monotonic()
     for index in count(task.start):
         if index == task.stop or (task.seconds is not None and time.monotonic() - begun >= task.seconds):
-            break
+            print(json.dumps({"ended": True}), file=report, flush=True)
+            return
         turn, which = divmod(index, len(task.readers))
         name, seed = task.readers[which], task.first_seed + turn
         print(json.dumps({"index": index, "reader": name, "seed": seed}), file=report, flush=True)

@@ -22,7 +22,9 @@ from dataparsers.phototourism import Phototourism
 from dataparsers.polycam import Polycam
 from dataparsers.record3d import Record3D
 from framework import DataParser, Dataset
+from framework.cli.compare import CompareFlags, plan_of
 from framework.cli.session import load_split
+from framework.config import from_plain, read_yaml
 from framework.dataset import load_dataset
 from framework.mapped_pixels import MappedPixels
 from framework.pixel_cache import PixelMemory, pack, unpack
@@ -234,6 +236,17 @@ def read_config(folder: Path, scratch: Path) -> None:
     require(is_dataclass(run.config) and is_dataclass(run.parser), "settings of another kind")
 
 
+def write_recipe(folder: Path) -> None:
+    lines = ["methods:", "- instant-ngp", "- vanilla-nerf --sampler occupancy", "max_seconds: 60.0", "data_flags: '--a 1'"]
+    (folder / "recipe.yml").write_text("\n".join(lines) + "\n")
+
+
+def read_recipe(folder: Path, scratch: Path) -> None:
+    """Of a comparison."""
+    plan = plan_of(from_plain(CompareFlags(), read_yaml(folder / "recipe.yml"), "recipe.yml"))
+    require(plan.contenders and plan.conditions.budget(), "a comparison of nothing")
+
+
 def read_checkpoints(folder: Path, scratch: Path) -> None:
     content = load_newest(folder / "run" / FOLDER)
     require(content is None or "model" in content, "a checkpoint without a model")
@@ -293,6 +306,7 @@ READERS: dict[str, Reader] = {
         write_record3d_whole, convert_record3d, ("EXR_RGBD/metadata.json",), ("perFrameIntrinsicCoeffs", "K", "w")
     ),
     "config": Reader(write_config, read_config, ("config.yml",), ("method", "dataparser", "machine", "data", "name")),
+    "comparison": Reader(write_recipe, read_recipe, ("recipe.yml",), ("methods", "data", "repeats", "target_psnr")),
     "checkpoint": Reader(write_run, read_checkpoints, ("run/nerfstudio_models/*.ckpt",)),
     "run": Reader(write_run, restore, ("run/nerfstudio_models/*.ckpt",)),
     "pixel-cache": Reader(write_pixel_cache, read_pixel_cache, ("pixels.bin",)),

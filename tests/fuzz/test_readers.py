@@ -20,7 +20,7 @@ COUNT = 60
 READERS = (
     "blender", "dnerf", "nerfstudio", "colmap-binary", "colmap-text", "llff", "llff-ndc", "record3d", "polycam",
     "phototourism", "ply", "images", "images-to-a-file", "masks", "depths", "photographs", "polycam-raw",
-    "record3d-raw", "config", "checkpoint", "run", "pixel-cache",
+    "record3d-raw", "config", "comparison", "checkpoint", "run", "pixel-cache",
 )  # fmt: skip
 """Their names here too, so that tests are collected without reading anything."""
 

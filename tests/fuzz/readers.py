@@ -237,8 +237,8 @@ def read_config(folder: Path, scratch: Path) -> None:
 
 
 def write_recipe(folder: Path) -> None:
-    lines = ["methods:", "- instant-ngp", "- vanilla-nerf --sampler occupancy", "max_seconds: 60.0", "data_flags: '--a 1'"]
-    (folder / "recipe.yml").write_text("\n".join(lines) + "\n")
+    methods = "methods:\n- instant-ngp\n- vanilla-nerf --sampler occupancy\n"
+    (folder / "recipe.yml").write_text(f"{methods}max_seconds: 60.0\ndata_flags: '--scale-factor 2'\n")
 
 
 def read_recipe(folder: Path, scratch: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dataparsers.reading import file_name, read_json, read_pose, read_times
+from dataparsers.reading import file_name, read_json, read_pose, read_times, shown
 from framework import Cameras, DataError, DataParser, ParsedScene
 from framework.dataset import Split, existing, image_size
 
@@ -101,5 +101,5 @@ def _focal_length(content: dict[str, Any], width: int, file: Path) -> float:
     """In pixels, from the horizontal field of view."""
     angle = content.get("camera_angle_x")
     if not isinstance(angle, (int, float)) or isinstance(angle, bool) or not SMALLEST_ANGLE < angle < math.pi:
-        raise DataError(f"{file}: 'camera_angle_x' is {angle!r}; it must be an angle between 0 and pi radians")
+        raise DataError(f"{file}: 'camera_angle_x' is {shown(angle)}; it must be an angle between 0 and pi radians")
     return 0.5 * width / math.tan(0.5 * angle)

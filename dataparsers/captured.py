@@ -22,6 +22,9 @@ REDUCED = (1, 2, 4, 8)
 """Whole numbers by which images are customarily reduced beforehand: those of `images` by 2 are in `images_2`."""
 ENDINGS = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp")
 """Endings that a reduced image may have instead of its original's."""
+EXTREME = 1e9
+"""Pixels of a focal length, and to a principal point, and scene units of a box from which on float32 is in danger of
+overflowing; focal lengths below its inverse are, too."""
 ASPECT_TOLERANCE = 0.03
 """Relative difference between the shapes of an image and of its camera that rounding sizes can explain."""
 
@@ -128,7 +131,7 @@ def captured_scene(
         )
     placement = place(photographs.poses, flags.orientation_method, flags.center_method, flags.auto_scale_poses)
     placement = replace(placement, scale=placement.scale * flags.scale_factor)
-    points = None if photographs.points is None else _exact(placement).points(photographs.points.double()).float()
+    points = None if photographs.points is None else _placed(photographs.points, placement)
     cameras = _cameras(photographs, placement)
     near = min(nearest_shown(cameras, points), flags.far / 2) if flags.near is None else flags.near
     photographs = photographs[chosen]
@@ -263,6 +266,24 @@ def _check_masks(masks: tuple[Path | None, ...] | None) -> None:
         raise DataError(f"{missing[0]}: this mask is missing, and {len(missing) - 1} more; restore or unname them")
 
 
+def checked_box(box: Tensor, source: str) -> Tensor:
+    """A box (2, 3) that something can be in.
+
+    Args:
+        source: what it is made from, as a subject.
+    Raises: DataError where it is none.
+    """
+    if not bool((box.abs() < EXTREME).all()) or not bool((box[0] < box[1]).all()):
+        raise DataError(f"{source} make a box of no size or beyond measure")
+    return box
+
+
+def _placed(points: Tensor, placement: Placement) -> Tensor:
+    """Sparse points (K, 3) in the scene's frame, without those that are too far away for float32."""
+    points = _exact(placement).points(points.double()).float()
+    return points[points.isfinite().all(-1)]
+
+
 def _exact(placement: Placement) -> Placement:
     """In double precision: positions of a mapped scene may be millions of units from their origin."""
     return replace(placement, transform=placement.transform.double())
@@ -276,6 +297,7 @@ def _cameras(photographs: Photographs, placement: Placement) -> Cameras:
     intrinsics = photographs.intrinsics * ratio.repeat(1, 2)
     if photographs.model == "orthographic":
         intrinsics[:, :2] /= placement.scale
+    _check_measure(photographs, intrinsics)
     poses = _exact(placement).poses(photographs.poses.double()).float()
     if not bool(poses.isfinite().all()):
         raise DataError(f"{photographs.folder}: positions of cameras are too large; leave --auto-scale-poses on")
@@ -310,3 +332,16 @@ def _check_intrinsics(photographs: Photographs, sizes: Tensor) -> None:
     lens, expected = photographs.lens, len(LENSES[photographs.model])
     if lens is not None and (lens.shape[1] != expected or not bool(lens.isfinite().all())):
         raise DataError(f"{photographs.folder}: a lens '{photographs.model}' needs {expected} finite coefficients")
+
+
+def _check_measure(photographs: Photographs, intrinsics: Tensor) -> None:
+    """Refuse cameras that nothing can be computed with.
+
+    Args:
+        intrinsics: (M, 4) fx, fy, cx, cy in pixels of the image files.
+    """
+    usable = (intrinsics[:, :2] > 1 / EXTREME).all(-1) & (intrinsics.abs() < EXTREME).all(-1)
+    if not bool(usable.all()):
+        first = int(usable.int().argmin())
+        values = ", ".join(f"{value:.3g}" for value in intrinsics[first].tolist())
+        raise DataError(f"{photographs.paths[first]}: its camera has fx, fy, cx, cy = {values} pixels: beyond measure")

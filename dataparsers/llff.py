@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dataparsers.captured import ENDINGS, REDUCED, Captured, Photographs, captured_scene, has_transforms
+from dataparsers.captured import ENDINGS, REDUCED, Captured, Photographs, captured_scene, checked_box, has_transforms
 from dataparsers.colmap_model import find_models
 from dataparsers.masks import find_masks
 from framework import DataError, ParsedScene
@@ -19,6 +19,7 @@ from framework.ndc import NdcCameras, find_ndc, ndc_box
 from framework.poses import Placement
 
 POSES = "poses_bounds.npy"
+BOUNDS = f"the depth bounds of {POSES}"
 NEAR_SHARE = 0.9
 """Rays start at this share of the smallest depth: of the points it was taken from, a few were nearer."""
 FORWARD = 0.7
@@ -84,7 +85,7 @@ class Llff(Captured):
         ends = poses[:, None, None, :, 3] + bounds[:, :, None, None] * corners[:, None]
         box = torch.stack([ends.amin((0, 1, 2)), ends.amax((0, 1, 2))]).float()
         centre = box.mean(0)
-        return replace(scene, box=centre + (box - centre) * self.scene_scale)
+        return replace(scene, box=checked_box(centre + (box - centre) * self.scene_scale, BOUNDS))
 
 
 def read_poses_bounds(file: Path, count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -154,7 +155,7 @@ def corner_directions(poses: Tensor, intrinsics: Tensor, sizes: Tensor) -> Tenso
 def _in_ndc(scene: ParsedScene, poses: Tensor, corners: Tensor, nears: Tensor) -> ParsedScene:
     """A scene in normalised device coordinates: all that is seen is in its box, so nothing is outside."""
     ndc = find_ndc(poses, corners, nears)
-    box = ndc_box(ndc, poses, corners).float()
+    box = checked_box(ndc_box(ndc, poses, corners).float(), BOUNDS)
     cameras = NdcCameras(**{f.name: getattr(scene.cameras, f.name) for f in fields(scene.cameras)}, ndc=ndc)
     # No ray is longer than the box's diagonal.
     return replace(scene, cameras=cameras, box=box, near=0.0, far=float((box[1] - box[0]).norm()), unbounded=False)

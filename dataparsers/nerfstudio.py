@@ -10,8 +10,17 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from dataparsers.captured import ENDINGS, Captured, Division, Photographs, captured_scene, from_original, image_sizes
-from dataparsers.reading import file_name, number, numbers, read_json, read_pose, read_times, rigid, shown
+from dataparsers.captured import (
+    ENDINGS,
+    Captured,
+    Division,
+    Photographs,
+    captured_scene,
+    checked_box,
+    from_original,
+    image_sizes,
+)
+from dataparsers.reading import file_name, number, numbers, read_json, read_pose, read_times, rigid, shown, side
 from framework import DataError, ParsedScene
 from framework.console import say
 from framework.dataset import Split
@@ -119,11 +128,14 @@ def _value(frame: dict[str, Any], content: dict[str, Any], key: str) -> Any:
     return content.get(key) if own is None else own
 
 
-def _number(
-    frame: dict[str, Any], content: dict[str, Any], key: str, where: str, positive: bool = False
-) -> float | None:
+def _number(frame: dict[str, Any], content: dict[str, Any], key: str, where: str) -> float | None:
     value = _value(frame, content, key)
-    return None if value is None else number(value, key, where, positive)
+    return None if value is None else number(value, key, where)
+
+
+def _side(frame: dict[str, Any], content: dict[str, Any], key: str, where: str) -> int | None:
+    value = _value(frame, content, key)
+    return None if value is None else side(value, key, where)
 
 
 def _image(path: Path) -> Path:
@@ -148,21 +160,19 @@ def _companions(
 
 def _sizes(frames: list[dict[str, Any]], content: dict[str, Any], where: list[str], paths: list[Path]) -> Tensor:
     """(M, 2) int64 width and height that intrinsics are for: as the file says, else those of the images."""
-    stated = [
-        [_number(frame, content, key, place, positive=True) for key in "wh"]
-        for frame, place in zip(frames, where, strict=True)
-    ]
+    stated = [[_side(frame, content, key, place) for key in "wh"] for frame, place in zip(frames, where, strict=True)]
     if any(None in size for size in stated):
         found = image_sizes(paths).tolist()
         stated = [other if None in size else size for size, other in zip(stated, found, strict=True)]
-    return torch.tensor(stated, dtype=torch.float64).round().long()
+    return torch.tensor(stated)
 
 
 def _camera_model(file: Path, content: dict[str, Any], frames: list[dict[str, Any]]) -> tuple[str, tuple[str, ...]]:
     """The projection of all frames, and the names of its coefficients in the file."""
     if content.get("is_fisheye") is True:  # instant-ngp's word for it
         return FISHEYE
-    named = {str(_value(frame, content, "camera_model") or "PERSPECTIVE") for frame in frames}
+    given = [_value(frame, content, "camera_model") or "PERSPECTIVE" for frame in frames]
+    named = {name if isinstance(name, str) else shown(name) for name in given}
     for name in sorted(named - set(CAMERA_MODELS)):
         raise DataError(f"{file}: unknown camera_model '{shown(name)[1:-1]}'. {nearest(name, CAMERA_MODELS)}")
     found = {CAMERA_MODELS[name] for name in named}
@@ -275,7 +285,8 @@ def _with_cube(scene: ParsedScene, content: dict[str, Any], file: Path, scene_sc
     center = (0.5 - torch.tensor(offset)) / unit
     center = scene.scale * (scene.transform[:, :3] @ center + scene.transform[:, 3])
     half = 0.5 * edge * scene.scale * scene_scale
-    return replace(scene, box=torch.stack([center - half, center + half]))
+    box = torch.stack([center - half, center + half])
+    return replace(scene, box=checked_box(box, f"{file}: 'aabb_scale', 'scale' and 'offset'"))
 
 
 def _from_original(scene: ParsedScene, content: dict[str, Any], file: Path) -> ParsedScene:
@@ -285,4 +296,8 @@ def _from_original(scene: ParsedScene, content: dict[str, Any], file: Path) -> P
     """
     matrix, scale, name = content.get("applied_transform"), content.get("applied_scale"), f"{file}: 'applied_transform'"
     applied = torch.eye(4, dtype=torch.float64) if matrix is None else rigid(matrix, name, name)
-    return from_original(scene, applied, 1.0 if scale is None else number(scale, "applied_scale", str(file), True))
+    scale = 1.0 if scale is None else number(scale, "applied_scale", str(file), positive=True)
+    scene = from_original(scene, applied, scale)
+    if scene.transform is None or not bool(scene.transform.isfinite().all()) or not 0 < scene.scale < math.inf:
+        raise DataError(f"{file}: 'applied_transform' and 'applied_scale' lead too far away")
+    return scene

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from dataparsers.captured import ENDINGS, Captured, Photographs, captured_scene, from_original, has_transforms
-from dataparsers.reading import number, read_json, rigid
+from dataparsers.reading import number, read_json, rigid, side
 from framework import DataError, ParsedScene
 from framework.dataset import Split
 from framework.scene import PoseSource
@@ -59,7 +59,7 @@ def _photographs(folder: Path, cameras: str, images: str) -> Photographs:
         poses.append(Z_UP.double() @ rigid(rows, str(file), str(file)))
         focal = [number(content.get(key), key, str(file), positive=True) for key in ("fx", "fy")]
         intrinsics.append(focal + [number(content.get(key), key, str(file)) for key in ("cx", "cy")])
-        sizes.append([round(number(content.get(key), key, str(file), positive=True)) for key in ("width", "height")])
+        sizes.append([side(content.get(key), key, str(file)) for key in ("width", "height")])
     depths = tuple(_depth(folder / "depth" / f"{file.stem}.png") for file in files)
     return Photographs(
         folder=folder,

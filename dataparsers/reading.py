@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,11 @@ import torch
 from torch import Tensor
 
 from framework import DataError
-from framework.cameras import check_pose
+from framework.cameras import LARGEST_SIDE, check_pose
+from framework.errors import shown as shown
 
-LONGEST_NAME = 250
-"""Characters of a file's or folder's name; most systems allow 255 bytes."""
+LONGEST_NAME, LONGEST_PATH = 250, 3000
+"""Bytes of a file's or folder's name, and of all on the way to a file; most systems allow 255, and 4096 in all."""
 
 
 def read_json(file: Path) -> dict[str, Any]:
@@ -68,7 +70,7 @@ def read_times(frames: list[Any], where: list[str]) -> Tensor | None:
     for frame, place in zip(frames, where, strict=True):
         time = frame.get("time")
         if not isinstance(time, (int, float)) or isinstance(time, bool) or not 0 <= time <= 1:
-            raise DataError(f"{place}: 'time' is {time!r}; it must be a number from 0 to 1")
+            raise DataError(f"{place}: 'time' is {shown(time)}; it must be a number from 0 to 1")
     return torch.tensor([float(frame["time"]) for frame in frames])
 
 
@@ -91,6 +93,17 @@ def number(value: Any, name: str, where: str, positive: bool = False) -> float:
     return result
 
 
+def side(value: Any, name: str, where: str) -> int:
+    """An image's width or height in whole pixels.
+
+    Raises: DataError where it is no number, or none that an image can have.
+    """
+    length = number(value, name, where, positive=True)
+    if not 1 <= length <= LARGEST_SIDE:
+        raise DataError(f"{where}: '{name}' is {shown(value)}; no image has such a side")
+    return round(length)
+
+
 def numbers(value: Any, count: int, name: str, where: str) -> list[float]:
     """A list of that many finite numbers.
 
@@ -101,12 +114,6 @@ def numbers(value: Any, count: int, name: str, where: str) -> list[float]:
     return [number(part, name, where) for part in value]
 
 
-def shown(value: Any) -> str:
-    """A value for a message: one short line whatever it holds."""
-    text = repr(value) if not isinstance(value, int) or abs(value) < 10**30 else "a huge whole number"
-    return text if len(text) <= 60 else f"{text[:57]}..."
-
-
 def file_name(value: Any, name: str, where: str) -> str:
     """The name of a file as a JSON entry gives it.
 
@@ -115,6 +122,15 @@ def file_name(value: Any, name: str, where: str) -> str:
     if not isinstance(value, str) or not value:
         raise DataError(f"{where}: '{name}' is missing")
     path = Path(value)
-    if not path.name or "\0" in value or max(len(part) for part in path.parts) > LONGEST_NAME:
+    if not path.name or "\0" in value or not _fits(path):
         raise DataError(f"{where}: '{name}' is not the name of a file")
     return value
+
+
+def _fits(path: Path) -> bool:
+    """Whether a file may be asked for by such a path, be it there or not."""
+    try:
+        longest = max(len(os.fsencode(part)) for part in path.parts)
+        return longest <= LONGEST_NAME and len(os.fsencode(path)) <= LONGEST_PATH
+    except UnicodeEncodeError:  # half of a character
+        return False

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dataparsers.captured import Captured, Photographs, captured_scene, has_transforms
-from dataparsers.reading import number, numbers, read_json
+from dataparsers.reading import numbers, read_json, side
 from framework import DataError, ParsedScene
 from framework.dataset import Split, existing
 from framework.kernels.math import cross_matrix
@@ -45,7 +45,7 @@ class Record3D(Captured):
         poses = _poses(content, file)
         paths = [_image(folder / "rgb", index) for index in range(len(poses))]
         keep = _spread(existing(paths, split), self.max_images)
-        width, height = (round(number(content.get(key), key, str(file), positive=True)) for key in "wh")
+        width, height = (side(content.get(key), key, str(file)) for key in "wh")
         photographs = Photographs(
             folder=folder,
             paths=tuple(paths),

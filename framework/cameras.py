@@ -22,6 +22,8 @@ from framework.lenses import LENSES as LENSES
 from framework.rays import Rays
 
 ROTATION_TOLERANCE = 1e-3
+LARGEST_SIDE = 10**9
+"""Pixels beyond which no image's width or height is believed, though files may have room for 2^64."""
 CENTER = torch.zeros(1, 2)
 """The one place in a pixel that is its centre, as columns and rows from there."""
 COMPILED = ("pinhole", *BENDING)
@@ -294,7 +296,7 @@ def check_pose(pose: Tensor, where: str) -> None:
     error = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max().item()
     if pose.shape[0] == 4:
         error = max(error, (pose[3] - torch.tensor([0.0, 0.0, 0.0, 1.0])).abs().max().item())
-    if error > ROTATION_TOLERANCE or torch.linalg.det(rotation).item() < 0:
+    if not error <= ROTATION_TOLERANCE or torch.linalg.det(rotation).item() < 0:  # NaN where squares overflow
         raise DataError(
             f"{where}: the pose is not rigid (its rotation is off an orthonormal, right-handed one by {error:.2g}); "
             "remove scale, shear or mirroring from the matrix"

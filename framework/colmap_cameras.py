@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from framework.cameras import LARGEST_SIDE
 from framework.errors import DataError
 from framework.lenses import LENSES
 
@@ -56,7 +57,8 @@ def from_colmap(model_name: str, params: Sequence[float], width: int, height: in
         raise DataError(f"COLMAP's camera model {model_name} has {len(names)} parameters ({listed}), not {len(params)}")
     values = dict(zip(names, (float(value) for value in params), strict=True))
     fx, fy = values.get("fx", values.get("f", 0.0)), values.get("fy", values.get("f", 0.0))
-    if not all(math.isfinite(value) for value in values.values()) or min(fx, fy, width, height) <= 0:
+    finite = all(math.isfinite(value) for value in values.values())
+    if not finite or min(fx, fy, width, height) <= 0 or max(width, height) > LARGEST_SIDE:
         numbers = " ".join(f"{name}={value:g}" for name, value in values.items())
         raise DataError(
             f"a COLMAP camera of model {model_name} cannot be: {width}x{height} pixels, {numbers}; "

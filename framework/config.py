@@ -14,7 +14,7 @@ from typing import Any, Literal, TypeVar, Union
 
 import yaml
 
-from framework.errors import ConfigError, nearest
+from framework.errors import ConfigError, nearest, shown
 
 T = TypeVar("T")
 RaysPerPixel = Literal[1, 4, 9, 16]
@@ -177,7 +177,8 @@ def from_plain(default: T, values: dict[str, Any], where: str) -> T:
     changes = {}
     for key, value in values.items():
         if key not in known:
-            raise ConfigError(f"{where}: unknown key '{key}'. {nearest(str(key), known)}")
+            name = key if isinstance(key, str) else shown(key)
+            raise ConfigError(f"{where}: unknown key {shown(name)}. {nearest(name, known)}")
         current = getattr(default, key)
         if dataclasses.is_dataclass(current) and isinstance(value, dict):
             changes[key] = from_plain(current, value, f"{where}: {key}")
@@ -196,12 +197,12 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
     if origin is Literal:
         if value in arguments:
             return value
-        raise ConfigError(f"{where} is {value!r}; it must be one of {', '.join(map(str, arguments))}")
+        raise ConfigError(f"{where} is {shown(value)}; it must be one of {', '.join(map(str, arguments))}")
     if origin is tuple and isinstance(value, (list, tuple)):
         inner = arguments[:1] * len(value) if arguments[-1] is Ellipsis else arguments
         if len(inner) == len(value):
             return tuple(_convert(item, kind, where) for item, kind in zip(value, inner, strict=True))
-    if hint is Path and isinstance(value, str):
+    if hint is Path and isinstance(value, str) and "\0" not in value:
         return Path(value)
     if hint is float and isinstance(value, str):  # YAML 1.1 reads 1e-3 as a string
         try:
@@ -213,22 +214,37 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
             return float(value)
         except OverflowError:
             pass
-    if isinstance(hint, type) and isinstance(value, hint) and (hint is not int or not isinstance(value, bool)):
+    if isinstance(hint, type) and isinstance(value, hint) and (hint is not int or _is_count(value)):
         return value
-    raise ConfigError(f"{where} is {value!r}; it must be {getattr(hint, '__name__', hint)}")
+    raise ConfigError(f"{where} is {shown(value)}; it must be {getattr(hint, '__name__', hint)}")
+
+
+def _is_count(value: int) -> bool:
+    """Whether an integer is one that processors count with; True and False are none, though Python thinks so."""
+    return not isinstance(value, bool) and abs(value) < 2**63
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """The safe loader without aliases: a few lines of them can stand for more than memory holds."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("an alias (*name) stands for something else; write it out")
+        return super().compose_node(parent, index)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """A YAML file that holds a mapping, read by the safe loader.
+    """A YAML file that holds a mapping, read by the safe loader, without aliases.
 
     Raises: ConfigError where it is missing, not YAML, or not a mapping.
     """
     try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        values = yaml.load(path.read_text(encoding="utf-8"), _PlainLoader)
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # bad text, bad dates, absurd nesting
-        raise ConfigError(f"{path} is not plain YAML: {' '.join(str(error).split())}") from error
+    except Exception as error:  # besides YAMLError: bad text, dates and nesting; `!!float ''` is an IndexError
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ConfigError(f"{path} is not plain YAML: {reason}") from error
     if not isinstance(values, dict):
         raise ConfigError(f"{path} must hold keys and values, such as 'method: instant-ngp'")
     return values

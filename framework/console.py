@@ -8,6 +8,8 @@ from typing import TypeVar
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from framework.errors import printable
+
 T = TypeVar("T")
 
 console = Console(stderr=True, highlight=False)
@@ -15,7 +17,7 @@ console = Console(stderr=True, highlight=False)
 
 def say(message: str) -> None:
     """Print a line to the person at the terminal; on standard error, so that output can be piped."""
-    console.print(message, markup=False, soft_wrap=True)
+    console.print(printable(message), markup=False, soft_wrap=True)
 
 
 def track(items: Iterable[T], title: str, total: int) -> Iterator[T]:

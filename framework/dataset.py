@@ -262,6 +262,8 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
     reached = pixels_with_rays(cameras, names, split)
     if reached is not None:
         kept = reached if kept is None else PixelSet.shared([kept, reached], 2)
+        if not len(kept):
+            raise DataError(f"split '{split}': masks leave only pixels that the lens has no ray for")
     return Dataset(
         pixels=decoded.pixels,
         cameras=cameras,

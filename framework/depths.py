@@ -51,8 +51,9 @@ def read_depths(paths: Sequence[Path | None], cameras: Cameras, unit: float) -> 
     parts = []
     for path, width, height in zip(paths, cameras.widths.tolist(), cameras.heights.tolist(), strict=True):
         depth = np.zeros((height, width), np.float32) if path is None else read_depth(path, width, height) * unit
-        known = np.isfinite(depth) & (depth > 0)
-        parts.append(torch.from_numpy(np.where(known, depth, 0).astype(np.float16).reshape(-1)))
+        with np.errstate(over="ignore"):
+            depth = depth.astype(np.float16)  # what is too far for it becomes infinite, and so is unknown
+        parts.append(torch.from_numpy(np.where(np.isfinite(depth) & (depth > 0), depth, 0).reshape(-1)))
     return torch.cat(parts)
 
 

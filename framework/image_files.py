@@ -7,8 +7,12 @@ from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
+from PIL import EpsImagePlugin
 
 from framework.errors import DataError
+
+# A file is read as what it holds, whatever its name; PostScript is a program, which Ghostscript would run.
+EpsImagePlugin.gs_binary = False
 
 BAND = 64
 """Rows of a reduced image that are made at once: float64 takes eight times the memory of the pixels it is made from."""
@@ -22,23 +26,25 @@ def image_size(paths: Sequence[Path]) -> tuple[int, int]:
     reason = ""
     for path in paths:
         try:
-            height, width = iio.improps(path, plugin="pillow").shape[:2]
-            return width, height
+            height, width = iio.improps(path, plugin="pillow", index=0).shape[:2]  # of an animation its first picture
+            if width and height:
+                return width, height
+            reason = reason or f"{path} has no pixel"
         except Exception as error:  # whatever the decoder raises, as in `read_image`
             reason = reason or f"{path} is not a readable image: {one_line(error)}"
     raise DataError(reason or "there is no image to read a size from")
 
 
 def read_image(path: Path, factor: int = 1) -> np.ndarray:
-    """An 8-bit image as (H, W, 4) uint8 with straight alpha, reduced by a whole number.
+    """An 8-bit image as (H, W, 4) uint8 with straight alpha, reduced by a whole number; of several the first.
 
     Raises: DataError where it cannot be decoded or has more than 8 bits a channel.
     """
     try:
-        mode = str(iio.immeta(path, plugin="pillow").get("mode", ""))
+        mode = str(iio.immeta(path, plugin="pillow", index=0).get("mode", ""))
         if mode.startswith(("I", "F")) or _is_deep_png(path):
             raise DataError(f"{path} has more than 8 bits a channel; convert it to an 8-bit PNG")
-        image = np.asarray(iio.imread(path, plugin="pillow", mode="RGBA"))
+        image = np.asarray(iio.imread(path, plugin="pillow", mode="RGBA", index=0))
     except DataError:
         raise
     except Exception as error:  # Pillow raises OSError, SyntaxError, struct.error, DecompressionBombError and more
@@ -75,7 +81,7 @@ def reduce_image(image: np.ndarray, factor: int) -> np.ndarray:
 def may_be_transparent(path: Path) -> bool:
     """Whether a file's header leaves room for alpha. A file whose header cannot be read has none."""
     try:
-        meta = iio.immeta(path, plugin="pillow")
+        meta = iio.immeta(path, plugin="pillow", index=0)
     except Exception:  # whatever the decoder raises; the file is reported when it is decoded
         return False
     return "A" in str(meta.get("mode", "")).upper() or "transparency" in meta

@@ -25,9 +25,11 @@ def read_mask(path: Path, width: int, height: int) -> np.ndarray:
     if not path.is_file():
         raise DataError(f"the mask {path} does not exist")
     try:
-        grey = np.asarray(iio.imread(path, plugin="pillow", mode="L"))
+        grey = np.asarray(iio.imread(path, plugin="pillow", mode="L", index=0))
     except Exception as error:  # as in `read_image`
         raise DataError(f"the mask {path} is not a readable image: {one_line(error)}") from error
+    if not grey.size:
+        raise DataError(f"the mask {path} has no pixel")
     used = grey >= THRESHOLD
     down, up = round(used.shape[1] / width), round(width / used.shape[1])
     if _times(used.shape, (height, width), down):

@@ -74,9 +74,10 @@ def unpack(path: Path) -> dict[str, np.ndarray] | None:
             file.seek(size - length)
             with np.load(io.BytesIO(file.read(length)), allow_pickle=False) as content:
                 facts = {name: content[name] for name in content.files}
-    except (OSError, ValueError, EOFError, KeyError):
+        whole = size - length == int(facts["pixels"]) * int(facts["channels"])
+    except Exception:  # numpy, zipfile and zlib raise ValueError, EOFError, KeyError, BadZipFile, zlib.error and more
         return None
-    return facts if size - length == int(facts["pixels"]) * int(facts["channels"]) else None
+    return facts if whole else None
 
 
 def temporary_store(path: Path, size: int) -> FileStore:
@@ -112,7 +113,7 @@ def _host() -> str:
 
 def _alive(process: str) -> bool:
     """Whether this machine runs a process of that number; taken for granted where it cannot be asked harmlessly."""
-    if os.name != "posix" or not process.isdigit():
+    if os.name != "posix" or not process.isdecimal():
         return True
     try:
         os.kill(int(process), 0)

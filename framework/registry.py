@@ -192,7 +192,7 @@ def recognize(path: Path | None) -> str:
     """
     if path is None:
         return "procedural"
-    if not path.is_dir():
+    if not os.path.isdir(path):  # `Path.is_dir` raises for names that no file can have
         raise DataError(f"--data {path}: there is no such folder")
     matches = [name for name in registered("dataparsers") if _recognizes(name, path)]
     if len(matches) == 1:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from framework.checked import checked
+from framework.errors import shown
+
 PoseSource = Literal["exact", "photographs", "device"]
+MOST_CAMERAS, LARGEST_SIZE, FARTHEST = 10**7, 10**9, 1e9
+"""Cameras, pixels of an image's side and scene units of what is believed of a scene that comes out of a file."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +47,24 @@ class Scene:
     """Light, exposure or camera differ between the photographs."""
     camera_to_worlds: Tensor | None = None
     """(num_cameras, 3, 4) the training cameras' poses as they are given."""
+
+    @classmethod
+    def of(cls, facts: Any) -> Scene:
+        """From facts out of a file.
+
+        Raises: ValueError where they are none that a scene can have.
+        """
+        scene = checked(cls, facts)
+        box, poses, count = scene.box, scene.camera_to_worlds, scene.num_cameras
+        if box.shape != (2, 3) or box.dtype != torch.float32 or box.layout != torch.strided:
+            raise ValueError(f"the scene's box has the shape {tuple(box.shape)}; it must be two corners")
+        if not bool((box.abs() < FARTHEST).all()) or not bool((box[0] < box[1]).all()):
+            raise ValueError("the scene's box has no size, or is beyond measure")
+        if not 1 <= count <= MOST_CAMERAS or (poses is not None and poses.shape != (count, 3, 4)):
+            raise ValueError(f"the scene has {shown(count)} cameras, which do not fit its poses")
+        if not 0 <= scene.near < scene.far < math.inf or not 1 <= scene.image_size <= LARGEST_SIZE:
+            raise ValueError(f"near {scene.near}, far {scene.far}, images of {shown(scene.image_size)} pixels")
+        return scene
 
     def to(self, device: torch.device | str) -> Scene:
         """The same facts on `device`."""

@@ -16,7 +16,7 @@ from framework.config import TrainConfig
 from framework.dataset import Dataset, ParsedScene, load_dataset, read_image
 from framework.device import machine_memory
 from framework.errors import ConfigError, DataError
-from framework.pixel_cache import PixelMemory
+from framework.pixel_cache import PixelMemory, unpack
 from framework.pixel_store import FileStore
 from tests.images import noise, parsed, write_noise
 
@@ -181,6 +181,18 @@ def test_a_damaged_file_is_not_used(scene: ParsedScene, folder: Path, damage: st
     path.write_bytes({"cut short": content[:-100], "other ending": content[:-1] + b"?", "empty": b""}[damage])
     assert torch.equal(cached(scene, folder).pixels, load_dataset(scene, "train").pixels)
     assert path.read_bytes() == content
+
+
+def test_a_byte_of_the_ending_that_changed(scene: ParsedScene, folder: Path) -> None:
+    """It is noticed, or means nothing, as some of a zip file's do."""
+    cached(scene, folder)
+    path, pixels = next(folder.iterdir()), sum(width * height for width, height in SIZES)
+    content = path.read_bytes()
+    for place in range(3 * pixels, len(content), 5):
+        path.write_bytes(content[:place] + bytes([content[place] ^ 0x55]) + content[place + 1 :])
+        found = unpack(path)
+        if found is not None:
+            assert (int(found["pixels"]), int(found["channels"]), found["left"].tolist()) == (pixels, 3, [0, 1, 2, 3])
 
 
 MEASURE = """

@@ -133,6 +133,9 @@ def broken(change: str) -> torch.Tensor:
         pose[:3, :3] *= 1.1
     elif change == "mirrored":
         pose[0, 0] = -1
+    elif change == "overflow":
+        pose = pose.double()
+        pose[:2, :2] = torch.tensor([[1e200, 1e200], [1e200, -1e200]])
     elif change == "shape":
         pose = pose[:2]
     return pose
@@ -145,6 +148,7 @@ def broken(change: str) -> torch.Tensor:
         ("inf", "not finite"),
         ("scaled", "not rigid"),
         ("mirrored", "not rigid"),
+        ("overflow", "not rigid"),
         ("shape", "4x4"),
     ],
 )

@@ -64,6 +64,14 @@ def test_numbers_as_yaml_writes_them() -> None:
         ("- a\n- b", "must hold keys and values"),
         ("a: [1", "is not plain YAML"),
         ("method: 2020-99-99", "is not plain YAML"),
+        ("method: !!float ''", "is not plain YAML"),
+        ("method: !!int ''", "is not plain YAML"),
+        ("method: !!bool perhaps", "is not plain YAML"),
+        ("method: !!timestamp now", "is not plain YAML"),
+        ("method: &a instant-ngp\nexperiment_name: *a", "an alias (*name) stands for something else"),
+        ("method: instant-ngp\nmachine: {seed: 18446744073709551616}", "'seed' is 18446744073709551616; it must be"),
+        ('method: instant-ngp\ndata: "a\\0b"', r"'data' is 'a\x00b'; it must be Path"),
+        ('method: instant-ngp\n"a\\nb": 4', r"unknown key 'a\nb'"),
         ("method: instant-ngp\nmachine: [1]", "'machine' is [1]"),
         ("method: instant-ngp\n3: 4", "unknown key '3'"),
         ("method: instant-ngp\ndataparser: {name: 3}", "unknown data format '3'"),
@@ -83,6 +91,16 @@ def test_bad_recipes_are_refused_in_one_line(tmp_path: Path, text: str, words: s
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("sign", ["", "-"])
+def test_numbers_of_more_digits_than_python_writes(tmp_path: Path, sign: str) -> None:
+    path = tmp_path / "recipe.yml"
+    refused = {"0x" + 5000 * "f": "a huge whole number; it must be int", "1" + 300 * ":1" + ".0": "is not plain YAML"}
+    for number, words in refused.items():
+        path.write_text(f"method: instant-ngp\nmax_eval_images: {sign}{number}")
+        with pytest.raises(ConfigError, match=words):
+            read_run(path)
+
+
 def test_a_deeply_nested_recipe_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "recipe.yml"
     path.write_text("a: " + "[" * 5_000)
@@ -92,6 +110,17 @@ def test_a_deeply_nested_recipe_is_refused(tmp_path: Path) -> None:
     except Exception as caught:  # not pytest.raises: a thousand frames of a RecursionError take minutes to print
         error = caught
     assert type(error) is ConfigError
+
+
+def test_a_few_lines_cannot_stand_for_more_than_memory_holds(tmp_path: Path) -> None:
+    """Each name stands for nine of the one before: as a value, and as keys to be merged."""
+    for first, many in (("[lol]", "[{}]"), ("{lol: 1}", "{{<<: [{}]}}")):
+        lines = [f"a0: &a0 {first}"]
+        lines += [f"a{n}: &a{n} {many.format(', '.join([f'*a{n - 1}'] * 9))}" for n in range(1, 40)]
+        path = tmp_path / "recipe.yml"
+        path.write_text("\n".join([*lines, "method: instant-ngp", "learning_rate: *a39"]))
+        with pytest.raises(ConfigError, match="alias"):
+            read_run(path)
 
 
 def test_a_recipe_cannot_run_code(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Images in memory: what is decoded is what was stored, hand-computed where it is changed."""
 
+import os
 import struct
 import zlib
 from pathlib import Path
@@ -14,7 +15,9 @@ from dataparsers.blender import Blender
 from framework.dataset import assemble, existing, image_size, load_dataset, read_image
 from framework.decoding import from_arrays
 from framework.errors import DataError
+from framework.masks import read_mask
 from framework.pixels import background_colors, composite
+from framework.processing.photographs import prepare
 from tests.images import noise, parsed, write_mask
 
 
@@ -44,6 +47,55 @@ def test_a_sixteen_bit_image_in_a_set_is_skipped_and_named(tiny: Path, capsys: p
     said = capsys.readouterr().err
     assert "1 of 10 images are unreadable and skipped" in said
     assert "r_3.png has more than 8 bits" in said
+
+
+def write_animation(path: Path, size: tuple[int, int] = (20, 20)) -> Path:
+    """Three pictures, each of one grey, in the format that the ending asks for; then it is called .png."""
+    pictures = [Image.new("L", size, 50 * index + 50) for index in range(3)]
+    pictures[0].save(path, save_all=True, append_images=pictures[1:])
+    return path.rename(path.with_suffix(".png"))
+
+
+@pytest.mark.parametrize("ending", [".gif", ".png"])
+def test_of_an_animation_the_first_picture_is_taken(tiny: Path, ending: str) -> None:
+    path = write_animation(tiny / "train" / f"r_0{ending}")
+    assert image_size([path]) == (20, 20)
+    assert np.array_equal(read_image(path), np.broadcast_to(np.uint8([50, 50, 50, 255]), (20, 20, 4)))
+    assert read_mask(path, 20, 20).shape == (20, 20)
+    data = load_dataset(Blender().parse(tiny, "train"), "train")
+    assert len(data) == 10
+    assert data.image(0)[7, 7].tolist() == [50, 50, 50, 255]
+    assert np.array_equal(data.image(1).numpy(), iio.imread(tiny / "train" / "r_1.png"))  # nothing was written over it
+
+
+@pytest.mark.parametrize("size", [(0, 20), (20, 0), (0, 0)])
+def test_an_image_without_a_pixel(tmp_path: Path, size: tuple[int, int]) -> None:
+    path = tmp_path / "none.png"
+    write_deep_png(path, 1, 1)
+    whole = path.read_bytes()
+    header = b"IHDR" + struct.pack(">IIBBBBB", *size, 8, 0, 0, 0, 0)
+    path.write_bytes(whole[:12] + header + struct.pack(">I", zlib.crc32(header)) + whole[33:])
+    with pytest.raises(DataError, match=r"none\.png"):
+        image_size([path])
+    with pytest.raises(DataError, match=r"none\.png"):
+        read_mask(path, 1, 1)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="puts a shell script in the way")
+def test_no_program_is_run_for_an_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pillow has PostScript drawn by Ghostscript, and knows it by its content, whatever the file is called."""
+    program = tmp_path / "bin" / "gs"
+    program.parent.mkdir()
+    program.write_text(f"#!/bin/sh\ntouch {tmp_path / 'proof'}\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(program.parent), prepend=os.pathsep)
+    script = tmp_path / "photograph.png"
+    script.write_text("%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 20 20\n%%EndComments\nshowpage\n%%EOF\n")
+    with pytest.raises(DataError, match=r"photograph\.png is not a readable image"):
+        read_image(script)
+    with pytest.raises(DataError, match=r"photograph\.png is not a readable image"):
+        prepare(tmp_path, Path("photograph.png"), tmp_path / "out", "photograph.png")
+    assert not (tmp_path / "proof").exists()
 
 
 def test_palette_images_keep_their_transparency(tmp_path: Path) -> None:

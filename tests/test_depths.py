@@ -46,8 +46,9 @@ def test_what_is_no_depth_image_is_named(content: str, tmp_path: Path) -> None:
         read_depth(path, 2, 2)
 
 
-def test_unknown_depths_are_zero(tmp_path: Path) -> None:
-    np.save(tmp_path / "d.npy", np.array([[np.nan, np.inf], [-1.0, 2.0]], np.float32))
+@pytest.mark.parametrize("endless", [np.inf, 2e5])  # float16 ends at 65504
+def test_unknown_depths_are_zero(tmp_path: Path, endless: float) -> None:
+    np.save(tmp_path / "d.npy", np.array([[np.nan, endless], [-1.0, 2.0]], np.float32))
     sizes = torch.tensor([2, 2])
     ones = torch.ones(2)
     cameras = Cameras(torch.eye(4)[:3].expand(2, 3, 4), ones, ones, ones, ones, sizes, sizes)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import shlex
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -88,13 +88,13 @@ def plan_of(flags: CompareFlags) -> Plan:
 
     Raises: ConfigError for what makes no sense.
     """
-    from framework.comparison.plan import Conditions, Contender, Plan
+    from framework.comparison.plan import Conditions, Contender, Plan, split_words
 
-    if flags.data is not None and not flags.data.is_dir():
+    if flags.data is not None and not os.path.isdir(flags.data):
         raise ConfigError(f"--data {flags.data}: there is no such folder")
     conditions = Conditions(
         data=None if flags.data is None else str(flags.data.resolve()),
-        data_flags=tuple(shlex.split(flags.data_flags)),
+        data_flags=split_words(flags.data_flags, "--data-flags"),
         max_seconds=flags.max_seconds,
         max_num_iterations=flags.max_num_iterations,
         target_psnr=flags.target_psnr,

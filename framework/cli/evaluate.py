@@ -80,8 +80,6 @@ def _command(arguments: list[str]) -> None:
             pictures=flags.render_output_path,
             round_to_uint8=flags.round_to_uint8,
         )
-    output = flags.output_path or trained.run.folder / "eval.json"
-    write_evaluation(output, trained.run, trained.checkpoint, found)
     say(f"{flags.split}: {found.line()}")
     if bound is not None:
         worst, faster = measured_error(trained.model, dataset, bound)
@@ -89,7 +87,11 @@ def _command(arguments: list[str]) -> None:
     if flags.eval_appearance == "half" and found.eval_appearance is None:
         say("--eval-appearance half: this run has no appearance vectors; whole photographs were judged")
     say(f"LPIPS {found.lpips_note}")
+    output = flags.output_path or trained.run.folder / "eval.json"
+    write_evaluation(output, trained.run, trained.checkpoint, found)
     say(f"written to {output}")
+    if found.pictures_note is not None:
+        raise ConfigError(found.pictures_note)
 
 
 if __name__ == "__main__":

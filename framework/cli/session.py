@@ -11,8 +11,9 @@ from framework.errors import DataError
 from framework.evaluation.evaluator import evaluate
 from framework.pixel_cache import PixelMemory
 from framework.training.checkpoint import FOLDER, load_newest
+from framework.training.lock import sole_user
 from framework.training.report import write_evaluation, write_summary
-from framework.training.run import Run, create_folder, write_json, write_transforms
+from framework.training.run import Run, create_folder, write_report, write_transforms
 from framework.training.skipping import as_plain, skip_report
 from framework.training.trainer import Trainer
 
@@ -24,23 +25,23 @@ def start(run: Run) -> None:
     run = replace(run, config=run.config.resolved())
     trainer = _prepare(run)
     trainer.restore_as_configured()
-    create_folder(run)
-    write_transforms(run, trainer.train_set)
-    write_json(run.folder / "scene_profile.json", trainer.profile().as_plain())
-    _finish(run, trainer)
+    with sole_user(run.folder):
+        create_folder(run)
+        _finish(run, trainer)
 
 
 def resume(run: Run) -> None:
     """Go on with a run from its newest checkpoint; from the beginning where it has none."""
-    trainer = _prepare(run)
-    checkpoint = load_newest(run.folder / FOLDER, trainer.device)
-    if checkpoint is None:
-        trainer.restore_as_configured()
-        say(f"{run.folder} has no checkpoint: starting from the beginning")
-    else:
-        trainer.restore(checkpoint)
-        say(f"resuming {run.folder} at step {trainer.state.step:,}")
-    _finish(run, trainer)
+    with sole_user(run.folder):
+        trainer = _prepare(run)
+        checkpoint = load_newest(run.folder / FOLDER, trainer.device)
+        if checkpoint is None:
+            trainer.restore_as_configured()
+            say(f"{run.folder} has no checkpoint: starting from the beginning")
+        else:
+            trainer.restore(checkpoint)
+            say(f"resuming {run.folder} at step {trainer.state.step:,}")
+        _finish(run, trainer)
 
 
 def _prepare(run: Run) -> Trainer:
@@ -56,6 +57,9 @@ def _prepare(run: Run) -> Trainer:
 
 
 def _finish(run: Run, trainer: Trainer) -> None:
+    # Also of a run that goes on: it may have been killed before it came to this.
+    write_transforms(run, trainer.train_set)
+    write_report(run.folder / "scene_profile.json", trainer.profile().as_plain())
     outcome = trainer.train()
     state = trainer.state
     say(
@@ -67,7 +71,7 @@ def _finish(run: Run, trainer: Trainer) -> None:
     rungs = skip_report(trainer)
     for rung in rungs:
         say(rung.line())
-    write_json(run.folder / "skip_report.json", as_plain(rungs))
+    write_report(run.folder / "skip_report.json", as_plain(rungs))
     write_summary(trainer, outcome)
     say(f"checkpoint: {outcome.checkpoint}")
     if outcome.interrupted:
@@ -83,9 +87,12 @@ def _finish(run: Run, trainer: Trainer) -> None:
         pictures=run.folder / "pictures",
         max_pictures=PICTURES,
     )
+    say(f"test: {found.line()}")  # first of all, for what follows needs room on the disk
+    if found.pictures_note is None:
+        say(f"pictures (photograph | render | error): {run.folder / 'pictures'}")
+    else:
+        say(f"warning: {found.pictures_note}")
     write_evaluation(run.folder / "eval.json", run, outcome.checkpoint, found)
-    say(f"test: {found.line()}")
-    say(f"pictures (photograph | render | error): {run.folder / 'pictures'}")
     say(f"evaluate again with: ns-eval --load-config {run.config_path}")
 
 

@@ -11,13 +11,24 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from framework.errors import ConfigError
+from framework.errors import ConfigError, shown
 from framework.registry import entry_of
 from framework.training.run import write_json
 
 FIRST_SEED = 42
 CURVE_POINTS = 12
 """Evaluations during a run, which its learning curve is made of."""
+
+
+def split_words(text: str, flag: str) -> tuple[str, ...]:
+    """The words of what a flag was given, as a shell has them.
+
+    Raises: ConfigError where quotes do not close.
+    """
+    try:
+        return tuple(shlex.split(text))
+    except ValueError as error:
+        raise ConfigError(f"{flag}: {shown(text)} cannot be read: {error}") from error
 
 
 @dataclass(frozen=True)
@@ -35,14 +46,11 @@ class Contender:
 
         Raises: ConfigError for an unknown method, or quotes that do not close.
         """
-        try:
-            words = shlex.split(text)
-        except ValueError as error:
-            raise ConfigError(f"--methods: {text!r} cannot be read: {error}") from error
+        words = split_words(text, "--methods")
         if not words:
             raise ConfigError("--methods holds an empty name")
         entry_of("methods", words[0])
-        return cls(" ".join(text.split()), words[0], tuple(words[1:]))
+        return cls(" ".join(text.split()), words[0], words[1:])
 
     @property
     def slug(self) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -16,12 +17,16 @@ from framework.cameras import Cameras, subpixels
 from framework.console import track
 from framework.dataset import Dataset
 from framework.device import has_bfloat16, wait_for
+from framework.errors import DataError
 from framework.evaluation.appearance import appearances, fitted_appearance, right_half
 from framework.evaluation.images import comparison, write_image
 from framework.evaluation.metrics import load_lpips, psnr, ssim
 from framework.kernels.math import safe_normalize
 from framework.model import Model
 from framework.pixels import composite
+
+LONGEST_STEM = 150
+"""Bytes of a photograph's name that its pictures are called by."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +108,8 @@ class Evaluation:
     """Which LPIPS was used, or why none."""
     eval_appearance: Literal["mean", "half"] | None = None
     """How held-out photographs were given an appearance; None for a method without."""
+    pictures_note: str | None = None
+    """Why pictures are missing, where they could not be written."""
 
     def line(self) -> str:
         """The results in a line."""
@@ -138,15 +145,17 @@ def evaluate(
             green and blue being x, y and z from -1 to 1; none if None.
         max_pictures: write only the first so many.
         round_to_uint8: measure the picture as it would be stored.
-    Raises: ValueError where there is nothing to evaluate.
+    Raises: DataError where there is nothing to evaluate.
     """
     half = model.config.eval_appearance == "half" and bool(appearances(model))
-    chosen = [index for index in spread(len(dataset), max_images) if _shows_something(dataset, index, half)]
+    shown = [index for index in range(len(dataset)) if _shows_something(dataset, index, half)]
+    chosen = [shown[place] for place in spread(len(shown), max_images)]
     if not chosen:
-        raise ValueError("there is no image to evaluate")
+        raise DataError(f"there is no image to evaluate: masks leave nothing of the {len(dataset)} that there are")
     lpips, lpips_note = load_lpips()
     background = evaluation_background(model)
     rows, seconds, rays = [], 0.0, 0
+    pictures_note: str | None = None
     for index in track(chosen, title, total=len(chosen)):
         target = composite(dataset.image(index).float() / 255, background)
         with fitted_appearance(model, dataset, index, background) if half else nullcontext():
@@ -167,14 +176,26 @@ def evaluate(
         seconds += view.seconds
         rays += rgb.shape[0] * rgb.shape[1] * model.config.rays_per_pixel
         if pictures is not None and (max_pictures is None or len(rows) <= max_pictures):
-            stem = f"{index:04d}_{Path(dataset.names[index]).stem}"
-            write_image(pictures / f"{stem}.png", rgb)
-            write_image(pictures / f"{stem}_comparison.png", comparison(rgb, target))
-            if view.normals is not None:
-                write_image(pictures / f"{stem}_normals.png", (view.normals + 1) / 2)
+            try:
+                _write_pictures(pictures, f"{index:04d}_{_short_stem(dataset.names[index])}", rgb, target, view.normals)
+            except OSError as error:  # the figures are worth more
+                pictures, pictures_note = None, f"cannot write pictures to {pictures}: {error.strerror or error}"
     results = {**_statistics(rows), "num_rays_per_sec": rays / seconds, "fps": len(rows) / seconds}
     protocol: Literal["mean", "half"] | None = ("half" if half else "mean") if appearances(model) else None
-    return Evaluation(rows, {**results, "num_images": len(rows)}, lpips_note, protocol)
+    return Evaluation(rows, {**results, "num_images": len(rows)}, lpips_note, protocol, pictures_note)
+
+
+def _write_pictures(folder: Path, stem: str, rgb: Tensor, target: Tensor, normals: Tensor | None) -> None:
+    """A view's picture, its comparison with the photograph, and its normals. Raises: OSError as it comes."""
+    write_image(folder / f"{stem}.png", rgb)
+    write_image(folder / f"{stem}_comparison.png", comparison(rgb, target))
+    if normals is not None:
+        write_image(folder / f"{stem}_normals.png", (normals + 1) / 2)
+
+
+def _short_stem(name: str) -> str:
+    """A photograph's name without its ending, so short that something may stand before and behind it."""
+    return os.fsencode(Path(name).stem)[:LONGEST_STEM].decode("utf-8", "ignore")
 
 
 def _judged(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -33,7 +34,12 @@ def comparison(prediction: Tensor, target: Tensor) -> Tensor:
 def write_image(path: Path, image: Tensor) -> None:
     """(H, W, 3) in [0, 1] as an 8-bit PNG; makes the folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    iio.imwrite(path, to_uint8(image))
+    try:
+        iio.imwrite(path, to_uint8(image))
+    except BaseException:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)  # half a picture is none
+        raise
 
 
 def write_animation(path: Path, frames: Sequence[Tensor], fps: float) -> None:

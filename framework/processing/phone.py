@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -10,20 +12,48 @@ import numpy as np
 
 from framework.console import say
 from framework.errors import DataError
+from framework.image_files import one_line
 from framework.processing.output import FINISHED
 from framework.processing.pipeline import prepared
 from framework.processing.pyramid import write_pyramid
 from framework.processing.transforms import Frame, Lens, content, write
 
 
-def read_json(path: Path) -> Any:
-    """Raises: DataError where the file is missing or not JSON."""
+UNUSABLE = (KeyError, TypeError, ValueError, OverflowError)
+"""What goes wrong where a JSON file lacks a number, or has something else in its place."""
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Raises: DataError where the file is missing, not JSON, or no object."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise DataError(f"there is no {path}") from error
-    except (ValueError, OSError) as error:
-        raise DataError(f"{path} is not JSON that can be read: {str(error).splitlines()[0]}") from error
+    except (ValueError, OSError, RecursionError) as error:
+        raise DataError(f"{path} is not JSON that can be read: {one_line(error)}") from error
+    if not isinstance(found, dict):
+        raise DataError(f"{path} must hold a JSON object: names and values between braces")
+    return found
+
+
+def finite(value: Any) -> float:
+    """A number out of a JSON file. Raises: one of `UNUSABLE` where it is none, or not finite."""
+    number = float(value)
+    if not math.isfinite(number):
+        raise ValueError(f"{number} is not finite")
+    return number
+
+
+def undistorted_lens(size: Iterable[Any], intrinsics: Iterable[Any]) -> Lens:
+    """The lens of a JSON file's width and height, and fx, fy, cx, cy, all in pixels.
+
+    Raises: one of `UNUSABLE` where they are not such.
+    """
+    width, height = (int(finite(value)) for value in size)
+    fx, fy, cx, cy = (finite(value) for value in intrinsics)
+    if min(fx, fy) <= 0:
+        raise ValueError("a focal length must be above zero")
+    return Lens("OPENCV", {"w": width, "h": height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy})
 
 
 def evenly(items: list, most: int) -> list:

@@ -16,6 +16,7 @@ from PIL import Image
 
 from framework.console import say, track
 from framework.errors import DataError
+from framework.image_files import one_line
 
 ENDINGS = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".heic", ".heif")
 _JPEG = (".jpg", ".jpeg")
@@ -75,7 +76,7 @@ def find_photographs(folder: Path, leave_out: Iterable[Path] = ()) -> list[Path]
 def natural_order(path: Path) -> list[tuple[int, int, str]]:
     """A sorting key by which numbers in a name count as numbers."""
     parts = re.split(r"(\d+)", path.as_posix().lower())
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts if part]
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts if part]
 
 
 def output_names(sources: Iterable[Path]) -> list[str]:
@@ -153,9 +154,9 @@ def prepare(folder: Path, source: Path, images: Path, name: str, upright: bool =
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):  # a full disk is no bad photograph
             raise
-        raise DataError(f"{path} is not a readable image: {_line(error)}") from error
+        raise DataError(f"{path} is not a readable image: {one_line(error)}") from error
     except Exception as error:  # Pillow raises SyntaxError, struct.error, DecompressionBombError and more
-        raise DataError(f"{path} is not a readable image: {_line(error)}") from error
+        raise DataError(f"{path} is not a readable image: {one_line(error)}") from error
     return Photograph(name, source.as_posix(), *size, device, orientation if turn is not None else 1)
 
 
@@ -202,7 +203,7 @@ def write_masks(folder: Path, photographs: list[Photograph], masks: Path, crop: 
             with Image.open(path) as image:
                 mask = image.convert("L").point(lambda value: 255 if value >= 128 else 0)
         except Exception as error:
-            raise DataError(f"{path} is not a readable mask: {_line(error)}") from error
+            raise DataError(f"{path} is not a readable mask: {one_line(error)}") from error
         size = (photograph.width + 2 * crop, photograph.height + 2 * crop)
         is_upright = photograph.orientation >= 5 and mask.size == size and size[0] != size[1]
         if photograph.orientation in _TURNS and not is_upright:
@@ -261,7 +262,3 @@ def _device(exif: Image.Exif) -> tuple:
     """Maker, model, focal length, focal length as on 35 mm film; None where not told."""
     details = exif.get_ifd(0x8769)
     return (*(str(exif.get(tag)) for tag in (0x010F, 0x0110)), *(str(details.get(tag)) for tag in (0x920A, 0xA405)))
-
-
-def _line(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]

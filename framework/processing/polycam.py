@@ -9,7 +9,7 @@ import numpy as np
 
 from framework.console import say
 from framework.errors import DataError
-from framework.processing.phone import evenly, read_json, write_folder
+from framework.processing.phone import UNUSABLE, evenly, finite, read_json, undistorted_lens, write_folder
 from framework.processing.photographs import find_photographs
 from framework.processing.transforms import Lens
 
@@ -35,7 +35,7 @@ def convert(export: Path, output: Path, num_downscales: int, most: int, min_blur
             without += 1
             continue
         camera = read_json(path)
-        if float(camera.get("blur_score", min_blur_score)) < min_blur_score:
+        if blur_score_of(camera, path, min_blur_score) < min_blur_score:
             blurred += 1
             continue
         posed[name] = (pose_of(camera, path), lens_of(camera, path))
@@ -54,14 +54,25 @@ def check(export: Path) -> None:
     _folders(export)
 
 
+def blur_score_of(camera: dict[str, Any], path: Path, unknown: float) -> float:
+    """How sharp Polycam thinks an image is; `unknown` where its JSON does not say.
+
+    Raises: DataError that names `path` where it is no number.
+    """
+    try:
+        return finite(camera.get("blur_score", unknown))
+    except UNUSABLE as error:
+        raise DataError(f"{path}: the blur_score is not a number") from error
+
+
 def pose_of(camera: dict[str, Any], path: Path) -> np.ndarray:
     """(4, 4) camera-to-world, OpenGL axes, z up, of a camera's JSON.
 
     Raises: DataError that names `path` where it is incomplete.
     """
     try:
-        rows = [[float(camera[f"t_{row}{column}"]) for column in range(4)] for row in range(3)]
-    except (KeyError, TypeError, ValueError) as error:
+        rows = [[finite(camera[f"t_{row}{column}"]) for column in range(4)] for row in range(3)]
+    except UNUSABLE as error:
         raise DataError(f"{path} has no whole pose (t_00 to t_23)") from error
     pose = np.eye(4)
     pose[:3] = Z_UP[:, :3] @ np.array(rows)
@@ -74,14 +85,10 @@ def lens_of(camera: dict[str, Any], path: Path) -> Lens:
     Raises: DataError that names `path` where it is incomplete.
     """
     try:
-        size = {"w": int(camera["width"]), "h": int(camera["height"])}
-        intrinsics = {ours: float(camera[theirs]) for ours, theirs in _INTRINSICS.items()}
-    except (KeyError, TypeError, ValueError) as error:
+        size = (camera["width"], camera["height"])
+        return undistorted_lens(size, [camera[name] for name in ("fx", "fy", "cx", "cy")])
+    except UNUSABLE as error:
         raise DataError(f"{path} has no whole lens (width, height, fx, fy, cx, cy)") from error
-    return Lens("OPENCV", {**size, **intrinsics})
-
-
-_INTRINSICS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy"}
 
 
 def _folders(export: Path) -> tuple[Path, Path]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from framework.console import say
 from framework.errors import DataError
-from framework.processing.phone import evenly, read_json, write_folder
+from framework.processing.phone import UNUSABLE, evenly, read_json, undistorted_lens, write_folder
 from framework.processing.photographs import find_photographs
 from framework.processing.transforms import Lens
 
@@ -28,7 +28,7 @@ def convert(export: Path, output: Path, num_downscales: int, most: int) -> None:
     path = root / "metadata.json"
     metadata = read_json(path)
     poses = poses_of(metadata, path)
-    numbered = {int(name.stem): name for name in find_photographs(root / "rgb") if name.stem.isdigit()}
+    numbered = {int(name.stem): name for name in find_photographs(root / "rgb") if name.stem.isdecimal()}
     usable = [number for number in sorted(numbered) if number < len(poses)]
     if len(usable) < len(numbered):
         say(f"{len(numbered) - len(usable)} images have a number beyond the {len(poses)} poses and are skipped")
@@ -59,11 +59,13 @@ def poses_of(metadata: dict[str, Any], path: Path) -> np.ndarray:
     """
     try:
         rows = np.array(metadata["poses"], np.float64).reshape(-1, 7)
-        rows[:, :4] /= np.linalg.norm(rows[:, :4], axis=1, keepdims=True)
-    except (KeyError, TypeError, ValueError) as error:
+    except UNUSABLE as error:
         raise DataError(f"{path} has no poses of 7 numbers each") from error
-    if not len(rows) or not np.isfinite(rows).all():
-        raise DataError(f"{path} has no poses, or some that are not finite")
+    with np.errstate(over="ignore"):
+        lengths = np.linalg.norm(rows[:, :4], axis=1, keepdims=True)
+    if not len(rows) or not np.isfinite(rows).all() or not (np.isfinite(lengths) & (lengths > 0)).all():
+        raise DataError(f"{path} has no poses, or some that are not finite or have no rotation")
+    rows[:, :4] /= lengths
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3] = rotations(rows[:, :4])
     poses[:, :3, 3] = rows[:, 4:]
@@ -87,13 +89,13 @@ def lenses_of(metadata: dict[str, Any], count: int, path: Path) -> list[Lens]:
     Raises: DataError that names `path` where they are incomplete.
     """
     try:
-        size = {"w": int(metadata["w"]), "h": int(metadata["h"])}
+        size = (metadata["w"], metadata["h"])
         own = metadata.get("perFrameIntrinsicCoeffs") or []
         if len(own) == count:
-            each = [tuple(map(float, row[:4])) for row in own]
+            each = [tuple(row[:4]) for row in own]
         else:
             matrix = np.array(metadata["K"], np.float64).reshape(3, 3).T
-            each = [(matrix[0, 0].item(), matrix[1, 1].item(), matrix[0, 2].item(), matrix[1, 2].item())] * count
-        return [Lens("OPENCV", size | dict(zip(("fl_x", "fl_y", "cx", "cy"), row, strict=True))) for row in each]
-    except (KeyError, TypeError, ValueError) as error:
+            each = [(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])] * count
+        return [undistorted_lens(size, intrinsics) for intrinsics in each]
+    except UNUSABLE as error:
         raise DataError(f"{path} has no whole lens (w, h, K of 9 numbers)") from error

@@ -1,11 +1,17 @@
-"""Checkpoints: tensors and plain data only, written so that a killed process never leaves half of one."""
+"""Checkpoints: tensors and plain data only, written so that a killed process never leaves half of one.
+
+A file is what torch writes and a seal, which is a hash of it: torch does not look whether a tensor's bytes are still
+those that were written. Before there were seals, `format` was 1.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import io
 import os
 import re
 import warnings
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +21,12 @@ from framework.console import say
 from framework.errors import CheckpointError
 
 FOLDER = "nerfstudio_models"
-FORMAT = 1
+UNSEALED, SEALED = 1, 2
+"""What `format` may be."""
+SEAL = b"\nsha256:"
+"""What stands before the hash, which ends the file."""
+PIECE = 2**24
+"""Bytes that are hashed at once."""
 _NAME = re.compile(r"step-(\d{9})\.ckpt")
 
 
@@ -34,10 +45,23 @@ def write_atomically(path: Path, write: Any) -> None:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+    _flush_folder(path.parent)
+
+
+def _flush_folder(folder: Path) -> None:
+    """Let the names in a folder reach the disk: the new one before older files are removed."""
+    with suppress(OSError):  # Windows opens no folders, and some file systems flush none
+        opened = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(opened)
+        finally:
+            os.close(opened)
 
 
 def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bool) -> Path:
-    """Write `state` as step-%09d.ckpt; then, unless `keep_all`, remove all but the two newest.
+    """Write `state` as step-%09d.ckpt; then, unless `keep_all`, remove all before it but the last.
+
+    Later ones stay: they were damaged, or the run would not have gone on from an earlier one, and push nothing out.
 
     Raises: CheckpointError where it cannot be written; older checkpoints are untouched then.
     """
@@ -45,14 +69,16 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bo
     try:
         folder.mkdir(parents=True, exist_ok=True)
         content = io.BytesIO()  # written by torch itself, a full disk is reported as "unexpected pos"
-        torch.save({"format": FORMAT, **state}, content)
+        torch.save({"format": SEALED, **state}, content)
+        content.seek(0, os.SEEK_END)
+        content.write(SEAL + hashlib.sha256(content.getbuffer()).hexdigest().encode())
         write_atomically(path, lambda file: file.write(content.getbuffer()))
     except (OSError, RuntimeError) as error:
         raise CheckpointError(f"cannot write {path}: {error}; earlier checkpoints stand") from error
     for remnant in folder.glob(".step-*.ckpt.*.tmp"):  # of a process that was killed while writing
         remnant.unlink(missing_ok=True)
     if not keep_all:
-        for old in list_checkpoints(folder)[:-2]:
+        for old in [other for other in list_checkpoints(folder) if other.name < path.name][:-1]:
             old.unlink(missing_ok=True)
     return path
 
@@ -65,23 +91,58 @@ def list_checkpoints(folder: Path) -> list[Path]:
 def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
     """Read a checkpoint. Nothing in it is executed (`weights_only`).
 
-    Raises: CheckpointError where it is missing, cut short or not one of ours.
+    Raises: CheckpointError where it is missing, not as it was written, or not one of ours.
     """
     try:
+        sealed = _is_sealed(path)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torch's doubts about foreign pickles; they are refused below
             state = torch.load(path, map_location=device, weights_only=True)
+    except CheckpointError:
+        raise
     except FileNotFoundError as error:
         raise CheckpointError(f"there is no checkpoint {path}") from error
     except Exception as error:  # torch raises RuntimeError, UnpicklingError, EOFError, KeyError, OSError and more
         raise CheckpointError(f"{path} is damaged or not a checkpoint of nerfloom") from error
-    if not isinstance(state, dict) or state.get("format") != FORMAT or "model" not in state:
-        raise CheckpointError(f"{path} is not a checkpoint of this version of nerfloom (format {FORMAT})")
+    number = state.get("format") if isinstance(state, dict) else None
+    if not isinstance(number, int) or number not in (UNSEALED, SEALED) or "model" not in state:
+        raise CheckpointError(f"{path} is not a checkpoint of this version of nerfloom (format {SEALED})")
+    if number == SEALED and not sealed:
+        raise CheckpointError(f"{path} is damaged: its seal is missing")
     return state
 
 
+def _is_sealed(path: Path) -> bool:
+    """Whether a file ends with a seal.
+
+    Raises: CheckpointError where it is not the seal of what stands before it; OSError as it comes.
+    """
+    length = len(SEAL) + 2 * hashlib.sha256().digest_size
+    with path.open("rb") as file:
+        left = max(file.seek(0, os.SEEK_END) - length, 0)
+        file.seek(left)
+        seal = file.read()
+        if not seal.startswith(SEAL):
+            return False
+        file.seek(0)
+        digest = hashlib.sha256()
+        while left:
+            piece = file.read(min(left, PIECE))
+            digest.update(piece)
+            left -= len(piece)
+    if seal != SEAL + digest.hexdigest().encode():
+        raise CheckpointError(f"{path} is damaged: it is not as it was written")
+    return True
+
+
 def load_newest(folder: Path, device: torch.device | str = "cpu") -> dict[str, Any] | None:
-    """The newest readable checkpoint of a folder, or None where the folder has none.
+    """The newest readable checkpoint of a folder, or None where the folder has none: see `find_newest`."""
+    found = find_newest(folder, device)
+    return None if found is None else found[1]
+
+
+def find_newest(folder: Path, device: torch.device | str = "cpu") -> tuple[Path, dict[str, Any]] | None:
+    """The newest readable checkpoint of a folder and its content, or None where the folder has none.
 
     A damaged one is reported and the one before it is taken.
 
@@ -90,7 +151,7 @@ def load_newest(folder: Path, device: torch.device | str = "cpu") -> dict[str, A
     paths = list_checkpoints(folder)
     for path in reversed(paths):
         try:
-            return load_checkpoint(path, device)
+            return path, load_checkpoint(path, device)
         except CheckpointError as error:
             say(f"{error}; trying the one before")
     if paths:

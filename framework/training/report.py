@@ -5,36 +5,41 @@ from __future__ import annotations
 from pathlib import Path
 
 from framework.device import peak_memory
+from framework.errors import ConfigError
 from framework.evaluation.evaluator import Evaluation
 from framework.machine import machine
-from framework.training.run import Run, write_json
+from framework.training.run import Run, write_json, write_report
 from framework.training.trainer import Outcome, Trainer
 
 SUMMARY = "summary.json"
 
 
 def write_evaluation(path: Path, run: Run, checkpoint: Path, found: Evaluation) -> None:
-    """`experiment_name, method_name, checkpoint, results`, and what was measured on each image."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(
-        path,
-        {
-            "experiment_name": run.folder.parent.parent.name,
-            "method_name": run.method,
-            "checkpoint": checkpoint.name,
-            "rays_per_pixel": run.config.resolved().rays_per_pixel,
-            "eval_appearance": found.eval_appearance,
-            "results": found.results,
-            "lpips": found.lpips_note,
-            "per_image": found.per_image,
-        },
-    )
+    """`experiment_name, method_name, checkpoint, results`, and what was measured on each image.
+
+    Raises: ConfigError where it cannot be written.
+    """
+    content = {
+        "experiment_name": run.folder.parent.parent.name,
+        "method_name": run.method,
+        "checkpoint": checkpoint.name,
+        "rays_per_pixel": run.config.resolved().rays_per_pixel,
+        "eval_appearance": found.eval_appearance,
+        "results": found.results,
+        "lpips": found.lpips_note,
+        "per_image": found.per_image,
+    }
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, content)
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def write_summary(trainer: Trainer, outcome: Outcome) -> None:
     """summary.json: how long training took, what it used, and on which machine."""
     state = trainer.state
-    write_json(
+    write_report(
         trainer.run.folder / SUMMARY,
         {
             "method": trainer.run.method,

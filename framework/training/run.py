@@ -10,6 +10,7 @@ outputs/{experiment}/{method}/{YYYY-mm-dd_HHMMSS}/
     summary.json                  steps, seconds, rays, memory, parameters, and the machine
     eval.json, pictures/          the final evaluation
     events.out.tfevents.*         TensorBoard
+    .lock                         held while a process trains
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from typing import Any
 import yaml
 
 from framework.config import TrainConfig, from_plain, read_yaml, to_plain
+from framework.console import say
 from framework.dataset import DataParser, Dataset
 from framework.errors import ConfigError
 from framework.registry import load_dataparser, load_method, recognize
@@ -110,7 +112,15 @@ def write_json(path: Path, content: Any) -> None:
     write_atomically(path, lambda file: file.write(text.encode()))
 
 
+def write_report(path: Path, content: Any) -> None:
+    """As `write_json`, but a full disk is only said: training, and what is in checkpoints, are worth more."""
+    try:
+        write_json(path, content)
+    except OSError as error:
+        say(f"warning: cannot write {path}: {error.strerror or error}; going on without")
+
+
 def write_transforms(run: Run, dataset: Dataset) -> None:
     """dataparser_transforms.json, as nerfstudio writes it."""
     content = {"transform": dataset.transform.tolist(), "scale": dataset.scale}
-    write_json(run.folder / "dataparser_transforms.json", content)
+    write_report(run.folder / "dataparser_transforms.json", content)

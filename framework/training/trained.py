@@ -15,7 +15,7 @@ from framework.errors import CheckpointError
 from framework.model import Model
 from framework.registry import load_method
 from framework.scene import Scene
-from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest
+from framework.training.checkpoint import FOLDER, find_newest, load_checkpoint
 from framework.training.run import Run, read_run
 
 
@@ -63,11 +63,14 @@ def load_trained(
     )
     run = dataclasses.replace(run, config=config)
     device = choose_device(machine)
-    content = load_checkpoint(checkpoint, device) if checkpoint else load_newest(run.folder / FOLDER, device)
-    if content is None:
-        raise CheckpointError(f"{run.folder / FOLDER} holds no checkpoint")
+    if checkpoint is None:
+        found = find_newest(run.folder / FOLDER, device)
+        if found is None:
+            raise CheckpointError(f"{run.folder / FOLDER} holds no checkpoint")
+        path, content = found
+    else:
+        path, content = checkpoint, load_checkpoint(checkpoint, device)
     model = restored_model(run.method, config, content, device)
-    path = checkpoint or run.folder / FOLDER / f"step-{content['state']['step']:09d}.ckpt"
     return Trained(run, model, path, content)
 
 
@@ -84,8 +87,8 @@ def restored_model(method: str, config: TrainConfig, checkpoint: dict[str, Any],
     Raises: CheckpointError where that lacks the scene, or has parameters of other names or sizes.
     """
     try:
-        scene = Scene(**checkpoint["scene"]).to("cpu")
-    except (KeyError, TypeError, AttributeError) as error:
+        scene = Scene.of(checkpoint.get("scene")).to("cpu")
+    except ValueError as error:
         raise CheckpointError(f"the checkpoint lacks the scene: {error}") from error
     model = build_model(method, config, scene).to(device).eval()
     restore_model(model, checkpoint)
@@ -99,6 +102,6 @@ def restore_model(model: Model[Any], checkpoint: dict[str, Any]) -> None:
     """
     try:
         model.load_state_dict(checkpoint["model"])
-    except (RuntimeError, TypeError, AttributeError, ValueError) as error:
+    except (RuntimeError, TypeError, AttributeError, ValueError, LookupError, ArithmeticError, MemoryError) as error:
         reason = " ".join(str(error).split())[:300]
         raise CheckpointError(f"the checkpoint does not fit the model's settings: {reason}") from error

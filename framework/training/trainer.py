@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from framework.cameras import CENTER, subpixels
+from framework.checked import checked
 from framework.config import to_plain
 from framework.console import say
 from framework.dataset import Dataset
@@ -31,7 +32,7 @@ from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest, 
 from framework.training.optim import first_non_finite, make_optimizer, set_learning_rate
 from framework.training.preparation import profile_of, skip_by_silhouettes
 from framework.training.progress import ProgressBar, StepReport, TensorBoard
-from framework.training.run import Run, write_json
+from framework.training.run import Run, write_report
 from framework.training.signals import stop_signals
 from framework.training.trained import build_model, restore_model
 
@@ -138,13 +139,14 @@ class Trainer:
             self.optimizer.load_state_dict(checkpoint["optimizer"])
             for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
                 group["initial_lr"] = rate  # a rate given on the command line counts
-            self.state = State(**checkpoint["state"])
+            self.state = checked(State, checkpoint["state"])
             if self.errors is not None and checkpoint.get("errors") is not None:
                 self.errors.errors.copy_(checkpoint["errors"])
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise CheckpointError(f"the checkpoint's optimiser does not fit: {error}") from error
+        except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+            raise CheckpointError(f"the checkpoint's optimiser or state does not fit: {error}") from error
         self.first_step = self.state.step
-        self._last_save = self._last_eval = self.state.seconds
+        self._last_save = self.state.seconds
+        self._last_eval = self.state.curve[-1][0] if self.state.curve else 0.0
 
     def restore_as_configured(self) -> None:
         """Start from --load-checkpoint or --load-dir, where given."""
@@ -173,9 +175,9 @@ class Trainer:
                 report = self.train_step()
                 bar.show(report)
                 self._log(report, board)
+                self._evaluate_if_due(board)  # before saving: a run that goes on from here does not come back to it
                 if self._due_to_save():
                     self._try_to_save()
-                self._evaluate_if_due(board)
         self._write_curve()
         return Outcome(reason, bool(stopped), self.save())
 
@@ -349,10 +351,7 @@ class Trainer:
 
     def _write_curve(self) -> None:
         rows = [{"seconds": s, "step": n, "psnr": p} for s, n, p in self.state.curve]
-        try:
-            write_json(self.run.folder / "learning_curve.json", rows)
-        except OSError as error:
-            say(f"warning: cannot write learning_curve.json: {error.strerror}; the checkpoint holds the curve too")
+        write_report(self.run.folder / "learning_curve.json", rows)
 
     def _due_to_save(self) -> bool:
         if self._bad_in_a_row:  # what is saved now might be ruined, and would push out what is not

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from framework.comparison.plan import Conditions, Contender, Job, Plan
+from framework.comparison.plan import Conditions, Contender, Job, Plan, split_words
 from framework.errors import ConfigError
 
 CONDITIONS = Conditions("/data/lego", ("--downscale-factor", "2"), 120.0, None, None, 2, "cpu", 4, None)
@@ -37,6 +37,12 @@ def test_labels_that_differ_have_folders_that_differ() -> None:
 def test_what_is_no_contender(text: str, reason: str) -> None:
     with pytest.raises(ConfigError, match=reason):
         Contender.of(text)
+
+
+def test_words_are_those_of_a_shell() -> None:
+    assert split_words("--scale-factor 2 'a b'", "--data-flags") == ("--scale-factor", "2", "a b")
+    with pytest.raises(ConfigError, match="--data-flags: \"'open\" cannot be read: No closing"):
+        split_words("'open", "--data-flags")
 
 
 def test_conditions_must_end_somewhere() -> None:

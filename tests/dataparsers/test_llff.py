@@ -134,6 +134,7 @@ BAD = {
     "near beyond far": (put(4, 15, 9.0), "row 4: the depth bounds are 9.0 and 7.0"),
     "near behind": (put(4, 15, -1.0), "row 4: the depth bounds are -1.0"),
     "far nan": (put(4, 16, np.nan), "row 4: the depth bounds"),
+    "far beyond float32": (put(4, 16, 1e300), r"depth bounds of poses_bounds\.npy make a box .* beyond measure"),
     "other shape": (put(0, 9, 120.0), "p00.png is 60x40 pixels"),
 }
 

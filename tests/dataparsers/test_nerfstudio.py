@@ -220,6 +220,15 @@ def test_sparse_points_lie_where_cameras_see_them(capture: Path) -> None:
     torch.testing.assert_close(scene.points, expected, rtol=0, atol=1e-6)
 
 
+def test_sparse_points_beyond_float32_are_left_out(capture: Path) -> None:
+    head = "ply\nformat ascii 1.0\nelement vertex 2\n" + "".join(f"property double {axis}\n" for axis in "xyz")
+    (capture / "points.ply").write_text(f"{head}end_header\n1e300 0 0\n0.5 0 0\n")
+    edit(capture, lambda c: c.update(ply_file_path="points.ply"))
+    points = ALL.parse(capture, "train").points
+    assert points is not None
+    assert len(points) == 1
+
+
 def test_missing_sparse_points_are_done_without(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     edit(capture, lambda c: c.update(ply_file_path="points.ply"))
     assert ALL.parse(capture, "train").points is None
@@ -340,6 +349,10 @@ BAD = {
     "no file": (lambda c: c["frames"][4].pop("file_path"), "frame 4: 'file_path' is missing"),
     "file name with a zero": (frame(file_path="a\0b"), "frame 4: 'file_path' is not the name of a file"),
     "endless file name": (frame(file_path="a" * 10_000), "frame 4: 'file_path' is not the name of a file"),
+    "letters of two bytes": (frame(file_path="é" * 200), "frame 4: 'file_path' is not the name of a file"),
+    "endless way to a file": (frame(file_path="a/" * 3000 + "b"), "frame 4: 'file_path' is not the name of a file"),
+    "half a letter": (frame(file_path="\ud800"), "frame 4: 'file_path' is not the name of a file"),
+    "name of two lines": (frame(mask_path="a\nb"), r"a\\nb: this mask is missing"),
     "no pose": (lambda c: c["frames"][4].pop("transform_matrix"), "frame 4: 'transform_matrix' is not a 4x4 matrix"),
     "nan pose": (cell(0, 3, math.nan), "frame 4: the pose holds a value that is not finite"),
     "text pose": (cell(0, 3, "x"), "frame 4: 'transform_matrix' is not a 4x4 matrix"),
@@ -357,6 +370,11 @@ BAD = {
     "nan centre": (put(cx=math.nan), "frame 0: 'cx' is nan"),
     "text coefficient": (put(k1="a"), "frame 0: 'k1' is 'a'"),
     "zero width": (put(w=0), "frame 0: 'w' is 0; it must be a number above zero"),
+    "endless width": (put(w=1e300), "frame 0: 'w' is 1e.300; no image has such a side"),
+    "no pixel wide": (put(w=0.3), "frame 0: 'w' is 0.3; no image has such a side"),
+    "focal length beyond float32": (put(fl_x=1e200), "has fx, fy, cx, cy = 1e.200, 52, 21, 14 pixels: beyond measure"),
+    "focal length that float32 rounds to zero": (put(fl_y=1e-60), "pixels: beyond measure"),
+    "centre beyond float32": (frame(cx=-1e200), r"004\.png: its camera has .* pixels: beyond measure"),
     "other shape": (put(w=30, h=40), r"000\.png is 40x30 pixels, but its camera is for the shape of 30x40"),
     "unknown camera": (put(camera_model="OPENCVV"), "unknown camera_model 'OPENCVV'. Did you mean 'OPENCV'"),
     "camera is a list": (put(camera_model=[1]), "unknown camera_model"),
@@ -373,7 +391,11 @@ BAD = {
         "'applied_transform': the pose is not rigid",
     ),
     "applied scale is zero": (put(applied_scale=0), "'applied_scale' is 0; it must be a number above zero"),
+    "applied scale is next to zero": (put(applied_scale=5e-324), "'applied_scale' lead too far away"),
     "cube is nothing": (put(aabb_scale=-1), "'aabb_scale' is -1"),
+    "cube is a point": (put(aabb_scale=1e-300), "make a box of no size or beyond measure"),
+    "cube is endless": (put(aabb_scale=1e300), "make a box of no size or beyond measure"),
+    "cube is nowhere": (put(aabb_scale=1, offset=[0, 1e300, 0]), "make a box of no size or beyond measure"),
     "offset is a number": (put(aabb_scale=1, offset=0.5), "'offset' is 0.5; it must be a list of 3 numbers"),
     "sparse points are a number": (put(ply_file_path=5), "'ply_file_path' is missing"),
     "sparse points are no points": (put(ply_file_path="transforms.json"), "transforms.json is not a PLY file"),

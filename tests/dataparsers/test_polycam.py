@@ -85,6 +85,7 @@ BAD = {
     "zero focal length": (lambda c: c.update(fx=0), "'fx' is 0; it must be a number above zero"),
     "no centre": (lambda c: c.pop("cx"), "'cx' is None"),
     "no height": (lambda c: c.pop("height"), "'height' is None; it must be a number above zero"),
+    "endless height": (lambda c: c.update(height=1e300), "'height' is 1e.300; no image has such a side"),
 }
 
 

@@ -100,6 +100,7 @@ BAD = {
     "singular K": (lambda c: c["K"].__setitem__(0, 0.0), "'K' is .*; it must be a camera's matrix"),
     "K by rows": (lambda c: c.update(K=[FX, 0, CX, 0, FY, CY, 0, 0, 1]), "'K' is .* column by column"),
     "no width": (lambda c: c.pop("w"), "'w' is None; it must be a number above zero"),
+    "endless width": (lambda c: c.update(w=1e300), "'w' is 1e.300; no image has such a side"),
     "other shape": (lambda c: c.update(w=HEIGHT, h=WIDTH), "is 20x15 pixels, but its camera is for the shape of 30x40"),
 }
 

@@ -31,6 +31,13 @@ def test_photographs_are_found_below_and_sorted_as_people_count(tmp_path: Path) 
         find_photographs(tmp_path / "b" / "..", leave_out=[tmp_path])
 
 
+def test_digits_that_are_no_numbers_are_letters(tmp_path: Path) -> None:
+    """Python takes a superscript for a digit, but makes no number of it."""
+    for name in ("12²3.png", "9²3.png"):
+        write(tmp_path / name)
+    assert [path.name for path in find_photographs(tmp_path)] == ["9²3.png", "12²3.png"]
+
+
 def test_names_are_safe_and_different() -> None:
     names = output_names([Path("a b.JPG"), Path("a_b.jpg"), Path("sub dir/x.tif"), Path("A_B.jpg")])
     assert names == ["a_b.jpg", "a_b_2.jpg", "sub_dir/x.png", "A_B_3.jpg"]

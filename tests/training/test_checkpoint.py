@@ -25,6 +25,22 @@ def test_the_two_newest_are_kept(tmp_path: Path) -> None:
     assert len(list_checkpoints(tmp_path)) == 3
 
 
+def test_a_damaged_later_one_pushes_nothing_out(tmp_path: Path) -> None:
+    """A run that went on from step 2, as what came after it cannot be read."""
+    paths = [save(tmp_path, step, keep_all=True) for step in (1, 2, 8, 9)]
+    for path in paths[2:]:
+        path.write_bytes(b"damaged")
+    for step in (3, 4):
+        save(tmp_path, step)
+        state = load_newest(tmp_path)
+        assert state is not None
+        assert state["model"]["w"][0] == step
+    names = [int(path.stem[5:]) for path in list_checkpoints(tmp_path)]
+    assert names == [3, 4, 8, 9]
+    save(tmp_path, 9)
+    assert [int(path.stem[5:]) for path in list_checkpoints(tmp_path)] == [8, 9]
+
+
 @pytest.mark.parametrize("keep", [0.0, 0.3, 0.99])
 def test_one_cut_short_falls_back_to_the_one_before(
     tmp_path: Path, keep: float, capsys: pytest.CaptureFixture[str]
@@ -42,6 +58,43 @@ def test_one_cut_short_falls_back_to_the_one_before(
     (tmp_path / "step-000000001.ckpt").write_bytes(b"")
     with pytest.raises(CheckpointError, match="none of the 2 checkpoints"):
         load_newest(tmp_path)
+
+
+def test_no_byte_may_change(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Those of a tensor least of all, which torch reads as they are."""
+    save(tmp_path, 1)
+    newest = save(tmp_path, 2)
+    whole = newest.read_bytes()
+    tensor = whole.index(torch.full((50,), 2.0).numpy().tobytes())
+    places = [0, tensor, tensor + 100, *range(10, len(whole), len(whole) // 40), *range(len(whole) - 80, len(whole), 3)]
+    for place in places:
+        newest.write_bytes(whole[:place] + bytes([whole[place] ^ 0x10]) + whole[place + 1 :])
+        with pytest.raises(CheckpointError, match=r"step-000000002\.ckpt is damaged"):
+            load_checkpoint(newest)
+        state = load_newest(tmp_path)
+        assert state is not None
+        assert state["model"]["w"][0] == 1
+        said = " ".join(capsys.readouterr().err.split())
+        assert "step-000000002.ckpt is damaged" in said
+        assert "trying the one before" in said
+
+
+def test_one_of_before_there_were_seals_is_read(tmp_path: Path) -> None:
+    torch.save({"format": 1, "model": {"w": torch.ones(3)}}, tmp_path / "step-000000007.ckpt")
+    state = load_newest(tmp_path)
+    assert state is not None
+    assert state["model"]["w"].tolist() == [1, 1, 1]
+
+
+def test_a_sealed_one_is_still_what_torch_writes(tmp_path: Path) -> None:
+    assert torch.load(save(tmp_path, 3), weights_only=True)["model"]["w"][0] == 3
+
+
+@pytest.mark.parametrize("number", [torch.zeros(2), "2", None, 2.0, [2]])
+def test_a_format_that_is_no_number(tmp_path: Path, number: object) -> None:
+    torch.save({"format": number, "model": {}}, tmp_path / "a.ckpt")
+    with pytest.raises(CheckpointError, match="not a checkpoint of this version"):
+        load_checkpoint(tmp_path / "a.ckpt")
 
 
 def test_missing_and_foreign_files(tmp_path: Path) -> None:

@@ -339,6 +339,33 @@ def test_a_good_checkpoint_outlives_a_divergence(shared_tiny: Path, tmp_path: Pa
     assert any(math.isfinite(loss) for loss in losses), losses
 
 
+def test_what_was_evaluated_is_not_forgotten_by_a_run_that_goes_on(shared_tiny: Path, tmp_path: Path) -> None:
+    """A step that is evaluated and saved: whoever goes on from there does not come back to it."""
+    settings = {"steps_per_eval_all_images": 4, "steps_per_save": 4, "max_num_iterations": 12}
+    whole = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "whole", True, **settings)
+    whole.train()
+    assert [step for _, step, _ in whole.state.curve] == [4, 8, 12]
+    for checkpoint in list_checkpoints(whole.checkpoint_folder):
+        again = tiny_trainer("instant-ngp", shared_tiny, tmp_path / checkpoint.stem, True, **settings)
+        again.restore(load_checkpoint(checkpoint))
+        again.train()
+        assert [(step, psnr) for _, step, psnr in again.state.curve] == [(n, p) for _, n, p in whole.state.curve]
+        written = json.loads((again.run.folder / "learning_curve.json").read_text())
+        assert [row["step"] for row in written] == [4, 8, 12]
+        assert [row["seconds"] for row in written] == sorted(row["seconds"] for row in written)
+
+
+def test_the_next_evaluation_is_due_when_it_would_have_been(shared_tiny: Path, tmp_path: Path) -> None:
+    settings = {"seconds_per_eval_all_images": 1e9, "max_num_iterations": 3}
+    first = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "first", True, **settings)
+    first.train_step()
+    first.state.seconds, first.state.curve = 1.5e9, ((0.2e9, 1, 10.0),)
+    second = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "second", True, **settings)
+    second.restore(load_checkpoint(first.save()))
+    second.train()
+    assert [step for _, step, _ in second.state.curve] == [1, 2]
+
+
 def test_what_a_killed_save_left_behind_is_cleared_by_the_next(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=4, steps_per_save=2)
     trainer.checkpoint_folder.mkdir(parents=True)

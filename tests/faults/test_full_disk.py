@@ -1,0 +1,187 @@
+"""A disk that is full at any moment: what was there stays, what could not be written is said, the run goes on.
+
+Checkpoints are tested with their own (`tests/training`), decoded pixels with theirs (`tests/test_cache.py`).
+"""
+
+import errno
+import json
+import os
+import stat
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import pytest
+import torch
+
+from framework.cli import evaluate as eval_command
+from framework.cli.session import start as start_session
+from framework.errors import ConfigError
+from framework.evaluation.evaluator import evaluate
+from framework.evaluation.images import write_image
+from framework.training.checkpoint import list_checkpoints, load_newest, write_atomically
+from framework.training.run import create_folder, read_run, write_report
+from tests.cli.helpers import TINY_NGP, run
+from tests.conftest import Refused
+from tests.faults.conftest import Disk
+from tests.training.helpers import tiny_run, tiny_trainer
+
+
+def full(*_: Any, **__: Any) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+class FullFile:
+    """A file that takes half of what is written to it."""
+
+    def __init__(self, file: Any) -> None:
+        self.file = file
+
+    def write(self, content: bytes) -> None:
+        self.file.write(content[: len(content) // 2])
+        self.file.flush()
+        full()
+
+
+@pytest.mark.parametrize("when", ["writing", "flushing", "renaming"])
+def test_what_was_there_stays_and_no_half_is_left(when: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(b"before")
+    if when != "writing":
+        monkeypatch.setattr(os, "fsync" if when == "flushing" else "replace", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_atomically(path, lambda file: (FullFile(file) if when == "writing" else file).write(b"after!"))
+    assert path.read_bytes() == b"before"
+    assert [file.name for file in tmp_path.iterdir()] == ["file"]
+
+
+def test_names_reach_the_disk_before_older_files_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    events: list[str] = []
+    fsync, replace = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda opened: (events.append(_kind(opened)), fsync(opened))[1])
+    monkeypatch.setattr(os, "replace", lambda *paths: (events.append("renamed"), replace(*paths))[1])
+    write_atomically(tmp_path / "file", lambda file: file.write(b"content"))
+    assert events == ["file", "renamed", *(["folder"] if os.name == "posix" else [])]
+
+
+def _kind(opened: int) -> str:
+    return "folder" if stat.S_ISDIR(os.fstat(opened).st_mode) else "file"
+
+
+def test_no_room_for_the_settings(shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The folder is then as free as before."""
+    a_run = tiny_run("instant-ngp", shared_tiny, tmp_path / "run")
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        with pytest.raises(ConfigError, match=r"cannot write the run's folder .*: No space left on device"):
+            create_folder(a_run)
+    assert list((tmp_path / "run").iterdir()) == []
+    create_folder(a_run)
+    assert read_run(a_run.config_path).method == "instant-ngp"
+
+
+def test_a_report_that_cannot_be_written_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_report(tmp_path / "curve.json", [1])
+    monkeypatch.setattr(os, "fsync", full)
+    write_report(tmp_path / "curve.json", [1, 2])
+    said = capsys.readouterr().err
+    assert f"warning: cannot write {tmp_path / 'curve.json'}: No space left on device; going on without" in said
+    assert json.loads((tmp_path / "curve.json").read_text()) == [1]
+
+
+def test_half_a_picture_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def half(path: Path, image: Any, **_: Any) -> None:
+        path.write_bytes(b"\x89PNG")
+        full()
+
+    monkeypatch.setattr(iio, "imwrite", half)
+    with pytest.raises(OSError, match="No space left"):
+        write_image(tmp_path / "a.png", torch.zeros(4, 4, 3))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_pictures_cost_no_figures(shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", evaluated=True)
+    assert trainer.eval_set is not None
+    with_room = evaluate(trainer.model, trainer.eval_set, pictures=tmp_path / "room")
+    assert with_room.pictures_note is None
+    assert len(list((tmp_path / "room").iterdir())) == 2 * len(trainer.eval_set)
+    monkeypatch.setattr(iio, "imwrite", full)
+    found = evaluate(trainer.model, trainer.eval_set, pictures=tmp_path / "full")
+    assert found.pictures_note == f"cannot write pictures to {tmp_path / 'full'}: No space left on device"
+    assert found.results["psnr"] == with_room.results["psnr"]
+    assert len(found.per_image) == len(trainer.eval_set)
+
+
+def test_a_session_ends_with_its_figures(
+    shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(iio, "imwrite", full)
+    start_session(tiny_run("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=2))
+    said = capsys.readouterr().err
+    assert "warning: cannot write pictures to " in said
+    assert "test: PSNR " in said
+    assert json.loads((tmp_path / "run" / "eval.json").read_text())["results"]["num_images"] == 3
+
+
+def test_an_evaluation_that_cannot_be_written_fails_at_the_end(
+    shared_tiny: Path, tmp_path: Path, refused: Refused
+) -> None:
+    tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=2, max_eval_images=0).train()
+    (tmp_path / "file").write_text("in the way")
+    config = ("--load-config", tmp_path / "run" / "config.yml", "--device-type", "cpu")
+    pictures = tmp_path / "file" / "pictures"
+    said = refused(eval_command.main, *config, "--render-output-path", pictures)
+    assert said.startswith(f"error: cannot write pictures to {pictures}: ")
+    assert (tmp_path / "run" / "eval.json").is_file()
+    said = refused(eval_command.main, *config, "--output-path", tmp_path / "file" / "eval.json")
+    assert said.startswith(f"error: cannot write {tmp_path / 'file' / 'eval.json'}: ")
+
+
+def test_photographs_with_long_names_have_pictures(tiny: Path, tmp_path: Path) -> None:
+    """Names of 245 bytes are as long as most systems allow with an ending, and pictures' are longer."""
+    content = json.loads((tiny / "transforms_val.json").read_text())
+    for index, frame in enumerate(content["frames"]):
+        name = f"{index}" + 120 * "\u00e9" + ".png"
+        (tiny / f"{frame['file_path']}.png").rename(tiny / name)
+        frame["file_path"] = name
+    (tiny / "transforms_val.json").write_text(json.dumps(content))
+    trainer = tiny_trainer("instant-ngp", tiny, tmp_path / "run", evaluated=True)
+    assert trainer.eval_set is not None
+    found = evaluate(trainer.model, trainer.eval_set, pictures=tmp_path / "pictures")
+    assert found.pictures_note is None
+    assert len(list((tmp_path / "pictures").iterdir())) == 2 * len(trainer.eval_set)
+
+
+def test_a_disk_that_fills_up_while_training(shared_tiny: Path, tmp_path: Path, disk: Disk) -> None:
+    """Really: room for one checkpoint and a half. The run trains to its end, keeps what it has, and is resumed."""
+    settings = {"max_num_iterations": 1, "max_eval_images": 0, "sparse_updates": False}
+    one = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "one", **settings).train()
+    disk(f"size={one.checkpoint.stat().st_size * 3 // 2 // 1024 + 64}k")
+    flags = ["--max-num-iterations", 12, "--steps-per-save", 4, "--max-eval-images", 0]
+    where = ["--data", shared_tiny, "--output-dir", tmp_path / "disk", "--timestamp", "t"]
+    done = run("ns-train", "instant-ngp", *where, *TINY_NGP, *flags)
+    folder = tmp_path / "disk" / shared_tiny.name / "instant-ngp" / "t"
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert "No space left on device; earlier checkpoints stand" in done.stderr
+    assert [path.name for path in list_checkpoints(folder / "nerfstudio_models")] == ["step-000000004.ckpt"]
+    assert not list((folder / "nerfstudio_models").glob(".*"))
+    disk("size=64m")
+    done = run("ns-train", "--resume", folder)
+    assert done.returncode == 0, done.stderr
+    saved = load_newest(folder / "nerfstudio_models")
+    assert saved is not None
+    assert saved["state"]["step"] == 12
+
+
+def test_a_disk_that_is_full_from_the_start(shared_tiny: Path, tmp_path: Path, disk: Disk) -> None:
+    disk("size=64k")
+    (tmp_path / "disk" / "rubbish").write_bytes(bytes(50_000))
+    with pytest.raises(OSError, match="No space"):
+        (tmp_path / "disk" / "more").write_bytes(bytes(10**6))
+    a_run = tiny_run("instant-ngp", shared_tiny, tmp_path / "disk" / "run")
+    with pytest.raises(ConfigError, match=r"cannot write the run's folder .*: No space left on device"):
+        create_folder(a_run)

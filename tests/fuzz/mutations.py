@@ -1,0 +1,90 @@
+"""Inputs that nobody should have to read, each of which its seed makes again.
+
+What is done to a file depends on what it is: bytes are flipped under a checksum that fits again, counts and sizes are
+what types hold at most, values are of other kinds, names lead elsewhere.
+"""
+
+from collections.abc import Callable, Sequence
+from fnmatch import fnmatch
+from random import Random
+
+from tests.fuzz.arrays import ARRAY
+from tests.fuzz.files import Files, Link
+from tests.fuzz.pictures import PICTURE
+from tests.fuzz.raw import RAW
+from tests.fuzz.text import TEXT
+from tests.fuzz.trees import damaged_json, damaged_yaml
+
+Mutation = Callable[[Random, bytes], bytes]
+TREES = {"json": damaged_json, "yml": damaged_yaml}
+KINDS: dict[str, Sequence[Mutation]] = {
+    "json": (*TEXT, *RAW),
+    "yml": (*TEXT, *RAW),
+    "txt": (*TEXT, *TEXT, *RAW),
+    "tsv": (*TEXT, *TEXT, *RAW),
+    "ply": (*TEXT, *RAW),
+    "npy": ARRAY,
+    "png": PICTURE,
+    "jpg": PICTURE,
+}
+"""Ending of a file's name to what may happen to it; all else is bytes."""
+SHARE_OF_TREES = 0.6
+"""Of the damage to files that hold names and values."""
+SHARE_OF_FILES = 0.08
+"""Of the damage that is to a whole file: missing, a link, another's content."""
+
+
+def damaged(seed: str, files: Files, targets: Sequence[str], words: Sequence[str]) -> tuple[Files, list[str]]:
+    """A folder's files with something wrong, and what was done to which.
+
+    Args:
+        targets: patterns of the names of files that may be damaged.
+        words: names of entries, to be added in the wrong place.
+    """
+    random, done = Random(seed), []
+    files = dict(files)
+    for _ in range(random.choice((1, 1, 1, 2, 3))):
+        names = [name for name in sorted(files) if any(fnmatch(name, target) for target in targets)]
+        if not names:
+            break
+        name = random.choice(names)
+        content = files[name]
+        if isinstance(content, Link) or random.random() < SHARE_OF_FILES:
+            done.append(f"{name}: {_other_file(random, files, name)}")
+        else:
+            files[name], what = _other_content(random, name.rpartition(".")[2].lower(), content, words)
+            done.append(f"{name}: {what}")
+    return files, done
+
+
+def _other_content(random: Random, ending: str, content: bytes, words: Sequence[str]) -> tuple[bytes, str]:
+    if ending in TREES and random.random() < SHARE_OF_TREES:
+        return TREES[ending](random, content, words)
+    if ending == "ckpt":
+        from tests.fuzz.checkpoints import CHECKPOINT  # brings torch
+
+        mutation = random.choice(CHECKPOINT)
+    else:
+        mutation = random.choice(KINDS.get(ending, RAW))
+    return mutation(random, content), mutation.__name__
+
+
+def _other_file(random: Random, files: Files, name: str) -> str:
+    """Change what stands under a name, in place; returns what was done."""
+    up = "../" * (name.count("/") + 1)
+    targets = {
+        "itself": name.rpartition("/")[2],
+        "nothing": "nowhere",
+        "a folder": ".",
+        "elsewhere": f"{up}outside/secret",
+    }
+    kind = random.choice(("missing", "another's", "a folder's", *targets))
+    if kind == "missing":
+        del files[name]
+    elif kind == "another's":
+        files[name] = files[random.choice(sorted(files))]
+    elif kind == "a folder's":
+        files[f"{name}/inside"] = files.pop(name)
+    else:
+        files[name] = Link(targets[kind])
+    return kind

@@ -1,0 +1,36 @@
+"""What became of an input, and what makes two of them alike."""
+
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one input."""
+
+    reader: str
+    seed: int
+    kind: Literal["accepted", "refused", "escaped"]
+    error: str = ""
+    """The type of what was raised."""
+    message: str = ""
+    damage: tuple[str, ...] = ()
+    """What had been done to which file."""
+    trace: str = ""
+    """Where an escape came from."""
+
+    @property
+    def shape(self) -> str:
+        """The message without what differs from input to input: names, values, numbers."""
+        text = re.sub(r"'[^']*'|\"[^\"]*\"", "'...'", self.message)
+        text = re.sub(r"\S*/\S*", "PATH", text)
+        return re.sub(r"[-+]?(\d[\d.,]*(e[-+]?\d+)?|\bnan\b|\binf\b)", "N", text)[:200]
+
+    def __str__(self) -> str:
+        lines = [
+            f"{self.reader}, seed {self.seed}: {self.kind}: {self.error}: {self.message[:500]}",
+            f"  damage: {'; '.join(self.damage)}",
+            f"  repeat: python -m tests.fuzz --reader {self.reader} --seed {self.seed} --count 1",
+        ]
+        return "\n".join([*lines, self.trace]) if self.trace else "\n".join(lines)

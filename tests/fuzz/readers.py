@@ -1,0 +1,314 @@
+"""Every reader of files that come from elsewhere, each with a small input that it takes."""
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import is_dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import torch
+
+from dataparsers.blender import Blender
+from dataparsers.colmap import Colmap
+from dataparsers.dnerf import DNeRF
+from dataparsers.llff import Llff
+from dataparsers.nerfstudio import Nerfstudio
+from dataparsers.phototourism import Phototourism
+from dataparsers.polycam import Polycam
+from dataparsers.record3d import Record3D
+from framework import DataParser, Dataset
+from framework.cli.compare import CompareFlags, plan_of
+from framework.cli.session import load_split
+from framework.config import from_plain, read_yaml
+from framework.dataset import load_dataset
+from framework.mapped_pixels import MappedPixels
+from framework.pixel_cache import PixelMemory, pack, unpack
+from framework.ply import read_points
+from framework.processing import polycam, record3d
+from framework.processing.photographs import find_photographs, prepare_all
+from framework.training.checkpoint import FOLDER, load_newest
+from framework.training.run import Run, create_folder, read_run
+from framework.training.trained import load_trained
+from framework.training.trainer import Trainer
+from tests.conftest import write_tiny
+from tests.dataparsers.captures import write_capture
+from tests.dataparsers.captures import write_images as write_pictures
+from tests.dataparsers.sparse_models import make_capture, write_colmap, write_images
+from tests.dataparsers.test_llff import poses_bounds
+from tests.dataparsers.test_polycam import write_polycam
+from tests.dataparsers.test_record3d import write_record3d
+from tests.fuzz.reader import Reader, require
+from tests.fuzz.sense import check_dataset, check_scene
+from tests.images import noise
+from tests.training.helpers import tiny_run
+
+MEMORY = 20e6
+"""Bytes of pixels that may be held in memory; small inputs stay far below."""
+COUNT = 5
+"""Photographs of a capture."""
+CAPTURE = (
+    "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "camera_model", "is_fisheye", "fl_x", "fl_y", "cx", "cy", "w", "h",
+    "camera_angle_x", "camera_angle_y", "file_path", "transform_matrix", "mask_path", "depth_file_path", "time",
+    "ply_file_path", "aabb_scale", "scale", "offset", "applied_scale", "applied_transform", "train_filenames",
+    "val_filenames", "test_filenames", "frames",
+)  # fmt: skip
+
+
+def edit(file: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+    content = json.loads(file.read_text())
+    change(content)
+    file.write_text(json.dumps(content))
+
+
+# -- formats ------------------------------------------------------------------------------------------------------
+
+
+def parse(parser: DataParser, folder: Path, scratch: Path) -> None:
+    """Recognise, which must never fail, and parse."""
+    type(parser).recognizes(folder)
+    check_scene(parser.parse(folder, "train"))
+
+
+def write_blender(folder: Path) -> None:
+    write_tiny(folder, size=8, counts=(4, 1, 1))
+
+
+def write_dnerf(folder: Path) -> None:
+    write_blender(folder)
+    edit(folder / "transforms_train.json", lambda c: [frame.update(time=i / 3) for i, frame in enumerate(c["frames"])])
+
+
+def write_nerfstudio(folder: Path) -> None:
+    """With all that the format may have."""
+    applied = [[1, 0, 0, 0.5], [0, -1, 0, 0.25], [0, 0, -1, 2.0]]
+    placed = {"applied_transform": applied, "applied_scale": 2.0, "aabb_scale": 4}
+    write_capture(folder, COUNT, camera_model="OPENCV", k1=0.01, ply_file_path="points.ply", **placed)
+    head = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+    (folder / "points.ply").write_text(f"{head}end_header\n0.3 -0.2 0.5\n-0.4 0.1 0.9\n0 0.5 0.2\n")
+    write_pictures(folder / "masks", ["000.png"])
+    write_pictures(folder / "depths", ["001.png"])
+    edit(folder / "transforms.json", lambda c: c["frames"][0].update(mask_path="masks/000.png", time=0.0))
+    edit(folder / "transforms.json", lambda c: c["frames"][1].update(depth_file_path="depths/001.png"))
+    edit(folder / "transforms.json", lambda c: [frame.update(time=i / COUNT) for i, frame in enumerate(c["frames"])])
+
+
+def write_sparse(folder: Path, binary: bool) -> None:
+    import pycolmap
+
+    capture = make_capture(COUNT)
+    write_images(folder / "images", capture.names)
+    model = write_colmap(folder / "sparse" / "0", capture, "OPENCV 60 40 50 48 31 19 0.1 -0.02 0.003 -0.001")
+    if binary:
+        pycolmap.Reconstruction(os.fspath(model)).write_binary(os.fspath(model))
+        for file in model.glob("*.txt"):
+            file.unlink()
+
+
+def write_phototourism(folder: Path) -> None:
+    capture = make_capture(COUNT)
+    write_images(folder / "dense" / "images", capture.names)
+    write_colmap(folder / "dense" / "sparse", capture)
+    rows = [f"{name}\t{index}.0\t{'test' if index == 4 else 'train'}\tgate" for index, name in enumerate(capture.names)]
+    (folder / "gate.tsv").write_text("\n".join(["filename\tid\tsplit\tdataset", *rows]) + "\n")
+
+
+def write_llff(folder: Path) -> None:
+    capture = make_capture(COUNT, spread=0.15)
+    write_images(folder / "images", capture.names)
+    np.save(folder / "poses_bounds.npy", poses_bounds(capture))
+
+
+def write_ply(folder: Path) -> None:
+    kinds = {"ascii": "", "binary_little_endian": "<f4", "binary_big_endian": ">f4"}
+    points = np.random.default_rng(0).normal(size=(6, 3))
+    for name, kind in kinds.items():
+        head = f"ply\nformat {name} 1.0\ncomment none\nelement vertex 6\n"
+        head += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+        body = points.astype(kind).tobytes() if kind else "\n".join(" ".join(map(str, row)) for row in points).encode()
+        (folder / f"{name}.ply").write_bytes(head.encode() + body)
+
+
+def read_ply(folder: Path, scratch: Path) -> None:
+    for file in sorted(folder.glob("*.ply")):
+        points = read_points(file)
+        require(points.shape[1:] == (3,) and bool(points.isfinite().all()), "points that are nowhere")
+
+
+# -- images -------------------------------------------------------------------------------------------------------
+
+
+def load(parser: DataParser, limit: float, folder: Path, scratch: Path) -> None:
+    """Parse and decode, into memory, or into a file where the limit is below the set's size."""
+    memory = PixelMemory(limit, scratch / "cache")
+    check_dataset(load_dataset(parser.parse(folder, "train"), "train", memory, masks="auto"))
+
+
+def write_masked(folder: Path) -> None:
+    """Photographs, each with a mask of its own and a depth image."""
+    write_capture(folder, COUNT)
+    (folder / "masks").mkdir()
+    (folder / "depths").mkdir()
+    content = json.loads((folder / "transforms.json").read_text())
+    for index, frame in enumerate(content["frames"]):
+        frame["mask_path"] = f"masks/{index}.png"
+        frame["depth_file_path"] = f"depths/{index}.{'png' if index % 2 else 'npy'}"
+        iio.imwrite(folder / frame["mask_path"], np.where(noise(40, 30, index)[..., 0] > 100, 255, 0).astype(np.uint8))
+        depth = 100 * noise(20, 15, index)[..., 0].astype(np.uint16)
+        if index % 2:
+            iio.imwrite(folder / frame["depth_file_path"], depth)
+        else:
+            np.save(folder / frame["depth_file_path"], depth.astype(np.float32))
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+def write_photographs(folder: Path) -> None:
+    for index, name in enumerate(("a b.png", "sub/c.png", "sub/d.JPG", "e.jpg")):
+        (folder / name).parent.mkdir(exist_ok=True)
+        iio.imwrite(folder / name, noise(20, 16, index), extension=Path(name).suffix.lower())
+
+
+def read_photographs(folder: Path, scratch: Path) -> None:
+    sources = find_photographs(folder)
+    photographs, unreadable = prepare_all(folder, sources, scratch / "images")
+    require(len(photographs) + len(unreadable) == len(sources), "a photograph that nobody speaks of")
+    for photograph in photographs:
+        require((scratch / "images" / photograph.name).is_file(), f"{photograph.name}, which is not there")
+
+
+# -- phones -------------------------------------------------------------------------------------------------------
+
+
+def convert_polycam(folder: Path, scratch: Path) -> None:
+    polycam.convert(folder, scratch / "data", 1, 100, 25.0, 3)
+    parse(Nerfstudio(), scratch / "data", scratch)
+
+
+def write_record3d_whole(folder: Path) -> None:
+    """Images of the size that the recording says."""
+    write_record3d(folder)
+    edit(folder / "EXR_RGBD" / "metadata.json", lambda c: c.update(w=20, h=15, K=[*(k / 2 for k in c["K"][:8]), 1]))
+
+
+def convert_record3d(folder: Path, scratch: Path) -> None:
+    record3d.convert(folder, scratch / "data", 1, 100)
+    parse(Nerfstudio(), scratch / "data", scratch)
+
+
+# -- runs ---------------------------------------------------------------------------------------------------------
+
+
+SMALL = {"log2_table_size": 8, "num_levels": 2}
+
+
+def without_place(folder: Path) -> None:
+    """A config.yml that says the same wherever it was made, so that a seed damages it in the same way."""
+    file = folder / "config.yml"
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join("data: photographs" if line.startswith("data: ") else line for line in lines) + "\n")
+
+
+def write_run(folder: Path) -> None:
+    """A run with two checkpoints."""
+    data = write_tiny(folder / "data", size=8, counts=(4, 1, 1))
+    run = tiny_run("instant-ngp", data, folder / "run", **SMALL)
+    create_folder(run)
+    without_place(run.folder)
+    trainer = Trainer(run, load_split(run, "train"), None)
+    trainer.config = replace(trainer.config, data=Path("photographs"))
+    for _ in range(2):
+        trainer.train_step()
+        trainer.save()
+    shutil.rmtree(data)
+
+
+def write_config(folder: Path) -> None:
+    create_folder(tiny_run("nerfacto", Path("photographs"), folder, max_seconds=60.0))
+    without_place(folder)
+
+
+def read_config(folder: Path, scratch: Path) -> None:
+    run = read_run(folder / "config.yml")
+    require(is_dataclass(run.config) and is_dataclass(run.parser), "settings of another kind")
+
+
+def write_recipe(folder: Path) -> None:
+    methods = "methods:\n- instant-ngp\n- vanilla-nerf --sampler occupancy\n"
+    (folder / "recipe.yml").write_text(f"{methods}max_seconds: 60.0\ndata_flags: '--scale-factor 2'\n")
+
+
+def read_recipe(folder: Path, scratch: Path) -> None:
+    """Of a comparison."""
+    plan = plan_of(from_plain(CompareFlags(), read_yaml(folder / "recipe.yml"), "recipe.yml"))
+    require(plan.contenders and plan.conditions.budget(), "a comparison of nothing")
+
+
+def read_checkpoints(folder: Path, scratch: Path) -> None:
+    content = load_newest(folder / "run" / FOLDER)
+    require(content is None or "model" in content, "a checkpoint without a model")
+
+
+@cache
+def _photographs(folder: Path) -> tuple[Run, Dataset]:
+    """What is trained on, for checkpoints to be restored to."""
+    shutil.rmtree(folder, ignore_errors=True)
+    run = tiny_run("instant-ngp", write_tiny(folder, size=8, counts=(4, 1, 1)), folder, **SMALL)
+    return run, load_split(run, "train")
+
+
+def restore(folder: Path, scratch: Path) -> None:
+    """As ns-eval does, and as --resume does."""
+    trained = load_trained(folder / "run" / "config.yml", device_type="cpu")
+    Trainer(*_photographs(scratch.parent / "photographs"), None).restore(trained.content)
+
+
+def write_pixel_cache(folder: Path) -> None:
+    facts = {
+        "pixels": np.array(300),
+        "channels": np.array(3),
+        "left": np.arange(2),
+        "light": np.zeros((2, 3, 5), np.float32),
+        "failure": np.array(""),
+    }
+    (folder / "pixels.bin").write_bytes(noise(20, 15, 0).tobytes() + pack(facts))
+
+
+def read_pixel_cache(folder: Path, scratch: Path) -> None:
+    facts = unpack(folder / "pixels.bin")
+    if facts is not None:
+        pixels = MappedPixels(folder / "pixels.bin", int(facts["pixels"]), int(facts["channels"]), 1e6)
+        require(len(pixels.look_up(torch.tensor([5, 3, 299]))) == 3, "pixels that are not there")
+
+
+READERS: dict[str, Reader] = {
+    "blender": Reader(write_blender, partial(parse, Blender()), ("transforms_train.json",), ("camera_angle_x", "time")),
+    "dnerf": Reader(write_dnerf, partial(parse, DNeRF()), ("transforms_train.json",), ("camera_angle_x", "time")),
+    "nerfstudio": Reader(write_nerfstudio, partial(parse, Nerfstudio()), ("transforms.json", "points.ply"), CAPTURE),
+    "colmap-binary": Reader(partial(write_sparse, binary=True), partial(parse, Colmap()), ("sparse/0/*.bin",)),
+    "colmap-text": Reader(partial(write_sparse, binary=False), partial(parse, Colmap()), ("sparse/0/*.txt",)),
+    "llff": Reader(write_llff, partial(parse, Llff()), ("poses_bounds.npy",)),
+    "llff-ndc": Reader(write_llff, partial(parse, Llff(ndc=True)), ("poses_bounds.npy",)),
+    "record3d": Reader(write_record3d, partial(parse, Record3D()), ("EXR_RGBD/metadata.json",), ("K", "w", "h")),
+    "polycam": Reader(write_polycam, partial(parse, Polycam()), ("keyframes/cameras/*.json",), ("fx", "cx", "width")),
+    "phototourism": Reader(write_phototourism, partial(parse, Phototourism()), ("gate.tsv",)),
+    "ply": Reader(write_ply, read_ply, ("*.ply",)),
+    "images": Reader(write_blender, partial(load, Blender(), MEMORY), ("train/*.png",)),
+    "images-to-a-file": Reader(write_blender, partial(load, Blender(), 0.0), ("train/*.png",)),
+    "masks": Reader(write_masked, partial(load, Nerfstudio(), MEMORY), ("masks/*.png",)),
+    "depths": Reader(write_masked, partial(load, Nerfstudio(), MEMORY), ("depths/*",)),
+    "photographs": Reader(write_photographs, read_photographs, ("*",)),
+    "polycam-raw": Reader(write_polycam, convert_polycam, ("keyframes/cameras/*.json",), ("blur_score", "fx", "width")),
+    "record3d-raw": Reader(
+        write_record3d_whole, convert_record3d, ("EXR_RGBD/metadata.json",), ("perFrameIntrinsicCoeffs", "K", "w")
+    ),
+    "config": Reader(write_config, read_config, ("config.yml",), ("method", "dataparser", "machine", "data", "name")),
+    "comparison": Reader(write_recipe, read_recipe, ("recipe.yml",), ("methods", "data", "repeats", "target_psnr")),
+    "checkpoint": Reader(write_run, read_checkpoints, ("run/nerfstudio_models/*.ckpt",)),
+    "run": Reader(write_run, restore, ("run/nerfstudio_models/*.ckpt",)),
+    "pixel-cache": Reader(write_pixel_cache, read_pixel_cache, ("pixels.bin",)),
+}
+"""By name."""

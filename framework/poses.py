@@ -33,7 +33,6 @@ class Placement:
         rotations = self.transform[:, :3] @ poses[:, :3, :3]
         return torch.cat([rotations, self.points(poses[:, :3, 3])[..., None]], dim=-1)
 
-
     def original_points(self, points: Tensor) -> Tensor:
         """Points (K, 3) of the scene in the input's frame: the inverse of `points`."""
         return (points / self.scale - self.transform[:, 3]) @ self.transform[:, :3]

@@ -37,6 +37,10 @@ class Placement:
         """Points (K, 3) of the scene in the input's frame: the inverse of `points`."""
         return (points / self.scale - self.transform[:, 3]) @ self.transform[:, :3]
 
+    def original_directions(self, directions: Tensor) -> Tensor:
+        """Unit directions (K, 3) of the scene in the input's frame."""
+        return directions @ self.transform[:, :3]
+
     def original_poses(self, poses: Tensor) -> Tensor:
         """Camera-to-world matrices (M, 3, 4) of the scene as those of the input: the inverse of `poses`."""
         rotations = self.transform[:, :3].T @ poses[:, :, :3]

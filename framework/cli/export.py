@@ -100,7 +100,7 @@ def _points(flags: PointFlags, trained: Trained, placement: Placement) -> None:
     if not len(found.positions):
         raise ConfigError("no training ray ends in a surface inside --reach; is the run trained? --reach 0 keeps all")
     positions = placement.original_points(found.positions.double()).float()
-    normals = None if found.normals is None else found.normals @ placement.transform[:, :3].float()
+    normals = None if found.normals is None else placement.original_directions(found.normals.double()).float()
     path = flags.output_dir / "point_cloud.ply"
     write_points(path, positions, found.colors, normals)
     say(f"{len(positions):,} points: {path}")

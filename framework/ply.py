@@ -114,8 +114,8 @@ def write_points(file: Path, positions: Tensor, colors: Tensor, normals: Tensor 
     stored = (colors.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
     columns += [(n, "uchar", "u1", v) for n, v in zip(("red", "green", "blue"), stored.T, strict=True)]
     table = np.empty(len(positions), [(name, kind) for name, _, kind, _ in columns])
-    for name, _, _, values in columns:
-        table[name] = values
+    for name, _, _, column in columns:
+        table[name] = column
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
     header += [f"property {called} {name}" for name, called, _, _ in columns]
     with file.open("wb") as stream:

@@ -36,10 +36,13 @@ class Placement:
         rotations = self.transform[:, :3] @ poses[:, :3, :3]
         return torch.cat([rotations, self.points(poses[:, :3, 3])[..., None]], dim=-1)
 
-
     def original_points(self, points: Tensor) -> Tensor:
         """Points (K, 3) of the scene in the input's frame: the inverse of `points`."""
         return (points / self.scale - self.transform[:, 3]) @ self.transform[:, :3]
+
+    def original_directions(self, directions: Tensor) -> Tensor:
+        """Unit directions (K, 3) of the scene in the input's frame."""
+        return directions @ self.transform[:, :3]
 
     def original_poses(self, poses: Tensor) -> Tensor:
         """Camera-to-world matrices (M, 3, 4) of the scene as those of the input: the inverse of `poses`."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from framework.cli.common import run_command
+from framework.cli.common import chosen_kind, run_command
 from framework.errors import ConfigError, nearest
 
 USAGE = """\
@@ -74,16 +74,12 @@ def main() -> None:
 
 
 def _command(arguments: list[str]) -> None:
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(USAGE)
+    if (chosen := chosen_kind(arguments, KINDS, USAGE, "there is no benchmark")) is None:
         return
     import tyro
 
-    if arguments[0] not in KINDS:
-        raise ConfigError(f"there is no benchmark '{arguments[0]}'. {nearest(arguments[0], KINDS)}")
-    flags, run = KINDS[arguments[0]]
-    prog = f"ns-bench {arguments[0]}"
-    run(tyro.cli(flags, prog=prog, args=arguments[1:], config=(tyro.conf.FlagConversionOff,)))
+    name, (flags, run), rest = chosen
+    run(tyro.cli(flags, prog=f"ns-bench {name}", args=rest, config=(tyro.conf.FlagConversionOff,)))
 
 
 def _kernels(flags: KernelFlags) -> None:

@@ -3,10 +3,33 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import TypeVar
 
 from framework.console import say
-from framework.errors import NerfloomError
+from framework.errors import ConfigError, NerfloomError, nearest
+
+K = TypeVar("K")
+
+
+def chosen_kind(
+    arguments: list[str], kinds: Mapping[str, K], usage: str, unknown: str
+) -> tuple[str, K, list[str]] | None:
+    """What the first argument names, and the arguments behind it; None where help was asked for, which is printed.
+
+    Args:
+        kinds: what may be named.
+        usage: the help.
+        unknown: how to call a name that is not among them, as in "unknown path".
+    Raises: ConfigError for such a name, with the nearest.
+    """
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(usage)
+        return None
+    name = arguments[0]
+    if name not in kinds:
+        raise ConfigError(f"{unknown} '{name}'. {nearest(name, list(kinds))}")
+    return name, kinds[name], arguments[1:]
 
 
 def run_command(command: Callable[[list[str]], None]) -> None:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from framework.cli.common import run_command
-from framework.errors import ConfigError, nearest
+from framework.cli.common import chosen_kind, run_command
+from framework.errors import ConfigError
 
 if TYPE_CHECKING:
     from framework.poses import Placement
@@ -60,16 +60,12 @@ def main() -> None:
 
 
 def _command(arguments: list[str]) -> None:
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(USAGE)
+    if (chosen := chosen_kind(arguments, KINDS, USAGE, "nothing is exported as")) is None:
         return
-    if arguments[0] not in KINDS:
-        raise ConfigError(f"nothing is exported as '{arguments[0]}'. {nearest(arguments[0], KINDS)}")
     import tyro
 
-    kind, run = KINDS[arguments[0]]
-    prog = f"ns-export {arguments[0]}"
-    flags = tyro.cli(kind, prog=prog, args=arguments[1:], config=(tyro.conf.FlagConversionOff,))
+    name, (kind, run), rest = chosen
+    flags = tyro.cli(kind, prog=f"ns-export {name}", args=rest, config=(tyro.conf.FlagConversionOff,))
     from framework.training.trained import load_trained
 
     trained = load_trained(flags.load_config, flags.load_checkpoint, flags.device_type, flags.data)
@@ -104,7 +100,7 @@ def _points(flags: PointFlags, trained: Trained, placement: Placement) -> None:
     if not len(found.positions):
         raise ConfigError("no training ray ends in a surface inside --reach; is the run trained? --reach 0 keeps all")
     positions = placement.original_points(found.positions.double()).float()
-    normals = None if found.normals is None else found.normals @ placement.transform[:, :3].float()
+    normals = None if found.normals is None else placement.original_directions(found.normals.double()).float()
     path = flags.output_dir / "point_cloud.ply"
     write_points(path, positions, found.colors, normals)
     say(f"{len(positions):,} points: {path}")

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import get_type_hints
 
-from framework.cli.common import run_command
+from framework.cli.common import chosen_kind, run_command
 from framework.console import say
-from framework.errors import ConfigError, DataError, nearest
+from framework.errors import ConfigError, DataError
 from framework.processing.settings import ColmapFlags, OutputFlags
 
 USAGE = """\
@@ -107,20 +107,13 @@ def main() -> None:
 
 
 def _command(arguments: list[str]) -> None:
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(USAGE)
+    if (chosen := chosen_kind(arguments, KINDS, USAGE, "unknown kind")) is None:
         return
-    kind = KINDS.get(arguments[0])
-    if kind is None:
-        raise ConfigError(f"unknown kind '{arguments[0]}'. {nearest(arguments[0], list(KINDS))}")
     import tyro
 
-    flags = tyro.cli(
-        kind,
-        prog=f"ns-process-data {arguments[0]}",
-        args=_spelt_out(arguments[1:], kind),
-        config=(tyro.conf.FlagConversionOff,),
-    )
+    name, kind, rest = chosen
+    options = (tyro.conf.FlagConversionOff,)
+    flags = tyro.cli(kind, prog=f"ns-process-data {name}", args=_spelt_out(rest, kind), config=options)
     flags.check()
     try:
         _process(flags)

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from framework.cli.common import run_command
+from framework.cli.common import chosen_kind, run_command
 from framework.config import RaysPerPixel
-from framework.errors import ConfigError, nearest
+from framework.errors import ConfigError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -97,16 +97,12 @@ def main() -> None:
 
 
 def _command(arguments: list[str]) -> None:
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(USAGE)
+    if (chosen := chosen_kind(arguments, PATHS, USAGE, "unknown path")) is None:
         return
-    path = PATHS.get(arguments[0])
-    if path is None:
-        raise ConfigError(f"unknown path '{arguments[0]}'. {nearest(arguments[0], list(PATHS))}")
     import tyro
 
-    prog = f"ns-render {arguments[0]}"
-    _render(tyro.cli(path, prog=prog, args=arguments[1:], config=(tyro.conf.FlagConversionOff,)))
+    name, path, rest = chosen
+    _render(tyro.cli(path, prog=f"ns-render {name}", args=rest, config=(tyro.conf.FlagConversionOff,)))
 
 
 def _render(flags: Flags) -> None:

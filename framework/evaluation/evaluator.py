@@ -90,7 +90,7 @@ def render_view(model: Model, dataset: Dataset, index: int, background: Tensor) 
 
 
 def evaluation_background(model: Model) -> Tensor:
-    """(3,) what training is over, white where that is random; black where it is left open and no photograph has alpha."""
+    """(3,) what training is over; white where that is random, but black where no photograph has alpha."""
     asked = model.config.background
     black = asked == "black" or (asked != "white" and not model.scene.has_alpha)
     return torch.full((3,), 0.0 if black else 1.0, device=model.device)

@@ -121,7 +121,7 @@ def test_data_for_the_embedded_scene_is_refused(shared_tiny: Path, tmp_path: Pat
 
 def test_a_missing_method_is_an_error() -> None:
     with pytest.raises(ConfigError, match="unknown method"):
-        _default_run("nerf")
+        _default_run("nerv")
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ PLANES = "--base-resolution 16 --num-scales 2 --features-per-scale 8 --grid-reso
 NGP, KPLANES = f"instant-ngp {SMALL} --samples-per-batch 4096", f"kplanes {PLANES} --samples-per-batch 4096"
 
 
+@pytest.mark.slow
 def test_two_methods_one_that_fails_and_a_second_call(shared_tiny: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     flags = ("--data", shared_tiny, "--max-num-iterations", 24, "--output-dir", out, "--curve-images", 1)

@@ -111,7 +111,7 @@ def write_recipe(path: Path, **values: object) -> Path:
         ("method: instant-ngp\nlearning_rat: 1", "unknown key 'learning_rat'. Did you mean 'learning_rate'"),
         ("method: instant-ngp\nmax_num_iterations: many", "'max_num_iterations' is 'many'; it must be int"),
         ("method: [", "is not plain YAML"),
-        ("method: nerf", "unknown method 'nerf'"),
+        ("method: nerv", "unknown method 'nerv'"),
     ],
 )
 def test_bad_recipes_are_one_line(text: str, words: str, tmp_path: Path, refused: Refused) -> None:

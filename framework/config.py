@@ -214,14 +214,14 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
             return float(value)
         except OverflowError:
             pass
-    if isinstance(hint, type) and isinstance(value, hint) and (hint is not int or _is_count(value)):
+    if isinstance(hint, type) and (_is_count(value) if hint is int else isinstance(value, hint)):
         return value
     raise ConfigError(f"{where} is {shown(value)}; it must be {getattr(hint, '__name__', hint)}")
 
 
-def _is_count(value: int) -> bool:
-    """Whether an integer is one that processors count with; True and False are none, though Python thinks so."""
-    return not isinstance(value, bool) and abs(value) < 2**63
+def _is_count(value: Any) -> bool:
+    """Whether a value is an integer that processors count with; True and False are none, though Python thinks so."""
+    return isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63
 
 
 class _PlainLoader(yaml.SafeLoader):

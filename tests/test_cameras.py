@@ -135,7 +135,7 @@ def broken(change: str) -> torch.Tensor:
         pose[0, 0] = -1
     elif change == "overflow":
         pose = pose.double()
-        pose[:2, :2] = torch.tensor([[1e200, 1e200], [1e200, -1e200]])
+        pose[:2, :2] = torch.tensor([[1e200, 1e200], [1e200, -1e200]], dtype=torch.float64)
     elif change == "shape":
         pose = pose[:2]
     return pose

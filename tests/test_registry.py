@@ -163,7 +163,7 @@ def test_recognition(shared_tiny: Path, tmp_path: Path) -> None:
     assert registry.recognize(None) == "procedural"
     with pytest.raises(DataError, match="there is no such folder"):
         registry.recognize(tmp_path / "nowhere")
-    with pytest.raises(DataError, match="there is no such folder"):
+    with pytest.raises(DataError, match=r"a{100}\.\.\.$"):  # an error of a line, however long the name
         registry.recognize(tmp_path / ("a" * 5000))
     with pytest.raises(DataError, match="no known data format"):
         registry.recognize(tmp_path)

@@ -82,6 +82,10 @@ class Conditions:
             raise ConfigError(
                 "say how long each method trains: --max-seconds 120, --max-num-iterations 5000, or --target-psnr 30"
             )
+        for name in ("max_seconds", "max_num_iterations", "target_psnr"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ConfigError(f"--{name.replace('_', '-')} is {value}; it must be more than 0")
         if self.curve_images < 1 or (self.max_eval_images is not None and self.max_eval_images < 1):
             raise ConfigError("--curve-images and --max-eval-images must be at least 1")
 

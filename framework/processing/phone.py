@@ -18,7 +18,6 @@ from framework.processing.pipeline import prepared
 from framework.processing.pyramid import write_pyramid
 from framework.processing.transforms import Frame, Lens, content, write
 
-
 UNUSABLE = (KeyError, TypeError, ValueError, OverflowError)
 """What goes wrong where a JSON file lacks a number, or has something else in its place."""
 

@@ -64,7 +64,7 @@ def require_rendered(rendered: Rendered, count: int, when: str) -> None:
     for name, shape in shapes.items():
         _require(values[name], shape, f"{when}, {name} of {count} rays")
     opacity = rendered.accumulation.detach()
-    if count and not (-TOLERANCE <= float(opacity.min()) and float(opacity.max()) <= 1 + TOLERANCE):
+    if count and not (float(opacity.min()) >= -TOLERANCE and float(opacity.max()) <= 1 + TOLERANCE):
         raise Fault(f"{when}, accumulation is from {opacity.min():.3g} to {opacity.max():.3g}; it must be in [0, 1]")
     if not isinstance(rendered.num_samples, int) or rendered.num_samples < 0:
         raise Fault(f"{when}, num_samples is {rendered.num_samples!r}; it is the number of evaluations, an int")

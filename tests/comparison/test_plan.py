@@ -41,13 +41,16 @@ def test_what_is_no_contender(text: str, reason: str) -> None:
 
 def test_words_are_those_of_a_shell() -> None:
     assert split_words("--scale-factor 2 'a b'", "--data-flags") == ("--scale-factor", "2", "a b")
-    with pytest.raises(ConfigError, match="--data-flags: \"'open\" cannot be read: No closing"):
+    with pytest.raises(ConfigError, match='--data-flags: "\'open" cannot be read: No closing'):
         split_words("'open", "--data-flags")
 
 
 def test_conditions_must_end_somewhere() -> None:
     with pytest.raises(ConfigError, match="say how long each method trains"):
         replace(CONDITIONS, max_seconds=None)
+    for nothing in ({"max_seconds": 0.0}, {"max_num_iterations": 0}, {"target_psnr": float("nan")}):
+        with pytest.raises(ConfigError, match="must be more than 0"):
+            replace(CONDITIONS, **nothing)
     assert CONDITIONS.budget() == "120 s of training"
     assert replace(CONDITIONS, target_psnr=30.0).budget() == "120 s of training, until 30.0 dB on the validation views"
 

@@ -33,6 +33,9 @@ SHARE_OF_TREES = 0.6
 SHARE_OF_FILES = 0.08
 """Of the damage that is to a whole file: missing, a link, another's content."""
 
+LARGEST = 2**25
+"""Bytes of a damaged file; the worker may write twice that."""
+
 
 def damaged(seed: str, files: Files, targets: Sequence[str], words: Sequence[str]) -> tuple[Files, list[str]]:
     """A folder's files with something wrong, and what was done to which.
@@ -66,7 +69,7 @@ def _other_content(random: Random, ending: str, content: bytes, words: Sequence[
         mutation = random.choice(CHECKPOINT)
     else:
         mutation = random.choice(KINDS.get(ending, RAW))
-    return mutation(random, content), mutation.__name__
+    return mutation(random, content)[:LARGEST], mutation.__name__
 
 
 def _other_file(random: Random, files: Files, name: str) -> str:
@@ -82,7 +85,7 @@ def _other_file(random: Random, files: Files, name: str) -> str:
     if kind == "missing":
         del files[name]
     elif kind == "another's":
-        files[name] = files[random.choice(sorted(files))]
+        files[name] = files[random.choice(sorted(set(files) - {name}) or [name])]
     elif kind == "a folder's":
         files[f"{name}/inside"] = files.pop(name)
     else:

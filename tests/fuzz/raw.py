@@ -29,7 +29,7 @@ def flip_bits(random: Random, content: bytes) -> bytes:
 
 
 def cut_short(random: Random, content: bytes) -> bytes:
-    return content[: random.randrange(len(content) + 1)]
+    return content[: random.randrange(max(len(content), 1))]
 
 
 def empty(random: Random, content: bytes) -> bytes:

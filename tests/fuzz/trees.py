@@ -173,4 +173,3 @@ def _with_piece(random: Random, text: str) -> bytes:
     index = random.randrange(len(lines)) if lines else 0
     name = lines[index].split(":")[0] if lines else "a"
     return encoded("\n".join([*lines[:index], f"{name}: {random.choice(YAML_PIECES)}", *lines[index + 1 :]]) + "\n")
-

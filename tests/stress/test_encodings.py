@@ -58,9 +58,7 @@ each_encoding = pytest.mark.parametrize("encoding", ENCODINGS)
 @each_encoding
 @FEW
 @given(
-    positions=st.lists(
-        st.tuples(*[st.sampled_from([0.0, 1e-30, 2.0**-24, 0.3, 1 - 2.0**-24, 1.0])] * 3), max_size=6
-    ),
+    positions=st.lists(st.tuples(*[st.sampled_from([0.0, 1e-30, 2.0**-24, 0.3, 1 - 2.0**-24, 1.0])] * 3), max_size=6),
     strided=st.booleans(),
 )
 def test_positions_on_faces(

@@ -151,7 +151,6 @@ def test_an_infinite_gradient_that_waits_for_the_optimiser_is_found(backend: str
 
 
 @pytest.mark.entry(3)
-@pytest.mark.xfail(strict=True, reason="a NaN picture, whose step is dropped, stays in the running mean for good")
 def test_one_nan_picture_does_not_spoil_the_running_mean(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run")
     render = trainer.model.render

@@ -30,7 +30,7 @@ def test_the_plain_run_comes_first_whatever_is_asked_for() -> None:
     assert select([]) == list(CONDITIONS)
     assert [c.name for c in select(["inside", "all-white"])] == ["plain", "all-white", "inside"]
     assert select(["plain"]) == [PLAIN]
-    with pytest.raises(ConfigError, match="--only: there is no condition 'all-whit'. Did you mean 'all-white'"):
+    with pytest.raises(ConfigError, match=r"--only: there is no condition 'all-whit'\. Did you mean 'all-white'"):
         select(["all-whit"])
 
 

@@ -133,7 +133,7 @@ def test_on_somebodys_data(
         (("instant-npg",), "unknown method 'instant-npg'. Did you mean 'instant-ngp'"),
         (("instant-ngp", "--only", "all-whit"), "Did you mean 'all-white'"),
         (("instant-ngp", "--data", "/no/such/folder"), "there is no such folder"),
-        (("instant-ngp 'open",), "METHOD: \"instant-ngp 'open\" cannot be read"),
+        (("instant-ngp 'open",), 'METHOD: "instant-ngp \'open" cannot be read'),
         (("instant-ngp", "--max-num-iterations", 0), "--max-num-iterations must be at least 1"),
         (("--data",), "the method comes first"),
         (("",), "the method is missing"),

@@ -55,5 +55,6 @@ def test_without_a_plain_run_to_compare_with_a_sound_run_passes() -> None:
 
 
 def test_an_error_is_a_line_and_says_its_type_unless_it_is_for_users() -> None:
-    assert in_a_line(ConfigError("one\n  two")) == "one two"
+    assert in_a_line(ConfigError("one  two")) == "one two"
+    assert in_a_line(ValueError("one\n  two")) == "ValueError: one two"
     assert in_a_line(KeyError("name")) == "KeyError: 'name'"

@@ -14,14 +14,17 @@ from framework.dataset import Dataset
 from framework.pixels import Batch
 
 EVERY = 3
-"""Batches of which one is spoiled: often, but not the ten in a row that end a run."""
+"""Batches of which the first is spoiled: often, but not the ten in a row that end a run."""
 
 Spoil = Callable[[Batch, int], Batch]
 """From a batch and the step's number to the batch that is learnt from."""
 
 
 def spoiled_pixel(value: float) -> Spoil:
-    """One pixel of every third batch, the first included, shows `value` in all channels."""
+    """One pixel of every third batch, the first included, shows `value` in all channels.
+
+    So many steps cannot but be dropped (`spoiled_batches`): whoever drops fewer has hidden what was wrong.
+    """
 
     def spoil(batch: Batch, step: int) -> Batch:
         if step % EVERY:
@@ -31,6 +34,11 @@ def spoiled_pixel(value: float) -> Spoil:
         return replace(batch, rgb=rgb)
 
     return spoil
+
+
+def spoiled_batches(steps: int) -> int:
+    """How many of the first `steps` batches are spoiled."""
+    return -(-steps // EVERY)
 
 
 def spoiled_pose(dataset: Dataset, value: float) -> Dataset:

@@ -18,6 +18,7 @@ from torch import Tensor
 from framework.cameras import Cameras, subpixels
 from framework.dataset import DataParser, Dataset, Split, load_dataset
 from framework.evaluation.evaluator import spread
+from framework.evaluation.paths import look_at
 from framework.image_files import reduce_image
 from framework.pixel_set import PixelSet
 from framework.scene import Scene
@@ -107,11 +108,8 @@ def ball_dataset(positions: Tensor, field_of_view: float) -> Dataset:
 
 def cameras_at(positions: Tensor, field_of_view: float) -> Cameras:
     """Cameras at positions (M, 3) float64 that look at the origin, z being up; `field_of_view` in degrees."""
-    back = positions / positions.norm(dim=-1, keepdim=True)
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=positions.dtype).expand_as(back)
-    right = torch.linalg.cross(up, back)
-    right = right / right.norm(dim=-1, keepdim=True)
-    poses = torch.stack([right, torch.linalg.cross(back, right), back, positions], dim=-1).float()
+    target, up = torch.zeros(3, dtype=positions.dtype), torch.tensor([0.0, 0.0, 1.0], dtype=positions.dtype)
+    poses = torch.stack([look_at(position, target, up) for position in positions]).float()
     count = (len(positions),)
     focal = SIZE / 2 / math.tan(math.radians(field_of_view) / 2)
     return Cameras(

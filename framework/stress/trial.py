@@ -8,7 +8,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import fmean
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,8 +20,10 @@ from framework.dataset import Dataset
 from framework.device import choose_device
 from framework.errors import NerfloomError
 from framework.evaluation.evaluator import evaluate, evaluation_background, render_view
+from framework.evaluation.metrics import psnr
 from framework.kernels.adam import all_finite
-from framework.pixels import Batch
+from framework.model import Model
+from framework.pixels import Batch, composite
 from framework.stress.conditions import Condition
 from framework.stress.scenes import Views
 from framework.training.run import Run
@@ -56,6 +60,8 @@ class Trial:
     """Why nothing came of it that can be used, in a line."""
     refused: bool = False
     """Whether it was the framework that said so, in words for a user (NerfloomError)."""
+    learnt: float | None = None
+    """dB above pictures that show the background alone, which a run has for nothing; None where there is no PSNR."""
 
 
 class StressedTrainer(Trainer):
@@ -103,11 +109,11 @@ def _trained_and_judged(condition: Condition, run: Run, views: Views, budget: Bu
     if trainer.train().interrupted:
         raise KeyboardInterrupt
     state = trainer.state
-    psnr = float(evaluate(trainer.model, changed.test).results["psnr"])
-    error = unsound(trainer, changed.test)
-    if error is None and not math.isfinite(psnr):
-        error = "the PSNR of the test views is not finite"
-    return Trial(psnr if math.isfinite(psnr) else None, state.step, state.skipped, state.seconds, error)
+    reached = float(evaluate(trainer.model, changed.test).results["psnr"])
+    done = Trial(steps=state.step, skipped=state.skipped, seconds=state.seconds, error=unsound(trainer, changed.test))
+    if not math.isfinite(reached):
+        return replace(done, error=done.error or "the PSNR of the test views is not finite")
+    return replace(done, psnr=reached, learnt=reached - blank_psnr(trainer.model, changed.test))
 
 
 def shortened(config: TrainConfig, budget: Budget) -> TrainConfig:
@@ -127,6 +133,13 @@ def shortened(config: TrainConfig, budget: Budget) -> TrainConfig:
         num_rays_per_batch=min(config.num_rays_per_batch, MOST_RAYS),
         samples_per_batch=None if samples is None else min(samples, MOST_SAMPLES),
     )
+
+
+def blank_psnr(model: Model[Any], test: Dataset) -> float:
+    """PSNR of pictures that show the background alone, dB, a mean over views; what masks ignore counts too."""
+    background = evaluation_background(model)
+    shown = (composite(test.image(index).float() / 255, background) for index in range(len(test)))
+    return fmean(psnr(background.expand_as(photograph), photograph) for photograph in shown)
 
 
 def unsound(trainer: Trainer, test: Dataset) -> str | None:

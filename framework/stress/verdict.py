@@ -8,12 +8,15 @@ from typing import Literal
 
 from framework.console import say
 from framework.stress.conditions import PLAIN, Condition
+from framework.stress.faults import spoiled_batches
 from framework.stress.scenes import Views
 from framework.stress.trial import Budget, Trial, attempt
 from framework.training.run import Run
 
 Outcome = Literal["pass", "degraded", "refused", "fail"]
 """refused: with a clear error, where that is as good an answer as a result."""
+LEAST_LEARNT = 3.0
+"""dB above empty pictures that a plain run must reach: beside one that has learnt nothing, everything passes."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,17 @@ class Verdict:
         """For people."""
         psnr = "" if self.psnr is None else f"  {self.psnr:.2f} dB"
         lost = "" if self.lost is None else f" ({0.0 - self.lost:+.2f})"
-        return f"{self.outcome}{psnr}{lost}  " + (self.error or self.reason or "")
+        steps = f"  {self.steps} steps" if self.steps else ""
+        skipped = f", {self.skipped} dropped" if self.skipped else ""
+        return f"{self.outcome}{psnr}{lost}{steps}{skipped}  " + (self.error or self.reason or "")
+
+    def cell(self) -> str:
+        """For a table: the outcome, and dB more or less than the plain run; of the plain run itself, its PSNR."""
+        if self.psnr is None:
+            return self.outcome
+        if self.lost is None or self.name == PLAIN.name:
+            return f"{self.outcome} {self.psnr:.1f} dB"
+        return f"{self.outcome} {0.0 - self.lost:+.1f}"
 
 
 def verdicts(run: Run, views: Views, conditions: Sequence[Condition], budget: Budget) -> Iterator[Verdict]:
@@ -80,8 +93,13 @@ def verdict_of(condition: Condition, trial: Trial, plain: float | None) -> Verdi
 
 def _weaknesses(condition: Condition, trial: Trial, lost: float | None) -> list[str]:
     found = []
+    if condition is PLAIN and trial.learnt is not None and trial.learnt < LEAST_LEARNT:
+        found.append(f"only {trial.learnt:.1f} dB better than empty pictures: too little to compare others with")
     if lost is not None and lost > condition.allowed:
         found.append(condition.reason or f"not to be expected: at most {condition.allowed:g} dB may be lost")
-    if trial.skipped and not condition.may_skip:
-        found.append(f"{trial.skipped} of {trial.steps} steps were not finite")
+    spoiled = 0 if condition.spoil is None else spoiled_batches(trial.steps)
+    if trial.skipped < spoiled:
+        found.append(f"{spoiled - trial.skipped} of {spoiled} spoiled batches were learnt from")
+    if trial.skipped > spoiled and not condition.may_skip:
+        found.append(f"{trial.skipped - spoiled} of {trial.steps} steps were not finite")
     return found

@@ -157,7 +157,13 @@ CONDITIONS = (
         settings=_fixed(mixed_precision="float16"),
         may_refuse=True,
     ),
-    Condition("1-ray", "one ray a step", rays=1, reason="it sees no more pixels than it does steps"),
+    Condition(
+        "1-ray",
+        "one ray a step",
+        settings=_fixed(train_rays_per_pixel_from=1.0),  # never several through a pixel
+        rays=1,
+        reason="it sees no more pixels than it does steps",
+    ),
     Condition("8192-rays", "8192 rays a step", rays=8192, reason="steps take longer: fewer may fit into the time"),
     # -- what should have been refused
     Condition("nan-pixels", "a NaN pixel in every third batch", spoil=spoiled_pixel(math.nan)),

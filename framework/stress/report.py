@@ -57,8 +57,9 @@ def markdown(results: Sequence[Result]) -> str:
     rows = "\n".join(_row(cells) for cells in (head, ["---"] * len(head), *body))
     lines = "\n".join(f"- {note}" for note in notes(results))
     on = results[0].machine
-    where = f"{on['processor']}, {on['threads']} threads, kernels {on['kernels']}, torch {on['torch']}"
-    return "\n\n".join(filter(None, (rows, lines, f"On {where}, commit {on['commit']}."))) + "\n"
+    where = f"{on['processor']}, {on['device']}, {on['threads']} threads, {on['kernels']} kernels"
+    version = f"torch {on['torch']}, nerfloom {on['nerfloom']}" + (f" at {on['commit']}" if on["commit"] else "")
+    return "\n\n".join(filter(None, (rows, lines, f"{where}; {version}."))) + "\n"
 
 
 def _row(cells: Sequence[str]) -> str:

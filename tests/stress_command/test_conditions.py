@@ -1,6 +1,7 @@
 """The list of conditions: complete, selectable, and each a scene and settings that hang together."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -62,6 +63,11 @@ def test_each_has_settings_that_are_accepted_or_refused(condition: Condition) ->
         assert changed.mixed_precision is True
     elif condition.name == "float32":
         assert changed.mixed_precision is False
+    elif condition.name == "1-ray":
+        assert replace(changed, train_rays_per_pixel_from=config.train_rays_per_pixel_from) == config
+    elif condition.name == "another-seed":
+        assert changed.machine.seed == config.machine.seed + 1
+        assert replace(changed, machine=config.machine) == config
     else:
         assert changed == config
 
@@ -76,10 +82,11 @@ def test_short_runs_take_small_steps() -> None:
 
 @pytest.mark.parametrize(("name", "rays"), [("1-ray", 1), ("8192-rays", 8192)])
 def test_a_step_has_so_many_rays(name: str, rays: int, tmp_path: Path) -> None:
-    """Also of a method whose rays follow its samples."""
-    run = tiny_run("instant-ngp", Path("none"), tmp_path)
+    """Also of a method whose rays follow its samples, and which sends four through a pixel."""
+    run, condition = tiny_run("instant-ngp", Path("none"), tmp_path, train_rays_per_pixel_from=0.0), BY_NAME[name]
     create_folder(run)
-    trainer = StressedTrainer(run, BALL.train, BY_NAME[name])
+    run = replace(run, config=from_plain(run.config, condition.settings(run.config), name))
+    trainer = StressedTrainer(run, BALL.train, condition)
     trainer.train_step()
     assert trainer.state.rays == rays
 

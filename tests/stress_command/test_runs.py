@@ -87,12 +87,17 @@ def stress(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
 def test_a_plugin_that_is_sick_once_fails_there_and_the_rest_goes_on(tmp_path: Path, refused: Refused) -> None:
     path = tmp_path / "out" / "sick.json"
     flags = ("--only", "1-ray", "duplicate-cameras", "nan-pixels", "--max-num-iterations", 40, "--output-path", path)
-    assert "1 of 4 conditions failed: 1-ray" in refused(main, SICK, *flags)
+    assert refused(main, SICK, *flags).endswith(f"1 of 4 runs failed: {SICK}: 1-ray")
     content = json.loads(path.read_text())
-    assert content["method"] == SICK
     assert content["data"] == "ball"
-    assert content["machine"]["torch"]
-    outcomes = {verdict["name"]: verdict for verdict in content["verdicts"]}
+    assert content["max_num_iterations"] == 40
+    assert content["conditions"]["1-ray"] == {"what": "one ray a step", "allowed": 2.0}
+    (found,) = content["methods"]
+    assert found["method"] == SICK
+    assert {"torch", "commit", "threads", "kernels"} <= set(found["machine"])
+    assert found["settings"]["num_levels"] == 4
+    assert found["settings"]["max_num_iterations"] == 40
+    outcomes = {verdict["name"]: verdict for verdict in found["verdicts"]}
     assert list(outcomes) == ["plain", "duplicate-cameras", "1-ray", "nan-pixels"]
     assert "10 steps in a row were not finite" in outcomes["1-ray"]["error"]
     assert "/" not in outcomes["1-ray"]["error"].replace("the run's folder/nerfstudio_models", "")
@@ -105,11 +110,41 @@ def test_a_plugin_that_is_sick_once_fails_there_and_the_rest_goes_on(tmp_path: P
 def test_a_plugin_that_is_always_sick_fails_everywhere(tmp_path: Path, refused: Refused) -> None:
     path = tmp_path / "sick.json"
     flags = ("--only", "all-white", "--max-num-iterations", 20, "--output-path", path)
-    assert "2 of 2 conditions failed: plain, all-white" in refused(main, f"{SICK} --sick-rays 999999999", *flags)
-    for verdict in json.loads(path.read_text())["verdicts"]:
+    method = f"{SICK} --sick-rays 999999999"
+    assert f"2 of 2 runs failed: {method}: plain, {method}: all-white" in refused(main, method, *flags)
+    for verdict in json.loads(path.read_text())["methods"][0]["verdicts"]:
         assert verdict["outcome"] == "fail"
         assert verdict["psnr"] is None
         assert verdict["lost"] is None
+
+
+@pytest.mark.usefixtures("sick")
+def test_several_methods_make_one_table(tmp_path: Path, refused: Refused) -> None:
+    """A row for each condition, a column for each method, and why what is no pass is none."""
+    path = tmp_path / "both.json"
+    flags = ("--only", "1-ray", "--max-num-iterations", 15, "--output-path", path)
+    healthy = " ".join(["instant-ngp", *TINY_NGP])
+    assert f"1 of 4 runs failed: {SICK}: 1-ray" in refused(main, healthy, SICK, *flags)
+    found = json.loads(path.read_text())["methods"]
+    assert [method["method"] for method in found] == [healthy, SICK]
+    assert [[verdict["name"] for verdict in method["verdicts"]] for method in found] == [["plain", "1-ray"]] * 2
+    lines = path.with_suffix(".md").read_text().splitlines()
+    assert lines[0] == f"| condition | {healthy} | {SICK} |"
+    assert lines[3].startswith("| 1-ray | ")
+    assert lines[3].endswith(" | fail |")
+    assert any(line.startswith(f"- {SICK}, 1-ray: fail: ") for line in lines)
+
+
+def test_all_stands_for_every_registered_method(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr("framework.cli.stress.stress", lambda methods, flags: asked.extend(methods) or [])
+    stress(monkeypatch, "all", "--only", "plain")
+    assert asked == list(registry.registered("methods"))
+    assert "instant-ngp" in asked
+
+
+def test_photographs_for_one_method_alone_are_refused(shared_tiny: Path, refused: Refused) -> None:
+    assert "--data stands behind the methods" in refused(main, f"instant-ngp --data {shared_tiny}")
 
 
 def test_on_somebodys_data(
@@ -123,8 +158,8 @@ def test_on_somebodys_data(
     assert "left out, for they need pictures that only the ball has: inside" in said
     content = json.loads(path.read_text())
     assert content["data"] == "ball"  # the folder's name
-    assert [verdict["name"] for verdict in content["verdicts"]] == ["plain", "one-image"]
-    assert str(shared_tiny) not in path.read_text()
+    assert [verdict["name"] for verdict in content["methods"][0]["verdicts"]] == ["plain", "one-image"]
+    assert str(shared_tiny) not in path.read_text() + path.with_suffix(".md").read_text()
 
 
 @pytest.mark.parametrize(
@@ -135,7 +170,9 @@ def test_on_somebodys_data(
         (("instant-ngp", "--data", "/no/such/folder"), "there is no such folder"),
         (("instant-ngp 'open",), 'METHOD: "instant-ngp \'open" cannot be read'),
         (("instant-ngp", "--max-num-iterations", 0), "--max-num-iterations must be at least 1"),
-        (("--data",), "the method comes first"),
+        (("instant-ngp", "--output-path", "table.md"), "--output-path table.md: it must end in .json"),
+        (("instant-ngp", "kplanez"), "unknown method 'kplanez'. Did you mean 'kplanes'"),
+        (("--data",), "the methods come first, before --data"),
         (("",), "the method is missing"),
     ],
 )

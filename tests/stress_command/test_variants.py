@@ -11,7 +11,7 @@ from framework.dataset import Dataset
 from framework.errors import DataError
 from framework.pixel_set import PixelSet
 from framework.pixels import draw_batch
-from framework.stress.faults import EVERY, spoiled_pixel, spoiled_pose
+from framework.stress.faults import EVERY, spoiled_batches, spoiled_pixel, spoiled_pose
 from framework.stress.scenes import NUM_TRAIN, SIZE, Views, ball_views
 from framework.stress.variants import (
     chosen,
@@ -177,6 +177,8 @@ def test_one_pixel_of_every_third_batch_is_spoiled(value: float) -> None:
         assert torch.equal(found.rgb[1:], batch.rgb[1:])
         assert bool(torch.isfinite(found.rgb[0]).all()) == (step % EVERY > 0)
     assert bool(torch.isfinite(batch.rgb).all())
+    spoiled = [not bool(torch.isfinite(spoil(batch, step).rgb).all()) for step in range(2 * EVERY)]
+    assert [sum(spoiled[:steps]) for steps in range(2 * EVERY)] == [spoiled_batches(n) for n in range(2 * EVERY)]
 
 
 def test_a_spoiled_pose_is_one_that_formats_refuse() -> None:

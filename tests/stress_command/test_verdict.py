@@ -6,12 +6,15 @@ import pytest
 
 from framework.errors import ConfigError
 from framework.stress.conditions import ALLOWED, PLAIN, Condition
+from framework.stress.faults import spoiled_pixel
 from framework.stress.trial import Trial, in_a_line
-from framework.stress.verdict import Outcome, verdict_of
+from framework.stress.verdict import LEAST_LEARNT, Outcome, verdict_of
 
 HARD = Condition("hard", "anything")
 EXPLAINED = Condition("explained", "anything", reason="who could do better")
 LENIENT = Condition("lenient", "anything", may_refuse=True, may_skip=True)
+SPOILED = Condition("spoiled", "anything", spoil=spoiled_pixel(math.nan))
+"""100 of the batches of 300 steps."""
 BROKEN = "RuntimeError: it broke"
 
 
@@ -19,6 +22,9 @@ BROKEN = "RuntimeError: it broke"
     ("condition", "trial", "outcome", "lost", "why"),
     [
         (PLAIN, Trial(30.0, 300), "pass", 0.0, None),
+        (PLAIN, Trial(30.0, 300, learnt=LEAST_LEARNT), "pass", 0.0, None),
+        (PLAIN, Trial(30.0, 300, learnt=1.0), "degraded", 0.0, "only 1.0 dB better than empty pictures"),
+        (HARD, Trial(30.0, 300, learnt=0.0), "pass", 0.0, None),
         (HARD, Trial(29.0, 300), "pass", 1.0, None),
         (HARD, Trial(41.0, 300), "pass", -11.0, None),
         (HARD, Trial(30.0 - ALLOWED - 0.1, 300), "degraded", ALLOWED + 0.1, "not to be expected: at most 2 dB"),
@@ -27,6 +33,9 @@ BROKEN = "RuntimeError: it broke"
         (HARD, Trial(30.0, 300, skipped=7), "degraded", 0.0, "7 of 300 steps were not finite"),
         (LENIENT, Trial(30.0, 300, skipped=100), "pass", 0.0, None),
         (EXPLAINED, Trial(12.0, 300, 7), "degraded", 18.0, "who could do better; 7 of 300 steps were not finite"),
+        (SPOILED, Trial(30.0, 300, skipped=100), "pass", 0.0, None),
+        (SPOILED, Trial(30.0, 300, skipped=60), "degraded", 0.0, "40 of 100 spoiled batches were learnt from"),
+        (SPOILED, Trial(30.0, 300, skipped=107), "degraded", 0.0, "7 of 300 steps were not finite"),
         (HARD, Trial(error=BROKEN), "fail", None, BROKEN),
         (HARD, Trial(error="no such thing", refused=True), "fail", None, "no such thing"),
         (LENIENT, Trial(error="no such thing", refused=True), "refused", None, "no such thing"),
@@ -52,6 +61,23 @@ def test_without_a_plain_run_to_compare_with_a_sound_run_passes() -> None:
     assert (found.outcome, found.psnr, found.lost) == ("pass", 12.0, None)
     assert "nan" not in found.line()
     assert math.isfinite(found.seconds)
+
+
+@pytest.mark.parametrize(
+    ("condition", "trial", "plain", "cell"),
+    [
+        (PLAIN, Trial(31.3, 300), 31.3, "pass 31.3 dB"),
+        (HARD, Trial(29.0, 300), 30.0, "pass -1.0"),
+        (HARD, Trial(41.0, 300), 30.0, "pass +11.0"),
+        (HARD, Trial(12.0, 300), None, "pass 12.0 dB"),
+        (EXPLAINED, Trial(12.0, 300), 30.0, "degraded -18.0"),
+        (HARD, Trial(error=BROKEN), 30.0, "fail"),
+        (HARD, Trial(29.0, 300, error="the parameter x is not finite"), 30.0, "fail -1.0"),
+        (LENIENT, Trial(error="no such thing", refused=True), 30.0, "refused"),
+    ],
+)
+def test_what_stands_in_a_table(condition: Condition, trial: Trial, plain: float | None, cell: str) -> None:
+    assert verdict_of(condition, trial, plain).cell() == cell
 
 
 def test_an_error_is_a_line_and_says_its_type_unless_it_is_for_users() -> None:

@@ -46,6 +46,7 @@ def test_what_the_cells_say() -> None:
     assert table.text(12, "reference") == "does not apply: no kernel takes part"
     assert table.text(12, SHARED) == "does not apply: kernels alone"
     assert table.text(13, "compiled") == "not run"
+    assert table.text(8, "Triton interpreter") == "does not apply: there are no Triton kernels yet"
     lines = table.markdown().splitlines()
     assert len(lines) == 2 + len(ENTRIES)
     assert {len(re.split(r"(?<!\\)[|]", line)) for line in lines} == {len(COLUMNS) + 4}

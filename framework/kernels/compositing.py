@@ -48,7 +48,7 @@ def exclusive_cumsum(values: Tensor) -> Tensor:
 def segmented_sum(values: Tensor, places: Tensor) -> Tensor:
     """(N,) sum of `values` (N,) over the `places` (N,) samples right in front of each, which are those of its ray.
 
-    Values of two rays never meet, so NaN and rounding stay where they are. There are log2 S passes, each of which doubles
+    Values of two rays never meet, so NaN and rounding stay where they are. In log2 S passes, each of which doubles
     how many are added up (Hillis and Steele 1986); unlike rows of S for each ray, one long ray costs no memory.
     """
     most = int(places.max()) if len(places) else 0

@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from framework.bounds import intersect_box
 from framework.kernels import native
-from framework.kernels.compositing import optical_depth
+from framework.kernels.compositing import optical_depth, segmented_sum
 from framework.rays import Rays
 
 BLOCK = 4
@@ -225,9 +225,9 @@ class ReferenceMarch:
         """As `March.wave`."""
         if len(self.alive) == 0:
             return None
-        ranks, within = ranges((self.counts[self.alive] - self.handed_out).clamp(max=limit))
+        ranks, self.places = ranges((self.counts[self.alive] - self.handed_out).clamp(max=limit))
         owners = self.alive[ranks]
-        chosen = self.offsets[:-1][owners] + self.handed_out + within
+        chosen = self.offsets[:-1][owners] + self.handed_out + self.places
         starts, ends = self.t_starts[chosen], self.t_ends[chosen]
         self.handed_out += limit
         wave = Wave(starts, ends, owners, self.rays.points(owners, (starts + ends) / 2))
@@ -239,12 +239,7 @@ class ReferenceMarch:
         """As `March.advance`."""
         wave = self.waves[-1]
         tau = optical_depth(sigma.detach().float(), wave.t_ends - wave.t_starts)
-        running = tau.double().cumsum(0) if tau.device.type != "mps" else tau.cumsum(0)
-        first = torch.ones_like(wave.owners, dtype=torch.bool)
-        first[1:] = wave.owners[1:] != wave.owners[:-1]
-        position = torch.arange(len(first), device=first.device)
-        start = torch.where(first, position, torch.zeros_like(position)).cummax(0).values if len(first) else position
-        before = self.spent[wave.owners] + ((running - tau) - (running - tau)[start]).float()
+        before = self.spent[wave.owners] + segmented_sum(tau, self.places)
         self.reached.append((~(before >= self.budget)).to(torch.uint8))
         self.spent.index_add_(0, wave.owners, tau)
         self.alive = self.alive[(self.counts[self.alive] > self.handed_out) & ~(self.spent[self.alive] >= self.budget)]

@@ -57,14 +57,19 @@ static inline Floats exponential(Floats x) {
     return x == x ? value : x;  // NaN stays NaN
 }
 
-constexpr float MAX_OPTICAL_DEPTH = 1e3f;
+constexpr float MAX_OPTICAL_DEPTH = 1e3f, MAX_FLOAT = 3.402823466e38f;
 
 // Of an interval; see ../compositing.py.
 static inline float optical_depth(float sigma, float delta) {
-    constexpr float MAX_FLOAT = 3.402823466e38f;
-    const float finite = sigma > MAX_FLOAT ? MAX_FLOAT : sigma;  // infinity * 0 would be NaN
-    const float tau = finite * delta;
+    const float density = sigma > MAX_FLOAT ? MAX_FLOAT : sigma;  // infinity * 0 would be NaN
+    const float length = delta > MAX_FLOAT ? MAX_FLOAT : delta;
+    const float tau = density * length;
     return tau > MAX_OPTICAL_DEPTH ? MAX_OPTICAL_DEPTH : tau;
+}
+
+// Its derivative by sigma: 0 where it is cut off, and in an interval without end.
+static inline float depth_slope(float sigma, float delta) {
+    return sigma * delta > MAX_OPTICAL_DEPTH || delta > MAX_FLOAT ? 0 : delta;
 }
 
 // Threads: the caller says how many, and torch's own OpenMP runtime provides them (see native.py).

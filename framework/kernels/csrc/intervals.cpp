@@ -34,8 +34,8 @@ EXPORT void interval_weights_backward(const float* sigma, const float* t, const 
             const float delta = edge[i + 1] - edge[i];
             depth += optical_depth(s[i], delta);
             after -= g[i] * w[i];
-            const float clipped = s[i] * delta > MAX_OPTICAL_DEPTH ? 0 : delta;
-            sigma_grad[r * bins + i] = clipped == 0 ? 0 : clipped * (g[i] * std::exp(-depth) - after);
+            const float slope = depth_slope(s[i], delta);
+            sigma_grad[r * bins + i] = slope == 0 ? 0 : slope * (g[i] * std::exp(-depth) - after);
         }
     }
 }

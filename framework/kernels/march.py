@@ -65,7 +65,8 @@ def refresh_occupancy(density: Tensor, occupied: Tensor, decay: float, step: flo
     """Mark, in place, the cells whose opacity over one step is at least `threshold`, or the mean if that is less.
 
     Args:
-        density: (n^3,) what is known of each cell, multiplied by `decay` first; infinite where nothing is.
+        density: (n^3,) what is known of each cell, multiplied by `decay` first; infinite where nothing is. A cell of
+            NaN is marked, so that a broken field is seen, and left out of the mean.
         occupied: (n^3,) bool, written.
         step: length of a step, scene units.
     """
@@ -78,7 +79,8 @@ def refresh_occupancy(density: Tensor, occupied: Tensor, decay: float, step: flo
         return
     density *= decay
     alpha = -torch.expm1(-density * step)
-    occupied.copy_(alpha >= min(threshold, alpha.mean().item()))
+    least = min(threshold, alpha.nanmean().item())  # the threshold where all are NaN
+    occupied.copy_(~(alpha < least))
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,8 @@ BLOCK = 4
 """Cells along an edge of a block of the coarser level."""
 RUN = 8
 """Steps that the reference tests together."""
+ROUNDING = 1e-5
+"""By how much, relatively, a mean of equal opacities may exceed them: cells that are all alike are not empty."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ def refresh_occupancy(density: Tensor, occupied: Tensor, decay: float, step: flo
         return
     density *= decay
     alpha = -torch.expm1(-density * step)
-    least = min(threshold, alpha.nanmean().item())  # the threshold where all are NaN
+    least = min(threshold, alpha.nanmean().item() * (1 - ROUNDING))  # the threshold where all are NaN
     occupied.copy_(~(alpha < least))
 
 

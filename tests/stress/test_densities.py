@@ -150,6 +150,14 @@ def test_thin_cells_are_told_from_empty_ones(backend: str) -> None:
 
 @pytest.mark.entry(5)
 @backends()
+@pytest.mark.parametrize("opacity", [1e-9, 1e-7, 1e-4, 3e-4, 1e-3, 7e-3])
+def test_cells_that_are_all_alike_are_not_empty(backend: str, opacity: float) -> None:
+    """Thin fog everywhere: its mean, rounded, may exceed every one of the equal opacities."""
+    assert bool(occupied_cells(torch.full((CELLS,), opacity / STEP)).all())
+
+
+@pytest.mark.entry(5)
+@backends()
 def test_a_nan_cell_leaves_the_others_alone(backend: str) -> None:
     density = torch.zeros(CELLS)
     density[::2] = 1e-3 / STEP

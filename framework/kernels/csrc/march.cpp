@@ -178,7 +178,8 @@ EXPORT float refresh_occupancy(float* density, int64_t cells, float decay, float
     double total = 0, count = 0;
     for (double part : opacity) total += part;
     for (int64_t part : known) count += double(part);
-    const float least = std::min(threshold, float(total / count));  // the threshold where all are NaN
+    constexpr double ROUNDING = 1e-5;  // see ../march.py
+    const float least = std::min(threshold, float(total / count * (1 - ROUNDING)));  // the threshold where all are NaN
     const float density_threshold = -std::log1p(-std::min(least, 1 - 1e-7f)) / step;
 #pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
     for (int64_t i = 0; i < cells; i++) occupied[i] = !(density[i] < density_threshold);

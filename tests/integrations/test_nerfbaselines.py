@@ -302,6 +302,15 @@ def test_masks_say_where_to_learn(kind: str) -> None:
     assert np.array_equal(data.kept.mask(0, len(data.pixels)).numpy(), used.reshape(-1))
 
 
+def test_masks_count_under_their_first_name_too() -> None:
+    used = np.random.default_rng(0).random((COUNT, SIZE, SIZE)) < 0.6
+    data = handed(3)
+    del data["masks"]
+    kept = Photographs.of({**data, "sampling_masks": list(used)}).decoded.kept
+    assert kept is not None
+    assert np.array_equal(kept.mask(0, used.size).numpy(), used.reshape(-1))
+
+
 def test_a_capture_is_placed_and_its_rays_start_before_its_points() -> None:
     """Cameras at 4 from a ball: the nearest of its points are 3 away, and positions come to lie within [-1, 1]."""
     around = np.random.default_rng(0).normal(size=(500, 3))

@@ -2,8 +2,10 @@
 
 import dataclasses
 import random
+import re
 import sys
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar
 
@@ -377,6 +379,11 @@ def test_a_module_without_a_docstring(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_every_check_has_a_fault_that_shows_it_works() -> None:
     assert {check for check, *_ in FAULTS} | {"summary"} == {check.name for check in CHECKS}
+
+
+def test_the_documentation_lists_every_check() -> None:
+    text = (Path(__file__).parents[1] / "docs" / "plugins.md").read_text(encoding="utf-8")
+    assert re.findall(r"^\| `([a-z0-9 ]+)` \|", text, re.MULTILINE) == [check.name for check in CHECKS]
 
 
 def test_the_callers_random_numbers_stay_as_they_are() -> None:

@@ -200,6 +200,12 @@ def test_the_spec_is_an_entry_point() -> None:
     assert project["entry-points"]["nerfbaselines.specs"] == {"nerfloom": "framework.integrations.nerfbaselines_spec"}
 
 
+@pytest.mark.parametrize("document", ["README.md", "docs/plugins.md"])
+def test_documents_name_every_method(document: str) -> None:
+    text = (ROOT / document).read_text(encoding="utf-8")
+    assert [spec["id"] for spec in SPECS if f"`{spec['id']}`" not in text] == []
+
+
 def test_nerfbaselines_knows_the_methods() -> None:
     nerfbaselines = pytest.importorskip("nerfbaselines", reason="nerfbaselines is not installed")
     schema = nerfbaselines.MethodSpec

@@ -1,6 +1,7 @@
 """framework.testing: every built-in method passes, and each kind of fault is found by its own check and no other."""
 
 import dataclasses
+import importlib
 import random
 import re
 import sys
@@ -23,6 +24,7 @@ from framework.testing import assert_method, check_method
 from framework.testing.check import CHECKS
 from tests.training.helpers import TINY
 
+ROOT = Path(__file__).parents[1]
 BUILT_IN = [name for name, entry in registered("methods").items() if entry.module.startswith("methods.")]
 SLOW = ("dnerf",)
 
@@ -31,6 +33,14 @@ SLOW = ("dnerf",)
 def test_every_built_in_method_passes(name: str) -> None:
     method = load_method(name)
     assert_method(method, name, dataclasses.replace(method.config, **TINY.get(name, {})))
+
+
+@pytest.mark.slow
+def test_the_method_in_the_readme_passes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (source,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    (tmp_path / "method_in_the_readme.py").write_text(source, encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert_method(importlib.import_module("method_in_the_readme").METHOD, "voxels")
 
 
 # -- a small method, and what can be wrong with it --------------------------------------------------------------------
@@ -382,7 +392,7 @@ def test_every_check_has_a_fault_that_shows_it_works() -> None:
 
 
 def test_the_documentation_lists_every_check() -> None:
-    text = (Path(__file__).parents[1] / "docs" / "plugins.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
     assert re.findall(r"^\| `([a-z0-9 ]+)` \|", text, re.MULTILINE) == [check.name for check in CHECKS]
 
 

@@ -100,3 +100,14 @@ def test_nothing_is_overwritten(tmp_path: Path, refused: Refused) -> None:
     below = tmp_path / "file" / "deeper"
     assert "cannot write" in refused(main, "my-method", "--dir", below)
     assert "the method's name comes first" in refused(main, "--dir", tmp_path / "new")
+
+
+@pytest.mark.parametrize("arguments", [[], ["-h"], ["my-method", "--help"]])
+def test_help_writes_nothing(
+    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["ns-new-method", *arguments])
+    main()
+    assert "usage: ns-new-method NAME [--dir DIR]" in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == []

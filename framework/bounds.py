@@ -39,15 +39,17 @@ def to_unit_box(positions: Tensor, box: Tensor) -> Tensor:
 def contract(positions: Tensor) -> Tensor:
     """All of space into the ball of radius 2: x inside the unit ball, (2 - 1/|x|) x/|x| outside.
 
-    mip-NeRF 360 (Barron et al. 2022), equation 10. Positions are clamped so that their square stays finite,
-    and max(1, |x|^2) keeps value and gradient finite at the origin.
+    mip-NeRF 360 (Barron et al. 2022), equation 10. Far away x is divided by its largest coordinate before it is
+    squared, so that the norm stays finite; max(1, |x|) keeps value and gradient finite at the origin. Infinite
+    coordinates are taken for the largest finite ones.
 
     Args:
         positions: (..., 3).
     Returns: (..., 3) with norm at most 2.
     """
-    limit = torch.finfo(positions.dtype).max ** 0.5 / 4
-    clamped = positions.clamp(-limit, limit)
-    squared = (clamped * clamped).sum(-1, keepdim=True).clamp(min=1)
-    norm = squared.sqrt()
-    return clamped * ((2 * norm - 1) / squared)
+    limit = torch.finfo(positions.dtype).max
+    finite = positions.clamp(-limit, limit)
+    largest = finite.detach().abs().amax(-1, keepdim=True).clamp(min=1)  # the result is the same whatever divides x
+    scaled = finite / largest
+    norm = (scaled * scaled).sum(-1, keepdim=True).clamp(min=1).sqrt()
+    return scaled * ((2 - 1 / (largest * norm)) / norm)

@@ -18,6 +18,8 @@ from framework.errors import ConfigError, nearest, shown
 
 T = TypeVar("T")
 RaysPerPixel = Literal[1, 4, 9, 16]
+SMALLEST_EPS = 1e-37
+"""Least epsilon of Adam: float32, in which it is added, holds little less, and without one a gradient of 0 is 0 / 0."""
 
 
 @dataclass(frozen=True)
@@ -139,8 +141,8 @@ class TrainConfig:
         for name in ("adam_beta1", "adam_beta2"):
             if not 0 <= getattr(self, name) < 1:
                 raise ConfigError(f"{_flag(name)} is {getattr(self, name)}; it must be at least 0 and less than 1")
-        if not self.adam_eps >= 0:
-            raise ConfigError(f"--adam-eps is {self.adam_eps}; it must be at least 0")
+        if not self.adam_eps >= SMALLEST_EPS:
+            raise ConfigError(f"--adam-eps is {self.adam_eps}; it must be at least {SMALLEST_EPS}")
         if self.max_seconds is not None and not self.max_seconds > 0:
             raise ConfigError(f"--max-seconds is {self.max_seconds}; it must be more than 0")
         if not 0 <= self.train_rays_per_pixel_from <= 1:

@@ -1,25 +1,34 @@
-"""Methods that people ask for by name and that live elsewhere: where, and what comes closest here."""
+"""Methods that people ask for by name and that live elsewhere: how to get them, and what comes closest here."""
 
 from __future__ import annotations
 
 _NERFSTUDIO = "it is a method of nerfstudio (pip install nerfstudio, ns-train {name})"
+_PLUGIN = "it is a plugin of nerfstudio (pip install git+https://github.com/{repository}, ns-train {name})"
+_GAUSSIANS = "Gaussians are drawn, not sampled along rays, which is all that is done here"
+_SURFACES = "surfaces are not learnt here yet"
+_ZIP_NERF = "the authors' code is https://github.com/jonbarron/camp_zipnerf; 'nerfacto' comes closest here"
+_MIP_NERF = "the authors' code is https://github.com/google/mipnerf; 'vanilla-nerf' comes closest here"
 
 ELSEWHERE: dict[str, str] = {
-    "splatfacto": f"Gaussians are no radiance field; {_NERFSTUDIO.format(name='splatfacto')}",
-    "gaussian-splatting": "Gaussians are no radiance field; the authors' code is graphdeco-inria/gaussian-splatting",
-    "neus": f"surfaces are not learnt here yet; {_NERFSTUDIO.format(name='neus')}",
-    "neus-facto": f"surfaces are not learnt here yet; {_NERFSTUDIO.format(name='neus-facto')}",
+    "splatfacto": f"{_GAUSSIANS}; {_NERFSTUDIO.format(name='splatfacto')}",
+    "gaussian-splatting": f"{_GAUSSIANS}; the authors' code is https://github.com/graphdeco-inria/gaussian-splatting",
+    "neus": f"{_SURFACES}; {_NERFSTUDIO.format(name='neus')}",
+    "neus-facto": f"{_SURFACES}; {_NERFSTUDIO.format(name='neus-facto')}",
     "generfacto": _NERFSTUDIO.format(name="generfacto"),
-    "instruct-nerf2nerf": "it is a plugin of nerfstudio, in ayaanzhaque/instruct-nerf2nerf",
-    "lerf": "it is a plugin of nerfstudio, in kerrj/lerf",
-    "tetra-nerf": "it is a plugin of nerfstudio, in jkulhanek/tetra-nerf",
-    "zip-nerf": "the authors' code is jonbarron/camp_zipnerf; 'nerfacto' comes closest here",
-    "zipnerf": "the authors' code is jonbarron/camp_zipnerf; 'nerfacto' comes closest here",
-    "mip-nerf": "the authors' code is google/mipnerf; 'vanilla-nerf' comes closest here",
-    "mipnerf": "the authors' code is google/mipnerf; 'vanilla-nerf' comes closest here",
+    "in2n": _PLUGIN.format(repository="ayaanzhaque/instruct-nerf2nerf", name="in2n"),
+    "instruct-nerf2nerf": _PLUGIN.format(repository="ayaanzhaque/instruct-nerf2nerf", name="in2n"),
+    "lerf": _PLUGIN.format(repository="kerrj/lerf", name="lerf"),
+    "pynerf": _PLUGIN.format(repository="hturki/pynerf", name="pynerf"),
+    "seathru-nerf": _PLUGIN.format(repository="AkerBP/seathru_nerf", name="seathru-nerf"),
+    "tetra-nerf": "it is a plugin of nerfstudio; https://github.com/jkulhanek/tetra-nerf says how to install it",
+    "zip-nerf": _ZIP_NERF,
+    "zipnerf": _ZIP_NERF,
+    "mip-nerf": _MIP_NERF,
+    "mipnerf": _MIP_NERF,
     "nerf": "here it is called 'vanilla-nerf'",
     "instant-ngp-bounded": "here it is called 'instant-ngp', and the scene's profile tells whether it is bounded",
+    "depth-nerfacto": "here 'nerfacto' does that where the photographs come with depth images",
     "k-planes": "here it is called 'kplanes'",
     "d-nerf": "here it is called 'dnerf'",
 }
-"""Name -> where to get it. A method that is registered under the name comes first."""
+"""Name -> how to get it. A method that is registered under the name comes first."""

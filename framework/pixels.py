@@ -41,6 +41,13 @@ class Batch:
     """(R,) what each pixel's loss is multiplied by, where they were not drawn evenly; 1 in the mean."""
 
 
+def training_background(asked: Background | Literal["auto"], has_alpha: bool) -> Background:
+    """What is behind transparent pixels in training: as asked for; of "auto", random where photographs have alpha."""
+    if asked != "auto":
+        return asked
+    return "random" if has_alpha else "black"
+
+
 def background_colors(kind: Background, count: int, device: torch.device) -> Tensor:
     """(count, 3) colours in [0, 1]; "random" draws a new one for each pixel, so that no fixed colour can be learnt."""
     if kind == "random":

@@ -125,6 +125,11 @@ class Samples:
         rays = torch.arange(self.num_rays, device=self.offsets.device)
         return torch.repeat_interleave(rays, self.counts, output_size=len(self))
 
+    @cached_property
+    def places(self) -> Tensor:
+        """(N,) how many samples stand in front of each on its ray."""
+        return torch.arange(len(self), device=self.offsets.device) - self.offsets[:-1][self.ray_indices]
+
     @property
     def t(self) -> Tensor:
         """(N,) distance at which the field is evaluated."""

@@ -73,18 +73,23 @@ def registered(kind: Kind) -> dict[str, Entry]:
 
 def _installed(kind: Kind) -> Iterator[Entry]:
     for point in entry_points(group=f"nerfloom.{kind}"):
-        package = point.dist.name if point.dist else point.module
-        yield Entry(point.name, point.module, point.attr or "", package)
+        yield _entry(point.name, point.value, point.dist.name if point.dist else "an unknown package")
 
 
 def _of_environment(kind: Kind) -> Iterator[Entry]:
     variable = VARIABLES[kind]
     for item in filter(None, (part.strip() for part in os.environ.get(variable, "").split(","))):
         name, _, value = (part.strip() for part in item.partition("="))
-        module, _, attribute = value.partition(":")
-        if not (name and module and attribute):
+        entry = _entry(name, value, variable)
+        if not name or entry.problem is not None:
             raise ConfigError(f"{variable} holds '{item}'; it must be name=module:attribute, several with commas")
-        yield Entry(name, module, attribute, variable)
+        yield entry
+
+
+def _entry(name: str, value: str, package: str) -> Entry:
+    module, _, attribute = (part.strip() for part in value.partition(":"))
+    problem = None if module and attribute else f"{package} registers '{value}', which is not module:attribute"
+    return Entry(name, module, attribute, package, problem)
 
 
 def summary(entry: Entry) -> str:
@@ -148,7 +153,7 @@ def _load(kind: Kind, name: str) -> Any:
     interface = getattr(loaded, "interface", INTERFACE)
     if not isinstance(interface, int) or not OLDEST_INTERFACE <= interface <= INTERFACE:
         newer = isinstance(interface, int) and interface > INTERFACE
-        remedy = "upgrade nerfloom" if newer else f"upgrade {entry.package}"
+        remedy = "upgrade nerfloom" if newer else "upgrade the plugin"
         raise ConfigError(f"{what} was written for plugin interface {interface}, and this is {INTERFACE}; {remedy}")
     return loaded
 

@@ -1,9 +1,12 @@
 """framework.testing: every built-in method passes, and each kind of fault is found by its own check and no other."""
 
 import dataclasses
+import importlib
 import random
+import re
 import sys
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar
 
@@ -21,6 +24,7 @@ from framework.testing import assert_method, check_method
 from framework.testing.check import CHECKS
 from tests.training.helpers import TINY
 
+ROOT = Path(__file__).parents[1]
 BUILT_IN = [name for name, entry in registered("methods").items() if entry.module.startswith("methods.")]
 SLOW = ("dnerf",)
 
@@ -29,6 +33,14 @@ SLOW = ("dnerf",)
 def test_every_built_in_method_passes(name: str) -> None:
     method = load_method(name)
     assert_method(method, name, dataclasses.replace(method.config, **TINY.get(name, {})))
+
+
+@pytest.mark.slow
+def test_the_method_in_the_readme_passes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (source,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    (tmp_path / "method_in_the_readme.py").write_text(source, encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert_method(importlib.import_module("method_in_the_readme").METHOD, "voxels")
 
 
 # -- a small method, and what can be wrong with it --------------------------------------------------------------------
@@ -99,6 +111,37 @@ class StillOnly(Tiny):
         super().__init__(config, scene)
 
 
+class NotDerived:
+    """Is built as a model is, and is none."""
+
+    def __init__(self, config: TinyConfig, scene: Scene) -> None:
+        pass
+
+
+class NothingToLearn(Tiny):
+    def __init__(self, config: TinyConfig, scene: Scene) -> None:
+        super().__init__(config, scene)
+        self.requires_grad_(False)
+
+
+class InDoubles(Tiny):
+    def render(self, rays: Rays, background: Tensor) -> Rendered:
+        rendered = super().render(rays, background)
+        return dataclasses.replace(rendered, rgb=rendered.rgb.double())
+
+
+class MoreThanOpaque(Tiny):
+    def render(self, rays: Rays, background: Tensor) -> Rendered:
+        rendered = super().render(rays, background)
+        return dataclasses.replace(rendered, accumulation=1 + rendered.accumulation)
+
+
+class CountsInTensors(Tiny):
+    def render(self, rays: Rays, background: Tensor) -> Rendered:
+        rendered = super().render(rays, background)
+        return dataclasses.replace(rendered, num_samples=torch.tensor(rendered.num_samples))
+
+
 class ColumnOfDepths(Tiny):
     def render(self, rays: Rays, background: Tensor) -> Rendered:
         rendered = super().render(rays, background)
@@ -132,6 +175,11 @@ class Fog(Tiny):
         return dataclasses.replace(rendered, accumulation=(1 + rendered.accumulation) / 2)
 
 
+class NamelessLoss(Tiny):
+    def loss(self, rendered: Rendered, batch: Batch, step: int) -> Any:
+        return (rendered.rgb - batch.rgb).square().mean()
+
+
 class LossOfEachRay(Tiny):
     def loss(self, rendered: Rendered, batch: Batch, step: int) -> dict[str, Tensor]:
         return {"rgb": (rendered.rgb - batch.rgb).square().mean(-1)}
@@ -151,6 +199,11 @@ class OneRayAPixel(Tiny):
 class HalfOptimised(Tiny):
     def param_groups(self) -> list[dict[str, Any]]:
         return [{"params": [self.field.net[0].weight, self.field.net[0].bias]}]
+
+
+class OptimisesAnother(Tiny):
+    def param_groups(self) -> list[dict[str, Any]]:
+        return [{"params": [*self.parameters(), torch.zeros(3, requires_grad=True)]}]
 
 
 class OptimisedTwice(Tiny):
@@ -267,21 +320,28 @@ class CountsForItself(Tiny):
         return {**super().loss(rendered, batch, step), "opacity": opacity}
 
 
-FAULTS: list[tuple[str, type[Model[Any]], Any, str]] = [
+FAULTS: list[tuple[str, type, Any, str]] = [
     ("config", Tiny, Unwritable(), "'weights'|parameterized generic"),
     ("config", Tiny, Undecorated(), r"write @dataclass\(frozen=True\)"),
     ("config", Tiny, Foreign(), "does not derive from framework.TrainConfig"),
     ("build", InABoxOnly, TinyConfig(), r"on photographs without .*needs a box \(test_check_method.py, line \d+\)"),
     ("build", StillOnly, TinyConfig(), "on a scene that moves: AssertionError"),
+    ("build", NotDerived, TinyConfig(), "NotDerived'> does not derive from framework.Model"),
+    ("build", NothingToLearn, TinyConfig(), "on a still scene in a box: the method has nothing to learn"),
     ("render", ColumnOfDepths, TinyConfig(), r"in evaluation, depth of 128 rays has shape \(128, 1\), not \(128,\)"),
     ("render", InfiniteDepth, TinyConfig(), "median_depth of 128 rays holds a value that is not finite"),
+    ("render", InDoubles, TinyConfig(), "in evaluation, rgb of 128 rays is torch.float64; make it torch.float32"),
+    ("render", MoreThanOpaque, TinyConfig(), r"accumulation is from \S+ to \S+; it must be in \[0, 1\]"),
+    ("render", CountsInTensors, TinyConfig(), r"num_samples is tensor\(\d+\); it is the number of evaluations, an int"),
     ("few rays", NeedsRays, TinyConfig(), "a picture of 0 rays: "),
     ("background", ForgetsTheBackground, TinyConfig(), "from a black to a white background"),
     ("background", Fog, TinyConfig(), "rays that miss the box are up to 0.5 opaque"),
+    ("loss", NamelessLoss, TinyConfig(), "the loss is Tensor, or empty; return a dictionary of named scalars"),
     ("loss", LossOfEachRay, TinyConfig(), r"the loss 'rgb' is \(128,\), not a scalar tensor"),
     ("loss", Detached, TinyConfig(), "no loss has a gradient"),
     ("loss", OneRayAPixel, TinyConfig(), "size of tensor"),
     ("groups", HalfOptimised, TinyConfig(), r"field.net.2.weight, field.net.2.bias are in no group"),
+    ("groups", OptimisesAnother, TinyConfig(), "no parameters of the model, 1 of them"),
     ("groups", OptimisedTwice, TinyConfig(), "field.net.0.bias is more than once"),
     ("unused parameters", Unused, TinyConfig(), "appearance is without a gradient"),
     ("gradients", BrokenGradient, TinyConfig(), "field.net.0.bias.grad is not finite in step 0"),
@@ -311,7 +371,7 @@ NAMES = [f"{check}-{model.__name__}-{type(config).__name__}" for check, model, c
 
 
 @pytest.mark.parametrize(("check", "model", "config", "words"), FAULTS, ids=NAMES)
-def test_each_fault_is_found_by_its_check_alone(check: str, model: type[Model[Any]], config: Any, words: str) -> None:
+def test_each_fault_is_found_by_its_check_alone(check: str, model: type, config: Any, words: str) -> None:
     method = Method(model, config, paper="none")
     failed = [finding for finding in check_method(method) if not finding.ok]
     assert [finding.check for finding in failed] == [check], failed
@@ -329,6 +389,11 @@ def test_a_module_without_a_docstring(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_every_check_has_a_fault_that_shows_it_works() -> None:
     assert {check for check, *_ in FAULTS} | {"summary"} == {check.name for check in CHECKS}
+
+
+def test_the_documentation_lists_every_check() -> None:
+    text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
+    assert re.findall(r"^\| `([a-z0-9 ]+)` \|", text, re.MULTILINE) == [check.name for check in CHECKS]
 
 
 def test_the_callers_random_numbers_stay_as_they_are() -> None:

@@ -12,7 +12,7 @@ from framework import registry
 from framework.elsewhere import ELSEWHERE
 from framework.errors import ConfigError, DataError
 
-BUILT_IN = {"dnerf", "instant-ngp", "kplanes", "tensorf", "vanilla-nerf"}
+BUILT_IN = {"dnerf", "instant-ngp", "kplanes", "nerfacto", "tensorf", "vanilla-nerf"}
 
 
 def test_the_built_in_methods_are_registered_like_anybodys() -> None:
@@ -107,7 +107,7 @@ def test_methods_of_the_environment_and_their_interface(environment: Callable[..
     assert registry.summary(registry.registered("methods")["mine"]) == "A method of the environment."
     with pytest.raises(ConfigError, match=r"'newer' .* plugin interface 2, and this is 1; upgrade nerfloom"):
         registry.load_method("newer")
-    with pytest.raises(ConfigError, match=r"'older' .* plugin interface 0, and this is 1; upgrade NERFLOOM_METHODS"):
+    with pytest.raises(ConfigError, match=r"'older' .* plugin interface 0, and this is 1; upgrade the plugin"):
         registry.load_method("older")
 
 
@@ -118,9 +118,7 @@ def test_an_unreadable_variable_is_told(environment: Callable[..., Path], value:
         registry.registered("methods")
 
 
-def test_two_packages_with_one_name_are_refused_and_the_rest_goes_on(
-    environment: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_the_environment_names_cannot_hide_what_is_installed(environment: Callable[..., Path]) -> None:
     environment(methods="instant-ngp=other_module:METHOD,kplanes=methods.kplanes:METHOD")
     both = "it is registered by both nerfloom and NERFLOOM_METHODS; uninstall or rename one of them"
     assert registry.summary(registry.registered("methods")["instant-ngp"]) == f"({both})"
@@ -129,12 +127,51 @@ def test_two_packages_with_one_name_are_refused_and_the_rest_goes_on(
     assert registry.load_method("kplanes").paper  # named twice, but for the same thing
 
 
+def install(folder: Path, package: str, methods: str) -> None:
+    """What an installed package leaves of its entry points."""
+    metadata = folder / f"{package.replace('-', '_')}-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+    (metadata / "entry_points.txt").write_text(f"[nerfloom.methods]\n{methods}\n")
+
+
+def test_two_packages_with_one_name_are_refused_and_the_rest_goes_on(
+    environment: Callable[..., Path], tmp_path: Path
+) -> None:
+    install(tmp_path, "voxels-one", "voxels = voxels_one:METHOD")
+    install(tmp_path, "voxels-two", "voxels = voxels_two:METHOD")
+    environment()
+    with pytest.raises(ConfigError, match="method 'voxels' cannot be used: it is registered by both") as raised:
+        registry.load_method("voxels")
+    assert set(re.findall(r"voxels-\w+", str(raised.value))) == {"voxels-one", "voxels-two"}
+    assert registry.load_method("kplanes").paper
+
+
+def test_an_entry_point_that_names_no_attribute_is_told_and_the_rest_goes_on(
+    environment: Callable[..., Path], tmp_path: Path
+) -> None:
+    install(tmp_path, "half-a-plugin", "half = only_a_module")
+    environment()
+    why = "half-a-plugin registers 'only_a_module', which is not module:attribute"
+    assert registry.summary(registry.registered("methods")["half"]) == f"({why})"
+    with pytest.raises(ConfigError, match=f"method 'half' cannot be used: {why}"):
+        registry.load_method("half")
+    assert registry.load_method("kplanes").paper
+
+
 def test_methods_that_live_elsewhere(environment: Callable[..., Path]) -> None:
     with pytest.raises(ConfigError, match=r"no method 'splatfacto': .*pip install nerfstudio, ns-train splatfacto"):
         registry.load_method("splatfacto")
     assert not set(ELSEWHERE) & set(registry.registered("methods"))
     environment({"env_plugin": METHOD_FILE.format(interface=1)}, methods="splatfacto=env_plugin:METHOD")
     assert registry.load_method("splatfacto").paper == "none"
+
+
+def test_what_is_said_to_be_here_is_here() -> None:
+    """Names in quotation marks are methods of ours."""
+    named = {name for said in ELSEWHERE.values() for name in re.findall(r"'([a-z-]+)'", said)}
+    assert named == {"dnerf", "instant-ngp", "kplanes", "nerfacto", "vanilla-nerf"}
+    assert named <= set(registry.registered("methods"))
 
 
 FORMAT_FILE = '''"""A data format that looks at nothing without failing."""

@@ -4,33 +4,86 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import torch
 
+TABLES = (1, 8, 64)
+"""MB of the tables that are gathered from."""
 
-def ceilings() -> dict[str, float]:
-    """What this machine can do at all, measured now with torch, on all threads."""
 
-    def best(run: Callable[[], object]) -> float:
-        spent = []
-        for _ in range(8):
-            start = time.perf_counter()
-            run()
-            spent.append(time.perf_counter() - start)
-        return min(spent)
+@dataclass(frozen=True)
+class Work:
+    """What a kernel cannot do without, for each of what it works on; its lower bound by the machine's ceilings."""
 
-    source = torch.rand(2**25)
-    target = torch.empty_like(source)
-    a, b = torch.rand(1024, 1024), torch.rand(1024, 1024)
-    out = {
-        "copy, GB/s": 2 * source.numel() * 4 / best(lambda: target.copy_(source)) / 1e9,
-        "float32 matrix product, GFLOP/s": 2 * 1024**3 / best(lambda: a @ b) / 1e9,
-    }
-    half_a, half_b = a.bfloat16(), b.bfloat16()
-    out["bfloat16 matrix product, GFLOP/s"] = 2 * 1024**3 / best(lambda: half_a @ half_b) / 1e9
-    for megabytes in (1, 8, 64):
-        table = torch.rand(megabytes * 2**17, 2)
-        index = torch.randint(len(table), (2**20,))
-        seconds = best(lambda table=table, index=index: table.index_select(0, index))  # type: ignore[misc]
-        out[f"gather of 8 bytes from {megabytes} MB, G/s"] = 2**20 / seconds / 1e9
-    return {name: round(value, 3) for name, value in out.items()}
+    bytes: float = 0.0
+    """Read or written in order."""
+    gathers: float = 0.0
+    """Of 8 bytes at places that nobody knows beforehand."""
+    table_bytes: float = 0.0
+    """Of what is gathered from."""
+    flops: float = 0.0
+    """Of matrix products; a multiplication and an addition are two."""
+    bfloat16: bool = False
+    """Whether the products are of bfloat16."""
+
+
+@dataclass(frozen=True)
+class Ceilings:
+    """Measured with torch, on all threads."""
+
+    copy: float
+    """Bytes read and written, 1/s."""
+    float32: float
+    """Of a product of matrices of 1024 x 1024, FLOP/s."""
+    bfloat16: float
+    """The same in bfloat16."""
+    gathers: dict[int, float] = field(default_factory=dict)
+    """Of 8 bytes, 1/s, by the table's MB."""
+
+    @classmethod
+    def measured(cls) -> Ceilings:
+        """The best of eight runs each, now."""
+        source = torch.rand(2**25)
+        target = torch.empty_like(source)
+        a, b = torch.rand(1024, 1024), torch.rand(1024, 1024)
+        half_a, half_b = a.bfloat16(), b.bfloat16()
+        gathers = {}
+        for megabytes in TABLES:
+            table = torch.rand(megabytes * 2**17, 2)
+            index = torch.randint(len(table), (2**20,))
+            gathers[megabytes] = len(index) / _best(lambda t=table, i=index: t.index_select(0, i))  # type: ignore[misc]
+        return cls(
+            copy=2 * source.nbytes / _best(lambda: target.copy_(source)),
+            float32=2 * 1024**3 / _best(lambda: a @ b),
+            bfloat16=2 * 1024**3 / _best(lambda: half_a @ half_b),
+            gathers=gathers,
+        )
+
+    def least(self, work: Work) -> float:
+        """Seconds that the slowest part of some work takes at least, were the others free.
+
+        Gathers are held against those at random from the smallest table measured that is no smaller. Neighbours in
+        space share much of what they gather, so a kernel may be faster than that.
+        """
+        size = next((size for size in TABLES if size * 2**20 >= work.table_bytes), TABLES[-1])
+        products = self.bfloat16 if work.bfloat16 else self.float32
+        return max(work.bytes / self.copy, work.gathers / self.gathers[size], work.flops / products)
+
+    def lines(self) -> list[str]:
+        """For people."""
+        gathers = ", ".join(f"{rate / 1e9:.2f} from {size} MB" for size, rate in self.gathers.items())
+        return [
+            f"copy {self.copy / 1e9:.1f} GB/s",
+            f"matrix product {self.float32 / 1e9:.0f} GFLOP/s, in bfloat16 {self.bfloat16 / 1e9:.0f}",
+            f"random gathers of 8 bytes, G/s: {gathers}",
+        ]
+
+
+def _best(run: Callable[[], object]) -> float:
+    spent = []
+    for _ in range(8):
+        start = time.perf_counter()
+        run()
+        spent.append(time.perf_counter() - start)
+    return min(spent)

@@ -1,25 +1,27 @@
-"""Time per sample and error of each compiled kernel against its torch reference, in one process, in alternating runs.
+"""Time and error of each compiled kernel against its torch reference, beside the least time the machine's ceilings allow.
 
-Times are medians; the speed-up is the median of the ratios of neighbouring runs, which a machine whose speed drifts
-disturbs least. NERFLOOM_KERNELS=avx2 in the environment forces that variant.
+Both run in one process, in turn, on one thread and on all. Errors are of both, against float64. NERFLOOM_KERNELS=avx2
+in the environment forces that variant.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import pairwise
-from statistics import median
 from typing import Any
 
 import torch
+from rich.table import Table
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from framework.benchmarks.ceilings import ceilings
-from framework.benchmarks.plane_lookups import layouts, plane_lookup
+from framework.benchmarks.ceilings import Ceilings, Work
+from framework.benchmarks.plane_lookups import grid_samples, layouts, planes_of
+from framework.benchmarks.timing import Run, alternating, differentiated, once
 from framework.cameras import Cameras
-from framework.console import say
+from framework.console import console, say
 from framework.errors import ConfigError
 from framework.kernels import native
 from framework.kernels.adam import sparse_adam, sparse_adam_reference
@@ -28,229 +30,12 @@ from framework.kernels.frequency import frequency_encoding, frequency_encoding_r
 from framework.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
 from framework.kernels.march import March, Occupancy, ReferenceMarch
 from framework.kernels.mlp import mlp, mlp_reference
+from framework.kernels.planes import PlanesLayout, planes, planes_reference
 from framework.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
 from framework.machine import machine
 from framework.rays import Rays, Samples
 
 BOX = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
-
-
-@dataclass(frozen=True)
-class Row:
-    """One kernel: run(function, inputs) for the compiled and the reference function on the same inputs."""
-
-    name: str
-    samples: int
-    inputs: list[Tensor]
-    compiled: Callable[..., Tensor]
-    reference: Callable[..., Tensor]
-    differentiable: bool = True
-
-
-def rays_and_positions(count: int) -> tuple[Rays, Tensor]:
-    """Rays through the unit box, 16 points close together on each: what a trained scene's samples look like."""
-    origins = torch.nn.functional.normalize(torch.randn(count // 16, 3), dim=-1) * 2 + 0.5
-    directions = torch.nn.functional.normalize(torch.rand(count // 16, 3) - origins, dim=-1)
-    rays = Rays(origins, directions, torch.zeros(count // 16), torch.full((count // 16,), 9.0))
-    t = (2 + torch.rand(count // 16, 1) - 0.5) + torch.arange(16) * 0.003
-    positions = origins[:, None] + t[..., None] * directions[:, None]
-    return rays, positions.reshape(-1, 3).clamp(0, 1)
-
-
-def rows(count: int) -> Iterator[Row]:
-    """Every kernel that has a value per sample."""
-    torch.manual_seed(0)
-    _, positions = rays_and_positions(count)
-    for log2 in (15, 17, 19):
-        layout = HashGridLayout.build(16, 16, 1024, log2)
-        table = torch.randn(layout.num_entries, 2)
-        yield Row(
-            f"hash grid, 16 levels x 2, tables of 2^{log2}",
-            count,
-            [positions, table],
-            lambda x, t, layout=layout: hash_grid(x.detach(), t, layout),
-            lambda x, t, layout=layout: hash_grid_reference(x.detach(), t, layout),
-        )
-    layout = HashGridLayout.build(16, 16, 1024, 17)
-    yield Row(
-        "hash grid, gradient of positions too, 2^17",
-        count,
-        [positions, torch.randn(layout.num_entries, 2)],
-        lambda x, t: hash_grid(x, t, layout),
-        lambda x, t: hash_grid_reference(x, t, layout),
-    )
-    for name, widths, activation in (("32-64-16", (32, 64, 16), "none"), ("32-64-64-3", (32, 64, 64, 3), "sigmoid")):
-        inputs = [torch.randn(count, widths[0])]
-        inputs += [torch.randn(b, a) * (2 / a) ** 0.5 for a, b in pairwise(widths)]
-        for kind in ("float32", "bfloat16") if native.has("mlp_forward_bf16") else ("float32",):
-            yield Row(
-                f"network {name}, {kind}",
-                count,
-                inputs,
-                lambda x, *w, a=activation, k=kind: _autocast(k, lambda: mlp([x], w, a)),
-                lambda x, *w, a=activation: mlp_reference([x], w, a),
-            )
-    offsets = torch.arange(0, count + 1, 16)
-    starts = (torch.rand(count // 16, 1) + torch.arange(16) * 0.01).reshape(-1)
-    samples = Samples(starts, starts + 0.01, offsets)
-    background, fars = torch.rand(count // 16, 3), torch.full((count // 16,), 9.0)
-    yield Row(
-        "compositing, 16 samples a ray",
-        count,
-        [torch.rand(count) * 50, torch.rand(count, 3)],
-        lambda s, c: composite(samples, s, c, background, fars).color,
-        lambda s, c: composite_reference(_like(samples, s), s, c, background.to(s), fars.to(s)).color,
-    )
-    yield Row(
-        "frequency encoding, 10 octaves of 3",
-        count,
-        [torch.rand(count, 3)],
-        lambda x: frequency_encoding(x, 10),
-        lambda x: frequency_encoding_reference(x, 10),
-    )
-    directions = torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
-    yield Row(
-        "spherical harmonics, 4 bands",
-        count,
-        [directions],
-        lambda d: spherical_harmonics(d.detach()),
-        lambda d: spherical_harmonics_reference(d.detach()),
-        differentiable=False,
-    )
-
-
-def _autocast(kind: str, run: Callable[[], Tensor]) -> Tensor:
-    with torch.autocast("cpu", torch.bfloat16, enabled=kind == "bfloat16"):
-        return run()
-
-
-def _like(samples: Samples, values: Tensor) -> Samples:
-    return Samples(samples.t_starts.to(values), samples.t_ends.to(values), samples.offsets)
-
-
-def timed(row: Row, repeats: int, all_threads: int) -> dict[str, object]:
-    """Forward alone and forward with backward, compiled and reference in turn, on 1 thread and on all."""
-    out: dict[str, object] = {"kernel": row.name, "samples": row.samples}
-    for threads in sorted({1, all_threads}):
-        torch.set_num_threads(threads)
-        times: dict[str, list[float]] = {}
-        for repeat in range(repeats + 1):
-            for name, function in (("compiled", row.compiled), ("reference", row.reference)):
-                leaves = [t.clone().requires_grad_(row.differentiable) for t in row.inputs]
-                start = time.perf_counter()
-                value = function(*leaves)
-                middle = time.perf_counter()
-                if row.differentiable:
-                    value.sum().backward()
-                end = time.perf_counter()
-                if repeat:  # the first is a warm-up
-                    times.setdefault(f"{name} forward", []).append(middle - start)
-                    times.setdefault(f"{name} backward", []).append(end - middle)
-        for name, spent in times.items():
-            if row.differentiable or name.endswith("forward"):
-                out[f"{name}, ns per sample, {threads} threads"] = round(median(spent) / row.samples * 1e9, 1)
-        slow = [a + b for a, b in zip(times["reference forward"], times["reference backward"], strict=True)]
-        fast = [a + b for a, b in zip(times["compiled forward"], times["compiled backward"], strict=True)]
-        out[f"speed-up, {threads} threads"] = round(median(a / b for a, b in zip(slow, fast, strict=True)), 1)
-    out |= errors(row)
-    return out
-
-
-def errors(row: Row) -> dict[str, float]:
-    """Errors of the value and of all gradients against float64: the largest over the largest, and root mean squares.
-
-    The largest error of a gradient tells little where it jumps: at a cell's face, and where a ReLU switches.
-    """
-    found = []
-    for function, kind in ((row.compiled, torch.float32), (row.reference, torch.float64)):
-        leaves = [t.detach().to(kind, copy=True).requires_grad_(row.differentiable) for t in row.inputs]
-        value = function(*leaves)
-        if row.differentiable:
-            (value * torch.linspace(-1, 1, value.numel()).view_as(value).to(kind)).sum().backward()
-        found.append([value.detach(), *(leaf.grad for leaf in leaves if leaf.grad is not None)])
-    relative = [
-        ((a.double() - b).abs().max() / b.abs().max()).item() for a, b in zip(*found, strict=True) if b.abs().max() > 0
-    ]
-    squares = [
-        ((a.double() - b).square().mean() / b.square().mean()).sqrt().item()
-        for a, b in zip(*found, strict=True)
-        if b.abs().max() > 0
-    ]
-    return {
-        "error of the value": relative[0],
-        "largest error of a gradient": max(relative[1:], default=0.0),
-        "root mean square error of a gradient": max(squares[1:], default=0.0),
-    }
-
-
-def marching(repeats: int) -> dict[str, object]:
-    """All samples of 8192 rays through a grid of which 3 % are occupied."""
-    torch.manual_seed(0)
-    rays, _ = rays_and_positions(8192 * 16)
-    centers = (torch.cartesian_prod(*[torch.arange(128)] * 3) + 0.5) / 128 - 0.5
-    grid = Occupancy.of((centers.norm(dim=-1) - 0.3).abs() < 0.015, BOX, 128)
-    times: dict[str, list[float]] = {"compiled": [], "reference": []}
-    found = 0
-    for repeat in range(repeats + 1):
-        for name, kind in (("compiled", March), ("reference", ReferenceMarch)):
-            start = time.perf_counter()
-            march, found = kind(rays, grid, 3**0.5 / 512, 0.0, None, 1e-4), 0
-            while (wave := march.wave(16)) is not None:
-                march.advance(torch.zeros_like(wave.t_starts))
-                found += len(wave.t_starts)
-            if repeat:
-                times[name].append(time.perf_counter() - start)
-    return {
-        "kernel": f"marching, {len(rays)} rays, {found} samples, ns per ray",
-        **{name: round(median(spent) / len(rays) * 1e9) for name, spent in times.items()},
-        "speed-up": round(median(r / c for c, r in zip(times["compiled"], times["reference"], strict=True)), 1),
-    }
-
-
-def updating(repeats: int) -> dict[str, object]:
-    """Sparse Adam on a table of which half of the entries have a gradient, ns per updated entry."""
-    torch.manual_seed(0)
-    entries = 2**19
-    grad = torch.randn(entries, 2) * (torch.rand(entries, 1) < 0.5)
-    times: dict[str, list[float]] = {"compiled": [], "reference": []}
-    updated = 0
-    for name, update in (("compiled", sparse_adam), ("reference", sparse_adam_reference)):
-        mean, square, uses = torch.zeros(entries, 2), torch.zeros(entries, 2), torch.zeros(entries)
-        values = torch.randn(entries, 2)
-        for repeat in range(repeats + 1):
-            mine = grad.clone()
-            start = time.perf_counter()
-            updated = update(values, mine, mean, square, uses, 1e-2, (0.9, 0.95), 1e-15)
-            if repeat:
-                times[name].append(time.perf_counter() - start)
-    return {
-        "kernel": f"sparse Adam, {updated} of {entries} entries x 2, ns per updated entry",
-        **{name: round(median(spent) / updated * 1e9, 2) for name, spent in times.items()},
-        "speed-up": round(median(times["reference"]) / median(times["compiled"]), 1),
-    }
-
-
-def ray_generation(model: str, lens: list[float], repeats: int) -> dict[str, object]:
-    """Rays through 8192 pixels of photographs of 1600 x 1200 by a lens of the usual strength, ns per ray."""
-    torch.manual_seed(0)
-    focal, cx, cy, width, height = (torch.tensor([value]) for value in (1100.0, 800.0, 600.0, 1600, 1200))
-    bent = torch.tensor([lens]) if lens else None
-    cameras = Cameras(torch.eye(4)[None, :3], focal, focal, cx, cy, width, height, model, bent)
-    flat = torch.randint(1600 * 1200, (8192,))
-    times: dict[str, list[float]] = {"compiled": [], "reference": []}
-    for repeat in range(repeats + 1):
-        for name, make in (("compiled", cameras.pixel_rays), ("reference", cameras.pixel_rays_reference)):
-            start = time.perf_counter()
-            make(flat, 0.1, 9.0)
-            if repeat:
-                times[name].append(time.perf_counter() - start)
-    return {
-        "kernel": f"rays of {model} cameras, ns per ray",
-        **{name: round(median(spent) / len(flat) * 1e9, 1) for name, spent in times.items()},
-        "speed-up": round(median(r / c for c, r in zip(times["compiled"], times["reference"], strict=True)), 1),
-    }
-
-
 LENSES: tuple[tuple[str, list[float]], ...] = (
     ("pinhole", []),
     ("opencv", [-0.28, 0.09, 6e-4, -9e-4, 0, 0, 0, 0, 0]),
@@ -259,32 +44,346 @@ LENSES: tuple[tuple[str, list[float]], ...] = (
 """Models, and coefficients of the usual strength."""
 
 
-def measure(samples: int, repeats: int) -> dict[str, Any]:
-    """Every kernel's times and errors, the machine, and its ceilings, measured now; rows are printed as they come.
+@dataclass(frozen=True)
+class Errors:
+    """Against float64: the largest error over the largest value, and root mean squares of gradients over theirs.
+
+    The largest error of a gradient would tell little where it jumps: at a cell's face, and where a ReLU switches.
+    """
+
+    value: float
+    gradient: float | None
+    """The worst input's; None without gradients."""
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """A compiled kernel, and what it is held against."""
+
+    name: str
+    unit: str
+    """What it works on: sample, ray or entry."""
+    count: int
+    """How many at once."""
+    compiled: Run
+    reference: Run
+    work: Work | None
+    """Of the forward pass, for each of them; None where no ceiling says anything."""
+    errors: Callable[[], tuple[Errors, Errors]] | None = None
+    """Of the compiled kernel and of the reference in float32."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """What was measured of a kernel; all times are ns for each of what it works on."""
+
+    kernel: str
+    unit: str
+    count: int
+    threads: int
+    forward: float
+    backward: float | None
+    reference_forward: float
+    reference_backward: float | None
+    speed_up: float
+    """Median ratio of neighbouring runs, forward and backward together."""
+    least_forward: float | None
+    """What the ceilings allow at best, on all threads."""
+    errors: Errors | None
+    reference_errors: Errors | None
+
+
+def measure(samples: int, repeats: int) -> tuple[list[Row], dict[str, Any]]:
+    """Measure every kernel and print a table.
 
     Args:
         samples: in a batch.
         repeats: of which medians are taken.
+    Returns: rows, and all as plain data with the machine and its ceilings.
     Raises: ConfigError where there are no compiled kernels.
     """
     if not native.available():
         raise ConfigError("there are no compiled kernels to measure; reinstall nerfloom with a C++ compiler at hand")
-    threads = torch.get_num_threads()
-    jobs: list[Callable[[], dict[str, object]]] = [
-        lambda row=row: timed(row, repeats, threads)  # type: ignore[misc]
-        for row in rows(samples)
+    threads, ceilings, rows = torch.get_num_threads(), Ceilings.measured(), []
+    for line in ceilings.lines():
+        say(f"ceiling: {line}")
+    for kernel in kernels(samples):
+        say(f"measuring {kernel.name}")
+        rows += measured(kernel, ceilings, repeats, threads)
+    console.print(table([row for row in rows if row.threads == threads]))
+    return rows, {"machine": machine(), "ceilings": asdict(ceilings), "rows": [asdict(row) for row in rows]}
+
+
+def measured(kernel: Kernel, ceilings: Ceilings, repeats: int, all_threads: int) -> list[Row]:
+    """One kernel's rows, on 1 thread and on all."""
+    rows = []
+    errors, reference_errors = kernel.errors() if kernel.errors else (None, None)
+    least = ceilings.least(kernel.work) * 1e9 if kernel.work else None
+    try:
+        for threads in sorted({1, all_threads}):
+            torch.set_num_threads(threads)
+            times = alternating(kernel.compiled, kernel.reference, repeats)
+            (forward, *backward), (reference_forward, *reference_backward) = (
+                [seconds / kernel.count * 1e9 for seconds in stages] for stages in (times.compiled, times.reference)
+            )
+            rows.append(
+                Row(
+                    kernel.name,
+                    kernel.unit,
+                    kernel.count,
+                    threads,
+                    forward,
+                    backward[0] if backward else None,
+                    reference_forward,
+                    reference_backward[0] if reference_backward else None,
+                    times.speed_up,
+                    least,
+                    errors,
+                    reference_errors,
+                )
+            )
+    finally:
+        torch.set_num_threads(all_threads)
+    return rows
+
+
+def table(rows: Sequence[Row]) -> Table:
+    """For people."""
+    found = Table(title="ns a sample, ray or entry: compiled (torch)", title_justify="left")
+    for heading in ("kernel", "forward", "least", "backward", "speed-up", "error", "of gradients"):
+        found.add_column(heading, justify="left" if heading == "kernel" else "right")
+    for row in rows:
+        found.add_row(
+            f"{row.kernel}, a {row.unit}",
+            f"{row.forward:.1f} ({row.reference_forward:.0f})",
+            "" if row.least_forward is None else f"{row.least_forward:.1f}",
+            "" if row.backward is None else f"{row.backward:.1f} ({row.reference_backward:.0f})",
+            f"{row.speed_up:.1f}",
+            _beside(row, "value"),
+            _beside(row, "gradient"),
+        )
+    return found
+
+
+def _beside(row: Row, name: str) -> str:
+    if row.errors is None or getattr(row.errors, name) is None:
+        return ""
+    return f"{getattr(row.errors, name):.0e} ({getattr(row.reference_errors, name):.0e})"
+
+
+# -- the kernels --------------------------------------------------------------------------------------------------
+
+
+def kernels(count: int) -> Iterator[Kernel]:
+    """Every kernel, in batches of `count` samples."""
+    torch.manual_seed(0)
+    positions = rays_and_positions(count)[1]
+    for log2 in (15, 17, 19):
+        yield of_function(f"hash grid, 16 levels x 2, tables of 2^{log2}", *_hash_grid(positions, log2, False))
+    yield of_function("hash grid, gradient of positions too, 2^17", *_hash_grid(positions, 17, True))
+    for widths, activation in (((32, 64, 16), "none"), ((32, 64, 64, 3), "sigmoid")):
+        for kind in ("float32", "bfloat16") if native.has("mlp_forward_bf16") else ("float32",):
+            name = f"network {'-'.join(map(str, widths))}, {kind}"
+            yield of_function(name, *_network(count, widths, activation, kind == "bfloat16"))
+    yield of_function("compositing, 16 samples a ray", *_compositing(count))
+    yield of_function(
+        "frequency encoding, 10 octaves of 3",
+        [torch.rand(count, 3)],
+        lambda x: frequency_encoding(x, 10),
+        lambda x: frequency_encoding_reference(x, 10),
+        Work(bytes=4 * (3 + 60)),
+    )
+    yield of_function(
+        "spherical harmonics, 4 bands",
+        [normalize(torch.randn(count, 3), dim=-1)],
+        spherical_harmonics,
+        spherical_harmonics_reference,
+        Work(bytes=4 * (3 + 16)),
+        backward=False,
+    )
+    for name, layout, features in layouts():
+        yield _plane_lookup(name, layout, features, count)
+    yield _marching()
+    yield _updating()
+    for model, lens in LENSES:
+        yield _ray_generation(model, lens)
+
+
+def of_function(
+    name: str,
+    inputs: list[Tensor],
+    compiled: Callable[..., Tensor],
+    reference: Callable[..., Tensor],
+    work: Work,
+    backward: bool = True,
+) -> Kernel:
+    """A function of tensors, the first of which has a row for each sample."""
+    return Kernel(
+        name,
+        "sample",
+        len(inputs[0]),
+        differentiated(compiled, inputs, None, backward),
+        differentiated(reference, inputs, None, backward),
+        work,
+        lambda: (errors(compiled, reference, inputs, backward), errors(reference, reference, inputs, backward)),
+    )
+
+
+def errors(
+    function: Callable[..., Tensor], truth: Callable[..., Tensor], inputs: Sequence[Tensor], backward: bool
+) -> Errors:
+    """Of a function in float32 against another in float64."""
+    (value, *gradients), (exact, *exact_gradients) = (
+        _value_and_gradients(run, inputs, kind, backward)
+        for run, kind in ((function, torch.float32), (truth, torch.float64))
+    )
+    worst = [
+        ((found.double() - right).square().mean() / right.square().mean()).sqrt().item()
+        for found, right in zip(gradients, exact_gradients, strict=True)
+        if right.abs().max() > 0
     ]
-    jobs += [lambda: marching(repeats), lambda: updating(repeats)]
-    jobs += [lambda m=model, c=lens: ray_generation(m, c, repeats) for model, lens in LENSES]  # type: ignore[misc]
-    jobs += [
-        lambda n=name, p=layout, f=features: plane_lookup(n, p, f, samples, repeats, threads)  # type: ignore[misc]
-        for name, layout, features in layouts()
-    ]
-    limits, table = ceilings(), []
-    say(str(limits))
-    for job in jobs:
-        torch.set_num_threads(threads)
-        table.append(job())
-        say(str(table[-1]))
-    torch.set_num_threads(threads)
-    return {"machine": machine(), "ceilings": limits, "rows": table}
+    largest = ((value.double() - exact).abs().max() / exact.abs().max()).item()
+    return Errors(largest, max(worst) if worst else None)
+
+
+def _value_and_gradients(
+    function: Callable[..., Tensor], inputs: Sequence[Tensor], kind: torch.dtype, backward: bool
+) -> list[Tensor]:
+    leaves = [tensor.detach().to(kind, copy=True).requires_grad_(backward) for tensor in inputs]
+    value = function(*leaves)
+    if backward:
+        (value * torch.linspace(-1, 1, value.numel()).view_as(value).to(kind)).sum().backward()
+    return [value.detach(), *(leaf.grad for leaf in leaves if leaf.grad is not None)]
+
+
+def rays_and_positions(count: int) -> tuple[Rays, Tensor]:
+    """Rays through the unit box, 16 points close together on each: what a trained scene's samples look like."""
+    origins = normalize(torch.randn(count // 16, 3), dim=-1) * 2 + 0.5
+    directions = normalize(torch.rand(count // 16, 3) - origins, dim=-1)
+    rays = Rays(origins, directions, torch.zeros(count // 16), torch.full((count // 16,), 9.0))
+    t = (2 + torch.rand(count // 16, 1) - 0.5) + torch.arange(16) * 0.003
+    positions = origins[:, None] + t[..., None] * directions[:, None]
+    return rays, positions.reshape(-1, 3).clamp(0, 1)
+
+
+Described = tuple[list[Tensor], Callable[..., Tensor], Callable[..., Tensor], Work]
+"""Inputs, the compiled function, the reference, and the work."""
+
+
+def _hash_grid(positions: Tensor, log2: int, of_positions: bool) -> Described:
+    layout = HashGridLayout.build(16, 16, 1024, log2)
+    values = torch.randn(layout.num_entries, 2)
+    # The positions are detached where nobody asks for their gradient: most fields do not.
+    kept = (lambda x: x) if of_positions else torch.Tensor.detach
+    return (
+        [positions, values],
+        lambda x, t: hash_grid(kept(x), t, layout),
+        lambda x, t: hash_grid_reference(kept(x), t, layout),
+        Work(bytes=4 * (3 + 32), gathers=16 * 8, table_bytes=values.nbytes),
+    )
+
+
+def _network(count: int, widths: tuple[int, ...], activation: str, bfloat16: bool) -> Described:
+    weights = [torch.randn(b, a) * (2 / a) ** 0.5 for a, b in pairwise(widths)]
+
+    def compiled(x: Tensor, *w: Tensor) -> Tensor:
+        with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
+            return mlp([x], w, activation)
+
+    return (
+        [torch.randn(count, widths[0]), *weights],
+        compiled,
+        lambda x, *w: mlp_reference([x], w, activation),
+        Work(4 * (widths[0] + widths[-1]), flops=2 * sum(a * b for a, b in pairwise(widths)), bfloat16=bfloat16),
+    )
+
+
+def _compositing(count: int) -> Described:
+    offsets = torch.arange(0, count + 1, 16)
+    starts = (torch.rand(count // 16, 1) + torch.arange(16) * 0.01).reshape(-1)
+    samples = Samples(starts, starts + 0.01, offsets)
+    background, fars = torch.rand(count // 16, 3), torch.full((count // 16,), 9.0)
+
+    def reference(density: Tensor, color: Tensor) -> Tensor:
+        like = Samples(samples.t_starts.to(density), samples.t_ends.to(density), offsets)
+        return composite_reference(like, density, color, background.to(density), fars.to(density)).color
+
+    return (
+        [torch.rand(count) * 50, torch.rand(count, 3)],
+        lambda density, color: composite(samples, density, color, background, fars).color,
+        reference,
+        Work(bytes=4 * (2 + 1 + 3) + 4 * 3 / 16),
+    )
+
+
+def _plane_lookup(name: str, layout: PlanesLayout, features: int, count: int) -> Kernel:
+    """Against torch's `grid_sample`; what is read is held against copying, for a corner's features lie together."""
+    positions = torch.rand(count, layout.dims)
+    values = torch.rand(layout.num_entries, features) + 0.5
+    gradient = torch.randn(count, layout.num_groups * features)
+    images = planes_of(values, layout)
+    corners = sum(2 ** len(axes) for factors in layout.axes for axes in factors)
+
+    def ours(v: Tensor) -> Tensor:
+        return planes(positions, v, layout)
+
+    def exact(v: Tensor) -> Tensor:
+        return planes_reference(positions.to(v), v, layout)
+
+    def theirs(*flat: Tensor) -> Tensor:
+        return grid_samples(positions, list(flat), layout)
+
+    return Kernel(
+        name,
+        "sample",
+        count,
+        differentiated(ours, [values], gradient),
+        differentiated(theirs, images, gradient),
+        Work(bytes=4 * features * (corners + layout.num_groups)),
+        lambda: (errors(ours, exact, [values], True), errors(exact, exact, [values], True)),
+    )
+
+
+def _marching() -> Kernel:
+    """All samples of 8192 rays through a grid of which 3 % are occupied."""
+    rays, _ = rays_and_positions(8192 * 16)
+    centers = (torch.cartesian_prod(*[torch.arange(128)] * 3) + 0.5) / 128 - 0.5
+    grid = Occupancy.of((centers.norm(dim=-1) - 0.3).abs() < 0.015, BOX, 128)
+
+    def march(kind: type[March] | type[ReferenceMarch]) -> None:
+        marching = kind(rays, grid, 3**0.5 / 512, 0.0, None, 1e-4)
+        while (wave := marching.wave(16)) is not None:
+            marching.advance(torch.zeros_like(wave.t_starts))
+
+    runs = [once(partial(march, kind)) for kind in (March, ReferenceMarch)]
+    return Kernel("marching through a grid of 128^3, 3 % occupied", "ray", len(rays), *runs, None)
+
+
+def _updating() -> Kernel:
+    """Sparse Adam on a table of which half of the entries have a gradient."""
+    entries = 2**19
+    grad = torch.randn(entries, 2) * (torch.rand(entries, 1) < 0.5)
+    updated = int((grad != 0).any(dim=1).sum())
+
+    def steps(update: Callable[..., int]) -> Run:
+        values, mean, square, uses = torch.randn(entries, 2), *torch.zeros(2, entries, 2), torch.zeros(entries)
+
+        def step() -> Sequence[float]:
+            mine = grad.clone()
+            return once(lambda: update(values, mine, mean, square, uses, 1e-2, (0.9, 0.95), 1e-15))()
+
+        return step
+
+    work = Work(bytes=4 * (2 * 4 + 1) * 2)  # value, gradient and both moments of 2, and its uses: read and written
+    runs = [steps(update) for update in (sparse_adam, sparse_adam_reference)]
+    return Kernel("sparse Adam, half of 2^19 x 2", "entry", updated, *runs, work)
+
+
+def _ray_generation(model: str, lens: list[float]) -> Kernel:
+    """Rays through 8192 pixels of photographs of 1600 x 1200 by a lens of the usual strength."""
+    focal, cx, cy, width, height = (torch.tensor([value]) for value in (1100.0, 800.0, 600.0, 1600, 1200))
+    bent = torch.tensor([lens]) if lens else None
+    cameras = Cameras(torch.eye(4)[None, :3], focal, focal, cx, cy, width, height, model, bent)
+    flat = torch.randint(1600 * 1200, (8192,))
+    runs = [once(partial(make, flat, 0.1, 9.0)) for make in (cameras.pixel_rays, cameras.pixel_rays_reference)]
+    return Kernel(f"rays of {model} cameras", "ray", len(flat), *runs, Work(bytes=8 + 4 * (3 + 3 + 2)))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from framework.comparison.measures import read_json
+from framework.comparison import plots
+from framework.comparison.measures import Row, read_json
 from framework.comparison.plan import Conditions, Contender, Plan
+from framework.console import say
 
 STANDARD = (
     "instant-ngp",
@@ -43,3 +46,14 @@ def published(folder: Path) -> dict[str, Any]:
     for run in runs:
         run["command"] = run["command"].replace(content["conditions"]["data"] or "\0", "DIR")
     return {**content, "conditions": conditions, "runs": runs}
+
+
+def draw(rows: Sequence[Row], path: Path) -> None:
+    """The report's picture of time against error, as a file of its own; where it cannot be drawn, that is said."""
+    if not any(row.runs for row in rows):
+        say("no picture of time against error: no method came to its end")
+    elif not plots.available():
+        say(plots.MISSING)
+    else:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(plots.time_against_error(rows), encoding="utf-8")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from framework.cli.common import chosen_kind, run_command
+from framework.console import say
 from framework.errors import ConfigError, nearest
 
 USAGE = """\
@@ -36,6 +37,8 @@ class KernelFlags:
     """Instruction sets, each measured in a process of its own, as in avx2 avx512; the fastest if not given."""
     output_dir: Path = RESULTS
     """Where kernels-VARIANT.json goes."""
+    plot_dir: Path | None = None
+    """Where a picture of the times goes; none if not given."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,8 @@ class MethodFlags:
     """Where runs and report go; outputs/bench-DATA if not given."""
     output_dir: Path = RESULTS
     """Where methods-DATA.json goes."""
+    plot_dir: Path | None = None
+    """Where a picture of time against error goes; none if not given."""
 
 
 def main() -> None:
@@ -90,12 +95,19 @@ def _kernels(flags: KernelFlags) -> None:
             raise ConfigError(f"--variants: there is no '{name}'. {nearest(name, native.NEEDS)}")
         command = [sys.executable, "-m", "framework.cli.bench", "kernels", "--output-dir", str(flags.output_dir)]
         command += ["--samples", str(flags.samples), "--repeats", str(flags.repeats)]
+        command += ["--plot-dir", str(flags.plot_dir)] if flags.plot_dir else []
         if subprocess.run(command, env={**os.environ, "NERFLOOM_KERNELS": name}).returncode:
             raise ConfigError(f"measuring the kernels' variant {name} failed; the lines above say why")
     if not flags.variants:
+        from framework.benchmarks import bars
         from framework.benchmarks.kernels import measure
 
-        _write(flags.output_dir / f"kernels-{native.variant()}.json", measure(flags.samples, flags.repeats))
+        rows, content = measure(flags.samples, flags.repeats)
+        name = f"kernels-{native.variant()}"
+        _write(flags.output_dir / f"{name}.json", content)
+        most = max(row.threads for row in rows)
+        if flags.plot_dir:
+            bars.draw([row for row in rows if row.threads == most], flags.plot_dir / f"{name}.png")
 
 
 def _quadrature(flags: QuadratureFlags) -> None:
@@ -106,13 +118,15 @@ def _quadrature(flags: QuadratureFlags) -> None:
 
 
 def _methods(flags: MethodFlags) -> None:
-    from framework.benchmarks.methods import published, standard_plan
+    from framework.benchmarks.methods import draw, published, standard_plan
     from framework.cli.compare import compare
 
     name = "procedural" if flags.data is None else flags.data.resolve().name
     folder = flags.run_dir or Path("outputs") / f"bench-{name}"
     rows = compare(standard_plan(flags.data, flags.max_seconds, flags.repeats, folder))
     _write(flags.output_dir / f"methods-{name}.json", published(folder))
+    if flags.plot_dir:
+        draw(rows, flags.plot_dir / f"methods-{name}.svg")
     failed = [row.label for row in rows if row.failures]
     if failed:
         raise ConfigError(f"these methods failed: {', '.join(failed)}; {folder / 'report.html'} says why")
@@ -126,7 +140,6 @@ KINDS: dict[str, tuple[type, Any]] = {
 
 
 def _write(path: Path, content: dict[str, Any]) -> None:
-    from framework.console import say
     from framework.training.run import write_json
 
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -26,7 +26,7 @@ from framework.errors import CheckpointError, ConfigError, DataError
 from framework.evaluation.appearance import appearances, fit_appearance, shown_appearance
 from framework.evaluation.evaluator import evaluation_background, render_image
 from framework.integrations.nerfbaselines_data import (
-    COLMAP_MODELS,
+    CAMERA_MODELS,
     Frame,
     FrameFlags,
     Handed,
@@ -96,7 +96,7 @@ class NerfloomMethod:
         return {
             "method_id": "",
             "required_features": frozenset(FEATURES),
-            "supported_camera_models": frozenset(COLMAP_MODELS),
+            "supported_camera_models": frozenset(CAMERA_MODELS),
             "supported_outputs": OUTPUTS,
             "can_resume_training": True,
         }

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from framework.cameras import Cameras, check_pose, join_cameras
-from framework.colmap_cameras import from_colmap
+from framework.colmap_cameras import PARAMETERS, from_colmap
 from framework.dataset import Dataset, Masks, ParsedScene, assemble
 from framework.decoding import Decoded, from_arrays
 from framework.errors import DataError
@@ -24,14 +24,10 @@ from framework.poses import NEAR, Placement, nearest_point, nearest_shown, place
 
 Handed = dict[str, Any]
 """nerfbaselines' `Dataset`; read are `cameras`, `image_paths`, `images`, `masks`, `points3D_xyz` and `metadata`."""
-COLMAP_MODELS: dict[str, tuple[str, tuple[int, ...]]] = {
-    "pinhole": ("PINHOLE", ()),
-    "opencv": ("OPENCV", (0, 1, 2, 3)),
-    "opencv_fisheye": ("OPENCV_FISHEYE", (0, 1, 4, 5)),
-    "full_opencv": ("FULL_OPENCV", (0, 1, 2, 3, 4, 5, 6, 7)),
-}
-"""nerfbaselines' camera models, in the order of their numbers -> COLMAP's name, and where the coefficients that COLMAP
-has of it stand among k1, k2, p1, p2, k3, k4, k5, k6."""
+CAMERA_MODELS = ("pinhole", "opencv", "opencv_fisheye", "full_opencv")
+"""nerfbaselines' camera models, in the order of their numbers. COLMAP has them all, under the same names."""
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""The order of nerfbaselines' distortion parameters, whichever the model; those that are left out are zero."""
 TO_OPENGL = np.array([1.0, -1.0, -1.0, 1.0])
 """Signs of a pose's columns."""
 FAR = 1000.0
@@ -76,9 +72,7 @@ class Photographs:
             raise DataError(f"the photographs' colours are {space}; only those stored as sRGB can be learnt from")
         cameras, paths = handed["cameras"], tuple(map(Path, handed["image_paths"]))
         sizes = [(int(width), int(height)) for width, height in cameras.image_sizes]
-        masks = handed.get("masks")
-        if masks is None:
-            masks = handed.get("sampling_masks")  # as they were called before
+        masks = handed.get("masks", handed.get("sampling_masks"))  # as they were called at first
         images = [_cut(image, *size, path) for image, size, path in zip(handed["images"], sizes, paths, strict=True)]
         used = None
         if masks is not None:
@@ -106,12 +100,11 @@ def cameras_of(handed: Any, names: Iterable[str]) -> Cameras:
 
 
 def _camera(camera: Any, name: str) -> Cameras:
-    model, places = list(COLMAP_MODELS.values())[int(camera.camera_models)]
-    coefficients = np.zeros(8)
-    given = np.asarray(camera.distortion_parameters)[:8]
-    coefficients[: len(given)] = given
+    model = CAMERA_MODELS[int(camera.camera_models)].upper()
+    given = dict(zip(COEFFICIENTS, camera.distortion_parameters, strict=False))
+    coefficients = [given.get(key, 0.0) for key in PARAMETERS[model][1].split()[4:]]  # behind fx fy cx cy
     width, height = (int(side) for side in camera.image_sizes)
-    numbers = from_colmap(model, [*camera.intrinsics, *coefficients[list(places)]], width, height)
+    numbers = from_colmap(model, [*camera.intrinsics, *coefficients], width, height)
     pose = torch.from_numpy(np.array(camera.poses, np.float64)[:3] * TO_OPENGL)
     check_pose(pose, name)
     return Cameras(

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from framework.kernels import native
 from framework.rays import Samples
@@ -25,25 +26,44 @@ MAX_OPTICAL_DEPTH = 1e3
 
 
 def optical_depth(sigma: Tensor, deltas: Tensor) -> Tensor:
-    """tau (N,) = sigma * delta, in [0, MAX_OPTICAL_DEPTH]; an interval of zero length has none, whatever sigma.
+    """tau (N,) = sigma * delta, in [0, MAX_OPTICAL_DEPTH]; none where density or length is 0, whatever the other.
 
-    NaN densities stay NaN: a broken field must be seen.
+    NaN densities stay NaN: a broken field must be seen. The density of an interval without end learns nothing: there
+    tau leaps from 0 to its bound as soon as there is any.
     """
-    sigma = sigma.clamp(max=torch.finfo(sigma.dtype).max)  # inf * 0 would be NaN
-    return (sigma * deltas).clamp(max=MAX_OPTICAL_DEPTH)
+    # Infinity times 0 would be NaN, in tau and in its gradient, so the largest number stands for it.
+    lengths = deltas.clamp(max=torch.finfo(deltas.dtype).max)
+    sigma = torch.where(deltas == torch.inf, sigma.detach(), sigma).clamp(max=torch.finfo(sigma.dtype).max)
+    return (sigma * lengths).clamp(max=MAX_OPTICAL_DEPTH)
+
+
+def exclusive_cumsum(values: Tensor) -> Tensor:
+    """(..., S) sum of `values` (..., S) over those in front in the last dimension.
+
+    Sums are moved on by one. Taking each value out of its own sum again would leave, of a large one, its rounding.
+    """
+    return functional.pad(values, (1, 0)).cumsum(-1)[..., :-1]
+
+
+def segmented_sum(values: Tensor, places: Tensor) -> Tensor:
+    """(N,) sum of `values` (N,) over the `places` (N,) samples right in front of each, which are those of its ray.
+
+    Values of two rays never meet, so NaN and rounding stay where they are. In log2 S passes, each of which doubles
+    how many are added up (Hillis and Steele 1986); unlike rows of S for each ray, one long ray costs no memory.
+    """
+    most = int(places.max()) if len(places) else 0
+    total, reach = values.roll(1).masked_fill(places < 1, 0), 1
+    while reach < most:
+        total = total + total.roll(reach).masked_fill(places < reach, 0)
+        reach *= 2
+    return total
 
 
 def exclusive_sum(values: Tensor, samples: Samples) -> Tensor:
     """(N,) sum of `values` (N,) over the samples in front on the same ray."""
     if samples.per_ray is not None:
-        padded = samples.padded(values)
-        return (padded.cumsum(-1) - padded).reshape(-1)
-    # One running sum over all rays, minus its value where the ray starts: float64, which Apple's GPUs lack, keeps
-    # what cancels.
-    running = (values if values.device.type == "mps" else values.double()).cumsum(0)
-    before = running - values
-    starts = torch.cat([running.new_zeros(1), running])[samples.offsets[:-1]]
-    return (before - starts[samples.ray_indices]).to(values.dtype)
+        return exclusive_cumsum(samples.padded(values)).reshape(-1)
+    return segmented_sum(values, samples.places)
 
 
 def ray_sum(values: Tensor, samples: Samples) -> Tensor:
@@ -62,7 +82,7 @@ def weights_and_transmittance(sigma: Tensor, samples: Samples) -> tuple[Tensor, 
         samples: the intervals.
     """
     tau = optical_depth(sigma, samples.deltas)
-    transmittance = torch.exp(-exclusive_sum(tau, samples).clamp(min=0))
+    transmittance = torch.exp(-exclusive_sum(tau, samples))
     return transmittance * -torch.expm1(-tau), transmittance
 
 
@@ -88,7 +108,8 @@ def composite_reference(samples: Samples, sigma: Tensor, rgb: Tensor, background
     left = (1 - opacity).clamp(min=0)
     color = ray_sum(weights[:, None] * rgb, samples) + left[:, None] * background
     with torch.no_grad():
-        moment = ray_sum(weights * samples.t, samples)
+        # An endless interval has an infinite t: where it stops no light, it has no part in the mean.
+        moment = ray_sum((weights * samples.t).masked_fill(weights == 0, 0), samples)
         far = fars[samples.ray_indices]
         seen = torch.where(transmittance - weights <= 0.5, torch.minimum(samples.t, far), far)
         median = fars.to(seen.dtype).scatter_reduce(0, samples.ray_indices, seen, "amin")
@@ -195,7 +216,7 @@ class _Distortion(torch.autograd.Function):
 
 
 def distortion(weights: Tensor, samples: Samples) -> Tensor:
-    """How far a ray's light is spread along it (mip-NeRF 360, Barron et al. 2022, equation 15), in O(N).
+    """How far a ray's light is spread along it (mip-NeRF 360, Barron et al. 2022, equation 15), not by pairs.
 
     Args:
         weights: (N,).
@@ -205,6 +226,10 @@ def distortion(weights: Tensor, samples: Samples) -> Tensor:
     if native.usable(weights, samples.t_starts, samples.t_ends) and not samples.t_starts.requires_grad:
         starts, ends = samples.t_starts.contiguous(), samples.t_ends.contiguous()
         return _Distortion.apply(weights.contiguous(), starts, ends, samples.offsets)
-    m, w = (samples.t_starts + samples.t_ends) / 2, weights
-    pairs = 2 * w * (m * exclusive_sum(w, samples) - exclusive_sum(w * m, samples))
-    return ray_sum(pairs + w * w * samples.deltas / 3, samples)
+    # m_i - m_j is the sum of the gaps between neighbouring middles from j to i: each counts for all weight in front.
+    # No term is negative, so nothing cancels, wherever the weights lie and however close together.
+    w, starts, ends = weights, samples.t_starts, samples.t_ends
+    gaps = ((starts - starts.roll(1)) + (ends - ends.roll(1))).masked_fill(samples.places == 0, 0) / 2
+    steps = gaps * exclusive_sum(w, samples)
+    apart = exclusive_sum(steps, samples) + steps
+    return ray_sum(w * (2 * apart + w * samples.deltas / 3), samples)

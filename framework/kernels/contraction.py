@@ -32,9 +32,8 @@ def contract_to_unit(positions: Tensor, box: Tensor) -> Tensor:
     return contract_to_unit_reference(positions, box)
 
 
-LIMIT = torch.finfo(torch.float32).max ** 0.5 / 4
-_forward = native.function("contract_positions", "pppqfpi")
-_backward = native.function("contract_positions_backward", "ppppqfpi")
+_forward = native.function("contract_positions", "pppqpi")
+_backward = native.function("contract_positions_backward", "ppppqpi")
 
 
 class _Contract(torch.autograd.Function):
@@ -43,7 +42,7 @@ class _Contract(torch.autograd.Function):
         count, out = len(positions), torch.empty_like(positions)
         _forward(
             native.pointer(positions, "positions", (count, 3)), native.pointer(centre, "the centre", (3,)),
-            native.pointer(scale, "the scale", (3,)), count, LIMIT, out.data_ptr(), native.threads(),
+            native.pointer(scale, "the scale", (3,)), count, out.data_ptr(), native.threads(),
         )  # fmt: skip
         ctx.save_for_backward(positions, centre, scale)
         return out
@@ -55,6 +54,6 @@ class _Contract(torch.autograd.Function):
         out, grad = torch.empty_like(positions), grad.contiguous()
         _backward(
             positions.data_ptr(), centre.data_ptr(), scale.data_ptr(), native.pointer(grad, "gradient", grad.shape),
-            len(positions), LIMIT, out.data_ptr(), native.threads(),
+            len(positions), out.data_ptr(), native.threads(),
         )  # fmt: skip
         return out, None, None

@@ -14,11 +14,17 @@ _backward = native.function("frequency_encoding_backward", "ppqiiipi")
 
 
 def frequency_encoding_reference(x: Tensor, num_frequencies: int, include_input: bool = True) -> Tensor:
-    """The encoding in torch: the truth, in any float type. Arguments as for `frequency_encoding`."""
+    """The encoding in torch: the truth, in float32 and float64. Arguments as for `frequency_encoding`."""
+    x = _widened(x)
     scales = 2.0 ** torch.arange(num_frequencies, device=x.device, dtype=x.dtype)
-    angles = x[:, None, :] * scales[:, None]
-    waves = torch.stack([angles.sin(), angles.cos()], dim=2).flatten(1)
+    angles = x[..., None, :] * scales[:, None]
+    waves = torch.stack([angles.sin(), angles.cos()], dim=-2).flatten(-3)
     return torch.cat([x, waves], dim=-1) if include_input else waves
+
+
+def _widened(x: Tensor) -> Tensor:
+    """As float32, where it is not float64: in half precision 2^9 x overflows from x = 128 on."""
+    return x if x.dtype == torch.float64 else x.float()
 
 
 class _FrequencyEncoding(torch.autograd.Function):
@@ -51,12 +57,14 @@ def frequency_encoding(x: Tensor, num_frequencies: int, include_input: bool = Tr
     frequency only while |x| * 2^(L - 1) stays well below 10^5: scenes are scaled to about 1.
 
     Args:
-        x: (N, D) input.
+        x: (..., D) input, of any type.
         num_frequencies: L, at least 0.
         include_input: put x itself in front.
-    Returns: (N, D * (2 L + include_input)): [x, sin(x), cos(x), sin(2 x), cos(2 x), ...]. First derivatives only
-        where compiled.
+    Returns: (..., D * (2 L + include_input)): [x, sin(x), cos(x), sin(2 x), cos(2 x), ...], in float64 where x is, and
+        in float32 otherwise. First derivatives only where compiled.
     """
-    if native.usable(x) and x.ndim == 2:
-        return _FrequencyEncoding.apply(x.contiguous(), num_frequencies, include_input)
+    x = _widened(x)
+    if native.usable(x) and x.ndim >= 2:
+        rows = x.flatten(0, -2).contiguous()
+        return _FrequencyEncoding.apply(rows, num_frequencies, include_input).unflatten(0, x.shape[:-1])
     return frequency_encoding_reference(x, num_frequencies, include_input)

@@ -62,13 +62,13 @@ def corners(positions: Tensor, layout: HashGridLayout, level: int) -> tuple[Tens
     """The 8 corners of the cell that each position lies in, at one level.
 
     Args:
-        positions: (N, 3); what lies outside [0, 1] is moved to the face.
+        positions: (N, 3); what lies outside [0, 1] is moved to the face. NaN is in cell 0, with NaN for weights.
     Returns: entries (8, N) int32 counted from the level's first one, trilinear weights (8, N), and the
         fractions (3, N) they are made of. Corner c is at (c >> 2 & 1, c >> 1 & 1, c & 1) along x, y, z.
     """
     resolution = layout.resolutions[level]
     scaled = positions.t().clamp(0, 1) * resolution
-    cell = scaled.detach().floor().clamp(max=resolution - 1)  # x = 1 belongs to the last cell
+    cell = scaled.detach().nan_to_num().floor().clamp(max=resolution - 1)  # x = 1 belongs to the last cell
     fractions = scaled - cell
     if layout.is_dense(level):
         x, y, z = _both_ends(cell.int(), ((resolution + 1) ** 2, resolution + 1, 1))

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from framework.kernels import native
-from framework.kernels.compositing import optical_depth
+from framework.kernels.compositing import exclusive_cumsum, optical_depth
 
 EPS = 1e-7
 """Keeps the loss of intervals without weight finite."""
@@ -23,7 +23,7 @@ EPS = 1e-7
 def interval_weights_reference(sigma: Tensor, t: Tensor) -> Tensor:
     """As `interval_weights`, in torch, in any float type."""
     tau = optical_depth(sigma, t.diff(dim=-1))
-    in_front = torch.exp(-(tau.cumsum(-1) - tau).clamp(min=0))
+    in_front = torch.exp(-exclusive_cumsum(tau))
     return in_front * -torch.expm1(-tau)
 
 

@@ -18,13 +18,15 @@ from torch.nn import functional
 
 from framework.bounds import intersect_box
 from framework.kernels import native
-from framework.kernels.compositing import optical_depth
+from framework.kernels.compositing import optical_depth, segmented_sum
 from framework.rays import Rays
 
 BLOCK = 4
 """Cells along an edge of a block of the coarser level."""
 RUN = 8
 """Steps that the reference tests together."""
+ROUNDING = 1e-5
+"""By how much, relatively, a mean of equal opacities may exceed them: cells that are all alike are not empty."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,8 @@ def refresh_occupancy(density: Tensor, occupied: Tensor, decay: float, step: flo
     """Mark, in place, the cells whose opacity over one step is at least `threshold`, or the mean if that is less.
 
     Args:
-        density: (n^3,) what is known of each cell, multiplied by `decay` first; infinite where nothing is.
+        density: (n^3,) what is known of each cell, multiplied by `decay` first; infinite where nothing is. A cell of
+            NaN is marked, so that a broken field is seen, and left out of the mean.
         occupied: (n^3,) bool, written.
         step: length of a step, scene units.
     """
@@ -78,7 +81,8 @@ def refresh_occupancy(density: Tensor, occupied: Tensor, decay: float, step: flo
         return
     density *= decay
     alpha = -torch.expm1(-density * step)
-    occupied.copy_(alpha >= min(threshold, alpha.mean().item()))
+    least = min(threshold, alpha.nanmean().item() * (1 - ROUNDING))  # the threshold where all are NaN
+    occupied.copy_(~(alpha < least))
 
 
 @dataclass(frozen=True)
@@ -225,9 +229,9 @@ class ReferenceMarch:
         """As `March.wave`."""
         if len(self.alive) == 0:
             return None
-        ranks, within = ranges((self.counts[self.alive] - self.handed_out).clamp(max=limit))
+        ranks, self.places = ranges((self.counts[self.alive] - self.handed_out).clamp(max=limit))
         owners = self.alive[ranks]
-        chosen = self.offsets[:-1][owners] + self.handed_out + within
+        chosen = self.offsets[:-1][owners] + self.handed_out + self.places
         starts, ends = self.t_starts[chosen], self.t_ends[chosen]
         self.handed_out += limit
         wave = Wave(starts, ends, owners, self.rays.points(owners, (starts + ends) / 2))
@@ -239,12 +243,7 @@ class ReferenceMarch:
         """As `March.advance`."""
         wave = self.waves[-1]
         tau = optical_depth(sigma.detach().float(), wave.t_ends - wave.t_starts)
-        running = tau.double().cumsum(0) if tau.device.type != "mps" else tau.cumsum(0)
-        first = torch.ones_like(wave.owners, dtype=torch.bool)
-        first[1:] = wave.owners[1:] != wave.owners[:-1]
-        position = torch.arange(len(first), device=first.device)
-        start = torch.where(first, position, torch.zeros_like(position)).cummax(0).values if len(first) else position
-        before = self.spent[wave.owners] + ((running - tau) - (running - tau)[start]).float()
+        before = self.spent[wave.owners] + segmented_sum(tau, self.places)
         self.reached.append((~(before >= self.budget)).to(torch.uint8))
         self.spent.index_add_(0, wave.owners, tau)
         self.alive = self.alive[(self.counts[self.alive] > self.handed_out) & ~(self.spent[self.alive] >= self.budget)]

@@ -76,10 +76,14 @@ def scale_gradient(values: Tensor, factors: Tensor) -> Tensor:
 
 
 def safe_normalize(v: Tensor, eps: float = 1e-12) -> Tensor:
-    """v / |v| over the last dimension; 0, with a zero gradient, where |v| < eps."""
-    squared = (v * v).sum(-1, keepdim=True)
-    usable = squared > eps * eps
-    return torch.where(usable, v / torch.where(usable, squared, torch.ones_like(squared)).sqrt(), torch.zeros_like(v))
+    """v / |v| over the last dimension; 0, with a zero gradient, where |v| < eps; NaN where v is not finite.
+
+    v is divided by its largest component first: in float32 the square of what is longer than 1.8e19 is infinite.
+    """
+    least = max(eps, torch.finfo(v.dtype).tiny)  # 1e-12 would be 0 in float16
+    scaled = v / v.detach().abs().amax(-1, keepdim=True).clamp(min=least)  # shorter than 1 where |v| < least
+    squared = (scaled * scaled).sum(-1, keepdim=True)
+    return (scaled / squared.clamp(min=1).sqrt()).masked_fill(squared < 1, 0)
 
 
 def cross_matrix(v: Tensor) -> Tensor:

@@ -58,7 +58,10 @@ def check_groups(subject: Subject) -> str:
         known = {id(parameter): name for name, parameter in learner.model.named_parameters()}
         held = Counter(id(p) for group in learner.model.param_groups() for p in group["params"])
         if strangers := held.keys() - known.keys():
-            raise Fault(f"{len(strangers)} tensors in param_groups() are no parameters of the model")
+            raise Fault(
+                f"param_groups() holds tensors that are no parameters of the model, {len(strangers)} of them; "
+                "make each an attribute that is a torch.nn.Parameter"
+            )
         if twice := [known[key] for key, count in held.items() if count > 1]:
             raise Fault(f"{_names(twice)} more than once in param_groups()")
         if missing := [name for name, p in learner.model.named_parameters() if p.requires_grad and not held[id(p)]]:

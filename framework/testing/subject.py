@@ -18,7 +18,7 @@ from framework.config import TrainConfig
 from framework.dataset import Dataset
 from framework.device import seed_step
 from framework.model import Method, Model
-from framework.pixels import Background, Batch, background_colors, draw_batch, gather_batch
+from framework.pixels import Batch, background_colors, draw_batch, gather_batch, training_background
 from framework.rays import Rays
 from framework.renderers import Rendered
 from framework.testing.finding import Fault
@@ -54,7 +54,8 @@ class Learner:
         """Steps taken."""
         self.history: list[float] = []
         """The loss before each."""
-        self.moves = False
+        self.has_gradient = False
+        """Whether the last loss leads back to the parameters; it does not where every ray meets nothing."""
 
     @cached_property
     def optimizer(self) -> Adam:
@@ -67,12 +68,8 @@ class Learner:
         """The pixels of the next step, each seen through `places` (K, 2)."""
         seed_step(SEED, self.done)
         count = min(self.config.num_rays_per_batch, RAYS)
-        return draw_batch(self.dataset, count, self._background(), places=places)
-
-    def _background(self) -> Background:
-        if self.config.background != "auto":
-            return self.config.background
-        return "random" if self.dataset.scene.has_alpha else "black"
+        background = training_background(self.config.background, self.dataset.scene.has_alpha)
+        return draw_batch(self.dataset, count, background, places=places)
 
     def rendered(self, rays: Rays, background: Tensor) -> Rendered:
         """The picture of rays as the next step sees it."""
@@ -99,15 +96,15 @@ class Learner:
         """Leave the gradients of the losses' sum where the optimiser finds them."""
         loss = total(losses)
         self.optimizer.zero_grad()
-        self.moves = loss.requires_grad  # not where every ray meets nothing
-        if self.moves:
+        self.has_gradient = loss.requires_grad
+        if self.has_gradient:
             loss.backward()
         self.history.append(float(loss.detach()))
 
     def descend(self) -> None:
         """The second half: the optimiser's step, where there are gradients."""
         set_learning_rate(self.optimizer, self.config, self.done, self.done / BUDGET)
-        if self.moves:
+        if self.has_gradient:
             self.optimizer.step()
         self.done += 1
 

@@ -26,7 +26,7 @@ from framework.evaluation.evaluator import evaluate, evaluation_background, rend
 from framework.evaluation.images import comparison
 from framework.evaluation.metrics import MAX_PSNR
 from framework.pixel_stream import PixelStream
-from framework.pixels import Background, Batch, LookUp, composite, draw_batch
+from framework.pixels import Background, Batch, LookUp, composite, draw_batch, training_background
 from framework.scene_profile import SceneProfile
 from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest, save_checkpoint
 from framework.training.optim import first_non_finite, make_optimizer, set_learning_rate
@@ -293,9 +293,7 @@ class Trainer:
         return subpixels(self.config.rays_per_pixel) if late else CENTER
 
     def _background(self) -> Background:
-        if self.config.background != "auto":
-            return self.config.background
-        return "random" if self.model.scene.has_alpha else "black"
+        return training_background(self.config.background, self.model.scene.has_alpha)
 
     def _account(self, batch: Batch, num_samples: int, mse: float, seconds: float) -> None:
         state = self.state

@@ -1,8 +1,13 @@
 """Run the installed commands as a person would."""
 
+import io
+import os
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
+from importlib.metadata import entry_points
 from pathlib import Path
+from unittest.mock import patch
 
 _FLAGS = "--num-levels 4 --max-resolution 64 --log2-table-size 12 --grid-resolution 16 --num-steps 64 --vis none"
 TINY_NGP = [*_FLAGS.split(), "--samples-per-batch", "4096"]
@@ -17,6 +22,22 @@ def run(name: str, *arguments: object, folder: Path | None = None) -> subprocess
     """Run a command and capture what it prints."""
     words = [command(name), *map(str, arguments)]
     return subprocess.run(words, capture_output=True, text=True, cwd=folder, timeout=300)
+
+
+def called(name: str, *arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """The same within this process, which saves the second that a new one takes to begin; for what ends soon."""
+    (entry,) = entry_points(group="console_scripts", name=name)
+    words, here = [name, *map(str, arguments)], Path.cwd()
+    code, out, err = 0, io.StringIO(), io.StringIO()
+    os.chdir(folder or here)
+    try:
+        with patch.object(sys, "argv", words), redirect_stdout(out), redirect_stderr(err):
+            entry.load()()
+    except SystemExit as end:
+        code = int(end.code or 0)
+    finally:
+        os.chdir(here)
+    return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
 
 
 def train(data: Path, output: Path, *flags: object, timestamp: str = "t") -> Path:

@@ -11,7 +11,7 @@ import yaml
 
 from framework.cli.train import _default_run, _parse_flags
 from framework.errors import ConfigError
-from tests.cli.helpers import TINY_NGP, command, run, train
+from tests.cli.helpers import TINY_NGP, called, command, run, train
 
 
 def test_help_is_quick_and_lists_every_method() -> None:
@@ -30,7 +30,7 @@ def test_help_is_quick_and_lists_every_method() -> None:
 
 
 def test_method_help_shows_its_flags_without_prefix() -> None:
-    done = run("ns-train", "vanilla-nerf", "--help")
+    done = called("ns-train", "vanilla-nerf", "--help")
     assert done.returncode == 0
     for flag in (
         "--sampler {auto,hierarchical,occupancy,proposal}",
@@ -54,21 +54,21 @@ def test_method_help_shows_its_flags_without_prefix() -> None:
     ],
 )
 def test_errors_are_one_line(arguments: list[str], words: str, tmp_path: Path) -> None:
-    done = run("ns-train", *arguments, folder=tmp_path)
+    done = called("ns-train", *arguments, folder=tmp_path)
     assert done.returncode == 1
     assert done.stderr.strip().startswith(words)
     assert len(done.stderr.strip().splitlines()) == 1
 
 
 def test_an_unknown_flag_gets_the_nearest() -> None:
-    done = run("ns-train", "instant-ngp", "--max-secnds", "3")
+    done = called("ns-train", "instant-ngp", "--max-secnds", "3")
     assert done.returncode == 2
     assert "--max-seconds" in done.stderr
     assert "Traceback" not in done.stderr
 
 
 def test_a_flag_out_of_range_says_so() -> None:
-    done = run("ns-train", "instant-ngp", "--max-seconds", "0")
+    done = called("ns-train", "instant-ngp", "--max-seconds", "0")
     assert done.returncode == 2
     assert "--max-seconds is 0.0; it must be more than 0" in " ".join(done.stderr.replace("│", " ").split())
     assert "Traceback" not in done.stderr
@@ -77,11 +77,11 @@ def test_a_flag_out_of_range_says_so() -> None:
 def test_damaged_data_is_one_line_and_debug_shows_more(tiny: Path, tmp_path: Path) -> None:
     (tiny / "transforms_train.json").write_text("{")
     arguments = ["instant-ngp", "--data", tiny, "--output-dir", tmp_path / "out"]
-    done = run("ns-train", *arguments)
+    done = called("ns-train", *arguments)
     assert done.returncode == 1
     assert "transforms_train.json is not JSON" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
-    assert "Traceback" in run("ns-train", *arguments, "--debug").stderr
+    assert "Traceback" in called("ns-train", *arguments, "--debug").stderr
     assert not (tmp_path / "out").exists()
 
 
@@ -114,7 +114,7 @@ def test_the_folder_follows_the_names(shared_tiny: Path) -> None:
 
 
 def test_data_for_the_embedded_scene_is_refused(shared_tiny: Path, tmp_path: Path) -> None:
-    done = run("ns-train", "instant-ngp", "--data", shared_tiny, "procedural", folder=tmp_path)
+    done = called("ns-train", "instant-ngp", "--data", shared_tiny, "procedural", folder=tmp_path)
     assert done.returncode == 1
     assert "the embedded scene reads no data" in done.stderr
 
@@ -165,14 +165,14 @@ def test_a_moved_run_and_moved_data(finished: Path, tiny: Path, tmp_path: Path) 
 
     moved = tmp_path / "elsewhere"
     shutil.copytree(finished, moved)
-    done = run("ns-eval", "--load-config", moved / "config.yml", "--data", tiny, "--max-images", 1)
+    done = called("ns-eval", "--load-config", moved / "config.yml", "--data", tiny, "--max-images", 1)
     assert done.returncode == 0, done.stderr
     assert json.loads((moved / "eval.json").read_text())["results"]["num_images"] == 1
 
 
 def test_eval_without_a_checkpoint(finished: Path, tmp_path: Path) -> None:
     (tmp_path / "config.yml").write_text((finished / "config.yml").read_text())
-    done = run("ns-eval", "--load-config", tmp_path / "config.yml")
+    done = called("ns-eval", "--load-config", tmp_path / "config.yml")
     assert done.returncode == 1
     assert "holds no checkpoint" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
@@ -182,13 +182,13 @@ def test_orbit(finished: Path, tmp_path: Path) -> None:
     from PIL import Image
 
     output = tmp_path / "orbit.gif"
-    done = run(
+    done = called(
         "ns-render", "orbit", "--load-config", finished / "config.yml", "--output-path", output, "--num-frames", 5
     )
     assert done.returncode == 0, done.stderr
     with Image.open(output) as animation:
         assert (animation.n_frames, animation.size) == (5, (20, 20))
-    assert run("ns-render", "orbi").stderr.startswith("error: unknown path 'orbi'. Did you mean 'orbit'?")
+    assert called("ns-render", "orbi").stderr.startswith("error: unknown path 'orbi'. Did you mean 'orbit'?")
 
 
 def test_a_recipe_with_overrides_and_resuming(shared_tiny: Path, tmp_path: Path) -> None:
@@ -201,7 +201,7 @@ def test_a_recipe_with_overrides_and_resuming(shared_tiny: Path, tmp_path: Path)
     assert done.returncode == 0, done.stderr
     folder = tmp_path / "ball" / "instant-ngp" / "r"
     assert (folder / "nerfstudio_models" / "step-000000005.ckpt").is_file()
-    done = run("ns-train", "--resume", folder, "--max-num-iterations", 8)
+    done = called("ns-train", "--resume", folder, "--max-num-iterations", 8)
     assert done.returncode == 0, done.stderr
     assert "at step 5" in done.stderr
     assert (folder / "nerfstudio_models" / "step-000000008.ckpt").is_file()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.helpers import run
+from tests.cli.helpers import called, run
 
 SMALL = "--num-levels 4 --max-resolution 64 --log2-table-size 12 --grid-resolution 16 --num-steps 64"
 PLANES = "--base-resolution 16 --num-scales 2 --features-per-scale 8 --grid-resolution 16 --num-steps 64"
@@ -56,7 +56,7 @@ def test_two_methods_one_that_fails_and_a_second_call(shared_tiny: Path, tmp_pat
     ],
 )
 def test_what_cannot_be_compared(flags: tuple[object, ...], reason: str, tmp_path: Path) -> None:
-    done = run("ns-compare", *flags, folder=tmp_path)
+    done = called("ns-compare", *flags, folder=tmp_path)
     assert done.returncode == 1
     assert reason in done.stderr.replace("\n", " ")
     assert "Traceback" not in done.stderr

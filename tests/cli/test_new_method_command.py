@@ -29,6 +29,12 @@ def test_the_example_is_what_the_command_writes() -> None:
     assert files(EXAMPLE) == package_of("dense-grid")
 
 
+def test_the_documentation_says_how_long_the_example_is() -> None:
+    (source,) = (EXAMPLE / "src").glob("*.py")
+    length = len(source.read_text(encoding="utf-8").splitlines())
+    assert f"one file of {length} lines" in (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
+
+
 def test_it_writes_a_package_and_says_how_to_go_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -94,3 +100,14 @@ def test_nothing_is_overwritten(tmp_path: Path, refused: Refused) -> None:
     below = tmp_path / "file" / "deeper"
     assert "cannot write" in refused(main, "my-method", "--dir", below)
     assert "the method's name comes first" in refused(main, "--dir", tmp_path / "new")
+
+
+@pytest.mark.parametrize("arguments", [[], ["-h"], ["my-method", "--help"]])
+def test_help_writes_nothing(
+    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["ns-new-method", *arguments])
+    main()
+    assert "usage: ns-new-method NAME [--dir DIR]" in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == []

@@ -14,7 +14,7 @@ import yaml
 from framework.cli.train import _default_run, _parse_flags, main
 from framework.registry import load_method
 from framework.training.run import Run, create_folder
-from tests.cli.helpers import TINY_NGP, run
+from tests.cli.helpers import TINY_NGP, called, run
 from tests.conftest import Refused
 from tests.training.helpers import tiny_run, tiny_trainer
 
@@ -63,7 +63,7 @@ def test_a_file_is_not_a_data_folder(tiny: Path, refused: Refused) -> None:
 
 
 def test_a_misspelt_data_format_gets_the_nearest(shared_tiny: Path) -> None:
-    done = run("ns-train", "instant-ngp", "--data", shared_tiny, "blendr")
+    done = called("ns-train", "instant-ngp", "--data", shared_tiny, "blendr")
     assert done.returncode != 0
     assert "Traceback" not in done.stderr
     assert "blendr" in done.stderr
@@ -72,7 +72,7 @@ def test_a_misspelt_data_format_gets_the_nearest(shared_tiny: Path) -> None:
 
 def test_a_file_in_the_way_of_the_output(shared_tiny: Path, tmp_path: Path) -> None:
     (tmp_path / "out").write_text("a file")
-    done = run("ns-train", "instant-ngp", "--data", shared_tiny, "--output-dir", tmp_path / "out", *TINY_NGP)
+    done = called("ns-train", "instant-ngp", "--data", shared_tiny, "--output-dir", tmp_path / "out", *TINY_NGP)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     last = done.stderr.strip().splitlines()[-1]
@@ -180,7 +180,7 @@ def test_the_folder_is_dated(shared_tiny: Path) -> None:
 
 
 def test_help_of_a_method_states_its_own_defaults(shared_tiny: Path) -> None:
-    said = " ".join(run("ns-train", "instant-ngp", "--data", shared_tiny, "--help").stdout.split())
+    said = " ".join(called("ns-train", "instant-ngp", "--data", shared_tiny, "--help").stdout.split())
     config = load_method("instant-ngp").config
     assert f"(default: {config.max_num_iterations})" in said
     for flag in ("--num-levels", "--log2-table-size", "--downscale-factor", "--mixed-precision"):

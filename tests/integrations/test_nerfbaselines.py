@@ -200,6 +200,12 @@ def test_the_spec_is_an_entry_point() -> None:
     assert project["entry-points"]["nerfbaselines.specs"] == {"nerfloom": "framework.integrations.nerfbaselines_spec"}
 
 
+@pytest.mark.parametrize("document", ["README.md", "docs/plugins.md"])
+def test_documents_name_every_method(document: str) -> None:
+    text = (ROOT / document).read_text(encoding="utf-8")
+    assert [spec["id"] for spec in SPECS if f"`{spec['id']}`" not in text] == []
+
+
 def test_nerfbaselines_knows_the_methods() -> None:
     nerfbaselines = pytest.importorskip("nerfbaselines", reason="nerfbaselines is not installed")
     schema = nerfbaselines.MethodSpec
@@ -300,6 +306,15 @@ def test_masks_say_where_to_learn(kind: str) -> None:
     data = dataset_of(photographs, Frame.of(photographs, FrameFlags()), "ignored")
     assert data.kept is not None
     assert np.array_equal(data.kept.mask(0, len(data.pixels)).numpy(), used.reshape(-1))
+
+
+def test_masks_count_under_their_first_name_too() -> None:
+    used = np.random.default_rng(0).random((COUNT, SIZE, SIZE)) < 0.6
+    data = handed(3)
+    del data["masks"]
+    kept = Photographs.of({**data, "sampling_masks": list(used)}).decoded.kept
+    assert kept is not None
+    assert np.array_equal(kept.mask(0, used.size).numpy(), used.reshape(-1))
 
 
 def test_a_capture_is_placed_and_its_rays_start_before_its_points() -> None:

@@ -116,7 +116,7 @@ def test_thin_samples_are_not_lost_in_float32() -> None:
 
 
 def test_one_opaque_ray_does_not_disturb_its_neighbours() -> None:
-    """The packed sum runs over all rays: a wall in one must not cost the next one's precision."""
+    """Packed samples of all rays stand in one row: a wall in one must not cost the next one's precision."""
     samples = Samples(torch.arange(6.0), torch.arange(6.0) + 1, torch.tensor([0, 3, 6]))
     sigma = torch.tensor([1e30, 1e30, 1e30, 1e-4, 1e-4, 1e-4])
     before = exclusive_sum(optical_depth(sigma, samples.deltas), samples)

@@ -99,6 +99,22 @@ def test_hidden_samples_are_never_handed_out() -> None:
     assert len(order) == int((march.leave > march.enter).sum())
 
 
+@pytest.mark.parametrize("kind", [March, ReferenceMarch])
+def test_a_nan_ray_does_not_show_what_is_hidden_on_others(kind) -> None:
+    if kind is March and not native.available():
+        pytest.skip("the compiled kernels are not installed")
+    march = kind(random_rays(100), occupancy(8, 1.0), 0.01, 0.0, None, 1e-4)
+    wave = march.wave(8)
+    assert wave is not None
+    first = int(wave.owners[0])
+    sigma = torch.full_like(wave.t_starts, 1e6)
+    sigma[wave.owners == first] = math.nan
+    march.advance(sigma)
+    counts = march.finish()[1].diff()
+    assert int(counts[first]) == int((wave.owners == first).sum()) > 1
+    assert int(counts[torch.arange(100) != first].max()) == 1
+
+
 @needs_kernels
 def test_threads_hand_out_the_same_samples() -> None:
     rays, grid, found = random_rays(500), occupancy(32, 0.05), []

@@ -15,16 +15,21 @@ from pathlib import Path
 
 import pytest
 
+from framework.registry import VARIABLES
+
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "plugin-method"
-SOURCES = ("pyproject.toml", "setup.py", "README.md", "LICENSE", "framework", "methods", "dataparsers")
+PACKAGES = ("framework", "methods", "dataparsers")
+SOURCES = ("pyproject.toml", "setup.py", "README.md", "LICENSE", *PACKAGES)
 BUILT = shutil.ignore_patterns("__pycache__", "lib", "build", "*.egg-info")
 SMALL = "--max-resolution 32 --grid-resolution 16 --num-steps 64 --samples-per-batch 4096"
 TINY_NGP = f"{SMALL} --num-levels 4 --log2-table-size 12"
 SCENE = "--size 24 --num-train 8"
 BIN = "Scripts" if os.name == "nt" else "bin"
+LEADS_ASTRAY = ("PYTHONPATH", "PYTHONHOME", *VARIABLES.values())
+"""Variables that lead Python to the sources, or Nerfloom to methods of the person who runs the tests."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +56,8 @@ class Installed:
 
 
 def run(words: list[object], folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run a program in a folder, without what leads Python to the sources."""
-    environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "PYTHONHOME")}
+    """Run a program in a folder, in an environment without what leads astray."""
+    environment = {key: value for key, value in os.environ.items() if key not in LEADS_ASTRAY}
     environment["NERFLOOM_CACHE"] = str(folder / "cache")
     return subprocess.run(
         list(map(str, words)), capture_output=True, text=True, cwd=folder, env=environment, timeout=900
@@ -77,7 +82,8 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
         copy.parent.mkdir(exist_ok=True)
         shutil.copytree(source, copy, ignore=BUILT) if source.is_dir() else shutil.copy(source, copy)
     shutil.copytree(EXAMPLE, folder / "example", ignore=BUILT)
-    pip: list[object] = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
+    # Isolated, pip follows no settings of the person who runs the tests, such as one to install into their home.
+    pip: list[object] = [sys.executable, "-m", "pip", "--isolated", "--disable-pip-version-check", "--no-cache-dir"]
     build = [*pip, "wheel", "--no-index", "--no-deps", "--no-build-isolation", "--wheel-dir", folder / "wheels"]
     checked([*build, folder / "sources", folder / "example"], folder)
     venv.EnvBuilder(symlinks=os.name != "nt").create(folder / "venv")
@@ -109,6 +115,15 @@ def test_the_wheel_is_what_runs(installed: Installed) -> None:
     assert [Path(file).is_relative_to(installed.modules) for file in files] == [True, True]
 
 
+def test_the_wheel_holds_all_that_the_sources_hold(installed: Installed) -> None:
+    """Templates, the report's page, the kernels' sources and the marks of types too."""
+    sources = installed.folder.parent / "sources"
+    files = [file for package in PACKAGES for file in (sources / package).rglob("*") if file.is_file()]
+    assert {file.suffix for file in files} >= {".py", ".typed", ".jinja", ".template", ".cpp", ".h"}
+    left_out = [file for file in files if not (installed.modules / file.relative_to(sources)).is_file()]
+    assert left_out == []
+
+
 def test_it_trains_and_is_evaluated(installed: Installed) -> None:
     listed = installed.run("ns-train", "--help").stdout
     assert "dense-grid      DenseGrid: features on dense grids" in listed
@@ -123,8 +138,6 @@ def test_it_trains_and_is_evaluated(installed: Installed) -> None:
 
 
 def test_it_is_compared_beside_another(installed: Installed) -> None:
-    if not (installed.folder / BIN / "ns-compare").exists():
-        pytest.skip("there is no ns-compare")
     output = installed.folder / "compared"
     flags = ["--max-num-iterations", 20, "--max-eval-images", 2, "--curve-images", 1, "--output-dir", output]
     methods = [f"dense-grid {SMALL}", f"instant-ngp {TINY_NGP}"]

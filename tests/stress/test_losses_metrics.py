@@ -51,13 +51,25 @@ def test_distortion_of_mass_at_the_far_end(backend: str, width: float) -> None:
 
 
 @pytest.mark.entry(21)
-@backends(reference="m W - M cancels in float32: what is left is as coarse as an interval next to s = 1 is wide")
-def test_distortion_of_two_intervals_next_to_the_end(backend: str) -> None:
-    """As short as float32 can make them: by hand."""
+@backends()
+@pytest.mark.parametrize("layout", ["alone", "behind empty space", "packed"])
+def test_distortion_of_two_intervals_next_to_the_end(backend: str, layout: str) -> None:
+    """As short as float32 can make them: by hand. With w = 2^-23, slopes are 2 sum_j w_j |m_i - m_j| + 2 w_i w / 3."""
     width, weights = 2.0**-23, torch.tensor([0.3, 0.7])
     edges = 1 - width * torch.tensor([[2.0, 1.0, 0.0]])
-    found = distortion(weights, Samples.regular(edges[:, :-1], edges[:, 1:])).item()
-    assert found == pytest.approx((2 * 0.3 * 0.7 + (0.3**2 + 0.7**2) / 3) * width, rel=1e-3)
+    if layout == "behind empty space":
+        edges, weights = torch.cat([torch.zeros(1, 1), edges], dim=-1), torch.tensor([0.0, 0.3, 0.7])
+    samples = Samples.regular(edges[:, :-1], edges[:, 1:])
+    if layout == "packed":  # behind a ray that is NaN, and one without samples
+        nan = torch.tensor([math.nan])
+        starts, ends = torch.cat([nan, samples.t_starts]), torch.cat([nan, samples.t_ends])
+        samples, weights = Samples(starts, ends, torch.tensor([0, 1, 1, 3])), torch.cat([nan, weights])
+    weights.requires_grad_()
+    found = distortion(weights, samples)[-1]
+    (slopes,) = torch.autograd.grad(found, weights)
+    assert found.item() == pytest.approx((2 * 0.3 * 0.7 + (0.3**2 + 0.7**2) / 3) * width, rel=1e-3)
+    truth = [(2 * 0.7 + 2 * 0.3 / 3) * width, (2 * 0.3 + 2 * 0.7 / 3) * width]
+    assert slopes[-2:].tolist() == pytest.approx(truth, rel=1e-3)
 
 
 # -- losses of nothing --------------------------------------------------------------------------------------------

@@ -37,8 +37,8 @@ static inline void store(float* to, Floats value) { std::memcpy(to, &value, size
 static inline Floats larger(Floats a, Floats b) { return a > b ? a : b; }
 static inline Floats smaller(Floats a, Floats b) { return a < b ? a : b; }
 
-// exp to 2 units in the last place: 2^n from the exponent's bits, the rest by a polynomial (Cephes' expf).
-static inline Floats exponential(Floats x) {
+// exp(x) as power * (1 + rest): 2^n from the exponent's bits, and Cephes' polynomial (expf), which is as small as x.
+static inline void split_exponential(Floats x, Floats& power, Floats& rest) {
     const Floats clipped = smaller(larger(x, splat(-87.3f)), splat(88.3f));
     const Ints n = __builtin_convertvector(clipped * 1.44269504f + (clipped < 0 ? splat(-0.5f) : splat(0.5f)), Ints);
     const Floats whole = __builtin_convertvector(n, Floats);
@@ -49,22 +49,40 @@ static inline Floats exponential(Floats x) {
     p = p * r + 4.1665795894e-2f;
     p = p * r + 1.6666665459e-1f;
     p = p * r + 5.0000001201e-1f;
-    p = p * r * r + r + 1.0f;
+    rest = p * r * r + r;
     const Ints exponent = (n + 127) << 23;
-    Floats power;
     std::memcpy(&power, &exponent, sizeof power);
-    const Floats value = p * power;
+}
+
+// exp to 2 units in the last place.
+static inline Floats exponential(Floats x) {
+    Floats power, rest;
+    split_exponential(x, power, rest);
+    const Floats value = (rest + 1.0f) * power;
     return x == x ? value : x;  // NaN stays NaN
 }
 
-constexpr float MAX_OPTICAL_DEPTH = 1e3f;
+// 1 - exp(-x), where subtracting would leave nothing of x below 6e-8.
+static inline Floats opacity_of(Floats x) {
+    Floats power, rest;
+    split_exponential(-x, power, rest);
+    const Floats value = (1.0f - power) - rest * power;
+    return x == x ? value : x;
+}
+
+constexpr float MAX_OPTICAL_DEPTH = 1e3f, MAX_FLOAT = 3.402823466e38f;
 
 // Of an interval; see ../compositing.py.
 static inline float optical_depth(float sigma, float delta) {
-    constexpr float MAX_FLOAT = 3.402823466e38f;
-    const float finite = sigma > MAX_FLOAT ? MAX_FLOAT : sigma;  // infinity * 0 would be NaN
-    const float tau = finite * delta;
+    const float density = sigma > MAX_FLOAT ? MAX_FLOAT : sigma;  // infinity * 0 would be NaN
+    const float length = delta > MAX_FLOAT ? MAX_FLOAT : delta;
+    const float tau = density * length;
     return tau > MAX_OPTICAL_DEPTH ? MAX_OPTICAL_DEPTH : tau;
+}
+
+// Its derivative by sigma: 0 where it is cut off, and in an interval without end.
+static inline float depth_slope(float sigma, float delta) {
+    return sigma * delta > MAX_OPTICAL_DEPTH || delta > MAX_FLOAT ? 0 : delta;
 }
 
 // Threads: the caller says how many, and torch's own OpenMP runtime provides them (see native.py).

@@ -20,7 +20,7 @@ EXPORT void composite_forward(const float* sigma, const float* rgb, const float*
             weights[n] = weight;
             depth += tau;
             total += weight;
-            mean += weight * t;
+            mean += weight == 0 ? 0 : weight * t;  // t is infinite in the middle of an endless interval
             for (int c = 0; c < 3; c++) sum[c] += weight * rgb[n * 3 + c];
             if (!found && in_front - weight <= 0.5f) {
                 half = t < half ? t : half;
@@ -60,8 +60,8 @@ EXPORT void composite_backward(const float* sigma, const float* rgb, const float
             const float delta = ends[n] - starts[n], tau = optical_depth(sigma[n], delta), own = sigma_grad[n];
             depth += tau;
             after -= own * weights[n];
-            const float clipped = sigma[n] * delta > MAX_OPTICAL_DEPTH ? 0 : delta;
-            sigma_grad[n] = clipped == 0 ? 0 : clipped * (own * std::exp(-depth) - after);
+            const float slope = depth_slope(sigma[n], delta);
+            sigma_grad[n] = slope == 0 ? 0 : slope * (own * std::exp(-depth) - after);
             for (int c = 0; c < 3; c++) rgb_grad[n * 3 + c] = weights[n] * g[c];
         }
     }

@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <vector>
 
 // Weights (rays, bins) of densities (rays, bins) between distances (rays, bins + 1).
@@ -34,8 +35,8 @@ EXPORT void interval_weights_backward(const float* sigma, const float* t, const 
             const float delta = edge[i + 1] - edge[i];
             depth += optical_depth(s[i], delta);
             after -= g[i] * w[i];
-            const float clipped = s[i] * delta > MAX_OPTICAL_DEPTH ? 0 : delta;
-            sigma_grad[r * bins + i] = clipped == 0 ? 0 : clipped * (g[i] * std::exp(-depth) - after);
+            const float slope = depth_slope(s[i], delta);
+            sigma_grad[r * bins + i] = slope == 0 ? 0 : slope * (g[i] * std::exp(-depth) - after);
         }
     }
 }
@@ -59,7 +60,8 @@ EXPORT void resample_intervals(const float* edges, const float* weights, const f
                 const double u = total * (j + double(shift[r])) / (count + 1);
                 while (bin < bins - 1 && cdf[bin + 1] <= u) bin++;
                 const double width = cdf[bin + 1] - cdf[bin];
-                const double share = width > 0 ? std::min(std::max((u - cdf[bin]) / width, 0.0), 1.0) : 0.0;
+                // Comparisons and the operands' order let NaN through, so that it is seen in the edges.
+                const double share = width <= 0 ? 0.0 : std::min(std::max((u - cdf[bin]) / width, 0.0), 1.0);
                 out[r * (count + 1) + j] = float(edge[bin] + share * (double(edge[bin + 1]) - edge[bin]));
             }
         }
@@ -104,44 +106,56 @@ EXPORT void proposal_excess(const float* edges, const float* weights, int64_t bi
     }
 }
 
-// Positions (count, 3) to [0, 1]^3: x = (position - centre) * scale, contracted into the ball of radius 2.
+namespace {
+
+// A position from the centre in half edges, x = (position - centre) * scale, as place / unit; unit is 1, but far away,
+// where squares would overflow, a power of two that makes everything smaller.
+struct Contracted {
+    float place[3], unit, factor, norm;  // the contracted position is factor * place; norm = max(1, |x|) * unit
+
+    Contracted(const float* position, const float* centre, const float* scale) {
+        constexpr float LARGEST = std::numeric_limits<float>::max();
+        float farthest = 0, squared = 0;
+        for (int c = 0; c < 3; c++) {
+            const float x = (position[c] - centre[c]) * scale[c];
+            place[c] = x > LARGEST ? LARGEST : x < -LARGEST ? -LARGEST : x;  // what is infinite has no direction
+            farthest = std::max(farthest, std::fabs(place[c]));
+        }
+        unit = farthest > 1e12f ? 0x1p-83f : 1.0f;  // from 1e12 to 3e38 becomes from 1e-13 to 4e13
+        for (int c = 0; c < 3; c++) {
+            place[c] *= unit;
+            squared += place[c] * place[c];
+        }
+        norm = std::sqrt(squared);
+        norm = norm < unit ? unit : norm;  // NaN stays
+        factor = (2 * norm - unit) / (norm * norm);
+    }
+};
+
+}  // namespace
+
+// Positions (count, 3) to [0, 1]^3: those within half an edge of the centre as they are, all others contracted into the
+// ball of radius 2.
 EXPORT void contract_positions(const float* positions, const float* centre, const float* scale, int64_t count,
-                               float limit, float* out, int threads) {
+                               float* out, int threads) {
 #pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
     for (int64_t n = 0; n < count; n++) {
-        float x[3], squared = 0;
-        for (int c = 0; c < 3; c++) {
-            x[c] = (positions[n * 3 + c] - centre[c]) * scale[c];
-            x[c] = x[c] > limit ? limit : x[c] < -limit ? -limit : x[c];
-            squared += x[c] * x[c];
-        }
-        squared = squared < 1 ? 1 : squared;
-        const float factor = (2 * std::sqrt(squared) - 1) / squared;
-        for (int c = 0; c < 3; c++) out[n * 3 + c] = 0.25f * x[c] * factor + 0.5f;
+        const Contracted x(positions + n * 3, centre, scale);
+        for (int c = 0; c < 3; c++) out[n * 3 + c] = 0.25f * x.place[c] * x.factor + 0.5f;
     }
 }
 
-// With n = |x| > 1 and y = x s(n), s(n) = 2/n - 1/n^2:  J^T g = s g + x (x . g) s'(n) / n.
+// With n = max(1, |x|) and y = x s(n), s(n) = 2/n - 1/n^2:  J^T g = s g + x (x . g) s'(n) / n, whose second part is 0
+// where n is 1.
 EXPORT void contract_positions_backward(const float* positions, const float* centre, const float* scale,
-                                        const float* grad, int64_t count, float limit, float* out, int threads) {
+                                        const float* grad, int64_t count, float* out, int threads) {
 #pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
     for (int64_t n = 0; n < count; n++) {
-        float x[3], squared = 0, along = 0;
-        bool clipped[3];
-        for (int c = 0; c < 3; c++) {
-            x[c] = (positions[n * 3 + c] - centre[c]) * scale[c];
-            clipped[c] = !(x[c] <= limit && x[c] >= -limit);
-            x[c] = x[c] > limit ? limit : x[c] < -limit ? -limit : x[c];
-            squared += x[c] * x[c];
-            along += x[c] * grad[n * 3 + c];
-        }
-        float factor = 1, radial = 0;
-        if (squared > 1) {
-            const float norm = std::sqrt(squared);
-            factor = (2 * norm - 1) / squared;
-            radial = along / norm * ((2 / norm - 2) / squared);
-        }
+        const Contracted x(positions + n * 3, centre, scale);
+        const float* g = grad + n * 3;
+        const float along = (x.place[0] * g[0] + x.place[1] * g[1] + x.place[2] * g[2]) / x.norm;
+        const float radial = along * ((2 * x.unit / x.norm - 2) / (x.norm * x.norm));
         for (int c = 0; c < 3; c++)
-            out[n * 3 + c] = clipped[c] ? 0 : 0.25f * scale[c] * (factor * grad[n * 3 + c] + radial * x[c]);
+            out[n * 3 + c] = 0.25f * scale[c] * x.unit * (x.factor * g[c] + radial * x.place[c]);
     }
 }

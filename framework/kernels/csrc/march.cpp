@@ -145,31 +145,44 @@ EXPORT void pack_occupancy(const uint8_t* occupied, int resolution, uint8_t* bit
 }
 
 // Marks the cells whose opacity over one step is at least `threshold`, or the mean opacity if that is less. The grid of
-// densities is multiplied by `decay` first. Returns the threshold used.
+// densities is multiplied by `decay` first. NaN is marked and left out of the mean. Returns the threshold used.
 EXPORT float refresh_occupancy(float* density, int64_t cells, float decay, float step, float threshold,
                                uint8_t* occupied, int threads) {
     constexpr int64_t RUN = 4096;
     const int64_t runs = (cells + RUN - 1) / RUN;
     std::vector<double> opacity(size_t(runs), 0.0);  // of each run, so that the sum does not depend on the threads
+    std::vector<int64_t> known(size_t(runs), 0);     // cells of each run that are not NaN
 #pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
     for (int64_t run = 0; run < runs; run++) {
         const int64_t end = std::min(cells, (run + 1) * RUN);
         int64_t i = run * RUN;
         Floats sum = splat(0);
+        Ints numbers = {};
         for (; i + LANES <= end; i += LANES) {
-            const Floats value = load(density + i) * decay;
+            const Floats value = load(density + i) * decay, alpha = opacity_of(value * step);
             store(density + i, value);
-            sum += 1 - exponential(value * -step);
+            sum += alpha == alpha ? alpha : splat(0);
+            numbers -= alpha == alpha;  // true is -1
         }
-        for (int lane = 0; lane < LANES; lane++) opacity[size_t(run)] += sum[lane];
-        for (; i < end; i++) opacity[size_t(run)] += -std::expm1((density[i] *= decay) * -step);
+        for (int lane = 0; lane < LANES; lane++) {
+            opacity[size_t(run)] += sum[lane];
+            known[size_t(run)] += numbers[lane];
+        }
+        for (; i < end; i++) {
+            const float alpha = -std::expm1((density[i] *= decay) * -step);
+            if (std::isnan(alpha)) continue;
+            opacity[size_t(run)] += alpha;
+            known[size_t(run)]++;
+        }
     }
-    double total = 0;
+    double total = 0, count = 0;
     for (double part : opacity) total += part;
-    const float least = std::min(threshold, float(total / double(cells)));
+    for (int64_t part : known) count += double(part);
+    constexpr double ROUNDING = 1e-5;  // see ../march.py
+    const float least = std::min(threshold, float(total / count * (1 - ROUNDING)));  // the threshold where all are NaN
     const float density_threshold = -std::log1p(-std::min(least, 1 - 1e-7f)) / step;
 #pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
-    for (int64_t i = 0; i < cells; i++) occupied[i] = density[i] >= density_threshold;
+    for (int64_t i = 0; i < cells; i++) occupied[i] = !(density[i] < density_threshold);
     return least;
 }
 

@@ -1,0 +1,40 @@
+"""Bars of what kernels take, compiled and in torch, beside the least time that the machine's ceilings allow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from framework.benchmarks.kernels import Row
+from framework.console import say
+
+
+def draw(rows: Sequence[Row], path: Path) -> bool:
+    """A picture of one thread count's rows: ns forward and backward, logarithmic.
+
+    Returns: whether it was drawn; it is not where matplotlib is absent, which is said.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        say("no picture of the kernels: pip install 'nerfloom[plots]'")
+        return False
+    figure = Figure(figsize=(9, 0.42 * len(rows) + 1), layout="constrained")
+    axes = figure.subplots()
+    places = range(len(rows), 0, -1)
+    ours = [row.forward + (row.backward or 0) for row in rows]
+    theirs = [row.reference_forward + (row.reference_backward or 0) for row in rows]
+    axes.barh([place + 0.2 for place in places], theirs, 0.4, color="#bbbbbb", label="torch")
+    axes.barh([place - 0.2 for place in places], ours, 0.4, color="#0072b2", label="compiled")
+    least = [(place - 0.2, row.least_forward) for place, row in zip(places, rows, strict=True) if row.least_forward]
+    heights, bounds = zip(*least, strict=True) if least else ((), ())
+    axes.plot(bounds, heights, "|", color="#d55e00", markersize=11, label="least by the ceilings, forward")
+    for place, row, value in zip(places, rows, theirs, strict=True):
+        axes.text(value * 1.1, place, f"{row.speed_up:.1f} x", va="center", fontsize=8)
+    axes.set(xscale="log", xlabel=f"ns a sample, ray or entry, forward and backward, {rows[0].threads} threads")
+    axes.set_yticks(list(places), [row.kernel for row in rows], fontsize=8)
+    axes.margins(x=0.1)
+    axes.legend(fontsize=8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=120)
+    return True

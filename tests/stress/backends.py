@@ -47,8 +47,3 @@ def backends(**broken: str) -> pytest.MarkDecorator:
             marks.append(pytest.mark.xfail(strict=True, reason=broken[name]))
         params.append(pytest.param(name, marks=marks))
     return pytest.mark.parametrize("backend", params, indirect=True)
-
-
-def known_on_all(reason: str) -> pytest.MarkDecorator:
-    """As `backends`, of a test that is known to fail on each of them."""
-    return backends(**dict.fromkeys(BACKENDS, reason))

@@ -19,6 +19,11 @@ def test_every_entry_has_tests_and_no_other_is_named() -> None:
     assert named == set(ENTRIES) == set(range(1, 26))
 
 
+def test_the_document_has_a_row_for_each_entry() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "stability.md").read_text(encoding="utf-8")
+    assert [int(n) for n in re.findall(r"^\| (\d+) \|", text, re.MULTILINE)] == list(ENTRIES)
+
+
 def test_every_test_names_its_entry(request: pytest.FixtureRequest) -> None:
     here = Path(__file__)
     tests = [item for item in request.session.items if item.path.parent == here.parent and item.path != here]

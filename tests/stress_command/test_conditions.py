@@ -27,6 +27,17 @@ def test_names_are_unique_and_the_help_lists_them_all() -> None:
     assert [name for name in BY_NAME if name not in words and name != "plain"] == []
 
 
+def test_the_document_says_what_each_may_lose() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "stability.md").read_text(encoding="utf-8")
+    table = text.split("| condition | dB that may be lost, and why |\n")[1].split("\n\n")[0]
+    rows = [line.split("|")[1:3] for line in table.splitlines()]
+    said = {name.strip(): allowed.strip() for names, allowed in rows for name in names.split(",")}
+    assert [name for name in BY_NAME if name not in said and name != "plain"] == []
+    for name, condition in BY_NAME.items():
+        if name not in ("plain", "float16"):
+            assert said[name].startswith(f"{condition.allowed:g}"), name
+
+
 def test_the_plain_run_comes_first_whatever_is_asked_for() -> None:
     assert select([]) == list(CONDITIONS)
     assert [c.name for c in select(["inside", "all-white"])] == ["plain", "all-white", "inside"]

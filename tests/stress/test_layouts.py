@@ -21,7 +21,7 @@ FUNCTIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "frequencies": lambda x: frequency_encoding(x, 4),
 }
 """What takes (N, 3)."""
-each_function = st.sampled_from(list(FUNCTIONS))
+any_function = st.sampled_from(list(FUNCTIONS))
 
 
 def some(*shape: int) -> Tensor:
@@ -32,7 +32,7 @@ def some(*shape: int) -> Tensor:
 @pytest.mark.entry(12)
 @backends()
 @FEW
-@given(name=each_function, count=st.integers(0, 5), stride=st.integers(2, 3), transposed=st.booleans())
+@given(name=any_function, count=st.integers(0, 5), stride=st.integers(2, 3), transposed=st.booleans())
 def test_rows_that_do_not_stand_side_by_side(
     backend: str, name: str, count: int, stride: int, transposed: bool
 ) -> None:
@@ -51,7 +51,7 @@ def test_rows_that_do_not_stand_side_by_side(
 @pytest.mark.entry(1, 12)
 @backends()
 @FEW
-@given(name=each_function, count=st.integers(0, 5), dtype=st.sampled_from([torch.float16, torch.bfloat16]))
+@given(name=any_function, count=st.integers(0, 5), dtype=st.sampled_from([torch.float16, torch.bfloat16]))
 def test_half_precision_is_right_to_its_own_rounding_or_refused(
     backend: str, name: str, count: int, dtype: torch.dtype
 ) -> None:

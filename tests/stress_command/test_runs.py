@@ -184,7 +184,7 @@ def test_what_cannot_be_begun_is_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_help_is_quick_and_complete(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_without_a_method(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     stress(monkeypatch, "--help")
     assert "usage: ns-stress METHOD" in capsys.readouterr().out
 

@@ -49,7 +49,8 @@ class PoseRefinement(nn.Module):
         """The rays of training cameras as they are believed to be; those of others where they then are."""
         if rays.camera_indices is None:
             return self.carried(rays)
-        motions = self.motions()[rays.camera_indices]
+        # Not `motions[camera_indices]`, whose gradient is added up in whatever order threads come.
+        motions = nn.functional.embedding(rays.camera_indices, self.motions().flatten(1)).view(-1, 3, 4)
         turned = (motions[:, :, :3] * rays.directions[:, None]).sum(-1)
         origins = rays.origins
         if self.group == "SE3":

@@ -131,3 +131,20 @@ def test_normals_are_learnt_and_shown(shared_tiny: Path, tmp_path: Path) -> None
     middle = image.accumulation > 0.95
     agreement = (image.normals * (2 * image.rgb - 1)).sum(-1)[middle]
     assert agreement.mean() > 0.7
+
+
+def test_appearances_of_many_samples_learn_the_same_bits_each_time() -> None:
+    """Gradients of looked-up rows that torch adds up by atomics differ from run to run."""
+    torch.manual_seed(0)
+    indices, weights = torch.randint(3, (50_000,)), torch.randn(50_000, 2)
+
+    def gradient() -> torch.Tensor:
+        appearance = Appearance(2, 3)
+        (weights * appearance(indices, len(indices))).sum().backward()
+        assert appearance.vectors.grad is not None
+        return appearance.vectors.grad
+
+    first = gradient()
+    assert all(torch.equal(gradient(), first) for _ in range(5))
+    exact = torch.zeros(3, 2, dtype=torch.float64).index_add_(0, indices, weights.double())
+    torch.testing.assert_close(first.double(), exact, rtol=1e-4, atol=1e-3)

@@ -1,4 +1,4 @@
-"""Time and error of each compiled kernel against its torch reference, beside the least time the machine's ceilings allow.
+"""Time and error of each compiled kernel against its torch reference, beside the least that the ceilings allow.
 
 Both run in one process, in turn, on one thread and on all. Errors are of both, against float64. NERFLOOM_KERNELS=avx2
 in the environment forces that variant.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -65,8 +64,8 @@ class Kernel:
     """What it works on: sample, ray or entry."""
     count: int
     """How many at once."""
-    compiled: Run
-    reference: Run
+    runs: tuple[Run, Run]
+    """Compiled, and the reference."""
     work: Work | None
     """Of the forward pass, for each of them; None where no ceiling says anything."""
     errors: Callable[[], tuple[Errors, Errors]] | None = None
@@ -122,7 +121,7 @@ def measured(kernel: Kernel, ceilings: Ceilings, repeats: int, all_threads: int)
     try:
         for threads in sorted({1, all_threads}):
             torch.set_num_threads(threads)
-            times = alternating(kernel.compiled, kernel.reference, repeats)
+            times = alternating(*kernel.runs, repeats)
             (forward, *backward), (reference_forward, *reference_backward) = (
                 [seconds / kernel.count * 1e9 for seconds in stages] for stages in (times.compiled, times.reference)
             )
@@ -222,8 +221,7 @@ def of_function(
         name,
         "sample",
         len(inputs[0]),
-        differentiated(compiled, inputs, None, backward),
-        differentiated(reference, inputs, None, backward),
+        (differentiated(compiled, inputs, None, backward), differentiated(reference, inputs, None, backward)),
         work,
         lambda: (errors(compiled, reference, inputs, backward), errors(reference, reference, inputs, backward)),
     )
@@ -283,7 +281,7 @@ def _hash_grid(positions: Tensor, log2: int, of_positions: bool) -> Described:
     )
 
 
-def _network(count: int, widths: tuple[int, ...], activation: str, bfloat16: bool) -> Described:
+def _network(count: int, widths: tuple[int, ...], activation: Activation, bfloat16: bool) -> Described:
     weights = [torch.randn(b, a) * (2 / a) ** 0.5 for a, b in pairwise(widths)]
 
     def compiled(x: Tensor, *w: Tensor) -> Tensor:
@@ -337,8 +335,7 @@ def _plane_lookup(name: str, layout: PlanesLayout, features: int, count: int) ->
         name,
         "sample",
         count,
-        differentiated(ours, [values], gradient),
-        differentiated(theirs, images, gradient),
+        (differentiated(ours, [values], gradient), differentiated(theirs, images, gradient)),
         Work(bytes=4 * features * (corners + layout.num_groups)),
         lambda: (errors(ours, exact, [values], True), errors(exact, exact, [values], True)),
     )
@@ -355,8 +352,8 @@ def _marching() -> Kernel:
         while (wave := marching.wave(16)) is not None:
             marching.advance(torch.zeros_like(wave.t_starts))
 
-    runs = [once(partial(march, kind)) for kind in (March, ReferenceMarch)]
-    return Kernel("marching through a grid of 128^3, 3 % occupied", "ray", len(rays), *runs, None)
+    runs = once(lambda: march(March)), once(lambda: march(ReferenceMarch))
+    return Kernel("marching through a grid of 128^3, 3 % occupied", "ray", len(rays), runs, None)
 
 
 def _updating() -> Kernel:
@@ -375,8 +372,8 @@ def _updating() -> Kernel:
         return step
 
     work = Work(bytes=4 * (2 * 4 + 1) * 2)  # value, gradient and both moments of 2, and its uses: read and written
-    runs = [steps(update) for update in (sparse_adam, sparse_adam_reference)]
-    return Kernel("sparse Adam, half of 2^19 x 2", "entry", updated, *runs, work)
+    runs = steps(sparse_adam), steps(sparse_adam_reference)
+    return Kernel("sparse Adam, half of 2^19 x 2", "entry", updated, runs, work)
 
 
 def _ray_generation(model: str, lens: list[float]) -> Kernel:
@@ -385,5 +382,5 @@ def _ray_generation(model: str, lens: list[float]) -> Kernel:
     bent = torch.tensor([lens]) if lens else None
     cameras = Cameras(torch.eye(4)[None, :3], focal, focal, cx, cy, width, height, model, bent)
     flat = torch.randint(1600 * 1200, (8192,))
-    runs = [once(partial(make, flat, 0.1, 9.0)) for make in (cameras.pixel_rays, cameras.pixel_rays_reference)]
-    return Kernel(f"rays of {model} cameras", "ray", len(flat), *runs, Work(bytes=8 + 4 * (3 + 3 + 2)))
+    runs = once(lambda: cameras.pixel_rays(flat, 0.1, 9.0)), once(lambda: cameras.pixel_rays_reference(flat, 0.1, 9.0))
+    return Kernel(f"rays of {model} cameras", "ray", len(flat), runs, Work(bytes=8 + 4 * (3 + 3 + 2)))

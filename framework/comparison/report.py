@@ -119,7 +119,11 @@ def condition_lines(conditions: Conditions, repeats: int, runs: Sequence[Measure
         f"Final figures are means over {judged} held-out views; learning curves over {conditions.curve_images} views "
         "at most, whose evaluation does not count as training time.",
         f"{repeats} seed{'s' if repeats > 1 else ''} a method"
-        + (": means, ± the standard deviation of a single run." if repeats > 1 else "; --repeats 3 would tell how much runs differ."),
+        + (
+            ": means, ± the standard deviation of a single run."
+            if repeats > 1
+            else "; --repeats 3 would tell how much runs differ."
+        ),
     ]
     notes = sorted({run.lpips_note for run in runs if run.lpips is None})
     return lines + [f"LPIPS {note}" for note in notes]

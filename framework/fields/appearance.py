@@ -26,7 +26,7 @@ class Appearance(nn.Module):
     def forward(self, camera_indices: Tensor | None, count: int) -> Tensor:
         """(N, D) of the photographs `camera_indices` (N,); of None, what is `shown` or else the mean, N times."""
         if camera_indices is not None:
-            # Its gradient is added up in order; that of `vectors[camera_indices]` as threads come, from 32,768 numbers on.
+            # Not `vectors[camera_indices]`, whose gradient is added up in whatever order threads come.
             return functional.embedding(camera_indices, self.vectors)
         return (self.vectors.mean(0) if self._shown is None else self._shown).expand(count, -1)
 

@@ -72,7 +72,7 @@ def resample_reference(
     edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float, padding: float
 ) -> Tensor:
     """As `resample`, in torch, in any float type."""
-    heavy = weights**power + padding
+    heavy = weights.to(torch.promote_types(weights.dtype, edges.dtype)) ** power + padding
     cdf = torch.cat([torch.zeros_like(heavy[:, :1]), heavy.cumsum(-1)], dim=-1)
     steps = torch.arange(count + 1, device=edges.device)
     u = cdf[:, -1:] * (steps + shift[:, None]) / (count + 1)

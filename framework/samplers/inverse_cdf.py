@@ -15,7 +15,7 @@ def inverse_cdf(edges: Tensor, weights: Tensor, u: Tensor, padding: float = 1e-5
         u: (R, S) in [0, 1]: random or evenly spaced, in any order.
     Returns: (R, S) points within [edges[:, 0], edges[:, -1]], in the order of u.
     """
-    weights = weights + padding
+    weights = weights.to(torch.promote_types(weights.dtype, edges.dtype)) + padding
     cdf = torch.cumsum(weights / weights.sum(-1, keepdim=True), dim=-1)
     # Rounding leaves the end off 1 by some 1e-7: it is set, not hoped for.
     cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf[:, :-1].clamp(max=1), torch.ones_like(cdf[:, :1])], dim=-1)

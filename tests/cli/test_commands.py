@@ -81,7 +81,7 @@ def test_damaged_data_is_one_line_and_debug_shows_more(tiny: Path, tmp_path: Pat
     assert done.returncode == 1
     assert "transforms_train.json is not JSON" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
-    assert "Traceback" in called("ns-train", *arguments, "--debug").stderr
+    assert "Traceback" in run("ns-train", *arguments, "--debug").stderr
     assert not (tmp_path / "out").exists()
 
 

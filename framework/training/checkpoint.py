@@ -11,12 +11,14 @@ import io
 import os
 import re
 import warnings
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 
+from framework.archives import unfolded_size
 from framework.console import say
 from framework.errors import CheckpointError
 
@@ -30,7 +32,7 @@ PIECE = 2**24
 _NAME = re.compile(r"step-(\d{9})\.ckpt")
 
 
-def write_atomically(path: Path, write: Any) -> None:
+def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Call `write(file)` on a temporary file beside `path`, flush it to disk and rename it.
 
     Raises: OSError as it comes; `path` is then as it was, and no temporary file is left.
@@ -95,6 +97,8 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
     """
     try:
         sealed = _is_sealed(path)
+        if unfolded_size(path) > path.stat().st_size:  # torch compresses nothing, but would unfold what is
+            raise CheckpointError(f"{path} is damaged: it would unfold to more than it holds")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torch's doubts about foreign pickles; they are refused below
             state = torch.load(path, map_location=device, weights_only=True)

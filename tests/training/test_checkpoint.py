@@ -2,6 +2,7 @@
 
 import errno
 import pickle
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -120,6 +121,18 @@ def test_a_checkpoint_cannot_run_code(tmp_path: Path) -> None:
         with pytest.raises(CheckpointError):
             load_checkpoint(tmp_path / name)
     assert not (tmp_path / "proof").exists()
+
+
+def test_one_that_would_unfold_to_more_than_it_holds_is_refused(tmp_path: Path) -> None:
+    """torch compresses nothing, but unfolds what is: 10 kB may stand for 10 MB, and 10 MB for more than memory has."""
+    path = save(tmp_path, 1)
+    with zipfile.ZipFile(path) as stored, zipfile.ZipFile(tmp_path / "bomb.ckpt", "w", zipfile.ZIP_DEFLATED) as packed:
+        for name in stored.namelist():
+            packed.writestr(name, stored.read(name))
+        packed.writestr("archive/data/9", bytes(10**7))
+    assert (tmp_path / "bomb.ckpt").stat().st_size < 10**5
+    with pytest.raises(CheckpointError, match="would unfold to more than it holds"):
+        load_checkpoint(tmp_path / "bomb.ckpt")
 
 
 def test_a_full_disk_leaves_the_old_one_and_no_rubbish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -52,7 +52,7 @@ def other_content(random: Random, content: bytes) -> bytes:
 
 
 def unfolding(random: Random, content: bytes) -> bytes:
-    """As before, but compressed, and with more in it than there are bytes."""
+    """The same content, but compressed, and with more in it than the file has bytes."""
     packed = io.BytesIO()
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as stored, zipfile.ZipFile(packed, "w") as bomb:

@@ -12,8 +12,8 @@ from framework.errors import CheckpointError
 from framework.training.checkpoint import list_checkpoints, load_checkpoint, load_newest, save_checkpoint
 
 
-def save(folder: Path, step: int, keep_all: bool = False) -> Path:
-    return save_checkpoint(folder, step, {"model": {"w": torch.full((50,), float(step))}}, keep_all)
+def save(folder: Path, step: int, keep_all: bool = False, before: int | None = None) -> Path:
+    return save_checkpoint(folder, step, {"model": {"w": torch.full((50,), float(step))}}, keep_all, before)
 
 
 def test_the_two_newest_are_kept(tmp_path: Path) -> None:
@@ -40,6 +40,21 @@ def test_a_damaged_later_one_pushes_nothing_out(tmp_path: Path) -> None:
     assert names == [3, 4, 8, 9]
     save(tmp_path, 9)
     assert [int(path.stem[5:]) for path in list_checkpoints(tmp_path)] == [8, 9]
+
+
+def test_the_one_that_stays_can_be_read(tmp_path: Path) -> None:
+    """A run that went on from step 4, as that of step 8 is damaged, and is past it: the damaged one goes."""
+    for step in (2, 4, 8):
+        save(tmp_path, step, keep_all=True)
+    (tmp_path / "step-000000008.ckpt").write_bytes(b"damaged")
+    newest = save(tmp_path, 9, before=4)
+    assert [int(path.stem[5:]) for path in list_checkpoints(tmp_path)] == [4, 9]
+    newest.write_bytes(b"damaged")
+    state = load_newest(tmp_path)
+    assert state is not None
+    assert state["model"]["w"][0] == 4
+    save(tmp_path, 10, before=7)  # of which there is none
+    assert [int(path.stem[5:]) for path in list_checkpoints(tmp_path)] == [9, 10]
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.3, 0.99])

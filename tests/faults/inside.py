@@ -35,6 +35,7 @@ def full_disk() -> None:
     """No file may grow beyond a size: the system itself refuses to write more."""
     import resource
 
+    sys.dont_write_bytecode = True  # Python may keep half of a compiled file, which ends every later import of it
     resource.setrlimit(resource.RLIMIT_FSIZE, (LARGEST_FILE, LARGEST_FILE))
     say_so()
 

@@ -13,6 +13,7 @@ from dataparsers.captured import ENDINGS, REDUCED, Captured, Photographs, captur
 from dataparsers.colmap_model import find_models
 from dataparsers.masks import find_masks
 from framework import DataError, ParsedScene
+from framework.arrays import read_array
 from framework.cameras import check_pose
 from framework.dataset import Split, one_line
 from framework.ndc import NdcCameras, find_ndc, ndc_box
@@ -98,14 +99,13 @@ def read_poses_bounds(file: Path, count: int) -> tuple[Tensor, Tensor, Tensor, T
     Raises: DataError where the file is missing, damaged, or of another number of images.
     """
     try:
-        table = np.load(file, allow_pickle=False)
+        table = read_array(file)
     except OSError as error:
         raise DataError(f"cannot read {file}: {error.strerror or one_line(error)}") from error
-    except Exception as error:  # numpy raises ValueError, EOFError, SyntaxError, MemoryError and more
+    except Exception as error:  # numpy raises ValueError, EOFError, SyntaxError, OverflowError and more
         raise DataError(f"{file} is not an array of numpy: {one_line(error)}") from error
-    if not isinstance(table, np.ndarray) or table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind not in "fiu":
-        shape = getattr(table, "shape", None)
-        raise DataError(f"{file} holds an array of shape {shape}; it must be numbers of shape (images, 17)")
+    if table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind not in "fiu":
+        raise DataError(f"{file} holds an array of shape {table.shape}; it must be numbers of shape (images, 17)")
     if len(table) != count:
         raise DataError(
             f"{file} has poses of {len(table)} images, but there are {count}: which is whose cannot be told; "

@@ -27,7 +27,7 @@ class MachineConfig:
     """Where the run happens."""
 
     seed: int = 42
-    """Random seed. The same seed, machine and thread count give the same bits."""
+    """Random seed. The same seed, processor and thread count give the same bits; a GPU's sums differ in rounding."""
     device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """Device to train on; auto takes CUDA where it is present."""
     num_threads: int | None = None

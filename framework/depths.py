@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from framework.arrays import read_array
 from framework.cameras import Cameras
 from framework.errors import DataError
 from framework.image_files import one_line
@@ -25,7 +26,7 @@ def read_depth(path: Path, width: int, height: int) -> np.ndarray:
     if not path.is_file():
         raise DataError(f"the depth image {path} does not exist")
     try:
-        depth = np.load(path, allow_pickle=False) if path.suffix == ".npy" else iio.imread(path, plugin="pillow")
+        depth = read_array(path) if path.suffix == ".npy" else iio.imread(path, plugin="pillow", index=0)
         depth = np.asarray(depth).astype(np.float32)
     except Exception as error:  # as in `read_image`
         raise DataError(f"the depth image {path} cannot be read: {one_line(error)}") from error

@@ -13,15 +13,18 @@ import torch
 from framework.config import MachineConfig
 from framework.errors import ConfigError
 
+MOST_THREADS = 1024
+"""That a file of settings may ask for: where the system refuses to start as many, OpenMP ends the process."""
+
 
 def choose_device(machine: MachineConfig) -> torch.device:
     """The device asked for, with its threads set.
 
-    Raises: ConfigError where this machine does not have it.
+    Raises: ConfigError where this machine does not have it, or the number of threads is none.
     """
     if machine.num_threads is not None:
-        if machine.num_threads < 1:
-            raise ConfigError(f"--machine.num-threads is {machine.num_threads}; it must be at least 1")
+        if not 1 <= machine.num_threads <= MOST_THREADS:
+            raise ConfigError(f"--machine.num-threads is {machine.num_threads}; it must be from 1 to {MOST_THREADS}")
         torch.set_num_threads(machine.num_threads)
     available = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
     if machine.device_type == "auto":

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from framework.archives import unfolded_size
 from framework.device import machine_memory
 from framework.errors import DataError
 from framework.pixel_store import FileStore
@@ -72,8 +73,11 @@ def unpack(path: Path) -> dict[str, np.ndarray] | None:
             if magic != MAGIC or length > size:
                 return None
             file.seek(size - length)
-            with np.load(io.BytesIO(file.read(length)), allow_pickle=False) as content:
-                facts = {name: content[name] for name in content.files}
+            packed = file.read(length)
+        if unfolded_size(io.BytesIO(packed)) > length:  # `pack` compresses nothing
+            return None
+        with np.load(io.BytesIO(packed), allow_pickle=False) as content:
+            facts = {name: content[name] for name in content.files}
         whole = size - length == int(facts["pixels"]) * int(facts["channels"])
     except Exception:  # numpy, zipfile and zlib raise ValueError, EOFError, KeyError, BadZipFile, zlib.error and more
         return None

@@ -1,6 +1,7 @@
 """Sets larger than memory may hold: decoded once, whole or not at all, and found again."""
 
 import errno
+import io
 import os
 import signal
 import subprocess
@@ -16,7 +17,7 @@ from framework.config import TrainConfig
 from framework.dataset import Dataset, ParsedScene, load_dataset, read_image
 from framework.device import machine_memory
 from framework.errors import ConfigError, DataError
-from framework.pixel_cache import PixelMemory, unpack
+from framework.pixel_cache import MAGIC, PixelMemory, unpack
 from framework.pixel_store import FileStore
 from tests.images import noise, parsed, write_noise
 
@@ -193,6 +194,18 @@ def test_a_byte_of_the_ending_that_changed(scene: ParsedScene, folder: Path) -> 
         found = unpack(path)
         if found is not None:
             assert (int(found["pixels"]), int(found["channels"]), found["left"].tolist()) == (pixels, 3, [0, 1, 2, 3])
+
+
+def test_an_ending_that_would_unfold_to_more_than_it_holds_is_not_read(scene: ParsedScene, folder: Path) -> None:
+    cached(scene, folder)
+    path, ending = next(folder.iterdir()), io.BytesIO()
+    facts = unpack(path)
+    assert facts is not None
+    np.savez_compressed(ending, **facts, more=np.zeros(10**6))
+    size = int(facts["pixels"]) * int(facts["channels"])
+    values = ending.getvalue()
+    path.write_bytes(path.read_bytes()[:size] + values + len(values).to_bytes(8, "little") + MAGIC)
+    assert unpack(path) is None
 
 
 MEASURE = """

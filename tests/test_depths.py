@@ -7,6 +7,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from framework.cameras import Cameras
 from framework.dataset import load_dataset
@@ -31,6 +32,16 @@ def test_a_smaller_depth_image_gives_its_nearest_value(tmp_path: Path) -> None:
     assert set(found.reshape(-1).tolist()) == {1.0, 2.0, 3.0, 4.0}
     assert found[0, 0] == 1
     assert found[3, 4] == 4
+
+
+def test_of_an_animation_the_first_picture_is_read(tmp_path: Path) -> None:
+    """All of them together may take any memory."""
+    steps = [np.full((2, 3), value, np.uint8) for value in (7, 9)]
+    first, second = map(Image.fromarray, steps)
+    first.save(tmp_path / "d.png", save_all=True, append_images=[second])
+    with Image.open(tmp_path / "d.png") as written:
+        assert written.n_frames == 2
+    assert read_depth(tmp_path / "d.png", 3, 2).tolist() == steps[0].tolist()
 
 
 @pytest.mark.parametrize("content", ["missing", "text", "colour", "pickle"])

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from framework.config import MachineConfig
-from framework.device import choose_device, has_bfloat16, peak_memory, stream_seed
+from framework.device import MOST_THREADS, choose_device, has_bfloat16, peak_memory, stream_seed
 from framework.errors import ConfigError
 
 
@@ -31,8 +31,10 @@ def test_threads_are_set_and_checked() -> None:
         assert torch.get_num_threads() == 1
     finally:
         torch.set_num_threads(before)
-    with pytest.raises(ConfigError, match=r"--machine\.num-threads is 0"):
-        choose_device(MachineConfig(num_threads=0))
+    for number in (0, MOST_THREADS + 1):
+        with pytest.raises(ConfigError, match=rf"--machine\.num-threads is {number}; it must be from 1 to "):
+            choose_device(MachineConfig(num_threads=number))
+    assert torch.get_num_threads() == before
 
 
 def test_peak_memory_counts_what_is_held() -> None:

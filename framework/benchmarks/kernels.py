@@ -28,7 +28,7 @@ from framework.kernels.compositing import composite, composite_reference
 from framework.kernels.frequency import frequency_encoding, frequency_encoding_reference
 from framework.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
 from framework.kernels.march import March, Occupancy, ReferenceMarch
-from framework.kernels.mlp import mlp, mlp_reference
+from framework.kernels.mlp import Activation, mlp, mlp_reference
 from framework.kernels.planes import PlanesLayout, planes, planes_reference
 from framework.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
 from framework.machine import machine
@@ -180,7 +180,8 @@ def kernels(count: int) -> Iterator[Kernel]:
     for log2 in (15, 17, 19):
         yield of_function(f"hash grid, 16 levels x 2, tables of 2^{log2}", *_hash_grid(positions, log2, False))
     yield of_function("hash grid, gradient of positions too, 2^17", *_hash_grid(positions, 17, True))
-    for widths, activation in (((32, 64, 16), "none"), ((32, 64, 64, 3), "sigmoid")):
+    networks: list[tuple[tuple[int, ...], Activation]] = [((32, 64, 16), "none"), ((32, 64, 64, 3), "sigmoid")]
+    for widths, activation in networks:
         for kind in ("float32", "bfloat16") if native.has("mlp_forward_bf16") else ("float32",):
             name = f"network {'-'.join(map(str, widths))}, {kind}"
             yield of_function(name, *_network(count, widths, activation, kind == "bfloat16"))

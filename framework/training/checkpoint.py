@@ -11,12 +11,14 @@ import io
 import os
 import re
 import warnings
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 
+from framework.archives import unfolded_size
 from framework.console import say
 from framework.errors import CheckpointError
 
@@ -30,7 +32,7 @@ PIECE = 2**24
 _NAME = re.compile(r"step-(\d{9})\.ckpt")
 
 
-def write_atomically(path: Path, write: Any) -> None:
+def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Call `write(file)` on a temporary file beside `path`, flush it to disk and rename it.
 
     Raises: OSError as it comes; `path` is then as it was, and no temporary file is left.
@@ -58,14 +60,17 @@ def _flush_folder(folder: Path) -> None:
             os.close(opened)
 
 
-def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bool) -> Path:
-    """Write `state` as step-%09d.ckpt; then, unless `keep_all`, remove all before it but the last.
+def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bool, before: int | None = None) -> Path:
+    """Write `state` as step-%09d.ckpt; then, unless `keep_all`, remove all before it but one.
 
     Later ones stay: they were damaged, or the run would not have gone on from an earlier one, and push nothing out.
 
+    Args:
+        before: the step of the one that stays, which the run has saved, or gone on from, last: a later one is damaged.
+            If there is none of that step, the last before `step` stays.
     Raises: CheckpointError where it cannot be written; older checkpoints are untouched then.
     """
-    path = folder / f"step-{step:09d}.ckpt"
+    path = _path(folder, step)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         content = io.BytesIO()  # written by torch itself, a full disk is reported as "unexpected pos"
@@ -77,10 +82,17 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bo
         raise CheckpointError(f"cannot write {path}: {error}; earlier checkpoints stand") from error
     for remnant in folder.glob(".step-*.ckpt.*.tmp"):  # of a process that was killed while writing
         remnant.unlink(missing_ok=True)
-    if not keep_all:
-        for old in [other for other in list_checkpoints(folder) if other.name < path.name][:-1]:
+    earlier = [other for other in list_checkpoints(folder) if other.name < path.name]
+    known = None if before is None else _path(folder, before)
+    staying = known if known in earlier else next(reversed(earlier), None)
+    for old in earlier:
+        if not keep_all and old != staying:
             old.unlink(missing_ok=True)
     return path
+
+
+def _path(folder: Path, step: int) -> Path:
+    return folder / f"step-{step:09d}.ckpt"
 
 
 def list_checkpoints(folder: Path) -> list[Path]:
@@ -95,6 +107,8 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
     """
     try:
         sealed = _is_sealed(path)
+        if unfolded_size(path) > path.stat().st_size:  # torch compresses nothing, but would unfold what is
+            raise CheckpointError(f"{path} is damaged: it would unfold to more than it holds")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torch's doubts about foreign pickles; they are refused below
             state = torch.load(path, map_location=device, weights_only=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import platform
 from collections.abc import Iterator
@@ -27,8 +28,10 @@ def sole_user(folder: Path) -> Iterator[None]:
         # A link could lead to a file of someone's, which would be written over.
         opened = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
     except OSError as error:
-        raise ConfigError(f"cannot write the run's folder {folder}: {error.strerror}") from error
+        raise ConfigError(f"cannot write the run's folder {folder}: {error.strerror or error}") from error
     try:
+        if not os.access(folder, os.W_OK):  # where a lock of before may be written to nevertheless
+            raise ConfigError(f"cannot write the run's folder {folder}: {os.strerror(errno.EACCES)}")
         if not _locked(opened):
             who = os.read(opened, 200).decode("utf-8", "replace") or "another process"
             raise ConfigError(f"{folder} is in use by {who}; wait until it has ended, or stop it")

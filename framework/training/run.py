@@ -82,7 +82,7 @@ def create_folder(run: Run) -> None:
         run.folder.mkdir(parents=True, exist_ok=True)
         write_atomically(run.config_path, lambda file: file.write(text.encode()))
     except OSError as error:
-        raise ConfigError(f"cannot write the run's folder {run.folder}: {error.strerror}") from error
+        raise ConfigError(f"cannot write the run's folder {run.folder}: {error.strerror or error}") from error
 
 
 def read_run(path: Path) -> Run:

@@ -11,7 +11,7 @@ import torch
 
 from framework.config import RaysPerPixel, TrainConfig
 from framework.device import choose_device
-from framework.errors import CheckpointError
+from framework.errors import CheckpointError, NerfloomError
 from framework.model import Model
 from framework.registry import load_method
 from framework.scene import Scene
@@ -84,13 +84,19 @@ def restored_model(method: str, config: TrainConfig, checkpoint: dict[str, Any],
 
     Args:
         checkpoint: its content; the model is made for the scene in it.
-    Raises: CheckpointError where that lacks the scene, or has parameters of other names or sizes.
+    Raises: CheckpointError where that lacks the scene, the settings make no model of it, or parameters have other names
+        or sizes.
     """
     try:
         scene = Scene.of(checkpoint.get("scene")).to("cpu")
     except ValueError as error:
         raise CheckpointError(f"the checkpoint lacks the scene: {error}") from error
-    model = build_model(method, config, scene).to(device).eval()
+    try:
+        model = build_model(method, config, scene).to(device).eval()
+    except NerfloomError:
+        raise
+    except (ArithmeticError, LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:
+        raise CheckpointError(f"the settings make no model: {_short(error)}") from error
     restore_model(model, checkpoint)
     return model
 
@@ -103,5 +109,9 @@ def restore_model(model: Model[Any], checkpoint: dict[str, Any]) -> None:
     try:
         model.load_state_dict(checkpoint["model"])
     except (RuntimeError, TypeError, AttributeError, ValueError, LookupError, ArithmeticError, MemoryError) as error:
-        reason = " ".join(str(error).split())[:300]
-        raise CheckpointError(f"the checkpoint does not fit the model's settings: {reason}") from error
+        raise CheckpointError(f"the checkpoint does not fit the model's settings: {_short(error)}") from error
+
+
+def _short(error: BaseException) -> str:
+    """What torch says in many lines, in one."""
+    return (" ".join(str(error).split()) or type(error).__name__)[:300]

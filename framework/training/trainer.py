@@ -101,6 +101,7 @@ class Trainer:
         self.first_step = 0
         self._bad_in_a_row = 0
         self._prepared = False
+        self._saved_step: int | None = None
         self._last_save = self._last_eval = self._picture_seconds = 0.0
 
     # -- checkpoints ------------------------------------------------------------------------------------------
@@ -124,9 +125,10 @@ class Trainer:
             "state": vars(self.state),
             "errors": None if self.errors is None else self.errors.errors,
         }
-        return save_checkpoint(
-            self.checkpoint_folder, self.state.step, content, keep_all=not self.config.save_only_latest_checkpoint
-        )
+        step, keep_all = self.state.step, not self.config.save_only_latest_checkpoint
+        path = save_checkpoint(self.checkpoint_folder, step, content, keep_all, before=self._saved_step)
+        self._saved_step = step
+        return path
 
     def restore(self, checkpoint: dict[str, Any]) -> None:
         """Continue from a checkpoint's content.
@@ -144,7 +146,7 @@ class Trainer:
                 self.errors.errors.copy_(checkpoint["errors"])
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise CheckpointError(f"the checkpoint's optimiser or state does not fit: {error}") from error
-        self.first_step = self.state.step
+        self.first_step = self._saved_step = self.state.step
         self._last_save = self.state.seconds
         self._last_eval = self.state.curve[-1][0] if self.state.curve else 0.0
 

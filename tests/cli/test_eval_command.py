@@ -147,6 +147,20 @@ def test_settings_that_do_not_fit_the_checkpoint(finished: Path, refused: Refuse
     assert "the checkpoint does not fit the model's settings" in said
 
 
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"features_per_level": 2**40}, "the settings make no model: "),
+        ({"machine": {"num_threads": 10**6}}, "--machine.num-threads is 1000000; it must be from 1 to 1024"),
+    ],
+)
+def test_settings_beyond_any_machine_are_refused(
+    settings: dict[str, Any], said: str, finished: Path, refused: Refused
+) -> None:
+    edit_config(finished, **settings)
+    assert refused(main, "--load-config", finished / "config.yml", "--device-type", "cpu").startswith(f"error: {said}")
+
+
 class Malicious:
     def __init__(self, proof: Path) -> None:
         self.proof = proof

@@ -15,15 +15,16 @@ import pytest
 import torch
 
 from framework.cli import evaluate as eval_command
+from framework.cli.session import resume
 from framework.cli.session import start as start_session
-from framework.errors import ConfigError
+from framework.errors import CheckpointError, ConfigError
 from framework.evaluation.evaluator import evaluate
 from framework.evaluation.images import write_image
-from framework.training.checkpoint import list_checkpoints, load_newest, write_atomically
+from framework.training.checkpoint import FOLDER, write_atomically
 from framework.training.run import create_folder, read_run, write_report
-from tests.cli.helpers import TINY_NGP, run
 from tests.conftest import Refused
 from tests.faults.conftest import Disk
+from tests.faults.runs import ended, readable_steps, start
 from tests.training.helpers import tiny_run, tiny_trainer
 
 
@@ -157,24 +158,32 @@ def test_photographs_with_long_names_have_pictures(tiny: Path, tmp_path: Path) -
 
 def test_a_disk_that_fills_up_while_training(shared_tiny: Path, tmp_path: Path, disk: Disk) -> None:
     """Really: room for one checkpoint and a half. The run trains to its end, keeps what it has, and is resumed."""
-    settings = {"max_num_iterations": 1, "max_eval_images": 0, "sparse_updates": False}
-    one = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "one", **settings).train()
+    one = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "one", max_num_iterations=1, max_eval_images=0).train()
     disk(f"size={one.checkpoint.stat().st_size * 3 // 2 // 1024 + 64}k")
-    flags = ["--max-num-iterations", 12, "--steps-per-save", 4, "--max-eval-images", 0]
-    where = ["--data", shared_tiny, "--output-dir", tmp_path / "disk", "--timestamp", "t"]
-    done = run("ns-train", "instant-ngp", *where, *TINY_NGP, *flags)
-    folder = tmp_path / "disk" / shared_tiny.name / "instant-ngp" / "t"
-    assert done.returncode == 1
-    assert "Traceback" not in done.stderr
-    assert "No space left on device; earlier checkpoints stand" in done.stderr
-    assert [path.name for path in list_checkpoints(folder / "nerfstudio_models")] == ["step-000000004.ckpt"]
-    assert not list((folder / "nerfstudio_models").glob(".*"))
+    settings = {"max_num_iterations": 12, "steps_per_save": 4, "max_eval_images": 0}
+    run = tiny_run("instant-ngp", shared_tiny, tmp_path / "disk" / "run", **settings)
+    with pytest.raises(CheckpointError, match="No space left on device; earlier checkpoints stand"):
+        start_session(run)
+    assert [path.name for path in (run.folder / FOLDER).iterdir()] == ["step-000000004.ckpt"]
+    assert readable_steps(run.folder) == [4]
     disk("size=64m")
-    done = run("ns-train", "--resume", folder)
-    assert done.returncode == 0, done.stderr
-    saved = load_newest(folder / "nerfstudio_models")
-    assert saved is not None
-    assert saved["state"]["step"] == 12
+    resume(run)
+    assert readable_steps(run.folder) == [8, 12]
+
+
+@pytest.mark.slow
+def test_files_that_may_not_grow(shared_tiny: Path, tmp_path: Path) -> None:
+    """Where no disk may be mounted: the system itself refuses to write more to a file."""
+    folder = tmp_path / "run"
+    tiny_trainer("instant-ngp", shared_tiny, folder, max_num_iterations=4, max_eval_images=0).train()
+    process = start("--resume", folder, "--max-num-iterations", 12, "--steps-per-save", 4, world="full disk")
+    said = ended(process)
+    assert process.returncode == 1
+    assert "Traceback" not in said
+    assert said.strip().splitlines()[-1].startswith("error: cannot write ")
+    assert said.count("File too large; earlier checkpoints stand") == 3  # at 8, at 12, and at the end: it went on
+    assert [path.name for path in (folder / FOLDER).iterdir()] == ["step-000000004.ckpt"]
+    assert readable_steps(folder) == [4]
 
 
 def test_a_disk_that_is_full_from_the_start(shared_tiny: Path, tmp_path: Path, disk: Disk) -> None:

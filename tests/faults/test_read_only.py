@@ -7,6 +7,7 @@ import pytest
 
 from framework.cli import evaluate as eval_command
 from framework.cli.train import main
+from framework.training.lock import LOCK
 from tests.cli.helpers import TINY_NGP
 from tests.conftest import Refused
 from tests.faults.conftest import Disk
@@ -24,9 +25,15 @@ def refuse_all(data: Path, folder: Path, a_run: Path, refused: Refused) -> None:
     assert f"cannot write {a_run / 'eval.json'}" in said
 
 
-def test_a_folder_without_the_right(shared_tiny: Path, tmp_path: Path, read_only: ReadOnly, refused: Refused) -> None:
+@pytest.mark.parametrize("locked_before", [False, True])
+def test_a_folder_without_the_right(
+    locked_before: bool, shared_tiny: Path, tmp_path: Path, read_only: ReadOnly, refused: Refused
+) -> None:
+    """The file of a lock of before may be written, but nothing else."""
     a_run = tmp_path / "outputs" / "run"
     tiny_trainer("instant-ngp", shared_tiny, a_run, max_num_iterations=1, max_eval_images=0).train()
+    if locked_before:
+        (a_run / LOCK).touch()
     read_only(a_run)
     read_only(tmp_path / "outputs")
     refuse_all(shared_tiny, tmp_path / "outputs", a_run, refused)

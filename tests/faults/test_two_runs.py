@@ -5,20 +5,19 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
+from framework.cli.session import start as start_session
 from framework.cli.train import main
 from framework.errors import ConfigError
 from framework.training.lock import LOCK, sole_user
 from tests.conftest import Refused
-from tests.training.helpers import tiny_trainer
-from tests.training.test_faults import new_run, start
+from tests.faults.runs import ROOT, ended, new_run, start, wait_for_checkpoint
+from tests.training.helpers import tiny_run, tiny_trainer
 
 pytest.importorskip("fcntl")
-ROOT = Path(__file__).parents[2]
 HOLD = """
 import sys, time
 from pathlib import Path
@@ -100,11 +99,19 @@ def test_a_run_that_goes_on_elsewhere_cannot_be_resumed(shared_tiny: Path, tmp_p
     assert sorted(path.name for path in (folder / "nerfstudio_models").iterdir()) == before
 
 
+def test_a_new_run_in_a_folder_that_is_held_is_refused(shared_tiny: Path, tmp_path: Path) -> None:
+    run = tiny_run("instant-ngp", shared_tiny, tmp_path / "run")
+    with sole_user(run.folder), pytest.raises(ConfigError, match=f"run is in use by process {os.getpid()} "):
+        start_session(run)
+    assert [path.name for path in run.folder.iterdir()] == [LOCK]
+
+
+@pytest.mark.slow
 def test_two_that_begin_at_once(shared_tiny: Path, tmp_path: Path) -> None:
     """One trains; the other says why it does not, and touches nothing."""
     flags, folder = new_run(shared_tiny, tmp_path, 40)
     both = [start(*flags) for _ in range(2)]
-    said = [process.communicate(timeout=120)[1] for process in both]
+    said = [ended(process) for process in both]
     assert sorted(process.returncode for process in both) == [0, 1], said
     refusal = next(text for text, process in zip(said, both, strict=True) if process.returncode == 1)
     last = refusal.strip().splitlines()[-1]
@@ -117,14 +124,10 @@ def test_two_that_begin_at_once(shared_tiny: Path, tmp_path: Path) -> None:
 def test_a_killed_run_is_resumed_at_once(shared_tiny: Path, tmp_path: Path) -> None:
     flags, folder = new_run(shared_tiny, tmp_path, 100_000)
     first = start(*flags)
-    deadline = time.monotonic() + 120
-    while not list(folder.glob("nerfstudio_models/step-*.ckpt")):
-        assert first.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_for_checkpoint(first, folder)
     first.kill()
     second = start("--resume", folder, "--max-num-iterations", 1)
-    first.communicate()
-    _, said = second.communicate(timeout=120)
-    assert second.returncode == 0, said
+    ended(first)
+    said = ended(second)
+    assert (first.returncode, second.returncode) == (-signal.SIGKILL, 0), said
     assert "resuming" in said

@@ -83,6 +83,13 @@ def take_all_memory(folder: Path) -> None:
     bytes(2**40)
 
 
+def hide_that_memory_ran_out(folder: Path) -> None:
+    try:
+        bytes(2**40)
+    except MemoryError as error:
+        raise DataError(f"{folder / 'a.bin'} is damaged") from error
+
+
 def take_more_and_more_memory(folder: Path) -> None:
     taken = []
     while True:
@@ -112,6 +119,6 @@ READERS = {
     for function in (
         refuse, refuse_in_two_lines, raise_another_error, take_nonsense, leave, write_elsewhere, write_where_we_are,
         write_to_the_data, remove_a_file_elsewhere, start_a_program, use_a_shell, unpickle, take_all_memory,
-        take_more_and_more_memory, fill_the_disk, never_end, abort, read_what_is_not_there,
+        hide_that_memory_ran_out, take_more_and_more_memory, fill_the_disk, never_end, abort, read_what_is_not_there,
     )
 }  # fmt: skip

@@ -3,6 +3,7 @@
 import hashlib
 import io
 import pickle
+import zipfile
 from random import Random
 from typing import Any
 
@@ -50,6 +51,19 @@ def other_content(random: Random, content: bytes) -> bytes:
     return written(found)
 
 
+def unfolding(random: Random, content: bytes) -> bytes:
+    """The same content, but compressed, and with more in it than the file has bytes."""
+    packed = io.BytesIO()
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as stored, zipfile.ZipFile(packed, "w") as bomb:
+            for name in stored.namelist():
+                bomb.writestr(zipfile.ZipInfo(name), stored.read(name), zipfile.ZIP_DEFLATED)  # of no date
+            bomb.writestr(zipfile.ZipInfo("archive/data/9"), bytes(2**22), zipfile.ZIP_DEFLATED)
+    except Exception:  # damaged before
+        return under_the_seal(random, content)
+    return sealed(packed.getvalue())
+
+
 def code(random: Random, content: bytes) -> bytes:
     """Pickles that would run code, in each way that torch has of writing them."""
     evil = {"format": random.choice((1, 2)), "model": Payload()}
@@ -58,4 +72,6 @@ def code(random: Random, content: bytes) -> bytes:
     return random.choice((written(evil), sealed(old.getvalue()), pickle.dumps(evil), sealed(pickle.dumps(evil))))
 
 
-CHECKPOINT = (under_the_seal, under_the_seal, other_content, other_content, other_content, other_content, code, *RAW)
+CHECKPOINT = (
+    under_the_seal, under_the_seal, other_content, other_content, other_content, other_content, unfolding, code, *RAW,
+)  # fmt: skip

@@ -1,12 +1,13 @@
 """The fuzzing itself: it finds readers that misbehave, and whatever it finds, a seed finds again."""
 
+import json
 import math
 import sys
 from pathlib import Path
 
 import pytest
 
-from tests.fuzz import broken, campaign
+from tests.fuzz import broken, campaign, report
 from tests.fuzz.mutations import damaged
 from tests.fuzz.outcome import Outcome
 from tests.fuzz.trees import at, changed, places
@@ -27,6 +28,7 @@ FOUND = {
     "use_a_shell": "os.system",
     "unpickle": "pickle.find_class",
     "take_all_memory": "MemoryError",
+    "hide_that_memory_ran_out": "more memory than it may have",
     "take_more_and_more_memory": "MemoryError",
     "fill_the_disk": "OSError",
     "never_end": "SIGALRM: it took too long",
@@ -98,6 +100,26 @@ def test_alike_is_what_differs_in_names_and_numbers_only() -> None:
 
     assert shape("/tmp/a/b.json: frame 3: 'time' is 0.5") == shape("/var/c.json: frame 12: 'time' is nan")
     assert shape("a is short") != shape("a is long")
+
+
+def test_counts_are_of_each_reader_and_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(report, "LIBRARIES", ("numpy",))
+    outcomes = [
+        Outcome("a", 3, "accepted"),
+        Outcome("a", 4, "refused", "DataError", "/x/y.json: frame 1 is none"),
+        Outcome("b", 3, "escaped", "KeyError", "'w'"),
+        Outcome("a", 5, "refused", "DataError", "/z.json: frame 2 is none"),
+        Outcome("a", 6, "refused", "DataError", "/z.json is empty"),
+    ]
+    found = json.loads(json.dumps(report.as_plain(outcomes, 1.25)))
+    assert found["readers"]["a"] == {
+        "inputs": 4, "accepted": 1, "refused": 3, "escaped": 0, "unique_outcomes": 3, "seeds": [3, 6],
+    }  # fmt: skip
+    assert (found["inputs"], found["unique_outcomes"], found["escaped"]) == (5, 4, 1)
+    assert [escape["reader"] for escape in found["escapes"]] == ["b"]
+    assert found["libraries"]["numpy"]
+    assert found["machine"]["python"]
+    assert report.summary(outcomes)[0] == "a: 4 inputs, 1 accepted, 3 refused in 2 ways, 0 escaped"
 
 
 def test_a_reader_that_fails_on_what_is_not_damaged_ends_the_campaign(

@@ -80,6 +80,15 @@ def built(reader: Reader, folder: Path) -> Files:
     return read_files(folder)
 
 
+def ran_out_of_memory(error: BaseException | None) -> bool:
+    """Whether an input was refused only because there was no more memory: a larger machine would have given it."""
+    while error is not None:
+        if isinstance(error, MemoryError) or "allocate" in str(error):  # of numpy and torch
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
 def attempt(name: str, reader: Reader, seed: int, files: Files, place: Place, watch: Watch, patience: float) -> Outcome:
     """Damage, write and read an input."""
     error: BaseException | None = None
@@ -101,6 +110,8 @@ def attempt(name: str, reader: Reader, seed: int, files: Files, place: Place, wa
         kind, trace = "escaped", "".join(traceback.format_exception(error, limit=-8))
     elif not message.isprintable():
         kind, message = "escaped", f"a message of several lines, or of commands: {message!r}"
+    elif ran_out_of_memory(error):
+        kind, message = "escaped", f"it asked for more memory than it may have: {message}"
     if notes or place.untouched() != before:
         kind, message = "escaped", f"it did what it may not: {'; '.join(notes) or 'it changed files elsewhere'}"
         (place.here / PROOF).unlink(missing_ok=True)

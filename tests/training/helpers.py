@@ -1,6 +1,7 @@
 """Tiny runs for the trainer's tests."""
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import torch
 from dataparsers.blender import Blender
 from framework.cli.session import load_split
 from framework.registry import load_method
+from framework.training.checkpoint import FOLDER, load_newest
 from framework.training.run import Run, create_folder
 from framework.training.trainer import Trainer
 
@@ -107,3 +109,39 @@ def assert_same_bits(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> 
     assert a.keys() == b.keys()
     different = [name for name in a if not torch.equal(a[name], b[name])]
     assert different == []
+
+
+TRAINED = ("method", "scene", "transform", "scale", "model", "optimizer", "state", "errors")
+"""What a checkpoint holds of training; the settings name folders, which differ."""
+CLOCKS = r"/state/(seconds|curve/\d+/0)"
+"""Where in it seconds are."""
+
+
+def differences(first: Path, second: Path) -> list[str]:
+    """What the newest checkpoints of two runs' folders do not have in common, to the last bit; clocks do not count."""
+    mine, theirs = _trained(first), _trained(second)
+    return sorted(name for name in mine.keys() | theirs.keys() if not _same(mine.get(name), theirs.get(name)))
+
+
+def _trained(folder: Path) -> dict[str, Any]:
+    content = load_newest(folder / FOLDER)
+    assert content is not None, f"{folder} has no checkpoint"
+    return _leaves({key: content[key] for key in TRAINED})
+
+
+def _leaves(value: Any, name: str = "") -> dict[str, Any]:
+    """All values in dictionaries, lists and tuples, by where they are."""
+    if isinstance(value, dict):
+        items = list(value.items())
+    elif isinstance(value, (list, tuple)):
+        items = list(enumerate(value))
+    else:
+        return {} if re.fullmatch(CLOCKS, name) else {name: value}
+    return {place: leaf for key, part in items for place, leaf in _leaves(part, f"{name}/{key}").items()}
+
+
+def _same(one: Any, other: Any) -> bool:
+    if not isinstance(one, torch.Tensor) or not isinstance(other, torch.Tensor):
+        return type(one) is type(other) and one == other
+    bits = [tensor.contiguous().reshape(-1).view(torch.uint8) for tensor in (one, other)]
+    return one.dtype == other.dtype and one.shape == other.shape and torch.equal(*bits)

@@ -2,6 +2,7 @@
 
 import errno
 import pickle
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -11,8 +12,8 @@ from framework.errors import CheckpointError
 from framework.training.checkpoint import list_checkpoints, load_checkpoint, load_newest, save_checkpoint
 
 
-def save(folder: Path, step: int, keep_all: bool = False) -> Path:
-    return save_checkpoint(folder, step, {"model": {"w": torch.full((50,), float(step))}}, keep_all)
+def save(folder: Path, step: int, keep_all: bool = False, before: int | None = None) -> Path:
+    return save_checkpoint(folder, step, {"model": {"w": torch.full((50,), float(step))}}, keep_all, before)
 
 
 def test_the_two_newest_are_kept(tmp_path: Path) -> None:
@@ -39,6 +40,21 @@ def test_a_damaged_later_one_pushes_nothing_out(tmp_path: Path) -> None:
     assert names == [3, 4, 8, 9]
     save(tmp_path, 9)
     assert [int(path.stem[5:]) for path in list_checkpoints(tmp_path)] == [8, 9]
+
+
+def test_the_one_that_stays_can_be_read(tmp_path: Path) -> None:
+    """A run that went on from step 4, as that of step 8 is damaged, and is past it: the damaged one goes."""
+    for step in (2, 4, 8):
+        save(tmp_path, step, keep_all=True)
+    (tmp_path / "step-000000008.ckpt").write_bytes(b"damaged")
+    newest = save(tmp_path, 9, before=4)
+    assert [int(path.stem[5:]) for path in list_checkpoints(tmp_path)] == [4, 9]
+    newest.write_bytes(b"damaged")
+    state = load_newest(tmp_path)
+    assert state is not None
+    assert state["model"]["w"][0] == 4
+    save(tmp_path, 10, before=7)  # of which there is none
+    assert [int(path.stem[5:]) for path in list_checkpoints(tmp_path)] == [9, 10]
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.3, 0.99])
@@ -120,6 +136,18 @@ def test_a_checkpoint_cannot_run_code(tmp_path: Path) -> None:
         with pytest.raises(CheckpointError):
             load_checkpoint(tmp_path / name)
     assert not (tmp_path / "proof").exists()
+
+
+def test_one_that_would_unfold_to_more_than_it_holds_is_refused(tmp_path: Path) -> None:
+    """torch compresses nothing, but unfolds what is: 10 kB may stand for 10 MB, and 10 MB for more than memory has."""
+    path = save(tmp_path, 1)
+    with zipfile.ZipFile(path) as stored, zipfile.ZipFile(tmp_path / "bomb.ckpt", "w", zipfile.ZIP_DEFLATED) as packed:
+        for name in stored.namelist():
+            packed.writestr(name, stored.read(name))
+        packed.writestr("archive/data/9", bytes(10**7))
+    assert (tmp_path / "bomb.ckpt").stat().st_size < 10**5
+    with pytest.raises(CheckpointError, match="would unfold to more than it holds"):
+        load_checkpoint(tmp_path / "bomb.ckpt")
 
 
 def test_a_full_disk_leaves_the_old_one_and_no_rubbish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,75 @@
+"""Runs that are stopped: by Ctrl-C, by SIGTERM, by SIGKILL. `test_campaign` does so at many more moments."""
+
+import dataclasses
+import signal
+from pathlib import Path
+
+import pytest
+
+from framework.cli.session import resume, start
+from framework.config import MachineConfig
+from framework.training.checkpoint import FOLDER
+from framework.training.lock import LOCK
+from framework.training.progress import StepReport
+from framework.training.run import create_folder, read_run
+from framework.training.trainer import Trainer
+from tests.faults import runs
+from tests.training.helpers import differences, tiny_run, tiny_trainer
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_run_after_the_step_at_hand_and_it_says_how_to_go_on(
+    number: signal.Signals,
+    shared_tiny: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    train_step = Trainer.train_step
+
+    def signalled(trainer: Trainer) -> StepReport:
+        report = train_step(trainer)
+        if report.step == 3:
+            signal.raise_signal(number)
+        return report
+
+    monkeypatch.setattr(Trainer, "train_step", signalled)
+    run = tiny_run("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=50)
+    start(run)
+    said = capsys.readouterr().err
+    assert f"stopped by {number.name}: step 3, " in said
+    assert f"continue with: ns-train --resume {run.folder}" in said
+    assert runs.readable_steps(run.folder) == [3]
+    assert not (run.folder / "eval.json").exists()
+
+
+def test_a_killed_run_ends_with_the_same_bits(shared_tiny: Path, tmp_path: Path) -> None:
+    """Killed in a process of its own, which saves all the time; resumed in this one."""
+    settings = {"max_num_iterations": 120, "max_eval_images": 0, "machine": MachineConfig(num_threads=2)}
+    tiny_trainer("instant-ngp", shared_tiny, tmp_path / "whole", **settings).train()
+    run = tiny_run("instant-ngp", shared_tiny, tmp_path / "killed", seconds_per_save=0.0, **settings)
+    create_folder(run)
+    process = runs.start("--resume", run.folder)
+    runs.wait_for_checkpoint(process, run.folder)
+    process.kill()
+    said = runs.ended(process)
+    assert process.returncode == -signal.SIGKILL, said
+    saved = runs.readable_steps(run.folder)
+    print(f"killed when {saved} were saved")
+    assert 0 < saved[-1] < 120
+    written = read_run(run.config_path)
+    resume(dataclasses.replace(written, config=dataclasses.replace(written.config, seconds_per_save=1e9)))
+    assert differences(tmp_path / "whole", run.folder) == []
+
+
+def test_a_run_killed_before_its_first_checkpoint_begins_anew(
+    shared_tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tiny_run("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=5, max_eval_images=0)
+    create_folder(run)
+    (run.folder / LOCK).write_text("process 1 on another machine")
+    (run.folder / FOLDER).mkdir()
+    (run.folder / FOLDER / ".step-000000002.ckpt.1.tmp").write_bytes(b"half of one")
+    resume(read_run(run.config_path))
+    assert "has no checkpoint: starting from the beginning" in capsys.readouterr().err
+    assert [path.name for path in (run.folder / FOLDER).iterdir()] == ["step-000000005.ckpt"]

@@ -14,6 +14,8 @@ from typing import Any
 
 from framework.comparison.plan import Conditions, Job
 
+SAME_TIME = 0.01
+"""Relative difference below which two times are the same: runs end with the step in which their seconds do."""
 Curve = tuple[tuple[float, float], ...]
 """(seconds of training, PSNR on the validation views), in order."""
 
@@ -169,8 +171,11 @@ def pareto(points: Sequence[tuple[float, float]]) -> list[bool]:
     """Which points (cost, quality) no other one beats: at most the cost and at least the quality, one of them strictly.
 
     Args:
-        points: cost, less being better; quality, more being better.
+        points: cost, less being better, those within `SAME_TIME` being the same; quality, more being better.
     """
-    return [
-        not any(c <= cost and q >= quality and (c < cost or q > quality) for c, q in points) for cost, quality in points
-    ]
+
+    def beaten(cost: float, quality: float) -> bool:
+        as_cheap = [(c, q) for c, q in points if c <= cost * (1 + SAME_TIME)]
+        return any(q > quality or (q == quality and c < cost * (1 - SAME_TIME)) for c, q in as_cheap)
+
+    return [not beaten(*point) for point in points]

@@ -35,6 +35,7 @@ def time_against_error(rows: Sequence[Row]) -> str:
     """
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter
 
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     FigureCanvasSVG(figure)
@@ -51,6 +52,9 @@ def time_against_error(rows: Sequence[Row]) -> str:
     for axes, name in ((training, "seconds"), (rendering, "render_seconds")):
         _front(axes, [(row.mean(name) or 0.0, row.mean("psnr") or 0.0) for _, row in kept])
         axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.grid(True, which="both", linewidth=0.3, alpha=0.6)
     training.set_xlabel("training, s")
     rendering.set_xlabel("rendering, s an image")

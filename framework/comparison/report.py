@@ -15,7 +15,7 @@ from typing import Any
 
 from framework.comparison import plots
 from framework.comparison.crops import views
-from framework.comparison.measures import Measured, Row, pareto
+from framework.comparison.measures import SAME_TIME, Measured, Row, pareto
 from framework.comparison.plan import Conditions, Plan
 from framework.evaluation.images import ERROR_AT_WHITE
 from framework.training.checkpoint import write_atomically
@@ -31,21 +31,21 @@ class Column:
     show: Callable[[float], str]
     best: Callable[[Sequence[float]], float] | None
     """`max` where more is better, `min` where less is; None where neither."""
+    same: float = 1e-9
+    """Relative difference below which two figures are both the best."""
 
 
 COLUMNS = (
     Column("PSNR, dB", "psnr", "{:.2f}".format, max),
     Column("SSIM", "ssim", "{:.4f}".format, max),
     Column("LPIPS", "lpips", "{:.4f}".format, min),
-    Column("training, s", "seconds", "{:.1f}".format, min),
+    Column("training, s", "seconds", "{:.1f}".format, min, SAME_TIME),
     Column("steps", "steps", "{:,.0f}".format, None),
     Column("training, rays/s", "rays_per_second", "{:,.0f}".format, max),
     Column("rendering, s/image", "render_seconds", "{:.2f}".format, min),
     Column("peak memory, GiB", "peak_memory_bytes", lambda value: f"{value / 2**30:.2f}", min),
     Column("parameters", "parameters", "{:,.0f}".format, min),
 )
-SAME = 1e-9
-"""Relative difference below which two figures are both the best."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def condition_lines(conditions: Conditions, repeats: int, runs: Sequence[Measure
     views_judged = sorted({run.views for run in runs})
     judged = " or ".join(map(str, views_judged)) or "all"
     lines = [
-        f"Every method trained for {conditions.budget()}, each run in a process of its own.",
+        f"Every method was given {conditions.budget()}, each run in a process of its own.",
         f"Final figures are means over {judged} held-out views; learning curves over {conditions.curve_images} views "
         "at most, whose evaluation does not count as training time.",
         f"{repeats} seed{'s' if repeats > 1 else ''} a method"
@@ -151,13 +151,20 @@ def _cell(column: Column, row: Row, rows: Sequence[Row]) -> Cell:
     others = [other for other in (r.mean(column.figure) for r in rows) if other is not None]
     if column.best is None or len(others) < 2:
         return Cell(text)
-    return Cell(text, math.isclose(value, column.best(others), rel_tol=SAME))
+    return Cell(text, _best(column, value, others))
+
+
+def _best(column: Column, value: float, others: Sequence[float]) -> bool:
+    """Whether a figure is the best; where all are the same, none is."""
+    assert column.best is not None
+    alike = [math.isclose(other, column.best(others), rel_tol=column.same) for other in others]
+    return not all(alike) and math.isclose(value, column.best(others), rel_tol=column.same)
 
 
 def levels(rows: Sequence[Row]) -> list[int]:
-    """The whole dB that some contender reached after its first evaluation, at most the ten highest."""
+    """The whole dB that some contender reached after its first evaluation, at most the highest sixteen."""
     reached = {level for row in rows for run in row.runs for level in run.seconds_to}
-    return sorted(reached)[-10:]
+    return sorted(reached)[-16:]
 
 
 def level_table(rows: Sequence[Row]) -> list[dict[str, Any]]:
@@ -184,7 +191,7 @@ def markdown(content: dict[str, Any]) -> str:
     """The report as Markdown, without pictures."""
     lines = [f"# {content['title']}", "", content["when"], "", *(f"- {line}" for line in content["conditions"]), ""]
     lines += _markdown_table(["method", *content["columns"]], content["rows"])
-    lines += ["", "Bold: best. *: no other method had a higher PSNR after as little training.", ""]
+    lines += ["", "Bold: best. *: no other method had a higher PSNR after as little training (times within 1 % are the same).", ""]
     if content["levels"]:
         lines += ["Seconds of training to PSNR on the validation views:", ""]
         lines += _markdown_table(["method", *(f"{level} dB" for level in content["levels"])], content["level_rows"])

@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 from tests.training.helpers import TINY, tiny_trainer
 
-torch.set_num_threads(2)
+torch.set_num_threads(int(sys.argv[3]))
 for kind in TINY:
     tiny_trainer(kind, Path(sys.argv[1]), Path(sys.argv[2]) / kind, max_num_iterations=30).train()
 """
@@ -43,18 +43,24 @@ def test_another_seed_leaves_another_checkpoint(shared_tiny: Path, tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_two_processes_leave_the_same_checkpoints(shared_tiny: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("threads", "kernels"),
+    [(1, "auto"), (2, "auto"), (1, "reference")],  # on several threads torch alone adds in any order
+)
+def test_two_processes_leave_the_same_checkpoints(
+    threads: int, kernels: str, shared_tiny: Path, tmp_path: Path
+) -> None:
     """However Python orders what it hashes, and whatever lay in memory before."""
     processes = [
         subprocess.Popen(
-            [sys.executable, "-c", TRAIN, str(shared_tiny), str(tmp_path / str(index))],
-            env={**os.environ, "PYTHONPATH": str(ROOT), **circumstances},
+            [sys.executable, "-c", TRAIN, str(shared_tiny), str(tmp_path / str(index)), str(threads)],
+            env={**os.environ, "PYTHONPATH": str(ROOT), "NERFLOOM_KERNELS": kernels, **circumstances},
             stderr=subprocess.PIPE,
             text=True,
         )
         for index, circumstances in enumerate(CIRCUMSTANCES)
     ]
-    said = [process.communicate(timeout=300)[1] for process in processes]
+    said = [process.communicate(timeout=600)[1] for process in processes]
     assert [process.returncode for process in processes] == [0, 0], said
     for kind in TINY:
         assert differences(tmp_path / "0" / kind, tmp_path / "1" / kind) == [], kind

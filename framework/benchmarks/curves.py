@@ -69,7 +69,10 @@ def _draw_scene(scene: str, by_sampler: dict[str, Curve], path: Path) -> Path:
         if curve.in_all != curve.evaluations:
             axes.plot(curve.in_all, errors, "--", linewidth=1, color=color)
     axes.set(xscale="log", yscale="log", title=scene)
-    axes.set(xlabel="evaluations a ray", ylabel="mean absolute error of colour")
+    axes.set(
+        xlabel="evaluations a ray (dashed: with those of coarse fields and proposals)",
+        ylabel="mean absolute error of colour",
+    )
     axes.grid(True, which="both", alpha=0.3)
     axes.legend()
     figure.savefig(path, dpi=120)

@@ -191,7 +191,11 @@ def markdown(content: dict[str, Any]) -> str:
     """The report as Markdown, without pictures."""
     lines = [f"# {content['title']}", "", content["when"], "", *(f"- {line}" for line in content["conditions"]), ""]
     lines += _markdown_table(["method", *content["columns"]], content["rows"])
-    lines += ["", "Bold: best. *: no other method had a higher PSNR after as little training (times within 1 % are the same).", ""]
+    lines += [
+        "",
+        "Bold: best. *: no other method had a higher PSNR after as little training (times within 1 % are the same).",
+        "",
+    ]
     if content["levels"]:
         lines += ["Seconds of training to PSNR on the validation views:", ""]
         lines += _markdown_table(["method", *(f"{level} dB" for level in content["levels"])], content["level_rows"])

@@ -150,8 +150,8 @@ class OccupancySampler(nn.Module):
     def update(self, step: int, density: DensityFunction) -> None:
         """Evaluate some cells and mark anew which are occupied: every 8 steps at first, every 16 later.
 
-        At first the cells come in the order of a fixed shuffle, so that each is seen soon; afterwards half of them
-        are drawn among all cells, so that an emptied one can fill again, and half among the occupied ones.
+        At first the cells come in the order of a fixed shuffle, so that each is seen soon; afterwards they are drawn
+        among all cells, so that an emptied one can fill again, among the occupied ones, and among those beside them.
         """
         warming_up = step < WARM_UP_STEPS
         if step == 0 or step % (8 if warming_up else 16):
@@ -184,26 +184,26 @@ class OccupancySampler(nn.Module):
         return cells[looked_at & ~self.carved[cells]]
 
     def _drawn(self) -> Tensor:
-        """Half anywhere, half among occupied cells, of a moving scene as many beside those.
+        """A third anywhere, a third among occupied cells, a third beside those.
 
-        A cell drawn twice is evaluated twice, harmlessly.
+        Cells beside are those that matter reaches into a little, and that one look may take for empty: of a thin shell
+        the error is 30 times less with them than without (`ns-bench quadrature`). A cell drawn twice is evaluated
+        twice, harmlessly.
         """
         num_cells = self.resolution**3
-        half = max(num_cells // 64, 1)
+        third = max(num_cells // 64, 1)
         device = self.occupied.device
         occupied = self.occupied.nonzero().squeeze(-1)
-        anywhere = torch.randint(num_cells, (half,), device=device)
+        anywhere = torch.randint(num_cells, (third,), device=device)
         anywhere = anywhere[~self.carved[anywhere]]
         if len(occupied) == 0:
             return anywhere
-        known = occupied[torch.randint(len(occupied), (half,), device=device)]
-        if not self.moving:
-            return torch.cat([anywhere, known])
-        beside = self._beside(occupied[torch.randint(len(occupied), (half,), device=device)])
+        known, within = (occupied[torch.randint(len(occupied), (third,), device=device)] for _ in range(2))
+        beside = self._beside(within)
         return torch.cat([anywhere, known, beside[~self.carved[beside]]])
 
     def _beside(self, cells: Tensor) -> Tensor:
-        """A random neighbour of each cell: where something moves to that was not there when the grid was emptied."""
+        """A random neighbour of each cell: where matter may reach, or, where something moves, may have come to."""
         n = self.resolution
         corner = torch.stack([cells // n**2, cells // n % n, cells % n], dim=-1)
         corner = (corner + torch.randint(-1, 2, corner.shape, device=cells.device)).clamp(0, n - 1)

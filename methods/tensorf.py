@@ -31,6 +31,10 @@ DENSITY_SHIFT, DENSITY_SCALE = -10.0, 25.0
 """Density is DENSITY_SCALE * softplus(sum of components + DENSITY_SHIFT): empty at first (section 4.4 and its code)."""
 BLIND_STEPS = 128
 """The field is empty at first: until it has learnt something, it does not say what cells to skip."""
+FIRST_SIDE, LAST_SIDE = 128, {"vm": 300, "cp": 500}
+"""Of the first grid and the last one, as cubes (section 5)."""
+VERTICES_PER_PIXEL = 2
+"""Along an axis, of the photographs' longer side: more tell nothing apart, and each of them has to be learnt."""
 MARGIN = 1
 """Cells of the occupancy grid kept around what is occupied when the box shrinks."""
 
@@ -53,10 +57,10 @@ class TensoRFConfig(SamplingConfig):
     """Of each group. If not given: 16 (vm) or 96 (cp)."""
     appearance_components: int | None = None
     """Of each group. If not given: 48 (vm) or 288 (cp)."""
-    first_voxels: int = 128**3
-    """Voxels that the vertices of the first grid make."""
+    first_voxels: int | None = None
+    """Voxels that the vertices of the first grid make. If not given: 128^3, or what the photographs tell apart."""
     last_voxels: int | None = None
-    """The same for the last grid. If not given: 300^3 (vm) or 500^3 (cp)."""
+    """The same for the last grid. If not given: 300^3 (vm) or 500^3 (cp), or what the photographs tell apart."""
     upsample_at: tuple[float, ...] = (0.07, 0.1, 0.13, 0.18, 0.23)
     """Shares of the budget after which the grid grows, in equal ratios; the box shrinks to what is occupied before."""
     sparsity: float = 8e-5
@@ -69,12 +73,11 @@ class TensoRFConfig(SamplingConfig):
     """Adam updates only the entries that a step used."""
 
     def resolved(self) -> TensoRFConfig:
-        density, appearance, side = (16, 48, 300) if self.decomposition == "vm" else (96, 288, 500)
+        density, appearance = (16, 48) if self.decomposition == "vm" else (96, 288)
         return replace(
             self,
             density_components=self.density_components or density,
             appearance_components=self.appearance_components or appearance,
-            last_voxels=self.last_voxels or side**3,
         )
 
 
@@ -147,7 +150,10 @@ class TensoRF(Model[TensoRFConfig]):
         assert config.density_components is not None
         assert config.appearance_components is not None
         axes = VM if config.decomposition == "vm" else CP
-        vertices = (self._vertices(config.first_voxels, scene.box),) * len(axes)
+        told_apart = VERTICES_PER_PIXEL * scene.image_size
+        self.first_voxels = config.first_voxels or min(FIRST_SIDE, told_apart) ** 3
+        self.last_voxels = config.last_voxels or min(LAST_SIDE[config.decomposition], told_apart) ** 3
+        vertices = (self._vertices(self.first_voxels, scene.box),) * len(axes)
         density, appearance = (
             FeaturePlanes(vertices, components, axes, config.sparse_updates, resizable=True)
             for components in (config.density_components, config.appearance_components)
@@ -180,7 +186,11 @@ class TensoRF(Model[TensoRFConfig]):
         ]
 
     def decisions(self) -> list[Decision]:
-        return sampler_decisions(self.config, self.scene)
+        found = sampler_decisions(self.config, self.scene)
+        if self.config.first_voxels is None or self.config.last_voxels is None:
+            sides = " to ".join(f"{voxels ** (1 / 3):.0f}^3" for voxels in (self.first_voxels, self.last_voxels))
+            found.append(Decision("voxels", sides, f"the photographs have {self.scene.image_size} pixels along a side"))
+        return found
 
     def before_step(self, step: int, progress: float) -> None:
         if step >= BLIND_STEPS or not isinstance(self.sampler, OccupancySampler):
@@ -193,13 +203,15 @@ class TensoRF(Model[TensoRFConfig]):
     @torch.no_grad()
     def _grow(self, share: float) -> None:
         """More voxels, over what of the box is occupied. Their number grows evenly in its logarithm."""
-        assert self.config.last_voxels is not None
-        voxels = self.config.first_voxels ** (1 - share) * self.config.last_voxels**share
+        voxels = self.first_voxels ** (1 - share) * self.last_voxels**share
         box, field = self._occupied_box(), self.field
+        vertices = self._vertices(voxels, box)
+        if torch.equal(box, field.box) and vertices == field.density_factors.layout.resolutions[0]:
+            return
         size = field.box[1] - field.box[0]
         lower, upper = (box[0] - field.box[0]) / size, (box[1] - field.box[0]) / size
         for factors in (field.density_factors, field.appearance_factors):
-            factors.resample((self._vertices(voxels, box),) * factors.layout.num_groups, lower, upper)
+            factors.resample((vertices,) * factors.layout.num_groups, lower, upper)
         field.box.copy_(box)
 
     def _occupied_box(self) -> Tensor:

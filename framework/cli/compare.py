@@ -110,11 +110,9 @@ def plan_of(flags: CompareFlags) -> Plan:
 
 def compare(plan: Plan, jobs_at_once: int = 1) -> list[Row]:
     """Run what is missing of a comparison and write its report; print its table."""
-    from rich.table import Table
-
     from framework.comparison import plots
     from framework.comparison.measures import measure, rows_of
-    from framework.comparison.report import COLUMNS, table, write_report
+    from framework.comparison.report import console_table, write_report
     from framework.comparison.runner import run_jobs
     from framework.console import console, say
 
@@ -127,10 +125,7 @@ def compare(plan: Plan, jobs_at_once: int = 1) -> list[Row]:
     runs = [run for run in (measure(job, plan.conditions) for job in plan.jobs()) if run is not None]
     rows = rows_of([contender.label for contender in plan.contenders], runs, failures)
     write_report(plan, rows)
-    shown = Table("method", *(column.title for column in COLUMNS))
-    for row in table(rows):
-        shown.add_row(row["label"], *(cell.text for cell in row["cells"]))
-    console.print(shown)
+    console.print(console_table(rows))
     return rows
 
 

@@ -13,6 +13,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from rich.table import Table
+
 from framework.comparison import plots
 from framework.comparison.crops import views
 from framework.comparison.measures import SAME_TIME, Measured, Row, pareto
@@ -140,6 +142,15 @@ def table(rows: Sequence[Row]) -> list[dict[str, Any]]:
         found.append(
             {"label": row.label, "color": plots.color_of(index), "front": row.label in on_front, "cells": cells}
         )
+    return found
+
+
+def console_table(rows: Sequence[Row]) -> Table:
+    """For a terminal: a line for each figure, for names of methods are long and lines are short."""
+    found = Table("", *(row.label for row in rows))
+    cells = [row["cells"] or [Cell("failed")] * len(COLUMNS) for row in table(rows)]
+    for column, figures in zip(COLUMNS, zip(*cells, strict=True), strict=True):
+        found.add_row(column.title, *(cell.text for cell in figures))
     return found
 
 

@@ -10,12 +10,13 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 import pytest
+from rich.console import Console
 
 from framework.comparison import plots
 from framework.comparison.crops import data_uri, views, worst_square
 from framework.comparison.measures import measure, rows_of
 from framework.comparison.plan import Plan
-from framework.comparison.report import write_report
+from framework.comparison.report import COLUMNS, console_table, write_report
 from tests.comparison.runs import CONDITIONS, draw, finish, plan
 
 LABELS = ("instant-ngp", "kplanes --num-scales 2", "tensorf")
@@ -62,6 +63,18 @@ def test_tables_in_markdown_and_csv_and_json(compared: Plan) -> None:
     assert content["runs"][0]["seconds_to"] == {"27": 15.0, "28": 30.0, "29": 45.0, "30": 60.0}
     assert content["runs"][1]["curve"][-1] == [60.0, 31.0]
     assert content["failures"] == {"tensorf": ["seed 42: <out> of memory (x.log)"]}
+
+
+def test_the_terminal_s_table_fits_eighty_columns() -> None:
+    """With six methods, one of them a long name."""
+    labels = [*LABELS, "kplanes", "nerfacto", "dnerf --sampler occupancy --canonical hash-grid"]
+    table = console_table(rows_of(labels, [], {label: ["no luck"] for label in labels}))
+    console = Console(width=80, file=io.StringIO())
+    console.print(table)
+    assert isinstance(console.file, io.StringIO)
+    lines = console.file.getvalue().splitlines()
+    assert sum("failed" in line for line in lines) == len(COLUMNS)
+    assert any("PSNR, dB" in line for line in lines)
 
 
 def test_all_may_have_failed(tmp_path: Path) -> None:

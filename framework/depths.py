@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import imageio.v3 as iio
 import numpy as np
@@ -15,6 +16,11 @@ from framework.cameras import Cameras
 from framework.errors import DataError
 from framework.image_files import one_line
 
+T = TypeVar("T")
+
+MOST_PIXELS = 64
+"""Of a depth image, for each of its photograph's; most have fewer than that."""
+
 
 def read_depth(path: Path, width: int, height: int) -> np.ndarray:
     """A depth image as (H, W) float32 in its own steps, for a photograph of width x height.
@@ -25,18 +31,35 @@ def read_depth(path: Path, width: int, height: int) -> np.ndarray:
     """
     if not path.is_file():
         raise DataError(f"the depth image {path} does not exist")
-    try:
-        depth = read_array(path) if path.suffix == ".npy" else iio.imread(path, plugin="pillow", index=0)
-        depth = np.asarray(depth).astype(np.float32)
-    except Exception as error:  # as in `read_image`
-        raise DataError(f"the depth image {path} cannot be read: {one_line(error)}") from error
-    if depth.ndim != 2 or not depth.size:
-        raise DataError(f"the depth image {path} has the shape {depth.shape}; it must have rows and columns alone")
+    shape = _or_refused(path, _shape)
+    if len(shape) != 2 or 0 in shape:
+        raise DataError(f"the depth image {path} has the shape {shape}; it must have rows and columns alone")
+    if shape[0] * shape[1] > MOST_PIXELS * width * height:  # before memory for them is asked for
+        raise DataError(
+            f"the depth image {path} has {shape[1]} x {shape[0]} pixels for a photograph of {width} x {height}; "
+            f"more than {MOST_PIXELS} times as many are not believed"
+        )
     rows, columns = (
         np.minimum((np.arange(count) + 0.5) * size / count, size - 1).astype(np.int64)
-        for count, size in zip((height, width), depth.shape, strict=True)
+        for count, size in zip((height, width), shape, strict=True)
     )
-    return depth[np.ix_(rows, columns)]
+    return _or_refused(path, lambda file: _values(file)[np.ix_(rows, columns)].astype(np.float32))
+
+
+def _shape(path: Path) -> tuple[int, ...]:
+    """What the file's head says."""
+    return read_array(path).shape if path.suffix == ".npy" else iio.improps(path, plugin="pillow", index=0).shape
+
+
+def _values(path: Path) -> np.ndarray:
+    return read_array(path) if path.suffix == ".npy" else np.asarray(iio.imread(path, plugin="pillow", index=0))
+
+
+def _or_refused(path: Path, read: Callable[[Path], T]) -> T:
+    try:
+        return read(path)
+    except Exception as error:  # as in `read_image`
+        raise DataError(f"the depth image {path} cannot be read: {one_line(error)}") from error
 
 
 def read_depths(paths: Sequence[Path | None], cameras: Cameras, unit: float) -> Tensor:

@@ -44,6 +44,16 @@ def test_of_an_animation_the_first_picture_is_read(tmp_path: Path) -> None:
     assert read_depth(tmp_path / "d.png", 3, 2).tolist() == steps[0].tolist()
 
 
+def test_a_picture_far_larger_than_its_photograph_is_refused_by_its_head(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    iio.imwrite(tmp_path / "d.png", np.zeros((33, 32), np.uint16))
+    assert read_depth(tmp_path / "d.png", 4, 5).shape == (5, 4)
+    monkeypatch.setattr("framework.depths._values", lambda path: pytest.fail("its pixels were read"))
+    with pytest.raises(DataError, match=r"d\.png has 32 x 33 pixels for a photograph of 4 x 4; more than 64 times"):
+        read_depth(tmp_path / "d.png", 4, 4)
+
+
 @pytest.mark.parametrize("content", ["missing", "text", "colour", "pickle"])
 def test_what_is_no_depth_image_is_named(content: str, tmp_path: Path) -> None:
     path = tmp_path / "d.npy"

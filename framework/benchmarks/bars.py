@@ -1,4 +1,4 @@
-"""Bars of what kernels take, compiled and in torch, beside the least time that the machine's ceilings allow."""
+"""Bars of what kernels take, compiled and in torch, beside the machine's ceilings."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def draw(rows: Sequence[Row], path: Path) -> bool:
     theirs = [row.reference_forward + (row.reference_backward or 0) for row in rows]
     axes.barh([place + 0.2 for place in places], theirs, 0.4, color="#bbbbbb", label="torch")
     axes.barh([place - 0.2 for place in places], ours, 0.4, color="#0072b2", label="compiled")
-    least = [(place - 0.2, row.least_forward) for place, row in zip(places, rows, strict=True) if row.least_forward]
-    heights, bounds = zip(*least, strict=True) if least else ((), ())
-    axes.plot(bounds, heights, "|", color="#d55e00", markersize=11, label="least by the ceilings, forward")
+    marks = [(place - 0.2, row.at_ceiling) for place, row in zip(places, rows, strict=True) if row.at_ceiling]
+    heights, bounds = zip(*marks, strict=True) if marks else ((), ())
+    axes.plot(bounds, heights, "|", color="#d55e00", markersize=11, label="forward at the ceiling")
     for place, row, value in zip(places, rows, theirs, strict=True):
         axes.text(value * 1.1, place, f"{row.speed_up:.1f} x", va="center", fontsize=8)
     axes.set(xscale="log", xlabel=f"ns a sample, ray or entry, forward and backward, {rows[0].threads} threads")

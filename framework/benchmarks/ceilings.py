@@ -14,7 +14,7 @@ TABLES = (1, 8, 64)
 
 @dataclass(frozen=True)
 class Work:
-    """What a kernel cannot do without, for each of what it works on; its lower bound by the machine's ceilings."""
+    """What a kernel has to do for each sample, ray or entry, whatever else it does."""
 
     bytes: float = 0.0
     """Read or written in order."""
@@ -60,11 +60,11 @@ class Ceilings:
             gathers=gathers,
         )
 
-    def least(self, work: Work) -> float:
-        """Seconds that the slowest part of some work takes at least, were the others free.
+    def seconds(self, work: Work) -> float:
+        """What the slowest part of some work takes at its ceiling's rate, the others being free.
 
         Gathers are held against those at random from the smallest table measured that is no smaller. Neighbours in
-        space share much of what they gather, so a kernel may be faster than that.
+        space share much of what they gather, so a kernel may well be faster than that.
         """
         size = next((size for size in TABLES if size * 2**20 >= work.table_bytes), TABLES[-1])
         products = self.bfloat16 if work.bfloat16 else self.float32

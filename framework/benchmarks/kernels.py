@@ -1,4 +1,4 @@
-"""Time and error of each compiled kernel against its torch reference, beside the least that the ceilings allow.
+"""Time and error of each compiled kernel against its torch reference, beside the ceilings.
 
 Both run in one process, in turn, on one thread and on all. Errors are of both, against float64. NERFLOOM_KERNELS=avx2
 in the environment forces that variant.
@@ -12,6 +12,7 @@ from itertools import pairwise
 from typing import Any
 
 import torch
+from rich.box import SIMPLE
 from rich.table import Table
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -86,8 +87,8 @@ class Row:
     reference_backward: float | None
     speed_up: float
     """Median ratio of neighbouring runs, forward and backward together."""
-    least_forward: float | None
-    """What the ceilings allow at best, on all threads."""
+    at_ceiling: float | None
+    """Of the forward pass at the rate of the slowest ceiling, on all threads."""
     errors: Errors | None
     reference_errors: Errors | None
 
@@ -117,7 +118,7 @@ def measured(kernel: Kernel, ceilings: Ceilings, repeats: int, all_threads: int)
     """One kernel's rows, on 1 thread and on all."""
     rows = []
     errors, reference_errors = kernel.errors() if kernel.errors else (None, None)
-    least = ceilings.least(kernel.work) * 1e9 if kernel.work else None
+    at_ceiling = ceilings.seconds(kernel.work) * 1e9 if kernel.work else None
     try:
         for threads in sorted({1, all_threads}):
             torch.set_num_threads(threads)
@@ -136,7 +137,7 @@ def measured(kernel: Kernel, ceilings: Ceilings, repeats: int, all_threads: int)
                     reference_forward,
                     reference_backward[0] if reference_backward else None,
                     times.speed_up,
-                    least,
+                    at_ceiling,
                     errors,
                     reference_errors,
                 )
@@ -147,27 +148,20 @@ def measured(kernel: Kernel, ceilings: Ceilings, repeats: int, all_threads: int)
 
 
 def table(rows: Sequence[Row]) -> Table:
-    """For people."""
-    found = Table(title="ns a sample, ray or entry: compiled (torch)", title_justify="left")
-    for heading in ("kernel", "forward", "least", "backward", "speed-up", "error", "of gradients"):
-        found.add_column(heading, justify="left" if heading == "kernel" else "right")
+    """For people: what fits a line of a terminal."""
+    found = Table(title="ns a sample, ray or entry", title_justify="left", box=SIMPLE, padding=(0, 1, 0, 0))
+    for heading in ("kernel", "forward", "backward", "torch", "speed-up", "error"):
+        found.add_column(heading, justify="left" if heading == "kernel" else "right", no_wrap=heading != "kernel")
     for row in rows:
         found.add_row(
-            f"{row.kernel}, a {row.unit}",
-            f"{row.forward:.1f} ({row.reference_forward:.0f})",
-            "" if row.least_forward is None else f"{row.least_forward:.1f}",
-            "" if row.backward is None else f"{row.backward:.1f} ({row.reference_backward:.0f})",
+            row.kernel,
+            f"{row.forward:.1f}",
+            "" if row.backward is None else f"{row.backward:.1f}",
+            f"{row.reference_forward + (row.reference_backward or 0):.0f}",
             f"{row.speed_up:.1f}",
-            _beside(row, "value"),
-            _beside(row, "gradient"),
+            "" if row.errors is None else f"{row.errors.value:.0e}",
         )
     return found
-
-
-def _beside(row: Row, name: str) -> str:
-    if row.errors is None or getattr(row.errors, name) is None:
-        return ""
-    return f"{getattr(row.errors, name):.0e} ({getattr(row.reference_errors, name):.0e})"
 
 
 # -- the kernels --------------------------------------------------------------------------------------------------

@@ -272,7 +272,7 @@ def cost_table(needed: list[dict[str, Any]]) -> Table:
 def _cost(cell: dict[str, Any]) -> str:
     if cell["evaluations"] is None:
         return "not met"
-    own, in_all = f"{cell['evaluations']:.0f}", f"{cell['in_all']:.0f}"
+    own, in_all = (f"{value:.1f}" if value < 10 else f"{value:.0f}" for value in (cell["evaluations"], cell["in_all"]))
     return own if own == in_all else f"{own} ({in_all})"
 
 

@@ -28,6 +28,8 @@ Pictures that are easier than the plain ones (all white, black or transparent), 
 degrees), have to be as good: for those it is `ALLOWED`.
 """
 
+A_THIRD = "a third of the steps teach nothing, as they should"
+
 Change = Callable[[Views], Views]
 Settings = Callable[[TrainConfig], dict[str, Any]]
 """From the plain run's settings to those that are changed, as plain values."""
@@ -166,8 +168,8 @@ CONDITIONS = (
     ),
     Condition("8192-rays", "8192 rays a step", rays=8192, reason="steps take longer: fewer may fit into the time"),
     # -- what should have been refused
-    Condition("nan-pixels", "a NaN pixel in every third batch", spoil=spoiled_pixel(math.nan)),
-    Condition("inf-pixels", "an infinite pixel in every third batch", spoil=spoiled_pixel(math.inf)),
+    Condition("nan-pixels", "a NaN pixel in every third batch", spoil=spoiled_pixel(math.nan), reason=A_THIRD),
+    Condition("inf-pixels", "an infinite pixel in every third batch", spoil=spoiled_pixel(math.inf), reason=A_THIRD),
     Condition(
         "nan-pose",
         "a camera whose pose is NaN, past the format that should have refused it",

@@ -129,6 +129,7 @@ CONDITIONS = (
         "cameras inside the object, which fills all pictures",
         lambda _: ball_views(90.0, RADIUS / 2),
         allowed=ALLOWED_OF_OTHER_PICTURES,
+        reason="matter right before the cameras explains a few photographs as well as walls do",
         ball_only=True,
     ),
     # -- where the scene is: see `variants.moved` for the two ways in which it arrives

@@ -40,6 +40,17 @@ def test_medians_of_stages_and_of_neighbours_ratios() -> None:
 
 
 @needs_kernels
+def test_a_kernel_is_measured_on_one_thread_and_on_all() -> None:
+    rows = measured(next(kernels(256)), CEILINGS, 1, torch.get_num_threads())
+    assert [row.threads for row in rows] == sorted({1, torch.get_num_threads()})
+    for row in rows:
+        assert row.forward > 0
+        assert row.errors is not None
+        assert row.errors.value < 1e-3
+
+
+@needs_kernels
+@pytest.mark.slow  # tables of 512^2 vertices in float64
 def test_every_kernel_is_measured_and_right(tmp_path: Path) -> None:
     threads = torch.get_num_threads()
     rows = [row for kernel in kernels(256) for row in measured(kernel, CEILINGS, 1, threads)]

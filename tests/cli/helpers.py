@@ -41,8 +41,8 @@ def called(name: str, *arguments: object, folder: Path | None = None) -> subproc
 
 
 def train(data: Path, output: Path, *flags: object, timestamp: str = "t") -> Path:
-    """Train the tiny instant-ngp; returns the run's folder."""
-    done = run(
+    """Train the tiny instant-ngp in this process; returns the run's folder."""
+    done = called(
         "ns-train", "instant-ngp", "--data", data, "--output-dir", output, "--timestamp", timestamp, *TINY_NGP, *flags
     )
     assert done.returncode == 0, done.stderr

@@ -11,7 +11,7 @@ import yaml
 
 from framework.cli.train import _default_run, _parse_flags
 from framework.errors import ConfigError
-from tests.cli.helpers import TINY_NGP, called, command, run, train
+from tests.cli.helpers import TINY_NGP, called, command, run
 
 
 def test_help_is_quick_and_lists_every_method() -> None:
@@ -127,7 +127,11 @@ def test_a_missing_method_is_an_error() -> None:
 @pytest.fixture(scope="module")
 def finished(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished tiny run, through the real command."""
-    return train(shared_tiny, tmp_path_factory.mktemp("out"), "--max-num-iterations", 60)
+    output = tmp_path_factory.mktemp("out")
+    flags = ["--data", shared_tiny, "--output-dir", output, "--timestamp", "t", "--max-num-iterations", 60, *TINY_NGP]
+    done = run("ns-train", "instant-ngp", *flags)
+    assert done.returncode == 0, done.stderr
+    return output / shared_tiny.name / "instant-ngp" / "t"
 
 
 def test_the_run_folder(finished: Path) -> None:

@@ -16,7 +16,7 @@ demo: .venv/installed
 	echo "turntable:" && ls $$run/orbit.gif
 
 test: .venv/installed-test
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -n auto -m "not slow"
 
 test-all: .venv/installed-test
 	$(BIN)/python -m pytest

@@ -13,10 +13,12 @@ import re
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import torch
+from torch.torch_version import TorchVersion
 
 from framework.archives import unfolded_size
 from framework.console import say
@@ -29,6 +31,8 @@ SEAL = b"\nsha256:"
 """What stands before the hash, which ends the file."""
 PIECE = 2**24
 """Bytes that are hashed at once."""
+SAFE_TORCH = "2.10"
+"""The first whose reader cannot be made to run code by a checkpoint, as far as is known (CVE-2026-24747)."""
 _NAME = re.compile(r"step-(\d{9})\.ckpt")
 
 
@@ -91,6 +95,14 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bo
     return path
 
 
+@cache
+def _warn_of(version: str) -> None:
+    say(
+        f"torch {version} can be made to run code by a checkpoint that was made for that (CVE-2026-24747): "
+        f"load none from strangers, or upgrade torch to {SAFE_TORCH} or newer"
+    )
+
+
 def _path(folder: Path, step: int) -> Path:
     return folder / f"step-{step:09d}.ckpt"
 
@@ -101,10 +113,12 @@ def list_checkpoints(folder: Path) -> list[Path]:
 
 
 def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
-    """Read a checkpoint. Nothing in it is executed (`weights_only`).
+    """Read a checkpoint. Nothing in it is executed (`weights_only`), unless torch is older than `SAFE_TORCH`.
 
     Raises: CheckpointError where it is missing, not as it was written, or not one of ours.
     """
+    if TorchVersion(torch.__version__) < SAFE_TORCH:
+        _warn_of(torch.__version__)
     try:
         sealed = _is_sealed(path)
         if unfolded_size(path) > path.stat().st_size:  # torch compresses nothing, but would unfold what is

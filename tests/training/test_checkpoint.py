@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from framework.errors import CheckpointError
+from framework.training import checkpoint
 from framework.training.checkpoint import list_checkpoints, load_checkpoint, load_newest, save_checkpoint
 
 
@@ -162,3 +163,15 @@ def test_a_full_disk_leaves_the_old_one_and_no_rubbish(tmp_path: Path, monkeypat
         save(tmp_path, 2)
     assert [p.name for p in tmp_path.iterdir()] == ["step-000000001.ckpt"]
     assert load_checkpoint(tmp_path / "step-000000001.ckpt")["model"]["w"][0] == 1
+
+
+@pytest.mark.parametrize(("version", "warned"), [("2.9.1+cpu", True), ("2.10.0", False), ("2.13.0+cpu", False)])
+def test_an_older_torch_is_warned_of_once(
+    version: str, warned: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = save(tmp_path, 1)
+    monkeypatch.setattr(torch, "__version__", version)
+    checkpoint._warn_of.cache_clear()
+    for _ in range(2):
+        assert load_checkpoint(path)["model"]["w"][0] == 1
+    assert capsys.readouterr().err.count("CVE-2026-24747") == int(warned)

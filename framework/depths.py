@@ -14,7 +14,7 @@ from torch import Tensor
 from framework.arrays import read_array
 from framework.cameras import Cameras
 from framework.errors import DataError
-from framework.image_files import one_line
+from framework.image_files import Content, one_line
 
 T = TypeVar("T")
 
@@ -52,7 +52,9 @@ def _shape(path: Path) -> tuple[int, ...]:
 
 
 def _values(path: Path) -> np.ndarray:
-    return read_array(path) if path.suffix == ".npy" else np.asarray(iio.imread(path, plugin="pillow", index=0))
+    return (
+        read_array(path) if path.suffix == ".npy" else np.asarray(iio.imread(Content(path), plugin="pillow", index=0))
+    )
 
 
 def _or_refused(path: Path, read: Callable[[Path], T]) -> T:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from framework.errors import DataError
 # A file is read as what it holds, whatever its name; PostScript is a program, which Ghostscript would run.
 EpsImagePlugin.gs_binary = False
 
+LARGEST_FILE = 2**30
+"""Bytes of an image file."""
 BAND = 64
 """Rows of a reduced image that are made at once: float64 takes eight times the memory of the pixels it is made from."""
 
@@ -35,6 +38,22 @@ def image_size(paths: Sequence[Path]) -> tuple[int, int]:
     raise DataError(reason or "there is no image to read a size from")
 
 
+class Content(io.BytesIO):
+    """All that an image file holds: of an open file, Pillow asks for as many bytes as a chunk claims to have.
+
+    Raises: OSError where it cannot be read; DataError where it is too large to be an image.
+    """
+
+    def __init__(self, path: Path) -> None:
+        if (size := path.stat().st_size) > LARGEST_FILE:
+            raise DataError(f"{path} has {size / 1e9:.1f} GB, and is no image that is read")
+        super().__init__(path.read_bytes())
+        self.path = path
+
+    def __repr__(self) -> str:
+        return f"'{self.path}'"  # as Pillow's messages have it
+
+
 def read_image(path: Path, factor: int = 1) -> np.ndarray:
     """An 8-bit image as (H, W, 4) uint8 with straight alpha, reduced by a whole number; of several the first.
 
@@ -44,7 +63,7 @@ def read_image(path: Path, factor: int = 1) -> np.ndarray:
         mode = str(iio.immeta(path, plugin="pillow", index=0).get("mode", ""))
         if mode.startswith(("I", "F")) or _is_deep_png(path):
             raise DataError(f"{path} has more than 8 bits a channel; convert it to an 8-bit PNG")
-        image = np.asarray(iio.imread(path, plugin="pillow", mode="RGBA", index=0))
+        image = np.asarray(iio.imread(Content(path), plugin="pillow", mode="RGBA", index=0))
     except DataError:
         raise
     except Exception as error:  # Pillow raises OSError, SyntaxError, struct.error, DecompressionBombError and more

@@ -8,7 +8,7 @@ import imageio.v3 as iio
 import numpy as np
 
 from framework.errors import DataError
-from framework.image_files import one_line
+from framework.image_files import Content, one_line
 
 THRESHOLD = 128
 """The least grey that counts as white."""
@@ -25,7 +25,7 @@ def read_mask(path: Path, width: int, height: int) -> np.ndarray:
     if not path.is_file():
         raise DataError(f"the mask {path} does not exist")
     try:
-        grey = np.asarray(iio.imread(path, plugin="pillow", mode="L", index=0))
+        grey = np.asarray(iio.imread(Content(path), plugin="pillow", mode="L", index=0))
     except Exception as error:  # as in `read_image`
         raise DataError(f"the mask {path} is not a readable image: {one_line(error)}") from error
     if not grey.size:

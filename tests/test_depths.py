@@ -1,6 +1,8 @@
 """Depth images: reading, distances along rays, and that they teach where light comes from."""
 
 import dataclasses
+import tracemalloc
+from contextlib import suppress
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -52,6 +54,22 @@ def test_a_picture_far_larger_than_its_photograph_is_refused_by_its_head(
     monkeypatch.setattr("framework.depths._values", lambda path: pytest.fail("its pixels were read"))
     with pytest.raises(DataError, match=r"d\.png has 32 x 33 pixels for a photograph of 4 x 4; more than 64 times"):
         read_depth(tmp_path / "d.png", 4, 4)
+
+
+def test_a_chunk_takes_no_more_memory_than_its_file_has(tmp_path: Path) -> None:
+    """Its length is a claim of up to 4 GB, and whoever believes it asks for as much."""
+    iio.imwrite(tmp_path / "d.png", np.full((15, 20), 1500, np.uint16))
+    content = bytearray((tmp_path / "d.png").read_bytes())
+    at = content.index(b"IDAT")
+    content[at - 4 : at] = (2**31 - 1).to_bytes(4, "big")
+    (tmp_path / "d.png").write_bytes(content)
+    tracemalloc.start()
+    try:
+        with suppress(DataError):
+            read_depth(tmp_path / "d.png", 20, 15)
+        assert tracemalloc.get_traced_memory()[1] < 2**24
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize("content", ["missing", "text", "colour", "pickle"])

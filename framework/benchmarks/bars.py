@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from framework.benchmarks.kernels import Row
+from framework.comparison import plots
 from framework.console import say
 
 
@@ -14,11 +15,11 @@ def draw(rows: Sequence[Row], path: Path) -> bool:
 
     Returns: whether it was drawn; it is not where matplotlib is absent, which is said.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        say("no picture of the kernels: pip install 'nerfloom[plots]'")
+    if not plots.available():
+        say(plots.MISSING)
         return False
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(9, 0.42 * len(rows) + 1), layout="constrained")
     axes = figure.subplots()
     places = range(len(rows), 0, -1)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
+from framework.comparison import plots
 from framework.console import say
 
 LEAST_ERROR = 1e-12
@@ -51,8 +51,8 @@ def draw(curves: dict[str, dict[str, Curve]], folder: Path) -> list[Path]:
 
     Returns: the pictures' paths; none where matplotlib is absent, which is said.
     """
-    if find_spec("matplotlib") is None:
-        say("no pictures of the curves: pip install 'nerfloom[plots]'")
+    if not plots.available():
+        say(plots.MISSING)
         return []
     folder.mkdir(parents=True, exist_ok=True)
     return [_draw_scene(scene, by_sampler, folder / f"quadrature-{scene}.png") for scene, by_sampler in curves.items()]

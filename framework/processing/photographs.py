@@ -16,7 +16,7 @@ from PIL import Image
 
 from framework.console import say, track
 from framework.errors import DataError
-from framework.image_files import one_line
+from framework.image_files import Content, one_line
 
 ENDINGS = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".heic", ".heif")
 _JPEG = (".jpg", ".jpeg")
@@ -133,7 +133,7 @@ def prepare(folder: Path, source: Path, images: Path, name: str, upright: bool =
     path, target = folder / source, images / name
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
-        with Image.open(path) as image:
+        with Image.open(Content(path)) as image:
             image.load()  # a file that was cut short fails here
             exif = image.getexif()
             orientation = exif.get(_ORIENTATION, 1)
@@ -200,7 +200,7 @@ def write_masks(folder: Path, photographs: list[Photograph], masks: Path, crop: 
         if path is None:
             continue
         try:
-            with Image.open(path) as image:
+            with Image.open(Content(path)) as image:
                 mask = image.convert("L").point(lambda value: 255 if value >= 128 else 0)
         except Exception as error:
             raise DataError(f"{path} is not a readable mask: {one_line(error)}") from error

@@ -168,7 +168,7 @@ def test_all_of_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pyte
     some = {name: scene for name, scene in scenes().items() if name in ("blobs", "sparse")}
     monkeypatch.setattr(quadrature, "scenes", lambda: some)
     monkeypatch.setattr(quadrature, "QUICK", TINY)
-    monkeypatch.setattr(curves, "find_spec", lambda name: None)
+    monkeypatch.setattr("framework.comparison.plots.available", lambda: False)
     content = quadrature.main(tmp_path / "out" / "quadrature.json", tmp_path / "plots", quick=True)
     assert json.loads((tmp_path / "out" / "quadrature.json").read_text()) == json.loads(json.dumps(content))
     assert len(content["rows"]) == 2 * 2 * 7

@@ -16,13 +16,18 @@ from tests.training.helpers import tiny_trainer
 ReadOnly = Callable[[Path], None]
 
 
-def refuse_all(data: Path, folder: Path, a_run: Path, refused: Refused) -> None:
-    """Begin a run in a folder, go on with one that is there, and evaluate it."""
+def assert_all_refused(data: Path, folder: Path, a_run: Path, refused: Refused) -> None:
+    """To begin a run in a folder, to go on with one that is there, and to evaluate it."""
     flags = ("--data", data, "--output-dir", folder, "--timestamp", "t", *TINY_NGP)
     assert refused(main, "instant-ngp", *flags).startswith(f"error: cannot write the run's folder {folder}")
     assert f"cannot write the run's folder {a_run}" in refused(main, "--resume", a_run)
     said = refused(eval_command.main, "--load-config", a_run / "config.yml", "--device-type", "cpu")
     assert f"cannot write {a_run / 'eval.json'}" in said
+
+
+def held(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.mark.parametrize("locked_before", [False, True])
@@ -36,14 +41,18 @@ def test_a_folder_without_the_right(
         (a_run / LOCK).touch()
     read_only(a_run)
     read_only(tmp_path / "outputs")
-    refuse_all(shared_tiny, tmp_path / "outputs", a_run, refused)
+    before = held(tmp_path / "outputs")
+    assert_all_refused(shared_tiny, tmp_path / "outputs", a_run, refused)
+    assert held(tmp_path / "outputs") == before
 
 
 def test_a_disk_that_is_read_only(shared_tiny: Path, tmp_path: Path, disk: Disk, refused: Refused) -> None:
     a_run = tmp_path / "disk" / "run"
     tiny_trainer("instant-ngp", shared_tiny, a_run, max_num_iterations=1, max_eval_images=0).train()
     disk("ro")
-    refuse_all(shared_tiny, tmp_path / "disk", a_run, refused)
+    before = held(tmp_path / "disk")
+    assert_all_refused(shared_tiny, tmp_path / "disk", a_run, refused)
+    assert held(tmp_path / "disk") == before
 
 
 def test_a_disk_that_becomes_read_only(

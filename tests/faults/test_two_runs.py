@@ -85,8 +85,10 @@ def test_a_file_system_without_locks_is_no_obstacle(tmp_path: Path, monkeypatch:
         raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr("fcntl.flock", none)
-    with sole_user(tmp_path), sole_user(tmp_path):
-        pass
+    with sole_user(tmp_path):
+        (tmp_path / LOCK).write_text("the first")
+        with sole_user(tmp_path):  # not refused, and it says who it is
+            assert (tmp_path / LOCK).read_text().startswith(f"process {os.getpid()} on ")
 
 
 def test_a_run_that_goes_on_elsewhere_cannot_be_resumed(shared_tiny: Path, tmp_path: Path, refused: Refused) -> None:

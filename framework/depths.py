@@ -31,7 +31,8 @@ def read_depth(path: Path, width: int, height: int) -> np.ndarray:
     """
     if not path.is_file():
         raise DataError(f"the depth image {path} does not exist")
-    shape = _or_refused(path, _shape)
+    stored = _or_refused(path, read_array) if path.suffix == ".npy" else None
+    shape = _or_refused(path, _shape) if stored is None else stored.shape
     if len(shape) != 2 or 0 in shape:
         raise DataError(f"the depth image {path} has the shape {shape}; it must have rows and columns alone")
     if shape[0] * shape[1] > MOST_PIXELS * width * height:  # before memory for them is asked for
@@ -43,18 +44,18 @@ def read_depth(path: Path, width: int, height: int) -> np.ndarray:
         np.minimum((np.arange(count) + 0.5) * size / count, size - 1).astype(np.int64)
         for count, size in zip((height, width), shape, strict=True)
     )
-    return _or_refused(path, lambda file: _values(file)[np.ix_(rows, columns)].astype(np.float32))
+    values = _or_refused(path, _values) if stored is None else stored
+    return _or_refused(path, lambda _: values[np.ix_(rows, columns)].astype(np.float32))
 
 
 def _shape(path: Path) -> tuple[int, ...]:
-    """What the file's head says."""
-    return read_array(path).shape if path.suffix == ".npy" else iio.improps(path, plugin="pillow", index=0).shape
+    """What a picture's head says."""
+    return iio.improps(path, plugin="pillow", index=0).shape
 
 
 def _values(path: Path) -> np.ndarray:
-    return (
-        read_array(path) if path.suffix == ".npy" else np.asarray(iio.imread(Content(path), plugin="pillow", index=0))
-    )
+    """A picture's, the first of several."""
+    return np.asarray(iio.imread(Content(path), plugin="pillow", index=0))
 
 
 def _or_refused(path: Path, read: Callable[[Path], T]) -> T:

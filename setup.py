@@ -31,7 +31,7 @@ if platform.machine().lower() in ("x86_64", "amd64"):
         "avx512": [*AVX2, *AVX512],
         "avx512_bf16": [*AVX2, *AVX512, "-mavx512bf16"],
     }
-FLAGS = ["-std=c++17", "-O3", "-g0", "-fno-math-errno", "-fno-trapping-math", "-fvisibility=hidden"]
+FLAGS = ["-std=c++17", "-O3", "-g0", "-fno-math-errno", "-fno-trapping-math", "-fvisibility=hidden", "-pthread"]
 
 
 class BuildKernels(build_ext):
@@ -83,21 +83,13 @@ class AnyPythonWheel(bdist_wheel):
         return "py3", "none", super().get_tag()[2]
 
 
-def threads() -> tuple[list[str], list[str]]:
-    """Flags to compile and link with. The OpenMP runtime is torch's own, found when the library is loaded."""
-    if sys.platform == "darwin":
-        return ["-Xpreprocessor", "-fopenmp"], ["-undefined", "dynamic_lookup"]
-    return ["-fopenmp"], []
-
-
-compile_flags, link_flags = threads()
 setup(
     ext_modules=[
         Extension(
             f"framework.kernels.lib.{name}",
             SOURCES,
-            extra_compile_args=[*FLAGS, *compile_flags, *flags],
-            extra_link_args=link_flags,
+            extra_compile_args=[*FLAGS, *flags],
+            extra_link_args=["-pthread"] if sys.platform == "linux" else [],
             depends=[*HEADERS],
         )
         for name, flags in VARIANTS.items()

@@ -5,6 +5,8 @@ Names are imported on use, so that `import framework` costs nothing.
 
 from __future__ import annotations
 
+import os
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -48,6 +50,14 @@ _HOMES = {
     "Scene": "scene",
     "TrainConfig": "config",
 }
+
+# Threads of torch's that wait look out for work for milliseconds, unless told otherwise before torch is loaded. Beside
+# another program that uses up the time in which they could work: a training is four times slower than its share of the
+# cores would make it. The first is for GNU's OpenMP (in rounds, some 20 microseconds), the other for LLVM's and Intel's
+# (in milliseconds).
+if "torch" not in sys.modules and "OMP_WAIT_POLICY" not in os.environ:
+    os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+    os.environ.setdefault("KMP_BLOCKTIME", "1")
 
 __version__ = "0.1.0"
 __all__ = sorted(_HOMES)

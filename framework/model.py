@@ -47,6 +47,9 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
     refines_poses: ClassVar[bool] = False
     """Whether it can refine the cameras' poses."""
 
+    runs_on_kernels: ClassVar[bool] = False
+    """Whether the compiled kernels do its heavy work: then torch's own operations keep to one CPU thread."""
+
     def decisions(self) -> list[Decision]:
         """What became of the method's options that were left to the data."""
         return []

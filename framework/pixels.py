@@ -144,10 +144,10 @@ def gather_colors(pixels: Tensor, flat: Tensor, behind: Tensor) -> tuple[Tensor,
     rgb, alpha = torch.empty(count, 3), torch.empty(count)
     _gather_colors(
         native.pointer(flat, "pixel indices", (count,), torch.int64), count,
-        native.pointer(pixels, "pixels", (len(pixels), channels), torch.uint8), channels,
+        native.pointer(pixels, "pixels", (len(pixels), channels), torch.uint8), len(pixels), channels,
         native.pointer(behind, "the background", (count, 3)), rgb.data_ptr(), alpha.data_ptr(), native.threads(),
     )  # fmt: skip
     return rgb, alpha if channels == 4 else None
 
 
-_gather_colors = native.function("gather_colors", "pqpippp" + "i")
+_gather_colors = native.function("gather_colors", "pqpqipppi")

@@ -78,6 +78,7 @@ class DNeRFConfig(HierarchicalConfig):
 class DNeRF(Model[DNeRFConfig]):
     """A deformed field, or one of place and time. Without times, the canonical field alone."""
 
+    runs_on_kernels = True
     learns_motion = True
 
     def __init__(self, config: DNeRFConfig, scene: Scene) -> None:

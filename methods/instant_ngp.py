@@ -85,6 +85,8 @@ class InstantNGPConfig(SamplingConfig):
 class InstantNGP(Model[InstantNGPConfig]):
     """One hash field, marched through an occupancy grid or sampled by proposals."""
 
+    runs_on_kernels = True
+
     def __init__(self, config: InstantNGPConfig, scene: Scene) -> None:
         super().__init__(config, scene)
         assert config.log2_table_size is not None

@@ -102,6 +102,7 @@ class ExplicitField(BoxField):
 class KPlanes(Model[KPlanesConfig]):
     """Planes of features, by an occupancy grid or proposals. Without times, the planes of time are left out."""
 
+    runs_on_kernels = True
     learns_motion = True
 
     def __init__(self, config: KPlanesConfig, scene: Scene) -> None:

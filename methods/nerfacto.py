@@ -86,6 +86,7 @@ class NerfactoConfig(SamplingConfig):
 class Nerfacto(Model[NerfactoConfig]):
     """One hash field, sampled where proposals say."""
 
+    runs_on_kernels = True
     learns_appearance = refines_poses = True
 
     def __init__(self, config: NerfactoConfig, scene: Scene) -> None:

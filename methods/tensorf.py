@@ -142,6 +142,8 @@ class TensorField(Field):
 class TensoRF(Model[TensoRFConfig]):
     """Factors that grow from coarse to fine, while their box shrinks to what an occupancy grid, if used, has found."""
 
+    runs_on_kernels = True
+
     growths: Tensor
     """Times the grid has grown."""
 

@@ -56,6 +56,8 @@ class VanillaNeRFConfig(HierarchicalConfig):
 class VanillaNeRF(Model[VanillaNeRFConfig]):
     """Two networks trained together (equations 5 and 6), or one with an occupancy grid or proposals."""
 
+    runs_on_kernels = True
+
     def __init__(self, config: VanillaNeRFConfig, scene: Scene) -> None:
         super().__init__(config, scene)
         self.contracted_box = contracted_box(config, scene)

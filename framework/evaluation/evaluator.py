@@ -22,6 +22,7 @@ from framework.evaluation.appearance import appearances, fitted_appearance, righ
 from framework.evaluation.images import comparison, write_image
 from framework.evaluation.metrics import load_lpips, psnr, ssim
 from framework.kernels.math import safe_normalize
+from framework.kernels.native import torch_on_one_thread
 from framework.model import Model
 from framework.pixels import composite
 
@@ -62,7 +63,10 @@ def render_image(
     model.eval()
     start = time.perf_counter()
     parts, normals = [], []
-    with torch.autocast(model.device.type, torch.bfloat16, enabled=use_bfloat16(model)):
+    with (
+        torch_on_one_thread(model.runs_on_kernels),
+        torch.autocast(model.device.type, torch.bfloat16, enabled=use_bfloat16(model)),
+    ):
         for pixels in cameras.image_pixels(index).split(max(model.config.eval_num_rays_per_chunk // per_pixel, 1)):
             rays = cameras.pixel_rays(pixels, scene.near, scene.far, times, places)
             # The number of a camera that is not a training camera must not be taken for one's.

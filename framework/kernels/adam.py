@@ -1,4 +1,4 @@
-"""Adam (Kingma and Ba 2015) on a table of which a step touches few entries.
+"""Adam (Kingma and Ba 2015), dense, and on a table of which a step touches few entries.
 
 Each entry sees Adam on the sequence of its own gradients that are not zero: its moments decay, and their bias is
 corrected, by the number of updates it has had, not by the number of steps. So an entry that is met for the first time
@@ -8,12 +8,16 @@ the same way; Mueller et al. 2022, section 4).
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from framework.kernels import native
 
 _sparse = native.function("adam_sparse", "pppppqifddfi", "q")
+_dense = native.function("adam_dense", "ppppppifddfi")
 _finite = native.function("all_finite", "pqi", "i")
 
 
@@ -59,6 +63,37 @@ def sparse_adam(
         native.pointer(square, "square", shape), native.pointer(grad, "grad", shape),
         native.pointer(seen, "seen", shape[:1]), *shape, rate, *betas, eps, native.threads(),
     )  # fmt: skip
+
+
+@torch.no_grad()
+def dense_adam_reference(
+    values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, step: float,
+    rate: float, betas: tuple[float, float], eps: float,
+) -> None:  # fmt: skip
+    """As `dense_adam` of one tensor, in torch, on any device and in any float type."""
+    mean.lerp_(grad, 1 - betas[0])
+    square.mul_(betas[1]).addcmul_(grad, grad, value=1 - betas[1])
+    unbias1, unbias2 = (1 - beta**step for beta in betas)
+    values.addcdiv_(mean, square.sqrt() / math.sqrt(unbias2) + eps, value=-rate / unbias1)
+
+
+def dense_adam(
+    values: Sequence[Tensor], grads: Sequence[Tensor], means: Sequence[Tensor], squares: Sequence[Tensor],
+    steps: Sequence[float], rate: float, betas: tuple[float, float], eps: float,
+) -> None:  # fmt: skip
+    """Update, in place, every value of several parameters (Kingma and Ba 2015, algorithm 1), compiled.
+
+    Args:
+        values, grads, means, squares: contiguous float32 on the CPU, of the same shapes: parameters, gradients, moments.
+        steps: updates each parameter has had, this one included.
+        rate, betas, eps: as for `sparse_adam`.
+    """
+    columns = [
+        native.pointers([native.pointer(t, name, tuple(v.shape)) for t, v in zip(tensors, values, strict=True)])
+        for name, tensors in (("values", values), ("mean", means), ("square", squares), ("grad", grads))
+    ]
+    counts = native.integers(tuple(v.numel() for v in values))
+    _dense(*columns, counts, native.doubles(steps), len(values), rate, *betas, eps, native.threads())
 
 
 def all_finite(values: Tensor) -> bool:

@@ -116,8 +116,8 @@ def composite_reference(samples: Samples, sigma: Tensor, rgb: Tensor, background
     return Composited(color, opacity, moment, median, weights)
 
 
-_forward = native.function("composite_forward", "ppppppqpppppppi")
-_backward = native.function("composite_backward", "pppppqppppppppi")
+_forward = native.function("composite_forward", "ppppppqqpppppppi")
+_backward = native.function("composite_backward", "pppppqqppppppppi")
 
 
 class _Composite(torch.autograd.Function):
@@ -135,7 +135,7 @@ class _Composite(torch.autograd.Function):
             native.pointer(sigma, "sigma", (count,)), native.pointer(rgb, "rgb", (count, 3)),
             native.pointer(starts, "t_starts", (count,)), native.pointer(ends, "t_ends", (count,)),
             None if points is None else native.pointer(points, "points", (count,)),
-            native.pointer(offsets, "offsets", (rays + 1,), torch.int64), rays,
+            native.pointer(offsets, "offsets", (rays + 1,), torch.int64), rays, count,
             native.pointer(background, "the background", (rays, 3)), native.pointer(fars, "fars", (rays,)),
             color.data_ptr(), opacity.data_ptr(), moment.data_ptr(), median.data_ptr(), weights.data_ptr(),
             native.threads(),
@@ -154,7 +154,7 @@ class _Composite(torch.autograd.Function):
         of_opacity, of_weights = (None if g is None else g.contiguous() for g in (grads[1], grads[4]))
         of_sigma, of_rgb = torch.empty_like(sigma), torch.empty_like(rgb)
         _backward(
-            sigma.data_ptr(), rgb.data_ptr(), starts.data_ptr(), ends.data_ptr(), offsets.data_ptr(), rays,
+            sigma.data_ptr(), rgb.data_ptr(), starts.data_ptr(), ends.data_ptr(), offsets.data_ptr(), rays, count,
             background.data_ptr(), weights.data_ptr(), opacity.data_ptr(),
             native.pointer(of_color, "the colour's gradient", (rays, 3)),
             None if of_opacity is None else native.pointer(of_opacity, "the opacity's gradient", (rays,)),
@@ -192,7 +192,7 @@ def distortion_reference(weights: Tensor, samples: Samples) -> Tensor:
     return torch.stack(losses) if losses else weights.sum()[None][:0]
 
 
-_distortion = native.function("distortion", "ppppqppi")
+_distortion = native.function("distortion", "ppppqqppi")
 
 
 class _Distortion(torch.autograd.Function):
@@ -203,7 +203,7 @@ class _Distortion(torch.autograd.Function):
         _distortion(
             native.pointer(weights, "weights", (count,)), native.pointer(starts, "t_starts", (count,)),
             native.pointer(ends, "t_ends", (count,)), native.pointer(offsets, "offsets", (rays + 1,), torch.int64),
-            rays, loss.data_ptr(), of_weights.data_ptr(), native.threads(),
+            rays, count, loss.data_ptr(), of_weights.data_ptr(), native.threads(),
         )  # fmt: skip
         ctx.save_for_backward(of_weights, offsets)
         return loss

@@ -103,9 +103,9 @@ def hash_grid_reference(positions: Tensor, table: Tensor, layout: HashGridLayout
     return torch.cat(features, dim=-1)
 
 
-_forward = native.function("hash_grid_forward", "pqpippipi", "i")
-_backward_table = native.function("hash_grid_backward_table", "pppiippipi", "i")
-_backward_positions = native.function("hash_grid_backward_positions", "pqppippipi", "i")
+_forward = native.function("hash_grid_forward", "pqpippipi")
+_backward_table = native.function("hash_grid_backward_table", "pppiippipi")
+_backward_positions = native.function("hash_grid_backward_positions", "pqppippipi")
 _adam = native.function("hash_grid_adam", "pppiippippppfddfi", "q")
 
 

@@ -326,7 +326,7 @@ def ranges(counts: Tensor) -> tuple[Tensor, Tensor]:
 
 
 _pack: Callable[..., None] = native.function("pack_occupancy", "pipp")
-_refresh: Callable[..., float] = native.function("refresh_occupancy", "pqfffpi", "f")
+_refresh: Callable[..., None] = native.function("refresh_occupancy", "pqfffpi")
 _begin: Callable[..., int] = native.function("march_begin", "pppppqpfppppi", "q")
 _wave: Callable[..., int] = native.function("march_wave", "pppppppqipffppipppppi", "q")
 _advance: Callable[..., int] = native.function("march_advance", "pqpipppfppp", "q")

@@ -1,8 +1,8 @@
 """The compiled CPU kernels: finding the library that fits this processor, and calling it safely.
 
 Each kernel's Python file declares the C functions it calls with `function`, and hands over tensors through `pointer`,
-which checks them. The library holds no thread of its own: it runs on torch's OpenMP threads. ctypes releases Python's
-lock during a call.
+which checks them. What goes wrong in C is a status there and an exception here. The library has threads of its own
+(`csrc/parallel.h`), as many as torch is set to use. ctypes releases Python's lock during a call.
 
 `NERFLOOM_KERNELS` overrides the choice: a variant's name (baseline, avx2, avx512, avx512_bf16), or "reference" for
 torch alone.
@@ -16,7 +16,8 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -90,8 +91,8 @@ def _load() -> tuple[str, ctypes.CDLL | None]:
 
 
 def _compiler_hint() -> str:
-    hints = {"Darwin": "'xcode-select --install'", "Windows": "clang"}
-    return hints.get(platform.system(), "the package g++ or clang")
+    hints = {"Darwin": "'xcode-select --install'", "Windows": "clang or MinGW's g++; MSVC cannot build them"}
+    return hints.get(platform.system(), "g++ or clang++")
 
 
 @functools.cache
@@ -101,13 +102,20 @@ def has(name: str) -> bool:
     return library is not None and hasattr(library, name)
 
 
+_FAILURES: dict[int, type[Exception]] = {1: MemoryError, 2: IndexError, 3: ValueError}
+"""What a status other than 0 becomes; any other is a RuntimeError."""
+
+
 def function(name: str, arguments: str, result: str = "") -> Callable[..., Any]:
     """A function of the library, found at its first call.
 
     Args:
-        name: its C name.
+        name: its C name. It returns a status (csrc/status.h).
         arguments: a letter each: p pointer, q 64-bit integer, i int, f float, d double.
-        result: the same for what it returns; empty for nothing.
+        result: the letter of what it writes through its last argument, which is not in `arguments` and which the
+            call returns; empty for nothing.
+
+    The call raises MemoryError, IndexError, ValueError or RuntimeError where the status says so.
     """
     bound: list[Any] = []
 
@@ -117,17 +125,26 @@ def function(name: str, arguments: str, result: str = "") -> Callable[..., Any]:
             if library is None:
                 raise RuntimeError(f"{name} was called without compiled kernels")
             found = getattr(library, name)
-            found.argtypes = [TYPES[letter] for letter in arguments]
-            found.restype = TYPES[result] if result else None
+            found.argtypes = [TYPES[letter] for letter in arguments] + [ctypes.c_void_p] * bool(result)
+            found.restype = ctypes.c_int
             bound.append(found)
-        if spent is None:
-            return bound[0](*values)
-        start = time.perf_counter()
-        out = bound[0](*values)
-        spent[name] = spent.get(name, 0.0) + time.perf_counter() - start
-        return out
+        start = time.perf_counter() if spent is not None else 0.0
+        out = TYPES[result]() if result else None
+        status = bound[0](*values) if out is None else bound[0](*values, ctypes.byref(out))
+        if spent is not None:
+            spent[name] = spent.get(name, 0.0) + time.perf_counter() - start
+        if status:
+            raise _FAILURES.get(status, RuntimeError)(f"{name}: {_last_error()}")
+        return None if out is None else out.value
 
     return call
+
+
+def _last_error() -> str:
+    library = _load()[1]
+    assert library is not None
+    library.last_error.restype = ctypes.c_char_p
+    return library.last_error().decode(errors="replace")
 
 
 def usable(*tensors: Tensor | None) -> bool:
@@ -163,6 +180,37 @@ def integers(values: tuple[int, ...]) -> Any:
     return (ctypes.c_int64 * len(values))(*values)
 
 
+def doubles(values: Sequence[float]) -> Any:
+    """A C array of 64-bit floating point numbers."""
+    return (ctypes.c_double * len(values))(*values)
+
+
+_threads: int | None = None
+
+
 def threads() -> int:
-    """Threads a kernel may use: as many as torch does."""
-    return torch.get_num_threads()
+    """Threads a kernel may use: as many as torch was set to."""
+    return torch.get_num_threads() if _threads is None else _threads
+
+
+@contextmanager
+def torch_on_one_thread(wanted: bool = True) -> Iterator[None]:
+    """Within it torch's own operations run on one thread, and the compiled kernels on as many as before.
+
+    Two sets of threads that look out for work in turn get into each other's way. Where kernels do the heavy work, what
+    torch's small operations gain from threads is less than what that costs.
+
+    Args:
+        wanted: whether to; without compiled kernels nothing changes either way.
+    """
+    global _threads
+    if not wanted or _threads is not None or not available():
+        yield
+        return
+    _threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(_threads)
+        _threads = None

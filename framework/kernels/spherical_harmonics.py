@@ -11,7 +11,7 @@ from torch import Tensor
 from framework.kernels import native
 
 MAX_LEVELS = 4
-_compiled = native.function("spherical_harmonics", "ppqipi")
+_compiled = native.function("spherical_harmonics", "pqipi")
 
 
 def spherical_harmonics(directions: Tensor, levels: int = 4) -> Tensor:
@@ -29,7 +29,7 @@ def spherical_harmonics(directions: Tensor, levels: int = 4) -> Tensor:
         out = directions.new_empty(len(directions), levels**2)
         directions = directions.contiguous()
         address = native.pointer(directions, "directions", (len(directions), 3))
-        _compiled(address, None, len(directions), levels, out.data_ptr(), native.threads())
+        _compiled(address, len(directions), levels, out.data_ptr(), native.threads())
         return out
     return spherical_harmonics_reference(directions, levels)
 

@@ -180,8 +180,8 @@ class OccupancySampler(nn.Module):
         share = math.ceil(4 * num_cells * 8 / WARM_UP_STEPS)
         places = torch.arange(turn * share, (turn + 1) * share, device=self.occupied.device)
         cells = places * SHUFFLE_STRIDE % num_cells
-        looked_at = self.occupied[cells] | (torch.rand(share, device=cells.device) < 1 / 8)
-        return cells[looked_at & ~self.carved[cells]]
+        looked_at = self.occupied.index_select(0, cells) | (torch.rand(share, device=cells.device) < 1 / 8)
+        return cells[looked_at & ~self.carved.index_select(0, cells)]
 
     def _drawn(self) -> Tensor:
         """A third anywhere, a third among occupied cells, a third beside those.

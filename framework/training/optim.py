@@ -10,7 +10,8 @@ from torch import Tensor
 from torch.optim.adam import adam
 
 from framework.config import TrainConfig
-from framework.kernels.adam import all_finite, sparse_adam
+from framework.kernels import native
+from framework.kernels.adam import all_finite, dense_adam, sparse_adam
 from framework.kernels.hash_grid import TableGradient
 from framework.kernels.memory import table
 from framework.kernels.planes import PlanesGradient
@@ -96,12 +97,20 @@ class Adam(torch.optim.Optimizer):
 
     def _step_dense(self, group: dict[str, Any]) -> None:
         with_grad = [p for p in group["params"] if p.grad is not None]
+        grads = [p.grad for p in with_grad]
         states = [self.state[p] for p in with_grad]
+        means, squares = [s["exp_avg"] for s in states], [s["exp_avg_sq"] for s in states]
+        if native.usable(*with_grad, *grads) and all(t.is_contiguous() for t in (*with_grad, *grads)):
+            for state in states:
+                state["step"] += 1
+            steps = [float(state["step"]) for state in states]
+            dense_adam(with_grad, grads, means, squares, steps, group["lr"], group["betas"], group["eps"])
+            return
         adam(
             with_grad,
-            [p.grad for p in with_grad],
-            [state["exp_avg"] for state in states],
-            [state["exp_avg_sq"] for state in states],
+            grads,
+            means,
+            squares,
             [],
             [state["step"] for state in states],
             fused=bool(with_grad) and with_grad[0].device.type in ("cpu", "cuda"),

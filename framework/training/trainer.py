@@ -25,6 +25,7 @@ from framework.errors import CheckpointError, DivergenceError
 from framework.evaluation.evaluator import evaluate, evaluation_background, render_view, use_bfloat16
 from framework.evaluation.images import comparison
 from framework.evaluation.metrics import MAX_PSNR
+from framework.kernels.native import torch_on_one_thread
 from framework.pixel_stream import PixelStream
 from framework.pixels import Background, Batch, LookUp, composite, draw_batch, training_background
 from framework.scene_profile import SceneProfile
@@ -219,6 +220,10 @@ class Trainer:
         """One batch, one step of Adam."""
         if not self._prepared:
             self._prepare()
+        with torch_on_one_thread(self.model.runs_on_kernels):
+            return self._train_step()
+
+    def _train_step(self) -> StepReport:
         state, start = self.state, time.perf_counter()
         seed_step(self.config.machine.seed, state.step)
         self.model.train()

@@ -1,8 +1,11 @@
-// What every kernel shares: the exported C interface, vectors, threads.
+// What every kernel shares: the exported C interface, vectors.
 //
 // The code uses the compiler's vectors of LANES floats (GCC and Clang on any processor); the library is built once for
 // each instruction set and the right one is chosen when it is loaded (framework/kernels/native.py).
 #pragma once
+
+#include "parallel.h"
+#include "status.h"
 
 #include <cstdint>
 #include <cstring>
@@ -84,23 +87,3 @@ static inline float optical_depth(float sigma, float delta) {
 static inline float depth_slope(float sigma, float delta) {
     return sigma * delta > MAX_OPTICAL_DEPTH || delta > MAX_FLOAT ? 0 : delta;
 }
-
-// Threads: the caller says how many, and torch's own OpenMP runtime provides them (see native.py).
-#if defined(_OPENMP)
-extern "C" int omp_get_thread_num(void);
-static inline int thread_index() { return omp_get_thread_num(); }
-#else
-static inline int thread_index() { return 0; }
-#endif
-
-// The part [begin, end) of `count` items that belongs to thread `index` of `threads`, in whole multiples of `grain`.
-struct Part {
-    int64_t begin, end;
-    Part(int64_t count, int index, int threads, int64_t grain = 1) {
-        const int64_t grains = (count + grain - 1) / grain;
-        begin = grains * index / threads * grain;
-        end = grains * (index + 1) / threads * grain;
-        if (begin > count) begin = count;
-        if (end > count) end = count;
-    }
-};

@@ -41,77 +41,79 @@ void sines_and_cosines(const float* angles, int count, float* sines, float* cosi
 }  // namespace
 
 // Rows [x, sin(x), cos(x), sin(2 x), ...] of x (N, dims); x itself only where `include_input`.
-EXPORT void frequency_encoding(const float* x, int64_t count, int dims, int frequencies, int include_input, float* out,
-                               int threads) {
-    const int values = dims * frequencies, padded = (values + LANES - 1) / LANES * LANES;
-    const int64_t width = int64_t(values) * 2 + (include_input ? dims : 0);
-    const size_t part = sizeof(float) * dims;
-#pragma omp parallel num_threads(threads) if (threads > 1)
-    {
-        std::vector<float> angles(padded, 0.0f), sines(padded), cosines(padded);
-#pragma omp for schedule(static)
-        for (int64_t n = 0; n < count; n++) {
-            float* row = out + n * width;
-            if (include_input) {
-                std::memcpy(row, x + n * dims, part);
-                row += dims;
+EXPORT int frequency_encoding(const float* x, int64_t count, int dims, int frequencies, int include_input, float* out,
+                              int threads) {
+    return guarded([&] {
+        const int values = dims * frequencies, padded = (values + LANES - 1) / LANES * LANES;
+        const int64_t width = int64_t(values) * 2 + (include_input ? dims : 0);
+        const size_t part = sizeof(float) * dims;
+        for_ranges(threads, count, 256, [&](int64_t begin, int64_t end) {
+            std::vector<float> angles(padded, 0.0f), sines(padded), cosines(padded);
+            for (int64_t n = begin; n < end; n++) {
+                float* row = out + n * width;
+                if (include_input) {
+                    std::memcpy(row, x + n * dims, part);
+                    row += dims;
+                }
+                for (int k = 0; k < frequencies; k++)
+                    for (int d = 0; d < dims; d++) angles[k * dims + d] = std::ldexp(1.0f, k) * x[n * dims + d];
+                sines_and_cosines(angles.data(), padded, sines.data(), cosines.data());
+                for (int k = 0; k < frequencies; k++, row += 2 * dims) {
+                    std::memcpy(row, sines.data() + k * dims, part);
+                    std::memcpy(row + dims, cosines.data() + k * dims, part);
+                }
             }
-            for (int k = 0; k < frequencies; k++)
-                for (int d = 0; d < dims; d++) angles[k * dims + d] = std::ldexp(1.0f, k) * x[n * dims + d];
-            sines_and_cosines(angles.data(), padded, sines.data(), cosines.data());
-            for (int k = 0; k < frequencies; k++, row += 2 * dims) {
-                std::memcpy(row, &sines[k * dims], part);
-                std::memcpy(row + dims, &cosines[k * dims], part);
-            }
-        }
-    }
+        });
+    });
 }
 
 // The gradient of x (N, dims), from the encoding's own rows and their gradient.
-EXPORT void frequency_encoding_backward(const float* rows, const float* grad, int64_t count, int dims, int frequencies,
-                                        int include_input, float* x_grad, int threads) {
-    const int first = include_input ? dims : 0;
-    const int64_t width = int64_t(dims) * frequencies * 2 + first;
-#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
-    for (int64_t n = 0; n < count; n++) {
-        const float *row = rows + n * width + first, *g = grad + n * width + first;
-        for (int d = 0; d < dims; d++) {
-            float sum = include_input ? grad[n * width + d] : 0.0f, scale = 1;
-            for (int k = 0; k < frequencies; k++, scale *= 2) {
-                const int s = k * 2 * dims + d, c = s + dims;
-                sum += scale * (row[c] * g[s] - row[s] * g[c]);
+EXPORT int frequency_encoding_backward(const float* rows, const float* grad, int64_t count, int dims, int frequencies,
+                                       int include_input, float* x_grad, int threads) {
+    return guarded([&] {
+        const int first = include_input ? dims : 0;
+        const int64_t width = int64_t(dims) * frequencies * 2 + first;
+        for_each(threads, count, 512, [&](int64_t n) {
+            const float *row = rows + n * width + first, *g = grad + n * width + first;
+            for (int d = 0; d < dims; d++) {
+                float sum = include_input ? grad[n * width + d] : 0.0f, scale = 1;
+                for (int k = 0; k < frequencies; k++, scale *= 2) {
+                    const int s = k * 2 * dims + d, c = s + dims;
+                    sum += scale * (row[c] * g[s] - row[s] * g[c]);
+                }
+                x_grad[n * dims + d] = sum;
             }
-            x_grad[n * dims + d] = sum;
-        }
-    }
+        });
+    });
 }
 
-// Real spherical harmonics of directions[owners[n]] (N), `levels` bands; owners may be null for directions[n].
-EXPORT void spherical_harmonics(const float* directions, const int64_t* owners, int64_t count, int levels, float* out,
-                                int threads) {
-    const int width = levels * levels;
-#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
-    for (int64_t n = 0; n < count; n++) {
-        const float* d = directions + (owners ? owners[n] : n) * 3;
-        const float x = d[0], y = d[1], z = d[2];
-        const float all[16] = {
-            0.28209479177387814f,
-            -0.4886025119029199f * y,
-            0.4886025119029199f * z,
-            -0.4886025119029199f * x,
-            1.0925484305920792f * x * y,
-            -1.0925484305920792f * y * z,
-            0.31539156525252005f * (3 * z * z - 1),
-            -1.0925484305920792f * x * z,
-            0.5462742152960396f * (x * x - y * y),
-            -0.5900435899266435f * y * (3 * x * x - y * y),
-            2.890611442640554f * x * y * z,
-            -0.4570457994644658f * y * (5 * z * z - 1),
-            0.3731763325901154f * z * (5 * z * z - 3),
-            -0.4570457994644658f * x * (5 * z * z - 1),
-            1.445305721320277f * z * (x * x - y * y),
-            -0.5900435899266435f * x * (x * x - 3 * y * y),
-        };
-        std::memcpy(out + n * width, all, sizeof(float) * width);
-    }
+// Real spherical harmonics of directions (N, 3), `levels` bands.
+EXPORT int spherical_harmonics(const float* directions, int64_t count, int levels, float* out, int threads) {
+    return guarded([&] {
+        if (levels < 1 || levels > 4) throw std::invalid_argument("spherical harmonics have 1 to 4 levels");
+        const int width = levels * levels;
+        for_each(threads, count, 2048, [&](int64_t n) {
+            const float* d = directions + n * 3;
+            const float x = d[0], y = d[1], z = d[2];
+            const float all[16] = {
+                0.28209479177387814f,
+                -0.4886025119029199f * y,
+                0.4886025119029199f * z,
+                -0.4886025119029199f * x,
+                1.0925484305920792f * x * y,
+                -1.0925484305920792f * y * z,
+                0.31539156525252005f * (3 * z * z - 1),
+                -1.0925484305920792f * x * z,
+                0.5462742152960396f * (x * x - y * y),
+                -0.5900435899266435f * y * (3 * x * x - y * y),
+                2.890611442640554f * x * y * z,
+                -0.4570457994644658f * y * (5 * z * z - 1),
+                0.3731763325901154f * z * (5 * z * z - 3),
+                -0.4570457994644658f * x * (5 * z * z - 1),
+                1.445305721320277f * z * (x * x - y * y),
+                -0.5900435899266435f * x * (x * x - 3 * y * y),
+            };
+            std::memcpy(out + n * width, all, sizeof(float) * width);
+        });
+    });
 }

@@ -1,6 +1,8 @@
 // Multiresolution hash encoding, forward and backward (Instant-NGP, section 3). See ../hash_grid.py for the reference.
 #include "adam.h"
 
+#include <atomic>
+#include <memory>
 #include <vector>
 
 namespace {
@@ -17,9 +19,11 @@ struct Level {
 };
 
 Level level_of(const int64_t* resolutions, const int64_t* offsets, int level) {
-    const int64_t vertices = resolutions[level] + 1, entries = offsets[level + 1] - offsets[level];
+    // In floating point, for the product of large resolutions does not fit 64 bits.
+    const double vertices = double(resolutions[level]) + 1;
+    const int64_t entries = offsets[level + 1] - offsets[level];
     return {offsets[level], uint32_t(entries - 1), int32_t(resolutions[level]),
-            vertices * vertices * vertices <= entries};
+            vertices * vertices * vertices <= double(entries)};
 }
 
 typedef uint32_t Words __attribute__((vector_size(LANES * 4)));
@@ -134,10 +138,8 @@ void forward_level(const Level& level, const Floats (*xyz)[3], const float* tabl
 template <int F>
 void forward(const float* positions, int64_t count, const float* table, const int64_t* resolutions,
              const int64_t* offsets, int levels, float* out, int threads) {
-    const int64_t stride = int64_t(levels) * F, chunks = (count + CHUNK - 1) / CHUNK;
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 1) if (threads > 1)
-    for (int64_t chunk = 0; chunk < chunks; chunk++) {
-        const int64_t begin = chunk * CHUNK, end = begin + CHUNK < count ? begin + CHUNK : count;
+    const int64_t stride = int64_t(levels) * F;
+    for_ranges(threads, count, CHUNK, [&](int64_t begin, int64_t end) {
         Floats xyz[CHUNK / LANES][3];
         for (int64_t n = begin; n < end; n += LANES)
             load_positions(positions, n, block(n, end), xyz[(n - begin) / LANES]);
@@ -146,7 +148,7 @@ void forward(const float* positions, int64_t count, const float* table, const in
             const auto run = level.dense ? forward_level<F, true> : forward_level<F, false>;
             run(level, xyz, table, begin, end, out + l * F, stride);
         }
-    }
+    });
 }
 
 template <int F, bool DENSE>
@@ -166,32 +168,30 @@ template <int F>
 struct Gathered {
     int64_t count;
     int levels;
-    std::vector<float> points, by_level;
+    std::unique_ptr<float[]> points, by_level;  // not std::vector, which would fill them with zeros first
 
     // `ends` holds the number of samples up to the end of each part.
     Gathered(const float* const* positions, const float* const* grads, const int64_t* ends, int parts, int levels,
              int threads)
-        : count(parts ? ends[parts - 1] : 0), levels(levels), points(size_t(count) * 3),
-          by_level(size_t(count) * levels * F) {
-        const int64_t stride = int64_t(levels) * F, chunks = (count + CHUNK - 1) / CHUNK;
-#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
-        for (int64_t chunk = 0; chunk < chunks; chunk++) {
-            const int64_t end = (chunk + 1) * CHUNK < count ? (chunk + 1) * CHUNK : count;
+        : count(parts ? ends[parts - 1] : 0), levels(levels), points(new float[size_t(count) * 3]),
+          by_level(new float[size_t(count) * levels * F]) {
+        const int64_t stride = int64_t(levels) * F;
+        for_ranges(threads, count, CHUNK, [&](int64_t begin, int64_t end) {
             int part = 0;
-            for (int64_t n = chunk * CHUNK; n < end; n++) {
+            for (int64_t n = begin; n < end; n++) {
                 while (n >= ends[part]) part++;
                 const int64_t within = part ? n - ends[part - 1] : n;
-                std::memcpy(&points[n * 3], positions[part] + within * 3, sizeof(float) * 3);
+                std::memcpy(points.get() + n * 3, positions[part] + within * 3, sizeof(float) * 3);
                 const float* from = grads[part] + within * stride;
                 for (int l = 0; l < levels; l++)
-                    std::memcpy(&by_level[(l * count + n) * F], from + l * F, sizeof(float) * F);
+                    std::memcpy(by_level.get() + (l * count + n) * F, from + l * F, sizeof(float) * F);
             }
-        }
+        });
     }
     // Adds a level's gradient to `table`, where that level's first entry stands.
     void scatter_to(const Level& level, int l, float* table) const {
         const auto run = level.dense ? scatter_level<F, true> : scatter_level<F, false>;
-        run(level, points.data(), count, &by_level[size_t(l) * count * F], table);
+        run(level, points.get(), count, by_level.get() + size_t(l) * count * F, table);
     }
 };
 
@@ -200,11 +200,10 @@ template <int F>
 void backward_table(const float* const* positions, const float* const* grads, const int64_t* ends, int parts,
                     const int64_t* resolutions, const int64_t* offsets, int levels, float* table, int threads) {
     const Gathered<F> samples(positions, grads, ends, parts, levels, threads);
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 1) if (threads > 1)
-    for (int turn = 0; turn < levels; turn++) {
-        const int l = levels - 1 - turn;  // the slowest first
+    for_each(threads, levels, 1, [&](int64_t turn) {
+        const int l = levels - 1 - int(turn);  // the slowest first
         samples.scatter_to(level_of(resolutions, offsets, l), l, table + offsets[l] * F);
-    }
+    });
 }
 
 // The same, and Adam on each level while its gradient is still in cache. Returns how many entries were updated.
@@ -213,20 +212,20 @@ int64_t adam_table(const float* const* positions, const float* const* grads, con
                    const int64_t* resolutions, const int64_t* offsets, int levels, float* values, float* mean,
                    float* square, float* seen, const adam::Settings& settings, int threads) {
     const Gathered<F> samples(positions, grads, ends, parts, levels, threads);
-    int64_t touched = 0;
-#pragma omp parallel num_threads(threads) reduction(+ : touched) if (threads > 1)
-    {
-        static thread_local std::vector<float> grad;  // zero between calls: the update clears what it has used
-#pragma omp for schedule(dynamic, 1)
-        for (int turn = 0; turn < levels; turn++) {
-            const int l = levels - 1 - turn;
-            const int64_t first = offsets[l], entries = offsets[l + 1] - first, i = first * F;
-            if (grad.size() < size_t(entries) * F) grad.resize(size_t(entries) * F, 0.0f);
-            samples.scatter_to(level_of(resolutions, offsets, l), l, grad.data());
-            touched += adam::update_range<F>(values + i, mean + i, square + i, grad.data(), seen + first, 0, entries,
-                                             F, settings);
-        }
-    }
+    // Of each thread, and zero between calls: the update clears what it has used.
+    static thread_local std::vector<std::vector<float>> kept;
+    std::vector<std::vector<float>>& grads_of = kept;
+    if (grads_of.size() < size_t(threads)) grads_of.resize(size_t(threads));
+    std::atomic<int64_t> touched{0};
+    for_chunks(threads, levels, [&](int64_t turn, int slot) {
+        const int l = levels - 1 - int(turn);
+        const int64_t first = offsets[l], entries = offsets[l + 1] - first, i = first * F;
+        std::vector<float>& grad = grads_of[size_t(slot)];
+        if (grad.size() < size_t(entries) * F) grad.resize(size_t(entries) * F, 0.0f);
+        samples.scatter_to(level_of(resolutions, offsets, l), l, grad.data());
+        touched += adam::update_range<F>(values + i, mean + i, square + i, grad.data(), seen + first, 0, entries, F,
+                                         settings);
+    });
     return touched;
 }
 
@@ -258,8 +257,7 @@ template <int F>
 void backward_positions(const float* positions, int64_t count, const float* table, const float* grad,
                         const int64_t* resolutions, const int64_t* offsets, int levels, float* out, int threads) {
     const int64_t stride = int64_t(levels) * F, blocks = (count + LANES - 1) / LANES;
-#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
-    for (int64_t b = 0; b < blocks; b++) {
+    for_each(threads, blocks, 256 / LANES, [&](int64_t b) {
         const int64_t n = b * LANES;
         const int size = block(n, count);
         Floats xyz[3], sum[3] = {splat(0), splat(0), splat(0)};
@@ -271,58 +269,62 @@ void backward_positions(const float* positions, int64_t count, const float* tabl
         }
         for (int s = 0; s < size; s++)
             for (int axis = 0; axis < 3; axis++) out[(n + s) * 3 + axis] = sum[axis][s];
-    }
+    });
 }
 
 }  // namespace
 
-// Each returns 0, or 1 where the number of features of an entry is not 1, 2, 4 or 8.
 #define FOR_FEATURES(features, call) \
     switch (features) {              \
-        case 1: call(1); return 0;   \
-        case 2: call(2); return 0;   \
-        case 4: call(4); return 0;   \
-        case 8: call(8); return 0;   \
-        default: return 1;           \
+        case 1: call(1); break;      \
+        case 2: call(2); break;      \
+        case 4: call(4); break;      \
+        case 8: call(8); break;      \
+        default: throw std::invalid_argument("hash grid: an entry has 1, 2, 4 or 8 features"); \
     }
 
 EXPORT int hash_grid_forward(const float* positions, int64_t count, const float* table, int features,
                              const int64_t* resolutions, const int64_t* offsets, int levels, float* out, int threads) {
+    return guarded([&] {
 #define CALL(F) forward<F>(positions, count, table, resolutions, offsets, levels, out, threads)
-    FOR_FEATURES(features, CALL)
+        FOR_FEATURES(features, CALL)
 #undef CALL
+    });
 }
 
 // Adds to `table_grad`.
 EXPORT int hash_grid_backward_table(const float* const* positions, const float* const* grads, const int64_t* ends,
                                     int parts, int features, const int64_t* resolutions, const int64_t* offsets,
                                     int levels, float* table_grad, int threads) {
+    return guarded([&] {
 #define CALL(F) backward_table<F>(positions, grads, ends, parts, resolutions, offsets, levels, table_grad, threads)
-    FOR_FEATURES(features, CALL)
+        FOR_FEATURES(features, CALL)
 #undef CALL
+    });
 }
 
-// Adam on what hash_grid_backward_table would add. Returns how many entries were updated, or -1 as above.
-EXPORT int64_t hash_grid_adam(const float* const* positions, const float* const* grads, const int64_t* ends, int parts,
-                              int features, const int64_t* resolutions, const int64_t* offsets, int levels,
-                              float* values, float* mean, float* square, float* seen, float rate, double beta1,
-                              double beta2, float eps, int threads) {
-    const adam::Settings settings(rate, beta1, beta2, eps);
-    const auto run = features == 1   ? adam_table<1>
-                     : features == 2 ? adam_table<2>
-                     : features == 4 ? adam_table<4>
-                     : features == 8 ? adam_table<8>
-                                     : nullptr;
-    if (!run) return -1;
-    return run(positions, grads, ends, parts, resolutions, offsets, levels, values, mean, square, seen, settings,
-               threads);
+// Adam on what hash_grid_backward_table would add. `touched`: how many entries were updated.
+EXPORT int hash_grid_adam(const float* const* positions, const float* const* grads, const int64_t* ends, int parts,
+                          int features, const int64_t* resolutions, const int64_t* offsets, int levels, float* values,
+                          float* mean, float* square, float* seen, float rate, double beta1, double beta2, float eps,
+                          int threads, int64_t* touched) {
+    return guarded([&] {
+        const adam::Settings settings(rate, beta1, beta2, eps);
+#define CALL(F)                                                                                                   \
+    *touched = adam_table<F>(positions, grads, ends, parts, resolutions, offsets, levels, values, mean, square, seen, \
+                             settings, threads)
+        FOR_FEATURES(features, CALL)
+#undef CALL
+    });
 }
 
 EXPORT int hash_grid_backward_positions(const float* positions, int64_t count, const float* table, const float* grad,
                                         int features, const int64_t* resolutions, const int64_t* offsets, int levels,
                                         float* positions_grad, int threads) {
+    return guarded([&] {
 #define CALL(F) \
     backward_positions<F>(positions, count, table, grad, resolutions, offsets, levels, positions_grad, threads)
-    FOR_FEATURES(features, CALL)
+        FOR_FEATURES(features, CALL)
 #undef CALL
+    });
 }

@@ -114,7 +114,7 @@ int march_ray(const Ray& ray, const Steps& steps, const Grid& grid, float enter,
 
 // One bit a cell, and for each block of 4^3 cells its distance (the largest over the axes, in blocks, at most 255) to a
 // block that holds an occupied cell; from one byte a cell.
-EXPORT void pack_occupancy(const uint8_t* occupied, int resolution, uint8_t* bits, uint8_t* blocks) {
+EXPORT int pack_occupancy(const uint8_t* occupied, int resolution, uint8_t* bits, uint8_t* blocks) {
     const int64_t cells = int64_t(resolution) * resolution * resolution, side = (resolution + BLOCK - 1) / BLOCK;
     std::memset(bits, 0, size_t((cells + 7) / 8));
     std::memset(blocks, 0, size_t(side * side * side));
@@ -142,127 +142,147 @@ EXPORT void pack_occupancy(const uint8_t* occupied, int resolution, uint8_t* bit
             }
             blocks[b] = uint8_t(std::min<int>(blocks[b], nearest));
         }
+    return DONE;
 }
 
 // Marks the cells whose opacity over one step is at least `threshold`, or the mean opacity if that is less. The grid of
-// densities is multiplied by `decay` first. NaN is marked and left out of the mean. Returns the threshold used.
-EXPORT float refresh_occupancy(float* density, int64_t cells, float decay, float step, float threshold,
-                               uint8_t* occupied, int threads) {
-    constexpr int64_t RUN = 4096;
-    const int64_t runs = (cells + RUN - 1) / RUN;
-    std::vector<double> opacity(size_t(runs), 0.0);  // of each run, so that the sum does not depend on the threads
-    std::vector<int64_t> known(size_t(runs), 0);     // cells of each run that are not NaN
-#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
-    for (int64_t run = 0; run < runs; run++) {
-        const int64_t end = std::min(cells, (run + 1) * RUN);
-        int64_t i = run * RUN;
-        Floats sum = splat(0);
-        Ints numbers = {};
-        for (; i + LANES <= end; i += LANES) {
-            const Floats value = load(density + i) * decay, alpha = opacity_of(value * step);
-            store(density + i, value);
-            sum += alpha == alpha ? alpha : splat(0);
-            numbers -= alpha == alpha;  // true is -1
-        }
-        for (int lane = 0; lane < LANES; lane++) {
-            opacity[size_t(run)] += sum[lane];
-            known[size_t(run)] += numbers[lane];
-        }
-        for (; i < end; i++) {
-            const float alpha = -std::expm1((density[i] *= decay) * -step);
-            if (std::isnan(alpha)) continue;
-            opacity[size_t(run)] += alpha;
-            known[size_t(run)]++;
-        }
-    }
-    double total = 0, count = 0;
-    for (double part : opacity) total += part;
-    for (int64_t part : known) count += double(part);
-    constexpr double ROUNDING = 1e-5;  // see ../march.py
-    const float least = std::min(threshold, float(total / count * (1 - ROUNDING)));  // the threshold where all are NaN
-    const float density_threshold = -std::log1p(-std::min(least, 1 - 1e-7f)) / step;
-#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
-    for (int64_t i = 0; i < cells; i++) occupied[i] = !(density[i] < density_threshold);
-    return least;
-}
-
-// Where each ray enters and leaves the box, and its first step: `enter` less a share of a step. Returns the number of
-// rays that hit the box, whose indices are written to `alive`.
-EXPORT int64_t march_begin(const float* origins, const float* directions, const float* nears, const float* fars,
-                           const float* shift, int64_t rays, const float* box, float step, float* enter, float* leave,
-                           float* first, int64_t* alive, int threads) {
-#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
-    for (int64_t r = 0; r < rays; r++) {
-        float from = 0, to = std::numeric_limits<float>::infinity();
-        for (int a = 0; a < 3; a++) {
-            const float o = origins[r * 3 + a], d = directions[r * 3 + a];
-            if (d == 0) {
-                if (o < box[a] || o > box[3 + a]) to = -1;
-                continue;
+// densities is multiplied by `decay` first. NaN is marked and left out of the mean.
+EXPORT int refresh_occupancy(float* density, int64_t cells, float decay, float step, float threshold,
+                             uint8_t* occupied, int threads) {
+    return guarded([&] {
+        constexpr int64_t RUN = 32768;
+        const int64_t runs = (cells + RUN - 1) / RUN;
+        std::vector<double> opacity(size_t(runs), 0.0);  // of each run, so that the sum does not depend on the threads
+        std::vector<int64_t> known(size_t(runs), 0);     // cells of each run that are not NaN
+        for_ranges(threads, cells, RUN, [&](int64_t i, int64_t end) {
+            double& of_run = opacity[size_t(i / RUN)];
+            int64_t& numbers_in_run = known[size_t(i / RUN)];
+            const float fade = decay, length = step;  // not captured: what is stored might be they
+            Floats sum = splat(0);
+            Ints numbers = {};
+            for (; i + LANES <= end; i += LANES) {
+                const Floats value = load(density + i) * fade, alpha = opacity_of(value * length);
+                store(density + i, value);
+                sum += alpha == alpha ? alpha : splat(0);
+                numbers -= alpha == alpha;  // true is -1
             }
-            const float one = (box[a] - o) / d, two = (box[3 + a] - o) / d;
-            from = std::max(from, std::min(one, two));
-            to = std::min(to, std::max(one, two));
-        }
-        enter[r] = std::max(from, nears[r]);
-        leave[r] = std::min(to, fars[r]);
-        first[r] = enter[r] - (shift ? shift[r] * step : 0);
-    }
-    int64_t hits = 0;
-    for (int64_t r = 0; r < rays; r++)
-        if (leave[r] > enter[r]) alive[hits++] = r;
-    return hits;
+            for (int lane = 0; lane < LANES; lane++) {
+                of_run += sum[lane];
+                numbers_in_run += numbers[lane];
+            }
+            for (; i < end; i++) {
+                const float alpha = -std::expm1((density[i] *= fade) * -length);
+                if (std::isnan(alpha)) continue;
+                of_run += alpha;
+                numbers_in_run++;
+            }
+        });
+        double total = 0, count = 0;
+        for (double part : opacity) total += part;
+        for (int64_t part : known) count += double(part);
+        constexpr double ROUNDING = 1e-5;  // see ../march.py
+        const float least = std::min(threshold, float(total / count * (1 - ROUNDING)));  // the threshold if all are NaN
+        const float density_threshold = -std::log1p(-std::min(least, 1 - 1e-7f)) / step;
+        for_ranges(threads, cells, 4 * RUN, [&](int64_t begin, int64_t end) {
+            const float limit = density_threshold;
+            for (int64_t i = begin; i < end; i++) occupied[i] = !(density[i] < limit);
+        });
+    });
 }
 
-// The next samples of each living ray, packed ray by ray. Returns their number N.
+// Where each ray enters and leaves the box, and its first step: `enter` less a share of a step. `hits`: the number of
+// rays that hit the box, whose indices are written to `alive`.
+EXPORT int march_begin(const float* origins, const float* directions, const float* nears, const float* fars,
+                       const float* shift, int64_t rays, const float* box, float step, float* enter, float* leave,
+                       float* first, int64_t* alive, int threads, int64_t* hits) {
+    return guarded([&] {
+        for_each(threads, rays, 4096, [&](int64_t r) {
+            float from = 0, to = std::numeric_limits<float>::infinity();
+            for (int a = 0; a < 3; a++) {
+                const float o = origins[r * 3 + a], d = directions[r * 3 + a];
+                if (d == 0) {
+                    if (o < box[a] || o > box[3 + a]) to = -1;
+                    continue;
+                }
+                const float one = (box[a] - o) / d, two = (box[3 + a] - o) / d;
+                from = std::max(from, std::min(one, two));
+                to = std::min(to, std::max(one, two));
+            }
+            enter[r] = std::max(from, nears[r]);
+            leave[r] = std::min(to, fars[r]);
+            first[r] = enter[r] - (shift ? shift[r] * step : 0);
+        });
+        int64_t found = 0;
+        for (int64_t r = 0; r < rays; r++)
+            if (leave[r] > enter[r]) alive[found++] = r;
+        *hits = found;
+    });
+}
+
+// The next samples of each living ray, packed ray by ray. `total`: their number N.
 // next (R): the step to go on from, kept up here; counts (A): samples of each living ray.
 // starts, ends (N), owners (N), positions (N, 3) have room for A * limit.
-EXPORT int64_t march_wave(const float* origins, const float* directions, const float* enter, const float* leave,
-                          const float* first, int32_t* next, const int64_t* alive, int64_t living, int limit,
-                          const float* box, float step, float cone, const uint8_t* bits, const uint8_t* blocks,
-                          int resolution, int32_t* counts, float* starts, float* ends, int64_t* owners,
-                          float* positions, int threads) {
-    const Grid grid{bits, blocks, resolution, (resolution + BLOCK - 1) / BLOCK};
-    std::vector<int64_t> totals(threads + 1, 0);
-#pragma omp parallel num_threads(threads) if (threads > 1)
-    {
-        const int me = thread_index();
-        const Part part(living, me, threads);
-        static thread_local std::vector<float> my_starts, my_ends;  // kept, for fresh memory costs page faults
-        my_starts.clear();
-        my_ends.clear();
-        for (int64_t i = part.begin; i < part.end; i++) {
-            const int64_t r = alive[i];
-            const Ray ray(origins + r * 3, directions + r * 3, box, resolution);
-            const Steps steps(first[r], step, cone);
-            counts[i] = march_ray(ray, steps, grid, enter[r], leave[r], limit, next[r], my_starts, my_ends);
-        }
-        totals[me + 1] = int64_t(my_starts.size());
-#pragma omp barrier
-        int64_t at = 0;
-        for (int t = 0; t < me; t++) at += totals[t + 1];
-        std::copy(my_starts.begin(), my_starts.end(), starts + at);
-        std::copy(my_ends.begin(), my_ends.end(), ends + at);
-        for (int64_t i = part.begin, n = at; i < part.end; i++) {
-            const int64_t r = alive[i];
-            for (int s = 0; s < counts[i]; s++, n++) {
-                owners[n] = r;
-                const float t = (starts[n] + ends[n]) / 2;
-                for (int a = 0; a < 3; a++) positions[n * 3 + a] = origins[r * 3 + a] + t * directions[r * 3 + a];
+EXPORT int march_wave(const float* origins, const float* directions, const float* enter, const float* leave,
+                      const float* first, int32_t* next, const int64_t* alive, int64_t living, int limit,
+                      const float* box, float step, float cone, const uint8_t* bits, const uint8_t* blocks,
+                      int resolution, int32_t* counts, float* starts, float* ends, int64_t* owners, float* positions,
+                      int threads, int64_t* total) {
+    struct Found {
+        std::vector<float> starts, ends;
+    };
+    struct Chunk {  // of rays: its samples are found[slot]'s from `begin` on, and belong at `at`
+        int slot;
+        int64_t begin, count, at;
+    };
+    return guarded([&] {
+        constexpr int64_t RAYS = 512;
+        const Grid grid{bits, blocks, resolution, (resolution + BLOCK - 1) / BLOCK};
+        static thread_local std::vector<Found> kept;  // for fresh memory costs page faults
+        std::vector<Found>& found = kept;             // the caller's, whichever thread looks
+        if (found.size() < size_t(threads)) found.resize(size_t(threads));
+        for (Found& of_slot : found) of_slot.starts.clear(), of_slot.ends.clear();
+        std::vector<Chunk> chunks(size_t((living + RAYS - 1) / RAYS));
+        for_chunks(threads, int64_t(chunks.size()), [&](int64_t c, int slot) {
+            Found& mine = found[size_t(slot)];
+            const int64_t before = int64_t(mine.starts.size()), last = std::min(living, (c + 1) * RAYS);
+            for (int64_t i = c * RAYS; i < last; i++) {
+                const int64_t r = alive[i];
+                const Ray ray(origins + r * 3, directions + r * 3, box, resolution);
+                const Steps steps(first[r], step, cone);
+                counts[i] = march_ray(ray, steps, grid, enter[r], leave[r], limit, next[r], mine.starts, mine.ends);
             }
+            chunks[size_t(c)] = {slot, before, int64_t(mine.starts.size()) - before, 0};
+        });
+        int64_t all = 0;
+        for (Chunk& chunk : chunks) {
+            chunk.at = all;
+            all += chunk.count;
         }
-    }
-    int64_t total = 0;
-    for (int64_t t : totals) total += t;
-    return total;
+        for_chunks(threads, int64_t(chunks.size()), [&](int64_t c, int) {
+            const Chunk& chunk = chunks[size_t(c)];
+            const Found& from = found[size_t(chunk.slot)];
+            std::copy_n(from.starts.begin() + chunk.begin, chunk.count, starts + chunk.at);
+            std::copy_n(from.ends.begin() + chunk.begin, chunk.count, ends + chunk.at);
+            const int64_t last = std::min(living, (c + 1) * RAYS);
+            for (int64_t i = c * RAYS, n = chunk.at; i < last; i++) {
+                const int64_t r = alive[i];
+                for (int s = 0; s < counts[i]; s++, n++) {
+                    owners[n] = r;
+                    const float t = (starts[n] + ends[n]) / 2;
+                    for (int a = 0; a < 3; a++) positions[n * 3 + a] = origins[r * 3 + a] + t * directions[r * 3 + a];
+                }
+            }
+        });
+        *total = all;
+    });
 }
 
 // After a wave's densities are known: adds to the optical depth `spent` (R) of each living ray, marks the samples that
-// light still reached, and writes the rays that go on. Returns the number of those.
-EXPORT int64_t march_advance(const int64_t* alive, int64_t living, const int32_t* counts, int limit,
-                             const float* sigma, const float* starts, const float* ends, float budget, float* spent,
-                             uint8_t* reached, int64_t* going_on) {
-    int64_t n = 0, left = 0;
+// light still reached, and writes the rays that go on. `left`: the number of those.
+EXPORT int march_advance(const int64_t* alive, int64_t living, const int32_t* counts, int limit, const float* sigma,
+                         const float* starts, const float* ends, float budget, float* spent, uint8_t* reached,
+                         int64_t* going_on, int64_t* left) {
+    int64_t n = 0, on = 0;
     for (int64_t i = 0; i < living; i++) {
         const int64_t r = alive[i];
         float tau = spent[r];
@@ -271,32 +291,40 @@ EXPORT int64_t march_advance(const int64_t* alive, int64_t living, const int32_t
             tau += sigma[n] * (ends[n] - starts[n]);
         }
         spent[r] = tau;
-        if (counts[i] == limit && !(tau >= budget)) going_on[left++] = r;
+        if (counts[i] == limit && !(tau >= budget)) going_on[on++] = r;
     }
-    return left;
+    *left = on;
+    return DONE;
 }
 
-// Order (M) in which the reached samples of all waves stand ray by ray, and offsets (R + 1). Returns M.
-EXPORT int64_t sort_by_ray(const int64_t* owners, const uint8_t* reached, int64_t count, int64_t rays, int64_t* order,
-                           int64_t* offsets) {
-    std::fill(offsets, offsets + rays + 1, 0);
-    for (int64_t n = 0; n < count; n++) offsets[owners[n] + 1] += reached[n];
-    for (int64_t r = 0; r < rays; r++) offsets[r + 1] += offsets[r];
-    std::vector<int64_t> at(offsets, offsets + rays);
-    for (int64_t n = 0; n < count; n++)
-        if (reached[n]) order[at[owners[n]]++] = n;
-    return offsets[rays];
+// Order (M) in which the reached samples of all waves stand ray by ray, and offsets (R + 1). `kept`: M.
+EXPORT int sort_by_ray(const int64_t* owners, const uint8_t* reached, int64_t count, int64_t rays, int64_t* order,
+                       int64_t* offsets, int64_t* kept) {
+    return guarded([&] {
+        std::fill(offsets, offsets + rays + 1, 0);
+        for (int64_t n = 0; n < count; n++) {
+            check_index(owners[n], rays, "owners");
+            offsets[owners[n] + 1] += reached[n];
+        }
+        for (int64_t r = 0; r < rays; r++) offsets[r + 1] += offsets[r];
+        std::vector<int64_t> at(offsets, offsets + rays);
+        for (int64_t n = 0; n < count; n++)
+            if (reached[n]) order[at[size_t(owners[n])]++] = n;
+        *kept = offsets[rays];
+    });
 }
 
 // Rows of `arrays` arrays, each in `parts` parts that stand one after another; ends holds the number of rows up to the
 // end of each part. Row order[m] of array a, of bytes[a] bytes, becomes row m of out[a]. part[a * parts + p].
-EXPORT void gather_rows(const uint8_t* const* part, const int64_t* bytes, int arrays, const int64_t* ends, int parts,
-                        const int64_t* order, int64_t count, uint8_t* const* out, int threads) {
-#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
-    for (int64_t m = 0; m < count; m++) {
-        const int64_t p = std::upper_bound(ends, ends + parts, order[m]) - ends;
-        const int64_t row = p ? order[m] - ends[p - 1] : order[m];
-        for (int a = 0; a < arrays; a++)
-            std::memcpy(out[a] + m * bytes[a], part[a * parts + p] + row * bytes[a], size_t(bytes[a]));
-    }
+EXPORT int gather_rows(const uint8_t* const* part, const int64_t* bytes, int arrays, const int64_t* ends, int parts,
+                       const int64_t* order, int64_t count, uint8_t* const* out, int threads) {
+    return guarded([&] {
+        for_each(threads, count, 1024, [&](int64_t m) {
+            check_index(order[m], parts ? ends[parts - 1] : 0, "the order");
+            const int64_t p = std::upper_bound(ends, ends + parts, order[m]) - ends;
+            const int64_t row = p ? order[m] - ends[p - 1] : order[m];
+            for (int a = 0; a < arrays; a++)
+                std::memcpy(out[a] + m * bytes[a], part[a * parts + p] + row * bytes[a], size_t(bytes[a]));
+        });
+    });
 }

@@ -117,7 +117,6 @@ struct Network {
         }
     }
     const float* bias_of(int l) const { return bias[l].empty() ? nullptr : bias[l].data(); }
-    int64_t sums(int l) const { return int64_t(wide[l] + 1) * wide[l + 1]; }
 };
 
 // A block's activations: layer[0] is the input, layer[L] the output before its activation function.
@@ -153,63 +152,60 @@ float* run_backward(const Network& net, const Block& block, float* grad, float* 
 }  // namespace
 
 // The input is `parts` arrays (count, part_widths[p]) side by side; widths are those of the input and every layer.
-EXPORT void mlp_forward(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
-                        const int64_t* widths, int layers, const float* const* weights,
-                        const float* const* biases, int activation, float* out, int threads) {
-    const Network net(widths, layers, weights, biases);
-    const Inputs input{parts, inputs, part_widths};
-    const int64_t blocks = (count + BLOCK - 1) / BLOCK;
-#pragma omp parallel num_threads(threads) if (threads > 1)
-    {
-        Block block;
-#pragma omp for schedule(static)
-        for (int64_t b = 0; b < blocks; b++) {
-            const int size = int(count - b * BLOCK < BLOCK ? count - b * BLOCK : BLOCK);
-            int64_t rows[BLOCK];
-            for (int r = 0; r < size; r++) rows[r] = b * BLOCK + r;
-            input.read(block.layer[0], net.wide[0], rows, size);
-            run_forward(net, block);
-            float* last = block.layer[layers];
-            activate(last, BLOCK * net.wide[layers], activation);
-            for (int r = 0; r < size; r++)
-                std::memcpy(out + rows[r] * net.width[layers], last + r * net.wide[layers],
-                            sizeof(float) * net.width[layers]);
-        }
-    }
+EXPORT int mlp_forward(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
+                       const int64_t* widths, int layers, const float* const* weights, const float* const* biases,
+                       int activation, float* out, int threads) {
+    return guarded([&] {
+        check_sizes(widths, layers);
+        const Network net(widths, layers, weights, biases);
+        const Inputs input{parts, inputs, part_widths};
+        for_ranges(threads, count, FORWARD_ROWS, [&](int64_t begin, int64_t end) {
+            Block block;
+            for (int64_t first = begin; first < end; first += BLOCK) {
+                const int size = int(std::min<int64_t>(end - first, BLOCK));
+                int64_t rows[BLOCK];
+                for (int r = 0; r < size; r++) rows[r] = first + r;
+                input.read(block.layer[0], net.wide[0], rows, size);
+                run_forward(net, block);
+                float* last = block.layer[layers];
+                activate(last, BLOCK * net.wide[layers], activation);
+                for (int r = 0; r < size; r++)
+                    std::memcpy(out + rows[r] * net.width[layers], last + r * net.wide[layers],
+                                sizeof(float) * net.width[layers]);
+            }
+        });
+    });
 }
 
 // Writes the inputs' gradients (parts that are null are left out) and the weights', (outputs, inputs) like them.
-EXPORT void mlp_backward(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
-                         const int64_t* widths, int layers, const float* const* weights,
-                         const float* const* biases, int activation, const float* grad, float* const* input_grads,
-                         float* const* weight_grads, float* const* bias_grads, int threads) {
-    const Network net(widths, layers, weights, biases);
-    const Inputs input{parts, inputs, part_widths};
-    const int outputs = net.width[layers];
-    size_t total = 0;
-    for (int l = 0; l < layers; l++) total += size_t(net.sums(l));
-    std::vector<float> sums(total * threads, 0.0f);
-#pragma omp parallel num_threads(threads) if (threads > 1)
-    {
-        Block block;
-        alignas(64) float first[BLOCK * MAX_WIDTH], second[BLOCK * MAX_WIDTH];
-        float* mine[MAX_LAYERS];
-        float* at = sums.data() + total * thread_index();
-        for (int l = 0; l < layers; l++) mine[l] = at, at += net.sums(l);
-        const Part part(count, thread_index(), threads, BLOCK);
-        for (int64_t next = part.begin; next < part.end;) {
-            int64_t rows[BLOCK];
-            const int size = live_rows(grad, outputs, input_grads, input, next, part.end, rows);
-            if (size == 0) break;
-            input.read(block.layer[0], net.wide[0], rows, size);
-            run_forward(net, block);
-            read_output_gradient(grad, outputs, net.wide[layers], rows, size, activation, block.layer[layers], first);
-            const float* dx = run_backward(net, block, first, second, mine);
-            write_input_gradient(dx, net.wide[0], input, rows, size, input_grads);
-        }
-    }
-    const float* sum = sums.data();
-    for (int l = 0; l < layers; sum += net.sums(l), l++)
-        write_weight_gradient(sum, int64_t(total), threads, net.width[l], net.wide[l], net.width[l + 1],
-                              net.wide[l + 1], weight_grads[l], bias_grads[l]);
+EXPORT int mlp_backward(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
+                        const int64_t* widths, int layers, const float* const* weights, const float* const* biases,
+                        int activation, const float* grad, float* const* input_grads, float* const* weight_grads,
+                        float* const* bias_grads, int threads) {
+    return guarded([&] {
+        check_sizes(widths, layers);
+        const Network net(widths, layers, weights, biases);
+        const Inputs input{parts, inputs, part_widths};
+        const int outputs = net.width[layers];
+        WeightSums sums(count, layers, net.wide, threads);
+        for_chunks(threads, sums.parts, [&](int64_t p, int) {
+            sums.clear(p);
+            Block block;
+            alignas(64) float first[BLOCK * MAX_WIDTH], second[BLOCK * MAX_WIDTH];
+            float* mine[MAX_LAYERS];
+            for (int l = 0; l < layers; l++) mine[l] = sums.of(p, l);
+            for (int64_t next = sums.begin(p); next < sums.end(p);) {
+                int64_t rows[BLOCK];
+                const int size = live_rows(grad, outputs, input_grads, input, next, sums.end(p), rows);
+                if (size == 0) break;
+                input.read(block.layer[0], net.wide[0], rows, size);
+                run_forward(net, block);
+                read_output_gradient(grad, outputs, net.wide[layers], rows, size, activation, block.layer[layers],
+                                     first);
+                const float* dx = run_backward(net, block, first, second, mine);
+                write_input_gradient(dx, net.wide[0], input, rows, size, input_grads);
+            }
+        });
+        sums.write(net.width, weight_grads, bias_grads);
+    });
 }

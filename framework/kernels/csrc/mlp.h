@@ -3,11 +3,21 @@
 
 #include "common.h"
 
+#include <vector>
+
 namespace mlp {
 
 constexpr int BLOCK = 32;
 constexpr int MAX_LAYERS = 8;
 constexpr int MAX_WIDTH = 384;  // K-Planes' explicit basis; D-NeRF's layer that is fed the encoded position again: 328
+
+constexpr int64_t FORWARD_ROWS = 8 * BLOCK;  // that a thread takes through the network before it takes others
+
+inline void check_sizes(const int64_t* widths, int layers) {
+    if (layers < 1 || layers > MAX_LAYERS) throw std::invalid_argument("a network has 1 to 8 layers");
+    for (int l = 0; l <= layers; l++)
+        if (widths[l] < 1 || widths[l] > MAX_WIDTH) throw std::invalid_argument("a layer has 1 to 384 features");
+}
 
 inline int padded(int width) { return (width + LANES - 1) / LANES * LANES; }
 
@@ -103,20 +113,64 @@ inline void write_input_gradient(const float* from, int wide, const Inputs& inpu
     }
 }
 
-// The sums over threads, (wide inputs, wide outputs) and one more row for the bias each, to the gradients of a layer's
-// weights (outputs, inputs) and bias (outputs).
-inline void write_weight_gradient(const float* sums, int64_t total, int threads, int in, int wide_in, int out,
-                                  int wide_out, float* grad, float* bias_grad) {
-    for (int o = 0; bias_grad && o < out; o++) {
-        bias_grad[o] = 0;
-        for (int t = 0; t < threads; t++) bias_grad[o] += sums[total * t + int64_t(wide_in) * wide_out + o];
-    }
-    for (int o = 0; o < out; o++)
-        for (int i = 0; i < in; i++) {
-            float value = 0;
-            for (int t = 0; t < threads; t++) value += sums[total * t + i * wide_out + o];
-            grad[o * in + i] = value;
+// The gradients of all weights and biases, in one sum for each part of the samples: what a part's is does not depend on
+// the threads, and parts are added in their order, so the same bits come out however many threads there are.
+struct WeightSums {
+    int64_t parts, rows;  // rows: of a part
+    int layers, threads;
+    const int* wide;  // widths in whole vectors, of the input and each layer
+    size_t size = 0;  // floats of a part
+    size_t first[MAX_LAYERS] = {};
+    std::vector<float>& sums;
+
+    // Large networks get fewer parts, for their sums would not stay in cache.
+    WeightSums(int64_t count, int layers, const int* wide, int threads)
+        : layers(layers), threads(threads), wide(wide), sums(kept()) {
+        for (int l = 0; l < layers; l++) {
+            first[l] = size;
+            size += size_t(wide[l] + 1) * size_t(wide[l + 1]);
         }
-}
+        constexpr int64_t ROWS = 1024, FEWEST = 16, FLOATS = 1 << 19;
+        const int64_t most = std::max(FEWEST, FLOATS / int64_t(size));
+        parts = std::min((count + ROWS - 1) / ROWS, most);
+        rows = parts ? ((count + parts - 1) / parts + BLOCK - 1) / BLOCK * BLOCK : 0;
+        parts = rows ? (count + rows - 1) / rows : 0;
+        this->count = count;
+        if (sums.size() < size * size_t(parts)) sums.resize(size * size_t(parts));
+    }
+    int64_t begin(int64_t part) const { return part * rows; }
+    int64_t end(int64_t part) const { return std::min(count, (part + 1) * rows); }
+
+    // Of one part: (wide inputs, wide outputs) of a layer and one more row for the bias.
+    float* of(int64_t part, int layer) const { return sums.data() + size * size_t(part) + first[layer]; }
+
+    void clear(int64_t part) const { std::fill_n(of(part, 0), size, 0.0f); }
+
+    // To the gradients of the weights (outputs, inputs) and biases (outputs), which may be null.
+    void write(const int* width, float* const* weight_grads, float* const* bias_grads) const {
+        for_ranges(threads, int64_t(size), 4096, [&](int64_t from, int64_t to) {
+            float* total = sums.data();
+            for (int64_t p = 1; p < parts; p++) {
+                const float* part = sums.data() + size * size_t(p);
+                for (int64_t i = from; i < to; i++) total[i] += part[i];
+            }
+        });
+        for (int l = 0; l < layers; l++) {
+            const float* sum = sums.data() + first[l];
+            const int in = width[l], out = width[l + 1], wide_out = wide[l + 1];
+            for (int o = 0; o < out; o++)
+                for (int i = 0; i < in; i++) weight_grads[l][o * in + i] = parts ? sum[i * wide_out + o] : 0;
+            for (int o = 0; bias_grads[l] && o < out; o++)
+                bias_grads[l][o] = parts ? sum[size_t(wide[l]) * wide_out + o] : 0;
+        }
+    }
+
+private:
+    int64_t count;
+    static std::vector<float>& kept() {  // by each thread that calls, for fresh memory costs page faults
+        static thread_local std::vector<float> sums;
+        return sums;
+    }
+};
 
 }  // namespace mlp

@@ -167,7 +167,6 @@ struct Network {
         }
     }
     int inner(int l) const { return (width[l] + 1) / 2 * 2; }
-    int64_t sums(int l) const { return int64_t(columns[l] + 1) * columns[l + 1]; }
     const float* bias_of(int l) const { return bias[l].empty() ? nullptr : bias[l].data(); }
 };
 
@@ -217,74 +216,71 @@ void read_input(const Network& net, const Inputs& input, const int64_t* rows, in
 }  // namespace
 
 // As mlp_forward and mlp_backward.
-EXPORT void mlp_forward_bf16(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
-                             const int64_t* widths, int layers, const float* const* weights,
-                             const float* const* biases, int activation, float* out, int threads) {
-    const Network net(widths, layers, weights, biases);
-    const Inputs input{parts, inputs, part_widths};
-    const int64_t blocks = (count + BLOCK - 1) / BLOCK;
-    const int outputs = net.width[layers], columns = net.columns[layers];
-#pragma omp parallel num_threads(threads) if (threads > 1)
-    {
-        Block block;
-#pragma omp for schedule(static)
-        for (int64_t b = 0; b < blocks; b++) {
-            const int size = int(count - b * BLOCK < BLOCK ? count - b * BLOCK : BLOCK);
-            int64_t rows[BLOCK];
-            for (int r = 0; r < size; r++) rows[r] = b * BLOCK + r;
-            read_input(net, input, rows, size, block);
-            run_forward(net, block);
-            activate(block.output, BLOCK * columns, activation);
-            for (int r = 0; r < size; r++)
-                std::memcpy(out + rows[r] * outputs, block.output + r * columns, sizeof(float) * outputs);
-        }
-    }
+EXPORT int mlp_forward_bf16(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
+                            const int64_t* widths, int layers, const float* const* weights,
+                            const float* const* biases, int activation, float* out, int threads) {
+    return guarded([&] {
+        check_sizes(widths, layers);
+        const Network net(widths, layers, weights, biases);
+        const Inputs input{parts, inputs, part_widths};
+        const int outputs = net.width[layers], columns = net.columns[layers];
+        for_ranges(threads, count, FORWARD_ROWS, [&](int64_t begin, int64_t end) {
+            Block block;
+            for (int64_t first = begin; first < end; first += BLOCK) {
+                const int size = int(std::min<int64_t>(end - first, BLOCK));
+                int64_t rows[BLOCK];
+                for (int r = 0; r < size; r++) rows[r] = first + r;
+                read_input(net, input, rows, size, block);
+                run_forward(net, block);
+                activate(block.output, BLOCK * columns, activation);
+                for (int r = 0; r < size; r++)
+                    std::memcpy(out + rows[r] * outputs, block.output + r * columns, sizeof(float) * outputs);
+            }
+        });
+    });
 }
 
-EXPORT void mlp_backward_bf16(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
-                              const int64_t* widths, int layers, const float* const* weights,
-                              const float* const* biases, int activation, const float* grad,
-                              float* const* input_grads, float* const* weight_grads, float* const* bias_grads,
-                              int threads) {
-    const Network net(widths, layers, weights, biases);
-    const Inputs input{parts, inputs, part_widths};
-    int64_t total = 0;
-    for (int l = 0; l < layers; l++) total += net.sums(l);
-    std::vector<float> sums(total * threads, 0.0f);
-#pragma omp parallel num_threads(threads) if (threads > 1)
-    {
-        Block block;
-        alignas(64) Half current[BLOCK * MAX_WIDTH], pairs_x[BLOCK * MAX_WIDTH], pairs_dy[BLOCK * MAX_WIDTH];
-        const Part part(count, thread_index(), threads, BLOCK);
-        for (int64_t next = part.begin; next < part.end;) {
-            int64_t rows[BLOCK];
-            const int size = live_rows(grad, net.width[layers], input_grads, input, next, part.end, rows);
-            if (size == 0) break;
-            read_input(net, input, rows, size, block);
-            run_forward(net, block);
-            read_output_gradient(grad, net.width[layers], net.columns[layers], rows, size, activation, block.output,
-                                 block.scratch);
-            to_halves(block.scratch, net.columns[layers], current, net.rows[layers], false, nullptr);
-            float* sum = sums.data() + total * (thread_index() + 1);
-            for (int l = layers - 1; l >= 0; l--) {
-                sum -= net.sums(l);
-                if (net.bias_of(l)) add_halves(current, net.rows[l + 1], net.columns[l + 1],
-                                               sum + net.columns[l] * net.columns[l + 1]);
-                interleave(block.layer[l], net.rows[l], pairs_x);
-                interleave(current, net.rows[l + 1], pairs_dy);
-                outer_product(pairs_x, net.rows[l], pairs_dy, net.rows[l + 1], net.columns[l], sum,
-                              net.columns[l + 1]);
-                product(current, net.rows[l + 1], net.backward[l].data(), net.columns[l], net.inner(l + 1),
-                        block.scratch, net.columns[l]);
-                if (l > 0) to_halves(block.scratch, net.columns[l], current, net.rows[l], false, block.layer[l]);
+EXPORT int mlp_backward_bf16(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
+                             const int64_t* widths, int layers, const float* const* weights,
+                             const float* const* biases, int activation, const float* grad,
+                             float* const* input_grads, float* const* weight_grads, float* const* bias_grads,
+                             int threads) {
+    return guarded([&] {
+        check_sizes(widths, layers);
+        const Network net(widths, layers, weights, biases);
+        const Inputs input{parts, inputs, part_widths};
+        WeightSums sums(count, layers, net.columns, threads);
+        for_chunks(threads, sums.parts, [&](int64_t p, int) {
+            sums.clear(p);
+            Block block;
+            alignas(64) Half current[BLOCK * MAX_WIDTH], pairs_x[BLOCK * MAX_WIDTH], pairs_dy[BLOCK * MAX_WIDTH];
+            for (int64_t next = sums.begin(p); next < sums.end(p);) {
+                int64_t rows[BLOCK];
+                const int size = live_rows(grad, net.width[layers], input_grads, input, next, sums.end(p), rows);
+                if (size == 0) break;
+                read_input(net, input, rows, size, block);
+                run_forward(net, block);
+                read_output_gradient(grad, net.width[layers], net.columns[layers], rows, size, activation,
+                                     block.output, block.scratch);
+                to_halves(block.scratch, net.columns[layers], current, net.rows[layers], false, nullptr);
+                for (int l = layers - 1; l >= 0; l--) {
+                    float* sum = sums.of(p, l);
+                    if (net.bias_of(l))
+                        add_halves(current, net.rows[l + 1], net.columns[l + 1],
+                                   sum + net.columns[l] * net.columns[l + 1]);
+                    interleave(block.layer[l], net.rows[l], pairs_x);
+                    interleave(current, net.rows[l + 1], pairs_dy);
+                    outer_product(pairs_x, net.rows[l], pairs_dy, net.rows[l + 1], net.columns[l], sum,
+                                  net.columns[l + 1]);
+                    product(current, net.rows[l + 1], net.backward[l].data(), net.columns[l], net.inner(l + 1),
+                            block.scratch, net.columns[l]);
+                    if (l > 0) to_halves(block.scratch, net.columns[l], current, net.rows[l], false, block.layer[l]);
+                }
+                write_input_gradient(block.scratch, net.columns[0], input, rows, size, input_grads);
             }
-            write_input_gradient(block.scratch, net.columns[0], input, rows, size, input_grads);
-        }
-    }
-    const float* sum = sums.data();
-    for (int l = 0; l < layers; sum += net.sums(l), l++)
-        write_weight_gradient(sum, total, threads, net.width[l], net.columns[l], net.width[l + 1],
-                              net.columns[l + 1], weight_grads[l], bias_grads[l]);
+        });
+        sums.write(net.width, weight_grads, bias_grads);
+    });
 }
 
 #endif

@@ -7,7 +7,7 @@
 
 namespace {
 
-constexpr int MAX_PLANES = 6;
+constexpr int MAX_PLANES = 6, MAX_DIMS = 4;
 
 // Vectors of features: V is Floats, four floats or one, whichever divides the number of features.
 typedef float Four __attribute__((vector_size(16)));
@@ -27,6 +27,14 @@ struct Layout {
     const int64_t* axes;         // (scales, planes, 2) the two axes of each plane; of a line the second is -1
     const int64_t* resolutions;  // (scales, dims)
     const int64_t* offsets;      // (scales, planes) first entry
+
+    Layout(int dims, int features, int scales, int planes, const int64_t* axes, const int64_t* resolutions,
+           const int64_t* offsets)
+        : dims(dims), features(features), scales(scales), planes(planes), axes(axes), resolutions(resolutions),
+          offsets(offsets) {
+        if (dims < 1 || dims > MAX_DIMS || planes < 1 || planes > MAX_PLANES || features < 1)
+            throw std::invalid_argument("planes: 1 to 4 axes, 1 to 6 factors and 1 feature or more are what there can be");
+    }
 };
 
 // Where a position falls on a plane: the entry of its cell's first corner, and the fractions along both axes.
@@ -82,10 +90,7 @@ void forward(const Layout& layout, const float* positions, int64_t count, const 
     const int F = layout.features, P = layout.planes;
     const int64_t width = int64_t(layout.scales) * F;
     constexpr int64_t CHUNK = 512;  // samples that go through a scale together: its planes stay in cache
-    const int64_t chunks = (count + CHUNK - 1) / CHUNK;
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 1) if (threads > 1)
-    for (int64_t chunk = 0; chunk < chunks; chunk++) {
-        const int64_t begin = chunk * CHUNK, end = begin + CHUNK < count ? begin + CHUNK : count;
+    for_ranges(threads, count, CHUNK, [&](int64_t begin, int64_t end) {
         for (int s = 0; s < layout.scales; s++) {
             Place at[2][MAX_PLANES];
             const auto find = [&](int64_t n, Place* found) {
@@ -105,7 +110,7 @@ void forward(const Layout& layout, const float* positions, int64_t count, const 
                 }
             }
         }
-    }
+    });
 }
 
 // Values of all planes, and the incoming gradient times the product of all others but each.
@@ -144,9 +149,8 @@ void backward_table(const Layout& layout, const float* positions, int64_t count,
     const int F = layout.features, P = layout.planes, lanes = size_of<V>();
     const int parts = F / lanes, units = layout.scales * parts;
     const int64_t width = int64_t(layout.scales) * F;
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 1) if (threads > 1)
-    for (int unit = 0; unit < units; unit++) {
-        const int s = layout.scales - 1 - unit / parts, c = unit % parts * lanes;  // the slowest first
+    for_each(threads, units, 1, [&](int64_t unit) {
+        const int s = layout.scales - 1 - int(unit) / parts, c = int(unit) % parts * lanes;  // the slowest first
         Place at[2][MAX_PLANES];
         const auto find = [&](int64_t n, Place* found) {
             for (int p = 0; p < P; p++) {
@@ -163,7 +167,7 @@ void backward_table(const Layout& layout, const float* positions, int64_t count,
             factors<V>(layout, at[turn], table, c, get<V>(grad + n * width + s * F + c), others);
             for (int p = 0; p < P; p++) scatter<V>(at[turn][p], table_grad + at[turn][p].first * F + c, F, others[p]);
         }
-    }
+    });
 }
 
 template <typename V>
@@ -171,9 +175,8 @@ void backward_positions(const Layout& layout, const float* positions, int64_t co
                         const float* grad, float* positions_grad, int threads) {
     const int F = layout.features, P = layout.planes, D = layout.dims;
     const int64_t width = int64_t(layout.scales) * F;
-#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
-    for (int64_t n = 0; n < count; n++) {
-        float sums[4] = {};
+    for_each(threads, count, 256, [&](int64_t n) {
+        float sums[MAX_DIMS] = {};
         for (int s = 0; s < layout.scales; s++) {
             Place at[MAX_PLANES];
             for (int p = 0; p < P; p++) at[p] = place(layout, positions + n * D, s, p);
@@ -201,42 +204,47 @@ void backward_positions(const Layout& layout, const float* positions, int64_t co
             }
         }
         std::memcpy(positions_grad + n * D, sums, sizeof(float) * D);
-    }
+    });
 }
 
 }  // namespace
 
-#define LAYOUT const Layout layout{dims, features, scales, planes, axes, resolutions, offsets}
 #define FOR_FEATURES(call)                         \
     if (features % LANES == 0) call(Floats);       \
     else if (features % 4 == 0) call(Four);        \
     else call(float)
 
-EXPORT void planes_forward(const float* positions, int64_t count, const float* table, int dims, int features,
-                           int scales, int planes, const int64_t* axes, const int64_t* resolutions,
-                           const int64_t* offsets, float* out, int threads) {
-    LAYOUT;
+EXPORT int planes_forward(const float* positions, int64_t count, const float* table, int dims, int features,
+                          int scales, int planes, const int64_t* axes, const int64_t* resolutions,
+                          const int64_t* offsets, float* out, int threads) {
+    return guarded([&] {
+        const Layout layout(dims, features, scales, planes, axes, resolutions, offsets);
 #define CALL(V) forward<V>(layout, positions, count, table, out, threads)
-    FOR_FEATURES(CALL);
+        FOR_FEATURES(CALL);
 #undef CALL
+    });
 }
 
 // Adds to `table_grad`.
-EXPORT void planes_backward_table(const float* positions, int64_t count, const float* table, int dims, int features,
-                                  int scales, int planes, const int64_t* axes, const int64_t* resolutions,
-                                  const int64_t* offsets, const float* grad, float* table_grad, int threads) {
-    LAYOUT;
+EXPORT int planes_backward_table(const float* positions, int64_t count, const float* table, int dims, int features,
+                                 int scales, int planes, const int64_t* axes, const int64_t* resolutions,
+                                 const int64_t* offsets, const float* grad, float* table_grad, int threads) {
+    return guarded([&] {
+        const Layout layout(dims, features, scales, planes, axes, resolutions, offsets);
 #define CALL(V) backward_table<V>(layout, positions, count, table, grad, table_grad, threads)
-    FOR_FEATURES(CALL);
+        FOR_FEATURES(CALL);
 #undef CALL
+    });
 }
 
-EXPORT void planes_backward_positions(const float* positions, int64_t count, const float* table, int dims,
-                                      int features, int scales, int planes, const int64_t* axes,
-                                      const int64_t* resolutions, const int64_t* offsets, const float* grad,
-                                      float* positions_grad, int threads) {
-    LAYOUT;
+EXPORT int planes_backward_positions(const float* positions, int64_t count, const float* table, int dims,
+                                     int features, int scales, int planes, const int64_t* axes,
+                                     const int64_t* resolutions, const int64_t* offsets, const float* grad,
+                                     float* positions_grad, int threads) {
+    return guarded([&] {
+        const Layout layout(dims, features, scales, planes, axes, resolutions, offsets);
 #define CALL(V) backward_positions<V>(layout, positions, count, table, grad, positions_grad, threads)
-    FOR_FEATURES(CALL);
+        FOR_FEATURES(CALL);
 #undef CALL
+    });
 }

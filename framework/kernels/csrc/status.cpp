@@ -1,0 +1,18 @@
+// The words of the last failure of each thread. See status.h.
+#include "common.h"
+
+#include <string>
+
+static thread_local char words[256];
+
+int remember(Status status, const char* what) noexcept {
+    std::strncpy(words, what, sizeof words - 1);
+    return status;
+}
+
+void bad_index(int64_t index, int64_t count, const char* what) {
+    throw std::out_of_range(std::string(what) + ": " + std::to_string(index) + " is not one of " +
+                            std::to_string(count));
+}
+
+EXPORT const char* last_error() { return words; }

@@ -107,7 +107,8 @@ class PixelSet:
 
     def pixels(self) -> Tensor:
         """(K,) int64 all of them."""
-        return self.at(torch.arange(len(self), device=self.starts.device))
+        shift = (self.starts - self.before[:-1]).repeat_interleave(self.before.diff())
+        return shift.add_(torch.arange(len(self), device=self.starts.device))
 
     def mask(self, first: int, last: int) -> Tensor:
         """(last - first,) bool: which of the pixels first .. last - 1 are in the set."""

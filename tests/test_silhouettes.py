@@ -80,7 +80,7 @@ def test_a_camera_inside_the_box_says_nothing_of_what_is_behind_it(ball: Dataset
     single = replace(one, cameras=one.cameras[index], pixels=one.pixels[:6400])
     silhouettes = Silhouettes.of(single)
     hull = visual_hull(silhouettes, BOX, 16)
-    behind = silhouettes.depth(0, centers(16)) < 0
+    behind = silhouettes.photograph(0).depth(centers(16)) < 0
     assert bool(hull[behind].all())
     assert not bool(hull.all())
 

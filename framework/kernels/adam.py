@@ -84,7 +84,7 @@ def dense_adam(
     """Update, in place, every value of several parameters (Kingma and Ba 2015, algorithm 1), compiled.
 
     Args:
-        values, grads, means, squares: contiguous float32 on the CPU, of the same shapes: parameters, gradients, moments.
+        values, grads, means, squares: contiguous float32 on the CPU, of the same shapes.
         steps: updates each parameter has had, this one included.
         rate, betas, eps: as for `sparse_adam`.
     """

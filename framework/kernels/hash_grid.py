@@ -16,6 +16,7 @@ from torch import Tensor
 
 from framework.kernels import native
 from framework.kernels.adam import all_finite
+from framework.kernels.deferred import Parts, waiting
 
 PRIMES = (1, 2654435761, 805459861)
 
@@ -118,7 +119,7 @@ class TableGradient:
 
     def __init__(self, layout: HashGridLayout) -> None:
         self.layout = layout
-        self.parts: list[tuple[Tensor, Tensor]] = []
+        self.parts: Parts = []
         """Positions (N, 3) and incoming gradient (N, L * F) of each encoding."""
 
     @property
@@ -172,8 +173,8 @@ class _HashGrid(torch.autograd.Function):
         ctx: Any,
         positions: Tensor,
         table: Tensor,
+        later: Tensor | None,
         layout: HashGridLayout,
-        deferred: TableGradient | None,
         known: Tensor | None,
     ) -> Tensor:
         count, features = len(positions), table.shape[1]
@@ -187,7 +188,7 @@ class _HashGrid(torch.autograd.Function):
                 points, count, entries, features, *layout.arrays, layout.num_levels, out.data_ptr(), native.threads()
             )
         ctx.save_for_backward(positions, table)
-        ctx.layout, ctx.deferred = layout, deferred
+        ctx.layout = layout
         return out
 
     @staticmethod
@@ -198,9 +199,7 @@ class _HashGrid(torch.autograd.Function):
         grad = grad.contiguous()
         incoming = native.pointer(grad, "the gradient", (count, layout.num_levels * features))
         grad_positions = grad_table = None
-        if ctx.needs_input_grad[1] and ctx.deferred is not None:
-            ctx.deferred.parts.append((positions, grad))
-        elif ctx.needs_input_grad[1]:
+        if ctx.needs_input_grad[1]:
             grad_table = torch.zeros_like(table)
             alone = TableGradient(layout)
             alone.parts.append((positions, grad))
@@ -211,7 +210,7 @@ class _HashGrid(torch.autograd.Function):
                 positions.data_ptr(), count, table.data_ptr(), incoming, features, *layout.arrays,
                 layout.num_levels, grad_positions.data_ptr(), native.threads(),
             )  # fmt: skip
-        return grad_positions, grad_table, None, None, None
+        return grad_positions, grad_table, grad if ctx.needs_input_grad[2] else None, None, None
 
 
 def hash_grid(
@@ -227,7 +226,7 @@ def hash_grid(
         positions: (N, 3) in [0, 1]; what lies outside is moved to the face.
         table: (E, F) entries of all levels, E = layout.num_entries.
         layout: resolutions and offsets.
-        deferred: where the compiled kernel's backward pass leaves the table's gradient, autograd getting none.
+        deferred: where a compiled backward pass that asks for the table's gradient leaves it, autograd getting none.
         known: (N, L * F) the result, where it was computed before without a gradient: only the backward pass is left.
     Returns: (N, L * F) features in the table's type. First derivatives only; see `hash_grid_reference`.
     Raises: ValueError where a shape does not fit the layout.
@@ -238,5 +237,9 @@ def hash_grid(
         raise ValueError(f"hash_grid: the table has shape {tuple(table.shape)}, not ({layout.num_entries}, F)")
     positions = positions.to(table.dtype)
     if native.usable(positions, table) and table.shape[1] in (1, 2, 4, 8):
-        return _HashGrid.apply(positions.contiguous(), table.contiguous(), layout, deferred, known)
+        positions, table, later = positions.contiguous(), table.contiguous(), None
+        if deferred is not None and table.requires_grad:
+            later = waiting(table, positions, layout.num_levels * table.shape[1], deferred.parts)
+            table = table.detach()
+        return _HashGrid.apply(positions, table, later, layout, known)
     return hash_grid_reference(positions, table, layout)

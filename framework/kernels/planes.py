@@ -19,6 +19,7 @@ from torch import Tensor
 
 from framework.kernels import memory, native
 from framework.kernels.adam import all_finite, sparse_adam
+from framework.kernels.deferred import Parts, waiting
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,7 @@ class PlanesGradient:
 
     def __init__(self, layout: PlanesLayout) -> None:
         self.layout = layout
-        self.parts: list[tuple[Tensor, Tensor]] = []
+        self.parts: Parts = []
         """Positions (N, D) and incoming gradient (N, G * F) of each look-up."""
         self.bands: list[tuple[int, Tensor]] = []
         """First entry and gradient (B, F) of each band of entries that was read as it is."""
@@ -180,8 +181,8 @@ class _Planes(torch.autograd.Function):
         ctx: Any,
         positions: Tensor,
         table: Tensor,
+        later: Tensor | None,
         layout: PlanesLayout,
-        deferred: PlanesGradient | None,
         known: Tensor | None,
     ) -> Tensor:
         if known is not None:
@@ -190,7 +191,7 @@ class _Planes(torch.autograd.Function):
             out = positions.new_empty(len(positions), layout.num_groups * table.shape[1])
             _forward(*_arguments(positions, table, layout), out.data_ptr(), native.threads())
         ctx.save_for_backward(positions, table)
-        ctx.layout, ctx.deferred = layout, deferred
+        ctx.layout = layout
         return out
 
     @staticmethod
@@ -204,12 +205,10 @@ class _Planes(torch.autograd.Function):
             incoming = _incoming(grad, positions, table, ctx.layout)
             arguments = _arguments(positions, table, ctx.layout)
             _backward_positions(*arguments, incoming, of_positions.data_ptr(), native.threads())
-        if ctx.needs_input_grad[1] and ctx.deferred is not None:
-            ctx.deferred.parts.append((positions, grad))
-        elif ctx.needs_input_grad[1]:
+        if ctx.needs_input_grad[1]:
             of_table = torch.zeros_like(table)
             _add_to(of_table, positions, table, grad, ctx.layout)
-        return of_positions, of_table, None, None, None
+        return of_positions, of_table, grad if ctx.needs_input_grad[2] else None, None, None
 
 
 def _add_to(total: Tensor, positions: Tensor, table: Tensor, grad: Tensor, layout: PlanesLayout) -> None:
@@ -231,7 +230,7 @@ def _arguments(positions: Tensor, table: Tensor, layout: PlanesLayout) -> tuple[
 
 
 class _Band(torch.autograd.Function):
-    """Entries [first, first + count) of a table, as they are."""
+    """Entries [first, first + count) of a table, as they are. Called back only for the table, its one input."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, first: int, count: int, deferred: PlanesGradient | None) -> Tensor:
@@ -280,7 +279,7 @@ def planes(
         positions: (N, D) in [0, 1]; what lies outside is moved to the edge.
         table: (E, F) entries of all planes, E = layout.num_entries.
         layout: resolutions and offsets.
-        deferred: where the compiled kernel's backward pass leaves the table's gradient, autograd getting none.
+        deferred: where a compiled backward pass that asks for the table's gradient leaves it, autograd getting none.
         known: (N, G * F) the result, where it was computed before without a gradient: only the backward pass is left.
     Returns: (N, G * F), group by group. First derivatives only where compiled; see `planes_reference`.
     Raises: ValueError where a shape does not fit the layout.
@@ -291,5 +290,9 @@ def planes(
         raise ValueError(f"planes: the table has shape {tuple(table.shape)}, not ({layout.num_entries}, F)")
     positions = positions.to(table.dtype)
     if native.usable(positions, table):
-        return _Planes.apply(positions.contiguous(), table.contiguous(), layout, deferred, known)
+        positions, table, later = positions.contiguous(), table.contiguous(), None
+        if deferred is not None and table.requires_grad:
+            later = waiting(table, positions, layout.num_groups * table.shape[1], deferred.parts)
+            table = table.detach()
+        return _Planes.apply(positions, table, later, layout, known)
     return planes_reference(positions, table, layout)

@@ -17,14 +17,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from framework.errors import ConfigError, shown
 from framework.kernels import memory, native
 from framework.kernels.adam import all_finite, sparse_adam
 from framework.kernels.deferred import Parts, waiting
 
+MAX_GROUPS, MAX_FACTORS = 64, 6
+MAX_VERTICES = 2**20
+"""Along an axis: float32 has 4 bits left for where between such vertices a position lies."""
+
 
 @dataclass(frozen=True)
 class PlanesLayout:
-    """Where each plane's entries stand in the one table (E, F) that all share."""
+    """Where each plane's entries stand in the one table (E, F) that all share.
+
+    Raises: ConfigError where axes, vertices or entries are none that factors can have: the kernels rely on it.
+    """
 
     resolutions: tuple[tuple[int, ...], ...]
     """Vertices along each of D axes, per group."""
@@ -34,27 +42,25 @@ class PlanesLayout:
     """First entry of each factor, per group."""
     num_entries: int
 
+    def __post_init__(self) -> None:
+        _check_factors(self.resolutions, self.axes)
+        for sizes, group, firsts in zip(self.resolutions, self.axes, self.offsets, strict=True):
+            for along, first in zip(group, firsts, strict=True):
+                last = first + math.prod(sizes[axis] for axis in along)
+                if not 0 <= first < last <= self.num_entries:
+                    raise ConfigError(f"planes of {self.num_entries} entries have none from {first} to {last}")
+
     @classmethod
     def build(
         cls, resolutions: tuple[tuple[int, ...], ...], axes: tuple[tuple[tuple[int, ...], ...], ...] | None = None
     ) -> PlanesLayout:
         """Factors along the given axes; a plane for every pair of axes in every group if not given.
 
-        Raises: ValueError where an axis has fewer than two vertices, or the groups differ in how many axes or factors
-            they have.
+        Raises: ConfigError where an axis has fewer than 2 or more than MAX_VERTICES vertices, or the groups differ in
+            how many axes or factors they have.
         """
-        dims = {len(scale) for scale in resolutions}
-        if len(dims) != 1 or not dims <= {2, 3, 4}:
-            raise ValueError(f"planes need the same 2 to 4 axes at every scale, not {sorted(dims)}")
-        if min(min(scale) for scale in resolutions) < 2:
-            raise ValueError(f"planes need two vertices or more along each axis, not {resolutions}")
-        (count,) = dims
-        axes = axes or (tuple(combinations(range(count), 2)),) * len(resolutions)
-        if len(axes) != len(resolutions) or len({len(group) for group in axes}) != 1 or not 1 <= len(axes[0]) <= 6:
-            raise ValueError(f"planes need as many factors in every group, 1 to 6, not {axes}")
-        for along in (along for group in axes for along in group):
-            if len(along) not in (1, 2) or len(set(along)) != len(along) or not set(along) <= set(range(count)):
-                raise ValueError(f"planes need one or two of the axes 0 to {count - 1} for each factor, not {along}")
+        axes = axes or tuple(tuple(combinations(range(len(scale)), 2)) for scale in resolutions)
+        _check_factors(resolutions, axes)
         offsets, total = [], 0
         for sizes, group in zip(resolutions, axes, strict=True):
             firsts = []
@@ -91,6 +97,23 @@ class PlanesLayout:
         flat = (tuple(value for row in rows for value in row) for rows in (self.resolutions, self.offsets))
         resolutions, offsets = (native.integers(values) for values in flat)
         return native.integers(axes), resolutions, offsets
+
+
+def _check_factors(resolutions: tuple[tuple[int, ...], ...], axes: tuple[tuple[tuple[int, ...], ...], ...]) -> None:
+    """Refuse vertices and axes that the kernels cannot bear. Raises: ConfigError."""
+    dims = {len(scale) for scale in resolutions}
+    if len(dims) != 1 or not dims <= {2, 3, 4} or len(resolutions) > MAX_GROUPS:
+        raise ConfigError(f"planes need the same 2 to 4 axes at every scale, of 1 to {MAX_GROUPS}, not {sorted(dims)}")
+    for size in (size for scale in resolutions for size in scale):
+        if not isinstance(size, int) or not 2 <= size <= MAX_VERTICES:
+            raise ConfigError(f"planes need 2 to {MAX_VERTICES} vertices along each axis, not {shown(size)}")
+    (count,) = dims
+    numbers = {len(group) for group in axes}
+    if len(axes) != len(resolutions) or len(numbers) != 1 or not numbers <= set(range(1, MAX_FACTORS + 1)):
+        raise ConfigError(f"planes need as many factors in every group, 1 to {MAX_FACTORS}, not {shown(axes)}")
+    for along in (along for group in axes for along in group):
+        if len(along) not in (1, 2) or len(set(along)) != len(along) or not set(along) <= set(range(count)):
+            raise ConfigError(f"planes need one or two of the axes 0 to {count - 1} for each factor, not {along}")
 
 
 def planes_reference(positions: Tensor, table: Tensor, layout: PlanesLayout) -> Tensor:

@@ -19,6 +19,7 @@ from torch.nn import functional
 from framework.bounds import intersect_box
 from framework.kernels import native
 from framework.kernels.compositing import optical_depth, segmented_sum
+from framework.kernels.given import check_indices
 from framework.rays import Rays
 
 BLOCK = 4
@@ -189,7 +190,9 @@ def sort_by_ray(owners: Tensor, reached: Tensor, num_rays: int) -> tuple[Tensor,
     Args:
         owners: (N,) int64.
         reached: (N,) uint8.
+    Raises: IndexError where there is no such ray.
     """
+    check_indices(owners, num_rays, "rays")
     if native.available() and owners.device.type == "cpu":
         order, offsets = torch.empty_like(owners), torch.empty(num_rays + 1, dtype=torch.int64)
         count = len(owners)

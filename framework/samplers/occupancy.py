@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from framework.errors import ConfigError, shown
 from framework.fields.base import DensityFunction, Field
 from framework.kernels import native
+from framework.kernels.given import is_followed
 from framework.kernels.march import March, Occupancy, ReferenceMarch, refresh_occupancy
 from framework.kernels.rows import gather_rows, take_rows
 from framework.rays import Rays, Samples
@@ -114,7 +115,11 @@ class OccupancySampler(nn.Module):
         """Samples in occupied cells, as far as light gets; densities and features attached.
 
         What is dropped could have changed a colour channel by at most `early_stop`, or `train_early_stop`.
+
+        Raises: ValueError where the rays ask for a gradient, which marched samples do not carry.
         """
+        if is_followed(rays.origins, rays.directions):
+            raise ValueError("marched samples carry no gradient to rays: detach these, or take a ProposalSampler")
         shift = torch.rand(len(rays), device=rays.origins.device) if jitter else None
         stop = self.train_early_stop if self.training else self.early_stop
         compiled = native.usable(rays.origins, rays.directions, self.box)

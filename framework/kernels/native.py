@@ -5,7 +5,7 @@ which checks them. The library holds no thread of its own: it runs on torch's Op
 lock during a call.
 
 `NERFLOOM_KERNELS` overrides the choice: a variant's name (baseline, avx2, avx512, avx512_bf16), or "reference" for
-torch alone.
+torch alone. `NERFLOOM_KERNEL_FOLDER` names another folder of libraries than the installed one (`make sanitize`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from framework.console import say
 from framework.device import processor_features
 from framework.errors import ConfigError
 
-FOLDER = Path(__file__).parent / "lib"
+FOLDER = Path(os.environ.get("NERFLOOM_KERNEL_FOLDER") or Path(__file__).parent / "lib")
 _AVX512 = ("avx512f", "avx512bw", "avx512dq", "avx512vl", "fma")
 NEEDS: dict[str, tuple[str, ...]] = {
     "avx512_bf16": (*_AVX512, "avx512_bf16"),

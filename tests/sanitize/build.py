@@ -31,19 +31,21 @@ class Sanitized:
 
     variant: str
     folder: Path
-    runtime: Path
-    """AddressSanitizer's, which must be loaded before Python."""
+    preloaded: tuple[Path, ...]
+    """What must be loaded before Python: AddressSanitizer, and the C++ library, whose exceptions it looks for then."""
 
 
-def runtime() -> Path:
-    """AddressSanitizer's library. Raises: Missing."""
+def runtime() -> tuple[Path, ...]:
+    """The libraries that must be loaded first. Raises: Missing."""
     if sys.platform != "linux" or shutil.which("g++") is None:
         raise Missing("it needs g++ on Linux")
-    told = subprocess.run(["g++", "-print-file-name=libasan.so"], capture_output=True, text=True, check=True)
-    found = Path(told.stdout.strip())
-    if not found.is_absolute():
-        raise Missing("g++ has no libasan.so: install the package libasan")
-    return found.resolve()
+    found = []
+    for name in ("libasan.so", "libstdc++.so.6"):
+        told = subprocess.run(["g++", f"-print-file-name={name}"], capture_output=True, text=True, check=True)
+        if not Path(told.stdout.strip()).is_absolute():
+            raise Missing(f"g++ has no {name}: install the package libasan")
+        found.append(Path(told.stdout.strip()).resolve())
+    return tuple(found)
 
 
 def build() -> Sanitized:
@@ -51,7 +53,7 @@ def build() -> Sanitized:
 
     Raises: Missing without compiler or runtime; CalledProcessError where it does not compile.
     """
-    asan = runtime()
+    preloaded = runtime()
     variant = next(name for name, needs in NEEDS.items() if processor_features().issuperset(needs))
     extension = next(e for e in _extensions() if e.name.rsplit(".", 1)[-1] == variant)
     FOLDER.mkdir(parents=True, exist_ok=True)
@@ -64,7 +66,7 @@ def build() -> Sanitized:
         list(pool.map(compile_one, extension.sources))
     library = FOLDER / f"{variant}{SUFFIX}"
     _run("g++", "-shared", *SANITIZERS, *map(str, objects.values()), *extension.extra_link_args, "-o", str(library))
-    return Sanitized(variant, FOLDER, asan)
+    return Sanitized(variant, FOLDER, preloaded)
 
 
 def _extensions() -> list[Extension]:

@@ -31,7 +31,21 @@ def check(library: Sanitized) -> int:
             print(said[-2000:])
             print(f"sanitize: the sanitizers are asleep: pixel {index} of 64 was not called a {words}")
             return 2
-    run = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", "-m", "not slow", *TESTS]
+    run = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-n",
+        "0",
+        "--capture=sys",
+        "-p",
+        "no:cacheprovider",
+        "-m",
+        "not slow",
+        *TESTS,
+    ]
+    # What a sanitizer says goes to the file descriptor, which pytest would otherwise keep from an aborted process.
     status = subprocess.run(run, cwd=ROOT, env=environment(library), check=False).returncode
     found = "nothing found" if status == 0 else f"something found, or a test that failed (exit status {status})"
     print(f"sanitize: {library.variant} with address, undefined and library assertions: {found}")
@@ -50,7 +64,7 @@ def environment(library: Sanitized) -> dict[str, str]:
     """Of a process that uses the library. Python and torch leak by design."""
     return {
         **os.environ,
-        "LD_PRELOAD": str(library.runtime),
+        "LD_PRELOAD": ":".join(map(str, library.preloaded)),
         "ASAN_OPTIONS": "detect_leaks=0:allocator_may_return_null=1",
         "UBSAN_OPTIONS": "print_stacktrace=1",
         "NERFLOOM_KERNELS": library.variant,

@@ -1,12 +1,13 @@
 # make demo   train on the embedded scene for a minute, and leave pictures
 # make test   the fast tests
+# make sanitize   the kernels' tests, on kernels that watch every read, write and sum
 # Both make .venv first. Running them again is quick: the installation is redone only when its inputs change.
 
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-all lint clean
+.PHONY: demo test test-all lint sanitize clean
 
 demo: .venv/installed
 	@run=outputs/demo/instant-ngp/$$(date +%Y-%m-%d_%H%M%S); \
@@ -24,6 +25,9 @@ test-all: .venv/installed-test
 lint: .venv/installed-test
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+
+sanitize: .venv/installed-test
+	$(BIN)/python -m tests.sanitize
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from framework.errors import DataError
 from framework.kernels import native
+from framework.kernels.given import check_indices, is_followed
 from framework.lenses import BENDING, Distortion, Seen, project, unproject
 from framework.lenses import LENSES as LENSES
 from framework.rays import Rays
@@ -178,10 +179,13 @@ class Cameras:
             near, far: the distances between which the scene lies.
             times: (M,) time of each camera.
             places: (K, 2) where in a pixel, columns and rows from its centre.
-        Returns: P * K rays, those of a pixel together.
+        Returns: P * K rays, those of a pixel together; with a gradient for poses and intrinsics that ask for one.
+        Raises: IndexError where there is no such pixel.
         """
-        if self.model in COMPILED and native.usable(self.camera_to_worlds, self.fx, places):
+        numbers = self.camera_to_worlds, self.fx, self.fy, self.cx, self.cy, places
+        if self.model in COMPILED and native.usable(*numbers) and not is_followed(*numbers, self.lens):
             return self._pixel_rays_compiled(flat, near, far, times, places)
+        check_indices(flat, int(self.offsets[-1]) if flat.device.type == "cpu" else 0, "pixels")
         return self.pixel_rays_reference(flat, near, far, times, places)
 
     def pixel_rays_reference(

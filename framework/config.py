@@ -6,11 +6,12 @@ This module imports neither torch nor any method, so that the command line answe
 from __future__ import annotations
 
 import dataclasses
+import math
 import types
 import typing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar, Union
+from typing import Any, ClassVar, Literal, TypeVar, Union
 
 import yaml
 
@@ -18,6 +19,9 @@ from framework.errors import ConfigError, nearest, shown
 
 T = TypeVar("T")
 RaysPerPixel = Literal[1, 4, 9, 16]
+Range = tuple[float, float]
+"""The least and the largest value of a setting, both allowed."""
+AT_LEAST_0: Range = (0, math.inf)
 SMALLEST_EPS = 1e-37
 """Least epsilon of Adam: float32, in which it is added, holds little less, and without one a gradient of 0 is 0 / 0."""
 
@@ -33,11 +37,31 @@ class MachineConfig:
     num_threads: int | None = None
     """Processor threads; all cores if not given."""
 
+    def __post_init__(self) -> None:
+        if not -(2**63) <= self.seed < 2**63:
+            raise ConfigError(f"--machine.seed is {shown(self.seed)}; it must be a number of 64 bits")
+
 
 @dataclass(frozen=True)
 class TrainConfig:
     """What every method can be told. A method's config derives from this and changes the defaults."""
 
+    RANGES: ClassVar[dict[str, Range]] = {
+        "max_num_iterations": (1, math.inf),
+        "num_rays_per_batch": (1, 2**20),
+        "eval_num_rays_per_chunk": (1, 2**20),
+        "samples_per_batch": (1, 2**24),
+        "steps_per_save": (1, math.inf),
+        "steps_per_eval_image": (1, math.inf),
+        "steps_per_eval_all_images": (1, math.inf),
+        "seconds_per_save": AT_LEAST_0,
+        "seconds_per_eval_all_images": AT_LEAST_0,
+        "max_eval_images": AT_LEAST_0,
+        "lr_warmup_steps": AT_LEAST_0,
+        "train_rays_per_pixel_from": (0, 1),
+    }
+    """What numbers may be, by name: a method's config names its own, and may change those of others. None, where it is
+    allowed, is in every range; of several numbers each must be in it."""
     data: Path | None = None
     """Folder of the data set. The embedded scene if not given."""
     cache_limit: float | None = None
@@ -124,18 +148,11 @@ class TrainConfig:
         return self
 
     def __post_init__(self) -> None:
-        for name in (
-            "max_num_iterations",
-            "num_rays_per_batch",
-            "eval_num_rays_per_chunk",
-            "steps_per_save",
-            "steps_per_eval_image",
-            "steps_per_eval_all_images",
-        ):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{_flag(name)} is {getattr(self, name)}; it must be at least 1")
-        if self.max_eval_images is not None and self.max_eval_images < 0:
-            raise ConfigError(f"--max-eval-images is {self.max_eval_images}; it must be at least 0")
+        ranges: dict[str, Range] = {}
+        for kind in reversed(type(self).__mro__):
+            ranges |= vars(kind).get("RANGES", {})
+        for name, (least, most) in ranges.items():
+            _check_range(name, getattr(self, name), least, most)
         if self.cache_limit is not None and not self.cache_limit >= 0:
             raise ConfigError(f"--cache-limit is {self.cache_limit}; it must be at least 0 MB")
         for name in ("adam_beta1", "adam_beta2"):
@@ -145,10 +162,16 @@ class TrainConfig:
             raise ConfigError(f"--adam-eps is {self.adam_eps}; it must be at least {SMALLEST_EPS}")
         if self.max_seconds is not None and not self.max_seconds > 0:
             raise ConfigError(f"--max-seconds is {self.max_seconds}; it must be more than 0")
-        if not 0 <= self.train_rays_per_pixel_from <= 1:
-            raise ConfigError(f"--train-rays-per-pixel-from is {self.train_rays_per_pixel_from}; it must be in [0, 1]")
         if not self.learning_rate > 0 or not 0 < self.lr_final <= 1:
             raise ConfigError("--learning-rate must be more than 0, and --lr-final in (0, 1]")
+
+
+def _check_range(name: str, value: Any, least: float, most: float) -> None:
+    """Refuse a setting, or one of several numbers in it, that is NaN, less than `least` or more than `most`."""
+    for number in value if isinstance(value, tuple) else (value,):
+        if number is not None and not least <= number <= most:
+            allowed = f"at least {least}" if most == math.inf else f"from {least} to {most}"
+            raise ConfigError(f"{_flag(name)} is {shown(number)}; it must be {allowed}")
 
 
 def _flag(name: str) -> str:

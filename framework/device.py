@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from framework.config import MachineConfig
 from framework.errors import ConfigError
@@ -39,6 +40,11 @@ def has_bfloat16(device: torch.device) -> bool:
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported()
     return device.type == "cpu" and bool({"amx_bf16", "avx512_bf16"} & processor_features())
+
+
+def exact(values: Tensor) -> Tensor:
+    """Values in float64: on the processor where their device, MPS, has none, else where they are."""
+    return (values.cpu() if values.device.type == "mps" else values).double()
 
 
 @cache

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from framework.dataset import Dataset
+from framework.device import exact
 
 TILE = 8
 """Pixels along an edge of the squares that share one figure."""
@@ -58,9 +59,9 @@ class ErrorMap:
         """
         errors = self.errors[self.squares(candidates)]
         share = EVENLY + (1 - EVENLY) * errors / errors.mean().clamp(min=1e-12)
-        ends = share.double().cumsum(0) * (count / len(candidates))
-        places = torch.arange(count, device=ends.device) + torch.rand((), device=ends.device, dtype=torch.float64)
-        taken = torch.searchsorted(ends, places, right=True).clamp(max=len(candidates) - 1)
+        ends = exact(share).cumsum(0) * (count / len(candidates))
+        places = torch.arange(count, device=ends.device) + torch.rand_like(ends[0])
+        taken = torch.searchsorted(ends, places, right=True).clamp(max=len(candidates) - 1).to(share.device)
         return taken, 1 / share[taken]
 
     def learn(self, pixels: Tensor, errors: Tensor) -> None:

@@ -38,6 +38,14 @@ class DivergenceError(NerfloomError):
     """Training met non-finite values too many times in a row to go on."""
 
 
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether memory was asked for that there is not: Python's own error, or one of torch's, which has many."""
+    said = str(error)
+    return isinstance(error, MemoryError) or (
+        isinstance(error, RuntimeError) and ("out of memory" in said or "allocate memory" in said)
+    )
+
+
 def nearest(name: str, candidates: Iterable[str]) -> str:
     """A hint naming the candidates closest to a misspelt `name`, or listing all of them.
 

@@ -14,6 +14,7 @@ from framework.dataset import Dataset
 from framework.depths import ray_distances
 from framework.error_map import ErrorMap
 from framework.kernels import native
+from framework.kernels.given import check_indices, is_followed
 from framework.rays import Rays
 
 Background = Literal["random", "white", "black"]
@@ -137,8 +138,11 @@ def gather_colors(pixels: Tensor, flat: Tensor, behind: Tensor) -> tuple[Tensor,
     """Colours (R, 3) of the pixels `flat` (R,) over `behind` (R, 3), and opacities (R,) where there are any.
 
     `pixels` (P, 3 or 4) are uint8, straight alpha.
+
+    Raises: IndexError where there is no such pixel.
     """
-    if not native.usable(behind):
+    if not native.usable(behind) or is_followed(behind):
+        check_indices(flat, len(pixels), "pixels")
         return gather_colors_reference(pixels, flat, behind)
     count, channels = len(flat), pixels.shape[1]
     rgb, alpha = torch.empty(count, 3), torch.empty(count)

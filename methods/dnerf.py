@@ -6,15 +6,18 @@ Pumarola et al., "D-NeRF: Neural Radiance Fields for Dynamic Scenes", CVPR 2021.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from torch import Tensor
 
 from framework import Decision, Field, Method, Model, Rays, Rendered, Scene
+from framework.config import AT_LEAST_0, Range
 from framework.encodings import HashGrid
 from framework.fields.deformed import DeformedField
 from framework.fields.encoded import EncodedField
 from framework.fields.nerf import NeRFField
+from framework.kernels.frequency import MAX_FREQUENCIES
+from framework.kernels.hash_grid import MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
 from framework.renderers import render_field, render_hierarchical
 from framework.samplers.choice import (
     HierarchicalConfig,
@@ -35,9 +38,22 @@ class DNeRFConfig(HierarchicalConfig):
     """Settings of dnerf; networks, samples and learning rate are the paper's.
 
     Unlike there, photographs with alpha are composited over random colours in training: over white, a scene with much
-    white in it is learnt as empty space, and stays so.
+    white in white in it is learnt as empty space, and stays so.
     """
 
+    RANGES: ClassVar[dict[str, Range]] = {
+        "num_layers": (3, 64),
+        "hidden_width": (2, 2**14),
+        "deformation_layers": (1, 64),
+        "deformation_width": (1, 2**14),
+        "position_frequencies": (0, MAX_FREQUENCIES),
+        "direction_frequencies": (0, MAX_FREQUENCIES),
+        "time_frequencies": (0, MAX_FREQUENCIES),
+        "grid_learning_rate": AT_LEAST_0,
+        "max_resolution": (1, MAX_RESOLUTION),
+        "log2_table_size": (1, MAX_LOG2_TABLE_SIZE),
+    }
+    """What these numbers may be."""
     max_num_iterations: int = 800_000
     num_rays_per_batch: int = 2_048
     learning_rate: float = 5e-4

@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 from torch import Tensor
 
 from framework import Decision, Method, Model, Rays, Rendered, Scene
-from framework.config import RaysPerPixel
+from framework.config import Range, RaysPerPixel
 from framework.encodings import HashGrid
 from framework.fields.encoded import EncodedField
+from framework.kernels.hash_grid import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
 from framework.renderers import render_field
 from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_decisions
 
@@ -35,6 +36,16 @@ SPARSE_FROM = 17
 class InstantNGPConfig(SamplingConfig):
     """Settings of instant-ngp."""
 
+    RANGES: ClassVar[dict[str, Range]] = {
+        "num_levels": (1, MAX_LEVELS),
+        "features_per_level": (1, 64),
+        "base_resolution": (1, MAX_RESOLUTION),
+        "max_resolution": (1, MAX_RESOLUTION),
+        "log2_table_size": (1, MAX_LOG2_TABLE_SIZE),
+        "detail": (1, 64),
+        "hidden_width": (1, 2**14),
+    }
+    """What these numbers may be."""
     max_num_iterations: int = 20_000
     num_rays_per_batch: int = 8_192
     rays_per_pixel: RaysPerPixel = 4

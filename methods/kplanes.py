@@ -6,17 +6,18 @@ Fridovich-Keil et al., "K-Planes: Explicit Radiance Fields in Space, Time, and A
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
 
-from framework import Batch, ConfigError, Decision, Method, Model, Rays, Rendered, Scene
+from framework import Batch, Decision, Method, Model, Rays, Rendered, Scene
+from framework.config import AT_LEAST_0, Range
 from framework.encodings import FeaturePlanes
 from framework.fields.base import MLP
 from framework.fields.encoded import BoxField, EncodedField
 from framework.kernels.math import truncated_exp
-from framework.kernels.planes import plane_band
+from framework.kernels.planes import MAX_VERTICES, plane_band
 from framework.kernels.spherical_harmonics import spherical_harmonics
 from framework.renderers import render_field
 from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_decisions
@@ -28,6 +29,17 @@ MAX_SCALES = 4
 class KPlanesConfig(SamplingConfig):
     """Settings of kplanes."""
 
+    RANGES: ClassVar[dict[str, Range]] = {
+        "base_resolution": (2, MAX_VERTICES),
+        "num_scales": (1, 16),
+        "time_resolution": (3, MAX_VERTICES),
+        "features_per_scale": (1, 2**14),
+        "hidden_width": (1, 2**14),
+        "space_tv": AT_LEAST_0,
+        "time_smoothness": AT_LEAST_0,
+        "time_sparsity": AT_LEAST_0,
+    }
+    """What these numbers may be."""
     max_num_iterations: int = 30_000
     samples_per_batch: int | None = 2**15
     learning_rate: float = 1e-2
@@ -42,7 +54,7 @@ class KPlanesConfig(SamplingConfig):
     num_scales: int | None = None
     """Scales. If not given: as many as the images' pixels can show, 4 at most."""
     time_resolution: int = 25
-    """Vertices along time, at every scale."""
+    """Vertices along time, at every scale; a second difference needs 3."""
     features_per_scale: int = 32
     """Features of a plane's vertex."""
     hidden_width: int = 64
@@ -55,13 +67,6 @@ class KPlanesConfig(SamplingConfig):
     """Weight of what keeps the planes of time at one, where nothing moves."""
     sparse_updates: bool = True
     """Adam updates only the entries that a step used."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.base_resolution < 2 or (self.num_scales is not None and self.num_scales < 1):
-            raise ConfigError("--base-resolution must be at least 2, and --num-scales at least 1")
-        if self.time_resolution < 3:
-            raise ConfigError(f"--time-resolution is {self.time_resolution}; a second difference needs at least 3")
 
 
 class ExplicitField(BoxField):

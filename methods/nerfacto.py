@@ -8,15 +8,17 @@ vectors (Martin-Brualla et al. 2021); gradients scaled near cameras (Philip and 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from torch import Tensor
 
 from framework import Batch, ConfigError, Decision, Method, Model, Rays, Rendered, Scene
+from framework.config import AT_LEAST_0, Range
 from framework.encodings import HashGrid
 from framework.fields.encoded import EncodedField
 from framework.fields.normals import NormalHead, density_normals, normal_penalties
 from framework.kernels.compositing import distortion, ray_sum
+from framework.kernels.hash_grid import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
 from framework.losses import depth_error
 from framework.pose_refinement import PoseRefinement
 from framework.rays import Samples
@@ -38,6 +40,20 @@ POSE_REASONS = {
 class NerfactoConfig(SamplingConfig):
     """Settings of nerfacto. What is not given is decided by the scene."""
 
+    RANGES: ClassVar[dict[str, Range]] = {
+        "distortion_loss_mult": AT_LEAST_0,
+        "appearance_embedding_dim": (0, 2**10),
+        "camera_learning_rate": AT_LEAST_0,
+        "depth_loss_mult": AT_LEAST_0,
+        "orientation_loss_mult": AT_LEAST_0,
+        "num_levels": (1, MAX_LEVELS),
+        "features_per_level": (1, 64),
+        "base_resolution": (1, MAX_RESOLUTION),
+        "max_resolution": (1, MAX_RESOLUTION),
+        "log2_table_size": (1, MAX_LOG2_TABLE_SIZE),
+        "hidden_width": (1, 2**14),
+    }
+    """What these numbers may be."""
     max_num_iterations: int = 30_000
     num_rays_per_batch: int = 2_048
     learning_rate: float = 1e-2

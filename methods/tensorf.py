@@ -5,9 +5,10 @@ Chen et al., "TensoRF: Tensorial Radiance Fields", ECCV 2022.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -15,9 +16,12 @@ from torch.nn.functional import softplus
 
 from framework import Batch, Decision, Field, Method, Model, Rays, Rendered, Scene
 from framework.bounds import to_unit_box
+from framework.config import AT_LEAST_0, Range
 from framework.encodings import FeaturePlanes
 from framework.fields.base import MLP
 from framework.kernels.contraction import contract_to_unit
+from framework.kernels.memory import require
+from framework.kernels.planes import PlanesLayout
 from framework.kernels.spherical_harmonics import spherical_harmonics
 from framework.renderers import render_field
 from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_decisions
@@ -43,6 +47,18 @@ MARGIN = 1
 class TensoRFConfig(SamplingConfig):
     """Settings of tensorf."""
 
+    RANGES: ClassVar[dict[str, Range]] = {
+        "network_learning_rate": AT_LEAST_0,
+        "density_components": (1, 2**14),
+        "appearance_components": (1, 2**14),
+        "first_voxels": (8, 2**30),
+        "last_voxels": (8, 2**30),
+        "upsample_at": AT_LEAST_0,
+        "sparsity": AT_LEAST_0,
+        "total_variation": AT_LEAST_0,
+        "hidden_width": (1, 2**14),
+    }
+    """What these numbers may be."""
     max_num_iterations: int = 30_000
     samples_per_batch: int | None = 2**15
     learning_rate: float = 2e-2
@@ -155,6 +171,10 @@ class TensoRF(Model[TensoRFConfig]):
         told_apart = VERTICES_PER_PIXEL * scene.image_size
         self.first_voxels = config.first_voxels or min(FIRST_SIDE, told_apart) ** 3
         self.last_voxels = config.last_voxels or min(LAST_SIDE[config.decomposition], told_apart) ** 3
+        components = config.density_components + config.appearance_components
+        for voxels in (self.first_voxels, self.last_voxels):  # before the training that the last would end
+            layout = PlanesLayout.build((self._vertices(voxels, scene.box),) * len(axes), axes)
+            require(4.0 * layout.num_entries * components, "a grid")
         vertices = (self._vertices(self.first_voxels, scene.box),) * len(axes)
         density, appearance = (
             FeaturePlanes(vertices, components, axes, config.sparse_updates, resizable=True)
@@ -171,9 +191,9 @@ class TensoRF(Model[TensoRFConfig]):
     @staticmethod
     def _vertices(voxels: float, box: Tensor) -> tuple[int, ...]:
         """Vertices along each axis of a grid of about so many cubes over the box."""
-        size = (box[1] - box[0]).double()
-        edge = (size.prod() / voxels) ** (1 / 3)
-        return tuple(max(round(n), 2) for n in (size / edge).tolist())
+        size = (box[1] - box[0]).tolist()
+        edge = (math.prod(size) / voxels) ** (1 / 3)
+        return tuple(max(round(length / edge), 2) for length in size)
 
     def render(self, rays: Rays, background: Tensor) -> Rendered:
         return render_field(self.field, self.sampler, rays, background, self.training)

@@ -8,12 +8,14 @@ space is skipped (as in NerfAcc, Li et al. 2023).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from torch import Tensor
 
 from framework import Decision, Method, Model, Rays, Rendered, Scene
+from framework.config import Range
 from framework.fields.nerf import NeRFField
+from framework.kernels.frequency import MAX_FREQUENCIES
 from framework.renderers import render_field, render_hierarchical
 from framework.samplers.choice import (
     HierarchicalConfig,
@@ -35,6 +37,13 @@ reached 22.5 dB on Lego after 90 s on two cores, where 2^13 samples, 512 steps a
 class VanillaNeRFConfig(HierarchicalConfig):
     """Settings of vanilla-nerf; the defaults are the paper's."""
 
+    RANGES: ClassVar[dict[str, Range]] = {
+        "num_layers": (3, 64),
+        "hidden_width": (2, 2**14),
+        "position_frequencies": (0, MAX_FREQUENCIES),
+        "direction_frequencies": (0, MAX_FREQUENCIES),
+    }
+    """What these numbers may be."""
     max_num_iterations: int = 200_000
     num_rays_per_batch: int = 4_096
     learning_rate: float = 5e-4

@@ -35,7 +35,7 @@ def test_every_methods_config_survives_yaml(method: str) -> None:
         ({"max_seconds": -1}, "--max-seconds is -1"),
         ({"learning_rate": 0}, "must be more than 0"),
         ({"rays_per_pixel": 2}, "must be one of 1, 4, 9, 16"),
-        ({"train_rays_per_pixel_from": 1.5}, "--train-rays-per-pixel-from is 1.5; it must be in"),
+        ({"train_rays_per_pixel_from": 1.5}, "--train-rays-per-pixel-from is 1.5; it must be from 0 to 1"),
         ({"learning_rate": float("nan")}, "must be more than 0"),
         ({"learning_rate": 10**400}, "'learning_rate'"),
         ({"steps_per_eval_image": 0}, "--steps-per-eval-image"),

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import TypeVar
 
 from framework.console import say
-from framework.errors import ConfigError, NerfloomError, nearest
+from framework.errors import ConfigError, NerfloomError, is_out_of_memory, nearest
 
 K = TypeVar("K")
 
@@ -52,6 +52,11 @@ def run_command(command: Callable[[list[str]], None]) -> None:
         if debug:
             raise
         say(f"error: {error}")
+        sys.exit(1)
+    except (MemoryError, RuntimeError) as error:
+        if debug or not is_out_of_memory(error):
+            raise
+        say("error: there is not enough memory; smaller settings, such as --num-rays-per-batch, take less")
         sys.exit(1)
     except KeyboardInterrupt:
         say("interrupted")

@@ -11,13 +11,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from framework.device import exact
+
 MAX_PSNR = 100.0
 """dB. Identical images would have infinity, which JSON cannot hold."""
 
 
 def psnr(prediction: Tensor, target: Tensor) -> float:
     """Peak signal-to-noise ratio in dB for a peak of 1; 100 for identical images."""
-    error = (prediction.double() - target.double()).square().mean().clamp(min=10 ** (-MAX_PSNR / 10))
+    error = (exact(prediction) - exact(target)).square().mean().clamp(min=10 ** (-MAX_PSNR / 10))
     return float(-10 * error.log10())
 
 
@@ -30,14 +32,15 @@ def ssim(prediction: Tensor, target: Tensor) -> float:
     """
     if min(prediction.shape[:2]) < 11:
         raise ValueError(f"SSIM needs at least 11x11 pixels, not {prediction.shape[1]}x{prediction.shape[0]}")
-    offsets = torch.arange(-5, 6, dtype=torch.float64, device=prediction.device)
+    prediction, target = exact(prediction), exact(target)
+    offsets = exact(torch.arange(-5, 6, device=prediction.device))
     line = torch.exp(-(offsets**2) / (2 * 1.5**2))
     line = line / line.sum()
 
     def blur(image: Tensor) -> Tensor:
         return functional.conv2d(functional.conv2d(image, line.view(1, 1, 11, 1)), line.view(1, 1, 1, 11))
 
-    x, y = (image.double().permute(2, 0, 1)[:, None] for image in (prediction, target))
+    x, y = (image.permute(2, 0, 1)[:, None] for image in (prediction, target))
     mean_x, mean_y = blur(x), blur(y)
     variance_x, variance_y = blur(x * x) - mean_x**2, blur(y * y) - mean_y**2
     covariance = blur(x * y) - mean_x * mean_y

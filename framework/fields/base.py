@@ -8,6 +8,8 @@ from itertools import pairwise
 
 from torch import Tensor, nn
 
+from framework.errors import ConfigError, shown
+from framework.kernels.memory import require
 from framework.kernels.mlp import Activation, mlp
 
 DensityFunction = Callable[[Tensor, Tensor | None], tuple[Tensor, Tensor]]
@@ -61,9 +63,13 @@ class MLP(nn.Sequential):
         widths: features of the input, of each hidden layer, and of the output.
         bias: whether the layers have one.
         activation: of the output.
+    Raises: ConfigError where a width is less than 1, or the machine has less memory than the weights take.
     """
 
     def __init__(self, *widths: int, bias: bool = True, activation: Activation = "none") -> None:
+        if min(widths) < 1:
+            raise ConfigError(f"a network's layers have 1 feature or more, not {shown(min(widths))}")
+        require(4.0 * sum(inputs * outputs for inputs, outputs in pairwise(widths)), "a network")
         layers: list[nn.Module] = []
         for index, (inputs, outputs) in enumerate(pairwise(widths)):
             if index:

@@ -30,10 +30,11 @@ def sparse_adam_reference(
     rows = (grad != 0).any(-1).nonzero().squeeze(-1)
     g = grad[rows]
     seen[rows] += 1
-    count = seen[rows].double()
+    # In the values' own type, which all devices have: 1 - beta^count by powers would lose digits.
+    count, logs = seen[rows], [math.log(beta) if beta else -math.inf for beta in betas]
     mean[rows] = betas[0] * mean[rows] + (1 - betas[0]) * g
     square[rows] = betas[1] * square[rows] + (1 - betas[1]) * g * g
-    unbias1, unbias2 = ((1 / (1 - beta**count)).to(values.dtype)[:, None] for beta in betas)
+    unbias1, unbias2 = ((-1 / torch.expm1(count * log)).to(values.dtype)[:, None] for log in logs)
     values[rows] -= rate * unbias1 * mean[rows] / ((unbias2 * square[rows]).sqrt() + eps)
     grad[rows] = 0
     return len(rows)

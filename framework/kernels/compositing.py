@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from framework.kernels import native
+from framework.kernels.given import check_offsets, is_followed
 from framework.rays import Samples
 
 MAX_OPTICAL_DEPTH = 1e3
@@ -173,10 +174,12 @@ def composite(samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor, 
         rgb: (N, 3) colour.
         background: (R, 3) or (3,) what shows where a ray is not opaque.
         fars: (R,) the rays' far ends.
+    Raises: IndexError where the samples' offsets do not divide them between the rays.
     """
+    check_offsets(samples.offsets, len(samples))
     background = background.expand(samples.num_rays, 3)
     tensors = (sigma, rgb, samples.t_starts, samples.t_ends, samples.points, background, fars)
-    if native.usable(*tensors) and not any(t is not None and t.requires_grad for t in tensors[2:]):
+    if native.usable(*tensors) and not is_followed(*tensors[2:]):
         inputs = [None if t is None else t.contiguous() for t in tensors]
         return Composited(*_Composite.apply(*inputs[:5], samples.offsets, *inputs[5:]))
     return composite_reference(samples, sigma, rgb, background, fars)
@@ -222,13 +225,16 @@ def distortion(weights: Tensor, samples: Samples) -> Tensor:
         weights: (N,).
         samples: their intervals.
     Returns: (R,) sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 delta_i / 3, in the unit of t.
+    Raises: IndexError where the samples' offsets do not divide them between the rays.
     """
-    if native.usable(weights, samples.t_starts, samples.t_ends) and not samples.t_starts.requires_grad:
-        starts, ends = samples.t_starts.contiguous(), samples.t_ends.contiguous()
+    check_offsets(samples.offsets, len(samples))
+    starts, ends = samples.t_starts, samples.t_ends
+    if native.usable(weights, starts, ends) and not is_followed(starts, ends):
+        starts, ends = starts.contiguous(), ends.contiguous()
         return _Distortion.apply(weights.contiguous(), starts, ends, samples.offsets)
     # m_i - m_j is the sum of the gaps between neighbouring middles from j to i: each counts for all weight in front.
     # No term is negative, so nothing cancels, wherever the weights lie and however close together.
-    w, starts, ends = weights, samples.t_starts, samples.t_ends
+    w = weights
     gaps = ((starts - starts.roll(1)) + (ends - ends.roll(1))).masked_fill(samples.places == 0, 0) / 2
     steps = gaps * exclusive_sum(w, samples)
     apart = exclusive_sum(steps, samples) + steps

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from framework.bounds import contract
 from framework.kernels import native
+from framework.kernels.given import is_followed
 
 
 def contract_to_unit_reference(positions: Tensor, box: Tensor) -> Tensor:
@@ -27,7 +28,7 @@ def contract_to_unit(positions: Tensor, box: Tensor) -> Tensor:
         box: (2, 3) corners of the part of space that is not contracted, but for its corners.
     Returns: (N, 3).
     """
-    if native.usable(positions, box):
+    if native.usable(positions, box) and not is_followed(box):
         return _Contract.apply(positions.contiguous(), (box[0] + box[1]) / 2, 2 / (box[1] - box[0]))
     return contract_to_unit_reference(positions, box)
 

@@ -9,6 +9,9 @@ from torch import Tensor
 
 from framework.kernels import native
 
+MAX_FREQUENCIES = 32
+"""Of which an encoding may be made: from float32 the sines of the last ones are noise long before."""
+
 _forward = native.function("frequency_encoding", "pqiiipi")
 _backward = native.function("frequency_encoding_backward", "ppqiiipi")
 
@@ -58,11 +61,14 @@ def frequency_encoding(x: Tensor, num_frequencies: int, include_input: bool = Tr
 
     Args:
         x: (..., D) input, of any type.
-        num_frequencies: L, at least 0.
+        num_frequencies: L, 0 to 32.
         include_input: put x itself in front.
     Returns: (..., D * (2 L + include_input)): [x, sin(x), cos(x), sin(2 x), cos(2 x), ...], in float64 where x is, and
         in float32 otherwise. First derivatives only where compiled.
+    Raises: ValueError for another number of frequencies.
     """
+    if not 0 <= num_frequencies <= MAX_FREQUENCIES:
+        raise ValueError(f"a frequency encoding has 0 to {MAX_FREQUENCIES} frequencies, not {num_frequencies}")
     x = _widened(x)
     if native.usable(x) and x.ndim >= 2:
         rows = x.flatten(0, -2).contiguous()

@@ -8,30 +8,57 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from framework.errors import ConfigError, shown
 from framework.kernels import native
 from framework.kernels.adam import all_finite
+from framework.kernels.deferred import Parts, waiting
 
 PRIMES = (1, 2654435761, 805459861)
+MAX_LEVELS = 64
+MAX_RESOLUTION = 2**20
+"""Cells along an axis: float32 has 4 bits left for where in such a cell a position lies."""
+MAX_LOG2_TABLE_SIZE = 28
+"""Entries of a level, as a power of two: 32 bits tell them apart."""
 
 
 @dataclass(frozen=True)
 class HashGridLayout:
-    """Where each level's entries stand in the one table (E, F) that all levels share."""
+    """Where each level's entries stand in the one table (E, F) that all levels share.
+
+    Raises: ConfigError where levels or their entries are none that a grid can have: the kernels rely on it.
+    """
 
     resolutions: tuple[int, ...]
     """Cells along each axis, per level."""
     offsets: tuple[int, ...]
     """First entry of each level; one more than there are levels, the last being E."""
 
+    def __post_init__(self) -> None:
+        _check("levels", len(self.resolutions), MAX_LEVELS)
+        if len(self.offsets) != len(self.resolutions) + 1 or self.offsets[0] != 0:
+            raise ConfigError(f"a hash grid of {len(self.resolutions)} levels has one offset more, the first being 0")
+        for resolution, (first, end) in zip(self.resolutions, pairwise(self.offsets), strict=True):
+            _check("cells along an axis", resolution, MAX_RESOLUTION)
+            _check("entries of a level", end - first, 2**MAX_LOG2_TABLE_SIZE)
+            if (resolution + 1) ** 3 > end - first and (end - first) & (end - first - 1):
+                raise ConfigError(f"a hash grid's level of {end - first} entries is hashed: it needs a power of two")
+
     @classmethod
     def build(cls, num_levels: int, base_resolution: int, max_resolution: int, log2_table_size: int) -> HashGridLayout:
-        """Resolutions grow geometrically from base to max (equations 2 and 3)."""
+        """Resolutions grow geometrically from base to max (equations 2 and 3).
+
+        Raises: ConfigError where a size is beyond MAX_LEVELS, MAX_RESOLUTION or MAX_LOG2_TABLE_SIZE, or less than 1.
+        """
+        _check("levels", num_levels, MAX_LEVELS)
+        _check("cells along an axis", base_resolution, MAX_RESOLUTION)
+        _check("cells along an axis", max_resolution, MAX_RESOLUTION)
+        _check("for log2 of a level's entries", log2_table_size, MAX_LOG2_TABLE_SIZE)
         growth = (max_resolution / base_resolution) ** (1 / max(num_levels - 1, 1))
         resolutions = tuple(int(base_resolution * growth**level + 1e-6) for level in range(num_levels))
         sizes = [min((resolution + 1) ** 3, 2**log2_table_size) for resolution in resolutions]
@@ -56,6 +83,12 @@ class HashGridLayout:
     def is_dense(self, level: int) -> bool:
         """Whether each vertex of a level has an entry of its own."""
         return (self.resolutions[level] + 1) ** 3 <= self.offsets[level + 1] - self.offsets[level]
+
+
+def _check(what: str, count: int, most: int) -> None:
+    """Refuse a count that is no whole number from 1 to `most`."""
+    if not isinstance(count, int) or not 1 <= count <= most:
+        raise ConfigError(f"a hash grid has 1 to {most} {what}, not {shown(count)}")
 
 
 def corners(positions: Tensor, layout: HashGridLayout, level: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -118,7 +151,7 @@ class TableGradient:
 
     def __init__(self, layout: HashGridLayout) -> None:
         self.layout = layout
-        self.parts: list[tuple[Tensor, Tensor]] = []
+        self.parts: Parts = []
         """Positions (N, 3) and incoming gradient (N, L * F) of each encoding."""
 
     @property
@@ -172,8 +205,8 @@ class _HashGrid(torch.autograd.Function):
         ctx: Any,
         positions: Tensor,
         table: Tensor,
+        later: Tensor | None,
         layout: HashGridLayout,
-        deferred: TableGradient | None,
         known: Tensor | None,
     ) -> Tensor:
         count, features = len(positions), table.shape[1]
@@ -187,7 +220,7 @@ class _HashGrid(torch.autograd.Function):
                 points, count, entries, features, *layout.arrays, layout.num_levels, out.data_ptr(), native.threads()
             )
         ctx.save_for_backward(positions, table)
-        ctx.layout, ctx.deferred = layout, deferred
+        ctx.layout = layout
         return out
 
     @staticmethod
@@ -198,9 +231,7 @@ class _HashGrid(torch.autograd.Function):
         grad = grad.contiguous()
         incoming = native.pointer(grad, "the gradient", (count, layout.num_levels * features))
         grad_positions = grad_table = None
-        if ctx.needs_input_grad[1] and ctx.deferred is not None:
-            ctx.deferred.parts.append((positions, grad))
-        elif ctx.needs_input_grad[1]:
+        if ctx.needs_input_grad[1]:
             grad_table = torch.zeros_like(table)
             alone = TableGradient(layout)
             alone.parts.append((positions, grad))
@@ -211,7 +242,7 @@ class _HashGrid(torch.autograd.Function):
                 positions.data_ptr(), count, table.data_ptr(), incoming, features, *layout.arrays,
                 layout.num_levels, grad_positions.data_ptr(), native.threads(),
             )  # fmt: skip
-        return grad_positions, grad_table, None, None, None
+        return grad_positions, grad_table, grad if ctx.needs_input_grad[2] else None, None, None
 
 
 def hash_grid(
@@ -227,7 +258,7 @@ def hash_grid(
         positions: (N, 3) in [0, 1]; what lies outside is moved to the face.
         table: (E, F) entries of all levels, E = layout.num_entries.
         layout: resolutions and offsets.
-        deferred: where the compiled kernel's backward pass leaves the table's gradient, autograd getting none.
+        deferred: where a compiled backward pass that asks for the table's gradient leaves it, autograd getting none.
         known: (N, L * F) the result, where it was computed before without a gradient: only the backward pass is left.
     Returns: (N, L * F) features in the table's type. First derivatives only; see `hash_grid_reference`.
     Raises: ValueError where a shape does not fit the layout.
@@ -238,5 +269,9 @@ def hash_grid(
         raise ValueError(f"hash_grid: the table has shape {tuple(table.shape)}, not ({layout.num_entries}, F)")
     positions = positions.to(table.dtype)
     if native.usable(positions, table) and table.shape[1] in (1, 2, 4, 8):
-        return _HashGrid.apply(positions.contiguous(), table.contiguous(), layout, deferred, known)
+        positions, table, later = positions.contiguous(), table.contiguous(), None
+        if deferred is not None and table.requires_grad:
+            later = waiting(table, positions, layout.num_levels * table.shape[1], deferred.parts)
+            table = table.detach()
+        return _HashGrid.apply(positions, table, later, layout, known)
     return hash_grid_reference(positions, table, layout)

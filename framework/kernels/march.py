@@ -19,6 +19,7 @@ from torch.nn import functional
 from framework.bounds import intersect_box
 from framework.kernels import native
 from framework.kernels.compositing import optical_depth, segmented_sum
+from framework.kernels.given import check_indices
 from framework.rays import Rays
 
 BLOCK = 4
@@ -189,6 +190,7 @@ def sort_by_ray(owners: Tensor, reached: Tensor, num_rays: int) -> tuple[Tensor,
     Args:
         owners: (N,) int64.
         reached: (N,) uint8.
+    Raises: IndexError where there is no such ray.
     """
     if native.available() and owners.device.type == "cpu":
         order, offsets = torch.empty_like(owners), torch.empty(num_rays + 1, dtype=torch.int64)
@@ -199,6 +201,7 @@ def sort_by_ray(owners: Tensor, reached: Tensor, num_rays: int) -> tuple[Tensor,
             offsets.data_ptr(),
         )  # fmt: skip
         return order[:kept], offsets
+    check_indices(owners, num_rays, "rays")
     chosen = reached.nonzero().squeeze(-1)
     order = chosen[owners[chosen].argsort(stable=True)]
     counts = torch.bincount(owners[chosen], minlength=num_rays)

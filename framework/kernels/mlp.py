@@ -147,7 +147,7 @@ def mlp(
         shapes = ", ".join(str(tuple(weight.shape)) for weight in weights)
         raise ValueError(f"mlp: weights of shapes {shapes} do not fit inputs of {widths[0]} features")
     small = max(widths) <= MAX_WIDTH and len(weights) <= MAX_LAYERS
-    if small and native.usable(*inputs, *weights):
+    if small and native.usable(*inputs, *weights, *(biases or ())):
         tensors = [x.contiguous() for x in (*inputs, *weights, *(biases or ()))]
         bf16 = torch.is_autocast_enabled("cpu") and native.has("mlp_forward_bf16")
         return _MLP.apply(_Plan(len(inputs), len(weights), activation, bf16), known, *tensors)

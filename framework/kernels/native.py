@@ -5,7 +5,7 @@ which checks them. What goes wrong in C is a status there and an exception here.
 (`csrc/parallel.h`), as many as torch is set to use. ctypes releases Python's lock during a call.
 
 `NERFLOOM_KERNELS` overrides the choice: a variant's name (baseline, avx2, avx512, avx512_bf16), or "reference" for
-torch alone.
+torch alone. `NERFLOOM_KERNEL_FOLDER` names another folder of libraries than the installed one (`make sanitize`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from framework.console import say
 from framework.device import processor_features
 from framework.errors import ConfigError
 
-FOLDER = Path(__file__).parent / "lib"
+FOLDER = Path(os.environ.get("NERFLOOM_KERNEL_FOLDER") or Path(__file__).parent / "lib")
 _AVX512 = ("avx512f", "avx512bw", "avx512dq", "avx512vl", "fma")
 NEEDS: dict[str, tuple[str, ...]] = {
     "avx512_bf16": (*_AVX512, "avx512_bf16"),

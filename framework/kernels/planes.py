@@ -17,13 +17,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from framework.errors import ConfigError, shown
 from framework.kernels import memory, native
 from framework.kernels.adam import all_finite, sparse_adam
+from framework.kernels.deferred import Parts, waiting
+
+MAX_GROUPS, MAX_FACTORS = 64, 6
+MAX_VERTICES = 2**20
+"""Along an axis: float32 has 4 bits left for where between such vertices a position lies."""
 
 
 @dataclass(frozen=True)
 class PlanesLayout:
-    """Where each plane's entries stand in the one table (E, F) that all share."""
+    """Where each plane's entries stand in the one table (E, F) that all share.
+
+    Raises: ConfigError where axes, vertices or entries are none that factors can have: the kernels rely on it.
+    """
 
     resolutions: tuple[tuple[int, ...], ...]
     """Vertices along each of D axes, per group."""
@@ -33,27 +42,25 @@ class PlanesLayout:
     """First entry of each factor, per group."""
     num_entries: int
 
+    def __post_init__(self) -> None:
+        _check_factors(self.resolutions, self.axes)
+        for sizes, group, firsts in zip(self.resolutions, self.axes, self.offsets, strict=True):
+            for along, first in zip(group, firsts, strict=True):
+                last = first + math.prod(sizes[axis] for axis in along)
+                if not 0 <= first < last <= self.num_entries:
+                    raise ConfigError(f"planes of {self.num_entries} entries have none from {first} to {last}")
+
     @classmethod
     def build(
         cls, resolutions: tuple[tuple[int, ...], ...], axes: tuple[tuple[tuple[int, ...], ...], ...] | None = None
     ) -> PlanesLayout:
         """Factors along the given axes; a plane for every pair of axes in every group if not given.
 
-        Raises: ValueError where an axis has fewer than two vertices, or the groups differ in how many axes or factors
-            they have.
+        Raises: ConfigError where an axis has fewer than 2 or more than MAX_VERTICES vertices, or the groups differ in
+            how many axes or factors they have.
         """
-        dims = {len(scale) for scale in resolutions}
-        if len(dims) != 1 or not dims <= {2, 3, 4}:
-            raise ValueError(f"planes need the same 2 to 4 axes at every scale, not {sorted(dims)}")
-        if min(min(scale) for scale in resolutions) < 2:
-            raise ValueError(f"planes need two vertices or more along each axis, not {resolutions}")
-        (count,) = dims
-        axes = axes or (tuple(combinations(range(count), 2)),) * len(resolutions)
-        if len(axes) != len(resolutions) or len({len(group) for group in axes}) != 1 or not 1 <= len(axes[0]) <= 6:
-            raise ValueError(f"planes need as many factors in every group, 1 to 6, not {axes}")
-        for along in (along for group in axes for along in group):
-            if len(along) not in (1, 2) or len(set(along)) != len(along) or not set(along) <= set(range(count)):
-                raise ValueError(f"planes need one or two of the axes 0 to {count - 1} for each factor, not {along}")
+        axes = axes or tuple(tuple(combinations(range(len(scale)), 2)) for scale in resolutions)
+        _check_factors(resolutions, axes)
         offsets, total = [], 0
         for sizes, group in zip(resolutions, axes, strict=True):
             firsts = []
@@ -90,6 +97,23 @@ class PlanesLayout:
         flat = (tuple(value for row in rows for value in row) for rows in (self.resolutions, self.offsets))
         resolutions, offsets = (native.integers(values) for values in flat)
         return native.integers(axes), resolutions, offsets
+
+
+def _check_factors(resolutions: tuple[tuple[int, ...], ...], axes: tuple[tuple[tuple[int, ...], ...], ...]) -> None:
+    """Refuse vertices and axes that the kernels cannot bear. Raises: ConfigError."""
+    dims = {len(scale) for scale in resolutions}
+    if len(dims) != 1 or not dims <= {2, 3, 4} or len(resolutions) > MAX_GROUPS:
+        raise ConfigError(f"planes need the same 2 to 4 axes at every scale, of 1 to {MAX_GROUPS}, not {sorted(dims)}")
+    for size in (size for scale in resolutions for size in scale):
+        if not isinstance(size, int) or not 2 <= size <= MAX_VERTICES:
+            raise ConfigError(f"planes need 2 to {MAX_VERTICES} vertices along each axis, not {shown(size)}")
+    (count,) = dims
+    numbers = {len(group) for group in axes}
+    if len(axes) != len(resolutions) or len(numbers) != 1 or not numbers <= set(range(1, MAX_FACTORS + 1)):
+        raise ConfigError(f"planes need as many factors in every group, 1 to {MAX_FACTORS}, not {shown(axes)}")
+    for along in (along for group in axes for along in group):
+        if len(along) not in (1, 2) or len(set(along)) != len(along) or not set(along) <= set(range(count)):
+            raise ConfigError(f"planes need one or two of the axes 0 to {count - 1} for each factor, not {along}")
 
 
 def planes_reference(positions: Tensor, table: Tensor, layout: PlanesLayout) -> Tensor:
@@ -132,7 +156,7 @@ class PlanesGradient:
 
     def __init__(self, layout: PlanesLayout) -> None:
         self.layout = layout
-        self.parts: list[tuple[Tensor, Tensor]] = []
+        self.parts: Parts = []
         """Positions (N, D) and incoming gradient (N, G * F) of each look-up."""
         self.bands: list[tuple[int, Tensor]] = []
         """First entry and gradient (B, F) of each band of entries that was read as it is."""
@@ -180,8 +204,8 @@ class _Planes(torch.autograd.Function):
         ctx: Any,
         positions: Tensor,
         table: Tensor,
+        later: Tensor | None,
         layout: PlanesLayout,
-        deferred: PlanesGradient | None,
         known: Tensor | None,
     ) -> Tensor:
         if known is not None:
@@ -190,7 +214,7 @@ class _Planes(torch.autograd.Function):
             out = positions.new_empty(len(positions), layout.num_groups * table.shape[1])
             _forward(*_arguments(positions, table, layout), out.data_ptr(), native.threads())
         ctx.save_for_backward(positions, table)
-        ctx.layout, ctx.deferred = layout, deferred
+        ctx.layout = layout
         return out
 
     @staticmethod
@@ -204,12 +228,10 @@ class _Planes(torch.autograd.Function):
             incoming = _incoming(grad, positions, table, ctx.layout)
             arguments = _arguments(positions, table, ctx.layout)
             _backward_positions(*arguments, incoming, of_positions.data_ptr(), native.threads())
-        if ctx.needs_input_grad[1] and ctx.deferred is not None:
-            ctx.deferred.parts.append((positions, grad))
-        elif ctx.needs_input_grad[1]:
+        if ctx.needs_input_grad[1]:
             of_table = torch.zeros_like(table)
             _add_to(of_table, positions, table, grad, ctx.layout)
-        return of_positions, of_table, None, None, None
+        return of_positions, of_table, grad if ctx.needs_input_grad[2] else None, None, None
 
 
 def _add_to(total: Tensor, positions: Tensor, table: Tensor, grad: Tensor, layout: PlanesLayout) -> None:
@@ -231,7 +253,7 @@ def _arguments(positions: Tensor, table: Tensor, layout: PlanesLayout) -> tuple[
 
 
 class _Band(torch.autograd.Function):
-    """Entries [first, first + count) of a table, as they are."""
+    """Entries [first, first + count) of a table, as they are. Called back only for the table, its one input."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, first: int, count: int, deferred: PlanesGradient | None) -> Tensor:
@@ -280,7 +302,7 @@ def planes(
         positions: (N, D) in [0, 1]; what lies outside is moved to the edge.
         table: (E, F) entries of all planes, E = layout.num_entries.
         layout: resolutions and offsets.
-        deferred: where the compiled kernel's backward pass leaves the table's gradient, autograd getting none.
+        deferred: where a compiled backward pass that asks for the table's gradient leaves it, autograd getting none.
         known: (N, G * F) the result, where it was computed before without a gradient: only the backward pass is left.
     Returns: (N, G * F), group by group. First derivatives only where compiled; see `planes_reference`.
     Raises: ValueError where a shape does not fit the layout.
@@ -291,5 +313,9 @@ def planes(
         raise ValueError(f"planes: the table has shape {tuple(table.shape)}, not ({layout.num_entries}, F)")
     positions = positions.to(table.dtype)
     if native.usable(positions, table):
-        return _Planes.apply(positions.contiguous(), table.contiguous(), layout, deferred, known)
+        positions, table, later = positions.contiguous(), table.contiguous(), None
+        if deferred is not None and table.requires_grad:
+            later = waiting(table, positions, layout.num_groups * table.shape[1], deferred.parts)
+            table = table.detach()
+        return _Planes.apply(positions, table, later, layout, known)
     return planes_reference(positions, table, layout)

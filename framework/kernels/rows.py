@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from framework.kernels import native
+from framework.kernels.given import check_indices
 
 _gather = native.function("gather_rows", "ppipipqpi")
 
@@ -45,9 +46,11 @@ def gather_rows(columns: Sequence[Sequence[Tensor]], order: Tensor) -> list[Tens
         columns: for each of the tensors its parts (N_p, ...); all have the same P parts of the same lengths.
         order: (M,) int64 indices into the N_1 + ... + N_P rows.
     Returns: (M, ...) of each tensor, without gradient.
+    Raises: IndexError where there is no such row.
     """
     first = columns[0]
     if order.device.type != "cpu" or not native.available():
+        check_indices(order, sum(len(part) for part in first), "rows")
         return [torch.cat(list(parts)).index_select(0, order) for parts in columns]
     ends = tuple(accumulate(len(part) for part in first))
     kept = [part.contiguous() for parts in columns for part in parts]

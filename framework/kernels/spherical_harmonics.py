@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from framework.kernels import native
+from framework.kernels.given import is_followed
 
 MAX_LEVELS = 4
 _compiled = native.function("spherical_harmonics", "pqipi")
@@ -25,7 +26,7 @@ def spherical_harmonics(directions: Tensor, levels: int = 4) -> Tensor:
     """
     if not 1 <= levels <= MAX_LEVELS:
         raise ValueError(f"spherical harmonics have 1 to {MAX_LEVELS} levels, not {levels}")
-    if native.usable(directions) and not directions.requires_grad:
+    if native.usable(directions) and not is_followed(directions):
         out = directions.new_empty(len(directions), levels**2)
         directions = directions.contiguous()
         address = native.pointer(directions, "directions", (len(directions), 3))

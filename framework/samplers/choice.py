@@ -3,25 +3,35 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 from torch import Tensor
 
-from framework.config import TrainConfig
+from framework.config import Range, TrainConfig
 from framework.errors import ConfigError
-from framework.samplers.occupancy import OccupancySampler
+from framework.samplers.occupancy import MAX_CELLS, OccupancySampler
 from framework.samplers.proposal import ProposalSampler
 from framework.scene import Scene
 from framework.scene_profile import Decision
 
 COARSEST_PROPOSAL = 128
 """Cells along an axis at the finest level of the first proposal; each further one has twice as many."""
+MOST_PROPOSALS = 8
 
 
 @dataclass(frozen=True)
 class SamplingConfig(TrainConfig):
     """Settings of a method that can be sampled through an occupancy grid or by proposals."""
 
+    RANGES: ClassVar[dict[str, Range]] = {
+        "grid_resolution": (1, MAX_CELLS),
+        "num_steps": (1, 2**20),
+        "early_stop": (0, 1),
+        "train_early_stop": (0, 1),
+        "num_proposal_samples": (1, 2**14),
+        "num_nerf_samples": (1, 2**14),
+    }
+    """What these numbers may be."""
     sampler: Literal["auto", "occupancy", "proposal"] = "auto"
     """occupancy: march through the box where it is not empty. proposal: small density fields say where to look, in all
     of space, contracted. auto: proposal where there may be something outside the box."""
@@ -40,16 +50,19 @@ class SamplingConfig(TrainConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if min((*self.num_proposal_samples, self.num_nerf_samples)) < 1:
-            raise ConfigError("--num-proposal-samples and --num-nerf-samples must be at least 1")
-        if not self.num_proposal_samples:
-            raise ConfigError("--num-proposal-samples must name one proposal or more, as in 128 64")
+        if not 1 <= len(self.num_proposal_samples) <= MOST_PROPOSALS:
+            raise ConfigError(f"--num-proposal-samples must name 1 to {MOST_PROPOSALS} proposals, as in 128 64")
 
 
 @dataclass(frozen=True)
 class HierarchicalConfig(SamplingConfig):
     """Settings of a method that can also be sampled as NeRF is, by a coarse field for a fine one."""
 
+    RANGES: ClassVar[dict[str, Range]] = {
+        "num_coarse_samples": (1, 2**14),
+        "num_fine_samples": (1, 2**14),
+    }
+    """What these numbers may be."""
     sampler: Literal["auto", "hierarchical", "occupancy", "proposal"] = "auto"  # type: ignore[assignment]
     """hierarchical: a coarse and a fine field. occupancy: one field and an occupancy grid. proposal: one field, and
     small density fields that say where to look, in all of space, contracted. auto: hierarchical, or proposal where

@@ -11,12 +11,16 @@ import math
 import torch
 from torch import Tensor, nn
 
+from framework.errors import ConfigError, shown
 from framework.fields.base import DensityFunction, Field
 from framework.kernels import native
+from framework.kernels.given import is_followed
 from framework.kernels.march import March, Occupancy, ReferenceMarch, refresh_occupancy
 from framework.kernels.rows import gather_rows, take_rows
 from framework.rays import Rays, Samples
 
+MAX_CELLS = 512
+"""Along an axis of the grid: of 512^3 cells what is known takes 0.8 GB."""
 CHUNK = 2**15
 """Cells evaluated at once."""
 WARM_UP_STEPS = 256
@@ -65,6 +69,11 @@ class OccupancySampler(nn.Module):
         moving: bool = False,
     ) -> None:
         super().__init__()
+        if not 1 <= resolution <= MAX_CELLS or not num_steps >= 1:
+            raise ConfigError(
+                f"an occupancy grid has 1 to {MAX_CELLS} cells along an axis and 1 step or more, "
+                f"not {shown(resolution)} and {shown(num_steps)}"
+            )
         self.resolution = resolution
         self.step_size = (box[1] - box[0]).norm().item() / num_steps
         self.early_stop = early_stop
@@ -106,7 +115,11 @@ class OccupancySampler(nn.Module):
         """Samples in occupied cells, as far as light gets; densities and features attached.
 
         What is dropped could have changed a colour channel by at most `early_stop`, or `train_early_stop`.
+
+        Raises: ValueError where the rays ask for a gradient, which marched samples do not carry.
         """
+        if is_followed(rays.origins, rays.directions):
+            raise ValueError("marched samples carry no gradient to rays: detach these, or take a ProposalSampler")
         shift = torch.rand(len(rays), device=rays.origins.device) if jitter else None
         stop = self.train_early_stop if self.training else self.early_stop
         compiled = native.usable(rays.origins, rays.directions, self.box)

@@ -8,6 +8,7 @@ disparity beyond for an unbounded scene, evenly throughout for a bounded one.
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import torch
@@ -137,7 +138,7 @@ class ProposalSampler(nn.Module):
 
 def half_edge(box: Tensor) -> float:
     """Half of the edge of the cube that is as large as `box` (2, 3): the unit of an unbounded scene's distances."""
-    return float((box[1] - box[0]).double().prod() ** (1 / 3) / 2)
+    return math.prod((box[1] - box[0]).tolist()) ** (1 / 3) / 2
 
 
 def to_disparity(t: Tensor) -> Tensor:

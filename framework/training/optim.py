@@ -13,7 +13,7 @@ from framework.config import TrainConfig
 from framework.kernels import native
 from framework.kernels.adam import all_finite, dense_adam, sparse_adam
 from framework.kernels.hash_grid import TableGradient
-from framework.kernels.memory import table
+from framework.kernels.memory import require, table
 from framework.kernels.planes import PlanesGradient
 from framework.model import Model
 
@@ -125,7 +125,11 @@ class Adam(torch.optim.Optimizer):
 
 
 def make_optimizer(model: Model, config: TrainConfig) -> Adam:
-    """Adam over the model's parameter groups, each remembering the rate it starts from as `initial_lr`."""
+    """Adam over the model's parameter groups, each remembering the rate it starts from as `initial_lr`.
+
+    Raises: ConfigError where the machine has less memory than it takes.
+    """
+    require(3.0 * 4 * model.size(), "the model's parameters and what Adam keeps of them")
     groups = []
     for group in model.param_groups():
         rate = group.get("lr", config.learning_rate)

@@ -11,7 +11,7 @@ import torch
 
 from framework.config import RaysPerPixel, TrainConfig
 from framework.device import choose_device
-from framework.errors import CheckpointError, NerfloomError
+from framework.errors import CheckpointError, ConfigError, NerfloomError, is_out_of_memory
 from framework.model import Model
 from framework.registry import load_method
 from framework.scene import Scene
@@ -75,8 +75,17 @@ def load_trained(
 
 
 def build_model(method: str, config: TrainConfig, scene: Scene) -> Model[Any]:
-    """A method's model with fresh parameters."""
-    return load_method(method).model(config.resolved(), scene)
+    """A method's model with fresh parameters.
+
+    Raises: ConfigError where the machine has less memory than it takes.
+    """
+    kind = load_method(method).model
+    try:
+        return kind(config.resolved(), scene)
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        raise ConfigError(f"the settings make a model of {method} that this machine has no memory for") from error
 
 
 def restored_model(method: str, config: TrainConfig, checkpoint: dict[str, Any], device: torch.device) -> Model[Any]:

@@ -303,7 +303,7 @@ EXPORT int sort_by_ray(const int64_t* owners, const uint8_t* reached, int64_t co
     return guarded([&] {
         std::fill(offsets, offsets + rays + 1, 0);
         for (int64_t n = 0; n < count; n++) {
-            check_index(owners[n], rays, "owners");
+            check_index(owners[n], rays, "rays");
             offsets[owners[n] + 1] += reached[n];
         }
         for (int64_t r = 0; r < rays; r++) offsets[r + 1] += offsets[r];
@@ -320,7 +320,7 @@ EXPORT int gather_rows(const uint8_t* const* part, const int64_t* bytes, int arr
                        const int64_t* order, int64_t count, uint8_t* const* out, int threads) {
     return guarded([&] {
         for_each(threads, count, 1024, [&](int64_t m) {
-            check_index(order[m], parts ? ends[parts - 1] : 0, "the order");
+            check_index(order[m], parts ? ends[parts - 1] : 0, "rows");
             const int64_t p = std::upper_bound(ends, ends + parts, order[m]) - ends;
             const int64_t row = p ? order[m] - ends[p - 1] : order[m];
             for (int a = 0; a < arrays; a++)

@@ -36,7 +36,7 @@ EXPORT int camera_rays(int model, const int64_t* flat, int64_t count, const floa
     return guarded([&] {
         const float radius = 2 / std::sqrt(12.0f);
         for_each(threads, count, 1024, [&](int64_t p) {
-            check_index(flat[p], offsets[images], "pixel indices");
+            check_index(flat[p], offsets[images], "pixels");
             const int64_t image = image_of(flat[p], offsets, images), within = flat[p] - offsets[image];
             const float column = float(within % widths[image]) + 0.5f - cx[image];
             const float row = float(within / widths[image]) + 0.5f - cy[image];
@@ -68,7 +68,7 @@ EXPORT int gather_colors(const int64_t* flat, int64_t count, const uint8_t* pixe
                          const float* background, float* rgb, float* alpha, int threads) {
     return guarded([&] {
         for_each(threads, count, 4096, [&](int64_t p) {
-            check_index(flat[p], num_pixels, "pixel indices");
+            check_index(flat[p], num_pixels, "pixels");
             const uint8_t* pixel = pixels + flat[p] * channels;
             const float cover = channels == 4 ? float(pixel[3]) / 255 : 1;
             for (int c = 0; c < 3; c++)

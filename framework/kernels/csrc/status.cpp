@@ -11,8 +11,8 @@ int remember(Status status, const char* what) noexcept {
 }
 
 void bad_index(int64_t index, int64_t count, const char* what) {
-    throw std::out_of_range(std::string(what) + ": " + std::to_string(index) + " is not one of " +
-                            std::to_string(count));
+    throw std::out_of_range(std::string(what) + ": index " + std::to_string(index) + " is out of range; there are " +
+                            std::to_string(count) + ", from 0");
 }
 
 EXPORT const char* last_error() { return words; }

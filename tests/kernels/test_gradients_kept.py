@@ -1,0 +1,240 @@
+"""No compiled operation drops a gradient that its reference has: each float input of each of them is asked for one."""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+import framework
+from framework.cameras import Cameras, subpixels
+from framework.fields.base import Field
+from framework.kernels.compositing import composite, composite_reference, distortion, distortion_reference
+from framework.kernels.contraction import contract_to_unit, contract_to_unit_reference
+from framework.kernels.frequency import frequency_encoding, frequency_encoding_reference
+from framework.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
+from framework.kernels.intervals import (
+    interval_weights,
+    interval_weights_reference,
+    proposal_excess,
+    proposal_excess_reference,
+)
+from framework.kernels.mlp import mlp, mlp_reference
+from framework.kernels.planes import PlanesLayout, planes, planes_reference
+from framework.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
+from framework.pixels import gather_colors, gather_colors_reference
+from framework.rays import Rays, Samples
+from framework.samplers.occupancy import OccupancySampler
+from tests.kernels.compiled import needs_kernels, relative_error
+
+pytestmark = needs_kernels
+GRID = HashGridLayout.build(3, 4, 20, 8)
+PLANES = PlanesLayout.build(((5, 6, 7), (8, 9, 10)))
+OFFSETS = torch.tensor([0, 3, 3, 8, 12])
+Function = Callable[..., Tensor]
+
+
+@dataclass(frozen=True)
+class Operation:
+    """What is compiled, what is true, and inputs whose gradients are compared."""
+
+    compiled: Function
+    reference: Function
+    inputs: Callable[[], dict[str, Tensor]]
+    kernels: tuple[str, ...]
+    without: frozenset[str] = frozenset()
+    """Inputs that are documented to have no gradient, in the reference either."""
+
+
+def rand(*shape: int) -> Tensor:
+    return torch.rand(shape) + 0.1
+
+
+def edges(rays: int, bins: int) -> Tensor:
+    return torch.linspace(0, 1, bins + 1) + 0.01 * torch.rand(rays, bins + 1).cumsum(-1)
+
+
+def sampled(starts: Tensor, ends: Tensor, points: Tensor | None = None) -> Samples:
+    return Samples(starts, ends, OFFSETS, points)
+
+
+def composited(form: Function) -> Function:
+    def run(sigma: Tensor, rgb: Tensor, starts: Tensor, lengths: Tensor, background: Tensor, fars: Tensor) -> Tensor:
+        found = form(sampled(starts, starts + lengths), sigma, rgb, background, fars)
+        return torch.cat([found.color.reshape(-1), found.opacity, found.weights])
+
+    return run
+
+
+def cameras(poses: Tensor, fx: Tensor, fy: Tensor, cx: Tensor, cy: Tensor) -> Cameras:
+    size = torch.full((2,), 6)
+    return Cameras(poses, fx, fy, cx, cy, size, size)
+
+
+def rays_of(name: str) -> Function:
+    def run(**numbers: Tensor) -> Tensor:
+        places = numbers.pop("places")
+        found = getattr(cameras(**numbers), name)(torch.arange(0, 72, 5), 0.0, 1.0, None, places)
+        assert found.pixel_radii is not None
+        return torch.cat([found.origins, found.directions, found.pixel_radii[:, None]], dim=-1)
+
+    return run
+
+
+def network(form: Function) -> Function:
+    def run(one: Tensor, two: Tensor, first: Tensor, second: Tensor, bias: Tensor, other: Tensor) -> Tensor:
+        return form([one, two], [first, second], "sigmoid", [bias, other])
+
+    return run
+
+
+BACKWARD_BF16 = ("mlp_forward_bf16", "mlp_backward_bf16")
+OPERATIONS = {
+    "hash grid": Operation(
+        lambda positions, table: hash_grid(positions, table, GRID),
+        lambda positions, table: hash_grid_reference(positions, table, GRID),
+        lambda: {"positions": torch.rand(20, 3), "table": rand(GRID.num_entries, 2)},
+        ("hash_grid_forward", "hash_grid_backward_table", "hash_grid_backward_positions"),
+    ),
+    "planes": Operation(
+        lambda positions, table: planes(positions, table, PLANES),
+        lambda positions, table: planes_reference(positions, table, PLANES),
+        lambda: {"positions": torch.rand(20, 3), "table": rand(PLANES.num_entries, 4)},
+        ("planes_forward", "planes_backward_table", "planes_backward_positions"),
+    ),
+    "mlp": Operation(
+        network(mlp),
+        network(mlp_reference),
+        lambda: {
+            "one": rand(9, 5), "two": rand(9, 2), "first": rand(8, 7), "second": rand(3, 8), "bias": rand(8),
+            "other": rand(3),
+        },
+        ("mlp_forward", "mlp_backward", *BACKWARD_BF16),
+    ),
+    "composite": Operation(
+        composited(composite),
+        composited(composite_reference),
+        lambda: {
+            "sigma": rand(12), "rgb": rand(12, 3), "starts": rand(12), "lengths": rand(12), "background": rand(4, 3),
+            "fars": rand(4) + 9,
+        },
+        ("composite_forward", "composite_backward"),
+    ),
+    "distortion": Operation(
+        lambda weights, starts, ends: distortion(weights, sampled(starts, ends)),
+        lambda weights, starts, ends: distortion_reference(weights, sampled(starts, ends)),
+        lambda: {"weights": rand(12), "starts": torch.arange(12) + rand(12), "ends": torch.arange(12) + 1 + rand(12)},
+        ("distortion",),
+    ),
+    "contraction": Operation(
+        contract_to_unit,
+        contract_to_unit_reference,
+        lambda: {"positions": 4 * torch.randn(20, 3), "box": torch.tensor([[-1.0] * 3, [1.0, 2.0, 1.5]])},
+        ("contract_positions", "contract_positions_backward"),
+    ),
+    "frequencies": Operation(
+        lambda x: frequency_encoding(x, 4),
+        lambda x: frequency_encoding_reference(x, 4),
+        lambda: {"x": rand(9, 3)},
+        ("frequency_encoding", "frequency_encoding_backward"),
+    ),
+    "spherical harmonics": Operation(
+        spherical_harmonics, spherical_harmonics_reference, lambda: {"directions": rand(9, 3)}, ("spherical_harmonics",)
+    ),
+    "interval weights": Operation(
+        interval_weights,
+        lambda sigma, t: interval_weights_reference(sigma, t.detach()),
+        lambda: {"sigma": rand(4, 6), "t": edges(4, 6)},
+        ("interval_weights", "interval_weights_backward"),
+        frozenset({"t"}),
+    ),
+    "proposals' excess": Operation(
+        proposal_excess,
+        lambda edges, weights, proposed, proposed_weights: proposal_excess_reference(
+            edges.detach(), weights.detach(), proposed.detach(), proposed_weights
+        ),
+        lambda: {
+            "edges": edges(4, 6), "weights": 3 * rand(4, 6), "proposed": edges(4, 9), "proposed_weights": rand(4, 9),
+        },
+        ("proposal_excess",),
+        frozenset({"edges", "weights", "proposed"}),
+    ),
+    "camera rays": Operation(
+        rays_of("pixel_rays"),
+        rays_of("pixel_rays_reference"),
+        lambda: {
+            "poses": torch.randn(2, 3, 4), "fx": rand(2) + 5, "fy": rand(2) + 5, "cx": rand(2) + 3, "cy": rand(2) + 3,
+            "places": subpixels(4),
+        },
+        ("camera_rays",),
+    ),
+    "colours": Operation(
+        lambda behind: gather_colors(COLORS, torch.arange(9), behind)[0],
+        lambda behind: gather_colors_reference(COLORS, torch.arange(9), behind)[0],
+        lambda: {"behind": rand(9, 3)},
+        ("gather_colors",),
+    ),
+}  # fmt: skip
+COLORS = torch.randint(256, (9, 4), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
+WITHOUT_A_GRADIENT = {
+    "pack_occupancy", "refresh_occupancy", "march_begin", "march_wave", "march_advance",  # refused, as tested below
+    "sort_by_ray", "gather_rows", "resample_intervals",  # documented to have none
+    "adam_sparse", "adam_dense", "all_finite", "hash_grid_adam",  # of the optimiser
+    "opaque_sums", "hold_balls", "pixels_near_balls",  # whose results are counted or true and false
+}  # fmt: skip
+
+
+def test_every_kernel_is_asked() -> None:
+    sources = "".join(file.read_text() for file in Path(framework.__file__).parent.rglob("*.py"))
+    declared = set(re.findall(r'native\.function\("(\w+)"', sources))
+    covered = {kernel for operation in OPERATIONS.values() for kernel in operation.kernels}
+    assert declared == covered | WITHOUT_A_GRADIENT
+
+
+CASES = [(name, given) for name, operation in OPERATIONS.items() for given in (*operation.inputs(), "all")]
+
+
+@pytest.mark.parametrize(("name", "given"), CASES, ids=[f"{name}-{given}" for name, given in CASES])
+def test_the_gradient_is_the_references(name: str, given: str) -> None:
+    """Of an input alone, and of all together."""
+    operation, found = OPERATIONS[name], []
+    torch.manual_seed(0)
+    inputs = operation.inputs()
+    asked = sorted(inputs) if given == "all" else [given]
+    for form in (operation.compiled, operation.reference):
+        ready = {key: value.clone().requires_grad_(key in asked) for key, value in inputs.items()}
+        out = form(**ready)
+        if out.requires_grad:
+            (out * torch.linspace(0.5, 1.5, out.numel()).view_as(out)).sum().backward()
+        found.append((out.detach(), [ready[key].grad for key in asked]))
+    (value, grads), (truth, true_grads) = found
+    assert relative_error(value, truth) < 1e-4
+    for key, grad, true in zip(asked, grads, true_grads, strict=True):
+        assert (true is None) == (key in operation.without or key == "fars"), key
+        assert (grad is None or not grad.any()) if true is None else grad is not None, key
+        if true is not None and grad is not None:
+            assert relative_error(grad, true) < 1e-3, key
+
+
+class Fog(Field):
+    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        return positions.square().sum(-1), positions
+
+    def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
+        return features
+
+
+@pytest.mark.parametrize("which", ["origins", "directions"])
+def test_marching_refuses_rays_that_are_learnt(which: str) -> None:
+    sampler = OccupancySampler(torch.tensor([[-1.0] * 3, [1.0] * 3]), 8, 16)
+    directions = torch.tensor([[0.0, 0.0, 1.0]]).expand(4, 3)
+    rays = Rays(torch.zeros(4, 3) - 2 * directions, directions, torch.zeros(4), torch.full((4,), 9.0))
+    assert len(sampler.sample(rays, Fog(), jitter=False)) > 0
+    learnt = replace(rays, **{which: getattr(rays, which).clone().requires_grad_()})
+    with pytest.raises(ValueError, match="carry no gradient to rays"):
+        sampler.sample(learnt, Fog(), jitter=False)
+    with torch.no_grad():
+        assert len(sampler.sample(learnt, Fog(), jitter=False)) > 0

@@ -72,12 +72,13 @@ def test_every_run_has_a_curve_at_its_price(
 
 
 def test_looks_change_no_bit(shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("framework.training.curve.is_due", lambda *_, **__: True)
-    blind = tiny_trainer("nerfacto", shared_tiny, tmp_path / "blind", max_num_iterations=12)
-    seeing = tiny_trainer("nerfacto", shared_tiny, tmp_path / "seeing", True, max_num_iterations=12)
+    monkeypatch.setattr("framework.training.curve.SHARE", math.inf)
+    monkeypatch.setattr("framework.training.curve.SPACING", 0.0)
+    blind = tiny_trainer("nerfacto", shared_tiny, tmp_path / "blind", max_num_iterations=8)
+    seeing = tiny_trainer("nerfacto", shared_tiny, tmp_path / "seeing", True, max_num_iterations=8)
     blind.train()
     seeing.train()
-    assert [point["step"] for point in written(seeing)] == list(range(1, 13))
+    assert [point["step"] for point in written(seeing)] == list(range(1, 9))
     assert written(blind) == []
     assert_same_bits(tensors(blind), tensors(seeing))
 

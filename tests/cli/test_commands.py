@@ -20,9 +20,9 @@ def test_help_is_quick_and_lists_every_method() -> None:
         done = subprocess.run([command("ns-train"), "--help"], capture_output=True, text=True, check=True)
         return time.perf_counter() - start, done.stdout
 
-    runs = [once() for _ in range(3)]
+    runs = [once() for _ in range(5)]
     best = min(seconds for seconds, _ in runs)
-    print(f"ns-train --help: {best:.2f} s at best of 3")
+    print(f"ns-train --help: {best:.2f} s at best of 5")
     assert best < 0.5
     lines = runs[0][1].splitlines()
     for name in ("instant-ngp", "vanilla-nerf", "blender", "procedural"):
@@ -161,7 +161,7 @@ def test_eval_repeats_the_numbers_of_training(finished: Path, tmp_path: Path) ->
     assert again["checkpoint"] == "step-000000060.ckpt"
     assert [row["name"] for row in again["per_image"]] == ["r_0.png", "r_1.png", "r_2.png"]
     assert again["results"]["lpips"] is None or again["lpips"] == "AlexNet"
-    assert len(list((tmp_path / "renders").glob("*.png"))) == 6
+    assert len(list((tmp_path / "renders").glob("*.png"))) == 9
 
 
 def test_a_moved_run_and_moved_data(finished: Path, tiny: Path, tmp_path: Path) -> None:

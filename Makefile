@@ -13,7 +13,7 @@ demo: .venv/installed
 	@run=outputs/demo/instant-ngp/$$(date +%Y-%m-%d_%H%M%S); \
 	$(BIN)/ns-train instant-ngp --max-seconds 60 --experiment-name demo --timestamp $$(basename $$run) && \
 	$(BIN)/ns-render orbit --load-config $$run/config.yml --output-path $$run/orbit.gif && \
-	echo "held-out photograph | render | error:" && ls $$run/pictures/*_comparison.png && \
+	echo "held-out views (photograph, render, error, depth, opacity):" && ls $$run/pictures/*_comparison.png && \
 	echo "turntable:" && ls $$run/orbit.gif
 
 test: .venv/installed-test

@@ -74,7 +74,8 @@ def train(data: Path, seconds: float, seed: int, target: float, switches: list[s
         command += ["--output-dir", folder, *switches]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         config = next(Path(folder).rglob("config.yml"))
-        curve = [(0.0, 0.0)] + [(p["seconds"], p["psnr"]) for p in read(config.parent / "learning_curve.json")]
+        points = [p for p in read(config.parent / "learning_curve.json") if p["full"]]
+        curve = [(0.0, 0.0)] + [(p["seconds"], p["psnr"]) for p in points]
         command = [sys.executable, "-m", "framework.cli.evaluate", "--load-config", str(config)]
         command += ["--output-path", str(Path(folder) / "all.json")]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)

@@ -88,8 +88,8 @@ class TrainConfig:
     """Keep the two newest checkpoints, not all."""
     steps_per_eval_image: int = 500
     """Steps between renders of one evaluation image for TensorBoard; fewer where they would slow training by 10 %."""
-    steps_per_eval_all_images: int = 25_000
-    """Steps between evaluations over all images of the validation split."""
+    steps_per_eval_all_images: int = 10_000
+    """Steps between evaluations over all images of the validation split; a few of them are looked at more often."""
     seconds_per_eval_all_images: float | None = None
     """Seconds of training between evaluations over all images; 15 if --target-psnr is given and this is not."""
     max_eval_images: int | None = None

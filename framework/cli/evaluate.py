@@ -20,7 +20,7 @@ class EvalFlags:
     output_path: Path | None = None
     """Where the JSON goes; eval.json beside config.yml if not given."""
     render_output_path: Path | None = None
-    """Folder for renders and comparisons (photograph | render | error) of every view."""
+    """Folder for every view's render, photograph, and comparison (photograph, render, error, depth, opacity)."""
     load_checkpoint: Path | None = None
     """A checkpoint other than the run's newest."""
     data: Path | None = None

@@ -14,7 +14,7 @@ from framework.training.checkpoint import FOLDER, load_newest
 from framework.training.lock import sole_user
 from framework.training.report import write_evaluation, write_summary
 from framework.training.run import Run, create_folder, write_report, write_transforms
-from framework.training.skipping import as_plain, skip_report
+from framework.training.skipping import as_plain, lines, skip_report
 from framework.training.trainer import Trainer
 
 PICTURES = 4
@@ -69,8 +69,8 @@ def _finish(run: Run, trainer: Trainer) -> None:
         + (f", {state.skipped} steps skipped as not finite" if state.skipped else "")
     )
     rungs = skip_report(trainer)
-    for rung in rungs:
-        say(rung.line())
+    for line in lines(rungs):
+        say(line)
     write_report(run.folder / "skip_report.json", as_plain(rungs))
     write_summary(trainer, outcome)
     say(f"checkpoint: {outcome.checkpoint}")
@@ -89,7 +89,7 @@ def _finish(run: Run, trainer: Trainer) -> None:
     )
     say(f"test: {found.line()}")  # first of all, for what follows needs room on the disk
     if found.pictures_note is None:
-        say(f"pictures (photograph | render | error): {run.folder / 'pictures'}")
+        say(f"pictures (photograph, render, error, depth, opacity): {run.folder / 'pictures'}")
     else:
         say(f"warning: {found.pictures_note}")
     write_evaluation(run.folder / "eval.json", run, outcome.checkpoint, found)

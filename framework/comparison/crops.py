@@ -11,12 +11,16 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 
+from framework.evaluation.images import error_map
+
 VIEWS = 3
 """Views shown."""
 CROP_SHARE = 4
 """A crop's edge is this part of the picture's shorter side."""
 LEAST_CROP = 32
 """Pixels of a crop's edge at least, where the picture has them."""
+PHOTOGRAPH = "_photograph.png"
+"""How a photograph's file ends; its render's ends in .png alone."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +49,9 @@ def views(folders: Sequence[tuple[str, Path]], count: int = VIEWS) -> list[View]
     """Some views that all contenders have rendered, evenly spread.
 
     Args:
-        folders: label and folder of comparisons (photograph | render | error) of each contender.
+        folders: label and folder of renders and their photographs of each contender.
     """
-    names = [{file.name for file in folder.glob("*_comparison.png")} for _, folder in folders]
+    names = [{file.name.removesuffix(PHOTOGRAPH) for file in folder.glob("*" + PHOTOGRAPH)} for _, folder in folders]
     shared = sorted(set.intersection(*names)) if names else []
     count = min(count, len(shared))
     chosen = [shared[index * len(shared) // count] for index in range(count)]
@@ -56,14 +60,13 @@ def views(folders: Sequence[tuple[str, Path]], count: int = VIEWS) -> list[View]
 
 def _view(name: str, folders: Sequence[tuple[str, Path]]) -> View | None:
     try:
-        strips = [np.asarray(iio.imread(folder / name))[..., :3] for _, folder in folders]
+        photograph = np.asarray(iio.imread(folders[0][1] / (name + PHOTOGRAPH)))[..., :3]
+        renders = [np.asarray(iio.imread(folder / f"{name}.png"))[..., :3] for _, folder in folders]
     except (OSError, ValueError):
         return None
-    if len({strip.shape for strip in strips}) != 1:
+    if {render.shape for render in renders} != {photograph.shape}:
         return None
-    thirds = [np.split(strip, 3, axis=1) for strip in strips]
-    photograph = thirds[0][0]
-    wrong = np.mean([np.abs(render.astype(float) - photograph).mean(-1) for _, render, _ in thirds], axis=0)
+    wrong = np.mean([np.abs(render.astype(float) - photograph).mean(-1) for render in renders], axis=0)
     top, left, edge = worst_square(wrong)
     part = (slice(top, top + edge), slice(left, left + edge))
     framed = photograph.copy()
@@ -72,12 +75,12 @@ def _view(name: str, folders: Sequence[tuple[str, Path]]) -> View | None:
     for columns in (part[1].start, part[1].stop - 1):
         framed[part[0], columns] = (255, 0, 160)
     return View(
-        name.removesuffix("_comparison.png"),
+        name,
         data_uri(framed),
         data_uri(photograph[part]),
         tuple(
-            Strip(label, data_uri(render), data_uri(render[part]), data_uri(error[part]))
-            for (label, _), (_, render, error) in zip(folders, thirds, strict=True)
+            Strip(label, data_uri(render), data_uri(render[part]), data_uri(error_map(render[part], photograph[part])))
+            for (label, _), render in zip(folders, renders, strict=True)
         ),
     )
 

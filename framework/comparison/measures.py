@@ -70,7 +70,8 @@ def measure(job: Job, conditions: Conditions) -> Measured | None:
         return None
     results = evaluation["results"]
     points = read_json(job.folder / "learning_curve.json") or []
-    curve = tuple((float(point["seconds"]), float(point["psnr"])) for point in points)
+    full = [p for p in points if p.get("full", True) and p["psnr"] is not None]  # looks at a few images do not compare
+    curve = tuple((float(p["seconds"]), float(p["psnr"])) for p in full)
     profile, rungs = (
         read_json(job.folder / "scene_profile.json") or {},
         read_json(job.folder / "skip_report.json") or [],

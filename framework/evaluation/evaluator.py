@@ -19,8 +19,9 @@ from framework.dataset import Dataset
 from framework.device import has_bfloat16, wait_for
 from framework.errors import DataError
 from framework.evaluation.appearance import appearances, fitted_appearance, right_half
-from framework.evaluation.images import comparison, write_image
+from framework.evaluation.images import write_image
 from framework.evaluation.metrics import load_lpips, psnr, ssim
+from framework.evaluation.panels import composed, view_panels
 from framework.kernels.math import safe_normalize
 from framework.kernels.native import torch_on_one_thread
 from framework.model import Model
@@ -48,7 +49,7 @@ class RenderedImage:
 
 @torch.no_grad()
 def render_image(
-    model: Model, cameras: Cameras, index: int, background: Tensor, times: Tensor | None = None
+    model: Model, cameras: Cameras, index: int, background: Tensor, times: Tensor | None = None, stride: int = 1
 ) -> RenderedImage:
     """What camera `index` sees, a chunk of pixels at a time, each the mean of `rays_per_pixel` rays.
 
@@ -57,6 +58,7 @@ def render_image(
         cameras: on the model's device.
         background: (3,) colour behind what is not opaque.
         times: (M,) time of each camera.
+        stride: only every so many-th row and column of the pixels; H and W are then what remains.
     """
     was_training, scene, per_pixel = model.training, model.scene, model.config.rays_per_pixel
     places = subpixels(per_pixel)
@@ -67,7 +69,8 @@ def render_image(
         torch_on_one_thread(model.runs_on_kernels),
         torch.autocast(model.device.type, torch.bfloat16, enabled=use_bfloat16(model)),
     ):
-        for pixels in cameras.image_pixels(index).split(max(model.config.eval_num_rays_per_chunk // per_pixel, 1)):
+        grid = every(cameras.image_pixels(index).view(int(cameras.heights[index]), -1), stride)
+        for pixels in grid.reshape(-1).split(max(model.config.eval_num_rays_per_chunk // per_pixel, 1)):
             rays = cameras.pixel_rays(pixels, scene.near, scene.far, times, places)
             # The number of a camera that is not a training camera must not be taken for one's.
             out = model.render(replace(rays, camera_indices=None), background).per_pixel(per_pixel)
@@ -77,9 +80,15 @@ def render_image(
     seconds = time.perf_counter() - start
     model.train(was_training)
     rgb, depth, accumulation = (torch.cat(column) for column in zip(*parts, strict=True))
-    shape = (int(cameras.heights[index]), int(cameras.widths[index]))
-    facing = torch.cat(normals).view(*shape, 3) if normals else None
-    return RenderedImage(rgb.view(*shape, 3), depth.view(shape), accumulation.view(shape), seconds, facing)
+    facing = torch.cat(normals).view(*grid.shape, 3) if normals else None
+    return RenderedImage(
+        rgb.view(*grid.shape, 3), depth.view(grid.shape), accumulation.view(grid.shape), seconds, facing
+    )
+
+
+def every(image: Tensor, stride: int) -> Tensor:
+    """Every `stride`-th row and column of an image (H, W, ...), the first being at half of the stride."""
+    return image[stride // 2 :: stride, stride // 2 :: stride]
 
 
 def use_bfloat16(model: Model) -> bool:
@@ -88,9 +97,9 @@ def use_bfloat16(model: Model) -> bool:
     return has_bfloat16(model.device) if chosen is None else chosen
 
 
-def render_view(model: Model, dataset: Dataset, index: int, background: Tensor) -> RenderedImage:
+def render_view(model: Model, dataset: Dataset, index: int, background: Tensor, stride: int = 1) -> RenderedImage:
     """The model's picture of the data set's view `index`, with the appearance meant for evaluation."""
-    return render_image(model, dataset.cameras, index, background, dataset.times)
+    return render_image(model, dataset.cameras, index, background, dataset.times, stride)
 
 
 def evaluation_background(model: Model) -> Tensor:
@@ -98,6 +107,45 @@ def evaluation_background(model: Model) -> Tensor:
     asked = model.config.background
     black = asked == "black" or (asked != "white" and not model.scene.has_alpha)
     return torch.full((3,), 0.0 if black else 1.0, device=model.device)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """How near a picture comes to its photograph."""
+
+    psnr: float
+    """dB."""
+    ssim: float | None
+    """None for a picture that is smaller than SSIM's window."""
+
+
+def measure(rgb: Tensor, target: Tensor, kept: Tensor | None) -> Measured:
+    """PSNR of the kept pixels; SSIM of the whole, in which the rest should agree.
+
+    Args:
+        rgb, target: (H, W, 3) picture and photograph.
+        kept: (H, W) bool which pixels count; all if None.
+    """
+    judged = (rgb, target) if kept is None else (rgb[kept], target[kept])
+    return Measured(psnr(*judged), ssim(rgb, target) if min(rgb.shape[:2]) >= 11 else None)
+
+
+def measure_view(model: Model, dataset: Dataset, index: int, background: Tensor, stride: int = 1) -> Measured:
+    """How near the picture of view `index` comes to its photograph, of every `stride`-th row and column of both."""
+    target = composite(every(dataset.image(index), stride).float() / 255, background)
+    kept = dataset.kept_of(index)
+    rgb = render_view(model, dataset, index, background, stride).rgb.clamp(0, 1)
+    (rgb, target), kept = _judged(rgb, target, None if kept is None else every(kept, stride), half=False)
+    return measure(rgb, target, kept)
+
+
+def views_to_judge(dataset: Dataset, half: bool = False) -> list[int]:
+    """The views of which masks leave something to judge.
+
+    Args:
+        half: whether only the right half counts.
+    """
+    return [index for index in range(len(dataset)) if _shows_something(dataset, index, half)]
 
 
 @dataclass(frozen=True)
@@ -145,14 +193,14 @@ def evaluate(
         model: the trained model.
         dataset: views with photographs, on the model's device.
         max_images: at most this many views, evenly spread; all if None.
-        pictures: folder for renders, comparisons (photograph | render | error), and normals where there are any, red,
-            green and blue being x, y and z from -1 to 1; none if None.
+        pictures: folder for renders, their photographs, comparisons (photograph, render, error, depth, opacity), and
+            normals where there are any, red, green and blue being x, y and z from -1 to 1; none if None.
         max_pictures: write only the first so many.
         round_to_uint8: measure the picture as it would be stored.
     Raises: DataError where there is nothing to evaluate.
     """
     half = model.config.eval_appearance == "half" and bool(appearances(model))
-    shown = [index for index in range(len(dataset)) if _shows_something(dataset, index, half)]
+    shown = views_to_judge(dataset, half)
     chosen = [shown[place] for place in spread(len(shown), max_images)]
     if not chosen:
         raise DataError(f"there is no image to evaluate: masks leave nothing of the {len(dataset)} that there are")
@@ -168,11 +216,12 @@ def evaluate(
         if round_to_uint8:
             rgb = (rgb * 255).round() / 255
         found, kept = _judged(rgb, target, dataset.kept_of(index), half)
+        measured = measure(*found, kept)
         rows.append(
             {
                 "name": dataset.names[index],
-                "psnr": psnr(*found) if kept is None else psnr(found[0][kept], found[1][kept]),
-                "ssim": ssim(*found) if min(found[0].shape[:2]) >= 11 else None,
+                "psnr": measured.psnr,
+                "ssim": measured.ssim,
                 "lpips": None if lpips is None else lpips(*found),
                 "seconds": view.seconds,
             }
@@ -181,7 +230,7 @@ def evaluate(
         rays += rgb.shape[0] * rgb.shape[1] * model.config.rays_per_pixel
         if pictures is not None and (max_pictures is None or len(rows) <= max_pictures):
             try:
-                _write_pictures(pictures, f"{index:04d}_{_short_stem(dataset.names[index])}", rgb, target, view.normals)
+                _write_pictures(pictures, f"{index:04d}_{_short_stem(dataset.names[index])}", rgb, target, view)
             except OSError as error:  # the figures are worth more
                 pictures, pictures_note = None, f"cannot write pictures to {pictures}: {error.strerror or error}"
     results = {**_statistics(rows), "num_rays_per_sec": rays / seconds, "fps": len(rows) / seconds}
@@ -189,12 +238,13 @@ def evaluate(
     return Evaluation(rows, {**results, "num_images": len(rows)}, lpips_note, protocol, pictures_note)
 
 
-def _write_pictures(folder: Path, stem: str, rgb: Tensor, target: Tensor, normals: Tensor | None) -> None:
-    """A view's picture, its comparison with the photograph, and its normals. Raises: OSError as it comes."""
+def _write_pictures(folder: Path, stem: str, rgb: Tensor, target: Tensor, view: RenderedImage) -> None:
+    """A view's picture, its photograph, both compared, and its normals. Raises: OSError as it comes."""
     write_image(folder / f"{stem}.png", rgb)
-    write_image(folder / f"{stem}_comparison.png", comparison(rgb, target))
-    if normals is not None:
-        write_image(folder / f"{stem}_normals.png", (normals + 1) / 2)
+    write_image(folder / f"{stem}_photograph.png", target)
+    write_image(folder / f"{stem}_comparison.png", composed(view_panels(rgb, target, view.depth, view.accumulation)))
+    if view.normals is not None:
+        write_image(folder / f"{stem}_normals.png", (view.normals + 1) / 2)
 
 
 def _short_stem(name: str) -> str:

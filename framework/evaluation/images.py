@@ -25,10 +25,10 @@ def heat(values: Tensor) -> Tensor:
     return torch.stack([3 * values, 3 * values - 1, 3 * values - 2], dim=-1).clamp(0, 1)
 
 
-def comparison(prediction: Tensor, target: Tensor) -> Tensor:
-    """Photograph | render | error, side by side: (H, 3 W, 3)."""
-    error = (prediction - target).abs().mean(-1) / ERROR_AT_WHITE
-    return torch.cat([target, prediction.clamp(0, 1), heat(error)], dim=1)
+def error_map(prediction: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """The mean absolute error over channels of two pictures (H, W, 3) uint8 as `heat` (H, W, 3) uint8."""
+    wrong = np.abs(prediction.astype(np.float32) - target).mean(-1) / 255
+    return to_uint8(heat(torch.from_numpy(wrong) / ERROR_AT_WHITE))
 
 
 def write_image(path: Path, image: Tensor) -> None:

@@ -16,8 +16,9 @@ from framework.config import TrainConfig
 from framework.dataset import Dataset
 from framework.errors import ConfigError, nearest
 from framework.stress.faults import Spoil, spoiled_pixel, spoiled_pose
-from framework.stress.scenes import RADIUS, Views, ball_views
+from framework.stress.scenes import Views, ball_views
 from framework.stress.variants import first_image, moved, one_pixel, plain_colored, transparent, twice
+from framework.testing.ball import RADIUS
 
 ALLOWED = 2.0
 """dB that a short run may lose before it is called degraded: a choice, whose control is what `another-seed` loses."""

@@ -18,13 +18,13 @@ from torch import Tensor
 from framework.cameras import Cameras, subpixels
 from framework.dataset import DataParser, Dataset, Split, load_dataset
 from framework.evaluation.evaluator import spread
-from framework.evaluation.paths import look_at
 from framework.image_files import reduce_image
 from framework.pixel_set import PixelSet
 from framework.scene import Scene
+from framework.testing.ball import RADIUS, cameras_at, trace
 
-RADIUS, HALF_SIZE = 0.7, 1.5
-"""Of the ball, and half the edge of its box, scene units. Every ray of FIELD_OF_VIEW or less meets the box."""
+HALF_SIZE = 1.5
+"""Half the edge of the ball's box, scene units. Every ray of FIELD_OF_VIEW or less meets the box."""
 FIELD_OF_VIEW, SIZE = 30.0, 24
 """Of the ball's pictures, degrees; and their width and height, pixels."""
 SHARE = 0.7
@@ -89,7 +89,7 @@ def directions(count: int, turn: float = 0.0) -> Tensor:
 
 def ball_dataset(positions: Tensor, field_of_view: float) -> Dataset:
     """Photographs of the ball from positions (M, 3) float64, all equally far from its centre."""
-    cameras = cameras_at(positions, field_of_view)
+    cameras = cameras_at(positions, field_of_view, SIZE)
     pixels = as_decoded(photograph(cameras))
     distance, reach = float(positions.norm(dim=-1).max()), HALF_SIZE * 3**0.5
     scene = Scene(
@@ -106,42 +106,15 @@ def ball_dataset(positions: Tensor, field_of_view: float) -> Dataset:
     return Dataset(pixels, cameras, None, names, scene, torch.eye(4)[:3], 1.0)
 
 
-def cameras_at(positions: Tensor, field_of_view: float) -> Cameras:
-    """Cameras at positions (M, 3) float64 that look at the origin, z being up; `field_of_view` in degrees."""
-    target, up = torch.zeros(3, dtype=positions.dtype), torch.tensor([0.0, 0.0, 1.0], dtype=positions.dtype)
-    poses = torch.stack([look_at(position, target, up) for position in positions]).float()
-    count = (len(positions),)
-    focal = SIZE / 2 / math.tan(math.radians(field_of_view) / 2)
-    return Cameras(
-        camera_to_worlds=poses,
-        fx=torch.full(count, focal),
-        fy=torch.full(count, focal),
-        cx=torch.full(count, SIZE / 2),
-        cy=torch.full(count, SIZE / 2),
-        widths=torch.full(count, SIZE),
-        heights=torch.full(count, SIZE),
-    )
-
-
 def photograph(cameras: Cameras) -> Tensor:
     """(P, 4) uint8 what cameras see of the ball, image after image: means over pixels, straight alpha."""
     flat = torch.arange(int(cameras.offsets[-1]))
     rays = cameras.pixel_rays(flat, 0.0, 1.0, places=subpixels(RAYS_PER_PIXEL))
-    colors, hits = trace(rays.origins.double(), rays.directions.double())
+    normals, hits = trace(rays.origins.double(), rays.directions.double())
     weights = hits.double().view(-1, RAYS_PER_PIXEL, 1)
-    sums = (colors.view(-1, RAYS_PER_PIXEL, 3) * weights).sum(1)
+    sums = ((0.5 + 0.5 * normals).view(-1, RAYS_PER_PIXEL, 3) * weights).sum(1)
     rgba = torch.cat([sums / weights.sum(1).clamp(min=1), weights.mean(1)], dim=-1)
     return (rgba * 255).round().to(torch.uint8)
-
-
-def trace(origins: Tensor, unit_directions: Tensor) -> tuple[Tensor, Tensor]:
-    """Colours (R, 3) in [0, 1] where rays (R, 3), (R, 3) first meet the ball's surface; (R,) bool whether they do."""
-    middle = -(origins * unit_directions).sum(-1)
-    squared = RADIUS**2 - origins.square().sum(-1) + middle.square()
-    half = squared.clamp(min=0).sqrt()
-    first = torch.where(middle > half, middle - half, middle + half)  # of a ray that starts inside, the way out
-    points = origins + first[:, None] * unit_directions
-    return 0.5 + 0.5 * points / RADIUS, (squared > 0) & (first > 0)
 
 
 # -- somebody's data ----------------------------------------------------------------------------------------------

@@ -12,13 +12,14 @@ from framework.cameras import Cameras
 from framework.dataset import Dataset
 from framework.rays import Rays
 from framework.scene import Scene
+from framework.testing.ball import cameras_at, trace
 
 COUNT, SIZE = 8, 24
 """Photographs, and their width and height, pixels."""
-RADIUS, DISTANCE = 0.7, 3.0
-"""Of the ball, and of the cameras from the origin, scene units. The box reaches from -1 to 1."""
-HALF_ANGLE = 0.35
-"""Half of the field of view, radians."""
+DISTANCE = 3.0
+"""Of the cameras from the origin, scene units. The box reaches from -1 to 1."""
+FIELD_OF_VIEW = 40.0
+"""Degrees."""
 RISE = 0.25
 """How far up and down the ball goes that moves, scene units."""
 
@@ -49,11 +50,7 @@ def _cameras() -> Cameras:
     """Around the origin and looking at it, some from above and some from below."""
     turn = torch.arange(COUNT) * (2 * math.pi / COUNT)
     back = normalize(torch.stack([turn.cos(), turn.sin(), 0.5 * (3 * turn).sin()], dim=-1), dim=-1)
-    right = normalize(torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0]).expand_as(back), back), dim=-1)
-    poses = torch.stack([right, torch.linalg.cross(back, right), back, DISTANCE * back], dim=-1)
-    focal, middle = torch.full((COUNT,), SIZE / 2 / math.tan(HALF_ANGLE)), torch.full((COUNT,), SIZE / 2)
-    sizes = torch.full((COUNT,), SIZE)
-    return Cameras(poses, focal, focal, middle, middle, sizes, sizes)
+    return cameras_at(DISTANCE * back, FIELD_OF_VIEW, SIZE)
 
 
 def _rays() -> Rays:
@@ -63,11 +60,8 @@ def _rays() -> Rays:
 
 def _ball(rays: Rays, centers: Tensor) -> tuple[Tensor, Tensor]:
     """Colours (R, 3) of balls around `centers`, (R, 3) or (3,), and 1 where (R,) a ray meets its ball, else 0."""
-    ahead = ((centers - rays.origins) * rays.directions).sum(-1)
-    past = rays.origins + ahead[:, None] * rays.directions - centers  # from the centre to the ray's nearest point
-    chord = RADIUS**2 - past.square().sum(-1)
-    normals = (past - chord.clamp(min=0).sqrt()[:, None] * rays.directions) / RADIUS
-    return 0.5 + 0.4 * normals.clamp(-1, 1), (chord > 0).float()
+    normals, hits = trace(rays.origins, rays.directions, centers)
+    return 0.5 + 0.4 * normals.clamp(-1, 1), hits.float()
 
 
 def _dataset(colors: Tensor, times: Tensor | None = None, unbounded: bool = False) -> Dataset:

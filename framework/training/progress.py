@@ -31,12 +31,14 @@ class StepReport:
     psnr: float
     """Of the batch, dB, smoothed."""
     rays_per_second: float
-    samples_per_ray: float
+    held_out_psnr: float | None
+    """Of the last look at a few held-out images, dB; None before the first."""
 
     def line(self) -> str:
+        held_out = "" if self.held_out_psnr is None else f", {self.held_out_psnr:.2f} dB on held-out images"
         return (
-            f"step {self.step:,}  loss {sum(self.losses.values()):.5f}  PSNR {self.psnr:.2f} dB  "
-            f"{self.rays_per_second / 1e3:.1f}k rays/s  {self.samples_per_ray:.1f} samples/ray"
+            f"step {self.step:,}  loss {sum(self.losses.values()):.5f}  PSNR {self.psnr:.2f} dB{held_out}  "
+            f"{self.rays_per_second / 1e3:.1f}k rays/s"
         )
 
 

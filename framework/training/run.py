@@ -5,7 +5,7 @@ outputs/{experiment}/{method}/{YYYY-mm-dd_HHMMSS}/
     dataparser_transforms.json    from the input's frame to the scene's
     nerfstudio_models/            checkpoints
     scene_profile.json            what the scene needs and what was decided by it
-    learning_curve.json           seconds, step, PSNR
+    learning_curve.json           seconds, step, PSNR, SSIM on held-out images, and on how many
     skip_report.json              what was skipped, and what that saved
     summary.json                  steps, seconds, rays, memory, parameters, and the machine
     eval.json, pictures/          the final evaluation

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from framework.training.trainer import Trainer
 
 PROBE_RAYS = 1024
+LEAST_TOLD = 0.005
+"""Share from which on what is skipped is told to people."""
 
 
 @dataclass(frozen=True)
@@ -34,11 +36,14 @@ class Rung:
     """How many times longer the probe's rays take to render without it; None where it saves nothing in rendering."""
     switch: str
     """How to turn it off."""
+    says: str
+    """What was skipped and what that saved, for people."""
 
-    def line(self) -> str:
-        """One line for people."""
-        saved = "" if self.rendering_saved is None else f": rendering is {self.rendering_saved:.1f} x as fast"
-        return f"skipped {self.skipped:6.1%} of {self.name}{saved}  (off: {self.switch})"
+
+def lines(rungs: list[Rung]) -> list[str]:
+    """For people; without what saved nothing."""
+    told = [f"  {rung.says}" for rung in rungs if rung.skipped >= LEAST_TOLD]
+    return ["left out:", *told] if told else []
 
 
 @torch.no_grad()
@@ -50,7 +55,8 @@ def skip_report(trainer: Trainer) -> list[Rung]:
         rungs += _sampling_rungs(trainer, samplers)
     if trainer.optimizer.entries_there:
         share = trainer.optimizer.entries_updated / trainer.optimizer.entries_there
-        rungs.append(Rung("table entries in a step's update", 1 - share, None, "--sparse-updates False"))
+        says = f"parameters that a step does not use: {1 - share:.0%} of each update of the feature tables"
+        rungs.append(Rung("table entries in a step's update", 1 - share, None, "--sparse-updates False", says))
     return rungs
 
 
@@ -65,22 +71,40 @@ def _sampling_rungs(trainer: Trainer, samplers: list[OccupancySampler]) -> list[
         unhidden, visible_count = _probe(trainer.model, rays)
         with _changed(samplers, occupied=True):
             everywhere, all_count = _probe(trainer.model, rays)
-    rungs = [
+    rungs = [Rung("cells, empty", empty, None, "no switch", f"empty space: {empty:.0%} of the box is never sampled")]
+    if carved:
+        says = f"{carved:.0%} of the box from the first step on, for the photographs show nothing there"
+        rungs.append(Rung("cells, outside the visual hull", carved, None, "--silhouette-cells False", says))
+    rungs += [
         Rung(
             "steps along a ray, in empty cells",
             1 - visible_count / max(all_count, 1),
             everywhere / unhidden,
             "no switch",
+            _along_rays("empty space along rays", all_count, visible_count, everywhere / unhidden),
         ),
-        Rung("the samples left, hidden", 1 - count / max(visible_count, 1), unhidden / usual, "--early-stop 0"),
-        Rung("cells, empty", empty, None, "no switch"),
+        Rung(
+            "the samples left, hidden",
+            1 - count / max(visible_count, 1),
+            unhidden / usual,
+            "--early-stop 0",
+            _along_rays("behind opaque surfaces", visible_count, count, unhidden / usual),
+        ),
     ]
-    if carved:
-        rungs.append(Rung("cells, outside the visual hull", carved, None, "--silhouette-cells False"))
     if drawn is not None and (kept is None or len(drawn) < len(kept)):  # else masks alone say what is drawn
         share = 1 - len(drawn) / len(trainer.train_set.pixels if kept is None else kept)
-        rungs.append(Rung("pixels, which see background alone", share, None, "--silhouette-pixels False"))
+        says = f"pixels that show only background: {share:.0%} of all are never drawn"
+        if share < 1:
+            says += f", and the others {1 / (1 - share):.1f} x as often"
+        rungs.append(Rung("pixels, which see background alone", share, None, "--silhouette-pixels False", says))
     return rungs
+
+
+def _along_rays(place: str, before: int, after: int, faster: float) -> str:
+    """A line about samples of the probe's rays that are not taken."""
+    left_out = 1 - after / max(before, 1)
+    a_ray = f"{after / PROBE_RAYS:.1f} a ray instead of {before / PROBE_RAYS:.1f}"
+    return f"{place}: {left_out:.0%} of samples, {a_ray}; renders {faster:.1f} x as fast"
 
 
 def _probe(model: Model[Any], rays: Rays) -> tuple[float, int]:

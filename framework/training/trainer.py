@@ -23,13 +23,14 @@ from framework.device import seed_step, wait_for
 from framework.error_map import ErrorMap
 from framework.errors import CheckpointError, DivergenceError
 from framework.evaluation.evaluator import evaluate, evaluation_background, render_view, use_bfloat16
-from framework.evaluation.images import comparison
 from framework.evaluation.metrics import MAX_PSNR
 from framework.kernels.native import torch_on_one_thread
+from framework.evaluation.panels import composed, view_panels
 from framework.pixel_stream import PixelStream
 from framework.pixels import Background, Batch, LookUp, composite, draw_batch, training_background
 from framework.scene_profile import SceneProfile
 from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest, save_checkpoint
+from framework.training.curve import Entry, FewImages, Point, in_order, rows
 from framework.training.optim import first_non_finite, make_optimizer, set_learning_rate
 from framework.training.preparation import profile_of, skip_by_silhouettes
 from framework.training.progress import ProgressBar, StepReport, TensorBoard
@@ -64,8 +65,10 @@ class State:
     """Running mean."""
     train_mse: float = 1.0
     """Running mean over batches, uncorrected."""
-    curve: tuple[tuple[float, int, float], ...] = ()
-    """(seconds, step, PSNR) of each evaluation over all images."""
+    curve: tuple[Entry, ...] = ()
+    """Each evaluation over all images."""
+    looks: tuple[Entry, ...] = ()
+    """Each look at a few images."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,8 @@ class Trainer:
         self.stream: PixelStream | None = None
         self.state = State()
         self.first_step = 0
+        limit, rays_per_pixel = self.config.max_eval_images, self.config.rays_per_pixel
+        self._few = None if eval_set is None else FewImages(eval_set, limit, rays_per_pixel)
         self._bad_in_a_row = 0
         self._prepared = False
         self._saved_step: int | None = None
@@ -179,6 +184,7 @@ class Trainer:
                 bar.show(report)
                 self._log(report, board)
                 self._evaluate_if_due(board)  # before saving: a run that goes on from here does not come back to it
+                self._look_if_due(report, board, last=not stopped and self._reason_to_stop(stopped) is not None)
                 if self._due_to_save():
                     self._try_to_save()
         self._write_curve()
@@ -252,7 +258,7 @@ class Trainer:
             losses={name: float(value.detach()) for name, value in losses.items()},
             psnr=self._train_psnr(),
             rays_per_second=len(batch.rays) / seconds,
-            samples_per_ray=state.samples_per_ray,
+            held_out_psnr=state.looks[-1][2] if state.looks else None,
         )
 
     def _draw(self, count: int, places: Tensor) -> Batch:
@@ -322,7 +328,7 @@ class Trainer:
                 **{f"train/loss/{name}": value for name, value in report.losses.items()},
                 "train/psnr": report.psnr,
                 "train/rays_per_second": report.rays_per_second,
-                "train/samples_per_ray": report.samples_per_ray,
+                "train/samples_per_ray": self.state.samples_per_ray,
                 "train/skipped_steps": float(self.state.skipped),
             }
             for index, group in enumerate(self.optimizer.param_groups):
@@ -340,23 +346,37 @@ class Trainer:
             background = evaluation_background(self.model)
             view = render_view(self.model, self.eval_set, index, background)
             target = composite(self.eval_set.image(index).float() / 255, background)
-            board.image("eval/photograph_render_error", comparison(view.rgb, target), step)
+            panels = view_panels(view.rgb.clamp(0, 1), target, view.depth, view.accumulation)
+            board.image("eval/comparison", composed(panels), step)
             self._picture_seconds += view.seconds
         every = config.seconds_per_eval_all_images
         if every is None and config.target_psnr is not None:
             every = 15.0
         due = every is not None and self.state.seconds - self._last_eval >= every
         if due or step % config.steps_per_eval_all_images == 0:
-            self._last_eval = self.state.seconds
+            self._last_eval, start = self.state.seconds, time.perf_counter()
             found = evaluate(self.model, self.eval_set, max_images=config.max_eval_images, title="Evaluating")
-            self.state.curve += ((self.state.seconds, step, found.results["psnr"]),)
-            board.scalars({"eval/psnr": found.results["psnr"]}, step)
+            psnr, ssim, images = (found.results[name] for name in ("psnr", "ssim", "num_images"))
+            took = time.perf_counter() - start
+            point = Point(self.state.seconds, step, psnr, ssim, images, evaluation_seconds=took)
+            self.state.curve += (point.entry(),)
+            board.scalars({"eval/psnr": psnr} | ({} if ssim is None else {"eval/ssim": ssim}), step)
             say(f"{self.state.seconds:5.0f} s  step {step:,}  {found.line()}")
             self._write_curve()
 
+    def _look_if_due(self, report: StepReport, board: TensorBoard, last: bool) -> None:
+        """A look at a few held-out images; its time does not count as training either."""
+        if self._few is None:
+            return
+        point = self._few.look_if_due(self.model, self.state.looks, report, last=last)
+        if point is not None:
+            self.state.looks += (point.entry(),)
+            values = {"eval_few_images/psnr": point.psnr, "eval_few_images/ssim": point.ssim}
+            board.scalars({name: value for name, value in values.items() if value is not None}, point.step)
+            self._write_curve()
+
     def _write_curve(self) -> None:
-        rows = [{"seconds": s, "step": n, "psnr": p} for s, n, p in self.state.curve]
-        write_report(self.run.folder / "learning_curve.json", rows)
+        write_report(self.run.folder / "learning_curve.json", rows(in_order(self.state.curve, self.state.looks)))
 
     def _due_to_save(self) -> bool:
         if self._bad_in_a_row:  # what is saved now might be ruined, and would push out what is not

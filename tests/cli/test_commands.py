@@ -147,7 +147,7 @@ def test_the_run_folder(finished: Path) -> None:
 
 def test_eval_repeats_the_numbers_of_training(finished: Path, tmp_path: Path) -> None:
     at_the_end = json.loads((finished / "eval.json").read_text())
-    done = run(
+    done = called(
         "ns-eval", "--load-config", finished / "config.yml", "--output-path", tmp_path / "o.json",
         "--render-output-path", tmp_path / "renders",
     )  # fmt: skip
@@ -161,7 +161,7 @@ def test_eval_repeats_the_numbers_of_training(finished: Path, tmp_path: Path) ->
     assert again["checkpoint"] == "step-000000060.ckpt"
     assert [row["name"] for row in again["per_image"]] == ["r_0.png", "r_1.png", "r_2.png"]
     assert again["results"]["lpips"] is None or again["lpips"] == "AlexNet"
-    assert len(list((tmp_path / "renders").glob("*.png"))) == 6
+    assert len(list((tmp_path / "renders").glob("*.png"))) == 9
 
 
 def test_a_moved_run_and_moved_data(finished: Path, tiny: Path, tmp_path: Path) -> None:
@@ -201,7 +201,7 @@ def test_a_recipe_with_overrides_and_resuming(shared_tiny: Path, tmp_path: Path)
     settings = dict(zip(names, map(yaml.safe_load, TINY_NGP[1::2]), strict=True))
     recipe.write_text(yaml.safe_dump({"method": "instant-ngp", "max_num_iterations": 99, **settings}))
     flags = ["--data", shared_tiny, "--output-dir", tmp_path, "--timestamp", "r", "--max-eval-images", 0]
-    done = run("ns-train", "--load-config", recipe, *flags, "--max-num-iterations", 5)
+    done = called("ns-train", "--load-config", recipe, *flags, "--max-num-iterations", 5)
     assert done.returncode == 0, done.stderr
     folder = tmp_path / "ball" / "instant-ngp" / "r"
     assert (folder / "nerfstudio_models" / "step-000000005.ckpt").is_file()

@@ -15,7 +15,7 @@ import yaml
 from PIL import Image
 
 from framework.cli.evaluate import main
-from tests.cli.helpers import run, train
+from tests.cli.helpers import called, train
 from tests.conftest import Refused
 
 RAYS = ("--rays-per-pixel", 4)
@@ -177,14 +177,14 @@ def test_a_checkpoint_that_would_run_code_does_not(zipped: bool, finished: Path,
         torch.save(content, evil)
     else:
         evil.write_bytes(pickle.dumps(content))
-    done = run("ns-eval", "--load-config", finished / "config.yml", "--load-checkpoint", evil)
+    done = called("ns-eval", "--load-config", finished / "config.yml", "--load-checkpoint", evil)
     assert done.returncode == 1
     assert done.stderr.strip() == f"error: {evil} is damaged or not a checkpoint of nerfloom"
     assert not proof.exists()
 
 
 def test_a_missing_flag_is_named() -> None:
-    done = run("ns-eval")
+    done = called("ns-eval")
     assert done.returncode == 2
     assert "--load-config" in done.stderr
     assert "Traceback" not in done.stderr

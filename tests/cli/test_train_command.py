@@ -122,7 +122,7 @@ def test_bad_recipes_are_one_line(text: str, words: str, tmp_path: Path, refused
 def test_a_recipe_that_would_run_code_does_not(tmp_path: Path) -> None:
     recipe, proof = tmp_path / "recipe.yml", tmp_path / "proof"
     recipe.write_text(f"method: !!python/object/apply:os.system ['touch {proof}']")
-    done = run("ns-train", "--load-config", recipe)
+    done = called("ns-train", "--load-config", recipe)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     assert done.stderr.startswith(f"error: {recipe} is not plain YAML")

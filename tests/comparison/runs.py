@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from framework.comparison.plan import Conditions, Contender, Job, Plan
-from framework.evaluation.images import comparison, write_image
+from framework.evaluation.images import write_image
 
 CONDITIONS = Conditions(None, (), 60.0, None, None, None, "cpu", 4, None)
 MACHINE = {"processor": "abacus", "threads": 2, "commit": None}
@@ -36,7 +36,10 @@ def finish(job: Job, psnr: float, seconds: float = 60.0, **changes: Any) -> None
     }
     results = {"psnr": psnr, "ssim": 0.9, "lpips": None, "fps": 4.0, "num_images": 16, "num_rays_per_sec": 1e6}
     evaluation = {"results": results, "lpips": "absent: pip install it", "per_image": []}
-    points = [{"seconds": s, "step": int(s), "psnr": psnr - 4 + s / 15} for s in (15.0, 30.0, 45.0, 60.0)]
+    points = [
+        {"seconds": s, "step": int(s), "psnr": psnr - 4 + s / 15, "full": full}
+        for s, full in ((7.0, False), (15.0, True), (30.0, True), (45.0, True), (50.0, False), (60.0, True))
+    ]
     decisions = [{"option": "background", "choice": "random", "reason": "there is <alpha>"}]
     for name, content in (
         ("summary.json", {**summary, **changes}),
@@ -49,11 +52,12 @@ def finish(job: Job, psnr: float, seconds: float = 60.0, **changes: Any) -> None
 
 
 def draw(job: Job, seed: int, names: tuple[str, ...] = ("0000_r_0", "0001_r_1"), size: int = 64) -> None:
-    """Write comparisons whose upper left quarter is worst."""
+    """Write renders whose upper left quarter is worst, and their photographs."""
     import torch
 
     noise = torch.from_numpy(np.random.default_rng(0).random((size, size, 3))).float()
     wrong = torch.from_numpy(np.random.default_rng(seed).random((size, size, 3))).float() * 0.05
     wrong[: size // 2, : size // 2] *= 10
     for name in names:
-        write_image(job.pictures / f"{name}_comparison.png", comparison((noise + wrong).clamp(0, 1), noise))
+        write_image(job.pictures / f"{name}.png", (noise + wrong).clamp(0, 1))
+        write_image(job.pictures / f"{name}_photograph.png", noise)

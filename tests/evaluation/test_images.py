@@ -2,11 +2,12 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from framework.evaluation.images import ERROR_AT_WHITE, comparison, heat, write_animation, write_image
+from framework.evaluation.images import ERROR_AT_WHITE, error_map, heat, write_animation, write_image
 
 
 def test_a_written_image_reads_back_rounded(tmp_path: Path) -> None:
@@ -22,13 +23,11 @@ def test_heat_runs_from_black_over_red_and_yellow_to_white() -> None:
     torch.testing.assert_close(colors, expected, atol=1e-6, rtol=0)
 
 
-def test_comparison_is_photograph_render_error() -> None:
-    target, prediction = torch.zeros(2, 2, 3), torch.full((2, 2, 3), ERROR_AT_WHITE)
-    side_by_side = comparison(prediction, target)
-    assert side_by_side.shape == (2, 6, 3)
-    torch.testing.assert_close(side_by_side[:, :2], target)
-    torch.testing.assert_close(side_by_side[:, 2:4], prediction)
-    torch.testing.assert_close(side_by_side[:, 4:], torch.ones(2, 2, 3))
+def test_an_error_map_is_white_where_the_error_is_as_stated() -> None:
+    target = np.zeros((1, 3, 3), np.uint8)
+    prediction = np.array([[[0] * 3, [round(255 * ERROR_AT_WHITE)] * 3, [28, 0, 0]]], np.uint8)
+    third = round(3 * 28 / 3 / 255 / ERROR_AT_WHITE * 255)  # of black to red
+    assert error_map(prediction, target).tolist() == [[[0, 0, 0], [255, 255, 255], [third, 0, 0]]]
 
 
 @pytest.mark.parametrize("ending", [".gif", ".webp", ".png"])

@@ -75,6 +75,10 @@ def readable_steps(folder: Path) -> list[int]:
 
 
 def curve(folder: Path) -> list[tuple[int, float]]:
-    """Steps and PSNR of what a run has written of its learning curve; of a file that was cut short this fails."""
+    """Steps and PSNR of a run's evaluations over all images, as written; of a file that was cut short this fails.
+
+    When a few images are looked at follows the clock, so no two runs have that in common.
+    """
     file = folder / "learning_curve.json"
-    return [(row["step"], row["psnr"]) for row in json.loads(file.read_text())] if file.exists() else []
+    rows = json.loads(file.read_text()) if file.exists() else []
+    return [(row["step"], row["psnr"]) for row in rows if row["full"]]

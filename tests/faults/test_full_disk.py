@@ -108,7 +108,7 @@ def test_pictures_cost_no_figures(shared_tiny: Path, tmp_path: Path, monkeypatch
     assert trainer.eval_set is not None
     with_room = evaluate(trainer.model, trainer.eval_set, pictures=tmp_path / "room")
     assert with_room.pictures_note is None
-    assert len(list((tmp_path / "room").iterdir())) == 2 * len(trainer.eval_set)
+    assert len(list((tmp_path / "room").iterdir())) == 3 * len(trainer.eval_set)
     monkeypatch.setattr(iio, "imwrite", full)
     found = evaluate(trainer.model, trainer.eval_set, pictures=tmp_path / "full")
     assert found.pictures_note == f"cannot write pictures to {tmp_path / 'full'}: No space left on device"
@@ -153,7 +153,7 @@ def test_photographs_with_long_names_have_pictures(tiny: Path, tmp_path: Path) -
     assert trainer.eval_set is not None
     found = evaluate(trainer.model, trainer.eval_set, pictures=tmp_path / "pictures")
     assert found.pictures_note is None
-    assert len(list((tmp_path / "pictures").iterdir())) == 2 * len(trainer.eval_set)
+    assert len(list((tmp_path / "pictures").iterdir())) == 3 * len(trainer.eval_set)
 
 
 def test_a_disk_that_fills_up_while_training(shared_tiny: Path, tmp_path: Path, disk: Disk) -> None:

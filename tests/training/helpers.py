@@ -113,8 +113,8 @@ def assert_same_bits(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> 
 
 TRAINED = ("method", "scene", "transform", "scale", "model", "optimizer", "state", "errors")
 """What a checkpoint holds of training; the settings name folders, which differ."""
-CLOCKS = r"/state/(seconds|curve/\d+/0)"
-"""Where in it seconds are."""
+CLOCKS = r"/state/(seconds|curve/\d+/[06]|looks/.*)"
+"""Where in it seconds are, and what follows them."""
 
 
 def differences(first: Path, second: Path) -> list[str]:

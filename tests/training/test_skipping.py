@@ -1,11 +1,12 @@
 """What is skipped is reported, can be switched off, and changes what is rendered as little as it says."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from framework.training.skipping import skip_report
+from framework.training.skipping import Rung, lines, skip_report
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 
 
@@ -21,7 +22,17 @@ def test_the_report_tells_what_was_skipped(shared_tiny: Path, tmp_path: Path) ->
     assert rungs["cells, empty"].skipped == pytest.approx(1 - sampler.occupied_share)
     assert rungs["cells, outside the visual hull"].skipped == pytest.approx(sampler.carved.float().mean().item())
     assert rungs["steps along a ray, in empty cells"].skipped > 0.1
-    assert "off: --silhouette-cells False" in rungs["cells, outside the visual hull"].line()
+    said = "\n".join(lines(list(rungs.values())))
+    assert f"empty space: {1 - sampler.occupied_share:.0%} of the box is never sampled" in said
+    share = rungs["steps along a ray, in empty cells"].skipped
+    assert f"empty space along rays: {share:.0%} of samples, " in said
+    assert all(rung.switch not in said and rung.name not in said for rung in rungs.values())
+
+
+def test_what_saved_nothing_is_not_told() -> None:
+    nothing = Rung("cells", 0.001, None, "--off", "empty space: 0% of the box")
+    assert lines([nothing]) == []
+    assert lines([nothing, replace(nothing, skipped=0.5, says="half of it")]) == ["left out:", "  half of it"]
 
 
 def test_every_switch_switches(shared_tiny: Path, tmp_path: Path) -> None:

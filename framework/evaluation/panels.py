@@ -1,0 +1,118 @@
+"""Pictures for people: a view beside its photograph, every part with a name, colour maps with their ranges."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from framework.evaluation.images import ERROR_AT_WHITE, heat, to_uint8
+
+SMALLEST_WIDTH = 160
+"""Pixels of a part's width; smaller pictures are enlarged by a whole number."""
+TEXT_SHARE, SMALLEST_TEXT = 24, 12
+"""Text is this part of a part's width in height, but so many pixels at least."""
+INK, PAPER = (20, 20, 20), (255, 255, 255)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A part of a picture."""
+
+    label: str
+    image: Tensor
+    """(H, W, 3) in [0, 1]."""
+    ends: tuple[str, str] | None = None
+    """What the two ends of the colour bar stand for; None where colours are colours."""
+    bar: Tensor | None = None
+    """(N, 3) colours of the bar from its first end to its last."""
+
+
+def view_panels(prediction: Tensor, target: Tensor, depth: Tensor, accumulation: Tensor) -> list[Panel]:
+    """Photograph, render, error, depth and opacity of a view.
+
+    Args:
+        prediction, target: (H, W, 3) render and photograph in [0, 1].
+        depth: (H, W) distance along the ray, scene units; shown where opacity is above one half, from its 2nd to its
+            98th percentile there.
+        accumulation: (H, W) opacity.
+    """
+    ramp = torch.linspace(0, 1, 256)
+    error = (prediction - target).abs().mean(-1) / ERROR_AT_WHITE
+    solid = accumulation > 0.5
+    near, far = depth_range(depth, solid)
+    shade = viridis(((depth - near) / max(far - near, 1e-9)).clamp(0, 1))
+    shade = torch.where(solid[..., None], shade, torch.ones_like(shade))
+    opacity = accumulation.clamp(0, 1)
+    return [
+        Panel("photograph", target),
+        Panel("render", prediction),
+        Panel("error", heat(error), ("0", f"{ERROR_AT_WHITE:g} or more"), heat(ramp[None])[0]),
+        Panel("depth, scene units", shade, (f"{near:.3g}", f"{far:.3g}"), viridis(ramp)),
+        Panel("opacity", opacity[..., None].expand(-1, -1, 3), ("0", "1"), ramp[:, None].expand(-1, 3)),
+    ]
+
+
+def depth_range(depth: Tensor, solid: Tensor) -> tuple[float, float]:
+    """2nd and 98th percentile of depths (H, W) where `solid` (H, W); of all where nothing is."""
+    values = depth[solid] if bool(solid.any()) else depth.flatten()
+    values = values[torch.isfinite(values)].double().sort().values
+    if not len(values):
+        return 0.0, 0.0
+    near, far = (float(values[round(share * (len(values) - 1))]) for share in (0.02, 0.98))
+    return near, far
+
+
+VIRIDIS = torch.tensor(
+    [
+        [0.267, 0.005, 0.329], [0.282, 0.095, 0.417], [0.279, 0.175, 0.483], [0.259, 0.252, 0.525],
+        [0.230, 0.322, 0.546], [0.199, 0.388, 0.555], [0.173, 0.449, 0.558], [0.149, 0.508, 0.557],
+        [0.128, 0.567, 0.551], [0.121, 0.626, 0.533], [0.158, 0.684, 0.502], [0.246, 0.739, 0.452],
+        [0.369, 0.789, 0.383], [0.516, 0.831, 0.294], [0.678, 0.864, 0.190], [0.846, 0.887, 0.100],
+        [0.993, 0.906, 0.144],
+    ]
+)  # fmt: skip
+"""matplotlib's colour map of that name at seventeen even places."""
+
+
+def viridis(values: Tensor) -> Tensor:
+    """Values (...) in [0, 1] as colours (..., 3), lighter as they grow; NaN as 0."""
+    colors = VIRIDIS.to(values)
+    places = values.nan_to_num(0.0).clamp(0, 1) * (len(colors) - 1)
+    low = places.floor().long().clamp(max=len(colors) - 2)
+    return torch.lerp(colors[low], colors[low + 1], (places - low)[..., None])
+
+
+def composed(panels: Sequence[Panel]) -> Tensor:
+    """Panels in a row, with a gap between them, labels above and colour bars below: (H', W', 3) in [0, 1].
+
+    Args:
+        panels: all of one size. Small ones are enlarged by a whole number, each pixel becoming a square.
+    """
+    height, width = panels[0].image.shape[:2]
+    factor = max(-(-SMALLEST_WIDTH // width), 1)
+    height, width = height * factor, width * factor
+    size = max(width // TEXT_SHARE, SMALLEST_TEXT)
+    font, gap, line = ImageFont.load_default(size), size, round(1.6 * size)
+    bars = gap // 2 + size // 2 + line if any(panel.bar is not None for panel in panels) else 0
+    paper = Image.new("RGB", (len(panels) * (width + gap) + gap, height + line + bars + gap // 2), PAPER)
+    draw = ImageDraw.Draw(paper)
+    for index, panel in enumerate(panels):
+        left = gap + index * (width + gap)
+        draw.text((left, line // 2), panel.label, INK, font, anchor="lm")
+        picture = Image.fromarray(to_uint8(panel.image)).resize((width, height), Image.Resampling.NEAREST)
+        paper.paste(picture, (left, line))
+        draw.rectangle((left - 1, line - 1, left + width, line + height), outline=(190, 190, 190))
+        if panel.bar is not None and panel.ends is not None:
+            top = line + height + gap // 2
+            bar = Image.fromarray(to_uint8(panel.bar[None])).resize((width, size // 2), Image.Resampling.BILINEAR)
+            paper.paste(bar, (left, top))
+            draw.rectangle((left - 1, top - 1, left + width, top + size // 2), outline=(190, 190, 190))
+            middle = top + size // 2 + line // 2
+            draw.text((left, middle), panel.ends[0], INK, font, anchor="lm")
+            draw.text((left + width, middle), panel.ends[1], INK, font, anchor="rm")
+    return torch.from_numpy(np.array(paper)).float() / 255

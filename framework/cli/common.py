@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import platform
 import sys
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import TypeVar
 
+import framework
 from framework.console import say
 from framework.errors import ConfigError, NerfloomError, nearest
+from framework.training.signals import exit_status, orderly_end
 
 K = TypeVar("K")
 
@@ -35,24 +39,37 @@ def chosen_kind(
 def run_command(command: Callable[[list[str]], None]) -> None:
     """Run a command on the process's arguments.
 
-    Errors a user can act on become one line and exit status 1; `--debug` anywhere shows the traceback instead.
+    Errors a user can act on become one line and exit status 1; `--debug` anywhere shows the traceback instead. A
+    command that a signal ends says so, and exits with 128 and the signal's number.
     """
-    arguments = sys.argv[1:]
-    debug = "--debug" in arguments
+    arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
+    debug = len(arguments) < len(sys.argv) - 1
+    if "--version" in (*arguments[:1], *arguments[-1:]):
+        print(version())
+        return
     try:
-        command([argument for argument in arguments if argument != "--debug"])
-    except NerfloomError as error:
-        if debug:
-            raise
-        say(f"error: {error}")
-        sys.exit(1)
+        with orderly_end():
+            command(arguments)
     except BrokenPipeError:
         sys.exit(1)
-    except OSError as error:
+    except (NerfloomError, OSError) as error:
         if debug:
             raise
-        say(f"error: {error}")
+        say(f"error: {in_our_words(error)}")
         sys.exit(1)
-    except KeyboardInterrupt:
-        say("interrupted")
-        sys.exit(130)
+    except KeyboardInterrupt as stop:
+        say(str(stop) or "interrupted")
+        sys.exit(exit_status(stop))
+
+
+def version() -> str:
+    """What --version prints: the package's version, where it lies, and the Python that runs it."""
+    place = Path(framework.__file__).parent
+    return f"nerfloom {framework.__version__} from {place} (Python {platform.python_version()})"
+
+
+def in_our_words(error: Exception) -> str:
+    """An error's line; of the system's errors the file comes first, and its number is left out."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename is not None else error.strerror
+    return str(error)

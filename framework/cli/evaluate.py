@@ -88,7 +88,7 @@ def _command(arguments: list[str]) -> None:
         say("--eval-appearance half: this run has no appearance vectors; whole photographs were judged")
     say(f"LPIPS {found.lpips_note}")
     output = flags.output_path or trained.run.folder / "eval.json"
-    write_evaluation(output, trained.run, trained.checkpoint, found)
+    write_evaluation(output, trained.run, trained.checkpoint, found, trained.model.device)
     say(f"written to {output}")
     if found.pictures_note is not None:
         raise ConfigError(found.pictures_note)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 from framework.console import say
@@ -9,19 +11,24 @@ from framework.dataset import Dataset, Split, load_dataset
 from framework.device import choose_device, peak_memory
 from framework.errors import DataError
 from framework.evaluation.evaluator import evaluate
+from framework.machine import kernels
 from framework.pixel_cache import PixelMemory
-from framework.training.checkpoint import FOLDER, load_newest
+from framework.training.checkpoint import FOLDER, list_checkpoints, load_newest
 from framework.training.lock import sole_user
 from framework.training.report import write_evaluation, write_summary
 from framework.training.run import Run, create_folder, write_report, write_transforms
+from framework.training.signals import Stopped, signal_of
 from framework.training.skipping import as_plain, skip_report
-from framework.training.trainer import Trainer
+from framework.training.trainer import Outcome, Trainer
 
 PICTURES = 4
 
 
 def start(run: Run) -> None:
-    """Train a new run."""
+    """Train a new run.
+
+    Raises: Stopped where somebody ends it; what was saved is said.
+    """
     run = replace(run, config=run.config.resolved())
     trainer = _prepare(run)
     trainer.restore_as_configured()
@@ -31,7 +38,7 @@ def start(run: Run) -> None:
 
 
 def resume(run: Run) -> None:
-    """Go on with a run from its newest checkpoint; from the beginning where it has none."""
+    """Go on with a run from its newest checkpoint; from the beginning where it has none. Raises as `start`."""
     with sole_user(run.folder):
         trainer = _prepare(run)
         checkpoint = load_newest(run.folder / FOLDER, trainer.device)
@@ -48,7 +55,8 @@ def _prepare(run: Run) -> Trainer:
     device = choose_device(run.config.machine)
     train_set = load_split(run, "train").to(device)
     eval_set = first_split(run, ("val", "test"))
-    say(f"{run.method} on {run.config.data or 'the embedded scene'} ({run.dataparser}), on {device.type}")
+    source = run.config.data or "the embedded scene"
+    say(f"{run.method} on {source} ({run.dataparser}), on {device.type}, kernels: {kernels(device)}")
     trainer = Trainer(run, train_set, None if eval_set is None else eval_set.to(device))
     for line in trainer.profile().lines():
         say(line)
@@ -60,7 +68,8 @@ def _finish(run: Run, trainer: Trainer) -> None:
     # Also of a run that goes on: it may have been killed before it came to this.
     write_transforms(run, trainer.train_set)
     write_report(run.folder / "scene_profile.json", trainer.profile().as_plain())
-    outcome = trainer.train()
+    with _saying_of_a_stop(lambda: _what_is_saved(trainer)):
+        outcome = trainer.train()
     state = trainer.state
     say(
         f"{outcome.reason}: step {state.step:,}, {state.seconds:.1f} s of training, "
@@ -74,9 +83,13 @@ def _finish(run: Run, trainer: Trainer) -> None:
     write_report(run.folder / "skip_report.json", as_plain(rungs))
     write_summary(trainer, outcome)
     say(f"checkpoint: {outcome.checkpoint}")
-    if outcome.interrupted:
-        say(f"continue with: ns-train --resume {run.folder}")
-        return
+    if outcome.stopped_by is not None:
+        raise Stopped(outcome.stopped_by, f"continue with: ns-train --resume {run.folder}")
+    with _saying_of_a_stop(lambda: f"stopped while evaluating; the trained run is saved: ns-eval {run.folder}"):
+        _evaluate(run, trainer, outcome)
+
+
+def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:
     test_set = first_split(run, ("test", "val"))
     if test_set is None or run.config.max_eval_images == 0:
         return
@@ -92,8 +105,25 @@ def _finish(run: Run, trainer: Trainer) -> None:
         say(f"pictures (photograph | render | error): {run.folder / 'pictures'}")
     else:
         say(f"warning: {found.pictures_note}")
-    write_evaluation(run.folder / "eval.json", run, outcome.checkpoint, found)
+    write_evaluation(run.folder / "eval.json", run, outcome.checkpoint, found, trainer.device)
     say(f"evaluate again with: ns-eval --load-config {run.config_path}")
+
+
+@contextmanager
+def _saying_of_a_stop(note: Callable[[], str]) -> Iterator[None]:
+    """Where a signal ends what is done meanwhile, say what came of it."""
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        raise Stopped(signal_of(stop), note()) from None
+
+
+def _what_is_saved(trainer: Trainer) -> str:
+    """Of a run that is ended at once."""
+    saved = list_checkpoints(trainer.checkpoint_folder)
+    if not saved:
+        return "stopped at once: nothing was saved"
+    return f"stopped at once: {saved[-1].name} is what was saved; continue with: ns-train --resume {trainer.run.folder}"
 
 
 def load_split(run: Run, split: Split) -> Dataset:

@@ -73,10 +73,15 @@ class Outcome:
 
     reason: str
     """Why it stopped."""
-    interrupted: bool
-    """Whether somebody stopped it."""
+    stopped_by: int | None
+    """The signal by which somebody stopped it; None where it came to its end."""
     checkpoint: Path
     """The last state."""
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether somebody stopped it."""
+        return self.stopped_by is not None
 
 
 class Trainer:
@@ -180,8 +185,9 @@ class Trainer:
                 self._evaluate_if_due(board)  # before saving: a run that goes on from here does not come back to it
                 if self._due_to_save():
                     self._try_to_save()
-        self._write_curve()
-        return Outcome(reason, bool(stopped), self.save())
+            self._write_curve()
+            checkpoint = self.save()  # a first Ctrl-C does not break it off
+        return Outcome(reason, next(iter(stopped), None), checkpoint)
 
     def _reason_to_stop(self, stopped: list[int]) -> str | None:
         if stopped:

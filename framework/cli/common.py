@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import sys
 from collections.abc import Callable, Mapping
@@ -11,6 +12,7 @@ from typing import TypeVar
 import framework
 from framework.console import say
 from framework.errors import ConfigError, NerfloomError, nearest
+from framework.from_nerfstudio import KINDS
 from framework.training.signals import exit_status, orderly_end
 
 K = TypeVar("K")
@@ -31,9 +33,42 @@ def chosen_kind(
         print(usage)
         return None
     name = arguments[0]
+    if name in KINDS and name not in kinds:
+        raise ConfigError(f"'{name}' is nerfstudio's; {KINDS[name]}")
     if name not in kinds:
         raise ConfigError(f"{unknown} '{name}'. {nearest(name, list(kinds))}")
     return name, kinds[name], arguments[1:]
+
+
+def with_run(arguments: list[str]) -> list[str]:
+    """The arguments of a command that takes a run, where it may stand without --load-config, as in ns-eval RUN_FOLDER.
+
+    Every flag has one value, or holds it after a =.
+    """
+    if any(word.partition("=")[0] == "--load-config" for word in arguments):
+        return arguments
+    place = 0
+    while place < len(arguments):
+        word = arguments[place]
+        if not word.startswith("-"):
+            return [*arguments[:place], "--load-config", *arguments[place:]]
+        place += 1 if "=" in word or word in ("-h", "--help") else 2
+    return arguments
+
+
+def make_room(path: Path) -> None:
+    """Make the folder of a file that is to be written, and see that it can be, before anything is spent on it.
+
+    Raises: ConfigError where it cannot.
+    """
+    there = os.path.lexists(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.open("ab").close()
+        if not there:
+            path.unlink()
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error.strerror}; name another place") from error
 
 
 def run_command(command: Callable[[list[str]], None]) -> None:

@@ -137,8 +137,11 @@ def _spelt_out(arguments: list[str], kind: type[OutputFlags]) -> list[str]:
 
 
 def _process(flags: OutputFlags) -> None:
+    from framework.processing.output import check_apart
+
     if not flags.data.exists():
         raise DataError(f"--data {flags.data}: there is no such file or folder")
+    check_apart(flags.output_dir, flags.data)
     if isinstance(flags, ColmapFlags):
         _find_poses(flags)
     else:

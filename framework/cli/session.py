@@ -22,6 +22,8 @@ from framework.training.skipping import as_plain, skip_report
 from framework.training.trainer import Outcome, Trainer
 
 PICTURES = 4
+FEW_PIXELS = 16
+"""Of an image's longer side, below which something went wrong with the images."""
 
 
 def start(run: Run) -> None:
@@ -60,6 +62,8 @@ def _prepare(run: Run) -> Trainer:
     trainer = Trainer(run, train_set, None if eval_set is None else eval_set.to(device))
     for line in trainer.profile().lines():
         say(line)
+    if train_set.scene.image_size < FEW_PIXELS:
+        say(f"warning: images of {train_set.scene.image_size} pixels show next to nothing; are they thumbnails?")
     say(f"{trainer.model.size():,} parameters; writing to {run.folder}")
     return trainer
 
@@ -131,7 +135,7 @@ def load_split(run: Run, split: Split) -> Dataset:
     memory = PixelMemory.of(run.config.cache_limit, run.config.cache_dir)
     # Masks tell what counts in an evaluation, whatever they mean in training: its figures stay comparable.
     masks = run.config.masks if split == "train" else "ignored"
-    return load_dataset(run.parser.parse(run.config.data, split), split, memory, masks)
+    return load_dataset(run.parse(split), split, memory, masks)
 
 
 def first_split(run: Run, splits: tuple[Split, ...]) -> Dataset | None:

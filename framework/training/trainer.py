@@ -140,7 +140,7 @@ class Trainer:
 
         Raises: CheckpointError where it belongs to another method or other sizes.
         """
-        restore_model(self.model, checkpoint)
+        restore_model(self.model, checkpoint, self.run.method)
         try:
             rates = [group["initial_lr"] for group in self.optimizer.param_groups]
             self.optimizer.load_state_dict(checkpoint["optimizer"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -118,7 +118,7 @@ def unreadable(path: Path, error: BaseException, what: str = "") -> DataError:
         size = path.stat().st_size
     except OSError:
         size = -1
-    unknown = any(isinstance(one, UnidentifiedImageError) for one in (error, error.__cause__, error.__context__))
+    unknown = any(isinstance(one, UnidentifiedImageError) for one in _chain(error))
     if isinstance(error, OSError) and error.errno is not None:
         reason = f"{error.strerror}"
     elif isinstance(error, DataError):
@@ -134,6 +134,13 @@ def unreadable(path: Path, error: BaseException, what: str = "") -> DataError:
     else:
         reason = "it is damaged or cut short; copy it again"
     return DataError(f"{name} is not a readable image: {reason}")
+
+
+def _chain(error: BaseException | None) -> Iterator[BaseException]:
+    """An error, and those that it was raised from or over."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
 
 
 def one_line(error: BaseException) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import platform
 import sys
@@ -68,7 +69,9 @@ def make_room(path: Path) -> None:
         if not there:
             path.unlink()
     except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error.strerror}; name another place") from error
+        # A file where a folder must be: `mkdir` only says that it exists.
+        reason = os.strerror(errno.ENOTDIR) if isinstance(error, FileExistsError) else error.strerror
+        raise ConfigError(f"cannot write {path}: {reason}; name another place") from error
 
 
 def run_command(command: Callable[[list[str]], None]) -> None:

@@ -125,9 +125,11 @@ def test_what_is_missing_is_named(finished: Path, tmp_path: Path, refused: Refus
     (tmp_path / "file").write_text("in the way")
     cases: list[tuple[list[object], str]] = [
         (["--load-config", tmp_path / "no.yml"], f"cannot read {tmp_path / 'no.yml'}: No such file"),
-        (["--load-config", finished], f"cannot read {finished}: Is a directory"),
         (["--load-config", config, "--max-images", 0], "--max-images is 0"),
-        (["--load-config", config, "--data", tmp_path / "gone"], str(tmp_path / "gone" / "transforms_test.json")),
+        (
+            ["--load-config", config, "--data", tmp_path / "gone"],
+            f"--data {tmp_path / 'gone'}: there is no such folder",
+        ),
         (["--load-config", config, "--load-checkpoint", tmp_path / "no.ckpt"], "there is no checkpoint"),
         (["--load-config", config, "--load-checkpoint", tmp_path / "file"], f"{tmp_path / 'file'} is damaged"),
         (["--load-config", config, "--output-path", tmp_path / "file" / "e.json"], str(tmp_path / "file")),

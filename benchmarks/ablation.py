@@ -12,13 +12,13 @@ from __future__ import annotations
 import argparse
 import json
 import subprocess
-import sys
 import tempfile
 from itertools import pairwise
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
+from framework.child import python_command
 from framework.kernels import native
 
 VARIANTS: dict[str, list[str]] = {
@@ -68,7 +68,7 @@ def main() -> None:
 def train(data: Path, seconds: float, seed: int, target: float, switches: list[str]) -> tuple[float | None, float]:
     """Seconds to the target, None where it was not met, and the final PSNR on the test views."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "framework.cli.train", "instant-ngp", "--data", str(data)]
+        command = python_command("framework.cli.train", "instant-ngp", "--data", data)
         command += ["--max-seconds", str(seconds), "--machine.seed", str(seed), "--vis", "none"]
         command += ["--seconds-per-eval-all-images", str(seconds / 9), "--max-eval-images", str(VIEWS)]
         command += ["--output-dir", folder, *switches]
@@ -76,7 +76,7 @@ def train(data: Path, seconds: float, seed: int, target: float, switches: list[s
         config = next(Path(folder).rglob("config.yml"))
         points = [p for p in read(config.parent / "learning_curve.json") if p["full"]]
         curve = [(0.0, 0.0)] + [(p["seconds"], p["psnr"]) for p in points]
-        command = [sys.executable, "-m", "framework.cli.evaluate", "--load-config", str(config)]
+        command = python_command("framework.cli.evaluate", "--load-config", config)
         command += ["--output-path", str(Path(folder) / "all.json")]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         return crossing(curve, target), read(Path(folder) / "all.json")["results"]["psnr"]

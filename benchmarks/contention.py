@@ -82,7 +82,10 @@ def main() -> None:
             alone = (table[work] or [measured])[0]["a second"][0]
             measured["share"] = [round(speed / alone, 2) for speed in measured["a second"]]
             table[work].append(measured)
-            print(f"{work:10s} {row.name:38s} {json.dumps({k: v for k, v in measured.items() if k != 'beside'})}", flush=True)
+            print(
+                f"{work:10s} {row.name:38s} {json.dumps({k: v for k, v in measured.items() if k != 'beside'})}",
+                flush=True,
+            )
     content = {"cores": os.cpu_count(), "seconds": flags.seconds, **table}
     flags.output.write_text(json.dumps(content, indent=2) + "\n")
 
@@ -107,9 +110,7 @@ def measure(row: Row, work: str, data: Path, seconds: float) -> dict[str, Any]:
             wait_for(of_child, "ready")
         loop = [sys.executable, "-c", LOOP.format(seconds=20 * seconds)]  # it ends by itself should we not
         loops = [
-            stack.enter_context(
-                subprocess.Popen(["nice", "-n", str(row.nice), *loop], start_new_session=row.own_group)
-            )
+            stack.enter_context(subprocess.Popen(["nice", "-n", str(row.nice), *loop], start_new_session=row.own_group))
             for _ in range(row.loops)
         ]
         time.sleep(0.5)

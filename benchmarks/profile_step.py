@@ -16,8 +16,9 @@ import time
 from pathlib import Path
 
 from framework.cli.session import load_split
+from framework.data_folder import find_data
 from framework.kernels import native
-from framework.registry import load_dataparser, load_method, recognize
+from framework.registry import load_dataparser, load_method
 from framework.training.run import Run, create_folder
 from framework.training.trainer import Trainer
 
@@ -36,7 +37,8 @@ def main() -> None:
     # The schedule must not end while it is measured: the settings for the time are taken, the time itself is not.
     config = dataclasses.replace(config, data=flags.data, vis="none", max_seconds=flags.max_seconds).resolved()
     config = dataclasses.replace(config, max_seconds=None)
-    name = recognize(flags.data)
+    folder_of_data, name = find_data(flags.data)
+    config = dataclasses.replace(config, data=folder_of_data)
     with tempfile.TemporaryDirectory() as folder:
         run = Run(flags.method, config, name, load_dataparser(name)(), Path(folder) / "run")
         create_folder(run)

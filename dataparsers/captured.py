@@ -327,7 +327,7 @@ def _check_intrinsics(photographs: Photographs, sizes: Tensor) -> None:
         if abs(math.log(found[0] * stated[1] / (found[1] * stated[0]))) > slack:
             raise DataError(
                 f"{path} is {found[0]}x{found[1]} pixels, but its camera is for the shape of "
-                f"{stated[0]}x{stated[1]}: it was cropped or turned"
+                f"{stated[0]}x{stated[1]}: it was cropped or turned; restore it, or take it out of the data"
             )
     lens, expected = photographs.lens, len(LENSES[photographs.model])
     if lens is not None and (lens.shape[1] != expected or not bool(lens.isfinite().all())):

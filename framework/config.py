@@ -16,6 +16,7 @@ from typing import Any, ClassVar, Literal, TypeVar, Union
 import yaml
 
 from framework.errors import ConfigError, nearest, shown
+from framework.from_nerfstudio import config_answer
 
 T = TypeVar("T")
 RaysPerPixel = Literal[1, 4, 9, 16]
@@ -264,9 +265,14 @@ def read_yaml(path: Path) -> dict[str, Any]:
     Raises: ConfigError where it is missing, not YAML, or not a mapping.
     """
     try:
-        values = yaml.load(path.read_text(encoding="utf-8"), _PlainLoader)
+        text = path.read_text(encoding="utf-8")
+        if (answer := config_answer(text)) is not None:
+            raise ConfigError(f"{path} {answer}")
+        values = yaml.load(text, _PlainLoader)
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from error
+    except ConfigError:
+        raise
     except Exception as error:  # besides YAMLError: bad text, dates and nesting; `!!float ''` is an IndexError
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ConfigError(f"{path} is not plain YAML: {reason}") from error

@@ -207,7 +207,8 @@ def _decode_one(files: ImageFiles, index: int, store: PixelStore, start: int, ch
     if image.shape[:2] != (height, width):
         found = f"{image.shape[1] * files.factor}x{image.shape[0] * files.factor}"
         expected = f"{width * files.factor}x{height * files.factor}"
-        raise DataError(f"{path} is {found} pixels, but its camera is for {expected}")
+        remedy = "resize it, or take it out of the data"
+        raise DataError(f"{path} is {found} pixels, but its camera is for {expected}, as others' are: {remedy}")
     mask = None if mask_path is None else read_mask(mask_path, width, height)
     store.write(start * channels, np.ascontiguousarray(image[..., :channels]).reshape(-1))
     opaque = channels == 3 or bool((image[..., 3] == 255).all())

@@ -14,7 +14,7 @@ from torch import Tensor
 from framework.arrays import read_array
 from framework.cameras import Cameras
 from framework.errors import DataError
-from framework.image_files import Content, one_line
+from framework.image_files import Content, unreadable
 
 T = TypeVar("T")
 
@@ -62,7 +62,7 @@ def _or_refused(path: Path, read: Callable[[Path], T]) -> T:
     try:
         return read(path)
     except Exception as error:  # as in `read_image`
-        raise DataError(f"the depth image {path} cannot be read: {one_line(error)}") from error
+        raise unreadable(path, error, "the depth image") from error
 
 
 def read_depths(paths: Sequence[Path | None], cameras: Cameras, unit: float) -> Tensor:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
-from PIL import EpsImagePlugin
+from PIL import EpsImagePlugin, Image, UnidentifiedImageError
 
 from framework.errors import DataError
 
@@ -34,7 +34,7 @@ def image_size(paths: Sequence[Path]) -> tuple[int, int]:
                 return width, height
             reason = reason or f"{path} has no pixel"
         except Exception as error:  # whatever the decoder raises, as in `read_image`
-            reason = reason or f"{path} is not a readable image: {one_line(error)}"
+            reason = reason or str(unreadable(path, error))
     raise DataError(reason or "there is no image to read a size from")
 
 
@@ -67,7 +67,7 @@ def read_image(path: Path, factor: int = 1) -> np.ndarray:
     except DataError:
         raise
     except Exception as error:  # Pillow raises OSError, SyntaxError, struct.error, DecompressionBombError and more
-        raise DataError(f"{path} is not a readable image: {one_line(error)}") from error
+        raise unreadable(path, error) from error
     return image if factor == 1 else reduce_image(image, factor)
 
 
@@ -104,6 +104,43 @@ def may_be_transparent(path: Path) -> bool:
     except Exception:  # whatever the decoder raises; the file is reported when it is decoded
         return False
     return "A" in str(meta.get("mode", "")).upper() or "transparency" in meta
+
+
+def unreadable(path: Path, error: BaseException, what: str = "") -> DataError:
+    """The error of a file that no decoder reads, in words that say what to do, for decoders' own are not for users.
+
+    Args:
+        error: whatever the decoder raised.
+        what: to call the file, as in "the mask".
+    """
+    name = f"{what} {path}".lstrip()
+    try:
+        size = path.stat().st_size
+    except OSError:
+        size = -1
+    unknown = any(isinstance(one, UnidentifiedImageError) for one in _chain(error))
+    if isinstance(error, OSError) and error.errno is not None:
+        reason = f"{error.strerror}"
+    elif isinstance(error, DataError):
+        reason = str(error)
+    elif size == 0:
+        reason = "the file is empty; copy it again"
+    elif unknown and path.suffix.lower() in (".heic", ".heif"):
+        reason = "HEIC needs another package: pip install pillow-heif"
+    elif unknown:
+        reason = "what it holds is no image, or its beginning is damaged; copy it again"
+    elif isinstance(error, Image.DecompressionBombError):
+        reason = "it has more pixels than are read; reduce it"
+    else:
+        reason = "it is damaged or cut short; copy it again"
+    return DataError(f"{name} is not a readable image: {reason}")
+
+
+def _chain(error: BaseException | None) -> Iterator[BaseException]:
+    """An error, and those that it was raised from or over."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
 
 
 def one_line(error: BaseException) -> str:

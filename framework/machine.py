@@ -29,13 +29,22 @@ def machine(device: torch.device | None = None) -> dict[str, Any]:
         "threads": torch.get_num_threads(),
         "memory, GB": round(memory / 1e9, 1) if memory < float("inf") else None,
         "device": torch.cuda.get_device_name(device) if on_cuda else (device.type if device is not None else "cpu"),
-        "kernels": native.variant(),
+        "kernels": kernels(device),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         "torch": torch.__version__,
         "nerfloom": framework.__version__,
         "commit": commit(),
     }
+
+
+def kernels(device: torch.device | None = None) -> str:
+    """What computes on a device: a variant of the compiled kernels, or "reference", which is torch alone.
+
+    Args:
+        device: the processor if None.
+    """
+    return native.variant() if device is None or device.type == "cpu" else "reference"
 
 
 def processor() -> str:

@@ -8,7 +8,7 @@ import imageio.v3 as iio
 import numpy as np
 
 from framework.errors import DataError
-from framework.image_files import Content, one_line
+from framework.image_files import Content, unreadable
 
 THRESHOLD = 128
 """The least grey that counts as white."""
@@ -27,7 +27,7 @@ def read_mask(path: Path, width: int, height: int) -> np.ndarray:
     try:
         grey = np.asarray(iio.imread(Content(path), plugin="pillow", mode="L", index=0))
     except Exception as error:  # as in `read_image`
-        raise DataError(f"the mask {path} is not a readable image: {one_line(error)}") from error
+        raise unreadable(path, error, "the mask") from error
     if not grey.size:
         raise DataError(f"the mask {path} has no pixel")
     used = grey >= THRESHOLD

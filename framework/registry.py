@@ -26,9 +26,9 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from framework.console import say
 from framework.elsewhere import ELSEWHERE
-from framework.errors import ConfigError, DataError, nearest
+from framework.errors import ConfigError, nearest
+from framework.from_nerfstudio import format_answer
 
 if TYPE_CHECKING:
     from framework.dataset import DataParser
@@ -135,6 +135,8 @@ def entry_of(kind: Kind, name: str) -> Entry:
         return known[name]
     if kind == "methods" and name in ELSEWHERE:
         raise ConfigError(f"Nerfloom has no method '{name}': {ELSEWHERE[name]}")
+    if kind == "dataparsers" and (answer := format_answer(name)) is not None:
+        raise ConfigError(answer)
     raise ConfigError(f"unknown {CALLED[kind]} '{name}'. {nearest(name, known)}")
 
 
@@ -186,36 +188,3 @@ def load_dataparser(name: str) -> type[DataParser]:
         entry = entry_of("dataparsers", name)
         raise ConfigError(f"data format '{name}': {entry.module}:{entry.attribute} is no framework.DataParser")
     return parser
-
-
-def recognize(path: Path | None) -> str:
-    """The name of the data format of a folder; the embedded scene for None.
-
-    Formats that cannot be loaded are reported and left out.
-
-    Raises: DataError where the folder is missing, or none or several formats recognise it.
-    """
-    if path is None:
-        return "procedural"
-    if not os.path.isdir(path):  # `Path.is_dir` raises for names that no file can have
-        raise DataError(f"--data {path}: there is no such folder")
-    matches = [name for name in registered("dataparsers") if _recognizes(name, path)]
-    if len(matches) == 1:
-        return matches[0]
-    known = ", ".join(registered("dataparsers"))
-    if not matches:
-        raise DataError(f"--data {path}: no known data format is found there. Known: {known}")
-    raise DataError(f"--data {path}: could be {' or '.join(matches)}; name one after the flags, as in '{matches[0]}'")
-
-
-def _recognizes(name: str, path: Path) -> bool:
-    try:
-        parser = load_dataparser(name)
-    except ConfigError as error:
-        say(f"warning: {error}; it is left out")
-        return False
-    try:
-        return parser.recognizes(path)
-    except Exception as error:  # it should not raise, but another's mistake must not stop everyone
-        say(f"warning: data format '{name}' failed to look at {path}: {type(error).__name__}: {error}; it is left out")
-        return False

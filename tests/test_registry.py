@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from framework import registry
+from framework.data_folder import find_data
 from framework.elsewhere import ELSEWHERE
 from framework.errors import ConfigError, DataError
 
@@ -188,7 +189,7 @@ def test_formats_that_fail_do_not_stop_others(
 ) -> None:
     modules = {"burning": FORMAT_FILE, "broken_format": "raise RuntimeError('never')\n"}
     environment(modules, dataparsers="burning=burning:Format,never=broken_format:X")
-    assert registry.recognize(shared_tiny) == "blender"
+    assert find_data(shared_tiny) == (shared_tiny, "blender")
     printed = capsys.readouterr()
     assert "data format 'burning' failed to look at" in printed.out + printed.err
     assert "the disk is on fire; it is left out" in (printed.out + printed.err).replace("\n", " ")
@@ -196,11 +197,11 @@ def test_formats_that_fail_do_not_stop_others(
 
 
 def test_recognition(shared_tiny: Path, tmp_path: Path) -> None:
-    assert registry.recognize(shared_tiny) == "blender"
-    assert registry.recognize(None) == "procedural"
+    assert find_data(shared_tiny) == (shared_tiny, "blender")
+    assert find_data(None) == (None, "procedural")
     with pytest.raises(DataError, match="there is no such folder"):
-        registry.recognize(tmp_path / "nowhere")
+        find_data(tmp_path / "nowhere")
     with pytest.raises(DataError, match=r"a{100}\.\.\.$"):  # an error of a line, however long the name
-        registry.recognize(tmp_path / ("a" * 5000))
+        find_data(tmp_path / ("a" * 5000))
     with pytest.raises(DataError, match="no known data format"):
-        registry.recognize(tmp_path)
+        find_data(tmp_path)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from framework.child import python_command
 from framework.cli.common import chosen_kind, run_command
 from framework.console import say
 from framework.errors import ConfigError, nearest
@@ -93,7 +93,7 @@ def _kernels(flags: KernelFlags) -> None:
     for name in flags.variants:
         if name not in native.NEEDS:
             raise ConfigError(f"--variants: there is no '{name}'. {nearest(name, native.NEEDS)}")
-        command = [sys.executable, "-m", "framework.cli.bench", "kernels", "--output-dir", str(flags.output_dir)]
+        command = python_command("framework.cli.bench", "kernels", "--output-dir", flags.output_dir)
         command += ["--samples", str(flags.samples), "--repeats", str(flags.repeats)]
         command += ["--plot-dir", str(flags.plot_dir)] if flags.plot_dir else []
         if subprocess.run(command, env={**os.environ, "NERFLOOM_KERNELS": name}).returncode:

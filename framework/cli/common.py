@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import platform
 import sys
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import TypeVar
 
+import framework
 from framework.console import say
 from framework.errors import ConfigError, NerfloomError, is_out_of_memory, nearest
+from framework.from_nerfstudio import KINDS
+from framework.training.signals import exit_status, orderly_end
 
 K = TypeVar("K")
 
@@ -27,37 +34,85 @@ def chosen_kind(
         print(usage)
         return None
     name = arguments[0]
+    if name in KINDS and name not in kinds:
+        raise ConfigError(f"'{name}' is nerfstudio's; {KINDS[name]}")
     if name not in kinds:
         raise ConfigError(f"{unknown} '{name}'. {nearest(name, list(kinds))}")
     return name, kinds[name], arguments[1:]
 
 
+def with_run(arguments: list[str]) -> list[str]:
+    """The arguments of a command that takes a run, where it may stand without --load-config, as in ns-eval RUN_FOLDER.
+
+    Every flag has one value, or holds it after a =.
+    """
+    if any(word.partition("=")[0] == "--load-config" for word in arguments):
+        return arguments
+    place = 0
+    while place < len(arguments):
+        word = arguments[place]
+        if not word.startswith("-"):
+            return [*arguments[:place], "--load-config", *arguments[place:]]
+        place += 1 if "=" in word or word in ("-h", "--help") else 2
+    return arguments
+
+
+def make_room(path: Path) -> None:
+    """Make the folder of a file that is to be written, and see that it can be, before anything is spent on it.
+
+    Raises: ConfigError where it cannot.
+    """
+    there = os.path.lexists(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.open("ab").close()
+        if not there:
+            path.unlink()
+    except OSError as error:
+        # A file where a folder must be: `mkdir` only says that it exists.
+        reason = os.strerror(errno.ENOTDIR) if isinstance(error, FileExistsError) else error.strerror
+        raise ConfigError(f"cannot write {path}: {reason}; name another place") from error
+
+
 def run_command(command: Callable[[list[str]], None]) -> None:
     """Run a command on the process's arguments.
 
-    Errors a user can act on become one line and exit status 1; `--debug` anywhere shows the traceback instead.
+    Errors a user can act on become one line and exit status 1; `--debug` anywhere shows the traceback instead. A
+    command that a signal ends says so, and exits with 128 and the signal's number.
     """
-    arguments = sys.argv[1:]
-    debug = "--debug" in arguments
+    arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
+    debug = len(arguments) < len(sys.argv) - 1
+    if "--version" in (*arguments[:1], *arguments[-1:]):
+        print(version())
+        return
     try:
-        command([argument for argument in arguments if argument != "--debug"])
-    except NerfloomError as error:
-        if debug:
-            raise
-        say(f"error: {error}")
-        sys.exit(1)
+        with orderly_end():
+            command(arguments)
     except BrokenPipeError:
         sys.exit(1)
-    except OSError as error:
+    except (NerfloomError, OSError) as error:
         if debug:
             raise
-        say(f"error: {error}")
+        say(f"error: {in_our_words(error)}")
         sys.exit(1)
     except (MemoryError, RuntimeError) as error:
         if debug or not is_out_of_memory(error):
             raise
         say("error: there is not enough memory; smaller settings, such as --num-rays-per-batch, take less")
         sys.exit(1)
-    except KeyboardInterrupt:
-        say("interrupted")
-        sys.exit(130)
+    except KeyboardInterrupt as stop:
+        say(str(stop) or "interrupted")
+        sys.exit(exit_status(stop))
+
+
+def version() -> str:
+    """What --version prints: the package's version, where it lies, and the Python that runs it."""
+    place = Path(framework.__file__).parent
+    return f"nerfloom {framework.__version__} from {place} (Python {platform.python_version()})"
+
+
+def in_our_words(error: Exception) -> str:
+    """An error's line; of the system's errors the file comes first, and its number is left out."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename is not None else error.strerror
+    return str(error)

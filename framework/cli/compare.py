@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -89,9 +89,10 @@ def plan_of(flags: CompareFlags) -> Plan:
     Raises: ConfigError for what makes no sense.
     """
     from framework.comparison.plan import Conditions, Contender, Plan, split_words
+    from framework.data_folder import find_data
 
     if flags.data is not None and not os.path.isdir(flags.data):
-        raise ConfigError(f"--data {flags.data}: there is no such folder")
+        flags = replace(flags, data=find_data(flags.data)[0])
     conditions = Conditions(
         data=None if flags.data is None else str(flags.data.resolve()),
         data_flags=split_words(flags.data_flags, "--data-flags"),

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from framework.cli.common import run_command
+from framework.cli.common import run_command, with_run
 from framework.config import RaysPerPixel
 from framework.errors import ConfigError
 
@@ -16,7 +16,7 @@ class EvalFlags:
     """Measure a trained run on held-out views."""
 
     load_config: Path
-    """The run's config.yml."""
+    """The run's folder, or its config.yml; the flag's name may be left out."""
     output_path: Path | None = None
     """Where the JSON goes; eval.json beside config.yml if not given."""
     render_output_path: Path | None = None
@@ -50,7 +50,7 @@ def main() -> None:
 def _command(arguments: list[str]) -> None:
     import tyro
 
-    flags = tyro.cli(EvalFlags, prog="ns-eval", args=arguments, config=(tyro.conf.FlagConversionOff,))
+    flags = tyro.cli(EvalFlags, prog="ns-eval", args=with_run(arguments), config=(tyro.conf.FlagConversionOff,))
     if flags.max_images is not None and flags.max_images < 1:
         raise ConfigError(f"--max-images is {flags.max_images}; it must be at least 1")
     from contextlib import nullcontext
@@ -88,7 +88,7 @@ def _command(arguments: list[str]) -> None:
         say("--eval-appearance half: this run has no appearance vectors; whole photographs were judged")
     say(f"LPIPS {found.lpips_note}")
     output = flags.output_path or trained.run.folder / "eval.json"
-    write_evaluation(output, trained.run, trained.checkpoint, found)
+    write_evaluation(output, trained.run, trained.checkpoint, found, trained.model.device)
     say(f"written to {output}")
     if found.pictures_note is not None:
         raise ConfigError(found.pictures_note)

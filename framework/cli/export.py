@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from framework.cli.common import chosen_kind, run_command
+from framework.cli.common import chosen_kind, make_room, run_command, with_run
 from framework.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from framework.training.trained import Trained
 
 USAGE = """\
-usage: ns-export WHAT --load-config RUN/config.yml --output-dir DIR [flags]
+usage: ns-export WHAT RUN_FOLDER --output-dir DIR [flags]
 
   pointcloud      point_cloud.ply: points on surfaces, with colours, and normals where the method has them
   cameras         transforms_train.json: the training cameras, refined where the run has refined them
@@ -28,7 +28,7 @@ class ExportFlags:
     """What every export can be told."""
 
     load_config: Path
-    """The run's config.yml."""
+    """The run's folder, or its config.yml; the flag's name may be left out."""
     output_dir: Path
     """Where files go."""
     load_checkpoint: Path | None = None
@@ -64,15 +64,15 @@ def _command(arguments: list[str]) -> None:
         return
     import tyro
 
-    name, (kind, run), rest = chosen
-    flags = tyro.cli(kind, prog=f"ns-export {name}", args=rest, config=(tyro.conf.FlagConversionOff,))
+    name, (kind, file, run), rest = chosen
+    flags = tyro.cli(kind, prog=f"ns-export {name}", args=with_run(rest), config=(tyro.conf.FlagConversionOff,))
     from framework.training.trained import load_trained
 
+    make_room(flags.output_dir / file)
     trained = load_trained(flags.load_config, flags.load_checkpoint, flags.device_type, flags.data)
     if trained.model.scene.warped:
         raise ConfigError("this run lives in normalised device coordinates (--ndc), which have no scale to export")
-    flags.output_dir.mkdir(parents=True, exist_ok=True)
-    run(flags, trained, _placement(trained))
+    run(flags, trained, _placement(trained), flags.output_dir / file)
 
 
 def _placement(trained: Trained) -> Placement:
@@ -82,7 +82,7 @@ def _placement(trained: Trained) -> Placement:
     return Placement(trained.content["transform"].double().cpu(), float(trained.content["scale"]))
 
 
-def _points(flags: PointFlags, trained: Trained, placement: Placement) -> None:
+def _points(flags: PointFlags, trained: Trained, placement: Placement, path: Path) -> None:
     if flags.num_points < 1 or not flags.reach >= 0:
         raise ConfigError("--num-points must be at least 1, and --reach at least 0")
     from framework.cli.session import load_split
@@ -101,12 +101,11 @@ def _points(flags: PointFlags, trained: Trained, placement: Placement) -> None:
         raise ConfigError("no training ray ends in a surface inside --reach; is the run trained? --reach 0 keeps all")
     positions = placement.original_points(found.positions.double()).float()
     normals = None if found.normals is None else placement.original_directions(found.normals.double()).float()
-    path = flags.output_dir / "point_cloud.ply"
     write_points(path, positions, found.colors, normals)
     say(f"{len(positions):,} points: {path}")
 
 
-def _cameras(flags: CameraFlags, trained: Trained, placement: Placement) -> None:
+def _cameras(flags: CameraFlags, trained: Trained, placement: Placement, path: Path) -> None:
     from framework.cli.session import load_split
     from framework.console import say
     from framework.export.cameras import believed, camera_list
@@ -115,12 +114,14 @@ def _cameras(flags: CameraFlags, trained: Trained, placement: Placement) -> None
     # With its images: one that could not be read has no camera in the model.
     dataset = load_split(trained.run, "train").to(trained.model.device)
     cameras = believed(trained.model, dataset.cameras)
-    path = flags.output_dir / "transforms_train.json"
     write_json(path, camera_list(cameras, dataset.names, placement))
     say(f"{len(cameras)} cameras: {path}")
 
 
-KINDS: dict[str, tuple[type[Any], Any]] = {"pointcloud": (PointFlags, _points), "cameras": (CameraFlags, _cameras)}
+KINDS: dict[str, tuple[type[Any], str, Any]] = {
+    "pointcloud": (PointFlags, "point_cloud.ply", _points),
+    "cameras": (CameraFlags, "transforms_train.json", _cameras),
+}
 
 if __name__ == "__main__":
     main()

@@ -13,6 +13,7 @@ from framework.cli.common import chosen_kind, run_command
 from framework.console import say
 from framework.errors import ConfigError, DataError
 from framework.processing.settings import ColmapFlags, OutputFlags
+from framework.training.signals import Stopped, signal_of
 
 USAGE = """\
 usage: ns-process-data KIND --data IN --output-dir OUT [flags]
@@ -117,9 +118,9 @@ def _command(arguments: list[str]) -> None:
     flags.check()
     try:
         _process(flags)
-    except KeyboardInterrupt:
-        say(f"interrupted; {flags.output_dir} is unfinished, --overwrite begins again")
-        sys.exit(130)
+    except KeyboardInterrupt as stop:
+        note = f"interrupted; {flags.output_dir} is unfinished, --overwrite begins again"
+        raise Stopped(signal_of(stop), note) from None
 
 
 def _spelt_out(arguments: list[str], kind: type[OutputFlags]) -> list[str]:
@@ -136,8 +137,11 @@ def _spelt_out(arguments: list[str], kind: type[OutputFlags]) -> list[str]:
 
 
 def _process(flags: OutputFlags) -> None:
+    from framework.processing.output import check_apart
+
     if not flags.data.exists():
         raise DataError(f"--data {flags.data}: there is no such file or folder")
+    check_apart(flags.output_dir, flags.data)
     if isinstance(flags, ColmapFlags):
         _find_poses(flags)
     else:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from framework.cli.common import chosen_kind, run_command
+from framework.cli.common import chosen_kind, make_room, run_command, with_run
 from framework.config import RaysPerPixel
 from framework.errors import ConfigError
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from framework.training.trained import Trained
 
 USAGE = """\
-usage: ns-render PATH --load-config RUN/config.yml --output-path FILE.gif [flags]
+usage: ns-render PATH RUN_FOLDER --output-path FILE.gif [flags]
 
 paths:
   orbit           a horizontal circle around the scene, as high and far as the training cameras
@@ -34,7 +34,7 @@ class RenderFlags:
     """What every path can be told."""
 
     load_config: Path
-    """The run's config.yml."""
+    """The run's folder, or its config.yml; the flag's name may be left out."""
     fps: float = 16.0
     """Pictures per second."""
     downscale_factor: int = 1
@@ -102,7 +102,7 @@ def _command(arguments: list[str]) -> None:
     import tyro
 
     name, path, rest = chosen
-    _render(tyro.cli(path, prog=f"ns-render {name}", args=rest, config=(tyro.conf.FlagConversionOff,)))
+    _render(tyro.cli(path, prog=f"ns-render {name}", args=with_run(rest), config=(tyro.conf.FlagConversionOff,)))
 
 
 def _render(flags: Flags) -> None:
@@ -110,6 +110,7 @@ def _render(flags: Flags) -> None:
         raise ConfigError("--num-frames and --downscale-factor must be at least 1, --fps more than 0")
     if flags.output_path.suffix.lower() not in (".gif", ".webp", ".png"):
         raise ConfigError(f"--output-path {flags.output_path}: the ending must be .gif, .webp or .png")
+    make_room(flags.output_path)
     from contextlib import nullcontext
 
     import torch
@@ -123,8 +124,8 @@ def _render(flags: Flags) -> None:
     trained = load_trained(
         flags.load_config, flags.load_checkpoint, flags.device_type, flags.data, flags.rays_per_pixel
     )
-    model, config = trained.model, trained.run.config
-    parsed = trained.run.parser.parse(config.data, flags.split if isinstance(flags, TimeFlags) else "train")
+    model = trained.model
+    parsed = trained.run.parse(flags.split if isinstance(flags, TimeFlags) else "train")
     cameras, times = _path(flags, trained, parsed)
     cameras = cameras.scaled(1 / (flags.downscale_factor * parsed.downscale_factor)).to(model.device)
     times = None if times is None else times.to(model.device)

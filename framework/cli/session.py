@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 from framework.console import say
@@ -9,19 +11,26 @@ from framework.dataset import Dataset, Split, load_dataset
 from framework.device import choose_device, peak_memory
 from framework.errors import DataError
 from framework.evaluation.evaluator import evaluate
+from framework.machine import kernels
 from framework.pixel_cache import PixelMemory
-from framework.training.checkpoint import FOLDER, load_newest
+from framework.training.checkpoint import FOLDER, list_checkpoints, load_newest
 from framework.training.lock import sole_user
 from framework.training.report import write_evaluation, write_summary
 from framework.training.run import Run, create_folder, write_report, write_transforms
+from framework.training.signals import Stopped, signal_of
 from framework.training.skipping import as_plain, lines, skip_report
-from framework.training.trainer import Trainer
+from framework.training.trainer import Outcome, Trainer
 
 PICTURES = 4
+FEW_PIXELS = 16
+"""Of an image's longer side, below which something went wrong with the images."""
 
 
 def start(run: Run) -> None:
-    """Train a new run."""
+    """Train a new run.
+
+    Raises: Stopped where somebody ends it; what was saved is said.
+    """
     run = replace(run, config=run.config.resolved())
     trainer = _prepare(run)
     trainer.restore_as_configured()
@@ -31,7 +40,7 @@ def start(run: Run) -> None:
 
 
 def resume(run: Run) -> None:
-    """Go on with a run from its newest checkpoint; from the beginning where it has none."""
+    """Go on with a run from its newest checkpoint; from the beginning where it has none. Raises as `start`."""
     with sole_user(run.folder):
         trainer = _prepare(run)
         checkpoint = load_newest(run.folder / FOLDER, trainer.device)
@@ -48,10 +57,13 @@ def _prepare(run: Run) -> Trainer:
     device = choose_device(run.config.machine)
     train_set = load_split(run, "train").to(device)
     eval_set = first_split(run, ("val", "test"))
-    say(f"{run.method} on {run.config.data or 'the embedded scene'} ({run.dataparser}), on {device.type}")
+    source = run.config.data or "the embedded scene"
+    say(f"{run.method} on {source} ({run.dataparser}), on {device.type}, kernels: {kernels(device)}")
     trainer = Trainer(run, train_set, None if eval_set is None else eval_set.to(device))
     for line in trainer.profile().lines():
         say(line)
+    if train_set.scene.image_size < FEW_PIXELS:
+        say(f"warning: images of {train_set.scene.image_size} pixels show next to nothing; are they thumbnails?")
     say(f"{trainer.model.size():,} parameters; writing to {run.folder}")
     return trainer
 
@@ -60,7 +72,8 @@ def _finish(run: Run, trainer: Trainer) -> None:
     # Also of a run that goes on: it may have been killed before it came to this.
     write_transforms(run, trainer.train_set)
     write_report(run.folder / "scene_profile.json", trainer.profile().as_plain())
-    outcome = trainer.train()
+    with _saying_of_a_stop(lambda: _what_is_saved(trainer)):
+        outcome = trainer.train()
     state = trainer.state
     say(
         f"{outcome.reason}: step {state.step:,}, {state.seconds:.1f} s of training, "
@@ -74,9 +87,13 @@ def _finish(run: Run, trainer: Trainer) -> None:
     write_report(run.folder / "skip_report.json", as_plain(rungs))
     write_summary(trainer, outcome)
     say(f"checkpoint: {outcome.checkpoint}")
-    if outcome.interrupted:
-        say(f"continue with: ns-train --resume {run.folder}")
-        return
+    if outcome.stopped_by is not None:
+        raise Stopped(outcome.stopped_by, f"continue with: ns-train --resume {run.folder}")
+    with _saying_of_a_stop(lambda: f"stopped while evaluating; the trained run is saved: ns-eval {run.folder}"):
+        _evaluate(run, trainer, outcome)
+
+
+def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:
     test_set = first_split(run, ("test", "val"))
     if test_set is None or run.config.max_eval_images == 0:
         return
@@ -92,8 +109,25 @@ def _finish(run: Run, trainer: Trainer) -> None:
         say(f"pictures (photograph, render, error, depth, opacity): {run.folder / 'pictures'}")
     else:
         say(f"warning: {found.pictures_note}")
-    write_evaluation(run.folder / "eval.json", run, outcome.checkpoint, found)
+    write_evaluation(run.folder / "eval.json", run, outcome.checkpoint, found, trainer.device)
     say(f"evaluate again with: ns-eval --load-config {run.config_path}")
+
+
+@contextmanager
+def _saying_of_a_stop(note: Callable[[], str]) -> Iterator[None]:
+    """Where a signal ends what is done meanwhile, say what came of it."""
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        raise Stopped(signal_of(stop), note()) from None
+
+
+def _what_is_saved(trainer: Trainer) -> str:
+    """Of a run that is ended at once."""
+    saved = list_checkpoints(trainer.checkpoint_folder)
+    if not saved:
+        return "stopped at once: nothing was saved"
+    return f"stopped at once: {saved[-1].name} is what was saved; continue with: ns-train --resume {trainer.run.folder}"
 
 
 def load_split(run: Run, split: Split) -> Dataset:
@@ -101,7 +135,7 @@ def load_split(run: Run, split: Split) -> Dataset:
     memory = PixelMemory.of(run.config.cache_limit, run.config.cache_dir)
     # Masks tell what counts in an evaluation, whatever they mean in training: its figures stay comparable.
     masks = run.config.masks if split == "train" else "ignored"
-    return load_dataset(run.parser.parse(run.config.data, split), split, memory, masks)
+    return load_dataset(run.parse(split), split, memory, masks)
 
 
 def first_split(run: Run, splits: tuple[Split, ...]) -> Dataset | None:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import shlex
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from framework.cli.common import run_command
 from framework.errors import ConfigError
+from framework.from_nerfstudio import flag_answer, vis_answer
 from framework.registry import entry_of, registered, summary
 
 if TYPE_CHECKING:
@@ -72,6 +76,8 @@ def _overview() -> str:
 
 def _default_run(method: str) -> Run:
     """A method with its default settings, its data not known yet."""
+    if os.path.exists(method) and method not in registered("methods"):
+        raise ConfigError(f"the method comes first, as in: ns-train nerfacto --data {shlex.quote(method)}")
     if method.startswith("-"):
         raise ConfigError(f"the method comes first, before {method}; ns-train --help lists them")
     entry_of("methods", method)  # a name that is unknown is told before anything heavy is imported
@@ -99,9 +105,12 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
     """
     import tyro
 
-    from framework.registry import load_dataparser, recognize
+    from framework.data_folder import find_data
+    from framework.registry import load_dataparser
     from framework.training.run import run_folder
 
+    if (answer := vis_answer(_take(flags, "--vis")[0] or "")) is not None:
+        raise ConfigError(answer)
     options = (tyro.conf.FlagConversionOff, tyro.conf.ConsolidateSubcommandArgs)
     looked, unknown = tyro.cli(
         type(run.config),
@@ -112,12 +121,12 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
         return_unknown_args=True,
     )
     if (word := _stray_word(unknown)) is not None:
-        entry_of("dataparsers", word)
-        named, flags = word, _without(flags, word)
+        _check_format(word, run.method)
+        (data, named), flags = find_data(looked.data, word), _without(flags, word)
     elif not run.dataparser or looked.data != run.config.data:
-        named = recognize(looked.data)
+        data, named = find_data(looked.data)
     else:
-        named = run.dataparser
+        data, named = looked.data, run.dataparser
     parser = run.parser if named == run.dataparser else load_dataparser(named)()
 
     # One flat set of flags: the method's and the data format's, so that their order does not matter.
@@ -126,6 +135,7 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
         for name, value in (("method", run.config), ("format", parser))
     ]
     both = dataclasses.make_dataclass("Flags", fields)
+    _check_for_nerfstudio(flags, run.method, [run.config, parser])
     parsed: Any = tyro.cli(
         both,
         prog=f"ns-train {run.method}",
@@ -134,8 +144,34 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
         default=both(run.config, parser),
         config=options,
     )
-    folder = run_folder(run.method, parsed.method) if fresh else run.folder
-    return dataclasses.replace(run, config=parsed.method, dataparser=named, parser=parsed.format, folder=folder)
+    config = dataclasses.replace(parsed.method, data=data)
+    folder = run_folder(run.method, config) if fresh else run.folder
+    return dataclasses.replace(run, config=config, dataparser=named, parser=parsed.format, folder=folder)
+
+
+def _check_format(word: str, method: str) -> None:
+    """Raises: ConfigError for a word that is no data format, with what was meant."""
+    if word not in registered("dataparsers") and os.path.exists(word):
+        raise ConfigError(f"'{word}' is no data format; the data is named by a flag: ns-train {method} --data {word}")
+    entry_of("dataparsers", word)
+
+
+def _check_for_nerfstudio(flags: list[str], method: str, settings: list[Any]) -> None:
+    """Raises: ConfigError for a flag of nerfstudio's, with ours."""
+    known = {name for value in settings for name in _flag_names(value)}
+    for flag in flags:
+        if flag.startswith("--") and (answer := flag_answer(flag, method, known)) is not None:
+            raise ConfigError(answer)
+
+
+def _flag_names(settings: Any, before: str = "--") -> Iterator[str]:
+    """The flags that set the fields of a dataclass."""
+    for field in dataclasses.fields(settings):
+        value, name = getattr(settings, field.name), before + field.name.replace("_", "-")
+        if dataclasses.is_dataclass(value):
+            yield from _flag_names(value, f"{name}.")
+        else:
+            yield name
 
 
 def _stray_word(unknown: list[str]) -> str | None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import re
 import shlex
-import sys
 import zlib
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from framework.child import python_command
 from framework.errors import ConfigError, shown
 from framework.registry import entry_of
 from framework.training.run import write_json
@@ -135,7 +135,7 @@ class Job:
 
     def train_command(self, conditions: Conditions) -> list[str]:
         """The command that trains; that goes on with training where there is something to go on with."""
-        start = [sys.executable, "-m", "framework.cli.train"]
+        start = python_command("framework.cli.train")
         if (self.folder / "config.yml").exists():
             return [*start, "--resume", str(self.folder)]
         c, flags = conditions, ["--vis", "none", "--max-eval-images", str(conditions.curve_images)]
@@ -156,7 +156,7 @@ class Job:
 
     def eval_command(self, conditions: Conditions) -> list[str]:
         """The command that evaluates the trained model."""
-        command = [sys.executable, "-m", "framework.cli.evaluate", "--load-config", str(self.folder / "config.yml")]
+        command = python_command("framework.cli.evaluate", "--load-config", self.folder / "config.yml")
         command += ["--output-path", str(self.evaluation), "--render-output-path", str(self.pictures)]
         command += ["--device-type", conditions.device_type]
         if conditions.max_eval_images is not None:

@@ -10,7 +10,7 @@ from framework.comparison.measures import Row, pareto
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f")
 """Okabe and Ito's, which colour-blind people tell apart."""
-MISSING = "without plots: pip install 'nerfloom[plots]'"
+MISSING = "without plots: pip install matplotlib"
 """What to say where matplotlib is not installed."""
 
 

@@ -127,6 +127,8 @@ def condition_lines(conditions: Conditions, repeats: int, runs: Sequence[Measure
             else "; --repeats 3 would tell how much runs differ."
         ),
     ]
+    if used := sorted({str(run.machine.get("kernels")) for run in runs}):
+        lines.append(f"Kernels: {' and '.join(used)}.")
     notes = sorted({run.lpips_note for run in runs if run.lpips is None})
     return lines + [f"LPIPS {note}" for note in notes]
 

@@ -19,6 +19,7 @@ from framework.comparison.measures import read_json
 from framework.comparison.plan import Conditions, Job, Plan
 from framework.console import console, say
 from framework.errors import ConfigError
+from framework.training.signals import NUMBERS, Stopped, handled
 
 LOOK_EVERY = 0.5
 """Seconds between looks at what a run has printed last."""
@@ -42,14 +43,13 @@ def run_jobs(plan: Plan, jobs_at_once: int = 1) -> dict[Job, Failure]:
     Args:
         jobs_at_once: so many run side by side, each on a CUDA device of its own.
     Returns: the jobs that failed.
-    Raises: ConfigError for more jobs at once than there are CUDA devices; KeyboardInterrupt once the runs under way
-        have saved.
+    Raises: ConfigError for more jobs at once than there are CUDA devices; Stopped once the runs under way have saved.
     """
     devices: Queue[str | None] = Queue()
     for device in _devices(plan.conditions, jobs_at_once):
         devices.put(device)
     jobs, failures = plan.jobs(), {}
-    stopped = threading.Event()
+    stopped, signals = threading.Event(), list[int]()
 
     def work(number: int) -> None:
         job = jobs[number]
@@ -68,27 +68,24 @@ def run_jobs(plan: Plan, jobs_at_once: int = 1) -> dict[Job, Failure]:
             failures[job] = failure
             say(f"  {job.title} failed: {failure.reason} (all it printed: {failure.log})")
 
-    with ThreadPoolExecutor(jobs_at_once) as pool, _interrupted(stopped):
+    with ThreadPoolExecutor(jobs_at_once) as pool, _noted(stopped, signals):
         for future in [pool.submit(work, number) for number in range(len(jobs))]:
             future.result()
-    if stopped.is_set():
-        raise KeyboardInterrupt
+    if signals:
+        raise Stopped(signals[0], "stopped; the same command goes on from here")
     return failures
 
 
 @contextmanager
-def _interrupted(stopped: threading.Event) -> Iterator[None]:
+def _noted(stopped: threading.Event, signals: list[int]) -> Iterator[None]:
     """Ctrl-C and SIGTERM set `stopped`, so that runs are ended in order and not left behind."""
 
     def note(number: int, frame: object) -> None:
+        signals.append(number)
         stopped.set()
 
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
+    with handled(NUMBERS, note):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _devices(conditions: Conditions, jobs_at_once: int) -> Sequence[str | None]:
@@ -171,7 +168,7 @@ def last_line(log: Path) -> str:
 
 
 def _reason(code: int, log: Path) -> str:
-    if code < 0:
-        name = signal.Signals(-code).name
+    if code < 0 or code - 128 in NUMBERS:
+        name = signal.Signals(-code if code < 0 else code - 128).name
         return f"ended by {name}" + (" (too little memory?)" if name == "SIGKILL" else "")
     return last_line(log).removeprefix("error: ") or f"exit status {code}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
@@ -33,17 +34,19 @@ def error_map(prediction: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 def write_image(path: Path, image: Tensor) -> None:
     """(H, W, 3) in [0, 1] as an 8-bit PNG; makes the folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        iio.imwrite(path, to_uint8(image))
-    except BaseException:
-        with suppress(OSError):
-            path.unlink(missing_ok=True)  # half a picture is none
-        raise
+    _write(path, to_uint8(image))
 
 
 def write_animation(path: Path, frames: Sequence[Tensor], fps: float) -> None:
     """(H, W, 3) frames in [0, 1] as an endless animation; the ending (.gif, .webp, .png) chooses the format."""
+    _write(path, np.stack([to_uint8(frame) for frame in frames]), duration=1000 / fps, loop=0)
+
+
+def _write(path: Path, pixels: np.ndarray, **options: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    images = np.stack([to_uint8(frame) for frame in frames])
-    iio.imwrite(path, images, duration=1000 / fps, loop=0)
+    try:
+        iio.imwrite(path, pixels, **options)
+    except BaseException:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)  # half a picture is none
+        raise

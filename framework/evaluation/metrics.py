@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from framework.device import exact
+from framework.extras import missing
 
 MAX_PSNR = 100.0
 """dB. Identical images would have infinity, which JSON cannot hold."""
@@ -54,8 +54,8 @@ def load_lpips() -> tuple[Callable[[Tensor, Tensor], float] | None, str]:
 
     Returns: the metric, or None; and a line that says which, and why.
     """
-    if importlib.util.find_spec("lpips") is None or importlib.util.find_spec("torchvision") is None:
-        return None, "absent: pip install 'nerfloom[lpips]'"
+    if (advice := missing("lpips")) is not None:
+        return None, f"absent: {advice}"
     weights = Path(torch.hub.get_dir()) / "checkpoints"
     if not list(weights.glob("alexnet-*.pth")):
         return None, f"absent: AlexNet's weights are not in {weights}"

@@ -1,4 +1,4 @@
-"""What is looked at in tensors that came from outside, before they are trusted. Compiled kernels look for themselves."""
+"""Checks of tensors that came from outside. Compiled kernels check indices themselves, as they use them."""
 
 from __future__ import annotations
 

@@ -27,6 +27,7 @@ from torch import Tensor
 from framework.console import say
 from framework.device import processor_features
 from framework.errors import ConfigError
+from framework.extras import reinstall
 
 FOLDER = Path(os.environ.get("NERFLOOM_KERNEL_FOLDER") or Path(__file__).parent / "lib")
 _AVX512 = ("avx512f", "avx512bw", "avx512dq", "avx512vl", "fma")
@@ -85,7 +86,7 @@ def _load() -> tuple[str, ctypes.CDLL | None]:
         raise ConfigError(f"NERFLOOM_KERNELS asks for '{asked}', but {FOLDER / asked}{SUFFIX} does not load: {problem}")
     say(
         f"note: without its compiled kernels ({problem}) nerfloom trains more than ten times slower on this processor; "
-        f"install a C++ compiler ({_compiler_hint()}), then 'pip install --force-reinstall --no-deps nerfloom'"
+        f"install a C++ compiler ({_compiler_hint()}), then: {reinstall()}"
     )
     return "reference", None
 

@@ -6,11 +6,25 @@ import re
 import shutil
 from pathlib import Path
 
+from framework.data_folder import processed_folder
 from framework.errors import DataError
 
 FINISHED = "transforms.json"
 """Written last: a folder with it is complete."""
 _OURS = re.compile(r"transforms\.json|sparse_pc\.ply|colmap|(images|masks)(_\d+)?")
+
+
+def check_apart(output: Path, data: Path) -> None:
+    """Raises: DataError where the output would be written over the input, or among it."""
+    if output.exists() and output.resolve() == data.resolve():
+        raise DataError(f"--output-dir {output} is the folder that --data names; {_another(output)}")
+    inside = data.resolve()
+    if inside.is_relative_to(output.resolve()) and _OURS.fullmatch(inside.relative_to(output.resolve()).parts[0]):
+        raise DataError(f"--data {data} overlaps what is written into --output-dir {output}; {_another(output)}")
+
+
+def _another(output: Path) -> str:
+    return f"name a folder of its own, as in: --output-dir {processed_folder(output)}"
 
 
 def claim(output: Path, data: Path, overwrite: bool) -> None:
@@ -20,8 +34,6 @@ def claim(output: Path, data: Path, overwrite: bool) -> None:
     """
     if output.exists() and not output.is_dir():
         raise DataError(f"--output-dir {output} is a file; name a folder")
-    if output.exists() and output.resolve() == data.resolve():
-        raise DataError(f"--output-dir {output} is the folder that --data names; name another one")
     present = sorted(output.iterdir()) if output.is_dir() else []
     if present and not overwrite:
         what = "a processed data set" if (output / FINISHED).exists() else f"'{present[0].name}' but no {FINISHED}"

@@ -15,10 +15,10 @@ import numpy as np
 from PIL import Image
 
 from framework.console import say, track
+from framework.data_folder import PHOTOGRAPHS
 from framework.errors import DataError
-from framework.image_files import Content, one_line
+from framework.image_files import Content, unreadable
 
-ENDINGS = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".heic", ".heif")
 _JPEG = (".jpg", ".jpeg")
 _ORIENTATION = 0x0112
 _TURNS = {
@@ -54,22 +54,22 @@ class Photograph:
 def find_photographs(folder: Path, leave_out: Iterable[Path] = ()) -> list[Path]:
     """Paths of the image files in a folder and below, relative to it; 'img2' comes before 'img10'.
 
-    Hidden files, and what is in the folders `leave_out`, are not looked at.
+    Hidden files, and what is in the folders `leave_out` that are below it, are not looked at.
 
     Raises: DataError where the folder does not exist or has no image.
     """
     if not folder.is_dir():
         raise DataError(f"--data {folder}: there is no such folder")
-    others = [path.resolve() for path in leave_out]
+    others = [path.resolve() for path in leave_out if not folder.resolve().is_relative_to(path.resolve())]
     found = []
     for path in folder.rglob("*"):
         relative = path.relative_to(folder)
-        if path.suffix.lower() not in ENDINGS or any(part.startswith(".") for part in relative.parts):
+        if path.suffix.lower() not in PHOTOGRAPHS or any(part.startswith(".") for part in relative.parts):
             continue
         if path.is_file() and not any(path.resolve().is_relative_to(other) for other in others):
             found.append(relative)
     if not found:
-        raise DataError(f"--data {folder} has no image (looked for {', '.join(ENDINGS)})")
+        raise DataError(f"--data {folder} has no image (looked for {', '.join(PHOTOGRAPHS)})")
     return sorted(found, key=natural_order)
 
 
@@ -154,9 +154,9 @@ def prepare(folder: Path, source: Path, images: Path, name: str, upright: bool =
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):  # a full disk is no bad photograph
             raise
-        raise DataError(f"{path} is not a readable image: {one_line(error)}") from error
+        raise unreadable(path, error) from error
     except Exception as error:  # Pillow raises SyntaxError, struct.error, DecompressionBombError and more
-        raise DataError(f"{path} is not a readable image: {one_line(error)}") from error
+        raise unreadable(path, error) from error
     return Photograph(name, source.as_posix(), *size, device, orientation if turn is not None else 1)
 
 
@@ -203,7 +203,7 @@ def write_masks(folder: Path, photographs: list[Photograph], masks: Path, crop: 
             with Image.open(Content(path)) as image:
                 mask = image.convert("L").point(lambda value: 255 if value >= 128 else 0)
         except Exception as error:
-            raise DataError(f"{path} is not a readable mask: {one_line(error)}") from error
+            raise unreadable(path, error, "the mask") from error
         size = (photograph.width + 2 * crop, photograph.height + 2 * crop)
         is_upright = photograph.orientation >= 5 and mask.size == size and size[0] != size[1]
         if photograph.orientation in _TURNS and not is_upright:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from PIL import Image
 
 from framework.console import say, track
 from framework.errors import DataError
+from framework.extras import missing
 from framework.processing.photographs import save
 
 
@@ -39,8 +39,8 @@ def open_video(path: Path) -> tuple[int, Iterator[np.ndarray]]:
     """
     if not path.is_file():
         raise DataError(f"--data {path}: there is no such file")
-    if find_spec("imageio_ffmpeg") is None:
-        raise DataError("reading a video needs ffmpeg: pip install 'nerfloom[video]'")
+    if (advice := missing("video")) is not None:
+        raise DataError(f"reading a video needs ffmpeg: {advice}")
     import imageio.v3 as iio
 
     try:

@@ -1,10 +1,11 @@
-"""Work in a process of its own: COLMAP prints to a log, a crash in it is an error in one line, Ctrl-C stops it."""
+"""Work in a process of its own: COLMAP prints to a log, a crash in it is an error in one line, it ends when we do."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
@@ -89,6 +90,7 @@ def _units(
 
 def _child(work: Callable[..., Any], arguments: tuple, sender: Connection, log: Path | None) -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # C++ would go on for minutes before Python saw a KeyboardInterrupt
+    threading.Thread(target=_end_with_the_parent, daemon=True).start()
     if log is not None:
         file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
         os.dup2(file, 1)
@@ -108,6 +110,14 @@ def _child(work: Callable[..., Any], arguments: tuple, sender: Connection, log: 
     except Exception as error:
         first = (str(error).strip().splitlines() or [""])[0]
         sender.send(("error", DataError(f"COLMAP: {type(error).__name__}: {first}")))
+
+
+def _end_with_the_parent() -> None:
+    """A parent that is killed can stop nothing. COLMAP lets go of Python's lock while it works."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _last_words(log: Path | None) -> str:

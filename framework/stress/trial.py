@@ -27,6 +27,7 @@ from framework.pixels import Batch, composite
 from framework.stress.conditions import Condition
 from framework.stress.scenes import Views
 from framework.training.run import Run
+from framework.training.signals import Stopped
 from framework.training.trainer import Trainer
 
 MOST_RAYS, MOST_SAMPLES = 512, 2**14
@@ -91,7 +92,7 @@ def attempt(condition: Condition, run: Run, views: Views, budget: Budget) -> Tri
     Args:
         run: the method and its settings; its folder is not used.
         views: the plain photographs.
-    Raises: KeyboardInterrupt where somebody stops it.
+    Raises: Stopped where somebody stops it.
     """
     with TemporaryDirectory() as folder:
         try:
@@ -106,8 +107,8 @@ def _trained_and_judged(condition: Condition, run: Run, views: Views, budget: Bu
     config = from_plain(config, condition.settings(config), condition.name)
     changed = condition.change(views).to(choose_device(config.machine))
     trainer = StressedTrainer(replace(run, config=config), changed.train, condition)
-    if trainer.train().interrupted:
-        raise KeyboardInterrupt
+    if (number := trainer.train().stopped_by) is not None:
+        raise Stopped(number)
     state = trainer.state
     reached = float(evaluate(trainer.model, changed.test).results["psnr"])
     done = Trial(steps=state.step, skipped=state.skipped, seconds=state.seconds, error=unsound(trainer, changed.test))

@@ -65,7 +65,7 @@ def verdicts(run: Run, views: Views, conditions: Sequence[Condition], budget: Bu
         run: the method and its settings.
         views: the plain photographs.
         conditions: the plain one first, for the others are compared with it.
-    Raises: KeyboardInterrupt where somebody stops it.
+    Raises: Stopped where somebody stops it.
     """
     plain = None
     for number, condition in enumerate(conditions, start=1):

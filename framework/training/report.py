@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import torch
+
 from framework.device import peak_memory
 from framework.errors import ConfigError
 from framework.evaluation.evaluator import Evaluation
-from framework.machine import machine
+from framework.machine import kernels, machine
 from framework.training.run import Run, write_json, write_report
 from framework.training.trainer import Outcome, Trainer
 
 SUMMARY = "summary.json"
 
 
-def write_evaluation(path: Path, run: Run, checkpoint: Path, found: Evaluation) -> None:
+def write_evaluation(path: Path, run: Run, checkpoint: Path, found: Evaluation, device: torch.device) -> None:
     """`experiment_name, method_name, checkpoint, results`, and what was measured on each image.
 
     Raises: ConfigError where it cannot be written.
@@ -23,6 +25,7 @@ def write_evaluation(path: Path, run: Run, checkpoint: Path, found: Evaluation) 
         "experiment_name": run.folder.parent.parent.name,
         "method_name": run.method,
         "checkpoint": checkpoint.name,
+        "kernels": kernels(device),
         "rays_per_pixel": run.config.resolved().rays_per_pixel,
         "eval_appearance": found.eval_appearance,
         "results": found.results,

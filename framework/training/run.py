@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -26,10 +27,13 @@ import yaml
 
 from framework.config import TrainConfig, from_plain, read_yaml, to_plain
 from framework.console import say
-from framework.dataset import DataParser, Dataset
-from framework.errors import ConfigError
-from framework.registry import load_dataparser, load_method, recognize
+from framework.data_folder import find_data
+from framework.dataset import DataParser, Dataset, ParsedScene, Split
+from framework.errors import ConfigError, DataError
+from framework.registry import load_dataparser, load_method
 from framework.training.checkpoint import write_atomically
+
+CONFIG = "config.yml"
 
 
 @dataclass(frozen=True)
@@ -49,7 +53,17 @@ class Run:
 
     @property
     def config_path(self) -> Path:
-        return self.folder / "config.yml"
+        return self.folder / CONFIG
+
+    def parse(self, split: Split) -> ParsedScene:
+        """Read a split of the run's data.
+
+        Raises: DataError where it is not there any more, or as the format does.
+        """
+        data = self.config.data
+        if data is not None and not os.path.exists(data):
+            raise DataError(f"{data}, the run's data, is not there; say where it is now: --data DIR")
+        return self.parser.parse(data, split)
 
 
 def run_folder(method: str, config: TrainConfig) -> Path:
@@ -85,13 +99,27 @@ def create_folder(run: Run) -> None:
         raise ConfigError(f"cannot write the run's folder {run.folder}: {error.strerror or error}") from error
 
 
+def config_file(path: Path) -> Path:
+    """A run's config.yml, by its own name or its folder's.
+
+    Raises: ConfigError for a folder that is no run's.
+    """
+    if not os.path.isdir(path) or (path / CONFIG).is_file():
+        return path / CONFIG if os.path.isdir(path) else path
+    deeper = ("*", "*/*", "*/*/*")  # outputs/{experiment}/{method}/{timestamp}
+    runs = sorted((file for below in deeper for file in path.glob(f"{below}/{CONFIG}")), key=os.path.getmtime)
+    newest = f"; the newest run in it is {runs[-1].parent}" if runs else ""
+    raise ConfigError(f"{path} is not a run's folder, for it has no {CONFIG}{newest}")
+
+
 def read_run(path: Path) -> Run:
-    """A run, or a recipe for one, from a YAML file.
+    """A run, or a recipe for one, from a YAML file; of a folder, from its config.yml.
 
     Keys are `method`, optionally `dataparser` (with `name` and the format's flags), and the method's settings.
 
     Raises: ConfigError for an unknown method, format or key, or a value of the wrong type.
     """
+    path = config_file(path)
     values = read_yaml(path)
     method = values.pop("method", None)
     if not isinstance(method, str):
@@ -101,7 +129,11 @@ def read_run(path: Path) -> Run:
     if not isinstance(data_flags, dict):
         raise ConfigError(f"{path}: 'dataparser' must hold keys and values, such as 'name: blender'")
     data_flags = dict(data_flags)
-    name = str(data_flags.pop("name", None) or recognize(config.data))
+    name = data_flags.pop("name", None)
+    if name is None:
+        data, name = find_data(config.data)
+        config = dataclasses.replace(config, data=data)
+    name = str(name)
     parser = from_plain(load_dataparser(name)(), data_flags, f"{path}: dataparser")
     return Run(method, config, name, parser, path.parent)
 

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from torch import Tensor
 
 from framework.config import RaysPerPixel, TrainConfig
+from framework.data_folder import find_data
 from framework.device import choose_device
 from framework.errors import CheckpointError, ConfigError, NerfloomError, is_out_of_memory
 from framework.model import Model
@@ -57,7 +59,7 @@ def load_trained(
     config = dataclasses.replace(
         run.config,
         machine=machine,
-        data=data or run.config.data,
+        data=run.config.data if data is None else find_data(data, run.dataparser)[0],
         rays_per_pixel=rays_per_pixel or run.config.rays_per_pixel,
         eval_appearance=eval_appearance or run.config.eval_appearance,
     )
@@ -106,19 +108,43 @@ def restored_model(method: str, config: TrainConfig, checkpoint: dict[str, Any],
         raise
     except (ArithmeticError, LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:
         raise CheckpointError(f"the settings make no model: {_short(error)}") from error
-    restore_model(model, checkpoint)
+    restore_model(model, checkpoint, method)
     return model
 
 
-def restore_model(model: Model[Any], checkpoint: dict[str, Any]) -> None:
+def restore_model(model: Model[Any], checkpoint: dict[str, Any], method: str | None = None) -> None:
     """Load a checkpoint's parameters into a model.
 
-    Raises: CheckpointError where names or sizes differ.
+    Args:
+        method: the model's, where it is known.
+    Raises: CheckpointError where the checkpoint is another method's, or names or sizes differ.
     """
+    made_by = checkpoint.get("method")
+    if None not in (made_by, method) and made_by != method:
+        raise CheckpointError(f"the checkpoint is of {made_by}, and does not fit {method}: name one of its own")
     try:
         model.load_state_dict(checkpoint["model"])
     except (RuntimeError, TypeError, AttributeError, ValueError, LookupError, ArithmeticError, MemoryError) as error:
-        raise CheckpointError(f"the checkpoint does not fit the model's settings: {_short(error)}") from error
+        reason = _difference(model.state_dict(), checkpoint["model"]) or _short(error)
+        raise CheckpointError(f"the checkpoint does not fit the model's settings: {reason}") from error
+
+
+def _difference(expected: dict[str, Any], found: Any) -> str:
+    """The first parameter that a checkpoint has of another size, or has not; empty where that is not the reason."""
+    if not isinstance(found, dict) or not all(isinstance(value, Tensor) for value in found.values()):
+        return ""
+    for name, value in expected.items():
+        if name not in found:
+            return f"it has no {name}; give the flags that it was trained with"
+        if found[name].shape != value.shape:
+            sizes = f"{_size(found[name])}, and by the settings {_size(value)}"
+            return f"its {name} is {sizes}; give the flags that it was trained with"
+    more = sorted(set(found) - set(expected))
+    return f"it has {more[0]}, and the model has not; give the flags that it was trained with" if more else ""
+
+
+def _size(value: Tensor) -> str:
+    return "x".join(map(str, value.shape)) or "a number"
 
 
 def _short(error: BaseException) -> str:

@@ -24,8 +24,8 @@ from framework.error_map import ErrorMap
 from framework.errors import CheckpointError, DivergenceError
 from framework.evaluation.evaluator import evaluate, evaluation_background, render_view, use_bfloat16
 from framework.evaluation.metrics import MAX_PSNR
-from framework.kernels.native import torch_on_one_thread
 from framework.evaluation.panels import composed, view_panels
+from framework.kernels.native import torch_on_one_thread
 from framework.pixel_stream import PixelStream
 from framework.pixels import Background, Batch, LookUp, composite, draw_batch, training_background
 from framework.scene_profile import SceneProfile
@@ -77,10 +77,15 @@ class Outcome:
 
     reason: str
     """Why it stopped."""
-    interrupted: bool
-    """Whether somebody stopped it."""
+    stopped_by: int | None
+    """The signal by which somebody stopped it; None where it came to its end."""
     checkpoint: Path
     """The last state."""
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether somebody stopped it."""
+        return self.stopped_by is not None
 
 
 class Trainer:
@@ -141,7 +146,7 @@ class Trainer:
 
         Raises: CheckpointError where it belongs to another method or other sizes.
         """
-        restore_model(self.model, checkpoint)
+        restore_model(self.model, checkpoint, self.run.method)
         try:
             rates = [group["initial_lr"] for group in self.optimizer.param_groups]
             self.optimizer.load_state_dict(checkpoint["optimizer"])
@@ -187,8 +192,9 @@ class Trainer:
                 self._look_if_due(report, board, last=not stopped and self._reason_to_stop(stopped) is not None)
                 if self._due_to_save():
                     self._try_to_save()
-        self._write_curve()
-        return Outcome(reason, bool(stopped), self.save())
+            self._write_curve()
+            checkpoint = self.save()  # a first Ctrl-C does not break it off
+        return Outcome(reason, next(iter(stopped), None), checkpoint)
 
     def _reason_to_stop(self, stopped: list[int]) -> str | None:
         if stopped:

@@ -71,10 +71,10 @@ def test_rays_per_pixel_are_as_the_run_says_or_as_asked(finished: Path, monkeypa
 
 
 def test_lpips_that_is_absent_is_null_with_a_reason(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("framework.evaluation.metrics.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("framework.extras.find_spec", lambda name: None)
     found = evaluate(monkeypatch, finished, "--max-images", 1)
     assert (found["results"]["lpips"], found["results"]["lpips_std"]) == (None, None)
-    assert found["lpips"] == "absent: pip install 'nerfloom[lpips]'"
+    assert found["lpips"] == "absent: pip install lpips torchvision"
 
 
 def test_rounded_numbers_are_those_of_the_written_pictures(
@@ -125,9 +125,11 @@ def test_what_is_missing_is_named(finished: Path, tmp_path: Path, refused: Refus
     (tmp_path / "file").write_text("in the way")
     cases: list[tuple[list[object], str]] = [
         (["--load-config", tmp_path / "no.yml"], f"cannot read {tmp_path / 'no.yml'}: No such file"),
-        (["--load-config", finished], f"cannot read {finished}: Is a directory"),
         (["--load-config", config, "--max-images", 0], "--max-images is 0"),
-        (["--load-config", config, "--data", tmp_path / "gone"], str(tmp_path / "gone" / "transforms_test.json")),
+        (
+            ["--load-config", config, "--data", tmp_path / "gone"],
+            f"{tmp_path / 'gone'}, the run's data, is not there",
+        ),
         (["--load-config", config, "--load-checkpoint", tmp_path / "no.ckpt"], "there is no checkpoint"),
         (["--load-config", config, "--load-checkpoint", tmp_path / "file"], f"{tmp_path / 'file'} is damaged"),
         (["--load-config", config, "--output-path", tmp_path / "file" / "e.json"], str(tmp_path / "file")),

@@ -57,11 +57,6 @@ def test_damaged_data_is_one_line(name: str, tiny: Path, tmp_path: Path, refused
     assert not (tmp_path / "out").exists()
 
 
-def test_a_file_is_not_a_data_folder(tiny: Path, refused: Refused) -> None:
-    said = refused(main, "instant-ngp", "--data", tiny / "transforms_train.json")
-    assert "transforms_train.json: there is no such folder" in said
-
-
 def test_a_misspelt_data_format_gets_the_nearest(shared_tiny: Path) -> None:
     done = called("ns-train", "instant-ngp", "--data", shared_tiny, "blendr")
     assert done.returncode != 0

@@ -10,7 +10,7 @@ from framework.comparison.plan import Conditions, Contender, Job, Plan
 from framework.evaluation.images import write_image
 
 CONDITIONS = Conditions(None, (), 60.0, None, None, None, "cpu", 4, None)
-MACHINE = {"processor": "abacus", "threads": 2, "commit": None}
+MACHINE = {"processor": "abacus", "threads": 2, "kernels": "avx2", "commit": None}
 
 
 def plan(folder: Path, *labels: str, repeats: int = 1) -> Plan:

@@ -54,6 +54,7 @@ def test_tables_in_markdown_and_csv_and_json(compared: Plan) -> None:
     assert "**31.00**" in row
     assert next(line for line in text.splitlines() if line.startswith("| instant-ngp")).startswith("| instant-ngp* |")
     assert "| tensorf | failed |" in text
+    assert "- Kernels: avx2." in text
     assert "**tensorf failed**: seed 42" in text
     rows = list(csv.DictReader(io.StringIO((compared.folder / "results.csv").read_text())))
     assert [row["label"] for row in rows] == list(LABELS[:2])

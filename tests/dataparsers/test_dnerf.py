@@ -7,15 +7,15 @@ import torch
 
 from dataparsers.blender import Blender
 from dataparsers.dnerf import DNeRF
+from framework.data_folder import find_data
 from framework.dataset import Split, load_dataset
 from framework.errors import DataError
-from framework.registry import recognize
 from tests.conftest import EditJson
 
 
 def test_times_make_a_moving_scene(tiny: Path, edit_json: EditJson) -> None:
     edit_json(lambda c: [frame.update(time=i / 9) for i, frame in enumerate(c["frames"])])
-    assert recognize(tiny) == "dnerf"
+    assert find_data(tiny)[1] == "dnerf"
     data = load_dataset(DNeRF().parse(tiny, "train"), "train")
     assert data.scene.moving
     assert data.times is not None
@@ -23,7 +23,7 @@ def test_times_make_a_moving_scene(tiny: Path, edit_json: EditJson) -> None:
 
 
 def test_without_times_it_is_the_blender_format(tiny: Path) -> None:
-    assert recognize(tiny) == "blender"
+    assert find_data(tiny)[1] == "blender"
     with pytest.raises(DataError, match="no frame has a 'time'"):
         DNeRF().parse(tiny, "train")
 
@@ -39,7 +39,7 @@ def test_broken_files_are_not_recognised_as_moving(content: str, tmp_path: Path)
 @pytest.mark.parametrize(("split", "count"), [("train", 150), ("val", 5), ("test", 20)])
 def test_real_moving_scene(real_data: Path, split: Split, count: int) -> None:
     folder = real_data / "bouncingballs"
-    assert recognize(folder) == "dnerf"
+    assert find_data(folder)[1] == "dnerf"
     parsed = DNeRF().parse(folder, split)
     assert parsed.times is not None
     assert len(parsed.times) == count

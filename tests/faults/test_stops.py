@@ -12,6 +12,7 @@ from framework.training.checkpoint import FOLDER
 from framework.training.lock import LOCK
 from framework.training.progress import StepReport
 from framework.training.run import create_folder, read_run
+from framework.training.signals import Stopped, exit_status
 from framework.training.trainer import Trainer
 from tests.faults import runs
 from tests.training.helpers import differences, tiny_run, tiny_trainer
@@ -35,12 +36,46 @@ def test_a_signal_ends_the_run_after_the_step_at_hand_and_it_says_how_to_go_on(
 
     monkeypatch.setattr(Trainer, "train_step", signalled)
     run = tiny_run("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=50)
-    start(run)
+    with pytest.raises(Stopped, match=f"^continue with: ns-train --resume {run.folder}$") as stop:
+        start(run)
+    assert exit_status(stop.value) == 128 + number
     said = capsys.readouterr().err
     assert f"stopped by {number.name}: step 3, " in said
-    assert f"continue with: ns-train --resume {run.folder}" in said
     assert runs.readable_steps(run.folder) == [3]
     assert not (run.folder / "eval.json").exists()
+
+
+@pytest.mark.parametrize("saving_every", [1, 1000])
+def test_a_second_ctrl_c_says_what_was_saved(
+    saving_every: int, shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ctrl_c_raises: None
+) -> None:
+    train_step = Trainer.train_step
+
+    def signalled(trainer: Trainer) -> StepReport:
+        if trainer.state.step == 3:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+        return train_step(trainer)
+
+    monkeypatch.setattr(Trainer, "train_step", signalled)
+    run = tiny_run("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=50, steps_per_save=saving_every)
+    with pytest.raises(Stopped) as stop:
+        start(run)
+    saved = f"step-000000003.ckpt is what was saved; continue with: ns-train --resume {run.folder}"
+    assert str(stop.value) == "stopped at once: " + (saved if saving_every == 1 else "nothing was saved")
+    assert runs.readable_steps(run.folder) == ([2, 3] if saving_every == 1 else [])
+    assert exit_status(stop.value) == 130
+
+
+def test_a_stopped_command_exits_as_shells_expect(shared_tiny: Path, tmp_path: Path) -> None:
+    """In a process of its own, while it saves all the time."""
+    flags, folder = runs.new_run(shared_tiny, tmp_path, 100_000)
+    process = runs.start(*flags)
+    runs.wait_for_checkpoint(process, folder)
+    process.terminate()
+    said = runs.ended(process)
+    assert process.returncode == 143, said
+    assert said.splitlines()[-1] == f"continue with: ns-train --resume {folder}"
 
 
 def test_a_killed_run_ends_with_the_same_bits(shared_tiny: Path, tmp_path: Path) -> None:

@@ -2,12 +2,17 @@
 
 import os
 import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from framework.errors import DataError
 from framework.processing.worker import Report, run_apart
+from tests.faults.runs import ROOT
 
 
 def work(report: Report, fate: str) -> int:
@@ -33,3 +38,50 @@ def test_a_process_that_runs_out_of_memory(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"^COLMAP: MemoryError: no memory$"):
         run_apart(work, ("out of memory",), "Matching", 3, tmp_path / "log.txt")
     assert run_apart(work, ("none",), "Matching", 3, tmp_path / "log.txt") == 7
+
+
+PARENT = """
+import sys
+from pathlib import Path
+from framework.cli.common import run_command
+from framework.processing.worker import run_apart
+from tests.faults.test_worker import endless
+
+if __name__ == "__main__":
+    run_command(lambda _: run_apart(endless, (sys.argv[1],), "Matching", 3, None))
+"""
+
+
+def endless(report: Report, place: str) -> None:
+    Path(place).write_text(str(os.getpid()))
+    time.sleep(600)
+
+
+def is_running(process: int) -> bool:
+    try:
+        return "Z" not in Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return False
+
+
+def until(condition: Callable[[], bool]) -> bool:
+    """Whether something comes true within a minute."""
+    end = time.monotonic() + 60
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.05)
+    return condition()
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGKILL, -9)])
+def test_it_ends_with_the_process_that_started_it(number: signal.Signals, status: int, tmp_path: Path) -> None:
+    place, script = tmp_path / "worker", tmp_path / "parent.py"
+    script.write_text(PARENT)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    parent = subprocess.Popen([sys.executable, str(script), str(place)], env=environment, stderr=subprocess.DEVNULL)
+    assert until(lambda: place.exists() and place.read_text() != "")
+    worker = int(place.read_text())
+    assert is_running(worker)
+    parent.send_signal(number)
+    assert parent.wait(60) == status
+    assert until(lambda: not is_running(worker))

@@ -27,8 +27,10 @@ def test_photographs_are_found_below_and_sorted_as_people_count(tmp_path: Path) 
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"") if name.endswith("txt") else write(tmp_path / name)
     assert [p.as_posix() for p in find_photographs(tmp_path)] == ["a 1.PNG", "b/img2.png", "b/img10.png"]
+    assert [p.as_posix() for p in find_photographs(tmp_path, leave_out=[tmp_path / "b"])] == ["a 1.PNG"]
+    (tmp_path / "c").mkdir()
     with pytest.raises(DataError, match="has no image"):
-        find_photographs(tmp_path / "b" / "..", leave_out=[tmp_path])
+        find_photographs(tmp_path / "c")
 
 
 def test_digits_that_are_no_numbers_are_letters(tmp_path: Path) -> None:

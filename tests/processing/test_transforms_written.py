@@ -10,7 +10,7 @@ from PIL import Image
 from dataparsers.nerfstudio import Nerfstudio
 from framework.errors import DataError
 from framework.processing import transforms
-from framework.processing.output import claim
+from framework.processing.output import check_apart, claim
 
 
 def world_to_camera(index: int) -> np.ndarray:
@@ -72,5 +72,5 @@ def test_a_folder_with_something_in_it_is_refused_unless_it_may_be_replaced(tmp_
     inner.mkdir()
     with pytest.raises(DataError, match="would remove"):
         claim(output, inner, True)
-    with pytest.raises(DataError, match="name another one"):
-        claim(data, data, True)
+    with pytest.raises(DataError, match="name a folder of its own"):
+        check_apart(data, data)

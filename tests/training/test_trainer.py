@@ -5,7 +5,6 @@ import json
 import math
 import os
 import signal
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -303,14 +302,6 @@ def test_a_small_picture_has_no_ssim_and_no_lpips_and_says_so(tiny: Path, tmp_pa
     assert found.results["ssim"] is None
     assert math.isfinite(found.results["psnr"])
     assert "SSIM absent" in found.line()
-
-
-@pytest.fixture
-def ctrl_c_raises() -> Iterator[None]:
-    """As in a terminal. What a shell starts in the background has it ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.usefixtures("ctrl_c_raises")

@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 import os
 import subprocess
-import sys
 from pathlib import Path
 
+from framework.child import python_command
 from framework.registry import load_method
 from framework.testing import assert_method
 
@@ -23,7 +23,7 @@ def test_ten_steps_on_the_embedded_scene(tmp_path: Path) -> None:
     """As a person would start them."""
     small = "--max-resolution 32 --grid-resolution 32 --num-steps 64 --samples-per-batch 4096 --max-eval-images 1"
     flags = [*small.split(), "--max-num-iterations", "10", "--vis", "none", "--output-dir", str(tmp_path)]
-    command = [sys.executable, "-m", "framework.cli.train", "dense-grid", *flags]
+    command = python_command("framework.cli.train", "dense-grid", *flags)
     environment = {**os.environ, "NERFLOOM_CACHE": str(tmp_path / "cache")}
     subprocess.run([*command, "procedural", "--size", "24", "--num-train", "8"], check=True, env=environment)
     assert list(tmp_path.rglob("step-000000010.ckpt"))

@@ -1,0 +1,54 @@
+"""What --data may name besides a data folder: parts of one, photographs, videos, nothing."""
+
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+
+from framework.cli.process_data import USAGE
+from framework.data_folder import find_data, processed_folder
+from framework.errors import DataError
+
+
+@pytest.mark.parametrize("part", ["transforms_train.json", "train", "."])
+def test_a_part_of_a_data_folder_stands_for_it(part: str, shared_tiny: Path) -> None:
+    assert find_data(shared_tiny / part) == (shared_tiny, "blender")
+    assert find_data(shared_tiny / part, "blender") == (shared_tiny, "blender")
+
+
+def test_what_is_called_otherwise_stands_for_itself(tiny: Path) -> None:
+    """Photographs that happen to lie in a data folder are not what was trained on before."""
+    shutil.copytree(tiny / "train", tiny / "new photographs")
+    with pytest.raises(DataError, match="there are 10 photographs, but no camera poses"):
+        find_data(tiny / "new photographs")
+    (tiny / "other.json").write_text("{}")
+    with pytest.raises(DataError, match=r"as a transforms\.json: --data .*other\.json nerfstudio$"):
+        find_data(tiny / "other.json")
+    assert find_data(tiny / "other.json", "nerfstudio") == (tiny / "other.json", "nerfstudio")
+
+
+def advised(path: Path) -> list[str]:
+    """The words of the command in what is said of a path."""
+    with pytest.raises(DataError) as error:
+        find_data(path)
+    return shlex.split(str(error.value).partition("Find them first: ")[2].partition(" (then: ")[0])
+
+
+def test_photographs_and_videos_get_a_command_to_paste(tiny: Path, tmp_path: Path) -> None:
+    for folder in ("my photographs", "my photographs/below", "clips"):
+        (tmp_path / folder).mkdir()
+    shutil.copy(tiny / "train" / "r_0.png", tmp_path / "my photographs" / "below" / "0.PNG")
+    (tmp_path / "clips" / "walk.MOV").touch()
+    photographs, clip = tmp_path / "my photographs", tmp_path / "clips" / "walk.MOV"
+    images = ["ns-process-data", "images", "--data", str(photographs), "--output-dir", f"{photographs}-processed"]
+    assert advised(photographs) == images
+    video = ["ns-process-data", "video", "--data", str(clip), "--output-dir", str(clip.with_name("walk-processed"))]
+    assert advised(clip) == advised(clip.parent) == video
+    assert all(f"  {kind} " in USAGE for kind in ("images", "video"))
+
+
+def test_the_output_has_a_name_even_for_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert processed_folder(Path(".")) == tmp_path.with_name(f"{tmp_path.name}-processed")
+    assert processed_folder(Path("photos")) == Path("photos-processed")

@@ -66,8 +66,8 @@ class Silhouettes:
     def photograph(self, image: int) -> Photograph:
         """A photograph's camera and sums."""
         cameras = self.dataset.cameras
-        numbers = (float(values[image]) for values in (cameras.fx, cameras.fy, cameras.cx, cameras.cy))
-        return Photograph(cameras.camera_to_worlds[image].contiguous(), *numbers, self.sums[image])
+        fx, fy, cx, cy = (float(values[image]) for values in (cameras.fx, cameras.fy, cameras.cx, cameras.cy))
+        return Photograph(cameras.camera_to_worlds[image].contiguous(), fx, fy, cx, cy, self.sums[image])
 
 
 @torch.no_grad()

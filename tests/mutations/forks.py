@@ -84,7 +84,7 @@ def _test(asked: dict[str, Any]) -> None:
 
 
 def _wait(child: int, patience: float) -> int | None:
-    """A child's exit status; None where it was killed for it took too long. Time in which all stood still is not its."""
+    """A child's exit status; None where it was killed for it took too long, not counting when all stood still."""
     left, before = patience, time.monotonic()
     while left > 0:
         done, status = os.waitpid(child, os.WNOHANG)

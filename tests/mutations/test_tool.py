@@ -64,10 +64,9 @@ def test_what_cannot_be_planted_is_named(tree: Path) -> None:
 def test_a_bug_is_there_only_while_it_is_planted(tree: Path) -> None:
     file, stale = tree / "framework" / "part.py", tree / "framework" / "__pycache__" / "part.cpython-311.pyc"
     stale.write_bytes(b"as it was")
-    with pytest.raises(KeyError), bug("value - 1", "value + 1").planted(tree):
+    with bug("value - 1", "value + 1").planted(tree):
         assert file.read_text() == SOURCE.replace("value - 1", "value + 1")
         assert not stale.exists()
-        raise KeyError
     assert file.read_text() == SOURCE
 
 

@@ -1,8 +1,8 @@
 """A capture of which everything is known: a patterned ball, photographed from all around through a known lens.
 
 Made without any of the framework's mathematics. A photograph's pixel has the colour that the ray through its centre
-meets, so whoever reads a capture rightly finds, along the ray of every pixel, the very colour that the pixel has; half a
-pixel, a coefficient or an axis that is wrong shows at once (`test_captures.py`).
+meets, so whoever reads a capture rightly finds, along the ray of every pixel, the very colour that the pixel has; half
+a pixel, a coefficient or an axis that is wrong shows at once (`test_captures.py`).
 """
 
 import math
@@ -25,6 +25,9 @@ WAVES = np.array([[19.0, 3.0, 5.0], [4.0, 17.0, -6.0], [-5.0, 7.0, 18.0]])
 """Of the pattern: radians a metre, for each channel."""
 
 
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "k7", "p1", "p2")
+
+
 @dataclass(frozen=True)
 class Lens:
     """How places on the plane z = 1 are bent, as OpenCV defines it."""
@@ -37,7 +40,7 @@ class Lens:
 
     def bend(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """OpenCV's formulas, written out."""
-        k1, k2, k3, k4, k5, k6, k7, p1, p2 = (self.named.get(n, 0.0) for n in "k1 k2 k3 k4 k5 k6 k7 p1 p2".split())
+        k1, k2, k3, k4, k5, k6, k7, p1, p2 = (self.named.get(name, 0.0) for name in COEFFICIENTS)
         r2 = x * x + y * y
         if self.model == "fisheye":
             r = np.sqrt(r2)
@@ -82,7 +85,7 @@ def opencv_pose(index: int) -> np.ndarray:
 def met(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What rays (R, 3) with unit directions meet: colours (R, 3) in [0, 1], distances (R,), and how surely (R,).
 
-    Surely is by how much, in radii squared, a ray passes within the ball; below 0 it misses, and the rest means nothing.
+    Surely is by how much, in radii squared, a ray passes within the ball; below 0 it misses: the rest means nothing.
     """
     towards = CENTRE - origins
     along = (towards * directions).sum(-1)

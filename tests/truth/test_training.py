@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import time
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +10,16 @@ import pytest
 import torch
 from torch import Tensor
 
+from framework.config import MachineConfig
 from framework.dataset import Dataset
 from framework.evaluation.appearance import fitted_appearance
 from framework.evaluation.evaluator import evaluate, render_view
 from framework.fields.base import Field
 from framework.pixel_set import PixelSet
-from framework.rays import Rays
+from framework.pixels import Batch, draw_batch
+from framework.rays import Rays, Samples
 from framework.registry import load_method
+from framework.renderers import Rendered, shade
 from framework.samplers.choice import SamplingConfig, make_sampler
 from framework.samplers.occupancy import OccupancySampler
 from framework.scene import Scene
@@ -148,3 +152,132 @@ def test_the_half_on_which_light_is_found_is_not_judged(lit: Trainer) -> None:
     picture = shown(lit, lit.train_set)[:, width // 2 :].double().clamp(0, 1)
     expected = -10 * math.log10(float((picture - truth).square().mean()))
     assert found.per_image[0]["psnr"] == pytest.approx(expected, abs=1e-3)
+
+
+# -- a step -------------------------------------------------------------------------------------------------------
+
+
+def test_training_is_not_said_to_take_longer_than_it_does(shared_tiny: Path, tmp_path: Path) -> None:
+    """Whatever there is to evaluate: the budget is of seconds."""
+    trainer = tiny_trainer(
+        "instant-ngp", shared_tiny, tmp_path / "run", evaluated=True, max_num_iterations=30,
+        steps_per_eval_all_images=5, max_eval_images=1,
+    )  # fmt: skip
+    begun = time.perf_counter()
+    trainer.train()
+    assert 0 < trainer.state.seconds < time.perf_counter() - begun
+
+
+def test_the_seed_and_the_step_decide_what_is_drawn(
+    shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the same parameters on, too: repeats of a comparison differ by their seeds."""
+    drawn: list[Tensor] = []
+
+    def noted(*arguments: Any) -> Batch:
+        batch = draw_batch(*arguments)
+        drawn.append(batch.pixels)
+        return batch
+
+    monkeypatch.setattr("framework.training.trainer.draw_batch", noted)
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        trainer = tiny_trainer("vanilla-nerf", shared_tiny, tmp_path / name, machine=MachineConfig(seed=seed))
+        trainer.train_step()
+        trainer.train_step()
+    first, second, again, _, other, _ = drawn
+    assert torch.equal(first, again)
+    assert not torch.equal(first, second)
+    assert not torch.equal(first, other)
+
+
+def test_adams_moments_decay_as_the_settings_say(shared_tiny: Path, tmp_path: Path) -> None:
+    """After one step the mean is (1 - beta1) g and the mean square (1 - beta2) g^2."""
+    trainer = tiny_trainer(
+        "vanilla-nerf", shared_tiny, tmp_path / "run", adam_beta1=0.8, adam_beta2=0.96, adam_eps=1e-12
+    )
+    trainer.train_step()
+    checked = 0
+    for group in trainer.optimizer.param_groups:
+        for parameter in group["params"]:
+            state = trainer.optimizer.state[parameter]
+            seen = state["exp_avg"].abs() > 1e-8
+            ratio = state["exp_avg"][seen].double().square() / state["exp_avg_sq"][seen].double()
+            checked += len(ratio)
+            torch.testing.assert_close(ratio, torch.full_like(ratio, 0.2**2 / 0.04), rtol=1e-3, atol=0)
+    assert checked > 100
+
+
+def test_each_group_has_the_rate_and_the_schedule_that_it_names(shared_tiny: Path, tmp_path: Path) -> None:
+    """Poses decay from the first step on, while the rest is held for half of the budget."""
+    trainer = captured(
+        shared_tiny, tmp_path, {"unbounded": True, "poses": "device"}, learning_rate=3e-3, camera_learning_rate=7e-4,
+        lr_schedule="hold-exponential", lr_final=0.04, max_num_iterations=1000,
+    )  # fmt: skip
+    trainer.state.step = 250
+    trainer.train_step()
+    rates = {group["name"]: group["lr"] for group in trainer.optimizer.param_groups}
+    expected = {"networks": 3e-3, "tables": 3e-3, "proposals": 1e-2, "poses": 7e-4 * 0.04**0.25}
+    assert rates == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize(("seconds", "size"), [(20.0, 16), (60.0, 16), (120.0, 17), (300.0, 18), (None, 18)])
+def test_longer_runs_of_instant_ngp_get_larger_tables(seconds: float | None, size: int) -> None:
+    config: Any = dataclasses.replace(load_method("instant-ngp").config, max_seconds=seconds).resolved()
+    assert config.log2_table_size == size
+    assert config.sparse_updates == (size >= 17)
+
+
+def test_a_pixel_is_several_rays_from_the_share_of_the_budget_on_that_is_asked_for(
+    shared_tiny: Path, tmp_path: Path
+) -> None:
+    trainer = tiny_trainer(
+        "vanilla-nerf", shared_tiny, tmp_path / "run", rays_per_pixel=4, train_rays_per_pixel_from=0.5,
+        max_num_iterations=10,
+    )  # fmt: skip
+    counts = []
+    for step in range(10):
+        trainer.state.step = step
+        before = trainer.state.rays
+        trainer.train_step()
+        counts.append(trainer.state.rays - before)
+        assert len(trainer._places_in_a_pixel()) == (4 if step + 1 >= 5 else 1)
+    assert counts == [128] * 10  # fewer pixels, of as many rays
+
+
+# -- what nerfacto adds -------------------------------------------------------------------------------------------
+
+
+def test_what_is_near_a_camera_learns_little(
+    shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Gradients are scaled by the squared distance, in half edges of the box, and by 1 beyond one of them."""
+    trainer = captured(shared_tiny, tmp_path, {"unbounded": True, "near": 0.05})
+    given: list[tuple[Samples, Tensor]] = []
+
+    def noted(field: Field, rays: Rays, samples: Samples, background: Tensor, factors: Tensor) -> Rendered:
+        given.append((samples, factors))
+        return shade(field, rays, samples, background, factors)
+
+    monkeypatch.setattr("methods.nerfacto.shade", noted)
+    trainer.train_step()
+    ((samples, factors),) = given
+    half = float((trainer.model.scene.box[1] - trainer.model.scene.box[0])[0]) / 2
+    torch.testing.assert_close(factors, (samples.t / half).square().clamp(max=1))
+    assert factors.min() < 0.1
+    assert factors.max() == 1
+
+
+def test_light_is_gathered_in_normalised_distance(shared_tiny: Path, tmp_path: Path) -> None:
+    """mip-NeRF 360, equation 15, by all pairs, of the intervals that the sampler works with."""
+    trainer = captured(shared_tiny, tmp_path, {"unbounded": True}, distortion_loss_mult=0.5)
+    model = trainer.model.train()
+    batch = draw_batch(trainer.train_set, 6, "black")
+    rendered = model.render(batch.rays, torch.zeros(6, 3))
+    assert rendered.samples is not None
+    assert rendered.samples.edges is not None
+    edges, weights = rendered.samples.edges.double(), rendered.samples.padded(rendered.weights).detach().double()
+    middles = (edges[:, 1:] + edges[:, :-1]) / 2
+    apart = (middles[:, :, None] - middles[:, None]).abs()
+    pairs = (weights[:, :, None] * weights[:, None] * apart).sum((1, 2))
+    expected = 0.5 * (pairs + (weights.square() * edges.diff(dim=-1)).sum(-1) / 3).mean()
+    assert float(model.loss(rendered, batch, 0)["distortion"].detach()) == pytest.approx(float(expected), rel=1e-3)

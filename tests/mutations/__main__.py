@@ -31,6 +31,7 @@ def main() -> int:
     parser.add_argument("--record", action="store_true", help="record anew what all tests run; plant none if alone")
     parser.add_argument("--jobs", type=int, default=campaign.default_jobs(), help="bugs at a time")
     parser.add_argument("--most", type=int, help="tests for a bug; all that run its lines if not given")
+    parser.add_argument("--without", action="append", default=[], metavar="FOLDER", help="as if these tests were not")
     parser.add_argument("--output", type=Path, help="JSON file for what became of each bug")
     flags = parser.parse_args()
     chosen = [bug for bug in all_bugs() if not flags.only or {bug.name, bug.kind} & set(flags.only)]
@@ -56,6 +57,7 @@ def _run(flags: argparse.Namespace, chosen: list[Bug]) -> int:
         known = Reach.load(KEPT) if KEPT.exists() and not flags.record else None
         reach = campaign.updated(known, whole, Path(temporary) / "record", os.cpu_count() or 1)
         reach.save(KEPT)
+        reach = reach.without(name for name in reach.files if name.startswith(tuple(flags.without)))
         print(f"{len(reach.seconds):,} tests pass without a bug", flush=True)
         results = []
         for result in campaign.run(chosen, reach, Path(temporary), flags.jobs, flags.most):

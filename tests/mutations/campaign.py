@@ -77,11 +77,7 @@ def updated(known: Reach | None, copy: Copy, folder: Path, processes: int) -> Re
     if known is None:
         return record(copy, folder, (), processes)
     now = digests(copy.root)
-    changed = [
-        file
-        for file in now
-        if Path(file).name.startswith("test_") and known.digests.get(file) != now[file] and not file.endswith("_.py")
-    ]
+    changed = [file for file in now if Path(file).name.startswith("test_") and known.digests.get(file) != now[file]]
     gone = [file for file in known.digests if file not in now]
     reach = known.without([*changed, *gone])
     if changed:

@@ -14,6 +14,8 @@ from statistics import fmean
 from tests.mutations.bug import Bug
 from tests.mutations.copy import PACKAGES
 
+OWN = "tests/mutations/"
+"""The tool's tests."""
 Lines = dict[str, dict[str, list[int]]]
 """File -> line -> contexts (indices) that ran it. A context is a test, or a fixture that several tests share."""
 
@@ -31,6 +33,11 @@ class Reach:
     seconds: dict[str, float] = field(default_factory=dict)
     """Test -> how long it took."""
 
+    @property
+    def files(self) -> set[str]:
+        """Where the tests are."""
+        return {name.partition("::")[0] for name in self.seconds}
+
     def tests(self, bug: Bug, root: Path) -> list[str]:
         """The tests that could notice a bug, those that will tell soonest first."""
         of_file = self.lines.get(bug.file, {})
@@ -39,7 +46,8 @@ class Reach:
         found = {self.contexts[index] for line in asked for index in of_file[line]}
         if not found:  # what only runs in a process that was killed leaves no record
             found = set(self.seconds)
-        return self._in_order(name for name in self.seconds if name in found or found & set(self.fixtures[name]))
+        able = (name for name in self.seconds if name in found or found & set(self.fixtures[name]))
+        return self._in_order(name for name in able if not name.startswith(OWN))  # which see every bug in the list
 
     def _in_order(self, tests: Iterable[str]) -> list[str]:
         """Short and narrow tests first; those of a file that share a fixture together, or it would be made anew."""

@@ -145,3 +145,23 @@ def test_points_behind_a_camera_do_not_say_where_its_rays_begin() -> None:
     camera = Cameras(torch.eye(4)[None, :3], numbers, numbers, numbers / 2, numbers / 2, numbers.long(), numbers.long())
     ahead, behind = torch.tensor([[0.0, 0.0, -4.0]]).repeat(9, 1), torch.tensor([[0.0, 0.0, 0.1]]).repeat(9, 1)
     assert nearest_shown(camera, torch.cat([ahead, behind])) == pytest.approx(0.5 * 4)
+
+
+def test_what_goes_with_a_photograph_goes_with_it_where_others_are_missing(tmp_path: Path) -> None:
+    """Its time, its depth and its pose; a missing file, one that cannot be read and those held out are left out."""
+    folder = write_nerfstudio(tmp_path)
+    content = json.loads((folder / "transforms.json").read_text())
+    for frame in content["frames"]:
+        frame["time"] = NAMES.index(Path(frame["file_path"]).name) / len(NAMES)
+    (folder / "transforms.json").write_text(json.dumps(content))
+    (folder / "images" / NAMES[2]).unlink()
+    (folder / "images" / NAMES[5]).write_bytes(b"no picture")
+    scene = Nerfstudio().parse(folder, "train")
+    data = load_dataset(scene, "train")
+    # Every eighth of those whose files are there.
+    there = [name for name in NAMES if name != NAMES[2]]
+    assert list(data.names) == [name for name in there if name not in (there[0], there[8], NAMES[5])]
+    assert data.times is not None
+    assert data.times.tolist() == pytest.approx([NAMES.index(name) / len(NAMES) for name in data.names])
+    kept = torch.tensor([index for index, path in enumerate(scene.image_paths) if path.name != NAMES[5]])
+    assert_pixels_show_the_ball(scene[kept], 1000.0)

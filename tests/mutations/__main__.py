@@ -55,9 +55,10 @@ def _run(flags: argparse.Namespace, chosen: list[Bug]) -> int:
     with tempfile.TemporaryDirectory(prefix="mutations-") as temporary:
         whole = make_copy(Path(temporary) / "whole")
         known = Reach.load(KEPT) if KEPT.exists() and not flags.record else None
-        reach = campaign.updated(known, whole, Path(temporary) / "record", os.cpu_count() or 1)
+        without = tuple(flags.without)
+        reach = campaign.updated(known, whole, Path(temporary) / "record", os.cpu_count() or 1, without)
         reach.save(KEPT)
-        reach = reach.without(name for name in reach.files if name.startswith(tuple(flags.without)))
+        reach = reach.without(name for name in reach.files if name.startswith(without))
         print(f"{len(reach.seconds):,} tests pass without a bug", flush=True)
         results = []
         for result in campaign.run(chosen, reach, Path(temporary), flags.jobs, flags.most):

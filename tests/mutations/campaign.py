@@ -69,9 +69,11 @@ def record(copy: Copy, folder: Path, files: Sequence[str], processes: int) -> Re
     return reach
 
 
-def updated(known: Reach | None, copy: Copy, folder: Path, processes: int) -> Reach:
+def updated(known: Reach | None, copy: Copy, folder: Path, processes: int, without: tuple[str, ...] = ()) -> Reach:
     """A record that has all tests as they are now: of what is known, only new and changed files are run again.
 
+    Args:
+        without: folders of tests that are left as they are known.
     Raises: TestsFail.
     """
     if known is None:

@@ -7,6 +7,7 @@ a pixel, a coefficient or an axis that is wrong shows at once (`test_captures.py
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -54,12 +55,30 @@ class Lens:
         return u, v
 
     def straighten(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The inverse, by fixed-point iteration: enough for lenses that bend little."""
+        """The inverse: of a fisheye's angle by bisection, else by fixed-point iteration."""
+        if self.model == "fisheye":
+            k1, k2, k3, k4 = (self.named.get(name, 0.0) for name in COEFFICIENTS[:4])
+            bent, low, high = np.hypot(u, v), np.zeros_like(u), np.full_like(u, 1.5)
+            for _ in range(60):
+                theta = (low + high) / 2
+                short = theta * (1 + k1 * theta**2 + k2 * theta**4 + k3 * theta**6 + k4 * theta**8) < bent
+                low, high = np.where(short, theta, low), np.where(short, high, theta)
+            scale = np.tan(low) / np.maximum(bent, 1e-12)
+            return u * scale, v * scale
         x, y = u.copy(), v.copy()
         for _ in range(200):
             bent_u, bent_v = self.bend(x, y)
             x, y = x + 0.7 * (u - bent_u), y + 0.7 * (v - bent_v)
         return x, y
+
+    @cached_property
+    def local(self) -> np.ndarray:
+        """(HEIGHT * WIDTH, 3) unit directions of the pixels in the camera's frame, OpenGL axes."""
+        fx, fy, cx, cy = self.intrinsics
+        rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+        x, y = self.straighten((columns.reshape(-1) - cx) / fx, (rows.reshape(-1) - cy) / fy)
+        directions = np.stack([x, -y, -np.ones_like(x)], -1)
+        return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
 
 
 def pose_of(index: int) -> np.ndarray:
@@ -97,11 +116,7 @@ def met(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def looks(pose: np.ndarray, lens: Lens) -> np.ndarray:
     """(HEIGHT * WIDTH, 3) unit directions of a camera's pixels."""
-    fx, fy, cx, cy = lens.intrinsics
-    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    x, y = lens.straighten((columns.reshape(-1) - cx) / fx, (rows.reshape(-1) - cy) / fy)
-    local = np.stack([x, -y, -np.ones_like(x)], -1)
-    return local / np.linalg.norm(local, axis=-1, keepdims=True) @ pose[:3, :3].T
+    return lens.local @ pose[:3, :3].T
 
 
 PINHOLE = Lens()

@@ -19,7 +19,7 @@ from framework.pixel_set import PixelSet
 from framework.pixels import Batch, draw_batch
 from framework.rays import Rays, Samples
 from framework.registry import load_method
-from framework.renderers import Rendered, shade
+from framework.renderers import Rendered, shade, volume_render
 from framework.samplers.choice import SamplingConfig, make_sampler
 from framework.samplers.occupancy import OccupancySampler
 from framework.scene import Scene
@@ -281,3 +281,20 @@ def test_light_is_gathered_in_normalised_distance(shared_tiny: Path, tmp_path: P
     pairs = (weights[:, :, None] * weights[:, None] * apart).sum((1, 2))
     expected = 0.5 * (pairs + (weights.square() * edges.diff(dim=-1)).sum(-1) / 3).mean()
     assert float(model.loss(rendered, batch, 0)["distortion"].detach()) == pytest.approx(float(expected), rel=1e-3)
+
+
+@pytest.mark.parametrize(("has_alpha", "opacity"), [(False, 1.0), (True, 0.0)])
+def test_a_ray_of_a_capture_ends_in_matter_unless_photographs_tell_what_is_empty(
+    has_alpha: bool, opacity: float
+) -> None:
+    """However thin what there is: the sky of a photograph without alpha is no hole."""
+    config: Any = dataclasses.replace(load_method("nerfacto").config, num_proposal_samples=(8,), num_nerf_samples=8)
+    scene = dataclasses.replace(SCENE, unbounded=True, has_alpha=has_alpha, near=0.05, far=1000.0)
+    count = 4
+    rays = Rays(
+        torch.zeros(count, 3), torch.eye(3)[[0, 1, 2, 0]], torch.full((count,), 0.05), torch.full((count,), 1e3)
+    )
+    samples = make_sampler(config, scene).eval().sample(rays, Fog(), False)
+    thin = torch.full((len(samples),), 1e-7)
+    rendered = volume_render(rays, samples, thin, torch.ones(len(samples), 3), torch.zeros(3))
+    torch.testing.assert_close(rendered.accumulation, torch.full((count,), opacity), atol=1e-3, rtol=0)

@@ -23,7 +23,7 @@ def marched(sampler: OccupancySampler) -> Tensor:
 
 def a_corner(places: Tensor) -> Tensor:
     """(K,) bool: a part of the box that no exchange or mirroring of axes leaves where it is."""
-    return (places[:, 0] > 0.5) & (places[:, 1] < 0) & (places[:, 2] > 1.5)
+    return (places[:, 0] > 0.5) & (places[:, 1] < 0) & (places[:, 2] > 0.75)
 
 
 def corner_cells() -> Tensor:

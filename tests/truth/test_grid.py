@@ -1,10 +1,15 @@
 """The occupancy grid that is marched is the one that there is: after carving, after a checkpoint, after an update."""
 
+from pathlib import Path
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from framework.rays import Rays
 from framework.samplers.occupancy import OccupancySampler
+from methods.tensorf import MARGIN
+from tests.training.helpers import tiny_trainer
 from tests.truth.test_training import Fog
 
 BOX = torch.tensor([[-1.0, -2.0, -3.0], [1.0, 2.0, 3.0]])
@@ -69,3 +74,16 @@ def test_cells_are_asked_for_where_they_are() -> None:
         used.update(step, density)
     assert_the_corner_alone_is_marched(used)
     assert torch.equal(used.occupied, corner_cells())
+
+
+def test_tensorfs_box_shrinks_to_all_that_is_occupied(shared_tiny: Path, tmp_path: Path) -> None:
+    """The cells 2 to 5, 7 and 3 to 12 along the axes, whole, and a margin."""
+    model: Any = tiny_trainer("tensorf", shared_tiny, tmp_path / "run").model
+    n = model.sampler.resolution
+    cells = torch.zeros(n, n, n, dtype=torch.bool)
+    cells[2:6, 7, 3:13] = True
+    model.sampler.carve(cells.view(-1))
+    low, high = torch.tensor([2.0, 7, 3]) - MARGIN, torch.tensor([6.0, 8, 13]) + MARGIN
+    box = model.field.box
+    expected = torch.stack([box[0] + (box[1] - box[0]) * end / n for end in (low, high)])
+    torch.testing.assert_close(model._occupied_box(), expected.clamp(float(box.min()), float(box.max())))

@@ -1,0 +1,1 @@
+"""Bugs by what they spoil, one module a part of the framework."""

@@ -1,0 +1,90 @@
+"""A comparison's figures and rules: what is called the best is the best, and what is repeated has another seed."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from framework.cli.train import run_of
+from framework.comparison.measures import Measured, measure, rows_of
+from framework.comparison.plan import Contender, Job
+from framework.comparison.report import COLUMNS, table
+from tests.comparison.runs import CONDITIONS, finish, plan
+
+BETTER = {
+    "PSNR, dB": 31.0, "SSIM": 0.95, "LPIPS": 0.05, "training, s": 50.0, "steps": 2000, "training, rays/s": 3e5,
+    "rendering, s/image": 0.2, "peak memory, GiB": 2**29, "parameters": 1000,
+}  # fmt: skip
+"""Of each column: by what PSNR and its like mean, not by what the report thinks."""
+WORSE = {
+    "PSNR, dB": 30.0, "SSIM": 0.9, "LPIPS": 0.1, "training, s": 60.0, "steps": 1000, "training, rays/s": 1e5,
+    "rendering, s/image": 0.4, "peak memory, GiB": 2**30, "parameters": 9000,
+}  # fmt: skip
+
+
+def finished(job: Job, figures: dict[str, float]) -> Measured:
+    """A run with such figures, read back from its files."""
+    changes = {
+        "steps": figures["steps"],
+        "rays_per_second": figures["training, rays/s"],
+        "peak_memory_bytes": figures["peak memory, GiB"],
+        "parameters": figures["parameters"],
+    }
+    finish(job, figures["PSNR, dB"], figures["training, s"], **changes)
+    evaluation = json.loads(job.evaluation.read_text())
+    evaluation["results"] |= {
+        "ssim": figures["SSIM"],
+        "lpips": figures["LPIPS"],
+        "fps": 1 / figures["rendering, s/image"],
+    }
+    job.evaluation.write_text(json.dumps(evaluation))
+    found = measure(job, CONDITIONS)
+    assert found is not None
+    return found
+
+
+def test_the_better_figure_of_every_column_is_called_the_best(tmp_path: Path) -> None:
+    assert {column.title for column in COLUMNS} == set(BETTER)
+    labels = ("tensorf", "kplanes")
+    jobs = plan(tmp_path, *labels).jobs()
+    runs = [finished(job, figures) for job, figures in zip(jobs, (WORSE, BETTER), strict=True)]
+    worse, better = table(rows_of(labels, runs, {}))
+    for column, bad, good in zip(COLUMNS, worse["cells"], better["cells"], strict=True):
+        assert (bad.best, good.best) == (False, column.title != "steps"), column.title
+    assert (worse["front"], better["front"]) == (False, True)
+    shown = {column.title: cell.text for column, cell in zip(COLUMNS, better["cells"], strict=True)}
+    assert shown["rendering, s/image"] == "0.20"
+    assert shown["peak memory, GiB"] == "0.50"
+
+
+def test_repeats_are_runs_of_other_seeds_in_other_folders(tmp_path: Path) -> None:
+    """As ns-train itself reads the commands."""
+    jobs = plan(tmp_path, "kplanes", "instant-ngp --num-levels 3", repeats=3).jobs()
+    runs = [run_of(*_method_and_flags(job)) for job in jobs]
+    assert [run.config.machine.seed for run in runs] == [42, 42, 43, 43, 44, 44]
+    assert [run.folder for run in runs] == [job.folder for job in jobs]
+    assert len({run.folder for run in runs}) == 6
+    assert {run.config.max_seconds for run in runs} == {60.0}
+    assert {run.config.max_eval_images for run in runs} == {4}
+    assert [getattr(run.config, "num_levels", None) for run in runs[:2]] == [None, 3]
+
+
+def test_what_a_contender_says_itself_counts(tmp_path: Path) -> None:
+    job = Job(Contender.of("kplanes --max-seconds 7 --machine.seed 3"), 42, tmp_path)
+    config = run_of(*_method_and_flags(job)).config
+    assert (config.max_seconds, config.machine.seed) == (7.0, 3)
+
+
+@pytest.mark.parametrize(("views", "flags"), [(None, []), (5, ["--max-images", "5"])])
+def test_all_views_are_judged_unless_some_are_asked_for(views: int | None, flags: list[str], tmp_path: Path) -> None:
+    """How many the learning curve is over says nothing about it."""
+    words = Job(Contender.of("kplanes"), 42, tmp_path).eval_command(replace(CONDITIONS, max_eval_images=views))
+    assert words[len(words) - len(flags) :] == flags
+    assert ("--max-images" in words) == bool(flags)
+
+
+def _method_and_flags(job: Job) -> tuple[str, list[str]]:
+    words = job.train_command(CONDITIONS)
+    at = words.index(job.contender.method)
+    return words[at], words[at + 1 :]

@@ -1,0 +1,300 @@
+"""Against closed forms: the learning rate by the clock, where rays end in each mode, and what light is fitted to."""
+
+import dataclasses
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from framework.config import MachineConfig
+from framework.dataset import Dataset
+from framework.evaluation.appearance import fitted_appearance
+from framework.evaluation.evaluator import evaluate, render_view
+from framework.fields.base import Field
+from framework.pixel_set import PixelSet
+from framework.pixels import Batch, draw_batch
+from framework.rays import Rays, Samples
+from framework.registry import load_method
+from framework.renderers import Rendered, shade, volume_render
+from framework.samplers.choice import SamplingConfig, make_sampler
+from framework.samplers.occupancy import OccupancySampler
+from framework.scene import Scene
+from framework.training.trainer import Trainer
+from tests.test_nerfacto import captured
+from tests.training.helpers import tiny_trainer
+
+BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+SCENE = Scene(BOX, 0.0, 10.0, 3, True, False, 20)
+
+
+# -- the learning rate --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("schedule", ["exponential", "cosine", "hold-exponential"])
+@pytest.mark.parametrize(("step", "seconds"), [(0, 0.0), (300, 20.0), (300, 60.0), (800, 60.0), (100, 95.0)])
+def test_the_rate_falls_over_the_budget_that_is_further_spent(
+    schedule: Any, step: int, seconds: float, shared_tiny: Path, tmp_path: Path
+) -> None:
+    """Of 100 seconds and 1000 steps. Every headline figure is made with a budget of seconds."""
+    trainer = tiny_trainer(
+        "instant-ngp", shared_tiny, tmp_path / "run", max_seconds=100.0, max_num_iterations=1000, lr_schedule=schedule,
+        learning_rate=0.02, lr_final=0.05, silhouette_cells=False, samples_per_batch=256,
+    )  # fmt: skip
+    trainer.state.step, trainer.state.seconds = step, seconds
+    spent = max(step / 1000, seconds / 100)
+    assert trainer.progress == pytest.approx(spent)
+    trainer.train_step()
+    factor = {
+        "exponential": 0.05**spent,
+        "cosine": 0.05 + 0.95 * (1 + math.cos(math.pi * spent)) / 2,
+        "hold-exponential": 1.0 if spent < 0.5 else 0.05 ** (2 * spent - 1),
+    }[schedule]
+    assert [group["lr"] for group in trainer.optimizer.param_groups] == pytest.approx(
+        [0.02 * factor] * len(trainer.optimizer.param_groups), rel=1e-4
+    )
+
+
+# -- where rays end -----------------------------------------------------------------------------------------------
+
+
+class Fog(Field):
+    """The same density everywhere."""
+
+    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        return torch.full((len(positions),), 10.0), torch.zeros(len(positions), 1)
+
+    def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
+        return torch.ones(len(features), 3)
+
+
+@pytest.mark.parametrize(("training", "stop"), [(False, 1e-4), (True, 1e-2)])
+def test_rays_end_where_the_mode_says(training: bool, stop: float) -> None:
+    """By what `--early-stop` and `--train-early-stop` are said to be, through the settings."""
+    config = dataclasses.replace(load_method("instant-ngp").config.resolved(), early_stop=1e-4, train_early_stop=1e-2)
+    assert isinstance(config, SamplingConfig)
+    config = dataclasses.replace(config, num_steps=400, grid_resolution=8)
+    sampler = make_sampler(config, SCENE).train(training)
+    assert isinstance(sampler, OccupancySampler)
+    count = 5
+    rays = Rays(
+        torch.tensor([[-3.0, 0.1, 0.2]]).repeat(count, 1), torch.tensor([[1.0, 0, 0]]).repeat(count, 1),
+        torch.zeros(count), torch.full((count,), 9.0),
+    )  # fmt: skip
+    samples = sampler.sample(rays, Fog(), False)
+    tau = 10 * sampler.step_size
+    assert samples.counts.tolist() == [math.ceil(-math.log(stop) / tau)] * count
+
+
+# -- light --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def lit(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Trainer:
+    """A method that has learnt a little, and has another light for every photograph."""
+    facts = {"unbounded": True, "appearance_varies": True}
+    folder = tmp_path_factory.mktemp("lit")
+    trainer = captured(shared_tiny, folder, facts, max_num_iterations=20, eval_appearance="half", background="white")
+    trainer.train()
+    vectors = trainer.model.field.appearance.vectors
+    with torch.no_grad():
+        vectors.copy_(torch.randn(vectors.shape, generator=torch.Generator().manual_seed(0)))
+    return trainer
+
+
+def changed(dataset: Dataset, first: int, last: int, kept: bool = False) -> Dataset:
+    """The first photograph with other colours in some columns; which masks then ignore, if `kept`."""
+    pixels, width = dataset.pixels.clone(), int(dataset.cameras.widths[0])
+    here = torch.zeros(len(pixels), dtype=torch.bool)
+    here[: width * int(dataset.cameras.heights[0])].view(-1, width)[:, first:last] = True
+    pixels[here, :3] = 255 - pixels[here, :3]
+    pixels[here, 3] = 255
+    return dataclasses.replace(dataset, pixels=pixels, kept=PixelSet.of_mask(~here) if kept else dataset.kept)
+
+
+@pytest.fixture
+def _soon_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("framework.evaluation.appearance.STEPS", 8)
+
+
+def shown(trainer: Trainer, dataset: Dataset) -> Tensor:
+    """The model's picture of the first view in the light that is found for it."""
+    background = torch.ones(3)
+    with fitted_appearance(trainer.model, dataset, 0, background):
+        return render_view(trainer.model, dataset, 0, background).rgb
+
+
+@pytest.mark.usefixtures("_soon_fitted")
+def test_light_is_found_on_the_half_that_is_not_judged(lit: Trainer) -> None:
+    width = int(lit.train_set.cameras.widths[0])
+    plain = shown(lit, lit.train_set)
+    assert torch.equal(shown(lit, changed(lit.train_set, width // 2, width)), plain)
+    assert not torch.allclose(shown(lit, changed(lit.train_set, 0, width // 2)), plain, atol=1e-3)
+    # What a mask ignores tells nothing, wherever it is.
+    for first, last in ((0, 4), (width - 4, width)):
+        masked = [
+            changed(dataset, first, last, True) for dataset in (lit.train_set, changed(lit.train_set, first, last))
+        ]
+        assert torch.equal(shown(lit, masked[0]), shown(lit, masked[1]))
+
+
+@pytest.mark.usefixtures("_soon_fitted")
+def test_the_half_on_which_light_is_found_is_not_judged(lit: Trainer) -> None:
+    """The figure is that of the right half of the very picture shown."""
+    width = int(lit.train_set.cameras.widths[0])
+    found = evaluate(lit.model, lit.train_set, max_images=1)
+    assert found.eval_appearance == "half"
+    rgba = lit.train_set.image(0)[:, width // 2 :].double() / 255
+    truth = rgba[..., :3] * rgba[..., 3:] + (1 - rgba[..., 3:])
+    picture = shown(lit, lit.train_set)[:, width // 2 :].double().clamp(0, 1)
+    expected = -10 * math.log10(float((picture - truth).square().mean()))
+    assert found.per_image[0]["psnr"] == pytest.approx(expected, abs=1e-3)
+
+
+# -- a step -------------------------------------------------------------------------------------------------------
+
+
+def test_training_is_not_said_to_take_longer_than_it_does(shared_tiny: Path, tmp_path: Path) -> None:
+    """Whatever there is to evaluate: the budget is of seconds."""
+    trainer = tiny_trainer(
+        "instant-ngp", shared_tiny, tmp_path / "run", evaluated=True, max_num_iterations=30,
+        steps_per_eval_all_images=5, max_eval_images=1,
+    )  # fmt: skip
+    begun = time.perf_counter()
+    trainer.train()
+    assert 0 < trainer.state.seconds < time.perf_counter() - begun
+
+
+def test_the_seed_and_the_step_decide_what_is_drawn(
+    shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the same parameters on, too: repeats of a comparison differ by their seeds."""
+    drawn: list[Tensor] = []
+
+    def noted(*arguments: Any) -> Batch:
+        batch = draw_batch(*arguments)
+        drawn.append(batch.pixels)
+        return batch
+
+    monkeypatch.setattr("framework.training.trainer.draw_batch", noted)
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        trainer = tiny_trainer("vanilla-nerf", shared_tiny, tmp_path / name, machine=MachineConfig(seed=seed))
+        trainer.train_step()
+        trainer.train_step()
+    first, second, again, _, other, _ = drawn
+    assert torch.equal(first, again)
+    assert not torch.equal(first, second)
+    assert not torch.equal(first, other)
+
+
+def test_adams_moments_decay_as_the_settings_say(shared_tiny: Path, tmp_path: Path) -> None:
+    """After one step the mean is (1 - beta1) g and the mean square (1 - beta2) g^2."""
+    trainer = tiny_trainer(
+        "vanilla-nerf", shared_tiny, tmp_path / "run", adam_beta1=0.8, adam_beta2=0.96, adam_eps=1e-12
+    )
+    trainer.train_step()
+    checked = 0
+    for group in trainer.optimizer.param_groups:
+        for parameter in group["params"]:
+            state = trainer.optimizer.state[parameter]
+            seen = state["exp_avg"].abs() > 1e-8
+            ratio = state["exp_avg"][seen].double().square() / state["exp_avg_sq"][seen].double()
+            checked += len(ratio)
+            torch.testing.assert_close(ratio, torch.full_like(ratio, 0.2**2 / 0.04), rtol=1e-3, atol=0)
+    assert checked > 100
+
+
+def test_each_group_has_the_rate_and_the_schedule_that_it_names(shared_tiny: Path, tmp_path: Path) -> None:
+    """Poses decay from the first step on, while the rest is held for half of the budget."""
+    trainer = captured(
+        shared_tiny, tmp_path, {"unbounded": True, "poses": "device"}, learning_rate=3e-3, camera_learning_rate=7e-4,
+        lr_schedule="hold-exponential", lr_final=0.04, max_num_iterations=1000,
+    )  # fmt: skip
+    trainer.state.step = 250
+    trainer.train_step()
+    rates = {group["name"]: group["lr"] for group in trainer.optimizer.param_groups}
+    expected = {"networks": 3e-3, "tables": 3e-3, "proposals": 1e-2, "poses": 7e-4 * 0.04**0.25}
+    assert rates == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize(("seconds", "size"), [(20.0, 16), (60.0, 16), (120.0, 17), (300.0, 18), (None, 18)])
+def test_longer_runs_of_instant_ngp_get_larger_tables(seconds: float | None, size: int) -> None:
+    config: Any = dataclasses.replace(load_method("instant-ngp").config, max_seconds=seconds).resolved()
+    assert config.log2_table_size == size
+    assert config.sparse_updates == (size >= 17)
+
+
+def test_a_pixel_is_several_rays_from_the_share_of_the_budget_on_that_is_asked_for(
+    shared_tiny: Path, tmp_path: Path
+) -> None:
+    trainer = tiny_trainer(
+        "vanilla-nerf", shared_tiny, tmp_path / "run", rays_per_pixel=4, train_rays_per_pixel_from=0.5,
+        max_num_iterations=10,
+    )  # fmt: skip
+    counts = []
+    for step in range(10):
+        trainer.state.step = step
+        before = trainer.state.rays
+        trainer.train_step()
+        counts.append(trainer.state.rays - before)
+        assert len(trainer._places_in_a_pixel()) == (4 if step + 1 >= 5 else 1)
+    assert counts == [128] * 10  # fewer pixels, of as many rays
+
+
+# -- what nerfacto adds -------------------------------------------------------------------------------------------
+
+
+def test_what_is_near_a_camera_learns_little(
+    shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Gradients are scaled by the squared distance, in half edges of the box, and by 1 beyond one of them."""
+    trainer = captured(shared_tiny, tmp_path, {"unbounded": True, "near": 0.05})
+    given: list[tuple[Samples, Tensor]] = []
+
+    def noted(field: Field, rays: Rays, samples: Samples, background: Tensor, factors: Tensor) -> Rendered:
+        given.append((samples, factors))
+        return shade(field, rays, samples, background, factors)
+
+    monkeypatch.setattr("methods.nerfacto.shade", noted)
+    trainer.train_step()
+    ((samples, factors),) = given
+    half = float((trainer.model.scene.box[1] - trainer.model.scene.box[0])[0]) / 2
+    torch.testing.assert_close(factors, (samples.t / half).square().clamp(max=1))
+    assert factors.min() < 0.1
+    assert factors.max() == 1
+
+
+def test_light_is_gathered_in_normalised_distance(shared_tiny: Path, tmp_path: Path) -> None:
+    """mip-NeRF 360, equation 15, by all pairs, of the intervals that the sampler works with."""
+    trainer = captured(shared_tiny, tmp_path, {"unbounded": True}, distortion_loss_mult=0.5)
+    model = trainer.model.train()
+    batch = draw_batch(trainer.train_set, 6, "black")
+    rendered = model.render(batch.rays, torch.zeros(6, 3))
+    assert rendered.samples is not None
+    assert rendered.samples.edges is not None
+    edges, weights = rendered.samples.edges.double(), rendered.samples.padded(rendered.weights).detach().double()
+    middles = (edges[:, 1:] + edges[:, :-1]) / 2
+    apart = (middles[:, :, None] - middles[:, None]).abs()
+    pairs = (weights[:, :, None] * weights[:, None] * apart).sum((1, 2))
+    expected = 0.5 * (pairs + (weights.square() * edges.diff(dim=-1)).sum(-1) / 3).mean()
+    assert float(model.loss(rendered, batch, 0)["distortion"].detach()) == pytest.approx(float(expected), rel=1e-3)
+
+
+@pytest.mark.parametrize(("has_alpha", "opacity"), [(False, 1.0), (True, 0.0)])
+def test_a_ray_of_a_capture_ends_in_matter_unless_photographs_tell_what_is_empty(
+    has_alpha: bool, opacity: float
+) -> None:
+    """However thin what there is: the sky of a photograph without alpha is no hole."""
+    config: Any = dataclasses.replace(load_method("nerfacto").config, num_proposal_samples=(8,), num_nerf_samples=8)
+    scene = dataclasses.replace(SCENE, unbounded=True, has_alpha=has_alpha, near=0.05, far=1000.0)
+    count = 4
+    rays = Rays(
+        torch.zeros(count, 3), torch.eye(3)[[0, 1, 2, 0]], torch.full((count,), 0.05), torch.full((count,), 1e3)
+    )
+    samples = make_sampler(config, scene).eval().sample(rays, Fog(), False)
+    thin = torch.full((len(samples),), 1e-7)
+    rendered = volume_render(rays, samples, thin, torch.ones(len(samples), 3), torch.zeros(3))
+    torch.testing.assert_close(rendered.accumulation, torch.full((count,), opacity), atol=1e-3, rtol=0)

@@ -1,0 +1,190 @@
+"""Operations that share work out over threads, on enough of it: errors beside the references, and a hash of all bits.
+
+    python -m tests.kernels.large [THREADS]
+
+prints a line of JSON. Without THREADS as many are used as torch finds in its environment.
+"""
+
+import hashlib
+import json
+import sys
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from framework.kernels.adam import dense_adam, dense_adam_reference, sparse_adam, sparse_adam_reference
+from framework.kernels.compositing import composite, composite_reference, distortion
+from framework.kernels.contraction import contract_to_unit, contract_to_unit_reference
+from framework.kernels.frequency import frequency_encoding, frequency_encoding_reference
+from framework.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
+from framework.kernels.intervals import (
+    interval_weights,
+    interval_weights_reference,
+    resample,
+    resample_reference,
+)
+from framework.kernels.march import March, Occupancy, ReferenceMarch, refresh_occupancy
+from framework.kernels.mlp import mlp, mlp_reference
+from framework.kernels.planes import PlanesLayout, planes, planes_reference
+from framework.rays import Rays, Samples
+from tests.kernels.compiled import relative_error
+
+COUNT = 20_000
+GRID = HashGridLayout.build(8, 8, 128, 14)
+PLANES = PlanesLayout.build(((32, 32, 32), (64, 64, 64)))
+BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
+
+
+def with_gradients(call: Callable[..., Tensor], inputs: list[Tensor], direction: Tensor, dtype: torch.dtype) -> list:
+    """The value, and the gradients of all inputs along `direction`."""
+    leaves = [x.to(dtype).requires_grad_() for x in inputs]
+    value = call(*leaves)
+    return [value.detach(), *torch.autograd.grad(value, leaves, direction.to(value))]
+
+
+def differentiable() -> dict[str, tuple[Callable[..., Tensor], Callable[..., Tensor], list[Tensor], int]]:
+    """Compiled form, reference, inputs, and features of the result."""
+    positions = torch.rand(COUNT, 3)
+    layers = [torch.randn(64, 32) / 6, torch.randn(64, 64) / 8, torch.randn(16, 64) / 8]
+    offsets = torch.arange(0, COUNT + 1, 8)
+    starts = torch.linspace(0, 1, 8).repeat(COUNT // 8)
+    samples = Samples(starts, starts + 0.1, offsets)
+    in_64 = Samples(starts.double(), starts.double() + 0.1, offsets)
+    rays = COUNT // 8
+
+    def colors(form: Callable[..., object], over: Samples) -> Callable[..., Tensor]:
+        def run(sigma: Tensor, rgb: Tensor) -> Tensor:
+            background, fars = torch.full((3,), 0.5).to(sigma), torch.full((rays,), 2.0).to(sigma)
+            return form(over, sigma, rgb, background, fars).color  # type: ignore[attr-defined]
+
+        return run
+
+    edges = torch.linspace(0, 3, 33).expand(COUNT // 10, 33)
+    return {
+        "hash grid": (
+            lambda x, table: hash_grid(x, table, GRID),
+            lambda x, table: hash_grid_reference(x, table, GRID),
+            [positions, torch.randn(GRID.num_entries, 2)],
+            16,
+        ),
+        "planes": (
+            lambda x, table: planes(x, table, PLANES),
+            lambda x, table: planes_reference(x, table, PLANES),
+            [positions, torch.rand(PLANES.num_entries, 16)],
+            32,
+        ),
+        "network": (
+            lambda x, *weights: mlp([x], weights),
+            lambda x, *weights: mlp_reference([x], weights),
+            [torch.randn(COUNT, 32), *layers],
+            16,
+        ),
+        "compositing": (
+            colors(composite, samples),
+            colors(composite_reference, in_64),
+            [3 * torch.rand(COUNT), torch.rand(COUNT, 3)],
+            3,
+        ),
+        "distortion": (
+            lambda w: distortion(w, samples)[:, None],
+            lambda w: distortion(w, in_64)[:, None],
+            [torch.rand(COUNT) / 8],
+            1,
+        ),
+        "contraction": (
+            lambda x: contract_to_unit(x, BOX),
+            lambda x: contract_to_unit_reference(x, BOX.double()),
+            [4 * torch.randn(COUNT, 3)],
+            3,
+        ),
+        "frequencies": (
+            lambda x: frequency_encoding(x, 6),
+            lambda x: frequency_encoding_reference(x, 6),
+            [torch.rand(COUNT, 3)],
+            39,
+        ),
+        "interval weights": (
+            lambda sigma: interval_weights(sigma, edges.contiguous()),
+            lambda sigma: interval_weights_reference(sigma, edges.double()),
+            [torch.rand(COUNT // 10, 32)],
+            32,
+        ),
+    }
+
+
+def optimised(form: Callable[..., object], dtype: torch.dtype, **extra: Tensor) -> list[Tensor]:
+    """Parameters and moments after three steps of Adam, dense or sparse."""
+    torch.manual_seed(1)
+    values, mean, square = (torch.rand(COUNT, 2).to(dtype) for _ in range(3))
+    seen = torch.zeros(COUNT, dtype=dtype)
+    for step in range(1, 4):
+        grad = torch.randn(COUNT, 2).to(dtype) * (torch.rand(COUNT, 1) > 0.5)
+        if form is dense_adam:
+            dense_adam([values], [grad], [mean], [square], [step], 0.01, (0.9, 0.99), 1e-15)
+        elif form is dense_adam_reference:
+            dense_adam_reference(values, grad, mean, square, step, 0.01, (0.9, 0.99), 1e-15)
+        else:
+            form(values, grad, mean, square, seen, 0.01, (0.9, 0.99), 1e-15)
+    return [values, mean, square]
+
+
+def marched(kind: type) -> list[Tensor]:
+    """The samples of rays through a grid of random cells, until their light is spent."""
+    torch.manual_seed(2)
+    count = 3000
+    origins = 3 * torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
+    directions = torch.nn.functional.normalize(torch.rand(count, 3) - 0.5 - origins, dim=-1)
+    rays = Rays(origins, directions, torch.zeros(count), torch.full((count,), 10.0))
+    march = kind(rays, Occupancy.of(torch.rand(32**3) < 0.1, BOX, 32), 0.01, 0.0, None, 1e-3)
+    sizes = [8, 8, 16, 1000]
+    while (wave := march.wave(sizes.pop(0) if sizes else 1000)) is not None:
+        march.advance(torch.full((len(wave.owners),), 20.0))
+    order, offsets = march.finish()
+    return [
+        order,
+        offsets,
+        *(torch.cat([getattr(w, name) for w in march.waves])[order] for name in ("t_starts", "owners")),
+    ]
+
+
+def measured() -> dict[str, tuple[float, list[Tensor]]]:
+    """The largest relative error, and the result, of each operation."""
+    torch.manual_seed(0)
+    found: dict[str, tuple[float, list[Tensor]]] = {}
+    for name, (compiled, reference, inputs, features) in differentiable().items():
+        direction = torch.randn(len(compiled(*inputs)), features)
+        ours = with_gradients(compiled, inputs, direction, torch.float32)
+        truth = with_gradients(reference, inputs, direction, torch.float64)
+        found[name] = max(relative_error(a, b) for a, b in zip(ours, truth, strict=True)), ours
+    for name, form, reference in (
+        ("dense Adam", dense_adam, dense_adam_reference),
+        ("sparse Adam", sparse_adam, sparse_adam_reference),
+    ):
+        steps, truth = optimised(form, torch.float32), optimised(reference, torch.float64)
+        found[name] = max(relative_error(a, b) for a, b in zip(steps, truth, strict=True)), steps
+    samples, expected = marched(March), marched(ReferenceMarch)
+    missing = [len(expected[0]) - len(samples[0]), *(int((a != b).sum()) for a, b in [(samples[1], expected[1])])]
+    found["marching"] = float(sum(map(abs, missing))) / len(expected[0]), samples
+    density, cells = torch.rand(64**3).log().neg(), torch.empty(64**3, dtype=torch.bool)
+    refresh_occupancy(density, cells, 0.95, 0.01, 0.01)
+    alpha = -torch.expm1(-density.double() * 0.01)
+    wrong = cells != ~(alpha < min(0.01, float(alpha.mean()) * (1 - 1e-5)))
+    found["occupancy"] = float(wrong.float().mean()), [density, cells.float()]
+    t, weights, shift = torch.rand(2000, 17).cumsum(-1), torch.rand(2000, 16), torch.rand(2000)
+    drawn = resample(t, weights, shift, 24, 1.0, 0.01)
+    truth = resample_reference(t.double(), weights.double(), shift.double(), 24, 1.0, 0.01)
+    found["resampling"] = relative_error(drawn, truth), [drawn]
+    return found
+
+
+if __name__ == "__main__":
+    if len(sys.argv) > 1:
+        torch.set_num_threads(int(sys.argv[1]))
+    results = measured()
+    digest = hashlib.sha256()
+    for _, tensors in results.values():
+        for tensor in tensors:
+            digest.update(tensor.detach().contiguous().numpy().tobytes())
+    errors = {name: error for name, (error, _) in results.items()}
+    print(json.dumps({"threads": torch.get_num_threads(), "bits": digest.hexdigest(), "errors": errors}))

@@ -1,0 +1,124 @@
+"""Results do not depend on threads: neither on how many are asked for, nor on how many come, nor on who takes what."""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+
+import pytest
+import torch
+
+from framework.kernels import native
+from framework.kernels.mlp import mlp
+from tests.kernels.compiled import needs_kernels
+from tests.kernels.large import measured
+
+pytestmark = needs_kernels
+ENVIRONMENTS = {
+    "a limit of one thread": {"OMP_THREAD_LIMIT": "1", "OMP_NUM_THREADS": "2"},
+    "fewer threads as the system likes": {"OMP_DYNAMIC": "true"},
+    "one thread": {"OMP_NUM_THREADS": "1"},
+    "two threads": {"OMP_NUM_THREADS": "2"},
+    "three threads": {"OMP_NUM_THREADS": "3"},
+    "eight threads": {"OMP_NUM_THREADS": "8"},
+    "threads that sleep": {"OMP_WAIT_POLICY": "PASSIVE", "OMP_NUM_THREADS": "2"},
+}
+QUICK = ("a limit of one thread", "eight threads")
+TOLERANCE = 2e-5
+
+
+@pytest.fixture(scope="module")
+def here() -> dict[str, object]:
+    """What a process measures that has one thread."""
+    return in_a_process()
+
+
+def in_a_process(**environment: str) -> dict[str, object]:
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("OMP_")}
+    # Asked for by name too, for torch takes no more than there are cores from its environment.
+    threads = environment.get("OMP_NUM_THREADS", "2" if environment else "1")
+    run = [sys.executable, "-m", "tests.kernels.large", threads]
+    done = subprocess.run(run, env=kept | environment, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in ENVIRONMENTS]
+)
+def test_values_and_gradients_are_the_references_in_every_environment(name: str, here: dict[str, object]) -> None:
+    found = in_a_process(**ENVIRONMENTS[name])
+    print(name, found["threads"], "threads; largest error", max(found["errors"].values()))
+    assert max(found["errors"].values()) < TOLERANCE
+    assert found["bits"] == here["bits"]
+
+
+def test_several_callers_at_once_get_what_one_gets() -> None:
+    """One of them has the threads, the others work alone meanwhile."""
+    torch.manual_seed(0)
+    inputs, weights = [torch.randn(20_000, 32)], [torch.randn(64, 32), torch.randn(16, 64)]
+    expected, found = mlp(inputs, weights), []
+    callers = [threading.Thread(target=lambda: found.extend(mlp(inputs, weights) for _ in range(10))) for _ in range(4)]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join()
+    assert len(found) == 40
+    assert all(torch.equal(value, expected) for value in found)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the system has no fork")
+def test_a_forked_process_has_threads_of_its_own() -> None:
+    """In a process of its own: what is forked here would hold this one's files."""
+    code = (
+        "import os, torch\n"
+        "from framework.kernels.mlp import mlp\n"
+        "torch.manual_seed(0); torch.set_num_threads(2)\n"
+        "x, w = [torch.randn(20_000, 32)], [torch.randn(64, 32), torch.randn(16, 64)]\n"
+        "expected = mlp(x, w)\n"
+        "child = os.fork()\n"
+        "if child == 0: os._exit(0 if all(torch.equal(mlp(x, w), expected) for _ in range(20)) else 1)\n"
+        "print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), torch.equal(mlp(x, w), expected))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert done.stdout.split() == ["0", "True"], done.stderr
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_an_error_in_one_chunk_is_raised_and_the_next_call_works(threads: int) -> None:
+    from framework.pixels import gather_colors
+
+    pixels, behind = torch.randint(256, (100, 4)).to(torch.uint8), torch.rand(50_000, 3)
+    good, before = torch.randint(100, (50_000,)), torch.get_num_threads()
+    bad = good.clone()
+    bad[41_234] = 100
+    torch.set_num_threads(threads)
+    try:
+        expected = gather_colors(pixels, good, behind)[0]
+        for _ in range(5):
+            with pytest.raises(IndexError, match="pixels: index 100 is out of range; there are 100, from 0"):
+                gather_colors(pixels, bad, behind)
+            assert torch.equal(gather_colors(pixels, good, behind)[0], expected)
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_memory_that_is_not_there_is_an_error_and_not_the_end_of_the_process() -> None:
+    refresh = native.function("refresh_occupancy", "pqfffpi")
+    with pytest.raises(MemoryError, match="refresh_occupancy: there is not enough memory"):
+        refresh(None, 2**58, 1.0, 0.1, 0.01, None, 2)  # a sum for each part of as many cells
+
+
+def test_what_no_kernel_can_do_is_refused_by_name() -> None:
+    forward = native.function("hash_grid_forward", "pqpippipi")
+    with pytest.raises(ValueError, match="hash_grid_forward: hash grid: an entry has 1, 2, 4 or 8 features"):
+        forward(None, 0, None, 3, None, None, 1, None, 1)
+    network = native.function("mlp_forward", "ppiqpippipi")
+    with pytest.raises(ValueError, match="a layer has 1 to 384 features"):
+        network(None, None, 1, 0, native.integers((385, 4)), 1, None, None, 0, None, 1)
+
+
+def test_results_are_finite() -> None:
+    """The hash is of numbers, not of NaN."""
+    assert all(bool(t.isfinite().all()) for _, tensors in measured().values() for t in tensors)

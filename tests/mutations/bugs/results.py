@@ -137,8 +137,8 @@ BUGS = (
         "masked-pixels-count",
         "evaluation",
         "framework/evaluation/evaluator.py",
-        "psnr(*found) if kept is None else psnr(found[0][kept], found[1][kept])",
-        "psnr(*found)",
+        "judged = (rgb, target) if kept is None else (rgb[kept], target[kept])",
+        "judged = (rgb, target)",
         "what masks ignore counts as right in PSNR",
     ),
     Bug(
@@ -200,9 +200,9 @@ BUGS = (
     Bug(
         "pictures-exchanged",
         "evaluation",
-        "framework/evaluation/images.py",
-        "torch.cat([target, prediction.clamp(0, 1), heat(error)], dim=1)",
-        "torch.cat([prediction.clamp(0, 1), target, heat(error)], dim=1)",
+        "framework/evaluation/panels.py",
+        'Panel("photograph", target),',
+        'Panel("photograph", prediction),',
         "what is called a photograph in comparisons is the render",
     ),
     Bug(
@@ -225,9 +225,9 @@ BUGS = (
     Bug(
         "curve-forgets-seconds",
         "report",
-        "framework/training/trainer.py",
-        'rows = [{"seconds": s, "step": n, "psnr": p} for s, n, p in self.state.curve]',
-        'rows = [{"seconds": n, "step": s, "psnr": p} for s, n, p in self.state.curve]',
+        "framework/training/curve.py",
+        "return Point(report.seconds, report.step, found.psnr",
+        "return Point(report.step, report.step, found.psnr",
         "the learning curve has steps for seconds",
     ),
     Bug(

@@ -45,6 +45,9 @@ class BuildKernels(build_ext):
         return []
 
     def build_extensions(self) -> None:
+        if self.compiler.compiler_type == "msvc":
+            self.warn("MSVC cannot compile the CPU kernels, which use Clang's and GCC's vectors: torch alone is used")
+            return
         try:
             with ThreadPoolExecutor(os.cpu_count()) as pool:
                 list(pool.map(self.build_extension, self.extensions))

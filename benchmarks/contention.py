@@ -140,9 +140,10 @@ def wait_for(process: subprocess.Popen[str], start: str) -> str:
 def child(data: Path, seconds: float, rendering: bool) -> dict[str, float]:
     """Train or render for so long once told to, and say how fast that went."""
     from framework.cli.session import load_split
+    from framework.data_folder import find_data
     from framework.evaluation.evaluator import evaluation_background, render_view
     from framework.kernels import native
-    from framework.registry import load_dataparser, load_method, recognize
+    from framework.registry import load_dataparser, load_method
     from framework.training.run import Run, create_folder
     from framework.training.trainer import Trainer
 
@@ -150,7 +151,7 @@ def child(data: Path, seconds: float, rendering: bool) -> dict[str, float]:
     # The settings are those for 45 s; the time itself is not taken, or the schedule would end in the middle.
     config = dataclasses.replace(config, data=data, vis="none", max_seconds=45.0).resolved()
     config = dataclasses.replace(config, max_seconds=None)
-    name = recognize(data)
+    _, name = find_data(data)
     with tempfile.TemporaryDirectory() as folder:
         run = Run("instant-ngp", config, name, load_dataparser(name)(), Path(folder) / "run")
         create_folder(run)

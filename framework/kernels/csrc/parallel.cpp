@@ -25,7 +25,7 @@ using std::chrono::microseconds;
 // How long a thread looks out for work, or for the end of a region, before it sleeps. Where it has a core to itself,
 // longer than most gaps between the regions of a step: being woken takes tens of microseconds. Where another program
 // wants the core, looking out uses up the time that the system would give us later.
-constexpr microseconds PATIENCE(200), CROWDED_PATIENCE(10);
+constexpr microseconds PATIENCE(2000), CROWDED_PATIENCE(10);
 
 // A look at the clock that takes longer than this means that the thread was not running meanwhile.
 constexpr microseconds INTERRUPTION(100);

@@ -10,6 +10,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from skimage.metrics import structural_similarity
 
+from framework.evaluation import panels
 from tests.cli.helpers import called
 from tests.truth.ball import CENTRE, COUNT, HEIGHT, HELD_OUT, NAMES, RADIUS, WAVES, WIDTH, photograph, pose_of
 from tests.truth.formats import BENT, write_nerfstudio
@@ -109,6 +110,15 @@ def evaluated(trained: Path, folder: Path, *flags: object) -> dict[str, Any]:
     return content
 
 
+def parts(comparison: np.ndarray) -> list[np.ndarray]:
+    """The first three parts of a comparison, without the frames around them, one pixel where it shows a square."""
+    factor = -(-panels.SMALLEST_WIDTH // WIDTH)
+    gap = max(factor * WIDTH // panels.TEXT_SHARE, panels.SMALLEST_TEXT)
+    top, step = round(1.6 * gap) + factor // 2, factor * WIDTH + gap
+    lefts = [gap + index * step + factor // 2 for index in range(3)]
+    return [comparison[top:, left:][: factor * HEIGHT : factor, : factor * WIDTH : factor] for left in lefts]
+
+
 def test_figures_are_those_of_the_pictures_and_of_the_photographs_held_out(trained: Path, tmp_path: Path) -> None:
     found = evaluated(trained, tmp_path)
     assert [row["name"] for row in found["per_image"]] == HELD_OUT
@@ -126,11 +136,13 @@ def test_figures_are_those_of_the_pictures_and_of_the_photographs_held_out(train
         assert row["psnr"] == pytest.approx(-10 * np.log10(error), abs=1e-3)
         assert row["ssim"] == pytest.approx(similarity, abs=1e-4)
         figures.append((row["psnr"], row["ssim"]))
-        three = np.asarray(Image.open(tmp_path / "pictures" / f"{stem}_comparison.png"), float) / 255
-        np.testing.assert_allclose(three[:, :WIDTH], truth, atol=0.51 / 255)
-        np.testing.assert_allclose(three[:, WIDTH : 2 * WIDTH], render, atol=1e-9)
+        written = np.asarray(Image.open(tmp_path / "pictures" / f"{stem}_photograph.png"), float) / 255
+        np.testing.assert_allclose(written, truth, atol=0.51 / 255)
+        three = parts(np.asarray(Image.open(tmp_path / "pictures" / f"{stem}_comparison.png"), float) / 255)
+        np.testing.assert_allclose(three[0], truth, atol=0.51 / 255)
+        np.testing.assert_allclose(three[1], render, atol=1e-9)
         shown = np.clip(3 * np.abs(render - truth).mean(-1) / 0.25, 0, 1)
-        np.testing.assert_allclose(three[:, 2 * WIDTH :, 0], shown, atol=2 / 255)
+        np.testing.assert_allclose(three[2][..., 0], shown, atol=2 / 255)
         facing = np.asarray(Image.open(tmp_path / "pictures" / f"{stem}_normals.png"), float) / 255 * 2 - 1
         assert facing.shape == (HEIGHT, WIDTH, 3)
     results = found["results"]

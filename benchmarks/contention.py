@@ -1,4 +1,4 @@
-"""What is left of training and rendering beside other programs.
+"""Speed of training and rendering beside other programs.
 
     python benchmarks/contention.py --data DIR [--seconds 20] [--output FILE]
 
@@ -39,7 +39,7 @@ class Row:
     environment: tuple[tuple[str, str], ...] = ()
 
     def fair_share(self, cores: int) -> float:
-        """Of the cores, for one training with a thread on each core."""
+        """Fair share of the cores for one training with a thread on each core."""
         if self.own_group:
             return 0.5
         weight = 1.0 if self.nice == 0 else 15 / 1024  # the scheduler's for nice 19

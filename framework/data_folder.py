@@ -90,7 +90,7 @@ def _recognizes(name: str, parser: type[DataParser], path: Path) -> bool:
 
 
 def _advice(path: Path) -> str:
-    """What to do with what is no data folder."""
+    """Say what to do about a path that is no data folder."""
     if not os.path.exists(path):
         return "there is no such folder"
     if os.path.isfile(path):

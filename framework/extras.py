@@ -1,4 +1,4 @@
-"""What to install for what is optional: by the packages' own names, which pip finds from a clone as well."""
+"""Advice on installing optional packages, by their own names, which pip finds from a clone as well."""
 
 from __future__ import annotations
 

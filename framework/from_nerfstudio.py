@@ -1,4 +1,4 @@
-"""What users of nerfstudio type, and what it is called here: plain data, and one answer a word."""
+"""Names that users of nerfstudio type, and ours for them: plain data, and one answer a word."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ SECTIONS = {
 }
 """The beginning of a flag of nerfstudio's -> what to say where no flag does it here."""
 VIEWERS = ("viewer", "viewer_legacy", "viewer_beta", "wandb", "comet")
-"""What nerfstudio's --vis may hold, alone or joined by +, and ours may not."""
+"""Values of nerfstudio's --vis, alone or joined by +, that ours does not take."""
 FORMATS = {
     "blender-data": "blender",
     "colmap-data": "colmap",
@@ -93,13 +93,13 @@ KINDS = {
 
 
 def vis_answer(value: str) -> str | None:
-    """What to say of a value of --vis that nerfstudio has and we have not; None for any other."""
+    """The answer to a value of --vis that nerfstudio has and we have not; None for any other."""
     foreign = set(value.split("+")) & set(VIEWERS)
     return f"--vis {value} is nerfstudio's; {SECTIONS['viewer']}" if foreign else None
 
 
 def flag_answer(flag: str, method: str, known: Collection[str]) -> str | None:
-    """What to say of a flag that nerfstudio has and we have not; None for any other.
+    """The answer to a flag that nerfstudio has and we have not; None for any other.
 
     Args:
         flag: as it was typed, perhaps with =VALUE.
@@ -124,7 +124,7 @@ def _ours(name: str) -> str:
 
 
 def format_answer(name: str) -> str | None:
-    """What to say of a data subcommand of nerfstudio's; None for any other word."""
+    """The answer to a data subcommand of nerfstudio's; None for any other word."""
     if name in FORMATS:
         return f"'{name}' is nerfstudio's; here the data format is called '{FORMATS[name]}'"
     if name in NO_FORMATS:
@@ -133,7 +133,7 @@ def format_answer(name: str) -> str | None:
 
 
 def config_answer(text: str) -> str | None:
-    """What to say of a YAML file's text where it is a config.yml of nerfstudio's; None for any other.
+    """The answer to a YAML file's text where it is a config.yml of nerfstudio's; None for any other.
 
     It is searched for the method and the data, and never loaded, for that would make its Python objects.
     """

@@ -106,7 +106,7 @@ def run_command(command: Callable[[list[str]], None]) -> None:
 
 
 def version() -> str:
-    """What --version prints: the package's version, where it lies, and the Python that runs it."""
+    """The line that --version prints: the package's version, where it lies, and the Python that runs it."""
     place = Path(framework.__file__).parent
     return f"nerfloom {framework.__version__} from {place} (Python {platform.python_version()})"
 

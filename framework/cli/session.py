@@ -23,7 +23,7 @@ from framework.training.trainer import Outcome, Trainer
 
 PICTURES = 4
 FEW_PIXELS = 16
-"""Of an image's longer side, below which something went wrong with the images."""
+"""Pixels of an image's longer side below which something went wrong with the images."""
 
 
 def start(run: Run) -> None:
@@ -123,7 +123,7 @@ def _saying_of_a_stop(note: Callable[[], str]) -> Iterator[None]:
 
 
 def _what_is_saved(trainer: Trainer) -> str:
-    """Of a run that is ended at once."""
+    """Say what is saved of a run that is ended at once."""
     saved = list_checkpoints(trainer.checkpoint_folder)
     if not saved:
         return "stopped at once: nothing was saved"

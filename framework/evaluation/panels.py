@@ -27,7 +27,7 @@ class Panel:
     image: Tensor
     """(H, W, 3) in [0, 1]."""
     ends: tuple[str, str] | None = None
-    """What the two ends of the colour bar stand for; None where colours are colours."""
+    """Values at the two ends of the colour bar; None where there is no bar."""
     bar: Tensor | None = None
     """(N, 3) colours of the bar from its first end to its last."""
 

@@ -31,7 +31,7 @@ class _Waiting(torch.autograd.Function):
 
 
 def waiting(table: Tensor, positions: Tensor, width: int, parts: Parts) -> Tensor:
-    """What a look-up takes in its table's place, so that its incoming gradient is left in `parts`.
+    """A stand-in for a look-up's table, so that its incoming gradient is left in `parts`.
 
     Only by a backward pass that asks for the table's gradient: `backward()`, or one whose `inputs` name the table.
     `autograd.grad` of the table finds no gradient to return; a look-up without `deferred` gives one.

@@ -104,7 +104,7 @@ def has(name: str) -> bool:
 
 
 _FAILURES: dict[int, type[Exception]] = {1: MemoryError, 2: IndexError, 3: ValueError}
-"""What a status other than 0 becomes; any other is a RuntimeError."""
+"""Exception for each status; any other status but 0 is a RuntimeError."""
 
 
 def function(name: str, arguments: str, result: str = "") -> Callable[..., Any]:

@@ -1,4 +1,4 @@
-"""What a photograph with alpha says about balls in space, and which of its pixels may see some of them.
+"""Balls in space that a photograph with alpha shows to be empty, and its pixels that may see the others.
 
 Used for the visual hull (Laurentini 1994): see `framework.silhouettes`.
 """

@@ -11,7 +11,7 @@ from framework.cameras import Cameras
 from framework.evaluation.paths import look_at
 
 RADIUS = 0.7
-"""Of the ball, scene units."""
+"""Radius of the ball, scene units."""
 
 
 def trace(origins: Tensor, unit_directions: Tensor, centers: Tensor | None = None) -> tuple[Tensor, Tensor]:

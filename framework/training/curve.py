@@ -34,7 +34,7 @@ PICTURE_SPEED = 2.0
 """Before the first look, a ray of a picture is taken to be so many times as fast as one of training, which also learns
 from it. Measured: 2 to 7 times."""
 MOST_PIXELS = 2**14
-"""Of an image that are looked at; more would tell little more."""
+"""Most pixels of an image that are looked at; more would tell little more."""
 LEAST_SIDE = 16
 """Pixels along the shorter side of an image that are looked at, at least: SSIM needs 11."""
 
@@ -49,7 +49,7 @@ class Point:
     """An evaluation during training."""
 
     seconds: float
-    """Of training until then."""
+    """Seconds of training until then."""
     step: int
     psnr: float
     """Mean over images, dB."""
@@ -60,7 +60,7 @@ class Point:
     pixel_stride: int = 1
     """Every so many-th row and column of their pixels."""
     evaluation_seconds: float | None = None
-    """That it took; they are not part of `seconds`."""
+    """Seconds the evaluation took; they are not part of `seconds`."""
     full: bool = True
     """Whether it is over all held-out images, or the --max-eval-images of them that were asked for."""
 

@@ -30,7 +30,7 @@ class Stopped(KeyboardInterrupt):
 
 
 def exit_status(stop: KeyboardInterrupt) -> int:
-    """What a shell expects of a process that a signal ended: 130 after Ctrl-C, 143 after SIGTERM."""
+    """Exit status that a shell expects of a process that a signal ended: 130 after Ctrl-C, 143 after SIGTERM."""
     return 128 + signal_of(stop)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 
-from framework.kernels import native
 from framework.kernels.silhouettes import (
     Photograph,
     hold_balls,
@@ -15,8 +14,9 @@ from framework.kernels.silhouettes import (
     pixels_near_balls,
     pixels_near_balls_reference,
 )
+from tests.kernels.compiled import needs_kernels
 
-pytestmark = pytest.mark.skipif(not native.available(), reason="the kernels are not built")
+pytestmark = needs_kernels
 
 
 def photograph(seed: int, distance: float) -> tuple[Photograph, torch.Tensor]:

@@ -18,7 +18,7 @@ from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
-from framework.child import python_command
+from framework.base.child import python_command
 from framework.kernels import native
 
 VARIANTS: dict[str, list[str]] = {

@@ -26,10 +26,10 @@ from PIL import Image
 
 from dataparsers.blender import Blender
 from dataparsers.procedural.views import write_dataset
+from framework.base.console import track
+from framework.base.registry import load_method
 from framework.cli.session import load_split
-from framework.console import track
-from framework.pixel_stream import PixelStream
-from framework.registry import load_method
+from framework.data.pixel_stream import PixelStream
 from framework.training.run import Run, create_folder
 from framework.training.trainer import Trainer
 

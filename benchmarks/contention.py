@@ -139,11 +139,11 @@ def wait_for(process: subprocess.Popen[str], start: str) -> str:
 
 def child(data: Path, seconds: float, rendering: bool) -> dict[str, float]:
     """Train or render for so long once told to, and say how fast that went."""
+    from framework.base.registry import load_dataparser, load_method
     from framework.cli.session import load_split
-    from framework.data_folder import find_data
+    from framework.data.data_folder import find_data
     from framework.evaluation.evaluator import evaluation_background, render_view
     from framework.kernels import native
-    from framework.registry import load_dataparser, load_method
     from framework.training.run import Run, create_folder
     from framework.training.trainer import Trainer
 

@@ -23,13 +23,13 @@ import torch
 from torch import Tensor
 
 from dataparsers.procedural import Procedural
-from framework.alignment import align_cameras, pose_errors
-from framework.cameras import Cameras
-from framework.dataset import Dataset, load_dataset
+from framework.base.registry import load_method
+from framework.cameras.cameras import Cameras
+from framework.cameras.refinement import PoseRefinement
+from framework.data.dataset import Dataset, load_dataset
 from framework.evaluation.evaluator import evaluate
+from framework.geometry.alignment import align_cameras, pose_errors
 from framework.kernels.math import cross_matrix
-from framework.pose_refinement import PoseRefinement
-from framework.registry import load_method
 from framework.training.run import Run, create_folder
 from framework.training.trainer import Trainer
 

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from framework.alignment import pose_errors
-from framework.processing.colmap import read_model
-from framework.processing.transforms import opengl_pose
+from framework.geometry.alignment import pose_errors
+from framework.tools.processing.colmap import read_model
+from framework.tools.processing.transforms import opengl_pose
 
 
 def main() -> None:

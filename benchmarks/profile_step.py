@@ -15,10 +15,10 @@ import tempfile
 import time
 from pathlib import Path
 
+from framework.base.registry import load_dataparser, load_method
 from framework.cli.session import load_split
-from framework.data_folder import find_data
+from framework.data.data_folder import find_data
 from framework.kernels import native
-from framework.registry import load_dataparser, load_method
 from framework.training.run import Run, create_folder
 from framework.training.trainer import Trainer
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dataparsers.reading import file_name, read_json, read_pose, read_times, shown
 from framework import Cameras, DataError, DataParser, ParsedScene
-from framework.dataset import Split, existing, image_size
+from framework.data.dataset import Split, existing, image_size
 
 TRANSFORMS = "transforms_train.json"
 SMALLEST_ANGLE = 1e-6

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from framework import Cameras, DataError, DataParser, ParsedScene
-from framework.cameras import LENSES
-from framework.dataset import Split, existing, image_size
-from framework.poses import Center, Orientation, Placement, held_out, nearest_shown, place
-from framework.scene import PoseSource
+from framework.cameras.cameras import LENSES
+from framework.cameras.poses import Center, Orientation, Placement, held_out, nearest_shown, place
+from framework.data.dataset import Split, existing, image_size
+from framework.data.scene import PoseSource
 
 LARGEST_SIDE = 1600
 """Pixels of an image's longer side above which images are reduced unless the user says by how much."""

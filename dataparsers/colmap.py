@@ -10,7 +10,7 @@ from dataparsers.colmap_lens import lenses_of
 from dataparsers.colmap_model import choose_model, find_models, read_model
 from dataparsers.masks import find_masks
 from framework import DataError, ParsedScene
-from framework.dataset import Split
+from framework.data.dataset import Split
 
 
 @dataclass(frozen=True)

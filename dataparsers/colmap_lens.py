@@ -10,8 +10,8 @@ from torch import Tensor
 
 from dataparsers.colmap_model import SparseCamera
 from framework import DataError
-from framework.cameras import LENSES
-from framework.colmap_cameras import PARAMETERS, Intrinsics, from_colmap
+from framework.cameras.cameras import LENSES
+from framework.cameras.colmap import PARAMETERS, Intrinsics, from_colmap
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ from torch import Tensor
 from dataparsers.colmap_files import check_binary, count_images
 from dataparsers.reading import file_name
 from framework import DataError
-from framework.cameras import check_pose
-from framework.console import say
-from framework.dataset import one_line
+from framework.base.console import say
+from framework.cameras.cameras import check_pose
+from framework.data.dataset import one_line
 
 PLACES = ("sparse", "colmap/sparse")
 """Where reconstructions are looked for, each there itself or in a folder of its own below."""

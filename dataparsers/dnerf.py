@@ -10,7 +10,7 @@ from pathlib import Path
 
 from dataparsers.blender import TRANSFORMS, Blender, has_times
 from framework import DataError, ParsedScene
-from framework.dataset import Split
+from framework.data.dataset import Split
 
 
 @dataclass(frozen=True)

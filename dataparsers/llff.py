@@ -13,11 +13,11 @@ from dataparsers.captured import ENDINGS, REDUCED, Captured, Photographs, captur
 from dataparsers.colmap_model import find_models
 from dataparsers.masks import find_masks
 from framework import DataError, ParsedScene
-from framework.arrays import read_array
-from framework.cameras import check_pose
-from framework.dataset import Split, one_line
-from framework.ndc import NdcCameras, find_ndc, ndc_box
-from framework.poses import Placement
+from framework.base.arrays import read_array
+from framework.cameras.cameras import check_pose
+from framework.cameras.ndc import NdcCameras, find_ndc, ndc_box
+from framework.cameras.poses import Placement
+from framework.data.dataset import Split, one_line
 
 POSES = "poses_bounds.npy"
 BOUNDS = f"the depth bounds of {POSES}"

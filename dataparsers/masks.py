@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePath
 
 from dataparsers.captured import REDUCED
-from framework.console import say
+from framework.base.console import say
 
 
 def find_masks(root: Path, names: Sequence[str]) -> tuple[Path | None, ...] | None:

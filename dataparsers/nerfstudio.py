@@ -22,10 +22,10 @@ from dataparsers.captured import (
 )
 from dataparsers.reading import file_name, number, numbers, read_json, read_pose, read_times, rigid, shown, side
 from framework import DataError, ParsedScene
-from framework.console import say
-from framework.dataset import Split
-from framework.errors import nearest
-from framework.ply import read_points
+from framework.base.console import say
+from framework.base.errors import nearest
+from framework.data.dataset import Split
+from framework.data.ply import read_points
 
 TRANSFORMS = "transforms.json"
 EvalMode = Literal["interval", "fraction", "filename", "all"]

@@ -17,7 +17,7 @@ from dataparsers.captured import Captured, captured_scene, has_transforms
 from dataparsers.colmap import read_photographs
 from dataparsers.colmap_model import choose_model, find_models
 from framework import DataError, ParsedScene
-from framework.dataset import Split
+from framework.data.dataset import Split
 
 SPARSE = "dense/sparse"
 

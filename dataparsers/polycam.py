@@ -10,8 +10,8 @@ import torch
 from dataparsers.captured import ENDINGS, Captured, Photographs, captured_scene, from_original, has_transforms
 from dataparsers.reading import number, read_json, rigid, side
 from framework import DataError, ParsedScene
-from framework.dataset import Split
-from framework.scene import PoseSource
+from framework.data.dataset import Split
+from framework.data.scene import PoseSource
 
 CAMERAS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
 """Folders in `keyframes` of cameras and their images, the better first: those that Polycam has refined."""

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from framework import DataError
-from framework.cameras import LARGEST_SIDE, check_pose
-from framework.errors import shown as shown
+from framework.base.errors import shown as shown
+from framework.cameras.cameras import LARGEST_SIDE, check_pose
 
 LONGEST_NAME, LONGEST_PATH = 250, 3000
 """Bytes of a file's or folder's name, and of all on the way to a file; most systems allow 255, and 4096 in all."""

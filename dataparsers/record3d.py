@@ -12,9 +12,9 @@ from torch import Tensor
 from dataparsers.captured import Captured, Photographs, captured_scene, has_transforms
 from dataparsers.reading import numbers, read_json, side
 from framework import DataError, ParsedScene
-from framework.dataset import Split, existing
+from framework.data.dataset import Split, existing
+from framework.data.scene import PoseSource
 from framework.kernels.math import cross_matrix
-from framework.scene import PoseSource
 
 METADATA, EXPORT = "metadata.json", "EXR_RGBD"
 NORM_TOLERANCE = 0.01

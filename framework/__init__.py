@@ -11,44 +11,44 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from framework.cameras import Cameras as Cameras
-    from framework.config import TrainConfig as TrainConfig
-    from framework.dataset import DataParser as DataParser
-    from framework.dataset import Dataset as Dataset
-    from framework.dataset import ParsedScene as ParsedScene
-    from framework.errors import ConfigError as ConfigError
-    from framework.errors import DataError as DataError
-    from framework.errors import NerfloomError as NerfloomError
+    from framework.base.config import TrainConfig as TrainConfig
+    from framework.base.errors import ConfigError as ConfigError
+    from framework.base.errors import DataError as DataError
+    from framework.base.errors import NerfloomError as NerfloomError
+    from framework.cameras.cameras import Cameras as Cameras
+    from framework.data.dataset import DataParser as DataParser
+    from framework.data.dataset import Dataset as Dataset
+    from framework.data.dataset import ParsedScene as ParsedScene
+    from framework.data.pixels import Batch as Batch
+    from framework.data.scene import Scene as Scene
     from framework.fields.base import Field as Field
+    from framework.geometry.rays import Rays as Rays
+    from framework.geometry.rays import Samples as Samples
     from framework.model import Method as Method
     from framework.model import Model as Model
-    from framework.pixels import Batch as Batch
-    from framework.rays import Rays as Rays
-    from framework.rays import Samples as Samples
-    from framework.renderers import Rendered as Rendered
+    from framework.rendering.volume import Rendered as Rendered
     from framework.samplers.base import Sampler as Sampler
-    from framework.scene import Scene as Scene
-    from framework.scene_profile import Decision as Decision
+    from framework.scene.profile import Decision as Decision
 
 _HOMES = {
-    "Batch": "pixels",
-    "Cameras": "cameras",
-    "ConfigError": "errors",
-    "DataError": "errors",
-    "DataParser": "dataset",
-    "Dataset": "dataset",
-    "Decision": "scene_profile",
+    "Batch": "data.pixels",
+    "Cameras": "cameras.cameras",
+    "ConfigError": "base.errors",
+    "DataError": "base.errors",
+    "DataParser": "data.dataset",
+    "Dataset": "data.dataset",
+    "Decision": "scene.profile",
     "Field": "fields.base",
     "Method": "model",
     "Model": "model",
-    "NerfloomError": "errors",
-    "ParsedScene": "dataset",
-    "Rays": "rays",
-    "Rendered": "renderers",
+    "NerfloomError": "base.errors",
+    "ParsedScene": "data.dataset",
+    "Rays": "geometry.rays",
+    "Rendered": "rendering.volume",
     "Sampler": "samplers.base",
-    "Samples": "rays",
-    "Scene": "scene",
-    "TrainConfig": "config",
+    "Samples": "geometry.rays",
+    "Scene": "data.scene",
+    "TrainConfig": "base.config",
 }
 
 # Threads of torch's that wait look out for work for milliseconds, unless told otherwise before torch is loaded. Beside

@@ -10,16 +10,16 @@ from typing import Any, ClassVar, Generic, TypeVar
 import torch
 from torch import Tensor, nn
 
-from framework.config import TrainConfig
-from framework.encodings import FeaturePlanes, HashGrid
-from framework.losses import mean_squared_error
-from framework.pixels import Batch
-from framework.rays import Rays
-from framework.renderers import Rendered
+from framework.base.config import TrainConfig
+from framework.data.pixels import Batch
+from framework.data.scene import Scene
+from framework.encodings.encodings import FeaturePlanes, HashGrid
+from framework.geometry.rays import Rays
+from framework.rendering.losses import mean_squared_error
+from framework.rendering.volume import Rendered
 from framework.samplers.occupancy import OccupancySampler
 from framework.samplers.proposal import ProposalSampler, interlevel_loss
-from framework.scene import Scene
-from framework.scene_profile import Decision
+from framework.scene.profile import Decision
 
 PROPOSAL_ADAM = {"lr": 1e-2, "betas": (0.9, 0.99), "eps": 1e-15}
 """Of proposals in any method."""

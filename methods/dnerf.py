@@ -11,14 +11,14 @@ from typing import Any, ClassVar, Literal
 from torch import Tensor
 
 from framework import Decision, Field, Method, Model, Rays, Rendered, Scene
-from framework.config import AT_LEAST_0, Range
-from framework.encodings import HashGrid
+from framework.base.config import AT_LEAST_0, Range
+from framework.encodings.encodings import HashGrid
 from framework.fields.deformed import DeformedField
 from framework.fields.encoded import EncodedField
 from framework.fields.nerf import NeRFField
 from framework.kernels.frequency import MAX_FREQUENCIES
 from framework.kernels.hash_grid import MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
-from framework.renderers import render_field, render_hierarchical
+from framework.rendering.volume import render_field, render_hierarchical
 from framework.samplers.choice import (
     HierarchicalConfig,
     chosen_sampler,

@@ -12,11 +12,11 @@ from typing import ClassVar, Literal
 from torch import Tensor
 
 from framework import Decision, Method, Model, Rays, Rendered, Scene
-from framework.config import Range, RaysPerPixel
-from framework.encodings import HashGrid
+from framework.base.config import Range, RaysPerPixel
+from framework.encodings.encodings import HashGrid
 from framework.fields.encoded import EncodedField
 from framework.kernels.hash_grid import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
-from framework.renderers import render_field
+from framework.rendering.volume import render_field
 from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_decisions
 
 PLANS = (

@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 
 from framework import Batch, Decision, Method, Model, Rays, Rendered, Scene
-from framework.config import AT_LEAST_0, Range
-from framework.encodings import FeaturePlanes
+from framework.base.config import AT_LEAST_0, Range
+from framework.encodings.encodings import FeaturePlanes
 from framework.fields.base import MLP
 from framework.fields.encoded import BoxField, EncodedField
 from framework.kernels.math import truncated_exp
 from framework.kernels.planes import MAX_VERTICES, plane_band
 from framework.kernels.spherical_harmonics import spherical_harmonics
-from framework.renderers import render_field
+from framework.rendering.volume import render_field
 from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_decisions
 
 MAX_SCALES = 4

@@ -13,16 +13,16 @@ from typing import Any, ClassVar, Literal
 from torch import Tensor
 
 from framework import Batch, ConfigError, Decision, Method, Model, Rays, Rendered, Scene
-from framework.config import AT_LEAST_0, Range
-from framework.encodings import HashGrid
+from framework.base.config import AT_LEAST_0, Range
+from framework.cameras.refinement import PoseRefinement
+from framework.encodings.encodings import HashGrid
 from framework.fields.encoded import EncodedField
 from framework.fields.normals import NormalHead, density_normals, normal_penalties
+from framework.geometry.rays import Samples
 from framework.kernels.compositing import distortion, ray_sum
 from framework.kernels.hash_grid import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
-from framework.losses import depth_error
-from framework.pose_refinement import PoseRefinement
-from framework.rays import Samples
-from framework.renderers import shade
+from framework.rendering.losses import depth_error
+from framework.rendering.volume import shade
 from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_decisions
 from framework.samplers.proposal import ProposalSampler, half_edge
 

@@ -15,15 +15,15 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from framework import Batch, Decision, Field, Method, Model, Rays, Rendered, Scene
-from framework.bounds import to_unit_box
-from framework.config import AT_LEAST_0, Range
-from framework.encodings import FeaturePlanes
+from framework.base.config import AT_LEAST_0, Range
+from framework.encodings.encodings import FeaturePlanes
 from framework.fields.base import MLP
+from framework.geometry.bounds import to_unit_box
 from framework.kernels.contraction import contract_to_unit
 from framework.kernels.memory import require
 from framework.kernels.planes import PlanesLayout
 from framework.kernels.spherical_harmonics import spherical_harmonics
-from framework.renderers import render_field
+from framework.rendering.volume import render_field
 from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_decisions
 from framework.samplers.occupancy import OccupancySampler
 

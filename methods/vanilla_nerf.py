@@ -13,10 +13,10 @@ from typing import Any, ClassVar, Literal
 from torch import Tensor
 
 from framework import Decision, Method, Model, Rays, Rendered, Scene
-from framework.config import Range
+from framework.base.config import Range
 from framework.fields.nerf import NeRFField
 from framework.kernels.frequency import MAX_FREQUENCIES
-from framework.renderers import render_field, render_hierarchical
+from framework.rendering.volume import render_field, render_hierarchical
 from framework.samplers.choice import (
     HierarchicalConfig,
     chosen_sampler,

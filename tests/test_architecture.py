@@ -107,6 +107,58 @@ def _fields(file: Path, base: str):
     return dataclasses.fields(getattr(module, base)) if dataclasses.is_dataclass(getattr(module, base, None)) else ()
 
 
+LAYERS = (
+    ("base",),
+    ("geometry",),
+    ("kernels",),
+    ("cameras",),
+    ("data",),
+    ("scene",),
+    ("encodings",),
+    ("fields",),
+    ("samplers",),
+    ("rendering",),
+    ("model",),
+    ("evaluation",),
+    ("training",),
+    ("export",),
+    ("tools",),
+    ("cli",),
+)
+"""Rooms of `framework`, each of which imports those above it only, at whatever place in a file."""
+
+
+def _room(module: str) -> int | None:
+    """The place of a module's room in LAYERS; None for what is none of ours."""
+    parts = module.split(".")
+    if parts[0] != "framework" or len(parts) < 2:
+        return None
+    return next((level for level, rooms in enumerate(LAYERS) if parts[1] in rooms), None)
+
+
+def _runtime_imports(node: ast.AST) -> set[str]:
+    """`imports`, less those for type checkers alone."""
+    checked = [item for item in ast.walk(node) if isinstance(item, ast.If) and "TYPE_CHECKING" in ast.dump(item.test)]
+    return imports(node) - {name for item in checked for name in imports(item)}
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda f: str(f.relative_to(ROOT)))
+def test_imports_run_one_way_through_the_rooms(file: Path) -> None:
+    parts = file.relative_to(ROOT).with_suffix("").parts
+    level = _room(".".join(parts))
+    if level is None or parts == ("framework", "base", "registry"):  # the registry finds what stands above it by name
+        return
+    for name in sorted(_runtime_imports(tree(file))):
+        other = _room(name)
+        assert other is None or other <= level, f"{'/'.join(parts)} imports {name}, whose room stands above its own"
+
+
+def test_nothing_is_at_the_root_of_the_framework_but_what_joins_the_rooms() -> None:
+    rooms = {room for layer in LAYERS for room in layer}
+    found = {path.stem for path in (ROOT / "framework").iterdir() if path.name != "__pycache__"}
+    assert found - rooms <= {"__init__", "py", "templates", "method"}
+
+
 def test_no_import_circles_in_the_framework() -> None:
     names = {
         ".".join(f.relative_to(ROOT).with_suffix("").parts): f

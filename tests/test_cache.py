@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 import torch
 
-from framework.config import TrainConfig
-from framework.dataset import Dataset, ParsedScene, load_dataset, read_image
-from framework.device import machine_memory
-from framework.errors import ConfigError, DataError
-from framework.pixel_cache import MAGIC, PixelMemory, unpack
-from framework.pixel_store import FileStore
+from framework.base.config import TrainConfig
+from framework.base.device import machine_memory
+from framework.base.errors import ConfigError, DataError
+from framework.data.dataset import Dataset, ParsedScene, load_dataset, read_image
+from framework.data.pixel_cache import MAGIC, PixelMemory, unpack
+from framework.data.pixel_store import FileStore
 from tests.images import noise, parsed, write_noise
 
 SIZES = [(40, 30), (17, 23), (64, 48), (31, 31)]
@@ -61,7 +61,7 @@ def test_a_later_run_decodes_nothing_and_says_so(
 ) -> None:
     first = cached(scene, folder)
     assert "decoding them once into" in capsys.readouterr().err.replace("\n", " ")
-    monkeypatch.setattr("framework.decoding.read_image", lambda *_: pytest.fail("decoded again"))
+    monkeypatch.setattr("framework.data.decoding.read_image", lambda *_: pytest.fail("decoded again"))
     second = cached(scene, folder)
     assert "decoded by an earlier run are read from" in capsys.readouterr().err.replace("\n", " ")
     assert torch.equal(first.pixels, second.pixels)
@@ -142,9 +142,9 @@ def test_an_error_leaves_no_file(scene: ParsedScene, folder: Path) -> None:
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from framework.dataset import load_dataset
-from framework.pixel_cache import PixelMemory
-from framework.pixel_store import FileStore
+from framework.data.dataset import load_dataset
+from framework.data.pixel_cache import PixelMemory
+from framework.data.pixel_store import FileStore
 from tests.images import parsed
 if sys.argv[3] == "killed":
     FileStore.finish = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
@@ -212,11 +212,11 @@ MEASURE = """
 import sys, threading
 from pathlib import Path
 import torch
-from framework.dataset import load_dataset
-from framework.pixel_cache import PixelMemory
-from framework.pixel_stream import PixelStream
-from framework.pixels import draw_batch
-from framework.device import seed_step
+from framework.data.dataset import load_dataset
+from framework.data.pixel_cache import PixelMemory
+from framework.data.pixel_stream import PixelStream
+from framework.data.pixels import draw_batch
+from framework.base.device import seed_step
 from tests.images import parsed
 
 def status(name):

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from framework.cameras import Cameras, check_pose, subpixels
-from framework.errors import DataError
+from framework.base.errors import DataError
+from framework.cameras.cameras import Cameras, check_pose, subpixels
 from tests.kernels.compiled import needs_kernels
 
 

@@ -1,4 +1,4 @@
-"""framework.testing: every built-in method passes, and each kind of fault is found by its own check and no other."""
+"""Every built-in method passes `check_method`, and each kind of fault is found by its own check and no other."""
 
 import dataclasses
 import importlib
@@ -16,12 +16,12 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from framework import Batch, ConfigError, Field, Method, Model, Rays, Rendered, Scene, TrainConfig
+from framework.base.registry import load_method, registered
 from framework.kernels.frequency import frequency_encoding
-from framework.registry import load_method, registered
-from framework.renderers import render_field
+from framework.rendering.volume import render_field
 from framework.samplers.occupancy import OccupancySampler
-from framework.testing import assert_method, check_method
-from framework.testing.check import CHECKS
+from framework.tools.testing import assert_method, check_method
+from framework.tools.testing.check import CHECKS
 from tests.training.helpers import TINY
 
 ROOT = Path(__file__).parents[1]

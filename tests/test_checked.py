@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 import torch
 
-from framework.checked import checked
-from framework.scene import Scene
+from framework.base.checked import checked
+from framework.data.scene import Scene
 from framework.training.trainer import State
 
 BOX = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from framework.child import PACKAGE, python_command
+from framework.base.child import PACKAGE, python_command
 
 SHADOW = 'raise SystemExit("a file of the working folder was imported")\n'
 
@@ -46,14 +46,15 @@ def test_a_parent_that_is_not_installed_hands_its_place_on(shadowed: Path) -> No
     """A copy of the package that no path leads to runs itself, and not the installed one."""
     copy = shadowed / "elsewhere" / "framework"
     copy.mkdir(parents=True)
-    (copy / "child.py").write_text((PACKAGE / "child.py").read_text())
+    (copy / "base").mkdir()
+    (copy / "base" / "child.py").write_text((PACKAGE / "base" / "child.py").read_text())
     (copy / "__init__.py").write_text("")
     (copy / "program.py").write_text("import framework, sys; print(framework.__file__, sys.argv[1:])")
-    command = [sys.executable, str(copy / "child.py"), "framework.program", "a b"]
+    command = [sys.executable, str(copy / "base" / "child.py"), "framework.program", "a b"]
     done = subprocess.run(command, cwd=shadowed, capture_output=True, text=True)
     assert done.stdout.split() == [str(copy / "__init__.py"), "['a", "b']"], done.stderr
 
 
 def test_no_file_beside_it_is_called_like_a_module_of_python() -> None:
-    """The folder is first on the path for the moment that it takes to remove it; encodings is loaded long before."""
-    assert {path.stem for path in PACKAGE.iterdir()} & set(sys.stdlib_module_names) <= {"encodings"}
+    """Its folder is first on the path for the moment that it takes to remove it."""
+    assert not {path.stem for path in (PACKAGE / "base").iterdir()} & set(sys.stdlib_module_names)

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from framework.config import TrainConfig, from_plain, to_plain
-from framework.errors import ConfigError
-from framework.registry import load_method, registered
+from framework.base.config import TrainConfig, from_plain, to_plain
+from framework.base.errors import ConfigError
+from framework.base.registry import load_method, registered
 from framework.training.run import read_run
 
 

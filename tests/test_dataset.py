@@ -12,12 +12,12 @@ import torch
 from PIL import Image
 
 from dataparsers.blender import Blender
-from framework.dataset import assemble, existing, image_size, load_dataset, read_image
-from framework.decoding import from_arrays
-from framework.errors import DataError
-from framework.masks import read_mask
-from framework.pixels import background_colors, composite
-from framework.processing.photographs import prepare
+from framework.base.errors import DataError
+from framework.data.dataset import assemble, existing, image_size, load_dataset, read_image
+from framework.data.decoding import from_arrays
+from framework.data.masks import read_mask
+from framework.data.pixels import background_colors, composite
+from framework.tools.processing.photographs import prepare
 from tests.images import noise, parsed, write_mask
 
 

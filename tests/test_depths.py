@@ -11,13 +11,13 @@ import pytest
 import torch
 from PIL import Image
 
-from framework.cameras import Cameras
-from framework.dataset import load_dataset
-from framework.depths import ray_distances, read_depth, read_depths
-from framework.errors import DataError
-from framework.losses import depth_error
-from framework.pixels import gather_batch
-from framework.rays import Samples
+from framework.base.errors import DataError
+from framework.cameras.cameras import Cameras
+from framework.data.dataset import load_dataset
+from framework.data.depths import ray_distances, read_depth, read_depths
+from framework.data.pixels import gather_batch
+from framework.geometry.rays import Samples
+from framework.rendering.losses import depth_error
 from tests.training.helpers import tiny_run, tiny_trainer
 
 
@@ -51,7 +51,7 @@ def test_a_picture_far_larger_than_its_photograph_is_refused_by_its_head(
 ) -> None:
     iio.imwrite(tmp_path / "d.png", np.zeros((33, 32), np.uint16))
     assert read_depth(tmp_path / "d.png", 4, 5).shape == (5, 4)
-    monkeypatch.setattr("framework.depths._values", lambda path: pytest.fail("its pixels were read"))
+    monkeypatch.setattr("framework.data.depths._values", lambda path: pytest.fail("its pixels were read"))
     with pytest.raises(DataError, match=r"d\.png has 32 x 33 pixels for a photograph of 4 x 4; more than 64 times"):
         read_depth(tmp_path / "d.png", 4, 4)
 
@@ -131,7 +131,7 @@ def ball_depths(folder: Path, parsed) -> tuple[Path, ...]:
 
 @pytest.mark.parametrize("places", [1, 4])
 def test_depths_reach_batches_as_distances(places: int, shared_tiny: Path, tmp_path: Path) -> None:
-    from framework.cameras import subpixels
+    from framework.cameras.cameras import subpixels
 
     run = tiny_run("nerfacto", shared_tiny, tmp_path)
     parsed = run.parser.parse(shared_tiny, "train")

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from framework.config import MachineConfig
-from framework.device import MOST_THREADS, choose_device, has_bfloat16, peak_memory, stream_seed
-from framework.errors import ConfigError
+from framework.base.config import MachineConfig
+from framework.base.device import MOST_THREADS, choose_device, has_bfloat16, peak_memory, stream_seed
+from framework.base.errors import ConfigError
 
 
 def test_every_step_has_a_stream_of_its_own() -> None:

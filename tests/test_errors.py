@@ -4,8 +4,8 @@ import pickle
 
 import pytest
 
-from framework.console import say
-from framework.errors import LONGEST_MESSAGE, DataError, printable, shown
+from framework.base.console import say
+from framework.base.errors import LONGEST_MESSAGE, DataError, printable, shown
 
 
 @pytest.mark.parametrize(

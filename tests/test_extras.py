@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from framework import extras
-from framework.comparison.plots import MISSING
+from framework.base import extras
+from framework.tools.comparison.plots import MISSING
 
 ROOT = Path(__file__).parents[1]
 

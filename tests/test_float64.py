@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from framework.device import exact
+from framework.base.device import exact
 from framework.kernels import native
 from framework.kernels.adam import sparse_adam_reference
 from tests.training.helpers import TINY, tiny_trainer
@@ -45,7 +45,7 @@ def taken_away(values: Tensor) -> Tensor:
 def alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Torch alone, as on a device that the kernels do not know."""
     monkeypatch.setattr(native, "available", lambda: False)
-    for name in ("framework.error_map", "framework.evaluation.metrics"):
+    for name in ("framework.data.error_map", "framework.evaluation.metrics"):
         monkeypatch.setattr(importlib.import_module(name), "exact", taken_away)
 
 

@@ -5,11 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from framework.cli.export import KINDS as EXPORTS
-from framework.cli.process_data import KINDS as INPUTS
-from framework.cli.render import PATHS
-from framework.cli.train import _flag_names, main
-from framework.from_nerfstudio import (
+from framework.base.from_nerfstudio import (
     CAMERA_SETTINGS,
     FORMATS,
     KINDS,
@@ -19,7 +15,11 @@ from framework.from_nerfstudio import (
     flag_answer,
     format_answer,
 )
-from framework.registry import load_dataparser, load_method, registered
+from framework.base.registry import load_dataparser, load_method, registered
+from framework.cli.export import KINDS as EXPORTS
+from framework.cli.process_data import KINDS as INPUTS
+from framework.cli.render import PATHS
+from framework.cli.train import _flag_names, main
 from tests.conftest import Refused
 
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.cameras import Cameras, subpixels
-from framework.lenses import LENSES, Distortion, bend, panorama, straighten, unproject
+from framework.cameras.cameras import Cameras, subpixels
+from framework.geometry.lenses import LENSES, Distortion, bend, panorama, straighten, unproject
 from tests.kernels.compiled import needs_kernels
 
 GOPRO = [-0.23, 0.04, 1.2e-3, -8e-4, 6e-3, 0.02, -0.01, 1e-3, 5e-4]

@@ -9,16 +9,16 @@ import pytest
 import torch
 
 from dataparsers.blender import Blender
-from framework.dataset import Dataset, load_dataset
-from framework.errors import DataError
+from framework.base.errors import DataError
+from framework.data.dataset import Dataset, load_dataset
+from framework.data.masks import read_mask
+from framework.data.pixel_cache import PixelMemory
+from framework.data.pixel_set import PixelSet
+from framework.data.pixels import composite, draw_batch
 from framework.evaluation.evaluator import evaluate, evaluation_background, render_view
 from framework.evaluation.metrics import psnr, ssim
-from framework.masks import read_mask
-from framework.pixel_cache import PixelMemory
-from framework.pixel_set import PixelSet
-from framework.pixels import composite, draw_batch
-from framework.scene_profile import SceneProfile
-from framework.silhouettes import Silhouettes
+from framework.scene.profile import SceneProfile
+from framework.scene.silhouettes import Silhouettes
 from framework.training.trainer import Trainer
 from tests.images import parsed, write_mask, write_noise
 from tests.training.helpers import tiny_run, tiny_trainer

@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 import torch
 
+from framework.data.pixels import composite
 from framework.evaluation.evaluator import render_image
 from framework.fields.deformed import DeformedField
 from framework.fields.nerf import NeRFField
-from framework.pixels import composite
-from framework.silhouettes import Silhouettes, visual_hull
+from framework.scene.silhouettes import Silhouettes, visual_hull
 from framework.training.trainer import Trainer
 from tests.training.helpers import tiny_run, tiny_trainer
 

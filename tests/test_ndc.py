@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from framework import Cameras
-from framework.errors import DataError
-from framework.ndc import Ndc, NdcCameras, find_ndc, middle_frame, ndc_box
+from framework.base.errors import DataError
+from framework.cameras.ndc import Ndc, NdcCameras, find_ndc, middle_frame, ndc_box
 
 NEARS = torch.full((5,), 2.0, dtype=torch.float64)
 

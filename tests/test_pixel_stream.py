@@ -8,13 +8,13 @@ import torch
 from scipy import stats
 
 from dataparsers.blender import Blender
-from framework.dataset import Dataset, load_dataset
-from framework.device import seed_step
-from framework.error_map import ErrorMap
-from framework.pixel_cache import PixelMemory
-from framework.pixel_set import PixelSet
-from framework.pixel_stream import PixelStream
-from framework.pixels import Batch, draw_batch, draw_pixels
+from framework.base.device import seed_step
+from framework.data.dataset import Dataset, load_dataset
+from framework.data.error_map import ErrorMap
+from framework.data.pixel_cache import PixelMemory
+from framework.data.pixel_set import PixelSet
+from framework.data.pixel_stream import PixelStream
+from framework.data.pixels import Batch, draw_batch, draw_pixels
 from framework.training.checkpoint import load_checkpoint
 from tests.images import write_noise
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer

@@ -8,9 +8,9 @@ import torch
 from scipy import stats
 
 from dataparsers.blender import Blender
-from framework.dataset import Dataset, load_dataset
-from framework.pixel_set import PixelSet
-from framework.pixels import composite, draw_batch, gather_colors, gather_colors_reference
+from framework.data.dataset import Dataset, load_dataset
+from framework.data.pixel_set import PixelSet
+from framework.data.pixels import composite, draw_batch, gather_colors, gather_colors_reference
 from tests.kernels.compiled import needs_kernels
 
 
@@ -50,8 +50,8 @@ def test_pixels_are_drawn_evenly_and_by_the_seed(dataset: Dataset) -> None:
 
 
 def test_images_of_different_sizes_share_one_buffer() -> None:
-    from framework.cameras import Cameras
-    from framework.scene import Scene
+    from framework.cameras.cameras import Cameras
+    from framework.data.scene import Scene
 
     sizes = torch.tensor([[4, 2], [3, 5]])
     pixels = torch.cat([torch.full((8, 3), 10), torch.full((15, 3), 200)]).to(torch.uint8)

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework.errors import DataError
-from framework.ply import read_points
+from framework.base.errors import DataError
+from framework.data.ply import read_points
 
 POINTS = [(1.0, 2.0, 3.0), (-0.5, 0.25, 1e3)]
 EXPECTED = torch.tensor(POINTS, dtype=torch.float64)

@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from framework.cameras import Cameras
+from framework.cameras.cameras import Cameras
+from framework.cameras.refinement import PoseRefinement
+from framework.geometry.rays import Rays
 from framework.kernels.math import cross_matrix
-from framework.pose_refinement import PoseRefinement
-from framework.rays import Rays
 
 
 def some_rays() -> Rays:

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from framework import registry
-from framework.data_folder import find_data
-from framework.elsewhere import ELSEWHERE
-from framework.errors import ConfigError, DataError
+from framework.base import registry
+from framework.base.elsewhere import ELSEWHERE
+from framework.base.errors import ConfigError, DataError
+from framework.data.data_folder import find_data
 
 BUILT_IN = {"dnerf", "instant-ngp", "kplanes", "nerfacto", "tensorf", "vanilla-nerf"}
 

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from dataparsers.blender import Blender
-from framework.dataset import Dataset, load_dataset
+from framework.data.dataset import Dataset, load_dataset
 from framework.kernels.march import Occupancy, candidates
-from framework.silhouettes import Silhouettes, pixels_near, visual_hull
+from framework.scene.silhouettes import Silhouettes, pixels_near, visual_hull
 from tests.conftest import write_tiny
 
 BOX = torch.tensor([[-1.2, -1.2, -1.2], [1.2, 1.2, 1.2]])

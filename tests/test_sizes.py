@@ -10,17 +10,17 @@ from typing import Any
 import pytest
 import torch
 
-from framework.config import MachineConfig, TrainConfig, from_plain
-from framework.encodings import FeaturePlanes, HashGrid
-from framework.errors import ConfigError, NerfloomError
+from framework.base.config import MachineConfig, TrainConfig, from_plain
+from framework.base.errors import ConfigError, NerfloomError
+from framework.base.registry import load_method, registered
+from framework.data.scene import Scene
+from framework.encodings.encodings import FeaturePlanes, HashGrid
 from framework.fields.base import MLP
 from framework.kernels.frequency import frequency_encoding
 from framework.kernels.hash_grid import MAX_RESOLUTION, HashGridLayout
 from framework.kernels.memory import table
 from framework.kernels.planes import PlanesLayout
-from framework.registry import load_method, registered
 from framework.samplers.occupancy import OccupancySampler
-from framework.scene import Scene
 from framework.training.trained import build_model
 from tests.training.helpers import TINY
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from dataparsers.blender import Blender
 from framework import DataError, DataParser, ParsedScene
-from framework.console import say, track
-from framework.dataset import Split
-from framework.user_cache import cache_folder
+from framework.base.console import say, track
+from framework.base.user_cache import cache_folder
+from framework.data.dataset import Split
 
 VERSION = 1
 """Raised whenever the scene's look changes, so that old caches are not read."""

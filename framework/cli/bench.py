@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from framework.child import python_command
+from framework.base.child import python_command
+from framework.base.console import say
+from framework.base.errors import ConfigError, nearest
 from framework.cli.common import chosen_kind, run_command
-from framework.console import say
-from framework.errors import ConfigError, nearest
 
 USAGE = """\
 usage: ns-bench WHAT [flags]
@@ -99,8 +99,8 @@ def _kernels(flags: KernelFlags) -> None:
         if subprocess.run(command, env={**os.environ, "NERFLOOM_KERNELS": name}).returncode:
             raise ConfigError(f"measuring the kernels' variant {name} failed; the lines above say why")
     if not flags.variants:
-        from framework.benchmarks import bars
-        from framework.benchmarks.kernels import measure
+        from framework.tools.benchmarks import bars
+        from framework.tools.benchmarks.kernels import measure
 
         rows, content = measure(flags.samples, flags.repeats)
         name = f"kernels-{native.variant()}"
@@ -111,15 +111,15 @@ def _kernels(flags: KernelFlags) -> None:
 
 
 def _quadrature(flags: QuadratureFlags) -> None:
-    from framework.benchmarks.quadrature import main as quadrature
+    from framework.tools.benchmarks.quadrature import main as quadrature
 
     flags.output_dir.mkdir(parents=True, exist_ok=True)
     quadrature(flags.output_dir / "quadrature.json", flags.plot_dir, flags.quick, flags.seed)
 
 
 def _methods(flags: MethodFlags) -> None:
-    from framework.benchmarks.methods import draw, published, standard_plan
     from framework.cli.compare import compare
+    from framework.tools.benchmarks.methods import draw, published, standard_plan
 
     name = "procedural" if flags.data is None else flags.data.resolve().name
     folder = flags.run_dir or Path("outputs") / f"bench-{name}"

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import TypeVar
 
 import framework
-from framework.console import say
-from framework.errors import ConfigError, NerfloomError, is_out_of_memory, nearest
-from framework.from_nerfstudio import KINDS
+from framework.base.console import say
+from framework.base.errors import ConfigError, NerfloomError, is_out_of_memory, nearest
+from framework.base.from_nerfstudio import KINDS
 from framework.training.signals import exit_status, orderly_end
 
 K = TypeVar("K")

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from framework.base.errors import ConfigError
 from framework.cli.common import run_command
-from framework.errors import ConfigError
 
 if TYPE_CHECKING:
-    from framework.comparison.measures import Row
-    from framework.comparison.plan import Plan
+    from framework.tools.comparison.measures import Row
+    from framework.tools.comparison.plan import Plan
 
 
 @dataclass(frozen=True)
@@ -57,14 +57,14 @@ def main() -> None:
 def _command(arguments: list[str]) -> None:
     import tyro
 
-    from framework.config import from_plain, read_yaml
+    from framework.base.config import from_plain, read_yaml
 
     recipe, arguments = _recipe(arguments)
     default = CompareFlags() if recipe is None else from_plain(CompareFlags(), read_yaml(recipe), str(recipe))
     options = (tyro.conf.FlagConversionOff,)
     flags = tyro.cli(CompareFlags, prog="ns-compare", args=arguments, default=default, config=options)
     plan = plan_of(flags)
-    from framework.console import say
+    from framework.base.console import say
 
     rows = compare(plan, flags.jobs)
     failed = [row.label for row in rows if row.failures]
@@ -88,8 +88,8 @@ def plan_of(flags: CompareFlags) -> Plan:
 
     Raises: ConfigError for what makes no sense.
     """
-    from framework.comparison.plan import Conditions, Contender, Plan, split_words
-    from framework.data_folder import find_data
+    from framework.data.data_folder import find_data
+    from framework.tools.comparison.plan import Conditions, Contender, Plan, split_words
 
     if flags.data is not None and not os.path.isdir(flags.data):
         flags = replace(flags, data=find_data(flags.data)[0])
@@ -111,11 +111,11 @@ def plan_of(flags: CompareFlags) -> Plan:
 
 def compare(plan: Plan, jobs_at_once: int = 1) -> list[Row]:
     """Run what is missing of a comparison and write its report; print its table."""
-    from framework.comparison import plots
-    from framework.comparison.measures import measure, rows_of
-    from framework.comparison.report import console_table, write_report
-    from framework.comparison.runner import run_jobs
-    from framework.console import console, say
+    from framework.base.console import console, say
+    from framework.tools.comparison import plots
+    from framework.tools.comparison.measures import measure, rows_of
+    from framework.tools.comparison.report import console_table, write_report
+    from framework.tools.comparison.runner import run_jobs
 
     if not plots.available():
         say(f"the report will be {plots.MISSING}")

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from framework.base.config import RaysPerPixel
+from framework.base.errors import ConfigError
 from framework.cli.common import run_command, with_run
-from framework.config import RaysPerPixel
-from framework.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ def _command(arguments: list[str]) -> None:
         raise ConfigError(f"--max-images is {flags.max_images}; it must be at least 1")
     from contextlib import nullcontext
 
+    from framework.base.console import say
     from framework.cli.session import load_split
-    from framework.console import say
     from framework.evaluation.error_bound import limited_error, measured_error, parse_error
     from framework.evaluation.evaluator import evaluate
     from framework.training.report import write_evaluation

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from framework.base.errors import ConfigError
 from framework.cli.common import chosen_kind, make_room, run_command, with_run
-from framework.errors import ConfigError
 
 if TYPE_CHECKING:
-    from framework.poses import Placement
+    from framework.cameras.poses import Placement
     from framework.training.trained import Trained
 
 USAGE = """\
@@ -77,7 +77,7 @@ def _command(arguments: list[str]) -> None:
 
 def _placement(trained: Trained) -> Placement:
     """Of the input in the run's scene."""
-    from framework.poses import Placement
+    from framework.cameras.poses import Placement
 
     return Placement(trained.content["transform"].double().cpu(), float(trained.content["scale"]))
 
@@ -85,11 +85,11 @@ def _placement(trained: Trained) -> Placement:
 def _points(flags: PointFlags, trained: Trained, placement: Placement, path: Path) -> None:
     if flags.num_points < 1 or not flags.reach >= 0:
         raise ConfigError("--num-points must be at least 1, and --reach at least 0")
+    from framework.base.console import say, track
+    from framework.base.device import seed_step
     from framework.cli.session import load_split
-    from framework.console import say, track
-    from framework.device import seed_step
+    from framework.data.ply import write_points
     from framework.export.points import joined, surface_points
-    from framework.ply import write_points
 
     model = trained.model
     dataset = load_split(trained.run, "train").to(model.device)
@@ -106,8 +106,8 @@ def _points(flags: PointFlags, trained: Trained, placement: Placement, path: Pat
 
 
 def _cameras(flags: CameraFlags, trained: Trained, placement: Placement, path: Path) -> None:
+    from framework.base.console import say
     from framework.cli.session import load_split
-    from framework.console import say
     from framework.export.cameras import believed, camera_list
     from framework.training.run import write_json
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from string import Template
 
+from framework.base.errors import ConfigError
+from framework.base.registry import registered
 from framework.cli.common import run_command
-from framework.errors import ConfigError
-from framework.registry import registered
 
 TEMPLATES = Path(__file__).parents[1] / "templates" / "method"
 SUFFIX = ".template"

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import get_type_hints
 
+from framework.base.console import say
+from framework.base.errors import ConfigError, DataError
 from framework.cli.common import chosen_kind, run_command
-from framework.console import say
-from framework.errors import ConfigError, DataError
-from framework.processing.settings import ColmapFlags, OutputFlags
+from framework.tools.processing.settings import ColmapFlags, OutputFlags
 from framework.training.signals import Stopped, signal_of
 
 USAGE = """\
@@ -137,7 +137,7 @@ def _spelt_out(arguments: list[str], kind: type[OutputFlags]) -> list[str]:
 
 
 def _process(flags: OutputFlags) -> None:
-    from framework.processing.output import check_apart
+    from framework.tools.processing.output import check_apart
 
     if not flags.data.exists():
         raise DataError(f"--data {flags.data}: there is no such file or folder")
@@ -149,11 +149,11 @@ def _process(flags: OutputFlags) -> None:
 
 
 def _find_poses(flags: ColmapFlags) -> None:
-    from framework.processing import colmap
-    from framework.processing.output import claim
-    from framework.processing.photographs import find_photographs
-    from framework.processing.pipeline import process
-    from framework.processing.video import open_video, write_frames
+    from framework.tools.processing import colmap
+    from framework.tools.processing.output import claim
+    from framework.tools.processing.photographs import find_photographs
+    from framework.tools.processing.pipeline import process
+    from framework.tools.processing.video import open_video, write_frames
 
     colmap.require()
     seconds: dict[str, float] = {}
@@ -174,8 +174,8 @@ def _find_poses(flags: ColmapFlags) -> None:
 
 
 def _convert(flags: OutputFlags) -> None:
-    from framework.processing import polycam, record3d
-    from framework.processing.output import claim
+    from framework.tools.processing import polycam, record3d
+    from framework.tools.processing.output import claim
 
     if isinstance(flags, PolycamFlags):
         polycam.check(flags.data)

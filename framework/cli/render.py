@@ -6,15 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from framework.base.config import RaysPerPixel
+from framework.base.errors import ConfigError
 from framework.cli.common import chosen_kind, make_room, run_command, with_run
-from framework.config import RaysPerPixel
-from framework.errors import ConfigError
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from framework.cameras import Cameras
-    from framework.dataset import ParsedScene
+    from framework.cameras.cameras import Cameras
+    from framework.data.dataset import ParsedScene
     from framework.training.trained import Trained
 
 USAGE = """\
@@ -115,7 +115,7 @@ def _render(flags: Flags) -> None:
 
     import torch
 
-    from framework.console import say, track
+    from framework.base.console import say, track
     from framework.evaluation.error_bound import limited_error, parse_error
     from framework.evaluation.evaluator import evaluation_background, render_image
     from framework.evaluation.images import write_animation, write_image

@@ -6,15 +6,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
-from framework.console import say
-from framework.dataset import Dataset, Split, load_dataset
-from framework.device import choose_device, peak_memory
-from framework.errors import DataError
+from framework.base.console import say
+from framework.base.device import choose_device, peak_memory
+from framework.base.errors import DataError
+from framework.data.dataset import Dataset, Split, load_dataset
+from framework.data.pixel_cache import PixelMemory
 from framework.evaluation.evaluator import evaluate
-from framework.machine import kernels
-from framework.pixel_cache import PixelMemory
 from framework.training.checkpoint import FOLDER, list_checkpoints, load_newest
 from framework.training.lock import sole_user
+from framework.training.machine import kernels
 from framework.training.report import write_evaluation, write_summary
 from framework.training.run import Run, create_folder, write_report, write_transforms
 from framework.training.signals import Stopped, signal_of

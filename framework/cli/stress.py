@@ -8,14 +8,14 @@ from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from framework.base.errors import ConfigError, NerfloomError
+from framework.base.registry import registered
 from framework.cli.common import run_command
-from framework.errors import ConfigError, NerfloomError
-from framework.registry import registered
 
 if TYPE_CHECKING:
-    from framework.stress.conditions import Condition
-    from framework.stress.report import Result
-    from framework.stress.trial import Budget
+    from framework.tools.stress.conditions import Condition
+    from framework.tools.stress.report import Result
+    from framework.tools.stress.trial import Budget
     from framework.training.run import Run
 
 USAGE = """\
@@ -86,12 +86,12 @@ def stress(methods: Sequence[str], flags: StressFlags) -> list[Result]:
 
     Raises: ConfigError or DataError for what cannot be begun.
     """
-    from framework.console import say
-    from framework.device import choose_device
-    from framework.machine import machine
-    from framework.stress.report import Result, markdown, settings_of
-    from framework.stress.scenes import ball_views, data_views
-    from framework.stress.verdict import verdicts
+    from framework.base.console import say
+    from framework.base.device import choose_device
+    from framework.tools.stress.report import Result, markdown, settings_of
+    from framework.tools.stress.scenes import ball_views, data_views
+    from framework.tools.stress.verdict import verdicts
+    from framework.training.machine import machine
 
     runs, conditions = [_run(method, flags) for method in methods], _conditions(flags)
     budget, path = _budget(flags), _path(runs, flags)
@@ -114,7 +114,7 @@ def stress(methods: Sequence[str], flags: StressFlags) -> list[Result]:
 def _run(method: str, flags: StressFlags) -> Run:
     """The method and its settings, as `ns-train` would take them."""
     from framework.cli.train import run_of
-    from framework.comparison.plan import split_words
+    from framework.tools.comparison.plan import split_words
 
     words, of_data = split_words(method, "METHOD"), split_words(flags.data_flags, "--data-flags")
     if not words:
@@ -128,8 +128,8 @@ def _run(method: str, flags: StressFlags) -> Run:
 
 def _conditions(flags: StressFlags) -> list[Condition]:
     """The conditions asked for, less those that cannot be made of somebody's data."""
-    from framework.console import say
-    from framework.stress.conditions import select
+    from framework.base.console import say
+    from framework.tools.stress.conditions import select
 
     asked = select(flags.only)
     if flags.data is None:
@@ -141,7 +141,7 @@ def _conditions(flags: StressFlags) -> list[Condition]:
 
 
 def _budget(flags: StressFlags) -> Budget:
-    from framework.stress.trial import Budget
+    from framework.tools.stress.trial import Budget
 
     if flags.max_num_iterations < 1 or (flags.max_seconds is not None and not flags.max_seconds > 0):
         raise ConfigError("--max-num-iterations must be at least 1, and --max-seconds more than 0")
@@ -183,8 +183,8 @@ def _print(results: Sequence[Result]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from framework.console import console, say
-    from framework.stress.report import notes, table
+    from framework.base.console import console, say
+    from framework.tools.stress.report import notes, table
 
     head, *rows = table(results)
     shown = Table()

@@ -9,10 +9,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from framework.base.errors import ConfigError
+from framework.base.from_nerfstudio import flag_answer, vis_answer
+from framework.base.registry import entry_of, registered, summary
 from framework.cli.common import run_command
-from framework.errors import ConfigError
-from framework.from_nerfstudio import flag_answer, vis_answer
-from framework.registry import entry_of, registered, summary
 
 if TYPE_CHECKING:
     from framework.training.run import Run
@@ -81,7 +81,7 @@ def _default_run(method: str) -> Run:
     if method.startswith("-"):
         raise ConfigError(f"the method comes first, before {method}; ns-train --help lists them")
     entry_of("methods", method)  # a name that is unknown is told before anything heavy is imported
-    from framework.registry import load_dataparser, load_method
+    from framework.base.registry import load_dataparser, load_method
     from framework.training.run import Run
 
     return Run(method, load_method(method).config, "", load_dataparser("procedural")(), Path())
@@ -105,8 +105,8 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
     """
     import tyro
 
-    from framework.data_folder import find_data
-    from framework.registry import load_dataparser
+    from framework.base.registry import load_dataparser
+    from framework.data.data_folder import find_data
     from framework.training.run import run_folder
 
     if (answer := vis_answer(_take(flags, "--vis")[0] or "")) is not None:

@@ -13,11 +13,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from framework.dataset import Dataset
+from framework.data.dataset import Dataset
+from framework.data.pixels import gather_batch
 from framework.fields.appearance import Appearance
-from framework.losses import mean_squared_error
 from framework.model import Model
-from framework.pixels import gather_batch
+from framework.rendering.losses import mean_squared_error
 
 STEPS, PIXELS, RATE = 60, 1024, 0.05
 """Of Adam: steps, pixels in each, learning rate."""

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from framework.dataset import Dataset
-from framework.errors import ConfigError
+from framework.base.errors import ConfigError
+from framework.data.dataset import Dataset
 from framework.evaluation.evaluator import evaluation_background, render_view, spread
 from framework.model import Model
 

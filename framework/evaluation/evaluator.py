@@ -13,11 +13,12 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from framework.cameras import Cameras, subpixels
-from framework.console import track
-from framework.dataset import Dataset
-from framework.device import has_bfloat16, wait_for
-from framework.errors import DataError
+from framework.base.console import track
+from framework.base.device import has_bfloat16, wait_for
+from framework.base.errors import DataError
+from framework.cameras.cameras import Cameras, subpixels
+from framework.data.dataset import Dataset
+from framework.data.pixels import composite
 from framework.evaluation.appearance import appearances, fitted_appearance, right_half
 from framework.evaluation.images import write_image
 from framework.evaluation.metrics import load_lpips, psnr, ssim
@@ -25,7 +26,6 @@ from framework.evaluation.panels import composed, view_panels
 from framework.kernels.math import safe_normalize
 from framework.kernels.native import torch_on_one_thread
 from framework.model import Model
-from framework.pixels import composite
 
 LONGEST_STEM = 150
 """Bytes of a photograph's name that its pictures are called by."""

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from framework.device import exact
-from framework.extras import missing
+from framework.base.device import exact
+from framework.base.extras import missing
 
 MAX_PSNR = 100.0
 """dB. Identical images would have infinity, which JSON cannot hold."""

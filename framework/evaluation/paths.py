@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from framework.cameras import Cameras
+from framework.cameras.cameras import Cameras
 from framework.kernels.math import safe_normalize
 
 STOPS = 24

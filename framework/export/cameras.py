@@ -7,9 +7,9 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from framework.cameras import Cameras
-from framework.pose_refinement import PoseRefinement
-from framework.poses import Placement
+from framework.cameras.cameras import Cameras
+from framework.cameras.poses import Placement
+from framework.cameras.refinement import PoseRefinement
 
 
 def believed(model: nn.Module, cameras: Cameras) -> Cameras:

@@ -9,11 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.dataset import Dataset
+from framework.data.dataset import Dataset
+from framework.data.pixels import draw_pixels
 from framework.evaluation.evaluator import evaluation_background, use_bfloat16
 from framework.kernels.math import safe_normalize
 from framework.model import Model
-from framework.pixels import draw_pixels
 
 OPAQUE = 0.5
 """Rays less opaque than this end in no surface."""

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 from torch import Tensor, nn
 
-from framework.errors import ConfigError, shown
+from framework.base.errors import ConfigError, shown
 from framework.kernels.memory import require
 from framework.kernels.mlp import Activation, mlp
 

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor, nn
 
 from framework.fields.base import MLP, Field
+from framework.geometry.rays import Samples
 from framework.kernels.compositing import ray_sum
 from framework.kernels.frequency import frequency_encoding
 from framework.kernels.math import safe_normalize
-from framework.rays import Samples
 
 FREQUENCIES = 2
 

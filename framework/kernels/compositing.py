@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from framework.geometry.rays import Samples
 from framework.kernels import native
 from framework.kernels.given import check_offsets, is_followed
-from framework.rays import Samples
 
 MAX_OPTICAL_DEPTH = 1e3
 """Of one interval. exp(-1000) is 0 even in float64, so nothing is lost, and sums stay finite."""

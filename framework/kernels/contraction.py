@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.bounds import contract
+from framework.geometry.bounds import contract
 from framework.kernels import native
 from framework.kernels.given import is_followed
 
@@ -21,7 +21,7 @@ def contract_to_unit_reference(positions: Tensor, box: Tensor) -> Tensor:
 def contract_to_unit(positions: Tensor, box: Tensor) -> Tensor:
     """All of space into [0, 1]^3, the ball inside `box` keeping half of its width.
 
-    mip-NeRF 360 (Barron et al. 2022), equation 10, see `framework.bounds.contract`; the ball of radius 2 just fits.
+    mip-NeRF 360 (Barron et al. 2022), equation 10 (`framework.geometry.bounds.contract`); the ball of radius 2 fits.
 
     Args:
         positions: (N, 3) scene coordinates.

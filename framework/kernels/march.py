@@ -16,11 +16,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from framework.bounds import intersect_box
+from framework.geometry.bounds import intersect_box
+from framework.geometry.rays import Rays
 from framework.kernels import native
 from framework.kernels.compositing import optical_depth, segmented_sum
 from framework.kernels.given import check_indices
-from framework.rays import Rays
 
 BLOCK = 4
 """Cells along an edge of a block of the coarser level."""

@@ -11,8 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.device import machine_memory
-from framework.errors import ConfigError
+from framework.base.device import machine_memory
+from framework.base.errors import ConfigError
 
 HUGE_PAGE = 2**21
 _MADV_HUGEPAGE = 14

@@ -24,10 +24,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.console import say
-from framework.device import processor_features
-from framework.errors import ConfigError
-from framework.extras import reinstall
+from framework.base.console import say
+from framework.base.device import processor_features
+from framework.base.errors import ConfigError
+from framework.base.extras import reinstall
 
 FOLDER = Path(os.environ.get("NERFLOOM_KERNEL_FOLDER") or Path(__file__).parent / "lib")
 _AVX512 = ("avx512f", "avx512bw", "avx512dq", "avx512vl", "fma")

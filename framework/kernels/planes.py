@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.errors import ConfigError, shown
+from framework.base.errors import ConfigError, shown
 from framework.kernels import memory, native
 from framework.kernels.adam import all_finite, sparse_adam
 from framework.kernels.deferred import Parts, waiting

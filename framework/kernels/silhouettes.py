@@ -1,6 +1,6 @@
 """Balls in space that a photograph with alpha shows to be empty, and its pixels that may see the others.
 
-Used for the visual hull (Laurentini 1994): see `framework.silhouettes`.
+Used for the visual hull (Laurentini 1994): see `framework.scene.silhouettes`.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from framework.fields.base import DensityFunction, Field
-from framework.rays import Rays, Samples
+from framework.geometry.rays import Rays, Samples
 
 
 class Sampler(Protocol):

@@ -7,12 +7,12 @@ from typing import ClassVar, Literal
 
 from torch import Tensor
 
-from framework.config import Range, TrainConfig
-from framework.errors import ConfigError
+from framework.base.config import Range, TrainConfig
+from framework.base.errors import ConfigError
+from framework.data.scene import Scene
 from framework.samplers.occupancy import MAX_CELLS, OccupancySampler
 from framework.samplers.proposal import ProposalSampler
-from framework.scene import Scene
-from framework.scene_profile import Decision
+from framework.scene.profile import Decision
 
 COARSEST_PROPOSAL = 128
 """Cells along an axis at the finest level of the first proposal; each further one has twice as many."""

@@ -11,13 +11,13 @@ import math
 import torch
 from torch import Tensor, nn
 
-from framework.errors import ConfigError, shown
+from framework.base.errors import ConfigError, shown
 from framework.fields.base import DensityFunction, Field
+from framework.geometry.rays import Rays, Samples
 from framework.kernels import native
 from framework.kernels.given import is_followed
 from framework.kernels.march import March, Occupancy, ReferenceMarch, refresh_occupancy
 from framework.kernels.rows import gather_rows, take_rows
-from framework.rays import Rays, Samples
 
 MAX_CELLS = 512
 """Along an axis of the grid: of 512^3 cells what is known takes 0.8 GB."""
@@ -153,7 +153,7 @@ class OccupancySampler(nn.Module):
     # -- keeping the grid up ----------------------------------------------------------------------------------
 
     def carve(self, hull: Tensor) -> None:
-        """Cells outside `hull` (n^3,) are known to be empty (`framework.silhouettes`), and stay so for good."""
+        """Cells outside `hull` (n^3,) are known to be empty (`framework.scene.silhouettes`), and stay so for good."""
         self.carved.copy_(~hull)
         self.density_grid.masked_fill_(self.carved, 0)
         self.occupied.logical_and_(hull)

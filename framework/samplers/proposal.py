@@ -14,12 +14,12 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from framework.bounds import intersect_box
-from framework.encodings import HashGrid
+from framework.encodings.encodings import HashGrid
 from framework.fields.base import DensityFunction, Field
 from framework.fields.encoded import DensityField
+from framework.geometry.bounds import intersect_box
+from framework.geometry.rays import Histogram, Rays, Samples
 from framework.kernels.intervals import interval_weights, proposal_excess, resample
-from framework.rays import Histogram, Rays, Samples
 
 ANNEALING_SLOPE = 10.0
 """b of the annealing of weights: u^(b x / ((b - 1) x + 1)) with x the share of `anneal_steps` done."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from framework.fields.base import DensityFunction, Field
-from framework.rays import Rays, Samples
+from framework.geometry.rays import Rays, Samples
 
 LAST_INTERVAL = 1e10
 """The authors' code lets the last sample stand for everything behind it."""

@@ -20,9 +20,9 @@ from typing import Any, BinaryIO
 import torch
 from torch.torch_version import TorchVersion
 
-from framework.archives import unfolded_size
-from framework.console import say
-from framework.errors import CheckpointError
+from framework.base.archives import unfolded_size
+from framework.base.console import say
+from framework.base.errors import CheckpointError
 
 FOLDER = "nerfstudio_models"
 UNSEALED, SEALED = 1, 2

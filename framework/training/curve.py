@@ -15,7 +15,7 @@ from dataclasses import asdict, astuple, dataclass
 from statistics import fmean
 from typing import Any, TypeAlias
 
-from framework.dataset import Dataset
+from framework.data.dataset import Dataset
 from framework.evaluation.evaluator import Measured, evaluation_background, measure_view, spread, views_to_judge
 from framework.model import Model
 from framework.training.progress import StepReport

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from framework.errors import ConfigError
+from framework.base.errors import ConfigError
 
 LOCK = ".lock"
 """The file that is locked; it says by whom, and means nothing when it is there unlocked."""

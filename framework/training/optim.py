@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
-from framework.config import TrainConfig
+from framework.base.config import TrainConfig
 from framework.kernels import native
 from framework.kernels.adam import all_finite, dense_adam, sparse_adam
 from framework.kernels.hash_grid import TableGradient

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from framework.config import TrainConfig
-from framework.console import say
-from framework.dataset import Dataset
+from framework.base.config import TrainConfig
+from framework.base.console import say
+from framework.cameras.ndc import NdcCameras
+from framework.data.dataset import Dataset
+from framework.data.pixel_set import PixelSet
+from framework.data.pixels import Background
 from framework.model import Model
-from framework.ndc import NdcCameras
-from framework.pixel_set import PixelSet
-from framework.pixels import Background
-from framework.scene_profile import Decision, SceneProfile
-from framework.silhouettes import Silhouettes, pixels_near, visual_hull
+from framework.scene.profile import Decision, SceneProfile
+from framework.scene.silhouettes import Silhouettes, pixels_near, visual_hull
 
 
 def profile_of(

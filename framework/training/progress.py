@@ -11,7 +11,7 @@ from typing import Any
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
-from framework.console import console, say
+from framework.base.console import console, say
 
 SECONDS_BETWEEN_LINES = 15.0
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import torch
 
-from framework.device import peak_memory
-from framework.errors import ConfigError
+from framework.base.device import peak_memory
+from framework.base.errors import ConfigError
 from framework.evaluation.evaluator import Evaluation
-from framework.machine import kernels, machine
+from framework.training.machine import kernels, machine
 from framework.training.run import Run, write_json, write_report
 from framework.training.trainer import Outcome, Trainer
 

@@ -25,12 +25,12 @@ from typing import Any
 
 import yaml
 
-from framework.config import TrainConfig, from_plain, read_yaml, to_plain
-from framework.console import say
-from framework.data_folder import find_data
-from framework.dataset import DataParser, Dataset, ParsedScene, Split
-from framework.errors import ConfigError, DataError
-from framework.registry import load_dataparser, load_method
+from framework.base.config import TrainConfig, from_plain, read_yaml, to_plain
+from framework.base.console import say
+from framework.base.errors import ConfigError, DataError
+from framework.base.registry import load_dataparser, load_method
+from framework.data.data_folder import find_data
+from framework.data.dataset import DataParser, Dataset, ParsedScene, Split
 from framework.training.checkpoint import write_atomically
 
 CONFIG = "config.yml"

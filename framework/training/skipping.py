@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from framework.device import wait_for
+from framework.base.device import wait_for
+from framework.data.pixels import draw_batch
+from framework.geometry.rays import Rays
 from framework.model import Model
-from framework.pixels import draw_batch
-from framework.rays import Rays
 from framework.samplers.occupancy import OccupancySampler
 
 if TYPE_CHECKING:

@@ -10,13 +10,13 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from framework.config import RaysPerPixel, TrainConfig
-from framework.data_folder import find_data
-from framework.device import choose_device
-from framework.errors import CheckpointError, ConfigError, NerfloomError, is_out_of_memory
+from framework.base.config import RaysPerPixel, TrainConfig
+from framework.base.device import choose_device
+from framework.base.errors import CheckpointError, ConfigError, NerfloomError, is_out_of_memory
+from framework.base.registry import load_method
+from framework.data.data_folder import find_data
+from framework.data.scene import Scene
 from framework.model import Model
-from framework.registry import load_method
-from framework.scene import Scene
 from framework.training.checkpoint import FOLDER, find_newest, load_checkpoint
 from framework.training.run import Run, read_run
 

@@ -14,21 +14,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.cameras import CENTER, subpixels
-from framework.checked import checked
-from framework.config import to_plain
-from framework.console import say
-from framework.dataset import Dataset
-from framework.device import seed_step, wait_for
-from framework.error_map import ErrorMap
-from framework.errors import CheckpointError, DivergenceError
+from framework.base.checked import checked
+from framework.base.config import to_plain
+from framework.base.console import say
+from framework.base.device import seed_step, wait_for
+from framework.base.errors import CheckpointError, DivergenceError
+from framework.cameras.cameras import CENTER, subpixels
+from framework.data.dataset import Dataset
+from framework.data.error_map import ErrorMap
+from framework.data.pixel_stream import PixelStream
+from framework.data.pixels import Background, Batch, LookUp, composite, draw_batch, training_background
 from framework.evaluation.evaluator import evaluate, evaluation_background, render_view, use_bfloat16
 from framework.evaluation.metrics import MAX_PSNR
 from framework.evaluation.panels import composed, view_panels
 from framework.kernels.native import torch_on_one_thread
-from framework.pixel_stream import PixelStream
-from framework.pixels import Background, Batch, LookUp, composite, draw_batch, training_background
-from framework.scene_profile import SceneProfile
+from framework.scene.profile import SceneProfile
 from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest, save_checkpoint
 from framework.training.curve import Entry, FewImages, Point, in_order, rows
 from framework.training.optim import first_non_finite, make_optimizer, set_learning_rate

@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.benchmarks.closed_forms import (
+from framework.geometry.rays import Rays
+from framework.tools.benchmarks.closed_forms import (
     BOX,
     Ball,
     Blobs,
@@ -20,7 +21,6 @@ from framework.benchmarks.closed_forms import (
     mean_place,
     scenes,
 )
-from framework.rays import Rays
 
 F64 = torch.float64
 BACKGROUND = torch.tensor([1.0, 0.3, 0.0], dtype=F64)

@@ -9,11 +9,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.benchmarks import curves, quadrature, sampling
-from framework.benchmarks.closed_forms import Block, ClosedForm, Medium, Solids, scenes
-from framework.benchmarks.curves import Curve, evaluations_needed
-from framework.benchmarks.quadrature import Row, Sizes, measured, skipping
-from framework.benchmarks.sampling import (
+from framework.fields.base import Field
+from framework.geometry.rays import Rays
+from framework.samplers.proposal import ProposalSampler
+from framework.samplers.uniform import UniformSampler
+from framework.tools.benchmarks import curves, quadrature, sampling
+from framework.tools.benchmarks.closed_forms import Block, ClosedForm, Medium, Solids, scenes
+from framework.tools.benchmarks.curves import Curve, evaluations_needed
+from framework.tools.benchmarks.quadrature import Row, Sizes, measured, skipping
+from framework.tools.benchmarks.sampling import (
     WHITE,
     filled_grid,
     fitted_proposals,
@@ -23,10 +27,6 @@ from framework.benchmarks.sampling import (
     renderers,
     sampled,
 )
-from framework.fields.base import Field
-from framework.rays import Rays
-from framework.samplers.proposal import ProposalSampler
-from framework.samplers.uniform import UniformSampler
 
 TINY = Sizes(counts=(8, 16), rays=64, skipping_rays=100, fit_steps=4, grid_resolution=16)
 
@@ -168,7 +168,7 @@ def test_all_of_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pyte
     some = {name: scene for name, scene in scenes().items() if name in ("blobs", "sparse")}
     monkeypatch.setattr(quadrature, "scenes", lambda: some)
     monkeypatch.setattr(quadrature, "QUICK", TINY)
-    monkeypatch.setattr("framework.comparison.plots.available", lambda: False)
+    monkeypatch.setattr("framework.tools.comparison.plots.available", lambda: False)
     content = quadrature.main(tmp_path / "out" / "quadrature.json", tmp_path / "plots", quick=True)
     assert json.loads((tmp_path / "out" / "quadrature.json").read_text()) == json.loads(json.dumps(content))
     assert len(content["rows"]) == 2 * 2 * 7

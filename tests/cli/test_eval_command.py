@@ -71,7 +71,7 @@ def test_rays_per_pixel_are_as_the_run_says_or_as_asked(finished: Path, monkeypa
 
 
 def test_lpips_that_is_absent_is_null_with_a_reason(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("framework.extras.find_spec", lambda name: None)
+    monkeypatch.setattr("framework.base.extras.find_spec", lambda name: None)
     found = evaluate(monkeypatch, finished, "--max-images", 1)
     assert (found["results"]["lpips"], found["results"]["lpips_std"]) == (None, None)
     assert found["lpips"] == "absent: pip install lpips torchvision"

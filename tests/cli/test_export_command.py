@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from framework.cameras.poses import Placement
+from framework.cameras.refinement import PoseRefinement
 from framework.cli.export import main
+from framework.data.ply import read_points, write_points
 from framework.export.cameras import believed, camera_list
-from framework.ply import read_points, write_points
-from framework.pose_refinement import PoseRefinement
-from framework.poses import Placement
 from tests.conftest import Refused
 from tests.training.helpers import tiny_trainer
 
@@ -62,7 +62,7 @@ def test_placement_is_undone_and_refinement_kept() -> None:
     poses = torch.cat([rotations, torch.randn(3, 3, 1).double()], -1)
     torch.testing.assert_close(placement.original_poses(placement.poses(poses)), poses)
 
-    from framework.cameras import Cameras
+    from framework.cameras.cameras import Cameras
 
     numbers = torch.ones(3)
     cameras = Cameras(placement.poses(poses).float(), *[numbers] * 4, *[numbers.long()] * 2)  # type: ignore[arg-type]

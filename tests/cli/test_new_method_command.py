@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from framework.base.errors import ConfigError
 from framework.cli.new_method import TEMPLATES, check_name, main, package_of
-from framework.errors import ConfigError
-from framework.testing import assert_method
+from framework.tools.testing import assert_method
 from tests.conftest import Refused
 
 ROOT = Path(__file__).parents[2]

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import yaml
 
+from framework.base.registry import load_method
 from framework.cli.train import _default_run, _parse_flags, main
-from framework.registry import load_method
 from framework.training.run import Run, create_folder
 from tests.cli.helpers import TINY_NGP, called, run
 from tests.conftest import Refused

@@ -6,7 +6,7 @@ from statistics import stdev
 
 import pytest
 
-from framework.comparison.measures import measure, pareto, rows_of, whole_levels
+from framework.tools.comparison.measures import measure, pareto, rows_of, whole_levels
 from tests.comparison.runs import CONDITIONS, finish, plan
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from framework.comparison.plan import Conditions, Contender, Job, Plan, split_words
-from framework.errors import ConfigError
+from framework.base.errors import ConfigError
+from framework.tools.comparison.plan import Conditions, Contender, Job, Plan, split_words
 
 CONDITIONS = Conditions("/data/lego", ("--downscale-factor", "2"), 120.0, None, None, 2, "cpu", 4, None)
 

@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from dataparsers.blender import Blender
-from framework.dataset import Split, load_dataset, read_image, reduce_image
-from framework.errors import DataError
+from framework.base.errors import DataError
+from framework.data.dataset import Split, load_dataset, read_image, reduce_image
 from tests.conftest import EditJson
 
 

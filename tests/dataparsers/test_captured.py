@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from dataparsers.nerfstudio import Nerfstudio
-from framework.dataset import DataParser, load_dataset
-from framework.errors import DataError
+from framework.base.errors import DataError
+from framework.data.dataset import DataParser, load_dataset
 from tests.conftest import write_tiny
 from tests.dataparsers.captures import FX, poses, worst_miss, write_capture, write_images
 from tests.dataparsers.test_polycam import write_polycam

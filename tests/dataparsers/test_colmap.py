@@ -11,10 +11,10 @@ import torch
 from dataparsers.colmap import Colmap
 from dataparsers.colmap_model import read_model
 from dataparsers.llff import Llff
-from framework.cameras import Cameras
-from framework.dataset import load_dataset
-from framework.errors import DataError
-from framework.poses import NEAR, nearest_shown
+from framework.base.errors import DataError
+from framework.cameras.cameras import Cameras
+from framework.cameras.poses import NEAR, nearest_shown
+from framework.data.dataset import load_dataset
 from tests.dataparsers.sparse_models import Capture, make_capture, misses, write_colmap, write_images
 
 pycolmap = pytest.importorskip("pycolmap")

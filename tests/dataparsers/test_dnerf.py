@@ -7,9 +7,9 @@ import torch
 
 from dataparsers.blender import Blender
 from dataparsers.dnerf import DNeRF
-from framework.data_folder import find_data
-from framework.dataset import Split, load_dataset
-from framework.errors import DataError
+from framework.base.errors import DataError
+from framework.data.data_folder import find_data
+from framework.data.dataset import Split, load_dataset
 from tests.conftest import EditJson
 
 

@@ -10,9 +10,9 @@ import torch
 
 from dataparsers.colmap import Colmap
 from dataparsers.llff import Llff
-from framework.dataset import load_dataset
-from framework.errors import DataError
-from framework.poses import NEAR
+from framework.base.errors import DataError
+from framework.cameras.poses import NEAR
+from framework.data.dataset import load_dataset
 from tests.dataparsers.sparse_models import Capture, make_capture, misses, write_images
 
 FOCAL = 55.0

@@ -13,8 +13,8 @@ import pytest
 import torch
 
 from dataparsers.nerfstudio import Nerfstudio
-from framework.dataset import Split, load_dataset
-from framework.errors import DataError
+from framework.base.errors import DataError
+from framework.data.dataset import Split, load_dataset
 from tests.dataparsers.captures import (
     CX,
     CY,
@@ -162,7 +162,7 @@ def seen_through(model: str, right: float, down: float, ahead: float) -> tuple[f
 
 @pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE", "EQUIRECTANGULAR", "ORTHOPHOTO"])
 def test_rays_through_lenses_meet_the_points_that_are_seen(capture: Path, model: str) -> None:
-    pytest.importorskip("framework.lenses")
+    pytest.importorskip("framework.geometry.lenses")
     edit(capture, lambda c: c.update(camera_model=model, **CURVED))
     scene = ALL.parse(capture, "train")
     placed, worst = to_scene(scene, POINTS), 0.0

@@ -7,8 +7,8 @@ import pytest
 from dataparsers.colmap import Colmap
 from dataparsers.llff import Llff
 from dataparsers.phototourism import Phototourism
-from framework.dataset import load_dataset
-from framework.errors import DataError
+from framework.base.errors import DataError
+from framework.data.dataset import load_dataset
 from tests.dataparsers.sparse_models import Capture, make_capture, misses, write_colmap, write_images
 
 pytest.importorskip("pycolmap")

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from dataparsers.record3d import Record3D, rotations
-from framework.dataset import load_dataset
-from framework.errors import DataError
+from framework.base.errors import DataError
+from framework.data.dataset import load_dataset
 from tests.dataparsers.captures import CX, CY, FX, FY, HEIGHT, WIDTH, poses, worst_miss, write_images
 
 COUNT = 12

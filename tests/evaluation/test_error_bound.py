@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from framework.errors import ConfigError
+from framework.base.errors import ConfigError
 from framework.evaluation.error_bound import limited_error, measured_error, parse_error
 from tests.training.helpers import tiny_trainer
 

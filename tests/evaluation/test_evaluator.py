@@ -8,14 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.cameras import Cameras, subpixels
-from framework.config import TrainConfig
+from framework.base.config import TrainConfig
+from framework.cameras.cameras import Cameras, subpixels
+from framework.data.pixels import Batch, draw_batch
+from framework.data.scene import Scene
 from framework.evaluation.evaluator import evaluation_background, render_image
+from framework.geometry.rays import Rays
 from framework.model import Model
-from framework.pixels import Batch, draw_batch
-from framework.rays import Rays
-from framework.renderers import Rendered
-from framework.scene import Scene
+from framework.rendering.volume import Rendered
 from tests.training.helpers import tiny_trainer
 
 SIZE = 12

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from framework.cameras import Cameras, check_pose
+from framework.cameras.cameras import Cameras, check_pose
 from framework.evaluation.paths import interpolate, look_at, orbit, replace_poses
 
 UP = torch.tensor([0.0, 0.0, 1.0])

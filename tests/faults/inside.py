@@ -10,7 +10,7 @@ from itertools import count, cycle
 import numpy as np
 
 from framework.cli.train import main
-from framework.mapped_pixels import MappedPixels
+from framework.data.mapped_pixels import MappedPixels
 
 INJECTED = "injected"
 DAY = 86_400.0

@@ -7,7 +7,7 @@ import sys
 import time
 from pathlib import Path
 
-from framework.errors import CheckpointError
+from framework.base.errors import CheckpointError
 from framework.training.checkpoint import FOLDER, list_checkpoints, load_checkpoint
 from tests.cli.helpers import TINY_NGP
 

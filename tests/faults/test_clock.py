@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from framework.base.errors import ConfigError
 from framework.cli.session import start
-from framework.errors import ConfigError
 from framework.training.checkpoint import list_checkpoints, load_newest
 from framework.training.run import run_folder
 from tests.training.helpers import tiny_run, tiny_trainer

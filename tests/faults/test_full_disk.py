@@ -14,10 +14,10 @@ import imageio.v3 as iio
 import pytest
 import torch
 
+from framework.base.errors import CheckpointError, ConfigError
 from framework.cli import evaluate as eval_command
 from framework.cli.session import resume
 from framework.cli.session import start as start_session
-from framework.errors import CheckpointError, ConfigError
 from framework.evaluation.evaluator import evaluate
 from framework.evaluation.images import write_image
 from framework.training.checkpoint import FOLDER, write_atomically

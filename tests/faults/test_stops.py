@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from framework.base.config import MachineConfig
 from framework.cli.session import resume, start
-from framework.config import MachineConfig
 from framework.training.checkpoint import FOLDER
 from framework.training.lock import LOCK
 from framework.training.progress import StepReport

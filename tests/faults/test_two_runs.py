@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from framework.base.errors import ConfigError
 from framework.cli.session import start as start_session
 from framework.cli.train import main
-from framework.errors import ConfigError
 from framework.training.lock import LOCK, sole_user
 from tests.conftest import Refused
 from tests.faults.runs import ROOT, ended, new_run, start, wait_for_checkpoint

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from framework.errors import DataError
-from framework.processing.worker import Report, run_apart
+from framework.base.errors import DataError
+from framework.tools.processing.worker import Report, run_apart
 from tests.faults.runs import ROOT
 
 
@@ -44,7 +44,7 @@ PARENT = """
 import sys
 from pathlib import Path
 from framework.cli.common import run_command
-from framework.processing.worker import run_apart
+from framework.tools.processing.worker import run_apart
 from tests.faults.test_worker import endless
 
 if __name__ == "__main__":

@@ -3,11 +3,11 @@
 import torch
 from torch import Tensor
 
-from framework.encodings import HashGrid
+from framework.encodings.encodings import HashGrid
 from framework.fields.base import Field
 from framework.fields.encoded import EncodedField
 from framework.fields.normals import NormalHead, density_normals, normal_penalties
-from framework.rays import Samples
+from framework.geometry.rays import Samples
 
 
 class Ball(Field):

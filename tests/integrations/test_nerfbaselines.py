@@ -18,10 +18,11 @@ import pytest
 import torch
 
 from dataparsers.blender import Blender
-from framework.config import from_plain
-from framework.dataset import load_dataset
-from framework.errors import CheckpointError, ConfigError, DataError
-from framework.integrations.nerfbaselines import (
+from framework.base.config import from_plain
+from framework.base.errors import CheckpointError, ConfigError, DataError
+from framework.base.registry import load_method, registered
+from framework.data.dataset import load_dataset
+from framework.tools.integrations.nerfbaselines import (
     InstantNGP,
     KPlanes,
     Nerfacto,
@@ -29,10 +30,9 @@ from framework.integrations.nerfbaselines import (
     TensoRF,
     VanillaNeRF,
 )
-from framework.integrations.nerfbaselines_data import Frame, FrameFlags, Photographs, cameras_of, dataset_of
-from framework.integrations.nerfbaselines_settings import flattened, parse_overrides
-from framework.integrations.nerfbaselines_spec import SPECS
-from framework.registry import load_method, registered
+from framework.tools.integrations.nerfbaselines_data import Frame, FrameFlags, Photographs, cameras_of, dataset_of
+from framework.tools.integrations.nerfbaselines_settings import flattened, parse_overrides
+from framework.tools.integrations.nerfbaselines_spec import SPECS
 from tests.conftest import ball_view
 from tests.training.helpers import TINY
 
@@ -187,7 +187,10 @@ def test_presets_are_settings_that_the_method_has(spec: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize(
     ("module", "forbidden"),
-    [("framework.integrations.nerfbaselines_spec", "torch"), ("framework.integrations.nerfbaselines", "methods")],
+    [
+        ("framework.tools.integrations.nerfbaselines_spec", "torch"),
+        ("framework.tools.integrations.nerfbaselines", "methods"),
+    ],
 )
 def test_without_nerfbaselines_both_are_imported_and_the_spec_without_torch(module: str, forbidden: str) -> None:
     code = f"import sys; sys.modules['nerfbaselines'] = None; import {module}; assert '{forbidden}' not in sys.modules"
@@ -197,7 +200,8 @@ def test_without_nerfbaselines_both_are_imported_and_the_spec_without_torch(modu
 def test_the_spec_is_an_entry_point() -> None:
     tomllib = pytest.importorskip("tomllib", reason="Python 3.10 has no tomllib")
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert project["entry-points"]["nerfbaselines.specs"] == {"nerfloom": "framework.integrations.nerfbaselines_spec"}
+    specs = project["entry-points"]["nerfbaselines.specs"]
+    assert specs == {"nerfloom": "framework.tools.integrations.nerfbaselines_spec"}
 
 
 @pytest.mark.parametrize("document", ["README.md", "docs/plugins.md"])

@@ -13,6 +13,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from framework.geometry.rays import Rays, Samples
 from framework.kernels.adam import dense_adam, dense_adam_reference, sparse_adam, sparse_adam_reference
 from framework.kernels.compositing import composite, composite_reference, distortion
 from framework.kernels.contraction import contract_to_unit, contract_to_unit_reference
@@ -27,7 +28,6 @@ from framework.kernels.intervals import (
 from framework.kernels.march import March, Occupancy, ReferenceMarch, refresh_occupancy
 from framework.kernels.mlp import mlp, mlp_reference
 from framework.kernels.planes import PlanesLayout, planes, planes_reference
-from framework.rays import Rays, Samples
 from tests.kernels.compiled import relative_error
 
 COUNT = 20_000

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from framework.geometry.rays import Samples
 from framework.kernels.compositing import (
     MAX_OPTICAL_DEPTH,
     Composited,
@@ -11,7 +12,6 @@ from framework.kernels.compositing import (
     distortion,
     distortion_reference,
 )
-from framework.rays import Samples
 from tests.kernels.compiled import needs_kernels, relative_error
 from tests.kernels.test_compositing import ragged
 

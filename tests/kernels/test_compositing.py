@@ -6,9 +6,9 @@ import pytest
 import torch
 from scipy.special import erf
 
+from framework.geometry.rays import Rays, Samples
 from framework.kernels.compositing import exclusive_sum, optical_depth, ray_sum, weights_and_transmittance
-from framework.rays import Rays, Samples
-from framework.renderers import volume_render
+from framework.rendering.volume import volume_render
 
 F64 = torch.float64
 

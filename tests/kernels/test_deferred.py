@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.encodings import FeaturePlanes, HashGrid
+from framework.encodings.encodings import FeaturePlanes, HashGrid
 from framework.kernels.hash_grid import TableGradient
 from framework.kernels.planes import PlanesGradient
 from framework.training.optim import Adam

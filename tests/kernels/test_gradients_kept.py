@@ -10,8 +10,10 @@ import torch
 from torch import Tensor
 
 import framework
-from framework.cameras import Cameras, subpixels
+from framework.cameras.cameras import Cameras, subpixels
+from framework.data.pixels import gather_colors, gather_colors_reference
 from framework.fields.base import Field
+from framework.geometry.rays import Rays, Samples
 from framework.kernels.compositing import composite, composite_reference, distortion, distortion_reference
 from framework.kernels.contraction import contract_to_unit, contract_to_unit_reference
 from framework.kernels.frequency import frequency_encoding, frequency_encoding_reference
@@ -25,8 +27,6 @@ from framework.kernels.intervals import (
 from framework.kernels.mlp import mlp, mlp_reference
 from framework.kernels.planes import PlanesLayout, planes, planes_reference
 from framework.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
-from framework.pixels import gather_colors, gather_colors_reference
-from framework.rays import Rays, Samples
 from framework.samplers.occupancy import OccupancySampler
 from tests.kernels.compiled import needs_kernels, relative_error
 

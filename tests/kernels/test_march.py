@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from framework.geometry.rays import Rays
 from framework.kernels import native
 from framework.kernels.march import (
     March,
@@ -15,7 +16,6 @@ from framework.kernels.march import (
     sort_by_ray,
     step_start,
 )
-from framework.rays import Rays
 from tests.kernels.compiled import needs_kernels
 
 BOX = torch.tensor([[-1.0, -1.5, -1.0], [1.0, 1.0, 2.0]])

@@ -87,7 +87,7 @@ def test_a_forked_process_has_threads_of_its_own() -> None:
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
 def test_an_error_in_one_chunk_is_raised_and_the_next_call_works(threads: int) -> None:
-    from framework.pixels import gather_colors
+    from framework.data.pixels import gather_colors
 
     pixels, behind = torch.randint(256, (100, 4)).to(torch.uint8), torch.rand(50_000, 3)
     good, before = torch.randint(100, (50_000,)), torch.get_num_threads()

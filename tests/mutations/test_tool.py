@@ -104,7 +104,7 @@ def test_short_tests_come_first_and_those_of_a_shared_fixture_together(tree: Pat
 @pytest.mark.slow
 def test_a_bug_is_noticed_and_what_is_none_is_not(tmp_path: Path) -> None:
     """In a copy, which alone is imported there; the tree itself is not touched."""
-    file = "framework/bounds.py"
+    file = "framework/geometry/bounds.py"
     before = (ROOT / file).read_text()
     old = "(positions - box[0]) / (box[1] - box[0])"
     wrong, right = (Bug(name, "kind", file, old, new, "") for name, new in (("w", "positions"), ("r", old + " + 0.0")))

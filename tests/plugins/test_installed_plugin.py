@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from framework.registry import VARIABLES
+from framework.base.registry import VARIABLES
 
 pytestmark = pytest.mark.slow
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from framework.errors import DataError
-from framework.processing import polycam, record3d
+from framework.base.errors import DataError
+from framework.tools.processing import polycam, record3d
 from tests.dataparsers.test_polycam import STAMPS, write_polycam
 from tests.dataparsers.test_record3d import write_record3d
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from framework.errors import DataError
-from framework.processing.photographs import find_photographs, output_names, prepare, prepare_all
+from framework.base.errors import DataError
+from framework.tools.processing.photographs import find_photographs, output_names, prepare, prepare_all
 
 
 def write(path: Path, size: tuple[int, int] = (6, 4), mode: str = "RGB", orientation: int | None = None) -> np.ndarray:

@@ -8,9 +8,9 @@ import pytest
 import torch
 from PIL import Image
 
-from framework.alignment import pose_errors
 from framework.cli.process_data import main
-from framework.processing.record3d import convert
+from framework.geometry.alignment import pose_errors
+from framework.tools.processing.record3d import convert
 from tests.conftest import Refused
 from tests.processing.scene import write_corner
 

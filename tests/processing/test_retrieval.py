@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from framework.processing.pair_matching import match
-from framework.processing.retrieval import all_pairs, looks_of, sequential_pairs, similar_pairs
+from framework.tools.processing.pair_matching import match
+from framework.tools.processing.retrieval import all_pairs, looks_of, sequential_pairs, similar_pairs
 
 
 def test_all_and_neighbouring_pairs() -> None:

@@ -8,9 +8,9 @@ import torch
 from PIL import Image
 
 from dataparsers.nerfstudio import Nerfstudio
-from framework.errors import DataError
-from framework.processing import transforms
-from framework.processing.output import check_apart, claim
+from framework.base.errors import DataError
+from framework.tools.processing import transforms
+from framework.tools.processing.output import check_apart, claim
 
 
 def world_to_camera(index: int) -> np.ndarray:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from framework.processing.video import sharpest, sharpness
+from framework.tools.processing.video import sharpest, sharpness
 
 
 def frame(blur: int, seed: int = 0) -> np.ndarray:

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from framework.bounds import intersect_box
 from framework.fields.base import Field
-from framework.rays import Rays, Samples
-from framework.renderers import volume_render
+from framework.geometry.bounds import intersect_box
+from framework.geometry.rays import Rays, Samples
+from framework.rendering.volume import volume_render
 from framework.samplers.occupancy import WARM_UP_STEPS, OccupancySampler
 
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])

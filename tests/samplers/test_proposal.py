@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from framework.fields.base import Field
-from framework.rays import Rays
-from framework.renderers import render_field
+from framework.geometry.rays import Rays
+from framework.rendering.volume import render_field
 from framework.samplers.proposal import ProposalSampler, from_disparity, interlevel_loss, to_disparity
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from framework.fields.base import Field
-from framework.rays import Rays
+from framework.geometry.rays import Rays
 from framework.samplers.uniform import LAST_INTERVAL, UniformSampler, samples_from_points, stratified_points
 
 

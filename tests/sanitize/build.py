@@ -12,7 +12,7 @@ from unittest import mock
 
 from setuptools import Extension
 
-from framework.device import processor_features
+from framework.base.device import processor_features
 from framework.kernels.native import NEEDS, SUFFIX
 
 ROOT = Path(__file__).parents[2]

@@ -9,9 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from framework.bounds import contract
-from framework.encodings import HashGrid
+from framework.encodings.encodings import HashGrid
 from framework.fields.encoded import EncodedField
+from framework.geometry.bounds import contract
+from framework.geometry.rays import Samples
 from framework.kernels.compositing import composite
 from framework.kernels.contraction import contract_to_unit
 from framework.kernels.frequency import frequency_encoding, frequency_encoding_reference
@@ -21,7 +22,6 @@ from framework.kernels.math import cross_matrix, safe_normalize, truncated_exp
 from framework.kernels.mlp import mlp
 from framework.kernels.planes import PlanesLayout, planes, planes_reference
 from framework.kernels.spherical_harmonics import spherical_harmonics
-from framework.rays import Samples
 from framework.samplers.inverse_cdf import inverse_cdf
 from framework.samplers.proposal import from_disparity, to_disparity
 from tests.kernels.compiled import relative_error

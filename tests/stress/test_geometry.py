@@ -12,16 +12,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from framework.appearance import QUANTILES, light_of
-from framework.bounds import intersect_box
-from framework.encodings import HashGrid
+from framework.data.light import QUANTILES, light_of
+from framework.encodings.encodings import HashGrid
 from framework.evaluation.images import to_uint8
 from framework.fields.encoded import EncodedField
 from framework.fields.normals import NormalHead, density_normals
+from framework.geometry.bounds import intersect_box
+from framework.geometry.rays import Rays
 from framework.kernels.contraction import contract_to_unit
 from framework.kernels.march import March, Occupancy
 from framework.kernels.math import safe_normalize
-from framework.rays import Rays
 from framework.samplers.proposal import from_disparity, to_disparity
 from tests.stress.backends import COMPILED, FEW, backends
 

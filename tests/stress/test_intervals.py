@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from framework.geometry.rays import Rays, Samples
 from framework.kernels.compositing import (
     MAX_OPTICAL_DEPTH,
     Composited,
@@ -16,8 +17,7 @@ from framework.kernels.compositing import (
     weights_and_transmittance,
 )
 from framework.kernels.intervals import interval_weights
-from framework.rays import Rays, Samples
-from framework.renderers import Rendered, volume_render
+from framework.rendering.volume import Rendered, volume_render
 from tests.kernels.test_compositing import EXTREMES, ragged
 from tests.stress.backends import FEW, backends
 

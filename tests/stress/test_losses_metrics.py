@@ -13,15 +13,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from framework.depths import read_depths
-from framework.encodings import FeaturePlanes
+from framework.data.depths import read_depths
+from framework.data.scene import Scene
+from framework.encodings.encodings import FeaturePlanes
 from framework.evaluation.metrics import MAX_PSNR, load_lpips, psnr, ssim
+from framework.geometry.rays import Histogram, Samples
 from framework.kernels.compositing import distortion, distortion_reference
 from framework.kernels.planes import PlanesLayout, plane_band
-from framework.losses import depth_error, mean_squared_error
-from framework.rays import Histogram, Samples
+from framework.rendering.losses import depth_error, mean_squared_error
 from framework.samplers.proposal import interlevel_loss
-from framework.scene import Scene
 from methods.kplanes import KPlanes, KPlanesConfig, _squared_steps
 from methods.tensorf import _variation
 from tests.images import parsed

@@ -7,11 +7,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from framework.cameras.poses import rotation_between
+from framework.cameras.refinement import PoseRefinement
+from framework.geometry.lenses import LENSES
+from framework.geometry.rays import Rays
 from framework.kernels.math import cross_matrix
-from framework.lenses import LENSES
-from framework.pose_refinement import PoseRefinement
-from framework.poses import rotation_between
-from framework.rays import Rays
 from tests.stress.backends import backends
 from tests.test_lenses import HEIGHT, WIDTH, cameras
 

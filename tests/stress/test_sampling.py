@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from framework.fields.base import Field
+from framework.geometry.rays import Rays
 from framework.kernels.intervals import resample
 from framework.kernels.march import March, Occupancy, ReferenceMarch
-from framework.rays import Rays
-from framework.renderers import render_field
+from framework.rendering.volume import render_field
 from framework.samplers.inverse_cdf import inverse_cdf
 from framework.samplers.proposal import FARTHEST, ProposalSampler, interlevel_loss
 from tests.kernels.test_march import walk

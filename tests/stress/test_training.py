@@ -12,16 +12,16 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from framework.config import TrainConfig
-from framework.encodings import HashGrid
-from framework.errors import ConfigError
+from framework.base.config import TrainConfig
+from framework.base.errors import ConfigError
+from framework.encodings.encodings import HashGrid
 from framework.evaluation.evaluator import evaluation_background, render_view
 from framework.fields.base import Field
 from framework.fields.encoded import EncodedField
 from framework.fields.nerf import NeRFField
+from framework.geometry.rays import Rays
 from framework.kernels.adam import sparse_adam
-from framework.rays import Rays
-from framework.renderers import Rendered, render_field
+from framework.rendering.volume import Rendered, render_field
 from framework.samplers.uniform import UniformSampler
 from framework.training.optim import Adam
 from framework.training.trainer import State, Trainer

@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from framework.base.config import from_plain
+from framework.base.errors import ConfigError
+from framework.base.registry import load_method
 from framework.cli.stress import USAGE
-from framework.config import from_plain
-from framework.errors import ConfigError
-from framework.registry import load_method
-from framework.stress.conditions import CONDITIONS, PLAIN, Condition, select
-from framework.stress.scenes import ball_views
-from framework.stress.trial import MOST_RAYS, MOST_SAMPLES, Budget, StressedTrainer, shortened
+from framework.tools.stress.conditions import CONDITIONS, PLAIN, Condition, select
+from framework.tools.stress.scenes import ball_views
+from framework.tools.stress.trial import MOST_RAYS, MOST_SAMPLES, Budget, StressedTrainer, shortened
 from framework.training.run import create_folder
 from tests.training.helpers import tiny_run
 

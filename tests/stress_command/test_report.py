@@ -3,9 +3,9 @@
 import json
 from pathlib import Path
 
-from framework.stress.report import Result, markdown, notes, settings_of, table
-from framework.stress.trial import Budget
-from framework.stress.verdict import Outcome, Verdict
+from framework.tools.stress.report import Result, markdown, notes, settings_of, table
+from framework.tools.stress.trial import Budget
+from framework.tools.stress.verdict import Outcome, Verdict
 from tests.training.helpers import tiny_run
 
 MACHINE = {

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework import registry
+from framework.base import registry
 from framework.cli.stress import main
-from framework.stress.conditions import CONDITIONS, PLAIN, select
-from framework.stress.scenes import ball_views
-from framework.stress.trial import Budget, attempt, unsound
-from framework.stress.verdict import verdicts
+from framework.tools.stress.conditions import CONDITIONS, PLAIN, select
+from framework.tools.stress.scenes import ball_views
+from framework.tools.stress.trial import Budget, attempt, unsound
+from framework.tools.stress.verdict import verdicts
 from tests.cli.helpers import TINY_NGP
 from tests.conftest import Refused
 from tests.training.helpers import TINY, tiny_run, tiny_trainer

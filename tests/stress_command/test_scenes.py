@@ -9,11 +9,11 @@ import torch
 from torch.nn.functional import normalize
 
 from dataparsers.blender import Blender
-from framework.bounds import intersect_box
-from framework.cameras import check_pose, subpixels
-from framework.dataset import Dataset, load_dataset
-from framework.pixel_set import PixelSet
-from framework.stress.scenes import (
+from framework.cameras.cameras import check_pose, subpixels
+from framework.data.dataset import Dataset, load_dataset
+from framework.data.pixel_set import PixelSet
+from framework.geometry.bounds import intersect_box
+from framework.tools.stress.scenes import (
     FIELD_OF_VIEW,
     NUM_TEST,
     NUM_TRAIN,
@@ -25,7 +25,7 @@ from framework.stress.scenes import (
     data_views,
     reduced,
 )
-from framework.testing.ball import RADIUS, trace
+from framework.tools.testing.ball import RADIUS, trace
 
 INSIDE = RADIUS / 2
 LOOKS = [(FIELD_OF_VIEW, None), (4.0, None), (90.0, INSIDE), (170.0, INSIDE)]

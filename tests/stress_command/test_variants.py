@@ -6,14 +6,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from framework.cameras import check_pose
-from framework.dataset import Dataset
-from framework.errors import DataError
-from framework.pixel_set import PixelSet
-from framework.pixels import draw_batch
-from framework.stress.faults import EVERY, spoiled_batches, spoiled_pixel, spoiled_pose
-from framework.stress.scenes import NUM_TRAIN, SIZE, Views, ball_views
-from framework.stress.variants import (
+from framework.base.errors import DataError
+from framework.cameras.cameras import check_pose
+from framework.data.dataset import Dataset
+from framework.data.pixel_set import PixelSet
+from framework.data.pixels import draw_batch
+from framework.tools.stress.faults import EVERY, spoiled_batches, spoiled_pixel, spoiled_pose
+from framework.tools.stress.scenes import NUM_TRAIN, SIZE, Views, ball_views
+from framework.tools.stress.variants import (
     chosen,
     first_image,
     mean_color,

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework.errors import CheckpointError
+from framework.base.errors import CheckpointError
 from framework.training import checkpoint
 from framework.training.checkpoint import list_checkpoints, load_checkpoint, load_newest, save_checkpoint
 

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 import torch
 
-from framework.checked import checked
+from framework.base.checked import checked
+from framework.base.registry import load_method, registered
 from framework.evaluation.evaluator import Measured, evaluate, evaluation_background, every, render_view
 from framework.evaluation.metrics import psnr
-from framework.registry import load_method, registered
 from framework.training.checkpoint import load_checkpoint
 from framework.training.curve import (
     FEW,

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from framework.config import TrainConfig
+from framework.base.config import TrainConfig
 from framework.training.optim import learning_rate_factor
 
 

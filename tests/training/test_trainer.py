@@ -15,8 +15,8 @@ from torch import Tensor
 
 from dataparsers.blender import Blender
 from framework import Batch, Method, Model, Rays, Rendered, registry
+from framework.base.errors import CheckpointError, ConfigError, DivergenceError
 from framework.cli.session import first_split, load_split
-from framework.errors import CheckpointError, ConfigError, DivergenceError
 from framework.evaluation.evaluator import evaluate, evaluation_background, render_view
 from framework.training.checkpoint import list_checkpoints, load_checkpoint
 from framework.training.run import create_folder
@@ -66,7 +66,7 @@ def test_resuming_continues_with_the_same_bits(kind: str, shared_tiny: Path, tmp
 
 
 def test_another_seed_gives_other_bits(shared_tiny: Path, tmp_path: Path) -> None:
-    from framework.config import MachineConfig
+    from framework.base.config import MachineConfig
 
     runs = [
         tiny_trainer("instant-ngp", shared_tiny, tmp_path / str(seed), machine=MachineConfig(seed=seed))

@@ -10,10 +10,10 @@ import torch
 
 from dataparsers.nerfstudio import Nerfstudio
 from framework import Cameras, ParsedScene
-from framework.dataset import Dataset, Split, load_dataset
-from framework.depths import read_depth
-from framework.poses import nearest_shown
-from framework.rays import Rays
+from framework.cameras.poses import nearest_shown
+from framework.data.dataset import Dataset, Split, load_dataset
+from framework.data.depths import read_depth
+from framework.geometry.rays import Rays
 from tests.truth.ball import CENTRE, HEIGHT, NAMES, RADIUS, WIDTH, met
 from tests.truth.formats import FORMATS, write_nerfstudio
 

@@ -12,9 +12,9 @@ from PIL import Image
 
 from dataparsers.blender import Blender
 from framework.cli.session import load_split
-from framework.dataset import Dataset, load_dataset
+from framework.data.dataset import Dataset, load_dataset
+from framework.data.pixels import gather_batch, gather_colors_reference
 from framework.evaluation.evaluator import evaluate, evaluation_background
-from framework.pixels import gather_batch, gather_colors_reference
 from framework.training.run import Run
 from tests.test_nerfacto import captured
 from tests.training.helpers import tiny_run, tiny_trainer

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from framework.cli.train import run_of
-from framework.comparison.measures import Measured, measure, rows_of
-from framework.comparison.plan import Contender, Job
-from framework.comparison.report import COLUMNS, table
+from framework.tools.comparison.measures import Measured, measure, rows_of
+from framework.tools.comparison.plan import Contender, Job
+from framework.tools.comparison.report import COLUMNS, table
 from tests.comparison.runs import CONDITIONS, finish, plan
 
 BETTER = {

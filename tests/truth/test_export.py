@@ -12,8 +12,8 @@ from scipy.linalg import expm
 from torch import Tensor
 
 from framework.export.points import joined, surface_points
-from framework.rays import Rays
-from framework.renderers import Rendered
+from framework.geometry.rays import Rays
+from framework.rendering.volume import Rendered
 from framework.training.checkpoint import FOLDER, load_newest
 from tests.training.helpers import tiny_trainer
 from tests.truth.ball import COUNT, HELD_OUT, NAMES, pose_of

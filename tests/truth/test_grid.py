@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.rays import Rays
+from framework.geometry.rays import Rays
 from framework.samplers.occupancy import OccupancySampler
 from methods.tensorf import MARGIN
 from tests.training.helpers import tiny_trainer

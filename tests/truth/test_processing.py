@@ -10,9 +10,9 @@ import torch
 from PIL import Image
 
 from dataparsers.nerfstudio import Nerfstudio
-from framework.dataset import load_dataset
-from framework.ply import read_points
-from framework.processing import pipeline, transforms
+from framework.data.dataset import load_dataset
+from framework.data.ply import read_points
+from framework.tools.processing import pipeline, transforms
 from tests.cli.helpers import called
 from tests.dataparsers.sparse_models import write_colmap
 from tests.truth.ball import CENTRE, COUNT, HEIGHT, NAMES, PINHOLE, RADIUS, WIDTH, Lens, photograph, write_photographs

@@ -10,19 +10,19 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.config import MachineConfig
-from framework.dataset import Dataset
+from framework.base.config import MachineConfig
+from framework.base.registry import load_method
+from framework.data.dataset import Dataset
+from framework.data.pixel_set import PixelSet
+from framework.data.pixels import Batch, draw_batch
+from framework.data.scene import Scene
 from framework.evaluation.appearance import fitted_appearance
 from framework.evaluation.evaluator import evaluate, render_view
 from framework.fields.base import Field
-from framework.pixel_set import PixelSet
-from framework.pixels import Batch, draw_batch
-from framework.rays import Rays, Samples
-from framework.registry import load_method
-from framework.renderers import Rendered, shade, volume_render
+from framework.geometry.rays import Rays, Samples
+from framework.rendering.volume import Rendered, shade, volume_render
 from framework.samplers.choice import SamplingConfig, make_sampler
 from framework.samplers.occupancy import OccupancySampler
-from framework.scene import Scene
 from framework.training.trainer import Trainer
 from tests.test_nerfacto import captured
 from tests.training.helpers import tiny_trainer

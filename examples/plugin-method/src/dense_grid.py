@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from framework import Field, Method, Model, Rays, Rendered, Scene
-from framework.bounds import to_unit_box
-from framework.encodings import HashGrid
+from framework.encodings.encodings import HashGrid
 from framework.fields.base import MLP
+from framework.geometry.bounds import to_unit_box
 from framework.kernels.contraction import contract_to_unit
 from framework.kernels.math import truncated_exp
 from framework.kernels.spherical_harmonics import spherical_harmonics
-from framework.renderers import render_field
+from framework.rendering.volume import render_field
 from framework.samplers import choice
 
 DIRECTION_LEVELS = 4

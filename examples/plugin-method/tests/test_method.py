@@ -7,9 +7,9 @@ import os
 import subprocess
 from pathlib import Path
 
-from framework.child import python_command
-from framework.registry import load_method
-from framework.testing import assert_method
+from framework.base.child import python_command
+from framework.base.registry import load_method
+from framework.tools.testing import assert_method
 
 
 def test_it_keeps_what_every_method_must() -> None:

@@ -47,7 +47,7 @@ BUGS = (
     Bug(
         "held-out-in-order-of-files",
         "splits",
-        "framework/poses.py",
+        "framework/cameras/poses.py",
         "order = sorted(range(len(names)), key=lambda index: names[index])\n    if every > 0:",
         "order = list(range(len(names)))\n    if every > 0:",
         "which photographs are held out depends on their order in the file, so figures are not nerfstudio's",
@@ -55,7 +55,7 @@ BUGS = (
     Bug(
         "held-out-one-later",
         "splits",
-        "framework/poses.py",
+        "framework/cameras/poses.py",
         "(rank % every == 0) != (split",
         "(rank % every == every - 1) != (split",
         "other photographs are judged than in published figures",
@@ -160,7 +160,7 @@ BUGS = (
     Bug(
         "near-of-all-pixels",
         "bounds",
-        "framework/poses.py",
+        "framework/cameras/poses.py",
         "[ahead & inside])",
         "[inside])",
         "points behind a camera decide where its rays start",
@@ -185,7 +185,7 @@ BUGS = (
     Bug(
         "colmap-tangential-exchanged",
         "lenses",
-        "framework/colmap_cameras.py",
+        "framework/cameras/colmap.py",
         '"OPENCV": ("opencv", "fx fy cx cy k1 k2 p1 p2")',
         '"OPENCV": ("opencv", "fx fy cx cy k1 k2 p2 p1")',
         "COLMAP's tangential distortion bends the wrong way, by pixels at the edges",
@@ -193,7 +193,7 @@ BUGS = (
     Bug(
         "written-lens-exchanged",
         "lenses",
-        "framework/processing/transforms.py",
+        "framework/tools/processing/transforms.py",
         '"OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")',
         '"OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "p1", "k2", "p2")',
         "ns-process-data writes COLMAP's second radial coefficient as the first tangential one",
@@ -201,7 +201,7 @@ BUGS = (
     Bug(
         "written-fisheye-loses-k4",
         "lenses",
-        "framework/processing/transforms.py",
+        "framework/tools/processing/transforms.py",
         'kind, distortion = model, ("k1", "k2", "k3", "k4")',
         'kind, distortion = model, ("k1", "k2", "k3")',
         "ns-process-data drops the last coefficient of a fisheye lens",
@@ -217,7 +217,7 @@ BUGS = (
     Bug(
         "full-opencv-numerator",
         "lenses",
-        "framework/colmap_cameras.py",
+        "framework/cameras/colmap.py",
         '"fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"',
         '"fx fy cx cy k1 k2 k3 k4 p1 p2 k5 k6"',
         "FULL_OPENCV cameras of COLMAP are bent by the wrong coefficients",
@@ -241,7 +241,7 @@ BUGS = (
     Bug(
         "crop-moves-nothing",
         "lenses",
-        "framework/processing/phone.py",
+        "framework/tools/processing/phone.py",
         '("cx", crop), ("cy", crop)',
         '("cx", 0), ("cy", 0)',
         "cropped images of ns-process-data polycam have a principal point that is off by the border",
@@ -250,7 +250,7 @@ BUGS = (
     Bug(
         "depth-unit-without-scale",
         "depth",
-        "framework/dataset.py",
+        "framework/data/dataset.py",
         "parsed.depth_unit * parsed.scale)",
         "parsed.depth_unit)",
         "depth images are in metres where the scene is not",
@@ -274,7 +274,7 @@ BUGS = (
     Bug(
         "depth-along-ray",
         "depth",
-        "framework/depths.py",
+        "framework/data/depths.py",
         "torch.where(cosines > 1e-3, depths.float() / cosines.clamp(min=1e-3), torch.zeros_like(cosines))",
         "torch.where(cosines > 1e-3, depths.float(), torch.zeros_like(cosines))",
         "depth along the axis is taken for distance along the ray, short at the edges of pictures",
@@ -282,7 +282,7 @@ BUGS = (
     Bug(
         "depth-rows-columns",
         "depth",
-        "framework/depths.py",
+        "framework/data/depths.py",
         "np.minimum((np.arange(count) + 0.5) * size / count, size - 1)",
         "np.minimum(np.arange(count) * size / count, size - 1)",
         "depth images of another size are shifted by half a pixel of theirs",
@@ -291,7 +291,7 @@ BUGS = (
     Bug(
         "mask-inverted",
         "masks",
-        "framework/masks.py",
+        "framework/data/masks.py",
         "used = grey >= THRESHOLD",
         "used = grey < THRESHOLD",
         "what a mask hides is learnt from, and the rest ignored",
@@ -323,7 +323,7 @@ BUGS = (
     Bug(
         "mask-decides-empty",
         "masks",
-        "framework/dataset.py",
+        "framework/data/dataset.py",
         "if len(kept) > ends[-1] / 2:",
         "if len(kept) < ends[-1] / 2:",
         "masks that hide a passer-by are taken for emptiness",
@@ -331,7 +331,7 @@ BUGS = (
     Bug(
         "opaque-alpha-of-masks",
         "masks",
-        "framework/pixels.py",
+        "framework/data/pixels.py",
         "torch.where(shown[:, None], rgb, behind), shown * (1.0 if alpha is None else alpha)",
         "rgb, shown * (1.0 if alpha is None else alpha)",
         "what masks cut away keeps its colour in training",
@@ -339,7 +339,7 @@ BUGS = (
     Bug(
         "premultiplied-on-reduction",
         "colours",
-        "framework/image_files.py",
+        "framework/data/image_files.py",
         "color = (blocks[..., :3] * blocks[..., 3:]).sum((1, 3)) / np.maximum(alpha, 1)",
         "color = (blocks[..., :3] * blocks[..., 3:]).sum((1, 3)) / (255 * factor**2)",
         "reduced colours are stored premultiplied: dark rims",
@@ -347,7 +347,7 @@ BUGS = (
     Bug(
         "premultiplied-on-reading",
         "colours",
-        "framework/image_files.py",
+        "framework/data/image_files.py",
         "    return image if factor == 1 else reduce_image(image, factor)",
         "    image[..., :3] = image[..., :3] * (image[..., 3:] / 255)\n"
         "    return image if factor == 1 else reduce_image(image, factor)",
@@ -356,7 +356,7 @@ BUGS = (
     Bug(
         "premultiplied-composite",
         "colours",
-        "framework/pixels.py",
+        "framework/data/pixels.py",
         "return rgba[..., :3] * rgba[..., 3:] + background * (1 - rgba[..., 3:])",
         "return rgba[..., :3] + background * (1 - rgba[..., 3:])",
         "photographs with alpha are taken for premultiplied when judged",
@@ -372,7 +372,7 @@ BUGS = (
     Bug(
         "training-background-white",
         "colours",
-        "framework/pixels.py",
+        "framework/data/pixels.py",
         'return "random" if has_alpha else "black"',
         'return "white" if has_alpha else "black"',
         "fog of the background's colour is never punished",
@@ -380,7 +380,7 @@ BUGS = (
     Bug(
         "times-not-divided",
         "data",
-        "framework/dataset.py",
+        "framework/data/dataset.py",
         "            times=None if self.times is None else self.times[index],\n            mask_paths",
         "            times=self.times,\n            mask_paths",
         "once a photograph is missing, all later ones have the time of another",
@@ -388,7 +388,7 @@ BUGS = (
     Bug(
         "cache-ignores-changes",
         "data",
-        "framework/pixel_cache.py",
+        "framework/data/pixel_cache.py",
         "about = (str(file.resolve()), stat.st_size, stat.st_mtime_ns)",
         "about = (str(file.resolve()),)",
         "photographs that were edited are read as they were when first decoded",

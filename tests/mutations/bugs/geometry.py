@@ -6,7 +6,7 @@ BUGS = (
     Bug(
         "pixel-corner",
         "cameras",
-        "framework/cameras.py",
+        "framework/cameras/cameras.py",
         "x = (columns + 0.5 - self.cx[camera_indices])",
         "x = (columns - self.cx[camera_indices])",
         "rays of bent lenses go through pixels' corners, pictures are shifted by half a pixel",
@@ -14,7 +14,7 @@ BUGS = (
     Bug(
         "projection-corner",
         "cameras",
-        "framework/cameras.py",
+        "framework/cameras/cameras.py",
         "return columns, y * self.fy[indices] + self.cy[indices] - 0.5, in_front",
         "return columns, y * self.fy[indices] + self.cy[indices], in_front",
         "points are projected half a pixel too low",
@@ -22,7 +22,7 @@ BUGS = (
     Bug(
         "scaled-principal-point",
         "cameras",
-        "framework/cameras.py",
+        "framework/cameras/cameras.py",
         'for name in ("fx", "fy", "cx", "cy")}\n        sizes',
         'for name in ("fx", "fy")} | {name: getattr(self, name) for name in ("cx", "cy")}\n        sizes',
         "with --downscale-factor pictures are shifted",
@@ -30,7 +30,7 @@ BUGS = (
     Bug(
         "joined-lens-lost",
         "cameras",
-        "framework/cameras.py",
+        "framework/cameras/cameras.py",
         "return Cameras(**joined, model=model, lens=torch.cat(lenses))",
         "return Cameras(**joined, model=model, lens=torch.cat(lenses[::-1]))",
         "of cameras that are joined, each has the lens of another",
@@ -38,7 +38,7 @@ BUGS = (
     Bug(
         "pixel-radius",
         "cameras",
-        "framework/cameras.py",
+        "framework/cameras/cameras.py",
         "pixel_radii = 2 / 12**0.5 / self.fx[camera_indices] * seen.spread",
         "pixel_radii = 2 / 12**0.5 * self.fx[camera_indices] * seen.spread",
         "cones are as wide as a lens is long",
@@ -46,7 +46,7 @@ BUGS = (
     Bug(
         "fisheye-as-sine",
         "lenses",
-        "framework/lenses.py",
+        "framework/geometry/lenses.py",
         "scale = torch.atan2(off_axis, depth) / off_axis.clamp(min=1e-30)",
         "scale = torch.sin(torch.atan2(off_axis, depth)) / off_axis.clamp(min=1e-30)",
         "points are projected through another fisheye than the one that pictures are made with",
@@ -54,7 +54,7 @@ BUGS = (
     Bug(
         "tangential-derivative",
         "lenses",
-        "framework/lenses.py",
+        "framework/geometry/lenses.py",
         "v = y * scale + p1 * (squared + 2 * y * y) + 2 * p2 * x * y",
         "v = y * scale + p1 * (squared + 2 * y * y) + p2 * x * y",
         "tangential distortion is half of what it is along one axis",
@@ -62,7 +62,7 @@ BUGS = (
     Bug(
         "panorama-turned",
         "lenses",
-        "framework/lenses.py",
+        "framework/geometry/lenses.py",
         "return width / (2 * math.pi), height / math.pi, width / 2, height / 2",
         "return width / math.pi, height / math.pi, width / 2, height / 2",
         "a panorama shows half of all directions twice as wide",
@@ -70,7 +70,7 @@ BUGS = (
     Bug(
         "place-not-centred",
         "poses",
-        "framework/poses.py",
+        "framework/cameras/poses.py",
         "transform = torch.cat([turn, -(turn @ middle)[:, None]], dim=-1)",
         "transform = torch.cat([turn, -middle[:, None]], dim=-1)",
         "a capture lies beside its box",
@@ -78,7 +78,7 @@ BUGS = (
     Bug(
         "up-from-backs",
         "poses",
-        "framework/poses.py",
+        "framework/cameras/poses.py",
         "turn = rotation_between(exact[:, :, 1].mean(0)",
         "turn = rotation_between(exact[:, :, 2].mean(0)",
         "scenes are turned by where cameras look and not by what is up: orbits go head over heels",
@@ -86,7 +86,7 @@ BUGS = (
     Bug(
         "autoscale-by-mean",
         "poses",
-        "framework/poses.py",
+        "framework/cameras/poses.py",
         "furthest = float(((origins - middle) @ turn.T).abs().max())",
         "furthest = float(((origins - middle) @ turn.T).abs().mean())",
         "cameras lie outside the box from -1 to 1, and nerfstudio's settings do not carry over",
@@ -94,7 +94,7 @@ BUGS = (
     Bug(
         "se3-order",
         "poses",
-        "framework/pose_refinement.py",
+        "framework/cameras/refinement.py",
         "return replace(rays, origins=origins + motions[:, :, 3], directions=turned)",
         "return replace(rays, origins=origins - motions[:, :, 3], directions=turned)",
         "poses are refined away from what is exported as refined",
@@ -102,7 +102,7 @@ BUGS = (
     Bug(
         "held-out-not-carried",
         "poses",
-        "framework/pose_refinement.py",
+        "framework/cameras/refinement.py",
         "        if rays.camera_indices is None:\n            return self.carried(rays)",
         "        if rays.camera_indices is None:\n            return rays",
         "held-out cameras stay where they were while the learnt scene has drifted",
@@ -110,7 +110,7 @@ BUGS = (
     Bug(
         "slab-inside",
         "bounds",
-        "framework/bounds.py",
+        "framework/geometry/bounds.py",
         "enter, leave = enter.amax(-1).clamp(min=0), leave.amin(-1)",
         "enter, leave = enter.amax(-1), leave.amin(-1)",
         "rays that start in the box begin behind their camera",
@@ -142,7 +142,7 @@ BUGS = (
     Bug(
         "ndc-slope",
         "contraction",
-        "framework/ndc.py",
+        "framework/cameras/ndc.py",
         "start = (origins[:, :2] + (self.near + origins[:, 2:]) * slope) / (self.near * size)",
         "start = (origins[:, :2] + self.near * slope) / (self.near * size)",
         "in normalised device coordinates cameras that stand before or behind the middle see shifted pictures",
@@ -262,7 +262,7 @@ BUGS = (
     Bug(
         "visual-hull-margin",
         "occupancy",
-        "framework/silhouettes.py",
+        "framework/scene/silhouettes.py",
         "centers, radius = (low + edge / 2).contiguous(), float(edge.norm()) / 2",
         "centers, radius = (low + edge / 2).contiguous(), float(edge.norm()) / 8",
         "thin parts of the object are carved away for good",
@@ -270,7 +270,7 @@ BUGS = (
     Bug(
         "silhouettes-of-masked",
         "occupancy",
-        "framework/silhouettes.py",
+        "framework/scene/silhouettes.py",
         "opaque |= ~kept  # who knows what is there",
         "opaque &= kept  # who knows what is there",
         "what a mask hides is carved away",
@@ -318,7 +318,7 @@ BUGS = (
     Bug(
         "depth-not-normalised",
         "rendering",
-        "framework/renderers.py",
+        "framework/rendering/volume.py",
         "mean = found.moment / torch.where(seen, found.opacity.detach(), torch.ones_like(found.moment))",
         "mean = found.moment",
         "depth of what is not opaque comes out nearer",
@@ -326,7 +326,7 @@ BUGS = (
     Bug(
         "directions-of-other-rays",
         "rendering",
-        "framework/renderers.py",
+        "framework/rendering/volume.py",
         "rays.directions.index_select(0, owners), cameras)",
         "rays.directions.index_select(0, owners.flip(0)), cameras)",
         "colours are seen from another ray's direction",
@@ -334,7 +334,7 @@ BUGS = (
     Bug(
         "pixel-of-one-ray",
         "rendering",
-        "framework/renderers.py",
+        "framework/rendering/volume.py",
         "rgb=self.rgb.view(*shape, 3).mean(1),",
         "rgb=self.rgb.view(*shape, 3)[:, 0],",
         "four rays a pixel cost four times as much and show one",

@@ -126,7 +126,7 @@ BUGS = (
     Bug(
         "error-weights-lost",
         "drawing",
-        "framework/error_map.py",
+        "framework/data/error_map.py",
         "return taken, 1 / share[taken]",
         "return taken, torch.ones_like(share[taken])",
         "--draw-by-error minimises another loss than was asked for",
@@ -134,7 +134,7 @@ BUGS = (
     Bug(
         "drawn-from-all",
         "drawing",
-        "framework/pixels.py",
+        "framework/data/pixels.py",
         "    if dataset.drawn is None:\n        return torch.randint(len(dataset.pixels)",
         "    if True:\n        return torch.randint(len(dataset.pixels)",
         "pixels that masks ignore are learnt from",
@@ -150,7 +150,7 @@ BUGS = (
     Bug(
         "last-pixel-never",
         "drawing",
-        "framework/pixels.py",
+        "framework/data/pixels.py",
         "return dataset.drawn.at(torch.randint(len(dataset.drawn), (count,), device=device))",
         "return dataset.drawn.at(torch.randint(max(len(dataset.drawn) // 2, 1), (count,), device=device))",
         "of masked photographs only the first half is learnt from",
@@ -174,7 +174,7 @@ BUGS = (
     Bug(
         "depth-loss-unknown",
         "losses",
-        "framework/losses.py",
+        "framework/rendering/losses.py",
         "return ray_sum(weights * apart, samples)[there].mean()",
         "return ray_sum(weights * apart, samples).mean()",
         "pixels without a depth are pulled to distance 1",
@@ -262,7 +262,7 @@ BUGS = (
     Bug(
         "appearance-by-alpha",
         "methods",
-        "framework/dataset.py",
+        "framework/data/dataset.py",
         "light is not None and light_spread(light) > APPEARANCE_STOPS",
         "light is not None and light_spread(light) < APPEARANCE_STOPS",
         "scenes in steady light get appearance vectors, those in changing light none",
@@ -270,7 +270,7 @@ BUGS = (
     Bug(
         "light-of-transparent",
         "methods",
-        "framework/appearance.py",
+        "framework/data/light.py",
         "use = use & (seen[:, 3] == 255)",
         "use = use & (seen[:, 3] >= 0)",
         "what is transparent decides what light there was",
@@ -342,7 +342,7 @@ BUGS = (
     Bug(
         "yaml-lists",
         "config",
-        "framework/config.py",
+        "framework/base/config.py",
         "        return [to_plain(item) for item in value]",
         "        return [to_plain(item) for item in value][:1]",
         "a setting of several numbers is written to config.yml with the first alone",
@@ -350,7 +350,7 @@ BUGS = (
     Bug(
         "unknown-key-ignored",
         "config",
-        "framework/config.py",
+        "framework/base/config.py",
         '            raise ConfigError(f"{where}: unknown key {shown(name)}. {nearest(name, known)}")',
         "            continue",
         "a misspelt key of a recipe is passed over in silence",
@@ -374,7 +374,7 @@ BUGS = (
     Bug(
         "bool-as-count",
         "config",
-        "framework/config.py",
+        "framework/base/config.py",
         "and not isinstance(value, bool) and abs(value) < 2**63",
         "and abs(value) < 2**63",
         "`max_num_iterations: yes` trains one step",

@@ -7,7 +7,7 @@ BUGS = (
     Bug(
         "less-is-better-turned",
         "comparison",
-        "framework/comparison/report.py",
+        "framework/tools/comparison/report.py",
         'Column("rendering, s/image", "render_seconds", "{:.2f}".format, min)',
         'Column("rendering, s/image", "render_seconds", "{:.2f}".format, max)',
         "the slowest renderer is shown in bold",
@@ -15,7 +15,7 @@ BUGS = (
     Bug(
         "lpips-more-is-better",
         "comparison",
-        "framework/comparison/report.py",
+        "framework/tools/comparison/report.py",
         'Column("LPIPS", "lpips", "{:.4f}".format, min)',
         'Column("LPIPS", "lpips", "{:.4f}".format, max)',
         "the worst LPIPS is shown in bold",
@@ -23,7 +23,7 @@ BUGS = (
     Bug(
         "memory-more-is-better",
         "comparison",
-        "framework/comparison/report.py",
+        "framework/tools/comparison/report.py",
         'f"{value / 2**30:.2f}", min)',
         'f"{value / 2**30:.2f}", max)',
         "the hungriest method is shown in bold",
@@ -31,7 +31,7 @@ BUGS = (
     Bug(
         "repeats-repeat-nothing",
         "comparison",
-        "framework/comparison/plan.py",
+        "framework/tools/comparison/plan.py",
         '"--machine.seed", str(self.seed)]\n        flags += ["--output-dir"',
         '"--machine.seed", str(FIRST_SEED)]\n        flags += ["--output-dir"',
         "all repeats have one seed: their deviation is noise of the clock",
@@ -39,7 +39,7 @@ BUGS = (
     Bug(
         "seeds-of-one",
         "comparison",
-        "framework/comparison/plan.py",
+        "framework/tools/comparison/plan.py",
         "seeds = range(FIRST_SEED, FIRST_SEED + self.repeats)",
         "seeds = range(FIRST_SEED, FIRST_SEED + 1)",
         "--repeats 3 runs once",
@@ -47,7 +47,7 @@ BUGS = (
     Bug(
         "contender-flags-first",
         "comparison",
-        "framework/comparison/plan.py",
+        "framework/tools/comparison/plan.py",
         "return [*start, self.contender.method, *flags, *self.contender.flags, *c.data_flags]",
         "return [*start, self.contender.method, *self.contender.flags, *flags, *c.data_flags]",
         "a contender's own flags do not count where the comparison says something, too",
@@ -55,7 +55,7 @@ BUGS = (
     Bug(
         "deviation-of-mean",
         "comparison",
-        "framework/comparison/measures.py",
+        "framework/tools/comparison/measures.py",
         "return None if len(values) < 2 or None in values else stdev(values)",
         "return None if len(values) < 2 or None in values else stdev(values) / len(values)",
         "the deviation of a run is shown smaller than it is",
@@ -63,7 +63,7 @@ BUGS = (
     Bug(
         "pareto-costly",
         "comparison",
-        "framework/comparison/measures.py",
+        "framework/tools/comparison/measures.py",
         "as_cheap = [(c, q) for c, q in points if c <= cost * (1 + SAME_TIME)]",
         "as_cheap = [(c, q) for c, q in points if c >= cost * (1 - SAME_TIME)]",
         "what is beaten by something cheaper and better is starred",
@@ -71,7 +71,7 @@ BUGS = (
     Bug(
         "levels-from-last-point",
         "comparison",
-        "framework/comparison/measures.py",
+        "framework/tools/comparison/measures.py",
         "reached[level] = t0 + (t1 - t0) * (level - p0) / (p1 - p0)",
         "reached[level] = t1",
         "seconds to a PSNR are those of the next evaluation",
@@ -79,7 +79,7 @@ BUGS = (
     Bug(
         "fps-as-seconds",
         "comparison",
-        "framework/comparison/measures.py",
+        "framework/tools/comparison/measures.py",
         'render_seconds=1 / results["fps"],',
         'render_seconds=results["fps"],',
         "images a second are shown as seconds an image",
@@ -87,7 +87,7 @@ BUGS = (
     Bug(
         "eval-on-other-views",
         "comparison",
-        "framework/comparison/plan.py",
+        "framework/tools/comparison/plan.py",
         "if conditions.max_eval_images is not None:\n            command +=",
         "if conditions.curve_images is not None:\n            command +=",
         "ns-compare's final evaluation fails or is over other views than asked for",
@@ -95,7 +95,7 @@ BUGS = (
     Bug(
         "interrupted-counts-as-done",
         "comparison",
-        "framework/comparison/runner.py",
+        "framework/tools/comparison/runner.py",
         'summary.get("interrupted") is False and job.evaluation.exists()',
         "job.evaluation.exists()",
         "a run that was stopped half way is compared with whole ones",
@@ -103,7 +103,7 @@ BUGS = (
     Bug(
         "crop-least-wrong",
         "comparison",
-        "framework/comparison/crops.py",
+        "framework/tools/comparison/crops.py",
         "inside.argmax()",
         "inside.argmin()",
         "the report shows crops where nothing is wrong",
@@ -249,7 +249,7 @@ BUGS = (
     Bug(
         "profile-transparent",
         "report",
-        "framework/scene_profile.py",
+        "framework/scene/profile.py",
         "int((dataset.image(index)[..., 3] == 0).sum())",
         "int((dataset.image(index)[..., 3] > 0).sum())",
         "the scene's profile says how much is opaque and calls it transparent",
@@ -266,7 +266,7 @@ BUGS = (
     Bug(
         "normals-turned-forward",
         "export",
-        "framework/poses.py",
+        "framework/cameras/poses.py",
         "return directions @ self.transform[:, :3]",
         "return directions @ self.transform[:, :3].T",
         "normals are turned the wrong way",
@@ -274,7 +274,7 @@ BUGS = (
     Bug(
         "points-without-scale",
         "export",
-        "framework/poses.py",
+        "framework/cameras/poses.py",
         "return (points / self.scale - self.transform[:, 3]) @ self.transform[:, :3]",
         "return ((points - self.transform[:, 3]) / self.scale) @ self.transform[:, :3]",
         "exported points are moved by the placement's own shift",
@@ -290,7 +290,7 @@ BUGS = (
     Bug(
         "exported-rotations",
         "export",
-        "framework/poses.py",
+        "framework/cameras/poses.py",
         "rotations = self.transform[:, :3].T @ poses[:, :, :3]",
         "rotations = self.transform[:, :3] @ poses[:, :, :3]",
         "exported cameras look elsewhere",
@@ -322,7 +322,7 @@ BUGS = (
     Bug(
         "ply-colours",
         "export",
-        "framework/ply.py",
+        "framework/data/ply.py",
         'zip(("red", "green", "blue"), stored.T, strict=True)',
         'zip(("blue", "green", "red"), stored.T, strict=True)',
         "red and blue are exchanged in exported points",
@@ -372,7 +372,7 @@ BUGS = (
     Bug(
         "colmap-frame-twice",
         "process-data",
-        "framework/processing/pipeline.py",
+        "framework/tools/processing/pipeline.py",
         "points = model.points @ transforms.Z_UP[:, :3].T",
         "points = model.points",
         "sparse points lie in another frame than the cameras",
@@ -380,7 +380,7 @@ BUGS = (
     Bug(
         "opengl-axes-written",
         "process-data",
-        "framework/processing/transforms.py",
+        "framework/tools/processing/transforms.py",
         "pose[:3, :3] = rotation.T * [1, -1, -1]",
         "pose[:3, :3] = rotation.T",
         "cameras of ns-process-data look backwards",
@@ -388,7 +388,7 @@ BUGS = (
     Bug(
         "applied-transform-identity",
         "process-data",
-        "framework/processing/polycam.py",
+        "framework/tools/processing/polycam.py",
         "write_folder(images, chosen, output, num_downscales, Z_UP, crop)",
         "write_folder(images, chosen, output, num_downscales, np.eye(4)[:3], crop)",
         "exports of a Polycam capture come out in another frame than Polycam's",
@@ -396,7 +396,7 @@ BUGS = (
     Bug(
         "record3d-own-intrinsics",
         "process-data",
-        "framework/processing/record3d.py",
+        "framework/tools/processing/record3d.py",
         "each = [(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])] * count",
         "each = [(matrix[0, 0], matrix[1, 1], matrix[2, 0], matrix[2, 1])] * count",
         "Record3D's principal point is written as 0, 0",
@@ -404,7 +404,7 @@ BUGS = (
     Bug(
         "record3d-transposed-rotation",
         "process-data",
-        "framework/processing/record3d.py",
+        "framework/tools/processing/record3d.py",
         "return np.array(rows).transpose(2, 0, 1)",
         "return np.array(rows).transpose(2, 1, 0)",
         "Record3D's cameras are turned the other way",
@@ -412,7 +412,7 @@ BUGS = (
     Bug(
         "exif-turn-inverted",
         "process-data",
-        "framework/processing/photographs.py",
+        "framework/tools/processing/photographs.py",
         "6: Image.Transpose.ROTATE_270",
         "6: Image.Transpose.ROTATE_90",
         "upright photographs of phones come out head down",
@@ -420,7 +420,7 @@ BUGS = (
     Bug(
         "pyramid-masks-grey",
         "process-data",
-        "framework/processing/pyramid.py",
+        "framework/tools/processing/pyramid.py",
         "lambda value: 255 if value == 255 else 0",
         "lambda value: 255 if value > 0 else 0",
         "reduced masks keep pixels that are partly hidden",
@@ -428,7 +428,7 @@ BUGS = (
     Bug(
         "blurred-frames-chosen",
         "process-data",
-        "framework/processing/video.py",
+        "framework/tools/processing/video.py",
         "if measured > best_sharpness:",
         "if measured < best_sharpness or best is None:",
         "the most blurred frame of each interval is taken",
@@ -436,7 +436,7 @@ BUGS = (
     Bug(
         "mask-of-other-name-written",
         "process-data",
-        "framework/processing/transforms.py",
+        "framework/tools/processing/transforms.py",
         'entry["mask_path"] = f"masks/{frame.mask}"',
         'entry["mask_path"] = f"images/{frame.mask}"',
         "masks named in transforms.json are not there",
@@ -444,7 +444,7 @@ BUGS = (
     Bug(
         "crop-size-only-once",
         "process-data",
-        "framework/processing/phone.py",
+        "framework/tools/processing/phone.py",
         '(("w", 2 * crop), ("h", 2 * crop)',
         '(("w", crop), ("h", crop)',
         "ns-process-data polycam refuses its own pictures",
@@ -452,7 +452,7 @@ BUGS = (
     Bug(
         "refined-poses-aligned-mirrored",
         "poses",
-        "framework/alignment.py",
+        "framework/geometry/alignment.py",
         "rotation = u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.linalg.det(u @ vh))]).double()) @ vh",
         "rotation = vh.T @ u.T",
         "held-out cameras are carried the wrong way when poses are refined",

@@ -1,0 +1,1 @@
+"""Settings, messages, the machine and names: what everything else stands on."""

@@ -1,0 +1,190 @@
+"""Names of methods and data formats. Nothing behind a name is imported until it is asked for.
+
+Built-in and third-party ones are registered alike, by entry points of the installed package:
+
+    [project.entry-points."nerfloom.methods"]
+    my-method = "my_package.my_method:METHOD"      # a framework.Method
+
+    [project.entry-points."nerfloom.dataparsers"]
+    my-format = "my_package.my_format:MyFormat"    # a framework.DataParser
+
+What is not installed is registered by the environment, for a shell's or a script's lifetime:
+
+    NERFLOOM_METHODS="my-method=my_file:METHOD,other=..."  NERFLOOM_DATAPARSERS="my-format=my_file:MyFormat"
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from framework.base.elsewhere import ELSEWHERE
+from framework.base.errors import ConfigError, nearest
+from framework.base.from_nerfstudio import format_answer
+
+if TYPE_CHECKING:
+    from framework.data.dataset import DataParser
+    from framework.model import Method
+
+Kind = Literal["methods", "dataparsers"]
+INTERFACE = 1
+"""Version of what plugins rely on (docs/plugins.md). A change that breaks them raises it."""
+OLDEST_INTERFACE = 1
+"""The oldest version that still works."""
+VARIABLES = {"methods": "NERFLOOM_METHODS", "dataparsers": "NERFLOOM_DATAPARSERS"}
+CALLED = {"methods": "method", "dataparsers": "data format"}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What stands behind a name."""
+
+    name: str
+    module: str
+    attribute: str
+    package: str
+    """The distribution that registers it, or the environment variable."""
+    problem: str | None = None
+    """Why it cannot be used, where that is known before it is imported."""
+
+
+@cache
+def registered(kind: Kind) -> dict[str, Entry]:
+    """Entries by name. One that two packages register for different things stays, with a `problem`.
+
+    Raises: ConfigError where the environment variable cannot be read.
+    """
+    found: dict[str, Entry] = {}
+    for entry in (*_installed(kind), *_of_environment(kind)):
+        other = found.setdefault(entry.name, entry)
+        if (other.module, other.attribute) != (entry.module, entry.attribute):
+            both = f"it is registered by both {other.package} and {entry.package}; uninstall or rename one of them"
+            found[entry.name] = replace(other, problem=both)
+    return dict(sorted(found.items()))
+
+
+def _installed(kind: Kind) -> Iterator[Entry]:
+    for point in entry_points(group=f"nerfloom.{kind}"):
+        yield _entry(point.name, point.value, point.dist.name if point.dist else "an unknown package")
+
+
+def _of_environment(kind: Kind) -> Iterator[Entry]:
+    variable = VARIABLES[kind]
+    for item in filter(None, (part.strip() for part in os.environ.get(variable, "").split(","))):
+        name, _, value = (part.strip() for part in item.partition("="))
+        entry = _entry(name, value, variable)
+        if not name or entry.problem is not None:
+            raise ConfigError(f"{variable} holds '{item}'; it must be name=module:attribute, several with commas")
+        yield entry
+
+
+def _entry(name: str, value: str, package: str) -> Entry:
+    module, _, attribute = (part.strip() for part in value.partition(":"))
+    problem = None if module and attribute else f"{package} registers '{value}', which is not module:attribute"
+    return Entry(name, module, attribute, package, problem)
+
+
+def summary(entry: Entry) -> str:
+    """The first line of the docstring of the module behind an entry, read without importing it; or what is wrong."""
+    if entry.problem is not None:
+        return f"({entry.problem})"
+    path = _source(entry.module)
+    if path is None:
+        return f"(its module {entry.module} was not found; it comes with {entry.package})"
+    try:
+        docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
+    except (OSError, SyntaxError, ValueError) as error:
+        return f"(its module {path} cannot be read: {type(error).__name__}; it comes with {entry.package})"
+    return (docstring or "").split("\n")[0]
+
+
+def _source(module: str) -> Path | None:
+    """The file a module would be imported from. Only the top-level package is asked, for asking imports parents."""
+    top, *rest = module.split(".")
+    try:
+        spec = importlib.util.find_spec(top)
+    except (ImportError, ValueError):
+        return None
+    if spec is None:
+        return None
+    if not rest and spec.origin:
+        return Path(spec.origin)
+    for folder in spec.submodule_search_locations or ():
+        base = Path(folder).joinpath(*rest)
+        for candidate in (base.with_suffix(".py"), base / "__init__.py"):
+            if candidate.is_file():
+                return candidate
+    return None
+
+
+def entry_of(kind: Kind, name: str) -> Entry:
+    """What a name is registered for.
+
+    Raises: ConfigError for an unknown name, with the nearest, or with where a known method lives that is not ours.
+    """
+    known = registered(kind)
+    if name in known:
+        return known[name]
+    if kind == "methods" and name in ELSEWHERE:
+        raise ConfigError(f"Nerfloom has no method '{name}': {ELSEWHERE[name]}")
+    if kind == "dataparsers" and (answer := format_answer(name)) is not None:
+        raise ConfigError(answer)
+    raise ConfigError(f"unknown {CALLED[kind]} '{name}'. {nearest(name, known)}")
+
+
+def _load(kind: Kind, name: str) -> Any:
+    entry = entry_of(kind, name)
+    what = f"{CALLED[kind]} '{name}' of {entry.package}"
+    if entry.problem is not None:
+        raise ConfigError(f"{CALLED[kind]} '{name}' cannot be used: {entry.problem}")
+    try:
+        loaded = import_module(entry.module)
+        for part in entry.attribute.split("."):
+            loaded = getattr(loaded, part)
+    except (Exception, SystemExit) as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise ConfigError(f"{what} cannot be loaded: {reason}") from error
+    interface = getattr(loaded, "interface", INTERFACE)
+    if not isinstance(interface, int) or not OLDEST_INTERFACE <= interface <= INTERFACE:
+        newer = isinstance(interface, int) and interface > INTERFACE
+        remedy = "upgrade nerfloom" if newer else "upgrade the plugin"
+        raise ConfigError(f"{what} was written for plugin interface {interface}, and this is {INTERFACE}; {remedy}")
+    return loaded
+
+
+def load_method(name: str) -> Method:
+    """Import a method by name.
+
+    Raises: ConfigError for an unknown name, where its module cannot be imported, or where it is no method of this
+        plugin interface.
+    """
+    from framework.model import Method
+
+    method = _load("methods", name)
+    if not isinstance(method, Method):
+        entry = entry_of("methods", name)
+        raise ConfigError(f"method '{name}': {entry.module}:{entry.attribute} is no framework.Method")
+    return method
+
+
+def load_dataparser(name: str) -> type[DataParser]:
+    """Import a data format by name.
+
+    Raises: ConfigError for an unknown name, where its module cannot be imported, or where it is no data format of this
+        plugin interface.
+    """
+    from framework.data.dataset import DataParser
+
+    parser = _load("dataparsers", name)
+    if not (isinstance(parser, type) and issubclass(parser, DataParser)):
+        entry = entry_of("dataparsers", name)
+        raise ConfigError(f"data format '{name}': {entry.module}:{entry.attribute} is no framework.DataParser")
+    return parser

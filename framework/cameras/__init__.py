@@ -1,0 +1,1 @@
+"""Cameras and their poses: from pixels to rays and back."""

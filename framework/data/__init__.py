@@ -1,0 +1,1 @@
+"""From files to pixels: images, masks, depths, caches, and batches drawn from them."""

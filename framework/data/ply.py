@@ -1,0 +1,123 @@
+"""Points of a PLY file (Turk 1994): ascii or binary, whatever else the file holds about them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from framework.base.errors import DataError
+
+TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "float32": "f4", "float64": "f8",
+}  # fmt: skip
+"""PLY's names of types, of both generations, to numpy's."""
+ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+LONGEST_HEADER = 1000
+"""Lines. A file without `end_header` is given up on after these."""
+LONGEST_LINE = 1000
+"""Bytes of a line of the header."""
+
+
+def read_points(file: Path) -> Tensor:
+    """(K, 3) float64 positions of the vertices; those that are not finite are left out.
+
+    No more memory is taken than the file has bytes for, whatever count its header claims.
+
+    Raises: DataError where the file cannot be read, is no PLY file, has no positions or is cut off.
+    """
+    try:
+        with file.open("rb") as stream:
+            order, count, columns = _header(stream, file)
+            return _positions(stream, file, order, count, columns)
+    except OSError as error:
+        raise DataError(f"cannot read {file}: {error.strerror}") from error
+
+
+def _header(stream: BinaryIO, file: Path) -> tuple[str, int, list[tuple[str, str]]]:
+    """Key of `ORDERS`, number of vertices, and the name and numpy type of each of their properties."""
+    if stream.readline(LONGEST_LINE).strip() != b"ply":
+        raise DataError(f"{file} is not a PLY file: its first line is not 'ply'")
+    order, count, element = "", -1, ""
+    columns: list[tuple[str, str]] = []
+    for _ in range(LONGEST_HEADER):
+        words = stream.readline(LONGEST_LINE).decode("ascii", "replace").split()
+        if words[:1] == ["end_header"]:
+            break
+        if words[:1] == ["format"] and len(words) > 1:
+            order = words[1]
+        elif words[:1] == ["element"] and len(words) == 3:
+            element = words[1]
+            if element == "vertex" and words[2].isdecimal() and len(words[2]) < 19:
+                count = int(words[2])
+            elif count < 0 and words[2] != "0":
+                raise DataError(f"{file}: its vertices must be its first element, and counted; '{element}' comes first")
+        elif words[:1] == ["property"] and element == "vertex":
+            if len(words) != 3 or words[1] not in TYPES:
+                raise DataError(f"{file}: a vertex has the property '{' '.join(words[1:])}'; lists are not read")
+            columns.append((words[2], TYPES[words[1]]))
+    else:
+        raise DataError(f"{file} is not a PLY file: its header has no end")
+    names = [name for name, _ in columns]
+    if order not in ORDERS:
+        raise DataError(f"{file}: its format is '{order}'; known: {', '.join(ORDERS)}")
+    if count < 0 or not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
+        raise DataError(f"{file}: it must list vertices with the properties x, y and z, each once")
+    return order, count, columns
+
+
+def _positions(stream: BinaryIO, file: Path, order: str, count: int, columns: list[tuple[str, str]]) -> Tensor:
+    start = stream.tell()
+    left = file.stat().st_size - start
+    row = np.dtype([(name, ORDERS[order] + kind) for name, kind in columns])
+    smallest = 2 * len(columns) if order == "ascii" else row.itemsize  # a digit and what parts it from the next
+    if count * smallest > left + 1:
+        raise DataError(f"{file} is cut off: it announces {count} points, for which its {left} bytes are too few")
+    if order == "ascii":
+        axes = _ascii_axes(stream, file, count, [name for name, _ in columns])
+    else:
+        table = np.fromfile(file, row, count, offset=start)
+        axes = [table[axis].astype(np.float64) for axis in "xyz"]
+    points = torch.from_numpy(np.stack(axes, axis=-1))
+    return points[points.isfinite().all(-1)]
+
+
+def _ascii_axes(stream: BinaryIO, file: Path, count: int, names: list[str]) -> list[np.ndarray]:
+    """The (count,) x, y and z."""
+    columns = [names.index(axis) for axis in "xyz"]
+    points = np.empty((3, count))
+    for index in range(count):
+        words = stream.readline().split()
+        if len(words) < len(names):
+            raise DataError(f"{file}: point {index} has {len(words)} values instead of {len(names)}")
+        try:
+            points[:, index] = [float(words[column]) for column in columns]
+        except ValueError as error:
+            raise DataError(f"{file}: point {index} is not made of numbers") from error
+    return list(points)
+
+
+def write_points(file: Path, positions: Tensor, colors: Tensor, normals: Tensor | None = None) -> None:
+    """Write a binary PLY file of points (K, 3), colours (K, 3) in [0, 1] and, where there are any, normals (K, 3).
+
+    Raises: OSError where it cannot be written.
+    """
+    columns: list[tuple[str, str, str, np.ndarray]] = []
+    for names, values in (("xyz", positions), (("nx", "ny", "nz"), normals)):
+        if values is not None:
+            columns += [(n, "float", "<f4", v) for n, v in zip(names, values.numpy().T, strict=True)]
+    stored = (colors.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    columns += [(n, "uchar", "u1", v) for n, v in zip(("red", "green", "blue"), stored.T, strict=True)]
+    table = np.empty(len(positions), [(name, kind) for name, _, kind, _ in columns])
+    for name, _, _, column in columns:
+        table[name] = column
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
+    header += [f"property {called} {name}" for name, called, _, _ in columns]
+    with file.open("wb") as stream:
+        stream.write(("\n".join([*header, "end_header"]) + "\n").encode())
+        stream.write(table.tobytes())

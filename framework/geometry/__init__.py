@@ -1,0 +1,1 @@
+"""Rays, boxes, lenses and similarities: pure functions of tensors."""

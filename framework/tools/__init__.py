@@ -1,0 +1,1 @@
+"""What is done around training: processing, comparing, measuring, testing."""

@@ -1,0 +1,381 @@
+"""Time and error of each compiled kernel against its torch reference, beside the ceilings.
+
+Both run in one process, in turn, on one thread and on all. Errors are of both, against float64. NERFLOOM_KERNELS=avx2
+in the environment forces that variant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from typing import Any
+
+import torch
+from rich.box import SIMPLE
+from rich.table import Table
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from framework.base.console import console, say
+from framework.base.errors import ConfigError
+from framework.cameras.cameras import Cameras
+from framework.geometry.rays import Rays, Samples
+from framework.kernels import native
+from framework.kernels.adam import sparse_adam, sparse_adam_reference
+from framework.kernels.compositing import composite, composite_reference
+from framework.kernels.frequency import frequency_encoding, frequency_encoding_reference
+from framework.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
+from framework.kernels.march import March, Occupancy, ReferenceMarch
+from framework.kernels.mlp import Activation, mlp, mlp_reference
+from framework.kernels.planes import PlanesLayout, planes, planes_reference
+from framework.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
+from framework.tools.benchmarks.ceilings import Ceilings, Work
+from framework.tools.benchmarks.plane_lookups import grid_samples, layouts, planes_of
+from framework.tools.benchmarks.timing import Run, alternating, differentiated, once
+from framework.training.machine import machine
+
+BOX = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+LENSES: tuple[tuple[str, list[float]], ...] = (
+    ("pinhole", []),
+    ("opencv", [-0.28, 0.09, 6e-4, -9e-4, 0, 0, 0, 0, 0]),
+    ("fisheye", [0.04, -0.01, 3e-3, -6e-4]),
+)
+"""Models, and coefficients of the usual strength."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Against float64: the largest error over the largest value, and root mean squares of gradients over theirs.
+
+    The largest error of a gradient would tell little where it jumps: at a cell's face, and where a ReLU switches.
+    """
+
+    value: float
+    gradient: float | None
+    """The worst input's; None without gradients."""
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """A compiled kernel, and what it is held against."""
+
+    name: str
+    unit: str
+    """What it works on: sample, ray or entry."""
+    count: int
+    """How many at once."""
+    runs: tuple[Run, Run]
+    """Compiled, and the reference."""
+    work: Work | None
+    """Of the forward pass, for each of them; None where no ceiling says anything."""
+    errors: Callable[[], tuple[Errors, Errors]] | None = None
+    """Of the compiled kernel and of the reference in float32."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """What was measured of a kernel; all times are ns for each of what it works on."""
+
+    kernel: str
+    unit: str
+    count: int
+    threads: int
+    forward: float
+    backward: float | None
+    reference_forward: float
+    reference_backward: float | None
+    speed_up: float
+    """Median ratio of neighbouring runs, forward and backward together."""
+    at_ceiling: float | None
+    """Of the forward pass at the rate of the slowest ceiling, on all threads."""
+    errors: Errors | None
+    reference_errors: Errors | None
+
+
+def measure(samples: int, repeats: int) -> tuple[list[Row], dict[str, Any]]:
+    """Measure every kernel and print a table.
+
+    Args:
+        samples: in a batch.
+        repeats: of which medians are taken.
+    Returns: rows, and all as plain data with the machine and its ceilings.
+    Raises: ConfigError where there are no compiled kernels.
+    """
+    if not native.available():
+        raise ConfigError("there are no compiled kernels to measure; reinstall nerfloom with a C++ compiler at hand")
+    threads, ceilings, rows = torch.get_num_threads(), Ceilings.measured(), []
+    for line in ceilings.lines():
+        say(f"ceiling: {line}")
+    for kernel in kernels(samples):
+        say(f"measuring {kernel.name}")
+        rows += measured(kernel, ceilings, repeats, threads)
+    console.print(table([row for row in rows if row.threads == threads]))
+    return rows, {"machine": machine(), "ceilings": asdict(ceilings), "rows": [asdict(row) for row in rows]}
+
+
+def measured(kernel: Kernel, ceilings: Ceilings, repeats: int, all_threads: int) -> list[Row]:
+    """One kernel's rows, on 1 thread and on all."""
+    rows = []
+    errors, reference_errors = kernel.errors() if kernel.errors else (None, None)
+    at_ceiling = ceilings.seconds(kernel.work) * 1e9 if kernel.work else None
+    try:
+        for threads in sorted({1, all_threads}):
+            torch.set_num_threads(threads)
+            times = alternating(*kernel.runs, repeats)
+            (forward, *backward), (reference_forward, *reference_backward) = (
+                [seconds / kernel.count * 1e9 for seconds in stages] for stages in (times.compiled, times.reference)
+            )
+            rows.append(
+                Row(
+                    kernel.name,
+                    kernel.unit,
+                    kernel.count,
+                    threads,
+                    forward,
+                    backward[0] if backward else None,
+                    reference_forward,
+                    reference_backward[0] if reference_backward else None,
+                    times.speed_up,
+                    at_ceiling,
+                    errors,
+                    reference_errors,
+                )
+            )
+    finally:
+        torch.set_num_threads(all_threads)
+    return rows
+
+
+def table(rows: Sequence[Row]) -> Table:
+    """For people: what fits a line of a terminal."""
+    found = Table(title="ns a sample, ray or entry", title_justify="left", box=SIMPLE, padding=(0, 1, 0, 0))
+    for heading in ("kernel", "forward", "backward", "torch", "speed-up", "error"):
+        found.add_column(heading, justify="left" if heading == "kernel" else "right", no_wrap=heading != "kernel")
+    for row in rows:
+        found.add_row(
+            row.kernel,
+            f"{row.forward:.1f}",
+            "" if row.backward is None else f"{row.backward:.1f}",
+            f"{row.reference_forward + (row.reference_backward or 0):.0f}",
+            f"{row.speed_up:.1f}",
+            "" if row.errors is None else f"{row.errors.value:.0e}",
+        )
+    return found
+
+
+# -- the kernels --------------------------------------------------------------------------------------------------
+
+
+def kernels(count: int) -> Iterator[Kernel]:
+    """Every kernel, in batches of `count` samples."""
+    torch.manual_seed(0)
+    positions = rays_and_positions(count)[1]
+    for log2 in (15, 17, 19):
+        yield of_function(f"hash grid, 16 levels x 2, tables of 2^{log2}", *_hash_grid(positions, log2, False))
+    yield of_function("hash grid, gradient of positions too, 2^17", *_hash_grid(positions, 17, True))
+    networks: list[tuple[tuple[int, ...], Activation]] = [((32, 64, 16), "none"), ((32, 64, 64, 3), "sigmoid")]
+    for widths, activation in networks:
+        for kind in ("float32", "bfloat16") if native.has("mlp_forward_bf16") else ("float32",):
+            name = f"network {'-'.join(map(str, widths))}, {kind}"
+            yield of_function(name, *_network(count, widths, activation, kind == "bfloat16"))
+    yield of_function("compositing, 16 samples a ray", *_compositing(count))
+    yield of_function(
+        "frequency encoding, 10 octaves of 3",
+        [torch.rand(count, 3)],
+        lambda x: frequency_encoding(x, 10),
+        lambda x: frequency_encoding_reference(x, 10),
+        Work(bytes=4 * (3 + 60)),
+    )
+    yield of_function(
+        "spherical harmonics, 4 bands",
+        [normalize(torch.randn(count, 3), dim=-1)],
+        spherical_harmonics,
+        spherical_harmonics_reference,
+        Work(bytes=4 * (3 + 16)),
+        backward=False,
+    )
+    for name, layout, features in layouts():
+        yield _plane_lookup(name, layout, features, count)
+    yield _marching()
+    yield _updating()
+    for model, lens in LENSES:
+        yield _ray_generation(model, lens)
+
+
+def of_function(
+    name: str,
+    inputs: list[Tensor],
+    compiled: Callable[..., Tensor],
+    reference: Callable[..., Tensor],
+    work: Work,
+    backward: bool = True,
+) -> Kernel:
+    """A function of tensors, the first of which has a row for each sample."""
+    return Kernel(
+        name,
+        "sample",
+        len(inputs[0]),
+        (differentiated(compiled, inputs, None, backward), differentiated(reference, inputs, None, backward)),
+        work,
+        lambda: (errors(compiled, reference, inputs, backward), errors(reference, reference, inputs, backward)),
+    )
+
+
+def errors(
+    function: Callable[..., Tensor], truth: Callable[..., Tensor], inputs: Sequence[Tensor], backward: bool
+) -> Errors:
+    """Of a function in float32 against another in float64."""
+    (value, *gradients), (exact, *exact_gradients) = (
+        _value_and_gradients(run, inputs, kind, backward)
+        for run, kind in ((function, torch.float32), (truth, torch.float64))
+    )
+    worst = [
+        ((found.double() - right).square().mean() / right.square().mean()).sqrt().item()
+        for found, right in zip(gradients, exact_gradients, strict=True)
+        if right.abs().max() > 0
+    ]
+    largest = ((value.double() - exact).abs().max() / exact.abs().max()).item()
+    return Errors(largest, max(worst) if worst else None)
+
+
+def _value_and_gradients(
+    function: Callable[..., Tensor], inputs: Sequence[Tensor], kind: torch.dtype, backward: bool
+) -> list[Tensor]:
+    leaves = [tensor.detach().to(kind, copy=True).requires_grad_(backward) for tensor in inputs]
+    value = function(*leaves)
+    if backward:
+        (value * torch.linspace(-1, 1, value.numel()).view_as(value).to(kind)).sum().backward()
+    return [value.detach(), *(leaf.grad for leaf in leaves if leaf.grad is not None)]
+
+
+def rays_and_positions(count: int) -> tuple[Rays, Tensor]:
+    """Rays through the unit box, 16 points close together on each: what a trained scene's samples look like."""
+    origins = normalize(torch.randn(count // 16, 3), dim=-1) * 2 + 0.5
+    directions = normalize(torch.rand(count // 16, 3) - origins, dim=-1)
+    rays = Rays(origins, directions, torch.zeros(count // 16), torch.full((count // 16,), 9.0))
+    t = (2 + torch.rand(count // 16, 1) - 0.5) + torch.arange(16) * 0.003
+    positions = origins[:, None] + t[..., None] * directions[:, None]
+    return rays, positions.reshape(-1, 3).clamp(0, 1)
+
+
+Described = tuple[list[Tensor], Callable[..., Tensor], Callable[..., Tensor], Work]
+"""Inputs, the compiled function, the reference, and the work."""
+
+
+def _hash_grid(positions: Tensor, log2: int, of_positions: bool) -> Described:
+    layout = HashGridLayout.build(16, 16, 1024, log2)
+    values = torch.randn(layout.num_entries, 2)
+    # The positions are detached where nobody asks for their gradient: most fields do not.
+    kept = (lambda x: x) if of_positions else torch.Tensor.detach
+    return (
+        [positions, values],
+        lambda x, t: hash_grid(kept(x), t, layout),
+        lambda x, t: hash_grid_reference(kept(x), t, layout),
+        Work(bytes=4 * (3 + 32), gathers=16 * 8, table_bytes=values.nbytes),
+    )
+
+
+def _network(count: int, widths: tuple[int, ...], activation: Activation, bfloat16: bool) -> Described:
+    weights = [torch.randn(b, a) * (2 / a) ** 0.5 for a, b in pairwise(widths)]
+
+    def compiled(x: Tensor, *w: Tensor) -> Tensor:
+        with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
+            return mlp([x], w, activation)
+
+    return (
+        [torch.randn(count, widths[0]), *weights],
+        compiled,
+        lambda x, *w: mlp_reference([x], w, activation),
+        Work(4 * (widths[0] + widths[-1]), flops=2 * sum(a * b for a, b in pairwise(widths)), bfloat16=bfloat16),
+    )
+
+
+def _compositing(count: int) -> Described:
+    offsets = torch.arange(0, count + 1, 16)
+    starts = (torch.rand(count // 16, 1) + torch.arange(16) * 0.01).reshape(-1)
+    samples = Samples(starts, starts + 0.01, offsets)
+    background, fars = torch.rand(count // 16, 3), torch.full((count // 16,), 9.0)
+
+    def reference(density: Tensor, color: Tensor) -> Tensor:
+        like = Samples(samples.t_starts.to(density), samples.t_ends.to(density), offsets)
+        return composite_reference(like, density, color, background.to(density), fars.to(density)).color
+
+    return (
+        [torch.rand(count) * 50, torch.rand(count, 3)],
+        lambda density, color: composite(samples, density, color, background, fars).color,
+        reference,
+        Work(bytes=4 * (2 + 1 + 3) + 4 * 3 / 16),
+    )
+
+
+def _plane_lookup(name: str, layout: PlanesLayout, features: int, count: int) -> Kernel:
+    """Against torch's `grid_sample`; what is read is held against copying, for a corner's features lie together."""
+    positions = torch.rand(count, layout.dims)
+    values = torch.rand(layout.num_entries, features) + 0.5
+    gradient = torch.randn(count, layout.num_groups * features)
+    images = planes_of(values, layout)
+    corners = sum(2 ** len(axes) for factors in layout.axes for axes in factors)
+
+    def ours(v: Tensor) -> Tensor:
+        return planes(positions, v, layout)
+
+    def exact(v: Tensor) -> Tensor:
+        return planes_reference(positions.to(v), v, layout)
+
+    def theirs(*flat: Tensor) -> Tensor:
+        return grid_samples(positions, list(flat), layout)
+
+    return Kernel(
+        name,
+        "sample",
+        count,
+        (differentiated(ours, [values], gradient), differentiated(theirs, images, gradient)),
+        Work(bytes=4 * features * (corners + layout.num_groups)),
+        lambda: (errors(ours, exact, [values], True), errors(exact, exact, [values], True)),
+    )
+
+
+def _marching() -> Kernel:
+    """All samples of 8192 rays through a grid of which 3 % are occupied."""
+    rays, _ = rays_and_positions(8192 * 16)
+    centers = (torch.cartesian_prod(*[torch.arange(128)] * 3) + 0.5) / 128 - 0.5
+    grid = Occupancy.of((centers.norm(dim=-1) - 0.3).abs() < 0.015, BOX, 128)
+
+    def march(kind: type[March] | type[ReferenceMarch]) -> None:
+        marching = kind(rays, grid, 3**0.5 / 512, 0.0, None, 1e-4)
+        while (wave := marching.wave(16)) is not None:
+            marching.advance(torch.zeros_like(wave.t_starts))
+
+    runs = once(lambda: march(March)), once(lambda: march(ReferenceMarch))
+    return Kernel("marching through a grid of 128^3, 3 % occupied", "ray", len(rays), runs, None)
+
+
+def _updating() -> Kernel:
+    """Sparse Adam on a table of which half of the entries have a gradient."""
+    entries = 2**19
+    grad = torch.randn(entries, 2) * (torch.rand(entries, 1) < 0.5)
+    updated = int((grad != 0).any(dim=1).sum())
+
+    def steps(update: Callable[..., int]) -> Run:
+        values, mean, square, uses = torch.randn(entries, 2), *torch.zeros(2, entries, 2), torch.zeros(entries)
+
+        def step() -> Sequence[float]:
+            mine = grad.clone()
+            return once(lambda: update(values, mine, mean, square, uses, 1e-2, (0.9, 0.95), 1e-15))()
+
+        return step
+
+    work = Work(bytes=4 * (2 * 4 + 1) * 2)  # value, gradient and both moments of 2, and its uses: read and written
+    runs = steps(sparse_adam), steps(sparse_adam_reference)
+    return Kernel("sparse Adam, half of 2^19 x 2", "entry", updated, runs, work)
+
+
+def _ray_generation(model: str, lens: list[float]) -> Kernel:
+    """Rays through 8192 pixels of photographs of 1600 x 1200 by a lens of the usual strength."""
+    focal, cx, cy, width, height = (torch.tensor([value]) for value in (1100.0, 800.0, 600.0, 1600, 1200))
+    bent = torch.tensor([lens]) if lens else None
+    cameras = Cameras(torch.eye(4)[None, :3], focal, focal, cx, cy, width, height, model, bent)
+    flat = torch.randint(1600 * 1200, (8192,))
+    runs = once(lambda: cameras.pixel_rays(flat, 0.1, 9.0)), once(lambda: cameras.pixel_rays_reference(flat, 0.1, 9.0))
+    return Kernel(f"rays of {model} cameras", "ray", len(flat), runs, Work(bytes=8 + 4 * (3 + 3 + 2)))

@@ -1,0 +1,244 @@
+"""What a comparison leaves for people and programs: report.html, report.md, results.json, results.csv."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from framework.evaluation.images import ERROR_AT_WHITE
+from framework.tools.comparison import plots
+from framework.tools.comparison.crops import views
+from framework.tools.comparison.measures import SAME_TIME, Measured, Row, pareto
+from framework.tools.comparison.plan import Conditions, Plan
+from framework.training.checkpoint import write_atomically
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the table."""
+
+    title: str
+    figure: str
+    """Of `Measured`."""
+    show: Callable[[float], str]
+    best: Callable[[Sequence[float]], float] | None
+    """`max` where more is better, `min` where less is; None where neither."""
+    same: float = 1e-9
+    """Relative difference below which two figures are both the best."""
+
+
+COLUMNS = (
+    Column("PSNR, dB", "psnr", "{:.2f}".format, max),
+    Column("SSIM", "ssim", "{:.4f}".format, max),
+    Column("LPIPS", "lpips", "{:.4f}".format, min),
+    Column("training, s", "seconds", "{:.1f}".format, min, SAME_TIME),
+    Column("steps", "steps", "{:,.0f}".format, None),
+    Column("training, rays/s", "rays_per_second", "{:,.0f}".format, max),
+    Column("rendering, s/image", "render_seconds", "{:.2f}".format, min),
+    Column("peak memory, GiB", "peak_memory_bytes", lambda value: f"{value / 2**30:.2f}", min),
+    Column("parameters", "parameters", "{:,.0f}".format, min),
+)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A figure in a table."""
+
+    text: str
+    best: bool = False
+
+
+def write_report(plan: Plan, rows: Sequence[Row]) -> Path:
+    """Write all four files. Returns: report.html."""
+    runs = [run for row in rows for run in row.runs]
+    content = _content(plan, rows, runs)
+    template = files("framework.tools.comparison").joinpath("report.html.jinja").read_text(encoding="utf-8")
+    import jinja2  # comes with torch
+
+    pages = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined)
+    _write(plan.folder / "report.html", pages.from_string(template).render(content))
+    _write(plan.folder / "report.md", markdown(content))
+    _write(plan.folder / "results.csv", _csv(runs))
+    plain = {
+        "conditions": vars(plan.conditions),
+        "repeats": plan.repeats,
+        "methods": [row.label for row in rows],
+        "failures": {row.label: list(row.failures) for row in rows if row.failures},
+        "runs": [run.as_plain() for run in runs],
+    }
+    _write(plan.folder / "results.json", json.dumps(plain, indent=2, allow_nan=False) + "\n")
+    return plan.folder / "report.html"
+
+
+def _write(path: Path, text: str) -> None:
+    write_atomically(path, lambda file: file.write(text.encode()))
+
+
+def _content(plan: Plan, rows: Sequence[Row], runs: Sequence[Measured]) -> dict[str, Any]:
+    """What both reports say."""
+    folders = [(row.label, Path(row.runs[0].folder) / "views") for row in rows if row.runs]
+    figure = plots.time_against_error(rows) if runs and plots.available() else None
+    data = Path(plan.conditions.data).name if plan.conditions.data else "the embedded scene"
+    return {
+        "title": f"{len(rows)} methods on {data}",
+        "when": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
+        "budget": plan.conditions.budget(),
+        "conditions": condition_lines(plan.conditions, plan.repeats, runs),
+        "columns": [column.title for column in COLUMNS],
+        "rows": table(rows),
+        "levels": levels(rows),
+        "level_rows": level_table(rows),
+        "failures": [(row.label, reason) for row in rows for reason in row.failures],
+        "figure": figure,
+        "no_figure": plots.MISSING,
+        "views": views(folders),
+        "error_at_white": ERROR_AT_WHITE,
+        "details": [
+            {"label": row.label, "color": plots.color_of(index), "run": row.runs[0]}
+            for index, row in enumerate(rows)
+            if row.runs
+        ],
+        "machines": machines(runs),
+    }
+
+
+def condition_lines(conditions: Conditions, repeats: int, runs: Sequence[Measured]) -> list[str]:
+    """What was the same for all, in sentences."""
+    views_judged = sorted({run.views for run in runs})
+    judged = " or ".join(map(str, views_judged)) or "all"
+    lines = [
+        f"Every method was given {conditions.budget()}, each run in a process of its own.",
+        f"Final figures are means over {judged} held-out views; learning curves over {conditions.curve_images} views "
+        "at most, whose evaluation does not count as training time.",
+        f"{repeats} seed{'s' if repeats > 1 else ''} a method"
+        + (
+            ": means, ± the standard deviation of a single run."
+            if repeats > 1
+            else "; --repeats 3 would tell how much runs differ."
+        ),
+    ]
+    if used := sorted({str(run.machine.get("kernels")) for run in runs}):
+        lines.append(f"Kernels: {' and '.join(used)}.")
+    notes = sorted({run.lpips_note for run in runs if run.lpips is None})
+    return lines + [f"LPIPS {note}" for note in notes]
+
+
+def table(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """The table's rows: label, colour, whether on a Pareto front, and a cell for each of `COLUMNS`."""
+    there = [row for row in rows if row.runs]
+    front = pareto([(row.mean("seconds") or math.inf, row.mean("psnr") or 0.0) for row in there])
+    on_front = {row.label for row, best in zip(there, front, strict=True) if best}
+    found = []
+    for index, row in enumerate(rows):
+        cells = [_cell(column, row, there) for column in COLUMNS] if row.runs else []
+        found.append(
+            {"label": row.label, "color": plots.color_of(index), "front": row.label in on_front, "cells": cells}
+        )
+    return found
+
+
+def console_table(rows: Sequence[Row]) -> Table:
+    """For a terminal: a line for each figure, for names of methods are long and lines are short."""
+    found = Table("", *(row.label for row in rows))
+    cells = [row["cells"] or [Cell("failed")] * len(COLUMNS) for row in table(rows)]
+    for column, figures in zip(COLUMNS, zip(*cells, strict=True), strict=True):
+        found.add_row(column.title, *(cell.text for cell in figures))
+    return found
+
+
+def _cell(column: Column, row: Row, rows: Sequence[Row]) -> Cell:
+    value, spread = row.mean(column.figure), row.deviation(column.figure)
+    if value is None:
+        return Cell("–")
+    text = column.show(value) + (f" ± {column.show(spread)}" if spread is not None and column.figure == "psnr" else "")
+    others = [other for other in (r.mean(column.figure) for r in rows) if other is not None]
+    if column.best is None or len(others) < 2:
+        return Cell(text)
+    return Cell(text, _best(column, value, others))
+
+
+def _best(column: Column, value: float, others: Sequence[float]) -> bool:
+    """Whether a figure is the best; where all are the same, none is."""
+    assert column.best is not None
+    alike = [math.isclose(other, column.best(others), rel_tol=column.same) for other in others]
+    return not all(alike) and math.isclose(value, column.best(others), rel_tol=column.same)
+
+
+def levels(rows: Sequence[Row]) -> list[int]:
+    """The whole dB that some contender reached after its first evaluation, at most the highest sixteen."""
+    reached = {level for row in rows for run in row.runs for level in run.seconds_to}
+    return sorted(reached)[-16:]
+
+
+def level_table(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Seconds of training to each of `levels`."""
+    found = []
+    for index, row in enumerate(rows):
+        times = [row.seconds_to(level) for level in levels(rows)]
+        cells = [Cell("–" if time is None else f"{time:.1f}") for time in times]
+        found.append({"label": row.label, "color": plots.color_of(index), "cells": cells})
+    return found
+
+
+def machines(runs: Sequence[Measured]) -> list[str]:
+    """The machines of the runs, in a line each."""
+    lines = []
+    for run in runs:
+        line = ", ".join(f"{name}: {value}" for name, value in run.machine.items() if value is not None)
+        if line not in lines:
+            lines.append(line)
+    return lines
+
+
+def markdown(content: dict[str, Any]) -> str:
+    """The report as Markdown, without pictures."""
+    lines = [f"# {content['title']}", "", content["when"], "", *(f"- {line}" for line in content["conditions"]), ""]
+    lines += _markdown_table(["method", *content["columns"]], content["rows"])
+    lines += [
+        "",
+        "Bold: best. *: no other method had a higher PSNR after as little training (times within 1 % are the same).",
+        "",
+    ]
+    if content["levels"]:
+        lines += ["Seconds of training to PSNR on the validation views:", ""]
+        lines += _markdown_table(["method", *(f"{level} dB" for level in content["levels"])], content["level_rows"])
+        lines.append("")
+    for label, reason in content["failures"]:
+        lines.append(f"- **{label} failed**: {reason}")
+    lines += ["", "Commands:", "", "```", *(detail["run"].command for detail in content["details"]), "```", ""]
+    lines += [f"Machine: {line}" for line in content["machines"]]
+    return "\n".join(lines) + "\n"
+
+
+def _markdown_table(head: list[str], rows: list[dict[str, Any]]) -> list[str]:
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for row in rows:
+        name = row["label"].replace("|", "\\|") + ("*" if row.get("front") else "")
+        cells = [f"**{cell.text}**" if cell.best else cell.text for cell in row["cells"]]
+        lines.append("| " + " | ".join([name, *(cells or ["failed"] + [""] * (len(head) - 2))]) + " |")
+    return lines
+
+
+CSV_FIGURES = ("label", "method", "seed", "psnr", "ssim", "lpips", "views", "steps", "seconds", "rays_per_second")
+CSV_MORE = ("render_seconds", "peak_memory_bytes", "parameters", "skipped_steps", "command")
+
+
+def _csv(runs: Sequence[Measured]) -> str:
+    reached = sorted({level for run in runs for level in run.seconds_to})
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow([*CSV_FIGURES, *CSV_MORE, *(f"seconds to {level} dB" for level in reached)])
+    for run in runs:
+        times = [run.seconds_to.get(level) for level in reached]
+        writer.writerow([*(getattr(run, name) for name in (*CSV_FIGURES, *CSV_MORE)), *times])
+    return file.getvalue()

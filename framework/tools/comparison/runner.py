@@ -1,0 +1,174 @@
+"""Running a comparison's jobs: each in processes of its own, one after the other or one on each device."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from queue import Queue
+
+from rich.status import Status
+
+from framework.base.console import console, say
+from framework.base.errors import ConfigError
+from framework.tools.comparison.measures import read_json
+from framework.tools.comparison.plan import Conditions, Job, Plan
+from framework.training.signals import NUMBERS, Stopped, handled
+
+LOOK_EVERY = 0.5
+"""Seconds between looks at what a run has printed last."""
+GRACE = 60.0
+"""Seconds that a run has to save before it is killed."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A job that did not work."""
+
+    reason: str
+    """The last line that it printed, or the signal that ended it."""
+    log: Path
+    """All that it printed."""
+
+
+def run_jobs(plan: Plan, jobs_at_once: int = 1) -> dict[Job, Failure]:
+    """Train and evaluate every job that is not done yet; a failed one is reported, and the others go on.
+
+    Args:
+        jobs_at_once: so many run side by side, each on a CUDA device of its own.
+    Returns: the jobs that failed.
+    Raises: ConfigError for more jobs at once than there are CUDA devices; Stopped once the runs under way have saved.
+    """
+    devices: Queue[str | None] = Queue()
+    for device in _devices(plan.conditions, jobs_at_once):
+        devices.put(device)
+    jobs, failures = plan.jobs(), {}
+    stopped, signals = threading.Event(), list[int]()
+
+    def work(number: int) -> None:
+        job = jobs[number]
+        if stopped.is_set():
+            return
+        if is_done(job):
+            say(f"[{number + 1}/{len(jobs)}] {job.title}: done before")
+            return
+        device = devices.get()
+        try:
+            say(f"[{number + 1}/{len(jobs)}] {job.title}: {plan.conditions.budget()}")
+            failure = run_job(job, plan.conditions, device, stopped)
+        finally:
+            devices.put(device)
+        if failure is not None and not stopped.is_set():
+            failures[job] = failure
+            say(f"  {job.title} failed: {failure.reason} (all it printed: {failure.log})")
+
+    with ThreadPoolExecutor(jobs_at_once) as pool, _noted(stopped, signals):
+        for future in [pool.submit(work, number) for number in range(len(jobs))]:
+            future.result()
+    if signals:
+        raise Stopped(signals[0], "stopped; the same command goes on from here")
+    return failures
+
+
+@contextmanager
+def _noted(stopped: threading.Event, signals: list[int]) -> Iterator[None]:
+    """Ctrl-C and SIGTERM set `stopped`, so that runs are ended in order and not left behind."""
+
+    def note(number: int, frame: object) -> None:
+        signals.append(number)
+        stopped.set()
+
+    with handled(NUMBERS, note):
+        yield
+
+
+def _devices(conditions: Conditions, jobs_at_once: int) -> Sequence[str | None]:
+    """What CUDA_VISIBLE_DEVICES is for each of the jobs that run side by side; None to leave it as it is."""
+    if jobs_at_once < 1:
+        raise ConfigError(f"--jobs is {jobs_at_once}; it must be at least 1")
+    if jobs_at_once == 1:
+        return [None]
+    import torch
+
+    there = torch.cuda.device_count() if conditions.device_type in ("auto", "cuda") else 0
+    if jobs_at_once > there:
+        raise ConfigError(
+            f"--jobs {jobs_at_once} needs as many CUDA devices, and there are {there}: runs that share one would slow "
+            "each other down, and no time would be comparable"
+        )
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    names = visible.split(",") if visible else [str(number) for number in range(there)]
+    return names[:jobs_at_once]
+
+
+def is_done(job: Job) -> bool:
+    """Whether a job has been trained to its end and evaluated."""
+    summary = read_json(job.folder / "summary.json")
+    return isinstance(summary, dict) and summary.get("interrupted") is False and job.evaluation.exists()
+
+
+def run_job(job: Job, conditions: Conditions, device: str | None, stopped: threading.Event) -> Failure | None:
+    """Train and evaluate one job. Returns: why it failed; None where it worked."""
+    job.log.parent.mkdir(parents=True, exist_ok=True)
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    if device is not None:
+        environment["CUDA_VISIBLE_DEVICES"] = device
+    for command in (job.train_command(conditions), job.eval_command(conditions)):
+        code = _run(command, job, environment, stopped)
+        if code != 0 or stopped.is_set():
+            return Failure(_reason(code, job.log), job.log)
+    if not is_done(job):
+        return Failure("it ended without a result", job.log)
+    return None
+
+
+def _run(command: list[str], job: Job, environment: dict[str, str], stopped: threading.Event) -> int:
+    """Run a command, its output going to the job's log, its last line to the terminal. Returns: its exit status."""
+    with job.log.open("ab") as log:
+        log.write(("$ " + " ".join(command) + "\n").encode())
+        log.flush()
+        # In a session of its own, so that Ctrl-C reaches it through us, once.
+        process = subprocess.Popen(command, stdout=log, stderr=log, env=environment, start_new_session=True)
+        # The terminal can show one status; runs side by side go without.
+        alone = console.is_terminal and "CUDA_VISIBLE_DEVICES" not in environment
+        with Status(job.title, console=console) if alone else nullcontext() as status:
+            while True:
+                try:
+                    return process.wait(timeout=LOOK_EVERY)
+                except subprocess.TimeoutExpired:
+                    if status is not None:
+                        status.update(f"{job.title}: {last_line(job.log)}")
+                if stopped.is_set():
+                    return _end(process)
+
+
+def _end(process: subprocess.Popen[bytes]) -> int:
+    """Let a run save and stop."""
+    process.terminate()
+    try:
+        return process.wait(timeout=GRACE)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
+
+
+def last_line(log: Path) -> str:
+    """The last line of a log that is not empty."""
+    with log.open("rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(size - 4096, 0))
+        lines = file.read().decode("utf-8", errors="replace").replace("\r", "\n").splitlines()
+    return next((line.strip() for line in reversed(lines) if line.strip()), "")
+
+
+def _reason(code: int, log: Path) -> str:
+    if code < 0 or code - 128 in NUMBERS:
+        name = signal.Signals(-code if code < 0 else code - 128).name
+        return f"ended by {name}" + (" (too little memory?)" if name == "SIGKILL" else "")
+    return last_line(log).removeprefix("error: ") or f"exit status {code}"

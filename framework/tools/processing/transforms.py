@@ -1,0 +1,148 @@
+"""transforms.json as nerfstudio reads it: lenses, camera-to-world poses with OpenGL axes, files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from framework.base.errors import DataError
+
+Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
+"""(3, 4) from COLMAP's frame, which tends to have y down, to one with z up."""
+
+_PARAMETERS = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
+}
+"""What COLMAP's parameters are, in their order; f is both focal lengths."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """What a camera's photographs have in common."""
+
+    model: str
+    """OPENCV, OPENCV_FISHEYE or PINHOLE."""
+    values: dict[str, float]
+    """w, h, fl_x, fl_y, cx, cy in pixels (the first pixel's centre is at 0.5) and k1, k2, ... as the model has them."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A photograph with its pose."""
+
+    name: str
+    """Path in the images folder, with '/'."""
+    pose: np.ndarray
+    """(3 or 4, 4) camera-to-world, OpenGL axes."""
+    lens: Lens
+    mask: str | None = None
+    """Path in the masks folder."""
+    image_id: int | None = None
+    """COLMAP's number of the image."""
+    source: str | None = None
+    """Path of the photograph in the input folder."""
+
+
+def lens_of(model: str, width: int, height: int, parameters: Sequence[float]) -> Lens:
+    """A COLMAP camera as a lens; models that are special cases of OPENCV become it.
+
+    Raises: DataError for a model that transforms.json cannot express.
+    """
+    if model not in _PARAMETERS:
+        raise DataError(f"camera model {model} has no place in transforms.json; it can hold {', '.join(_PARAMETERS)}")
+    named = dict(zip(_PARAMETERS[model], map(float, parameters), strict=True))
+    focal = named.pop("f", None)
+    if focal is not None:
+        named = {"fl_x": focal, "fl_y": focal, **named}
+    distortion: tuple[str, ...] = ()
+    if model.endswith("PINHOLE"):
+        kind = "PINHOLE"
+    elif model == "OPENCV_FISHEYE":
+        kind, distortion = model, ("k1", "k2", "k3", "k4")
+    else:
+        kind, distortion = "OPENCV", ("k1", "k2", "p1", "p2")
+    ordered = {"w": width, "h": height, **{key: named[key] for key in ("fl_x", "fl_y", "cx", "cy")}}
+    return Lens(kind, ordered | {key: named.get(key, 0.0) for key in distortion})
+
+
+def opengl_pose(world_to_camera: np.ndarray) -> np.ndarray:
+    """(4, 4) camera-to-world with OpenGL axes (y up, looking along -z) of a (3, 4) world-to-camera with y down."""
+    rotation, translation = world_to_camera[:, :3], world_to_camera[:, 3]
+    pose = np.eye(4)
+    pose[:3, :3] = rotation.T * [1, -1, -1]
+    pose[:3, 3] = -rotation.T @ translation
+    return pose
+
+
+def transformed(poses: np.ndarray, transform: np.ndarray) -> np.ndarray:
+    """Camera-to-world poses (..., 4, 4) after a change (3, 4) of the world's frame."""
+    return np.concatenate([transform, [[0.0, 0, 0, 1]]]) @ poses
+
+
+def content(frames: list[Frame], applied: np.ndarray, points: str | None, more: dict[str, Any]) -> dict[str, Any]:
+    """What transforms.json holds.
+
+    Args:
+        frames: at least one; the lens stands at the top where all have the same, else with each frame.
+        applied: (3, 4) from the frame of the poses' origin (COLMAP, phone) to that of `frames`.
+        points: name of the point cloud beside it.
+        more: further entries of the top.
+    """
+    models = {frame.lens.model for frame in frames}
+    if len(models) > 1:
+        raise DataError(f"transforms.json holds one camera model, not {' and '.join(sorted(models))}")
+    shared = frames[0].lens.values if all(frame.lens == frames[0].lens for frame in frames) else None
+    top: dict[str, Any] = {"camera_model": frames[0].lens.model, **(shared or {})}
+    top |= {"applied_transform": applied.tolist(), **more}
+    if points is not None:
+        top["ply_file_path"] = points
+    top["frames"] = []
+    for frame in frames:
+        entry: dict[str, Any] = {"file_path": f"images/{frame.name}"}
+        if frame.mask is not None:
+            entry["mask_path"] = f"masks/{frame.mask}"
+        if frame.source is not None:
+            entry["source_path"] = frame.source
+        if shared is None:
+            entry |= frame.lens.values
+        pose = np.eye(4)
+        pose[:3] = frame.pose[:3]
+        entry["transform_matrix"] = pose.tolist()
+        if frame.image_id is not None:
+            entry["colmap_im_id"] = frame.image_id
+        top["frames"].append(entry)
+    return top
+
+
+def write(path: Path, value: dict[str, Any]) -> None:
+    """Write JSON so that a killed process leaves the whole of it or nothing."""
+    from framework.training.checkpoint import write_atomically  # brings torch
+
+    text = json.dumps(value, indent=2, allow_nan=False)
+    write_atomically(path, lambda file: file.write(text.encode()))
+
+
+def write_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
+    """Write a point cloud as a text PLY.
+
+    Args:
+        points: (K, 3) positions.
+        colors: (K, 3) uint8.
+    """
+    names = [*(f"property float {axis}" for axis in "xyz"), *(f"property uint8 {c}" for c in ("red", "green", "blue"))]
+    header = ["ply", "format ascii 1.0", f"element vertex {len(points)}", *names, "end_header"]
+    rows = [
+        f"{x:.8g} {y:.8g} {z:.8g} {r} {g} {b}"
+        for (x, y, z), (r, g, b) in zip(points.tolist(), colors.tolist(), strict=True)
+    ]
+    path.write_text("\n".join([*header, *rows]) + "\n", encoding="ascii")

@@ -1,0 +1,194 @@
+"""The hard conditions: what each does to the photographs and to the run, and what is then expected of a method.
+
+Everywhere: no crash, nothing that is not finite at the end, and no step dropped but those whose pixels were spoiled.
+How much worse than the plain run it may be is said by each condition; where more is lost for a reason that no method
+can help, the condition says that too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from framework.base.config import TrainConfig
+from framework.base.errors import ConfigError, nearest
+from framework.data.dataset import Dataset
+from framework.tools.stress.faults import Spoil, spoiled_pixel, spoiled_pose
+from framework.tools.stress.scenes import Views, ball_views
+from framework.tools.stress.variants import first_image, moved, one_pixel, plain_colored, transparent, twice
+from framework.tools.testing.ball import RADIUS
+
+ALLOWED = 2.0
+"""dB that a short run may lose before it is called degraded: a choice, whose control is what `another-seed` loses."""
+ALLOWED_OF_OTHER_PICTURES = 5.0
+"""The same where the pictures that are judged show more or less than the plain run's, so that figures compare roughly.
+
+Pictures that are easier than the plain ones (all white, black or transparent), or that show as much of the ball (4
+degrees), have to be as good: for those it is `ALLOWED`.
+"""
+
+A_THIRD = "a third of the steps teach nothing, as they should"
+
+Change = Callable[[Views], Views]
+Settings = Callable[[TrainConfig], dict[str, Any]]
+"""From the plain run's settings to those that are changed, as plain values."""
+
+
+def _same(views: Views) -> Views:
+    return views
+
+
+def _none(config: TrainConfig) -> dict[str, Any]:
+    return {}
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What is hard, and what is expected."""
+
+    name: str
+    """For the command line and the table."""
+    what: str
+    """What is done, for people."""
+    change: Change = _same
+    """To the photographs."""
+    settings: Settings = _none
+    """To the run's settings."""
+    rays: int | None = None
+    """Rays in a step, whatever the method would take; as many as it takes if None."""
+    spoil: Spoil | None = None
+    """To every third batch."""
+    allowed: float = ALLOWED
+    """dB lost against the plain run before it is called degraded."""
+    reason: str | None = None
+    """Why more may be lost; None where nothing would explain it."""
+    may_refuse: bool = False
+    """A clear refusal (NerfloomError) is as good an answer as a result."""
+    may_skip: bool = False
+    """Any step may be dropped because it is not finite."""
+    ball_only: bool = False
+    """It needs pictures from elsewhere, which can be made of the ball, and not of somebody's data."""
+
+
+def _both(change: Callable[[Dataset], Dataset]) -> Change:
+    """Change the photographs that are learnt from and those that judge."""
+    return lambda views: views.each(change)
+
+
+def _train(change: Callable[[Dataset], Dataset]) -> Change:
+    """Change the photographs that are learnt from."""
+    return lambda views: replace(views, train=change(views.train))
+
+
+def _moved(scale: float = 1.0, shift: float = 0.0, placed: bool = False) -> Change:
+    return lambda views: moved(views, scale, shift, placed)
+
+
+def _fixed(**settings: Any) -> Settings:
+    return lambda config: settings
+
+
+# Why more may be lost, where that is shared or long.
+UNIT = "density is per unit of length, and starts at about 1: a format that does not place cameras wants --scale-factor"
+FAR_OFF = "float32 resolves 0.001 there, and frequency encodings nothing: such a scene should be placed"
+
+PLAIN = Condition("plain", "nothing hard: what the others are compared with")
+CONDITIONS = (
+    PLAIN,
+    # -- what the photographs show
+    Condition("all-white", "white opaque photographs", _both(lambda d: plain_colored(d, 255))),
+    Condition("all-black", "black opaque photographs", _both(lambda d: plain_colored(d, 0))),
+    Condition("all-transparent", "photographs of nothing, alpha 0", _both(transparent)),
+    Condition("one-image", "a single photograph", _train(first_image), reason="it says little of the other sides"),
+    Condition(
+        "one-pixel-images",
+        "photographs of one pixel",
+        _both(one_pixel),
+        allowed=ALLOWED_OF_OTHER_PICTURES,
+        reason="a dozen pixels are all that there is, each the mean of a picture of which its ray sees the middle",
+    ),
+    Condition("duplicate-cameras", "every photograph and its camera twice", _train(twice)),
+    # -- how it is looked at
+    Condition(
+        "field-of-view-4",
+        "pictures 4 degrees wide, from as far away as that takes",
+        lambda _: ball_views(4.0),
+        ball_only=True,
+    ),
+    Condition(
+        "field-of-view-170",
+        "pictures 170 degrees wide, from inside: from outside, hardly a pixel would see the ball",
+        lambda _: ball_views(170.0, RADIUS / 2),
+        allowed=ALLOWED_OF_OTHER_PICTURES,
+        reason="a pixel in the middle spans over 40 degrees",
+        ball_only=True,
+    ),
+    Condition(
+        "inside",
+        "cameras inside the object, which fills all pictures",
+        lambda _: ball_views(90.0, RADIUS / 2),
+        allowed=ALLOWED_OF_OTHER_PICTURES,
+        reason="matter right before the cameras explains a few photographs as well as walls do",
+        ball_only=True,
+    ),
+    # -- where the scene is: see `variants.moved` for the two ways in which it arrives
+    Condition("scale-1e-6", "a scene a million times smaller, not placed", _moved(1e-6), reason=UNIT),
+    Condition("scale-1e6", "a scene a million times larger, not placed", _moved(1e6), reason=UNIT),
+    Condition("shift-1e4", "a scene 10,000 units off along each axis, not placed", _moved(shift=1e4), reason=FAR_OFF),
+    Condition("placed", "cameras placed as those of captures are", _moved(placed=True)),
+    Condition("scale-1e-6-placed", "a scene a million times smaller, then placed", _moved(1e-6, placed=True)),
+    Condition("scale-1e6-placed", "a scene a million times larger, then placed", _moved(1e6, placed=True)),
+    Condition("shift-1e4-placed", "a scene 10,000 units off, then placed", _moved(shift=1e4, placed=True)),
+    # -- how it is trained
+    Condition(
+        "another-seed",
+        "the plain run from another seed: what runs differ by anyway",
+        settings=lambda config: {"machine": {"seed": config.machine.seed + 1}},
+    ),
+    Condition(
+        "learning-rate-x10",
+        "ten times the learning rate",
+        settings=lambda config: {"learning_rate": 10 * config.learning_rate},
+        reason="ten times the rate that it was tuned for",
+    ),
+    Condition("float32", "--mixed-precision False", settings=_fixed(mixed_precision=False)),
+    Condition("bfloat16", "--mixed-precision True", settings=_fixed(mixed_precision=True)),
+    Condition(
+        "float16",
+        "--mixed-precision float16, which is not offered: its range would want a gradient scaler",
+        settings=_fixed(mixed_precision="float16"),
+        may_refuse=True,
+    ),
+    Condition(
+        "1-ray",
+        "one ray a step",
+        settings=_fixed(train_rays_per_pixel_from=1.0),  # never several through a pixel
+        rays=1,
+        reason="it sees no more pixels than it does steps",
+    ),
+    Condition("8192-rays", "8192 rays a step", rays=8192, reason="steps take longer: fewer may fit into the time"),
+    # -- what should have been refused
+    Condition("nan-pixels", "a NaN pixel in every third batch", spoil=spoiled_pixel(math.nan), reason=A_THIRD),
+    Condition("inf-pixels", "an infinite pixel in every third batch", spoil=spoiled_pixel(math.inf), reason=A_THIRD),
+    Condition(
+        "nan-pose",
+        "a camera whose pose is NaN, past the format that should have refused it",
+        _train(lambda d: spoiled_pose(d, math.nan)),
+        may_refuse=True,
+        may_skip=True,
+    ),
+)
+
+
+def select(names: Sequence[str]) -> list[Condition]:
+    """The conditions of these names, in their usual order, behind the plain run; all if none is named.
+
+    Raises: ConfigError for an unknown name, with the nearest.
+    """
+    known = [condition.name for condition in CONDITIONS]
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"--only: there is no condition '{name}'. {nearest(name, known)}")
+    return [condition for condition in CONDITIONS if condition is PLAIN or not names or condition.name in names]

@@ -1,0 +1,15 @@
+"""Checks for a method's author: does it keep what the trainer and the evaluator rely on?
+
+In a test of your package:
+
+    from framework.tools.testing import assert_method
+
+    def test_the_method():
+        assert_method(METHOD)
+"""
+
+from __future__ import annotations
+
+from framework.tools.testing.check import assert_method as assert_method
+from framework.tools.testing.check import check_method as check_method
+from framework.tools.testing.finding import Finding as Finding

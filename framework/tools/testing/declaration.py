@@ -1,0 +1,44 @@
+"""Checks of what a method declares: its settings and its summary."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from dataclasses import fields
+
+import yaml
+
+from framework.base.config import TrainConfig, from_plain, to_plain
+from framework.tools.testing.finding import Fault
+from framework.tools.testing.subject import Subject
+
+
+def check_config(subject: Subject) -> str:
+    """Settings are a frozen dataclass derived from TrainConfig, and survive config.yml."""
+    config = subject.config
+    kind = type(config)
+    if not isinstance(config, TrainConfig):
+        raise Fault(f"{kind.__name__} does not derive from framework.TrainConfig, as every method's settings do")
+    # Python itself refuses a dataclass that derives from a frozen one and is not frozen.
+    if "__dataclass_fields__" not in vars(kind) and inspect.get_annotations(kind):
+        raise Fault(f"{kind.__name__} is no dataclass of its own; write @dataclass(frozen=True) above it")
+    for what, before in (("the settings", config), ("resolved() settings", config.resolved())):
+        written = yaml.safe_dump(to_plain(before))
+        after = from_plain(subject.method.config, yaml.safe_load(written), "config.yml")
+        if after != before:
+            lost = [f.name for f in fields(before) if getattr(after, f.name) != getattr(before, f.name)]
+            raise Fault(
+                f"{what} do not survive config.yml ({', '.join(lost) or type(before).__name__}); a setting is a bool, "
+                "a number, a string, a Path, a Literal, a tuple of those, or a dataclass of those"
+            )
+    return f"{len(fields(config))} settings survive config.yml"
+
+
+def check_summary(subject: Subject) -> str:
+    """The module has a docstring, whose first line is the method's summary."""
+    module = subject.method.model.__module__
+    docstring = getattr(sys.modules.get(module), "__doc__", None) or ""
+    summary = docstring.strip().split("\n")[0]
+    if not summary:
+        raise Fault(f"the module {module} has no docstring; its first line is what ns-train --help shows")
+    return summary

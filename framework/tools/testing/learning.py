@@ -1,0 +1,187 @@
+"""Checks of how a model learns: its loss, its gradients, and that training is repeatable and leads somewhere."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from framework.cameras.cameras import subpixels
+from framework.tools.testing.finding import Fault
+from framework.tools.testing.rendering import require_rendered
+from framework.tools.testing.subject import STEPS, Learner, Subject, total
+from framework.training.optim import first_non_finite
+
+FIRST_STEPS = 3
+"""Whose gradients are looked at."""
+GRADIENT_STEPS = 40
+"""Within which every parameter must have had a gradient: proposals have none until they fall short."""
+REPEATED_STEPS = 2
+"""After which two models are compared."""
+RAYS_PER_PIXEL = 4
+LEARNT = 0.8
+"""The most that may be left of the error after STEPS steps, as a share."""
+
+
+def check_loss(subject: Subject) -> str:
+    """`loss` returns named scalars that are finite and lead back to the parameters, also of several rays a pixel."""
+
+    def look(learner: Learner) -> None:
+        for count in (1, RAYS_PER_PIXEL):
+            _, losses = learner.losses(learner.batch(subpixels(count)))
+            _require_losses(losses, "" if count == 1 else f" of {count} rays a pixel")
+
+    subject.on_each_scene(look)
+    return "named scalars, finite, with a gradient"
+
+
+def _require_losses(losses: dict[str, Tensor], of: str) -> None:
+    if not isinstance(losses, dict) or not losses:
+        raise Fault(f"the loss{of} is {type(losses).__name__}, or empty; return a dictionary of named scalars")
+    for name, value in losses.items():
+        if not isinstance(value, Tensor) or value.ndim:
+            shape = tuple(value.shape) if isinstance(value, Tensor) else value
+            raise Fault(f"the loss{of} '{name}' is {shape}, not a scalar tensor; take its mean")
+        if not bool(torch.isfinite(value)):
+            raise Fault(f"the loss{of} '{name}' is {float(value.detach())} in the first step")
+    if not total(losses).requires_grad:
+        raise Fault(f"no loss{of} has a gradient; is something detached, or computed under torch.no_grad()?")
+
+
+def check_groups(subject: Subject) -> str:
+    """`param_groups` holds every parameter exactly once."""
+
+    def look(learner: Learner) -> None:
+        known = {id(parameter): name for name, parameter in learner.model.named_parameters()}
+        held = Counter(id(p) for group in learner.model.param_groups() for p in group["params"])
+        if strangers := held.keys() - known.keys():
+            raise Fault(
+                f"param_groups() holds tensors that are no parameters of the model, {len(strangers)} of them; "
+                "make each an attribute that is a torch.nn.Parameter"
+            )
+        if twice := [known[key] for key, count in held.items() if count > 1]:
+            raise Fault(f"{_names(twice)} more than once in param_groups()")
+        if missing := [name for name, p in learner.model.named_parameters() if p.requires_grad and not held[id(p)]]:
+            raise Fault(f"{_names(missing)} in no group of param_groups(), and never updated")
+
+    subject.on_each_scene(look)
+    return "every parameter is in one group"
+
+
+def check_gradients(subject: Subject) -> str:
+    """In the first steps, parameters and their gradients are finite."""
+
+    def look(learner: Learner) -> None:
+        for step in range(FIRST_STEPS):
+            learner.step_backward()
+            if (bad := first_non_finite(learner.model, learner.optimizer)) is not None:
+                raise Fault(f"{bad} is not finite in step {step}")
+            learner.descend()
+
+    subject.on_each_scene(look)
+    return "finite in the first steps"
+
+
+def check_unused(subject: Subject) -> str:
+    """Every parameter that asks for a gradient gets one, sooner or later."""
+
+    def look(learner: Learner) -> None:
+        waiting = {name for name, parameter in learner.model.named_parameters() if parameter.requires_grad}
+        for _ in range(GRADIENT_STEPS):
+            learner.step_backward()
+            waiting -= {name for name, p in learner.model.named_parameters() if _has_gradient(learner, p)}
+            if not waiting:
+                return
+            learner.descend()
+        raise Fault(
+            f"{_names(sorted(waiting))} without a gradient, or with one of zeros, in each of {GRADIENT_STEPS} steps; "
+            "use it, or set requires_grad to False"
+        )
+
+    subject.on_each_scene(look)
+    return "every parameter gets a gradient"
+
+
+def _has_gradient(learner: Learner, parameter: Tensor) -> bool:
+    """Whether some entry has a gradient that is not zero, which of sparse tables may still wait to be added up."""
+    deferred = learner.optimizer.deferred.get(parameter)
+    if deferred is not None and deferred.pending:
+        return True
+    return parameter.grad is not None and bool((parameter.grad != 0).any())
+
+
+def _names(names: list[str]) -> str:
+    """Some names, as the subject of a sentence."""
+    some = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+    return f"{some} {'is' if len(names) == 1 else 'are'}"
+
+
+def check_repetition(subject: Subject) -> str:
+    """The same seed gives the same bits."""
+    learners = [subject.learner(), subject.learner()]
+    for learner in learners:
+        for _ in range(REPEATED_STEPS):
+            learner.step()
+    require_same(learners[0], learners[1], f"after {REPEATED_STEPS} steps by the same seed", "draw with torch only")
+    return "two models of one seed are the same after two steps, bit for bit"
+
+
+def require_same(one: Learner, other: Learner, when: str, remedy: str) -> None:
+    """Raises: Fault where two models differ in a bit of what they keep."""
+    first, second = one.model.state_dict(), other.model.state_dict()
+    different = [name for name, value in first.items() if not torch.equal(value, second[name])]
+    if different:
+        raise Fault(f"{when}, {_names(different)} different; {remedy}")
+
+
+def check_training(subject: Subject) -> str:
+    """Training goes on for a while without an error, the loss staying finite."""
+    history = subject.trained.history
+    bad = [step for step, loss in enumerate(history) if not math.isfinite(loss)]
+    if bad:
+        raise Fault(f"the loss is not finite in {len(bad)} of {STEPS} steps, the first being step {bad[0]}")
+    return f"{STEPS} steps"
+
+
+def check_learning(subject: Subject) -> str:
+    """What is trained shows the photographs better than what is not."""
+    before, after = subject.learner().error(), subject.trained.error()
+    change = f"from {before:.3g} to {after:.3g} in {STEPS} steps"
+    if not after < LEARNT * before:
+        raise Fault(
+            f"the squared error goes {change}; check the loss's sign and the learning rates, or give a config with a "
+            "smaller model and a higher --learning-rate"
+        )
+    return f"the squared error falls {change}"
+
+
+def check_nan_colors(subject: Subject) -> str:
+    """A photograph's NaN is seen in the loss, so that the trainer drops the step."""
+    learner = subject.learner()
+    batch = learner.batch()
+    rgb = batch.rgb.clone()
+    rgb[0] = torch.nan
+    _, losses = learner.losses(replace(batch, rgb=rgb))
+    if bool(torch.isfinite(total(losses))):
+        raise Fault("a NaN among a batch's colours leaves the loss finite; let it through, the trainer drops the step")
+    return "a NaN in a photograph makes the loss NaN, and the trainer drops the step"
+
+
+def check_bfloat16(subject: Subject) -> str:
+    """Under autocast a step works, and pictures and losses are float32 and finite."""
+
+    def look(learner: Learner) -> None:
+        batch = learner.batch()
+        with torch.autocast("cpu", torch.bfloat16):
+            rendered, losses = learner.losses(batch)
+        require_rendered(rendered, len(batch.rays), "under autocast")
+        _require_losses(losses, " under autocast")
+        learner.backward(losses)
+        if (bad := first_non_finite(learner.model, learner.optimizer)) is not None:
+            raise Fault(f"under autocast {bad} is not finite")
+
+    subject.on_each_scene(look)
+    return "a step under torch.autocast gives a finite float32 picture"

@@ -1,0 +1,40 @@
+"""The check of checkpoints: what is loaded shows the same and learns on as if nothing had happened."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import torch
+
+from framework.tools.testing.finding import Fault
+from framework.tools.testing.learning import require_same
+from framework.tools.testing.subject import SEED, Learner, Subject
+from framework.training.checkpoint import load_checkpoint, save_checkpoint
+from framework.training.trained import restore_model
+
+
+def check_checkpoint(subject: Subject) -> str:
+    """A model that is loaded renders the same picture, and takes the same next step, bit for bit."""
+    trained, loaded = subject.trained, subject.learner(seed=SEED + 1)
+    _hand_over(trained, loaded)
+    view = trained.view()
+    before, after = (learner.show(view.rays, view.background) for learner in (trained, loaded))
+    remedy = "what a model remembers must be a parameter or a buffer (register_buffer), so that state_dict() holds it"
+    for name in ("rgb", "median_depth", "accumulation"):
+        if not torch.equal(getattr(before, name), getattr(after, name)):
+            raise Fault(f"loaded into a new model, a checkpoint renders another picture ({name}); {remedy}")
+    for learner in (trained, loaded):
+        learner.step()
+    require_same(trained, loaded, "a step after a checkpoint was loaded", remedy)
+    return "a loaded one gives the same picture and the same next step, bit for bit"
+
+
+def _hand_over(trained: Learner, fresh: Learner) -> None:
+    """Load into one what the other saves."""
+    content = {"model": trained.model.state_dict(), "optimizer": trained.optimizer.state_dict()}
+    with tempfile.TemporaryDirectory() as folder:
+        content = load_checkpoint(save_checkpoint(Path(folder), trained.done, content, keep_all=True))
+    restore_model(fresh.model, content)
+    fresh.optimizer.load_state_dict(content["optimizer"])
+    fresh.done = trained.done

@@ -1,0 +1,74 @@
+"""What a measurement was made on: a figure without it says nothing."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import framework
+from framework.base.device import machine_memory
+from framework.kernels import native
+
+
+def machine(device: torch.device | None = None) -> dict[str, Any]:
+    """Processor, cores, threads, memory, device, kernels, versions and commit, as plain data.
+
+    Args:
+        device: what is computed on; the processor if None.
+    """
+    on_cuda = device is not None and device.type == "cuda"
+    memory = machine_memory()
+    return {
+        "processor": processor(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "memory, GB": round(memory / 1e9, 1) if memory < float("inf") else None,
+        "device": torch.cuda.get_device_name(device) if on_cuda else (device.type if device is not None else "cpu"),
+        "kernels": kernels(device),
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "nerfloom": framework.__version__,
+        "commit": commit(),
+    }
+
+
+def kernels(device: torch.device | None = None) -> str:
+    """What computes on a device: a variant of the compiled kernels, or "reference", which is torch alone.
+
+    Args:
+        device: the processor if None.
+    """
+    return native.variant() if device is None or device.type == "cpu" else "reference"
+
+
+def processor() -> str:
+    """The processor's name, as far as the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    names = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    return next(names, "") or platform.processor() or platform.machine()
+
+
+def commit() -> str | None:
+    """The commit of the checkout that is run, with + where files differ from it; None for an installed package."""
+    root = Path(framework.__file__).parents[1]
+    if not (root / ".git").exists():
+        return None
+    try:
+        head = _git(root, "rev-parse", "--short=12", "HEAD")
+        return head + ("+" if _git(root, "status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def _git(root: Path, *words: str) -> str:
+    done = subprocess.run(["git", "-C", root, *words], capture_output=True, text=True, timeout=10, check=True)
+    return done.stdout.strip()

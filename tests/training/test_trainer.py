@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from dataparsers.blender import Blender
-from framework import Batch, Method, Model, Rays, Rendered, registry
+from framework import Batch, Method, Model, Rays, Rendered
+from framework.base import registry
 from framework.base.errors import CheckpointError, ConfigError, DivergenceError
 from framework.cli.session import first_split, load_split
 from framework.evaluation.evaluator import evaluate, evaluation_background, render_view

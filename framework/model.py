@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from framework.base.config import TrainConfig
 from framework.data.pixels import Batch
 from framework.data.scene import Scene
-from framework.encodings.encodings import FeaturePlanes, HashGrid
+from framework.encodings.hash_grid import HashGrid
+from framework.encodings.planes import FeaturePlanes
 from framework.geometry.rays import Rays
 from framework.rendering.losses import mean_squared_error
 from framework.rendering.volume import Rendered

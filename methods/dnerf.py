@@ -12,7 +12,7 @@ from torch import Tensor
 
 from framework import Decision, Field, Method, Model, Rays, Rendered, Scene
 from framework.base.config import AT_LEAST_0, Range
-from framework.encodings.encodings import HashGrid
+from framework.encodings.hash_grid import HashGrid
 from framework.fields.deformed import DeformedField
 from framework.fields.encoded import EncodedField
 from framework.fields.nerf import NeRFField

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from framework import Decision, Method, Model, Rays, Rendered, Scene
 from framework.base.config import Range, RaysPerPixel
-from framework.encodings.encodings import HashGrid
+from framework.encodings.hash_grid import HashGrid
 from framework.fields.encoded import EncodedField
 from framework.kernels.hash_grid import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
 from framework.rendering.volume import render_field

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from framework import Batch, Decision, Method, Model, Rays, Rendered, Scene
 from framework.base.config import AT_LEAST_0, Range
-from framework.encodings.encodings import FeaturePlanes
+from framework.encodings.planes import FeaturePlanes
 from framework.fields.base import MLP
 from framework.fields.encoded import BoxField, EncodedField
 from framework.kernels.math import truncated_exp

@@ -15,7 +15,7 @@ from torch import Tensor
 from framework import Batch, ConfigError, Decision, Method, Model, Rays, Rendered, Scene
 from framework.base.config import AT_LEAST_0, Range
 from framework.cameras.refinement import PoseRefinement
-from framework.encodings.encodings import HashGrid
+from framework.encodings.hash_grid import HashGrid
 from framework.fields.encoded import EncodedField
 from framework.fields.normals import NormalHead, density_normals, normal_penalties
 from framework.geometry.rays import Samples

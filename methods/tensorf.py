@@ -16,7 +16,7 @@ from torch.nn.functional import softplus
 
 from framework import Batch, Decision, Field, Method, Model, Rays, Rendered, Scene
 from framework.base.config import AT_LEAST_0, Range
-from framework.encodings.encodings import FeaturePlanes
+from framework.encodings.planes import FeaturePlanes
 from framework.fields.base import MLP
 from framework.geometry.bounds import to_unit_box
 from framework.kernels.contraction import contract_to_unit

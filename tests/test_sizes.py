@@ -14,7 +14,8 @@ from framework.base.config import MachineConfig, TrainConfig, from_plain
 from framework.base.errors import ConfigError, NerfloomError
 from framework.base.registry import load_method, registered
 from framework.data.scene import Scene
-from framework.encodings.encodings import FeaturePlanes, HashGrid
+from framework.encodings.hash_grid import HashGrid
+from framework.encodings.planes import FeaturePlanes
 from framework.fields.base import MLP
 from framework.kernels.frequency import frequency_encoding
 from framework.kernels.hash_grid import MAX_RESOLUTION, HashGridLayout

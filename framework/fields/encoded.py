@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.encodings.encodings import FeaturePlanes, HashGrid
+from framework.encodings.hash_grid import HashGrid
+from framework.encodings.planes import FeaturePlanes
 from framework.fields.appearance import Appearance
 from framework.fields.base import MLP, Field
 from framework.kernels.contraction import contract_to_unit

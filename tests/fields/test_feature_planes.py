@@ -6,7 +6,7 @@ import pytest
 import torch
 from scipy.stats import chisquare
 
-from framework.encodings.encodings import FeaturePlanes
+from framework.encodings.planes import FeaturePlanes
 from framework.kernels.adam import sparse_adam_reference
 from framework.training.checkpoint import load_checkpoint
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer

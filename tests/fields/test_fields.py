@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from framework.encodings.encodings import HashGrid
+from framework.encodings.hash_grid import HashGrid
 from framework.fields.base import Field
 from framework.fields.encoded import EncodedField
 from framework.fields.nerf import NeRFField

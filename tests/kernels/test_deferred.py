@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.encodings.encodings import FeaturePlanes, HashGrid
+from framework.encodings.hash_grid import HashGrid
+from framework.encodings.planes import FeaturePlanes
 from framework.kernels.hash_grid import TableGradient
 from framework.kernels.planes import PlanesGradient
 from framework.training.optim import Adam

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from framework.encodings.encodings import HashGrid
+from framework.encodings.hash_grid import HashGrid
 from framework.kernels.hash_grid import PRIMES, HashGridLayout, corners, hash_grid, hash_grid_reference
 
 MIXED = HashGridLayout.build(num_levels=4, base_resolution=4, max_resolution=40, log2_table_size=9)

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from framework.encodings.encodings import HashGrid
+from framework.encodings.hash_grid import HashGrid
 from framework.fields.encoded import EncodedField
 from framework.kernels.march import refresh_occupancy
 from framework.kernels.math import MAX_LOG_DENSITY, split_density, truncated_exp

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from framework.data.light import QUANTILES, light_of
-from framework.encodings.encodings import HashGrid
+from framework.encodings.hash_grid import HashGrid
 from framework.evaluation.images import to_uint8
 from framework.fields.encoded import EncodedField
 from framework.fields.normals import NormalHead, density_normals

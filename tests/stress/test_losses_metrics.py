@@ -15,7 +15,7 @@ from torch import Tensor
 
 from framework.data.depths import read_depths
 from framework.data.scene import Scene
-from framework.encodings.encodings import FeaturePlanes
+from framework.encodings.planes import FeaturePlanes
 from framework.evaluation.metrics import MAX_PSNR, load_lpips, psnr, ssim
 from framework.geometry.rays import Histogram, Samples
 from framework.kernels.compositing import distortion, distortion_reference

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from framework.base.config import TrainConfig
 from framework.base.errors import ConfigError
-from framework.encodings.encodings import HashGrid
+from framework.encodings.hash_grid import HashGrid
 from framework.evaluation.evaluator import evaluation_background, render_view
 from framework.fields.base import Field
 from framework.fields.encoded import EncodedField

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from framework import Field, Method, Model, Rays, Rendered, Scene
-from framework.encodings.encodings import HashGrid
+from framework.encodings.hash_grid import HashGrid
 from framework.fields.base import MLP
 from framework.geometry.bounds import to_unit_box
 from framework.kernels.contraction import contract_to_unit

@@ -1,131 +1,176 @@
-"""What the trainer and the evaluator know of a method."""
+"""What the trainer, the evaluator and the commands know of a method."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar, cast, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 
 from framework.base.config import TrainConfig
-from framework.data.pixels import Batch
+from framework.base.device import has_bfloat16
+from framework.base.optimised import ParameterGroup, RowChange, parameter_groups
+from framework.cameras.cameras import Cameras
+from framework.cameras.view import View
 from framework.data.scene import Scene
-from framework.encodings.hash_grid import HashGrid
-from framework.encodings.planes import FeaturePlanes
-from framework.geometry.rays import Rays
-from framework.rendering.losses import mean_squared_error
-from framework.rendering.volume import Rendered
-from framework.samplers.occupancy import OccupancySampler
-from framework.samplers.proposal import ProposalSampler, interlevel_loss
-from framework.scene.profile import Decision
-
-PROPOSAL_ADAM = {"lr": 1e-2, "betas": (0.9, 0.99), "eps": 1e-15}
-"""Of proposals in any method."""
+from framework.fields.appearance import Appearance
+from framework.geometry.points import Points
+from framework.rendering.rendered import Picture
 
 ConfigT = TypeVar("ConfigT", bound=TrainConfig)
+PartT = TypeVar("PartT")
+
+
+@dataclass(frozen=True)
+class Loss:
+    """What a model makes of a batch."""
+
+    terms: dict[str, Tensor]
+    """Named scalars; their sum is minimised."""
+    rgb: Tensor
+    """The colours that it showed, shaped like the batch's; for the running error and the choice of pixels."""
+    num_samples: int = 0
+    """Evaluations of the field; 0 of a method that has none."""
+
+    @property
+    def total(self) -> Tensor:
+        """What is minimised."""
+        return torch.stack(list(self.terms.values())).sum()
 
 
 class Model(nn.Module, ABC, Generic[ConfigT]):
-    """A radiance field that can be trained. `self.training` tells random sampling (True) from fixed (False).
+    """What is trained and rendered. `self.training` tells random sampling (True) from fixed (False).
 
     Args:
-        config: the method's settings.
+        config: the method's settings, decided.
         scene: facts about the data.
     """
+
+    batches: ClassVar[Literal["pixels", "views"]]
+    """What it learns from: pixels of all images (`PixelBatch`), or one whole image (`ViewBatch`)."""
 
     def __init__(self, config: ConfigT, scene: Scene) -> None:
         super().__init__()
         self.config = config
         self.scene = scene
 
-    learns_motion: ClassVar[bool] = False
-    """Whether it uses the photographs' times."""
-    learns_appearance: ClassVar[bool] = False
-    """Whether it can learn that light differs between photographs."""
-    refines_poses: ClassVar[bool] = False
-    """Whether it can refine the cameras' poses."""
+    @abstractmethod
+    def loss(self, batch: Any, step: int) -> Loss:
+        """Return what is to be minimised on a batch.
 
-    runs_on_kernels: ClassVar[bool] = False
-    """Whether the compiled kernels do its heavy work: then torch's own operations keep to one CPU thread."""
-
-    def decisions(self) -> list[Decision]:
-        """What became of the method's options that were left to the data."""
-        return []
+        Args:
+            batch: a `PixelBatch` or a `ViewBatch`, as `batches` says.
+            step: training steps done.
+        """
 
     @abstractmethod
-    def render(self, rays: Rays, background: Tensor) -> Rendered:
-        """Colour, depth and opacity of R rays over `background`, (R, 3) or (3,). R may be 0."""
+    def render_view(self, view: View, background: Tensor) -> Picture:
+        """Return what a camera sees, in evaluation mode and without gradient.
 
-    def loss(self, rendered: Rendered, batch: Batch, step: int) -> dict[str, Tensor]:
-        """Named scalars; their sum is minimised. By default the squared error of every level, and the proposals' loss.
-
-        `rendered` and `batch.rgb` are of pixels. Of several rays a pixel there are as many `batch.rays`, and
-        `rendered.samples` and `.weights` are the rays'.
+        Args:
+            view: the camera, on the model's device.
+            background: (3,) colour behind what is not opaque.
         """
-        losses = {"rgb": mean_squared_error(rendered.rgb, batch.rgb, batch.weights)}
-        if rendered.coarse is not None:
-            losses["rgb_coarse"] = mean_squared_error(rendered.coarse.rgb, batch.rgb, batch.weights)
-        if rendered.samples is not None and rendered.samples.proposals and rendered.weights is not None:
-            losses["interlevel"] = interlevel_loss(rendered.samples, rendered.weights)
-        return losses
-
-    def param_groups(self) -> list[dict[str, Any]]:
-        """Adam's parameter groups. Each has `params` and may set `lr`, `betas`, `eps`, `sparse`, `schedule`.
-
-        By default the tables of encodings that ask for it are a group that is updated sparsely.
-        """
-        grids, groups = self.sparse_grids, self.proposal_groups()
-        apart = [grid.table for grid in grids] + [p for group in groups for p in group["params"]]
-        rest = [p for p in self.parameters() if not any(p is other for other in apart)]
-        groups.insert(0, {"params": rest, "name": "networks"})
-        return groups + ([{"params": [g.table for g in grids], "name": "tables", "sparse": True}] if grids else [])
-
-    def proposal_groups(self) -> list[dict[str, Any]]:
-        """The group of the proposals' parameters, small hash grids whatever the method is; none without proposals."""
-        samplers = [module for module in self.modules() if isinstance(module, ProposalSampler)]
-        params = [p for sampler in samplers for p in sampler.parameters()]
-        return [{"params": params, "name": "proposals", **PROPOSAL_ADAM}] if params else []
-
-    @cached_property
-    def sparse_grids(self) -> list[HashGrid | FeaturePlanes]:
-        """Encodings whose tables are updated sparsely."""
-        tables = (m for m in self.modules() if isinstance(m, (HashGrid, FeaturePlanes)))
-        return [module for module in tables if module.deferred is not None]
-
-    @property
-    def occupancy_samplers(self) -> list[OccupancySampler]:
-        """The grids that the photographs' silhouettes can empty before the first step."""
-        return [module for module in self.modules() if isinstance(module, OccupancySampler)]
 
     def before_step(self, step: int, progress: float) -> None:
-        """Schedules, as functions of the step and of the share of the budget spent, and refreshing of samplers."""
+        """Follow schedules and refresh samplers, before a training step.
+
+        Args:
+            step: training steps done.
+            progress: share of the budget spent.
+        """
+
+    def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
+        """Return rows of parameters to add, drop or reorder, after a training step; gradients are still there.
+
+        Args:
+            step: training steps done before it.
+            progress: share of the budget spent.
+        """
+        return ()
+
+    def groups(self) -> list[ParameterGroup]:
+        """Return the parameters, grouped as the modules that hold them say (`Optimised`)."""
+        return parameter_groups(self)
 
     @property
-    def samples_per_batch(self) -> int | None:
-        """Samples a training step should evaluate, the number of rays following; None for a fixed number of rays."""
-        return self.config.samples_per_batch
+    def samples_per_step(self) -> int | None:
+        """Samples a training step should evaluate, the number of pixels following; None for a fixed number."""
+        return None
+
+    @property
+    def rays_per_pixel(self) -> int:
+        """Rays of which a pixel of a picture is the mean, where the view does not say."""
+        return 1
+
+    @property
+    def runs_on_kernels(self) -> bool:
+        """Whether compiled kernels do the heavy work: then torch's own operations keep to one CPU thread."""
+        return False
 
     @property
     def device(self) -> torch.device:
+        """Where the parameters are."""
         return next(self.parameters()).device
 
+    @property
+    def uses_bfloat16(self) -> bool:
+        """Whether networks run in bfloat16: as configured, else as the device allows."""
+        chosen = self.config.mixed_precision
+        return has_bfloat16(self.device) if chosen is None else chosen
+
     def size(self) -> int:
-        """Number of trainable parameters."""
+        """Return the number of trainable parameters."""
         return sum(parameter.numel() for parameter in self.parameters())
 
 
-@dataclass(frozen=True)
-class Method:
-    """A method as its file declares it; its name is the entry point's, its summary the file's first line."""
+# -- what some models can do --------------------------------------------------------------------------------------
 
-    model: type[Model[Any]]
-    """Built as `model(config, scene)`."""
-    config: TrainConfig
-    """Default settings."""
-    paper: str
-    """Where it was published."""
-    interface: int = 1
-    """The version of the plugin interface it was written for (`registry.INTERFACE`)."""
+
+class LearnsMotion:
+    """A model that uses the images' times."""
+
+
+@runtime_checkable
+class HasAppearance(Protocol):
+    """A model that can give each image an appearance of its own."""
+
+    appearance: Appearance | None
+    """The images' vectors; None where the settings or the scene leave them out."""
+
+
+@runtime_checkable
+class RefinesPoses(Protocol):
+    """A model that can refine the training cameras' poses."""
+
+    def refined_cameras(self, cameras: Cameras) -> Cameras:
+        """Return the training cameras where they are believed to be after training.
+
+        Args:
+            cameras: M training cameras as they are given.
+        """
+
+
+@runtime_checkable
+class HasDensity(Protocol):
+    """A model that knows density anywhere."""
+
+    def density(self, points: Points) -> Tensor:
+        """Return density (N,), 1/length.
+
+        Args:
+            points: N points, scene coordinates.
+        """
+
+
+def parts(model: nn.Module, kind: Callable[..., PartT]) -> list[PartT]:
+    """Return the modules of a model that have a capability.
+
+    Args:
+        model: whose modules are looked at.
+        kind: a protocol or class, as in `parts(model, SkipsCells)`.
+    """
+    return [module for module in model.modules() if isinstance(module, cast("type[PartT]", kind))]

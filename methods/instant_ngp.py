@@ -6,18 +6,16 @@ Mueller et al., "Instant Neural Graphics Primitives with a Multiresolution Hash 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from dataclasses import dataclass
+from typing import ClassVar
 
-from torch import Tensor
-
-from framework import Decision, Method, Model, Rays, Rendered, Scene
-from framework.base.config import Range, RaysPerPixel
+from framework import Decision, Method, Scene
+from framework.base.config import AUTO, Auto, Range
+from framework.base.decisions import Choice, fill
 from framework.encodings.hash_grid import HashGrid
 from framework.fields.encoded import EncodedField
 from framework.kernels.hash_grid import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
-from framework.rendering.volume import render_field
-from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_decisions
+from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_choice
 
 PLANS = (
     (60.0, 16, 512, 2**15, 1),
@@ -33,7 +31,19 @@ SPARSE_FROM = 17
 
 
 @dataclass(frozen=True)
-class InstantNGPConfig(SamplingConfig):
+class InstantNGPConfig(
+    SamplingConfig,
+    max_num_iterations=20_000,
+    num_rays_per_batch=8_192,
+    rays_per_pixel=4,
+    train_rays_per_pixel_from=0.75,
+    learning_rate=1e-2,
+    lr_schedule="hold-exponential",
+    lr_final=0.05,
+    adam_beta2=0.95,
+    adam_eps=1e-15,
+    num_steps=AUTO,
+):
     """Settings of instant-ngp."""
 
     RANGES: ClassVar[dict[str, Range]] = {
@@ -46,94 +56,81 @@ class InstantNGPConfig(SamplingConfig):
         "hidden_width": (1, 2**14),
     }
     """What these numbers may be."""
-    max_num_iterations: int = 20_000
-    num_rays_per_batch: int = 8_192
-    rays_per_pixel: RaysPerPixel = 4
-    train_rays_per_pixel_from: float = 0.75
-    samples_per_batch: int | None = None
-    """Samples in a training step, the number of rays following. If not given: what suits the time (see `PLANS`)."""
-    learning_rate: float = 1e-2
-    lr_schedule: Literal["constant", "exponential", "cosine", "hold-exponential"] = "hold-exponential"
-    lr_final: float = 0.05
-    adam_beta2: float = 0.95
-    adam_eps: float = 1e-15
     num_levels: int = 16
     """Resolutions of the hash grid."""
     features_per_level: int = 2
     """Features stored at a grid vertex."""
     base_resolution: int = 16
     """Cells along an axis at the coarsest level."""
-    max_resolution: int | None = None
+    max_resolution: Auto[int] = AUTO
     """Cells along an axis at the finest level. If not given: a power of two, `detail` cells a pixel or more."""
-    detail: int | None = None
+    detail: Auto[int] = AUTO
     """Finest cells along the images' longer side for each of its pixels. If not given: what suits the time."""
-    log2_table_size: int | None = None
+    log2_table_size: Auto[int] = AUTO
     """Entries of a level's table at most, as a power of two. If not given: what suits the time."""
-    sparse_updates: bool | None = None
+    sparse_updates: Auto[bool] = AUTO
     """Adam updates only the table entries that a step used. If not given: where there are 2^17 or more a level."""
     hidden_width: int = 64
     """Features of a layer of the two networks."""
     view_dependence: bool = True
     """Colours depend on where they are seen from. False saves a few per cent of the time, and most scenes need it."""
-    num_steps: int | None = None
-    """Steps along the box's diagonal. If not given: what suits the time."""
-
-    def resolved(self) -> InstantNGPConfig:
-        seconds = math.inf if self.max_seconds is None else self.max_seconds
-        _, log2_table_size, num_steps, samples, detail = next(plan for plan in PLANS if seconds <= plan[0])
-        log2_table_size = self.log2_table_size or log2_table_size
-        sparse = log2_table_size >= SPARSE_FROM if self.sparse_updates is None else self.sparse_updates
-        return replace(
-            self,
-            log2_table_size=log2_table_size,
-            sparse_updates=sparse,
-            num_steps=self.num_steps or num_steps,
-            detail=self.detail or detail,
-            samples_per_batch=self.samples_per_batch or samples,
-        )
 
 
-class InstantNGP(Model[InstantNGPConfig]):
-    """One hash field, marched through an occupancy grid or sampled by proposals."""
+def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, list[Decision]]:
+    """Return the settings with what suits the time and the scene, and why.
 
-    runs_on_kernels = True
-
-    def __init__(self, config: InstantNGPConfig, scene: Scene) -> None:
-        super().__init__(config, scene)
-        assert config.log2_table_size is not None
-        assert config.detail is not None
-        finest = config.max_resolution or 2 ** (config.detail * scene.image_size - 1).bit_length()
-        grid = HashGrid(
-            config.num_levels,
-            config.features_per_level,
-            config.base_resolution,
+    Args:
+        config: settings, some of which may be open.
+        scene: facts about the data.
+    """
+    seconds = math.inf if config.max_seconds is None else config.max_seconds
+    limit, log2_table_size, num_steps, samples, detail = next(plan for plan in PLANS if seconds <= plan[0])
+    suits = "that suits the time" if limit < math.inf else "there is time for it"
+    config, made = fill(
+        config,
+        sampler_choice(config, scene.unbounded),
+        Choice("log2_table_size", log2_table_size, suits),
+        Choice("num_steps", num_steps, suits, "steps along the box's diagonal"),
+        Choice("detail", detail, suits, "finest cells a pixel"),
+        Choice("samples_per_batch", samples, suits, "samples a step"),
+    )
+    finest = 2 ** (config.detail * scene.image_size - 1).bit_length()
+    pays = config.log2_table_size >= SPARSE_FROM
+    config, more = fill(
+        config,
+        Choice(
+            "max_resolution",
             finest,
-            config.log2_table_size,
-            bool(config.sparse_updates),
-        )
-        self.field = EncodedField(
-            scene.box,
-            grid,
-            config.hidden_width,
-            direction_levels=4 if config.view_dependence else 0,
-            unbounded=contracted_box(config, scene) is not None,
-        )
-        self.sampler = make_sampler(config, scene)
-
-    def decisions(self) -> list[Decision]:
-        found = sampler_decisions(self.config, self.scene)
-        if self.config.max_resolution is not None:
-            return found
-        size, detail = self.scene.image_size, self.config.detail
-        reason = f"each of the images' {size} pixels gets {detail} or more"
-        finest = self.field.encoding.layout.resolutions[-1]
-        return [*found, Decision("finest cells along an axis", f"{finest}", reason)]
-
-    def render(self, rays: Rays, background: Tensor) -> Rendered:
-        return render_field(self.field, self.sampler, rays, background, self.training)
-
-    def before_step(self, step: int, progress: float) -> None:
-        self.sampler.update(step, self.field.density)
+            f"each of the images' {scene.image_size} pixels gets {config.detail} or more",
+            "finest cells along an axis",
+        ),
+        Choice("sparse_updates", pays, f"tables have 2^{config.log2_table_size} entries a level"),
+    )
+    return config, made + more
 
 
-METHOD = Method(InstantNGP, InstantNGPConfig(), paper="arXiv:2201.05989")
+def make_field(config: InstantNGPConfig, scene: Scene) -> EncodedField:
+    """Return one hash field.
+
+    Args:
+        config: the settings, decided.
+        scene: facts about the data.
+    """
+    grid = HashGrid(
+        config.num_levels,
+        config.features_per_level,
+        config.base_resolution,
+        config.max_resolution,
+        config.log2_table_size,
+        config.sparse_updates,
+    )
+    return EncodedField(
+        scene.box,
+        grid,
+        config.hidden_width,
+        direction_levels=4 if config.view_dependence else 0,
+        unbounded=contracted_box(config, scene) is not None,
+    )
+
+
+METHOD = Method(InstantNGPConfig(), paper="arXiv:2201.05989", field=make_field, sampler=make_sampler, decide=decide)

@@ -11,22 +11,31 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from framework import Batch, Decision, Method, Model, Rays, Rendered, Scene
-from framework.base.config import AT_LEAST_0, Range
+from framework import Decision, LearnsMotion, Method, PixelBatch, Points, RayModel, Rendered, Scene
+from framework.base.config import AT_LEAST_0, AUTO, Auto, Range
+from framework.base.decisions import Choice, fill
 from framework.encodings.planes import FeaturePlanes
 from framework.fields.base import MLP
 from framework.fields.encoded import BoxField, EncodedField
 from framework.kernels.math import truncated_exp
 from framework.kernels.planes import MAX_VERTICES, plane_band
 from framework.kernels.spherical_harmonics import spherical_harmonics
-from framework.rendering.volume import render_field
-from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_decisions
+from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_choice
 
 MAX_SCALES = 4
 
 
 @dataclass(frozen=True)
-class KPlanesConfig(SamplingConfig):
+class KPlanesConfig(
+    SamplingConfig,
+    max_num_iterations=30_000,
+    samples_per_batch=2**15,
+    learning_rate=1e-2,
+    lr_schedule="hold-exponential",
+    lr_final=0.02,
+    adam_beta2=0.99,
+    adam_eps=1e-12,
+):
     """Settings of kplanes."""
 
     RANGES: ClassVar[dict[str, Range]] = {
@@ -40,18 +49,11 @@ class KPlanesConfig(SamplingConfig):
         "time_sparsity": AT_LEAST_0,
     }
     """What these numbers may be."""
-    max_num_iterations: int = 30_000
-    samples_per_batch: int | None = 2**15
-    learning_rate: float = 1e-2
-    lr_schedule: Literal["constant", "exponential", "cosine", "hold-exponential"] = "hold-exponential"
-    lr_final: float = 0.02
-    adam_beta2: float = 0.99
-    adam_eps: float = 1e-12
     decoder: Literal["hybrid", "explicit"] = "hybrid"
     """hybrid: two small networks. explicit: linear density, and a learned basis of colours."""
     base_resolution: int = 64
     """Vertices along an axis of space at the coarsest scale; each scale doubles it."""
-    num_scales: int | None = None
+    num_scales: Auto[int] = AUTO
     """Scales. If not given: as many as the images' pixels can show, 4 at most."""
     time_resolution: int = 25
     """Vertices along time, at every scale; a second difference needs 3."""
@@ -84,13 +86,13 @@ class ExplicitField(BoxField):
         self.density_head = torch.nn.Linear(planes.num_features, 1, bias=False)
         self.basis = MLP(16, width, width, 3 * planes.num_features)
 
-    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        features = self.encode(positions, times)
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        features = self.encode(points.positions, points.times)
         return truncated_exp(self.density_head(features)[:, 0]), features
 
     @torch.no_grad()
     def trace(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        sigma, features = self.density(positions, times)
+        sigma, features = self.density(Points(positions, times))
         return sigma, features, features[:, :0]
 
     def retrace(
@@ -104,51 +106,12 @@ class ExplicitField(BoxField):
         return torch.sigmoid((basis * features[:, None]).sum(-1).float())
 
 
-class KPlanes(Model[KPlanesConfig]):
-    """Planes of features, by an occupancy grid or proposals. Without times, the planes of time are left out."""
+class KPlanes(RayModel[KPlanesConfig], LearnsMotion):
+    """Planes of features in space and, for a scene that moves, in time, with the paper's regularisers."""
 
-    runs_on_kernels = True
-    learns_motion = True
-
-    def __init__(self, config: KPlanesConfig, scene: Scene) -> None:
-        super().__init__(config, scene)
-        time = (config.time_resolution,) if scene.moving else ()
-        resolutions = tuple((config.base_resolution << s,) * 3 + time for s in range(self.num_scales))
-        planes = FeaturePlanes(resolutions, config.features_per_scale, sparse=config.sparse_updates)
-        kind = EncodedField if config.decoder == "hybrid" else ExplicitField
-        unbounded = contracted_box(config, scene) is not None
-        self.field = kind(scene.box, planes, config.hidden_width, unbounded=unbounded)
-        self.sampler = make_sampler(config, scene)
-
-    @property
-    def num_scales(self) -> int:
-        """As configured, else until a plane has a vertex a pixel or more, but no more than the paper's 4."""
-        config, scales = self.config, 1
-        if config.num_scales is not None:
-            return config.num_scales
-        while scales < MAX_SCALES and config.base_resolution << (scales - 1) < self.scene.image_size:
-            scales += 1
-        return scales
-
-    def decisions(self) -> list[Decision]:
-        found = sampler_decisions(self.config, self.scene)
-        if not self.scene.moving:
-            found.append(Decision("planes of time", "left out", "the photographs have no times"))
-        if self.config.num_scales is None:
-            reason = f"the images have {self.scene.image_size} pixels"
-            found.append(Decision("scales", f"{self.num_scales}", reason))
-        return found
-
-    def render(self, rays: Rays, background: Tensor) -> Rendered:
-        return render_field(self.field, self.sampler, rays, background, self.training)
-
-    def before_step(self, step: int, progress: float) -> None:
-        self.sampler.update(step, self.field.density)
-
-    def loss(self, rendered: Rendered, batch: Batch, step: int) -> dict[str, Tensor]:
-        losses = super().loss(rendered, batch, step)
+    def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
         variation, roughness, activity = self._regularisers(rendered.rgb.new_zeros(()))
-        losses["space_tv"] = self.config.space_tv * variation
+        losses = {"space_tv": self.config.space_tv * variation}
         if self.scene.moving:
             losses["time_smoothness"] = self.config.time_smoothness * roughness
             losses["time_sparsity"] = self.config.time_sparsity * activity
@@ -159,6 +122,7 @@ class KPlanes(Model[KPlanesConfig]):
 
         Equations 4 to 6, on a random band of rows of each plane of space, and on time's small planes whole.
         """
+        assert isinstance(self.field, BoxField)
         planes = self.field.encoding
         assert isinstance(planes, FeaturePlanes)
         variations, roughness, activity = [], [zero], [zero]
@@ -182,4 +146,40 @@ def _squared_steps(plane: Tensor, dim: int) -> Tensor:
     return plane.diff(dim=dim).square().mean() if plane.shape[dim] > 1 else plane.new_zeros(())
 
 
-METHOD = Method(KPlanes, KPlanesConfig(), paper="arXiv:2301.10241")
+def decide(config: KPlanesConfig, scene: Scene) -> tuple[KPlanesConfig, list[Decision]]:
+    """Return the settings with what the scene decides, and why.
+
+    Args:
+        config: settings, some of which may be open.
+        scene: facts about the data.
+    """
+    scales = 1  # until a plane has a vertex a pixel or more, but no more than the paper's 4
+    while scales < MAX_SCALES and config.base_resolution << (scales - 1) < scene.image_size:
+        scales += 1
+    config, made = fill(
+        config,
+        sampler_choice(config, scene.unbounded),
+        Choice("num_scales", scales, f"the images have {scene.image_size} pixels", "scales"),
+    )
+    if not scene.moving:
+        made.append(Decision("planes of time", "left out", "the images have no times"))
+    return config, made
+
+
+def make_field(config: KPlanesConfig, scene: Scene) -> BoxField:
+    """Return a field that reads feature planes.
+
+    Args:
+        config: the settings, decided.
+        scene: facts about the data.
+    """
+    time = (config.time_resolution,) if scene.moving else ()
+    resolutions = tuple((config.base_resolution << scale,) * 3 + time for scale in range(config.num_scales))
+    planes = FeaturePlanes(resolutions, config.features_per_scale, sparse=config.sparse_updates)
+    kind = EncodedField if config.decoder == "hybrid" else ExplicitField
+    return kind(scene.box, planes, config.hidden_width, unbounded=contracted_box(config, scene) is not None)
+
+
+METHOD = Method(
+    KPlanesConfig(), paper="arXiv:2301.10241", field=make_field, sampler=make_sampler, model=KPlanes, decide=decide
+)

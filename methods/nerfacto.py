@@ -8,27 +8,45 @@ vectors (Martin-Brualla et al. 2021); gradients scaled near cameras (Philip and 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from torch import Tensor
 
-from framework import Batch, ConfigError, Decision, Method, Model, Rays, Rendered, Scene
-from framework.base.config import AT_LEAST_0, Range
+from framework import (
+    Cameras,
+    ConfigError,
+    Decision,
+    Field,
+    Method,
+    PixelBatch,
+    Points,
+    RayModel,
+    Rays,
+    Rendered,
+    Renderer,
+    Sampler,
+    Samples,
+    Scene,
+)
+from framework.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
+from framework.base.decisions import Choice, fill
+from framework.base.optimised import Optimised
 from framework.cameras.refinement import PoseRefinement
 from framework.encodings.hash_grid import HashGrid
-from framework.fields.encoded import EncodedField
+from framework.fields.appearance import Appearance
+from framework.fields.encoded import NUM_FEATURES, EncodedField
 from framework.fields.normals import NormalHead, density_normals, normal_penalties
-from framework.geometry.rays import Samples
 from framework.kernels.compositing import distortion, ray_sum
 from framework.kernels.hash_grid import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
 from framework.rendering.losses import depth_error
-from framework.rendering.volume import shade
-from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_decisions
-from framework.samplers.proposal import ProposalSampler, half_edge
+from framework.rendering.volume import VolumeRenderer, shade
+from framework.samplers.choice import SamplingConfig, make_sampler, sampler_choice
+from framework.samplers.proposal import half_edge
 
 APPEARANCE_SIZE = 16
 DISTORTION = 2e-3
 DEPTH = 0.1
+DEPTH_REASONS = {True: "there are depth images", False: "there are no depth images"}
 POSE_REASONS = {
     "exact": "the poses are exact",
     "photographs": "the poses were found in the photographs themselves",
@@ -37,7 +55,19 @@ POSE_REASONS = {
 
 
 @dataclass(frozen=True)
-class NerfactoConfig(SamplingConfig):
+class NerfactoConfig(
+    SamplingConfig,
+    AppearanceConfig,
+    max_num_iterations=30_000,
+    num_rays_per_batch=2_048,
+    learning_rate=1e-2,
+    lr_schedule="hold-exponential",
+    lr_final=0.02,
+    adam_beta2=0.99,
+    adam_eps=1e-15,
+    eval_num_rays_per_chunk=4_096,
+    sampler="proposal",
+):
     """Settings of nerfacto. What is not given is decided by the scene."""
 
     RANGES: ClassVar[dict[str, Range]] = {
@@ -54,33 +84,24 @@ class NerfactoConfig(SamplingConfig):
         "hidden_width": (1, 2**14),
     }
     """What these numbers may be."""
-    max_num_iterations: int = 30_000
-    num_rays_per_batch: int = 2_048
-    learning_rate: float = 1e-2
-    lr_schedule: Literal["constant", "exponential", "cosine", "hold-exponential"] = "hold-exponential"
-    lr_final: float = 0.02
-    adam_beta2: float = 0.99
-    adam_eps: float = 1e-15
-    eval_num_rays_per_chunk: int = 4_096
-    sampler: Literal["auto", "occupancy", "proposal"] = "proposal"
-    contraction: bool | None = None
+    contraction: Auto[bool] = AUTO
     """Contract all of space around the box. If not given: where there may be something outside it."""
-    distortion_loss_mult: float | None = None
+    distortion_loss_mult: Auto[float] = AUTO
     """Weight of the distortion loss. If not given: 0.002 for unbounded scenes, else none."""
-    appearance_embedding_dim: int | None = None
+    appearance_embedding_dim: Auto[int] = AUTO
     """Features in which each photograph may differ. If not given: 16 where light differs between them, else none."""
     camera_optimizer: Literal["auto", "off", "SO3xR3", "SE3"] = "auto"
     """Refine the training cameras' poses; auto: SO3xR3 where a device tracked them."""
     camera_learning_rate: float = 1e-3
     """Of the poses."""
-    depth_loss_mult: float | None = None
+    depth_loss_mult: Auto[float] = AUTO
     """Weight of how far light comes from, against depth images. If not given: 0.1 where there are any, else none."""
     predict_normals: bool = False
     """Learn normals too, as the density's gradient has them but smoother."""
     orientation_loss_mult: float = 0.1
     """Weight of predicted normals that face away from where they are seen, relative to their distance from the
     density's."""
-    gradient_scaling: bool | None = None
+    gradient_scaling: Auto[bool] = AUTO
     """Gradients grow with squared distance up to half of the box's edge, against floaters at cameras. If not given: for
     unbounded scenes."""
     num_levels: int = 16
@@ -99,153 +120,173 @@ class NerfactoConfig(SamplingConfig):
     """Features of a layer of the two networks."""
 
 
-class Nerfacto(Model[NerfactoConfig]):
-    """One hash field, sampled where proposals say."""
+class NerfactoRenderer(VolumeRenderer):
+    """Volume rendering whose gradients fade near cameras, and with normals where they are predicted.
 
-    runs_on_kernels = True
-    learns_appearance = refines_poses = True
+    Args:
+        unit_length: distance from a camera up to which gradients are scaled; None for no scaling.
+        normals: predicts normals; None for none.
+    """
 
-    def __init__(self, config: NerfactoConfig, scene: Scene) -> None:
-        if config.contraction is not None:
-            scene = replace(scene, unbounded=config.contraction)
-        super().__init__(config, scene)
-        self.unbounded = contracted_box(config, scene) is not None
-        grid = HashGrid(
-            config.num_levels,
-            config.features_per_level,
-            config.base_resolution,
-            config.max_resolution,
-            config.log2_table_size,
-            config.sparse_updates,
-        )
-        self.field = EncodedField(
-            scene.box,
-            grid,
-            config.hidden_width,
-            unbounded=self.unbounded,
-            appearance=(self.appearance_size, scene.num_cameras) if self.appearance_size else None,
-        )
-        self.sampler = make_sampler(config, scene)
-        self.unit_length = half_edge(scene.box)
-        self.normals = NormalHead(self.field.num_features, config.hidden_width) if config.predict_normals else None
-        group, given = self.pose_group, scene.camera_to_worlds
-        self.poses = None if group == "off" else PoseRefinement(scene.num_cameras, group, given)
-        if self.poses is not None and scene.warped:
-            raise ConfigError("--camera-optimizer: poses cannot be refined in normalised device coordinates")
-        if self.poses is not None and not isinstance(self.sampler, ProposalSampler):
-            raise ConfigError("--camera-optimizer needs --sampler proposal: marched samples carry no gradient to rays")
+    def __init__(self, unit_length: float | None, normals: NormalHead | None) -> None:
+        super().__init__()
+        self.unit_length, self.normals = unit_length, normals
 
-    # -- what the scene decides -------------------------------------------------------------------------------
-
-    @property
-    def appearance_size(self) -> int:
-        asked = self.config.appearance_embedding_dim
-        return (APPEARANCE_SIZE if self.scene.appearance_varies else 0) if asked is None else asked
-
-    @property
-    def pose_group(self) -> Literal["off", "SO3xR3", "SE3"]:
-        asked = self.config.camera_optimizer
-        if asked == "auto":
-            return "SO3xR3" if self.scene.poses == "device" and not self.scene.warped else "off"
-        return asked
-
-    @property
-    def distortion_mult(self) -> float:
-        asked = self.config.distortion_loss_mult
-        return (DISTORTION if self.unbounded else 0.0) if asked is None else asked
-
-    @property
-    def depth_mult(self) -> float:
-        asked = self.config.depth_loss_mult
-        return (DEPTH if self.scene.has_depth else 0.0) if asked is None else asked
-
-    @property
-    def scales_gradients(self) -> bool:
-        asked = self.config.gradient_scaling
-        return self.unbounded if asked is None else asked
-
-    def decisions(self) -> list[Decision]:
-        config, found = self.config, sampler_decisions(self.config, self.scene)
-        if config.contraction is None:
-            reason = "there may be something outside the box" if self.unbounded else "the scene ends at its box"
-            found.append(Decision("contraction", _on(self.unbounded), reason))
-        reason = f"contraction is {_on(self.unbounded)}"
-        if config.distortion_loss_mult is None:
-            found.append(Decision("distortion loss", f"{self.distortion_mult:g}", reason))
-        if config.gradient_scaling is None:
-            found.append(Decision("gradient scaling near cameras", _on(self.scales_gradients), reason))
-        if config.appearance_embedding_dim is None:
-            varies = self.scene.appearance_varies
-            reason = "light differs between the photographs" if varies else "the photographs are lit alike"
-            found.append(Decision("appearance features", f"{self.appearance_size}", reason))
-        if config.depth_loss_mult is None and self.scene.has_depth:
-            found.append(Decision("depth loss", f"{self.depth_mult:g}", "there are depth images"))
-        if config.camera_optimizer == "auto":
-            found.append(Decision("pose refinement", self.pose_group, POSE_REASONS[self.scene.poses]))
-        return found
-
-    # -- rendering and learning -------------------------------------------------------------------------------
-
-    def render(self, rays: Rays, background: Tensor) -> Rendered:
-        if self.poses is not None:
-            rays = self.poses(rays)
-        samples = self.sampler.sample(rays, self.field, self.training)
-        if samples.sigma is None or samples.features is None:
-            samples = samples.evaluated(*self.field.density(samples.positions(rays), samples.times(rays)))
+    def shade(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
         factors = None
-        if self.training and self.scales_gradients:
+        if self.training and self.unit_length is not None:
             factors = (samples.t / self.unit_length).square().clamp(max=1)
-        rendered = shade(self.field, rays, samples, background, factors)
-        return rendered if self.normals is None else self._with_normals(self.normals, rays, rendered)
+        rendered = shade(rays, samples, field, background, factors)
+        return rendered if self.normals is None else self._with_normals(self.normals, field, rays, samples, rendered)
 
-    def _with_normals(self, head: NormalHead, rays: Rays, rendered: Rendered) -> Rendered:
-        """Normals in the picture, and in training what is wrong with them."""
-        samples, weights = rendered.samples, rendered.weights
-        assert samples is not None
+    def _with_normals(
+        self, head: NormalHead, field: Field, rays: Rays, samples: Samples, rendered: Rendered
+    ) -> Rendered:
+        """Return the same with normals, and in training with what is wrong with them."""
+        assert isinstance(field, EncodedField)
         assert samples.features is not None
-        assert weights is not None
-        positions = samples.positions(rays).detach()
-        predicted = head(samples.features.detach(), 2 * self.field.unit(positions) - 1)
+        assert rendered.weights is not None
+        points, weights = Points(samples.positions(rays).detach(), samples.times(rays)), rendered.weights
+        predicted = head(samples.features.detach(), 2 * field.unit(points.positions) - 1)
         facing = ray_sum(weights.detach()[:, None] * predicted, samples)
         if not self.training:
             return replace(rendered, normals=facing)
-        found = density_normals(self.field, positions, samples.times(rays))
+        target = density_normals(field, points)
         directions = rays.directions.detach().index_select(0, samples.ray_indices)
-        penalties = normal_penalties(predicted, found, directions, weights, samples)
+        penalties = normal_penalties(predicted, target, directions, weights, samples)
         return replace(rendered, normals=facing, penalties=penalties)
 
-    def before_step(self, step: int, progress: float) -> None:
-        self.sampler.update(step, self.field.density)
 
-    def loss(self, rendered: Rendered, batch: Batch, step: int) -> dict[str, Tensor]:
-        losses = super().loss(rendered, batch, step)
-        samples, weights = rendered.samples, rendered.weights
+class Nerfacto(RayModel[NerfactoConfig]):
+    """One hash field, sampled where proposals say, with what a capture asks for."""
+
+    def __init__(
+        self, config: NerfactoConfig, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer
+    ) -> None:
+        super().__init__(config, scene, field, sampler, renderer)
+        self.poses: PoseRefinement | None = None
+        if config.camera_optimizer in ("SO3xR3", "SE3"):
+            if scene.warped:
+                raise ConfigError("--camera-optimizer: poses cannot be refined in normalised device coordinates")
+            if config.sampler != "proposal":
+                raise ConfigError(
+                    "--camera-optimizer needs --sampler proposal: marched samples carry no gradient to rays"
+                )
+            self.poses = PoseRefinement(scene.num_cameras, config.camera_optimizer, scene.camera_to_worlds)
+            self.poses.optimised = Optimised("poses", config.camera_learning_rate, schedule="exponential")
+
+    @property
+    def appearance(self) -> Appearance | None:
+        """The images' appearance vectors."""
+        return self.field.appearance if isinstance(self.field, EncodedField) else None
+
+    def refined_cameras(self, cameras: Cameras) -> Cameras:
+        """Return the training cameras where they are believed to be.
+
+        Args:
+            cameras: M training cameras as they are given.
+        """
+        return cameras if self.poses is None else self.poses.refined(cameras)
+
+    def render(self, rays: Rays, background: Tensor) -> Rendered:
+        return super().render(rays if self.poses is None else self.poses(rays), background)
+
+    def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
+        config, samples, weights = self.config, rendered.samples, rendered.weights
+        losses: dict[str, Tensor] = {}
         if samples is None or weights is None or not samples.num_rays:
             return losses
-        if self.distortion_mult > 0 and samples.edges is not None:
+        if config.distortion_loss_mult > 0 and samples.edges is not None:
             normalised = Samples.regular(samples.edges[:, :-1], samples.edges[:, 1:])
-            losses["distortion"] = self.distortion_mult * distortion(weights, normalised).mean()
-        if self.depth_mult > 0 and batch.distances is not None:
-            known = batch.distances.repeat_interleave(samples.num_rays // len(batch.distances))
-            losses["depth"] = self.depth_mult * depth_error(weights, samples, known)
-        for name, found in rendered.penalties.items():
-            losses[name] = (self.config.orientation_loss_mult if name == "orientation" else 1.0) * found.mean()
+            losses["distortion"] = config.distortion_loss_mult * distortion(weights, normalised).mean()
+        if config.depth_loss_mult > 0 and batch.distances is not None:
+            distances = batch.distances.repeat_interleave(batch.rays_per_pixel)
+            losses["depth"] = config.depth_loss_mult * depth_error(weights, samples, distances)
+        for name, penalty in rendered.penalties.items():
+            losses[name] = (config.orientation_loss_mult if name == "orientation" else 1.0) * penalty.mean()
         return losses
 
-    def param_groups(self) -> list[dict[str, Any]]:
-        groups = super().param_groups()
-        if self.poses is None:
-            return groups
-        tangents = self.poses.tangents
-        groups[0]["params"] = [p for p in groups[0]["params"] if p is not tangents]
-        return [
-            *groups,
-            {"params": [tangents], "lr": self.config.camera_learning_rate, "schedule": "exponential", "name": "poses"},
-        ]
+
+def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[Decision]]:
+    """Return the settings with what the scene asks for, and why.
+
+    Args:
+        config: settings, some of which may be open.
+        scene: facts about the data.
+    """
+    unbounded = scene.unbounded if config.contraction is None else config.contraction
+    config, made = fill(config, sampler_choice(config, unbounded))
+    contracted = unbounded and config.sampler == "proposal"
+    reason = f"contraction is {'on' if contracted else 'off'}"
+    lit = "light differs between the images" if scene.appearance_varies else "the images are lit alike"
+    refined = "SO3xR3" if scene.poses == "device" and not scene.warped else "off"
+    around = "there may be something outside the box" if contracted else "the scene ends at its box"
+    config, more = fill(
+        config,
+        Choice("contraction", contracted, around),
+        Choice("distortion_loss_mult", DISTORTION if contracted else 0.0, reason, "distortion loss"),
+        Choice("gradient_scaling", contracted, reason, "gradient scaling near cameras"),
+        Choice(
+            "appearance_embedding_dim", APPEARANCE_SIZE if scene.appearance_varies else 0, lit, "appearance features"
+        ),
+        Choice("depth_loss_mult", DEPTH if scene.has_depth else 0.0, DEPTH_REASONS[scene.has_depth], "depth loss"),
+        Choice("camera_optimizer", refined, POSE_REASONS[scene.poses], "pose refinement"),
+    )
+    return config, made + more
 
 
-def _on(choice: bool) -> str:
-    return "on" if choice else "off"
+def make_field(config: NerfactoConfig, scene: Scene) -> EncodedField:
+    """Return one hash field, with appearance vectors where light differs.
+
+    Args:
+        config: the settings, decided.
+        scene: facts about the data.
+    """
+    grid = HashGrid(
+        config.num_levels,
+        config.features_per_level,
+        config.base_resolution,
+        config.max_resolution,
+        config.log2_table_size,
+        config.sparse_updates,
+    )
+    size = config.appearance_embedding_dim
+    return EncodedField(
+        scene.box,
+        grid,
+        config.hidden_width,
+        unbounded=config.contraction and config.sampler == "proposal",
+        appearance=(size, scene.num_cameras) if size else None,
+    )
 
 
-METHOD = Method(Nerfacto, NerfactoConfig(), paper="arXiv:2302.04264")
+def sampler(config: NerfactoConfig, scene: Scene) -> Sampler:
+    """Return the sampler that is asked for, of all of space where it is contracted.
+
+    Args:
+        config: the settings, decided.
+        scene: facts about the data.
+    """
+    return make_sampler(config, replace(scene, unbounded=config.contraction))
+
+
+def renderer(config: NerfactoConfig, scene: Scene) -> Renderer:
+    """Return the renderer, with a head for normals where they are asked for.
+
+    Args:
+        config: the settings, decided.
+        scene: facts about the data.
+    """
+    normals = NormalHead(NUM_FEATURES, config.hidden_width) if config.predict_normals else None
+    return NerfactoRenderer(half_edge(scene.box) if config.gradient_scaling else None, normals)
+
+
+METHOD = Method(
+    NerfactoConfig(),
+    paper="arXiv:2302.04264",
+    field=make_field,
+    sampler=sampler,
+    renderer=renderer,
+    model=Nerfacto,
+    decide=decide,
+)

@@ -7,15 +7,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from framework import Batch, Decision, Field, Method, Model, Rays, Rendered, Scene
-from framework.base.config import AT_LEAST_0, Range
+from framework import (
+    Decision,
+    Field,
+    Method,
+    PixelBatch,
+    Points,
+    RayModel,
+    Rendered,
+    Renderer,
+    Sampler,
+    Scene,
+)
+from framework.base.config import AT_LEAST_0, AUTO, Auto, Range
+from framework.base.decisions import Choice, fill
+from framework.base.optimised import Optimised
 from framework.encodings.planes import FeaturePlanes
 from framework.fields.base import MLP
 from framework.geometry.bounds import to_unit_box
@@ -23,9 +36,8 @@ from framework.kernels.contraction import contract_to_unit
 from framework.kernels.memory import require
 from framework.kernels.planes import PlanesLayout
 from framework.kernels.spherical_harmonics import spherical_harmonics
-from framework.rendering.volume import render_field
-from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_decisions
-from framework.samplers.occupancy import OccupancySampler
+from framework.samplers.base import SkipsCells
+from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_choice
 
 VM = (((0, 1), (2,)), ((0, 2), (1,)), ((1, 2), (0,)))
 """Three groups: a plane, and the line across it (equation 4)."""
@@ -44,7 +56,15 @@ MARGIN = 1
 
 
 @dataclass(frozen=True)
-class TensoRFConfig(SamplingConfig):
+class TensoRFConfig(
+    SamplingConfig,
+    max_num_iterations=30_000,
+    samples_per_batch=2**15,
+    learning_rate=2e-2,
+    lr_schedule="exponential",
+    lr_final=0.1,
+    adam_beta2=0.99,
+):
     """Settings of tensorf."""
 
     RANGES: ClassVar[dict[str, Range]] = {
@@ -59,23 +79,17 @@ class TensoRFConfig(SamplingConfig):
         "hidden_width": (1, 2**14),
     }
     """What these numbers may be."""
-    max_num_iterations: int = 30_000
-    samples_per_batch: int | None = 2**15
-    learning_rate: float = 2e-2
-    lr_schedule: Literal["constant", "exponential", "cosine", "hold-exponential"] = "exponential"
-    lr_final: float = 0.1
-    adam_beta2: float = 0.99
     network_learning_rate: float = 1e-3
     """Of the basis and the colour network."""
     decomposition: Literal["vm", "cp"] = "vm"
     """vm: planes and lines. cp: lines alone, which is slower to learn and under 4 MB."""
-    density_components: int | None = None
+    density_components: Auto[int] = AUTO
     """Of each group. If not given: 16 (vm) or 96 (cp)."""
-    appearance_components: int | None = None
+    appearance_components: Auto[int] = AUTO
     """Of each group. If not given: 48 (vm) or 288 (cp)."""
-    first_voxels: int | None = None
+    first_voxels: Auto[int] = AUTO
     """Voxels that the vertices of the first grid make. If not given: 128^3, or what the photographs tell apart."""
-    last_voxels: int | None = None
+    last_voxels: Auto[int] = AUTO
     """The same for the last grid. If not given: 300^3 (vm) or 500^3 (cp), or what the photographs tell apart."""
     upsample_at: tuple[float, ...] = (0.07, 0.1, 0.13, 0.18, 0.23)
     """Shares of the budget after which the grid grows, in equal ratios; the box shrinks to what is occupied before."""
@@ -87,14 +101,6 @@ class TensoRFConfig(SamplingConfig):
     """Features of a layer of the colour network."""
     sparse_updates: bool = True
     """Adam updates only the entries that a step used."""
-
-    def resolved(self) -> TensoRFConfig:
-        density, appearance = (16, 48) if self.decomposition == "vm" else (96, 288)
-        return replace(
-            self,
-            density_components=self.density_components or density,
-            appearance_components=self.appearance_components or appearance,
-        )
 
 
 class TensorField(Field):
@@ -109,6 +115,7 @@ class TensorField(Field):
     """
 
     box: Tensor
+    runs_on_kernels = True
 
     def __init__(
         self,
@@ -126,8 +133,8 @@ class TensorField(Field):
         self.basis = torch.nn.Linear(appearance.num_features, num_features, bias=False)
         self.color_head = MLP(num_features + 16, width, width, 3, activation="sigmoid")
 
-    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        unit = self._unit(positions)
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        unit = self._unit(points.positions)
         return self._sigma(self.density_factors(unit), unit), unit
 
     @torch.no_grad()
@@ -155,68 +162,25 @@ class TensorField(Field):
         return self.color_head(appearance.float(), spherical_harmonics(directions)).float()
 
 
-class TensoRF(Model[TensoRFConfig]):
+class TensoRF(RayModel[TensoRFConfig]):
     """Factors that grow from coarse to fine, while their box shrinks to what an occupancy grid, if used, has found."""
-
-    runs_on_kernels = True
 
     growths: Tensor
     """Times the grid has grown."""
 
-    def __init__(self, config: TensoRFConfig, scene: Scene) -> None:
-        super().__init__(config, scene)
-        assert config.density_components is not None
-        assert config.appearance_components is not None
-        axes = VM if config.decomposition == "vm" else CP
-        told_apart = VERTICES_PER_PIXEL * scene.image_size
-        self.first_voxels = config.first_voxels or min(FIRST_SIDE, told_apart) ** 3
-        self.last_voxels = config.last_voxels or min(LAST_SIDE[config.decomposition], told_apart) ** 3
-        components = config.density_components + config.appearance_components
-        for voxels in (self.first_voxels, self.last_voxels):  # before the training that the last would end
-            layout = PlanesLayout.build((self._vertices(voxels, scene.box),) * len(axes), axes)
-            require(4.0 * layout.num_entries * components, "a grid")
-        vertices = (self._vertices(self.first_voxels, scene.box),) * len(axes)
-        density, appearance = (
-            FeaturePlanes(vertices, components, axes, config.sparse_updates, resizable=True)
-            for components in (config.density_components, config.appearance_components)
-        )
-        unbounded = contracted_box(config, scene) is not None
-        self.field = TensorField(scene.box, density, appearance, config.hidden_width, unbounded=unbounded)
-        with torch.no_grad():  # of CP's triple products the factors are larger, as in the authors' code
-            for factors in (density, appearance):
-                factors.table.normal_(0, 0.1 if config.decomposition == "vm" else 0.2)
-        self.sampler = make_sampler(config, scene)
+    def __init__(self, config: TensoRFConfig, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer) -> None:
+        super().__init__(config, scene, field, sampler, renderer)
         self.register_buffer("growths", torch.zeros((), dtype=torch.int64))
 
-    @staticmethod
-    def _vertices(voxels: float, box: Tensor) -> tuple[int, ...]:
-        """Vertices along each axis of a grid of about so many cubes over the box."""
-        size = (box[1] - box[0]).tolist()
-        edge = (math.prod(size) / voxels) ** (1 / 3)
-        return tuple(max(round(length / edge), 2) for length in size)
-
-    def render(self, rays: Rays, background: Tensor) -> Rendered:
-        return render_field(self.field, self.sampler, rays, background, self.training)
-
-    def param_groups(self) -> list[dict[str, Any]]:
-        tables = [self.field.density_factors.table, self.field.appearance_factors.table]
-        networks = [*self.field.basis.parameters(), *self.field.color_head.parameters()]
-        return [
-            *self.proposal_groups(),
-            {"params": networks, "lr": self.config.network_learning_rate, "name": "networks"},
-            {"params": tables, "name": "tables", "sparse": self.config.sparse_updates},
-        ]
-
-    def decisions(self) -> list[Decision]:
-        found = sampler_decisions(self.config, self.scene)
-        if self.config.first_voxels is None or self.config.last_voxels is None:
-            sides = " to ".join(f"{voxels ** (1 / 3):.0f}^3" for voxels in (self.first_voxels, self.last_voxels))
-            found.append(Decision("voxels", sides, f"the photographs have {self.scene.image_size} pixels along a side"))
-        return found
+    @property
+    def factors(self) -> TensorField:
+        """The field, whose factors grow."""
+        assert isinstance(self.field, TensorField)
+        return self.field
 
     def before_step(self, step: int, progress: float) -> None:
-        if step >= BLIND_STEPS or not isinstance(self.sampler, OccupancySampler):
-            self.sampler.update(step, self.field.density)
+        if step >= BLIND_STEPS or not isinstance(self.sampler, SkipsCells):
+            super().before_step(step, progress)
         due = sum(progress >= share for share in self.config.upsample_at)
         if due > int(self.growths):
             self.growths.fill_(due)
@@ -225,9 +189,9 @@ class TensoRF(Model[TensoRFConfig]):
     @torch.no_grad()
     def _grow(self, share: float) -> None:
         """More voxels, over what of the box is occupied. Their number grows evenly in its logarithm."""
-        voxels = self.first_voxels ** (1 - share) * self.last_voxels**share
-        box, field = self._occupied_box(), self.field
-        vertices = self._vertices(voxels, box)
+        voxels = self.config.first_voxels ** (1 - share) * self.config.last_voxels**share
+        box, field = self._occupied_box(), self.factors
+        vertices = vertices_of(voxels, box)
         if torch.equal(box, field.box) and vertices == field.density_factors.layout.resolutions[0]:
             return
         size = field.box[1] - field.box[0]
@@ -238,20 +202,20 @@ class TensoRF(Model[TensoRFConfig]):
 
     def _occupied_box(self) -> Tensor:
         """(2, 3) corners of what holds all occupied cells and a margin; the field's box where none is."""
-        sampler = self.sampler
-        if not isinstance(sampler, OccupancySampler):
-            return self.field.box.clone()
+        sampler, box = self.sampler, self.factors.box
+        if not isinstance(sampler, SkipsCells):
+            return box.clone()
         n = sampler.resolution
         cells = sampler.occupied.nonzero().squeeze(-1)
         if len(cells) == 0:
-            return self.field.box.clone()
+            return box.clone()
         corners = torch.stack([cells // n**2, cells // n % n, cells % n], dim=-1)
         ends = torch.stack([corners.min(0).values - MARGIN, corners.max(0).values + 1 + MARGIN]) / n
         found = torch.lerp(sampler.box[0], sampler.box[1], ends)
-        return torch.stack([found[0].maximum(self.field.box[0]), found[1].minimum(self.field.box[1])])
+        return torch.stack([found[0].maximum(box[0]), found[1].minimum(box[1])])
 
-    def loss(self, rendered: Rendered, batch: Batch, step: int) -> dict[str, Tensor]:
-        losses, field = super().loss(rendered, batch, step), self.field
+    def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
+        losses, field = dict[str, Tensor](), self.factors
         if self.config.sparsity:
             weight = self.config.sparsity * (0.5 if int(self.growths) else 1.0)
             losses["sparsity"] = weight * _sum_over_bands(field.density_factors, lambda band: band.abs().mean())
@@ -278,4 +242,67 @@ def _variation(band: Tensor) -> Tensor:
     return found
 
 
-METHOD = Method(TensoRF, TensoRFConfig(), paper="arXiv:2203.09517")
+def decide(config: TensoRFConfig, scene: Scene) -> tuple[TensoRFConfig, list[Decision]]:
+    """Return the settings with what the images tell apart, and why.
+
+    Args:
+        config: settings, some of which may be open.
+        scene: facts about the data.
+    """
+    density, appearance = (16, 48) if config.decomposition == "vm" else (96, 288)
+    told_apart = VERTICES_PER_PIXEL * scene.image_size
+    first, last = (min(side, told_apart) for side in (FIRST_SIDE, LAST_SIDE[config.decomposition]))
+    decomposed = f"the decomposition is {config.decomposition}"
+    pixels = f"the images have {scene.image_size} pixels along a side"
+    return fill(
+        config,
+        sampler_choice(config, scene.unbounded),
+        Choice("density_components", density, decomposed),
+        Choice("appearance_components", appearance, decomposed),
+        Choice("first_voxels", first**3, pixels, shown=f"{first}^3"),
+        Choice("last_voxels", last**3, pixels, shown=f"{last}^3"),
+    )
+
+
+def vertices_of(voxels: float, box: Tensor) -> tuple[int, ...]:
+    """Return the vertices along each axis of a grid of about so many cubes over a box.
+
+    Args:
+        voxels: how many cubes.
+        box: (2, 3) corners.
+    """
+    size = (box[1] - box[0]).tolist()
+    edge = (math.prod(size) / voxels) ** (1 / 3)
+    return tuple(max(round(length / edge), 2) for length in size)
+
+
+def make_field(config: TensoRFConfig, scene: Scene) -> TensorField:
+    """Return the factors and the network that reads them.
+
+    Args:
+        config: the settings, decided.
+        scene: facts about the data.
+    Raises: ConfigError where the machine has less memory than the last grid takes.
+    """
+    axes = VM if config.decomposition == "vm" else CP
+    counts = config.density_components, config.appearance_components
+    for voxels in (config.first_voxels, config.last_voxels):  # before the training that the last would end
+        layout = PlanesLayout.build((vertices_of(voxels, scene.box),) * len(axes), axes)
+        require(4.0 * layout.num_entries * sum(counts), "a grid")
+    vertices = (vertices_of(config.first_voxels, scene.box),) * len(axes)
+    density, appearance = (
+        FeaturePlanes(vertices, count, axes, config.sparse_updates, resizable=True) for count in counts
+    )
+    unbounded = contracted_box(config, scene) is not None
+    field = TensorField(scene.box, density, appearance, config.hidden_width, unbounded=unbounded)
+    field.optimised = Optimised("networks", learning_rate=config.network_learning_rate)
+    for factors in (density, appearance):
+        factors.optimised = Optimised("tables", config.learning_rate, sparse=config.sparse_updates)
+        with torch.no_grad():  # of CP's triple products the factors are larger, as in the authors' code
+            factors.table.normal_(0, 0.1 if config.decomposition == "vm" else 0.2)
+    return field
+
+
+METHOD = Method(
+    TensoRFConfig(), paper="arXiv:2203.09517", field=make_field, sampler=make_sampler, model=TensoRF, decide=decide
+)

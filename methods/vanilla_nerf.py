@@ -8,33 +8,36 @@ space is skipped (as in NerfAcc, Li et al. 2023).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from functools import partial
+from typing import ClassVar
 
-from torch import Tensor
-
-from framework import Decision, Method, Model, Rays, Rendered, Scene
+from framework import Decision, Method, Sampler, Scene
 from framework.base.config import Range
+from framework.base.decisions import Choice, fill
+from framework.base.optimised import Optimised
 from framework.fields.nerf import NeRFField
 from framework.kernels.frequency import MAX_FREQUENCIES
-from framework.rendering.volume import render_field, render_hierarchical
-from framework.samplers.choice import (
-    HierarchicalConfig,
-    chosen_sampler,
-    contracted_box,
-    make_sampler,
-    sampler_decisions,
-)
-from framework.samplers.occupancy import OccupancySampler
+from framework.samplers.choice import HierarchicalConfig, contracted_box, make_sampler, sampler_choice
 
 OCCUPANCY_SAMPLES_PER_BATCH = 2**12
 """With the occupancy grid the number of samples a ray varies a hundredfold, so the number of rays follows it."""
+A_RAY = "the number of samples on a ray varies a hundredfold"
 OCCUPANCY_RATE = 2.0
 """Times the learning rate with the occupancy grid. Smaller batches and longer steps (`num_steps`) at twice the rate
 reached 22.5 dB on Lego after 90 s on two cores, where 2^13 samples, 512 steps and the paper's rate were at 17."""
 
 
 @dataclass(frozen=True)
-class VanillaNeRFConfig(HierarchicalConfig):
+class VanillaNeRFConfig(
+    HierarchicalConfig,
+    max_num_iterations=200_000,
+    num_rays_per_batch=4_096,
+    learning_rate=5e-4,
+    lr_final=0.1,
+    adam_eps=1e-7,
+    background="white",
+    num_steps=192,
+):
     """Settings of vanilla-nerf; the defaults are the paper's."""
 
     RANGES: ClassVar[dict[str, Range]] = {
@@ -44,12 +47,6 @@ class VanillaNeRFConfig(HierarchicalConfig):
         "direction_frequencies": (0, MAX_FREQUENCIES),
     }
     """What these numbers may be."""
-    max_num_iterations: int = 200_000
-    num_rays_per_batch: int = 4_096
-    learning_rate: float = 5e-4
-    lr_final: float = 0.1
-    adam_eps: float = 1e-7
-    background: Literal["auto", "random", "white", "black"] = "white"
     num_layers: int = 8
     """Layers before density."""
     hidden_width: int = 256
@@ -58,61 +55,50 @@ class VanillaNeRFConfig(HierarchicalConfig):
     """L of the position's encoding."""
     direction_frequencies: int = 4
     """L of the direction's encoding."""
-    num_steps: int | None = 192
-    """Steps along the box's diagonal with the occupancy grid."""
 
 
-class VanillaNeRF(Model[VanillaNeRFConfig]):
-    """Two networks trained together (equations 5 and 6), or one with an occupancy grid or proposals."""
+def decide(config: VanillaNeRFConfig, scene: Scene) -> tuple[VanillaNeRFConfig, list[Decision]]:
+    """Return the settings with what the scene decides, and why.
 
-    runs_on_kernels = True
-
-    def __init__(self, config: VanillaNeRFConfig, scene: Scene) -> None:
-        super().__init__(config, scene)
-        self.contracted_box = contracted_box(config, scene)
-        hierarchical = chosen_sampler(config, scene) == "hierarchical"
-        self.fine = self._field()
-        self.coarse = self._field() if hierarchical else None
-        self.sampler = None if hierarchical else make_sampler(config, scene)
-
-    def _field(self) -> NeRFField:
-        c = self.config
-        return NeRFField(
-            c.hidden_width,
-            c.num_layers,
-            skip=c.num_layers // 2 + 1,
-            position_frequencies=c.position_frequencies,
-            direction_frequencies=c.direction_frequencies,
-            contracted=self.contracted_box,
-        )
-
-    def decisions(self) -> list[Decision]:
-        return sampler_decisions(self.config, self.scene)
-
-    def render(self, rays: Rays, background: Tensor) -> Rendered:
-        if self.sampler is not None:
-            return render_field(self.fine, self.sampler, rays, background, self.training)
-        assert self.coarse is not None
-        counts = self.config.num_coarse_samples, self.config.num_fine_samples
-        return render_hierarchical(self.coarse, self.fine, rays, background, counts, self.training)
-
-    def param_groups(self) -> list[dict[str, Any]]:
-        faster = OCCUPANCY_RATE if isinstance(self.sampler, OccupancySampler) else 1.0
-        fields = [p for field in (self.fine, self.coarse) if field is not None for p in field.parameters()]
-        return [
-            {"params": fields, "lr": self.config.learning_rate * faster, "name": "networks"},
-            *self.proposal_groups(),
-        ]
-
-    @property
-    def samples_per_batch(self) -> int | None:
-        if isinstance(self.sampler, OccupancySampler) and self.config.samples_per_batch is None:
-            return OCCUPANCY_SAMPLES_PER_BATCH
-        return self.config.samples_per_batch
-
-    def before_step(self, step: int, progress: float) -> None:
-        if self.sampler is not None:
-            self.sampler.update(step, self.fine.density)
+    Args:
+        config: settings, some of which may be open.
+        scene: facts about the data.
+    """
+    config, made = fill(config, sampler_choice(config, scene.unbounded))
+    if config.sampler != "occupancy":
+        return config, made
+    config, more = fill(config, Choice("samples_per_batch", OCCUPANCY_SAMPLES_PER_BATCH, A_RAY, "samples a step"))
+    return config, made + more
 
 
-METHOD = Method(VanillaNeRF, VanillaNeRFConfig(), paper="arXiv:2003.08934")
+def make_field(config: VanillaNeRFConfig, scene: Scene) -> NeRFField:
+    """Return one network; the coarse one is of the same shape.
+
+    Args:
+        config: the settings, decided.
+        scene: facts about the data.
+    """
+    field = NeRFField(
+        config.hidden_width,
+        config.num_layers,
+        skip=config.num_layers // 2 + 1,
+        position_frequencies=config.position_frequencies,
+        direction_frequencies=config.direction_frequencies,
+        contracted=contracted_box(config, scene),
+    )
+    if config.sampler == "occupancy":
+        field.optimised = Optimised(learning_rate=OCCUPANCY_RATE * config.learning_rate)
+    return field
+
+
+def sampler(config: VanillaNeRFConfig, scene: Scene) -> Sampler:
+    """Return the sampler that is asked for; the coarse field of the paper's is a network like the fine one.
+
+    Args:
+        config: the settings, decided.
+        scene: facts about the data.
+    """
+    return make_sampler(config, scene, partial(make_field, config, scene))
+
+
+METHOD = Method(VanillaNeRFConfig(), paper="arXiv:2003.08934", field=make_field, sampler=sampler, decide=decide)

@@ -6,12 +6,13 @@ This module imports neither torch nor any method, so that the command line answe
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import math
 import types
 import typing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeVar, Union
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar, Union
 
 import yaml
 
@@ -20,6 +21,22 @@ from framework.base.from_nerfstudio import config_answer
 
 T = TypeVar("T")
 RaysPerPixel = Literal[1, 4, 9, 16]
+if TYPE_CHECKING:
+    Auto = Annotated[T, "left to the data"]
+else:
+
+    class Auto:
+        """`Auto[T]`: a setting of type T that may be left to the data, by None, until `Method.decide` fills it in.
+
+        Type checkers take it for T: what is built from settings is built after they were decided.
+        """
+
+        def __class_getitem__(cls, kind: Any) -> Any:
+            return kind | None
+
+
+AUTO: Any = None
+"""The default of an `Auto` setting."""
 Range = tuple[float, float]
 """The least and the largest value of a setting, both allowed."""
 AT_LEAST_0: Range = (0, math.inf)
@@ -49,9 +66,6 @@ class TrainConfig:
 
     RANGES: ClassVar[dict[str, Range]] = {
         "max_num_iterations": (1, math.inf),
-        "num_rays_per_batch": (1, 2**20),
-        "eval_num_rays_per_chunk": (1, 2**20),
-        "samples_per_batch": (1, 2**24),
         "steps_per_save": (1, math.inf),
         "steps_per_eval_image": (1, math.inf),
         "steps_per_eval_all_images": (1, math.inf),
@@ -59,7 +73,6 @@ class TrainConfig:
         "seconds_per_eval_all_images": AT_LEAST_0,
         "max_eval_images": AT_LEAST_0,
         "lr_warmup_steps": AT_LEAST_0,
-        "train_rays_per_pixel_from": (0, 1),
     }
     """What numbers may be, by name: a method's config names its own, and may change those of others. None, where it is
     allowed, is in every range; of several numbers each must be in it."""
@@ -103,14 +116,6 @@ class TrainConfig:
     """Start from the newest checkpoint in this folder."""
     load_checkpoint: Path | None = None
     """Start from this checkpoint."""
-    num_rays_per_batch: int = 4_096
-    """Rays in a training step."""
-    rays_per_pixel: RaysPerPixel = 1
-    """Rays of which a pixel of a picture is the mean, as a camera sees areas, not points. More: closer, and slower."""
-    train_rays_per_pixel_from: float = 1.0
-    """Share of the budget after which training too averages that many rays; until then it uses one."""
-    samples_per_batch: int | None = None
-    """Let the number of rays follow, so that a step evaluates about this many samples."""
     learning_rate: float = 5e-4
     """Adam's learning rate at the start."""
     lr_schedule: Literal["constant", "exponential", "cosine", "hold-exponential"] = "exponential"
@@ -125,28 +130,30 @@ class TrainConfig:
     """Adam's decay of the squared gradient."""
     adam_eps: float = 1e-8
     """Adam's epsilon."""
-    silhouette_cells: bool = True
-    """Where photographs are transparent, cells of the occupancy grid that one of them shows empty are never marched."""
-    silhouette_pixels: bool = True
-    """Pixels whose ray meets only such cells are never drawn."""
-    draw_by_error: bool = False
-    """Draw half of the pixels where the error was large lately, with weights that keep the mean loss as it is."""
     masks: Literal["auto", "ignored", "empty"] = "auto"
     """What masks say in training of pixels that they do not keep: nothing, or that nothing is there, as around an
     object that was cut out. auto: the latter if they take away over half of all pixels, not the same of each image."""
     background: Literal["auto", "random", "white", "black"] = "auto"
     """Behind transparent pixels in training; auto: random if images have alpha. Evaluation is over white, or black."""
-    eval_appearance: Literal["mean", "half"] = "mean"
-    """Appearance of held-out photographs, of methods that have one: the mean of all, or optimised on the left half, the
-    right half being judged (NeRF-W's protocol)."""
-    eval_num_rays_per_chunk: int = 8_192
-    """Rays rendered at once in evaluation. It changes memory and speed, never the picture."""
     machine: MachineConfig = field(default_factory=MachineConfig)
     """Seed, device and threads."""
 
-    def resolved(self) -> TrainConfig:
-        """The settings with what depends on other settings filled in, as they are written to config.yml."""
-        return self
+    def __init_subclass__(cls, **defaults: Any) -> None:
+        """Change defaults of inherited settings without repeating their types.
+
+        As in `class MyConfig(RayConfig, learning_rate=1e-2)`.
+
+        Args:
+            defaults: new defaults by name.
+        Raises: TypeError for a name that is no setting.
+        """
+        super().__init_subclass__()
+        for name, value in defaults.items():
+            owner = next((base for base in cls.__mro__[1:] if name in inspect.get_annotations(base)), None)
+            if owner is None:
+                raise TypeError(f"{cls.__name__} inherits no setting '{name}', whose default it changes")
+            cls.__annotations__[name] = typing.get_type_hints(owner, include_extras=True)[name]
+            setattr(cls, name, value)
 
     def __post_init__(self) -> None:
         ranges: dict[str, Range] = {}
@@ -165,6 +172,40 @@ class TrainConfig:
             raise ConfigError(f"--max-seconds is {self.max_seconds}; it must be more than 0")
         if not self.learning_rate > 0 or not 0 < self.lr_final <= 1:
             raise ConfigError("--learning-rate must be more than 0, and --lr-final in (0, 1]")
+
+
+@dataclass(frozen=True)
+class RayConfig(TrainConfig):
+    """What every method that casts rays can be told."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        "num_rays_per_batch": (1, 2**20),
+        "eval_num_rays_per_chunk": (1, 2**20),
+        "samples_per_batch": (1, 2**24),
+        "train_rays_per_pixel_from": (0, 1),
+    }
+    """What these numbers may be."""
+    num_rays_per_batch: int = 4_096
+    """Rays in a training step."""
+    rays_per_pixel: RaysPerPixel = 1
+    """Rays of which a pixel of a picture is the mean, as a camera sees areas, not points. More: closer, and slower."""
+    train_rays_per_pixel_from: float = 1.0
+    """Share of the budget after which training too averages that many rays; until then it uses one."""
+    samples_per_batch: int | None = None
+    """Let the number of rays follow, so that a step evaluates about this many samples."""
+    draw_by_error: bool = False
+    """Draw half of the pixels where the error was large lately, with weights that keep the mean loss as it is."""
+    eval_num_rays_per_chunk: int = 8_192
+    """Rays rendered at once in evaluation. It changes memory and speed, never the picture."""
+
+
+@dataclass(frozen=True)
+class AppearanceConfig(TrainConfig):
+    """What a method can be told that gives each image an appearance of its own."""
+
+    eval_appearance: Literal["mean", "half"] = "mean"
+    """Appearance of held-out images: the mean of all, or optimised on the left half, the right half being judged
+    (NeRF-W's protocol)."""
 
 
 def _check_range(name: str, value: Any, least: float, most: float) -> None:

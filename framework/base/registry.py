@@ -32,13 +32,13 @@ from framework.base.from_nerfstudio import format_answer
 
 if TYPE_CHECKING:
     from framework.data.dataset import DataParser
-    from framework.model import Method
+    from framework.method import Method
 
 Kind = Literal["methods", "dataparsers"]
-INTERFACE = 1
+INTERFACE: dict[Kind, int] = {"methods": 2, "dataparsers": 1}
 """Version of what plugins rely on (docs/plugins.md). A change that breaks them raises it."""
-OLDEST_INTERFACE = 1
-"""The oldest version that still works."""
+CHANGED = "docs/plugins.md, 'From interface 1 to 2', says what to change"
+"""What to tell of methods that were written for the version before."""
 VARIABLES = {"methods": "NERFLOOM_METHODS", "dataparsers": "NERFLOOM_DATAPARSERS"}
 CALLED = {"methods": "method", "dataparsers": "data format"}
 
@@ -151,12 +151,14 @@ def _load(kind: Kind, name: str) -> Any:
             loaded = getattr(loaded, part)
     except (Exception, SystemExit) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
+        if isinstance(error, ImportError) and (error.name or "").split(".")[0] == "framework":
+            reason += f". It looks written for an older plugin interface: {CHANGED}"
         raise ConfigError(f"{what} cannot be loaded: {reason}") from error
-    interface = getattr(loaded, "interface", INTERFACE)
-    if not isinstance(interface, int) or not OLDEST_INTERFACE <= interface <= INTERFACE:
-        newer = isinstance(interface, int) and interface > INTERFACE
-        remedy = "upgrade nerfloom" if newer else "upgrade the plugin"
-        raise ConfigError(f"{what} was written for plugin interface {interface}, and this is {INTERFACE}; {remedy}")
+    interface, ours = getattr(loaded, "interface", INTERFACE[kind]), INTERFACE[kind]
+    if interface != ours:
+        newer = isinstance(interface, int) and interface > ours
+        remedy = "upgrade nerfloom" if newer else CHANGED
+        raise ConfigError(f"{what} was written for plugin interface {interface}, and this is {ours}; {remedy}")
     return loaded
 
 
@@ -166,7 +168,7 @@ def load_method(name: str) -> Method:
     Raises: ConfigError for an unknown name, where its module cannot be imported, or where it is no method of this
         plugin interface.
     """
-    from framework.model import Method
+    from framework.method import Method
 
     method = _load("methods", name)
     if not isinstance(method, Method):

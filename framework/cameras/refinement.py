@@ -8,6 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from framework.base.optimised import Optimised
 from framework.cameras.cameras import Cameras
 from framework.geometry.alignment import align_cameras
 from framework.geometry.rays import Rays
@@ -29,6 +30,7 @@ class PoseRefinement(nn.Module):
     """
 
     given: Tensor | None
+    optimised: Optimised | None = None
 
     def __init__(self, count: int, group: Group = "SO3xR3", given: Tensor | None = None) -> None:
         super().__init__()

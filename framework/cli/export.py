@@ -90,8 +90,11 @@ def _points(flags: PointFlags, trained: Trained, placement: Placement, path: Pat
     from framework.cli.session import load_split
     from framework.data.ply import write_points
     from framework.export.points import joined, surface_points
+    from framework.ray_model import RayModel
 
     model = trained.model
+    if not isinstance(model, RayModel):
+        raise ConfigError(f"ns-export pointcloud: {trained.run.method} casts no rays, which end in surfaces")
     dataset = load_split(trained.run, "train").to(model.device)
     seed_step(trained.run.config.machine.seed, 0)
     chunks = -(-flags.num_points // model.config.eval_num_rays_per_chunk)

@@ -116,8 +116,9 @@ def _render(flags: Flags) -> None:
     import torch
 
     from framework.base.console import say, track
+    from framework.cameras.view import View
     from framework.evaluation.error_bound import limited_error, parse_error
-    from framework.evaluation.evaluator import evaluation_background, render_image
+    from framework.evaluation.evaluator import evaluation_background
     from framework.evaluation.images import write_animation, write_image
     from framework.training.trained import load_trained
 
@@ -134,7 +135,7 @@ def _render(flags: Flags) -> None:
     frames = []
     with nullcontext() if bound is None else limited_error(model, bound):
         for index in track(range(flags.num_frames), "Rendering", total=flags.num_frames):
-            frames.append(render_image(model, cameras, index, background, times).rgb)
+            frames.append(model.render_view(View.of(cameras, index, times), background).rgb)
     if isinstance(flags, TimeFlags) and flags.output_path.suffix.lower() == ".png":
         write_image(flags.output_path, torch.cat(frames, dim=1))
         say(f"pictures, side by side: {flags.output_path}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 
 from framework.base.console import say
 from framework.base.device import choose_device, peak_memory
@@ -31,8 +30,8 @@ def start(run: Run) -> None:
 
     Raises: Stopped where somebody ends it; what was saved is said.
     """
-    run = replace(run, config=run.config.resolved())
     trainer = _prepare(run)
+    run = trainer.run  # with what was decided
     trainer.restore_as_configured()
     with sole_user(run.folder):
         create_folder(run)
@@ -71,7 +70,8 @@ def _prepare(run: Run) -> Trainer:
 def _finish(run: Run, trainer: Trainer) -> None:
     # Also of a run that goes on: it may have been killed before it came to this.
     write_transforms(run, trainer.train_set)
-    write_report(run.folder / "scene_profile.json", trainer.profile().as_plain())
+    if trainer.first_step == 0:  # later there is nothing left to decide
+        write_report(run.folder / "scene_profile.json", trainer.profile().as_plain())
     with _saying_of_a_stop(lambda: _what_is_saved(trainer)):
         outcome = trainer.train()
     state = trainer.state

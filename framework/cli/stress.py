@@ -99,7 +99,8 @@ def stress(methods: Sequence[str], flags: StressFlags) -> list[Result]:
     results: list[Result] = []
     for method, run in zip(methods, runs, strict=True):
         say(f"{method}:")
-        result = Result(method, machine(choose_device(run.config.machine)), settings_of(run, budget), ())
+        settings = settings_of(run, budget, views.train.scene)
+        result = Result(method, machine(choose_device(run.config.machine)), settings, ())
         for verdict in verdicts(run, views, conditions, budget):
             result = replace(result, verdicts=(*result.verdicts, verdict))
             _write(path, flags, conditions, [*results, result])

@@ -17,6 +17,7 @@ from framework.base.errors import DataError
 from framework.base.splits import Split as Split
 from framework.cameras.cameras import Cameras
 from framework.cameras.ndc import NdcCameras
+from framework.cameras.view import View
 from framework.data.coverage import pixels_with_rays
 from framework.data.decoding import Decoded, ImageFiles, decode
 from framework.data.depths import read_depths
@@ -159,6 +160,15 @@ class Dataset:
             alpha = pixels[:, 3] * shown if pixels.shape[1] == 4 else shown * pixels.new_tensor(255)
             pixels = torch.cat([pixels[:, :3], alpha[:, None].to(torch.uint8)], dim=-1)
         return pixels.view(height, width, -1)
+
+    def view(self, index: int, stride: int = 1) -> View:
+        """Return the camera of image `index`, at its time.
+
+        Args:
+            index: which image.
+            stride: only every so many-th row and column of its pixels.
+        """
+        return View.of(self.cameras, index, self.times, stride)
 
     def kept_of(self, index: int) -> Tensor | None:
         """(H, W) bool: which pixels of image `index` no mask ignores; None where no image has ignored ones."""

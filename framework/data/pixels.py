@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from framework.cameras.cameras import CENTER
+from framework.cameras.view import View
 from framework.data.dataset import Dataset
 from framework.data.depths import ray_distances
 from framework.data.error_map import ErrorMap
@@ -23,7 +24,7 @@ LookUp = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True)
-class Batch:
+class PixelBatch:
     """R pixels to learn from."""
 
     pixels: Tensor
@@ -40,6 +41,33 @@ class Batch:
     """(R,) along the pixel's ray to what a depth image shows, 0 where unknown, where there are such images."""
     weights: Tensor | None = None
     """(R,) what each pixel's loss is multiplied by, where they were not drawn evenly; 1 in the mean."""
+
+    def __len__(self) -> int:
+        return self.pixels.shape[0]
+
+    @property
+    def rays_per_pixel(self) -> int:
+        """K, rays of a pixel."""
+        return max(len(self.rays) // max(len(self), 1), 1)
+
+
+@dataclass(frozen=True)
+class ViewBatch:
+    """One whole image to learn from."""
+
+    index: int
+    """Which training image."""
+    view: View
+    """Its camera."""
+    rgb: Tensor
+    """(H, W, 3) colours over `background`."""
+    background: Tensor
+    """(3,) what shows where the image is transparent."""
+    alpha: Tensor | None = None
+    """(H, W) opacity, where the images have it."""
+
+    def __len__(self) -> int:
+        return self.rgb.shape[0] * self.rgb.shape[1]
 
 
 def training_background(asked: Background | Literal["auto"], has_alpha: bool) -> Background:
@@ -78,7 +106,7 @@ def draw_batch(
     errors: ErrorMap | None = None,
     places: Tensor = CENTER,
     look_up: LookUp | None = None,
-) -> Batch:
+) -> PixelBatch:
     """`count` pixels worth drawing with what they should show: evenly, or also where `errors` are large.
 
     A ray goes through each of the `places` (K, 2) in a pixel (`Cameras.pixel_rays`). Pixels that lie in a file are
@@ -99,7 +127,7 @@ def draw_batch(
 
 def gather_batch(
     dataset: Dataset, flat: Tensor, behind: Tensor, places: Tensor = CENTER, stored: Tensor | None = None
-) -> Batch:
+) -> PixelBatch:
     """The pixels `flat` (R,), counted through all images, over the background `behind` (R, 3).
 
     Their stored colours (R, 3 or 4) are looked up where `stored` does not give them.
@@ -115,7 +143,7 @@ def gather_batch(
     if dataset.opaque is not None:
         shown = dataset.opaque.contains(flat)
         rgb, alpha = torch.where(shown[:, None], rgb, behind), shown * (1.0 if alpha is None else alpha)
-    return Batch(flat, rays, rgb, behind, alpha, _distances(dataset, flat, rays))
+    return PixelBatch(flat, rays, rgb, behind, alpha, _distances(dataset, flat, rays))
 
 
 def _distances(dataset: Dataset, flat: Tensor, rays: Rays) -> Tensor | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
+from framework.base.optimised import Optimised
 from framework.kernels.hash_grid import HashGridLayout, TableGradient, hash_grid
 from framework.kernels.memory import table
 
@@ -35,6 +36,7 @@ class HashGrid(nn.Module):
         self.layout = HashGridLayout.build(num_levels, base_resolution, max_resolution, log2_table_size)
         # Small random values, as in the paper's section 4: features start near zero but not alike.
         self.table = nn.Parameter(table(self.layout.num_entries, features_per_level).uniform_(-1e-4, 1e-4))
+        self.optimised = Optimised("tables", sparse=True) if sparse else None
         self.deferred = TableGradient(self.layout) if sparse else None
         self.num_features = num_levels * features_per_level
 

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from framework.base.optimised import Optimised
 from framework.kernels.memory import table
 from framework.kernels.planes import PlanesGradient, PlanesLayout, plane_band, planes
 
@@ -46,6 +47,7 @@ class FeaturePlanes(nn.Module):
                 for index, along in enumerate(factors):
                     if 3 in along:
                         self.layout.factor(self.table, group, index).fill_(1)
+        self.optimised = Optimised("tables", sparse=True) if sparse else None
         self.deferred = PlanesGradient(self.layout) if sparse else None
 
     def forward(self, positions: Tensor, known: Tensor | None = None) -> Tensor:

@@ -6,9 +6,10 @@ vector; one is optimised on its left half, all else being fixed, and the picture
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,28 +17,40 @@ from torch import Tensor
 from framework.data.dataset import Dataset
 from framework.data.pixels import gather_batch
 from framework.fields.appearance import Appearance
-from framework.model import Model
+from framework.model import HasAppearance, Model
+from framework.ray_model import RayModel
 from framework.rendering.losses import mean_squared_error
 
 STEPS, PIXELS, RATE = 60, 1024, 0.05
 """Of Adam: steps, pixels in each, learning rate."""
 
 
-def appearances(model: Model) -> list[Appearance]:
-    """The model's appearance vectors; empty for a method that has none."""
-    return [module for module in model.modules() if isinstance(module, Appearance)]
+def appearance_of(model: Model[Any]) -> Appearance | None:
+    """Return the images' appearance vectors; None of a model that has none.
+
+    Args:
+        model: any method's.
+    """
+    return model.appearance if isinstance(model, HasAppearance) else None
 
 
 def right_half(image: Tensor) -> Tensor:
-    """(H, W - W // 2, ...) what is judged of an image (H, W, ...)."""
+    """Return (H, W - W // 2, ...), what is judged of an image.
+
+    Args:
+        image: (H, W, ...).
+    """
     return image[:, image.shape[1] // 2 :]
 
 
 @contextmanager
-def fitted_appearance(model: Model, dataset: Dataset, index: int, background: Tensor) -> Iterator[None]:
-    """Show photograph `index` in the appearance found on its left half.
+def fitted_appearance(model: Model[Any], dataset: Dataset, index: int, background: Tensor) -> Iterator[None]:
+    """Show image `index` in the appearance found on its left half.
 
     Args:
+        model: with appearance vectors.
+        dataset: held-out images.
+        index: which of them.
         background: (3,) colour behind what is not opaque.
     """
     with shown_appearance(model, fit_appearance(model, dataset, _left_pixels(dataset, index), background)):
@@ -45,31 +58,39 @@ def fitted_appearance(model: Model, dataset: Dataset, index: int, background: Te
 
 
 @contextmanager
-def shown_appearance(model: Model, vectors: Sequence[Tensor]) -> Iterator[None]:
-    """Show what is not a training photograph in an appearance: a vector (D,) for each of the model's `appearances`."""
-    with ExitStack() as stack:
-        for module, vector in zip(appearances(model), vectors, strict=True):
-            stack.enter_context(module.shown(vector))
+def shown_appearance(model: Model[Any], vector: Tensor | None) -> Iterator[None]:
+    """Show what is no training image in an appearance.
+
+    Args:
+        model: whose pictures are meant.
+        vector: (D,) the appearance; None of a model without.
+    """
+    appearance = appearance_of(model)
+    with nullcontext() if appearance is None or vector is None else appearance.shown(vector):
         yield
 
 
 def fit_appearance(
-    model: Model, dataset: Dataset, pixels: Tensor, background: Tensor, start: Sequence[Tensor] | None = None
-) -> list[Tensor]:
-    """The appearance in which the model's picture comes nearest to a photograph, all else being fixed.
+    model: Model[Any], dataset: Dataset, pixels: Tensor, background: Tensor, start: Tensor | None = None
+) -> Tensor | None:
+    """Find the appearance in which the model's picture comes nearest to an image, all else being fixed.
 
     Args:
+        model: what is shown.
+        dataset: the images.
         pixels: (P,) which to look at, counted through all images; P may be 0.
         background: (3,) colour behind what is not opaque.
-        start: the vectors to start from; the mean of the training photographs' if None.
-    Returns: a vector (D,) for each of the model's `appearances`.
+        start: (D,) the vector to start from; the mean of the training images' if None.
+    Returns: (D,) the vector; None of a model without appearance.
     """
-    first = [module.vectors.mean(0) for module in appearances(model)] if start is None else start
-    vectors = [vector.detach().clone().requires_grad_() for vector in first]
-    if vectors and len(pixels):
-        with shown_appearance(model, vectors):
-            _fit(model, dataset, pixels, vectors, background)
-    return [vector.detach() for vector in vectors]
+    appearance = appearance_of(model)
+    if appearance is None:
+        return None
+    vector = (appearance.vectors.mean(0) if start is None else start).detach().clone().requires_grad_()
+    if len(pixels) and isinstance(model, RayModel):
+        with appearance.shown(vector):
+            _fit(model, dataset, pixels, vector, background)
+    return vector.detach()
 
 
 def _left_pixels(dataset: Dataset, index: int) -> Tensor:
@@ -80,18 +101,16 @@ def _left_pixels(dataset: Dataset, index: int) -> Tensor:
     return pixels.reshape(-1) if kept is None else pixels[kept[:, : width // 2]]
 
 
-def _fit(model: Model, dataset: Dataset, pixels: Tensor, vectors: list[Tensor], background: Tensor) -> None:
+def _fit(model: RayModel[Any], dataset: Dataset, pixels: Tensor, vector: Tensor, background: Tensor) -> None:
     was_training = model.training
     model.eval()
-    optimizer = torch.optim.Adam(vectors, lr=RATE)
+    optimizer = torch.optim.Adam([vector], lr=RATE)
     draws = torch.Generator().manual_seed(0)
     with torch.enable_grad(), torch.autocast(model.device.type, torch.bfloat16, enabled=False):
         for _ in range(STEPS):
             chosen = pixels[torch.randint(len(pixels), (PIXELS,), generator=draws).to(pixels.device)]
             batch = gather_batch(dataset, chosen, background.repeat(len(chosen), 1))
             rendered = model.render(replace(batch.rays, camera_indices=None), batch.background)
-            loss = mean_squared_error(rendered.rgb, batch.rgb)
-            for vector, grad in zip(vectors, torch.autograd.grad(loss, vectors), strict=True):
-                vector.grad = grad
+            (vector.grad,) = torch.autograd.grad(mean_squared_error(rendered.rgb, batch.rgb), [vector])
             optimizer.step()
     model.train(was_training)

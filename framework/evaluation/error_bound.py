@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from framework.base.device import wait_for
 from framework.base.errors import ConfigError
 from framework.data.dataset import Dataset
-from framework.evaluation.evaluator import evaluation_background, render_view, spread
-from framework.model import Model
+from framework.evaluation.evaluator import evaluation_background, spread
+from framework.model import Model, parts
+from framework.samplers.base import StopsEarly
 
 MEASURED_VIEWS = 4
 
@@ -35,7 +38,7 @@ def limited_error(model: Model[Any], bound: float) -> Iterator[None]:
 
     Raises: ConfigError for a method whose rays do not end early.
     """
-    samplers = model.occupancy_samplers
+    samplers = parts(model, StopsEarly)
     if not samplers:
         raise ConfigError("--max-error: this run has no occupancy grid to stop its rays early; leave it out")
     before = [sampler.early_stop for sampler in samplers]
@@ -55,7 +58,9 @@ def measured_error(model: Model[Any], dataset: Dataset, bound: float) -> tuple[f
         views = []
         for place, stop in enumerate((0.0, bound)):
             with limited_error(model, stop):
-                views.append(render_view(model, dataset, index, background))
-            times[place] += views[-1].seconds
+                start = time.perf_counter()
+                views.append(model.render_view(dataset.view(index), background))
+                wait_for(model.device)
+                times[place] += time.perf_counter() - start
         worst = max(worst, float((views[0].rgb - views[1].rgb).abs().max()))
     return worst, times[0] / times[1]

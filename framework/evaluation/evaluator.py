@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any, Literal
@@ -13,93 +13,22 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from framework.base.config import AppearanceConfig
 from framework.base.console import track
-from framework.base.device import has_bfloat16, wait_for
+from framework.base.device import wait_for
 from framework.base.errors import DataError
-from framework.cameras.cameras import Cameras, subpixels
+from framework.cameras.view import every
 from framework.data.dataset import Dataset
 from framework.data.pixels import composite
-from framework.evaluation.appearance import appearances, fitted_appearance, right_half
+from framework.evaluation.appearance import appearance_of, fitted_appearance, right_half
 from framework.evaluation.images import write_image
 from framework.evaluation.metrics import load_lpips, psnr, ssim
 from framework.evaluation.panels import composed, view_panels
-from framework.kernels.math import safe_normalize
-from framework.kernels.native import torch_on_one_thread
 from framework.model import Model
+from framework.rendering.rendered import Picture
 
 LONGEST_STEM = 150
 """Bytes of a photograph's name that its pictures are called by."""
-
-
-@dataclass(frozen=True)
-class RenderedImage:
-    """A whole picture."""
-
-    rgb: Tensor
-    """(H, W, 3)."""
-    depth: Tensor
-    """(H, W) median distance along the ray, scene units."""
-    accumulation: Tensor
-    """(H, W) opacity."""
-    seconds: float
-    """Time it took."""
-    normals: Tensor | None = None
-    """(H, W, 3) unit directions away from surfaces, scene coordinates, of a method that has them."""
-
-
-@torch.no_grad()
-def render_image(
-    model: Model, cameras: Cameras, index: int, background: Tensor, times: Tensor | None = None, stride: int = 1
-) -> RenderedImage:
-    """What camera `index` sees, a chunk of pixels at a time, each the mean of `rays_per_pixel` rays.
-
-    Args:
-        model: in any mode; it is put into evaluation mode and back.
-        cameras: on the model's device.
-        background: (3,) colour behind what is not opaque.
-        times: (M,) time of each camera.
-        stride: only every so many-th row and column of the pixels; H and W are then what remains.
-    """
-    was_training, scene, per_pixel = model.training, model.scene, model.config.rays_per_pixel
-    places = subpixels(per_pixel)
-    model.eval()
-    start = time.perf_counter()
-    parts, normals = [], []
-    with (
-        torch_on_one_thread(model.runs_on_kernels),
-        torch.autocast(model.device.type, torch.bfloat16, enabled=use_bfloat16(model)),
-    ):
-        grid = every(cameras.image_pixels(index).view(int(cameras.heights[index]), -1), stride)
-        for pixels in grid.reshape(-1).split(max(model.config.eval_num_rays_per_chunk // per_pixel, 1)):
-            rays = cameras.pixel_rays(pixels, scene.near, scene.far, times, places)
-            # The number of a camera that is not a training camera must not be taken for one's.
-            out = model.render(replace(rays, camera_indices=None), background).per_pixel(per_pixel)
-            parts.append((out.rgb.float(), out.median_depth.float(), out.accumulation.float()))
-            normals += [] if out.normals is None else [safe_normalize(out.normals.float())]
-    wait_for(model.device)
-    seconds = time.perf_counter() - start
-    model.train(was_training)
-    rgb, depth, accumulation = (torch.cat(column) for column in zip(*parts, strict=True))
-    facing = torch.cat(normals).view(*grid.shape, 3) if normals else None
-    return RenderedImage(
-        rgb.view(*grid.shape, 3), depth.view(grid.shape), accumulation.view(grid.shape), seconds, facing
-    )
-
-
-def every(image: Tensor, stride: int) -> Tensor:
-    """Every `stride`-th row and column of an image (H, W, ...), the first being at half of the stride."""
-    return image[stride // 2 :: stride, stride // 2 :: stride]
-
-
-def use_bfloat16(model: Model) -> bool:
-    """The run's precision: as configured, else as the device allows."""
-    chosen = model.config.mixed_precision
-    return has_bfloat16(model.device) if chosen is None else chosen
-
-
-def render_view(model: Model, dataset: Dataset, index: int, background: Tensor, stride: int = 1) -> RenderedImage:
-    """The model's picture of the data set's view `index`, with the appearance meant for evaluation."""
-    return render_image(model, dataset.cameras, index, background, dataset.times, stride)
 
 
 def evaluation_background(model: Model) -> Tensor:
@@ -134,7 +63,7 @@ def measure_view(model: Model, dataset: Dataset, index: int, background: Tensor,
     """How near the picture of view `index` comes to its photograph, of every `stride`-th row and column of both."""
     target = composite(every(dataset.image(index), stride).float() / 255, background)
     kept = dataset.kept_of(index)
-    rgb = render_view(model, dataset, index, background, stride).rgb.clamp(0, 1)
+    rgb = model.render_view(dataset.view(index, stride), background).rgb.clamp(0, 1)
     (rgb, target), kept = _judged(rgb, target, None if kept is None else every(kept, stride), half=False)
     return measure(rgb, target, kept)
 
@@ -199,7 +128,8 @@ def evaluate(
         round_to_uint8: measure the picture as it would be stored.
     Raises: DataError where there is nothing to evaluate.
     """
-    half = model.config.eval_appearance == "half" and bool(appearances(model))
+    has_appearance = appearance_of(model) is not None
+    half = has_appearance and isinstance(model.config, AppearanceConfig) and model.config.eval_appearance == "half"
     shown = views_to_judge(dataset, half)
     chosen = [shown[place] for place in spread(len(shown), max_images)]
     if not chosen:
@@ -211,8 +141,11 @@ def evaluate(
     for index in track(chosen, title, total=len(chosen)):
         target = composite(dataset.image(index).float() / 255, background)
         with fitted_appearance(model, dataset, index, background) if half else nullcontext():
-            view = render_view(model, dataset, index, background)
-        rgb = view.rgb.clamp(0, 1)
+            start = time.perf_counter()
+            picture = model.render_view(dataset.view(index), background)
+            wait_for(model.device)
+            spent = time.perf_counter() - start
+        rgb = picture.rgb.clamp(0, 1)
         if round_to_uint8:
             rgb = (rgb * 255).round() / 255
         found, kept = _judged(rgb, target, dataset.kept_of(index), half)
@@ -223,28 +156,29 @@ def evaluate(
                 "psnr": measured.psnr,
                 "ssim": measured.ssim,
                 "lpips": None if lpips is None else lpips(*found),
-                "seconds": view.seconds,
+                "seconds": spent,
             }
         )
-        seconds += view.seconds
-        rays += rgb.shape[0] * rgb.shape[1] * model.config.rays_per_pixel
+        seconds += spent
+        rays += picture.num_rays
         if pictures is not None and (max_pictures is None or len(rows) <= max_pictures):
             try:
-                _write_pictures(pictures, f"{index:04d}_{_short_stem(dataset.names[index])}", rgb, target, view)
+                _write_pictures(pictures, f"{index:04d}_{_short_stem(dataset.names[index])}", rgb, target, picture)
             except OSError as error:  # the figures are worth more
                 pictures, pictures_note = None, f"cannot write pictures to {pictures}: {error.strerror or error}"
     results = {**_statistics(rows), "num_rays_per_sec": rays / seconds, "fps": len(rows) / seconds}
-    protocol: Literal["mean", "half"] | None = ("half" if half else "mean") if appearances(model) else None
+    protocol: Literal["mean", "half"] | None = ("half" if half else "mean") if has_appearance else None
     return Evaluation(rows, {**results, "num_images": len(rows)}, lpips_note, protocol, pictures_note)
 
 
-def _write_pictures(folder: Path, stem: str, rgb: Tensor, target: Tensor, view: RenderedImage) -> None:
+def _write_pictures(folder: Path, stem: str, rgb: Tensor, target: Tensor, picture: Picture) -> None:
     """A view's picture, its photograph, both compared, and its normals. Raises: OSError as it comes."""
     write_image(folder / f"{stem}.png", rgb)
     write_image(folder / f"{stem}_photograph.png", target)
-    write_image(folder / f"{stem}_comparison.png", composed(view_panels(rgb, target, view.depth, view.accumulation)))
-    if view.normals is not None:
-        write_image(folder / f"{stem}_normals.png", (view.normals + 1) / 2)
+    panels = view_panels(rgb, target, picture.median_depth, picture.accumulation)
+    write_image(folder / f"{stem}_comparison.png", composed(panels))
+    if picture.normals is not None:
+        write_image(folder / f"{stem}_normals.png", (picture.normals + 1) / 2)
 
 
 def _short_stem(name: str) -> str:

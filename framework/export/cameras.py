@@ -5,17 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from framework.cameras.cameras import Cameras
 from framework.cameras.poses import Placement
-from framework.cameras.refinement import PoseRefinement
+from framework.model import Model, RefinesPoses
 
 
-def believed(model: nn.Module, cameras: Cameras) -> Cameras:
-    """A run's training cameras, refined where the model has refined them."""
-    refinement = next((module for module in model.modules() if isinstance(module, PoseRefinement)), None)
-    return cameras if refinement is None else refinement.refined(cameras)
+def believed(model: Model[Any], cameras: Cameras) -> Cameras:
+    """Return a run's training cameras, refined where the model has refined them.
+
+    Args:
+        model: the run's.
+        cameras: M training cameras as they are given.
+    """
+    return model.refined_cameras(cameras) if isinstance(model, RefinesPoses) else cameras
 
 
 def camera_list(cameras: Cameras, names: Sequence[str], placement: Placement) -> list[dict[str, Any]]:

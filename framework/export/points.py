@@ -11,16 +11,16 @@ from torch import Tensor
 
 from framework.data.dataset import Dataset
 from framework.data.pixels import draw_pixels
-from framework.evaluation.evaluator import evaluation_background, use_bfloat16
+from framework.evaluation.evaluator import evaluation_background
 from framework.kernels.math import safe_normalize
-from framework.model import Model
+from framework.ray_model import RayModel
 
 OPAQUE = 0.5
 """Rays less opaque than this end in no surface."""
 
 
 @dataclass(frozen=True)
-class Points:
+class SurfacePoints:
     """K points on surfaces, scene coordinates."""
 
     positions: Tensor
@@ -32,7 +32,7 @@ class Points:
 
 
 @torch.no_grad()
-def surface_points(model: Model[Any], dataset: Dataset, count: int, reach: float | None) -> Iterator[Points]:
+def surface_points(model: RayModel[Any], dataset: Dataset, count: int, reach: float | None) -> Iterator[SurfacePoints]:
     """Points that random training pixels show, chunk by chunk; fewer than `count` where rays end in nothing.
 
     Args:
@@ -48,7 +48,7 @@ def surface_points(model: Model[Any], dataset: Dataset, count: int, reach: float
     for start in range(0, count, chunk):
         pixels = draw_pixels(dataset, min(chunk, count - start)).to(model.device)
         rays = dataset.cameras.pixel_rays(pixels, scene.near, scene.far, dataset.times)
-        with torch.autocast(model.device.type, torch.bfloat16, enabled=use_bfloat16(model)):
+        with torch.autocast(model.device.type, torch.bfloat16, enabled=model.uses_bfloat16):
             out = model.render(rays, background)
         depth = out.median_depth.float()
         positions = rays.origins + depth[:, None] * rays.directions
@@ -56,13 +56,13 @@ def surface_points(model: Model[Any], dataset: Dataset, count: int, reach: float
         if reach is not None:
             kept &= ((positions - middle).abs() <= reach * half).all(-1)
         normals = None if out.normals is None else safe_normalize(out.normals.float())[kept].cpu()
-        yield Points(positions[kept].cpu(), out.rgb.float().clamp(0, 1)[kept].cpu(), normals)
+        yield SurfacePoints(positions[kept].cpu(), out.rgb.float().clamp(0, 1)[kept].cpu(), normals)
 
 
-def joined(parts: Iterator[Points]) -> Points:
+def joined(parts: Iterator[SurfacePoints]) -> SurfacePoints:
     """All points of some parts."""
     found = list(parts)
-    whole = Points(torch.cat([p.positions for p in found]), torch.cat([p.colors for p in found]), None)
+    whole = SurfacePoints(torch.cat([p.positions for p in found]), torch.cat([p.colors for p in found]), None)
     if any(part.normals is None for part in found):
         return whole
     return replace(whole, normals=torch.cat([p.normals for p in found if p.normals is not None]))

@@ -5,27 +5,36 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from itertools import pairwise
+from typing import ClassVar, Protocol, runtime_checkable
 
 from torch import Tensor, nn
 
 from framework.base.errors import ConfigError, shown
+from framework.base.optimised import Optimised
+from framework.geometry.points import Footprint, Points
 from framework.kernels.memory import require
 from framework.kernels.mlp import Activation, mlp
 
-DensityFunction = Callable[[Tensor, Tensor | None], tuple[Tensor, Tensor]]
-"""(positions (N, 3), times (N,) or None) -> density (N,), features (N, F). What samplers are given."""
+DensityFunction = Callable[[Points], tuple[Tensor, Tensor]]
+"""Points (N) to density (N,) and features (N, F): what samplers are given."""
 
 
 class Field(nn.Module, ABC):
     """Density and colour at a point. Two functions, so that a sampler can ask for density alone."""
 
+    footprint: ClassVar[Footprint] = "none"
+    """What `density` wants to know of the points' size."""
+    optimised: Optimised | None = None
+    """How its parameters are optimised; as the model's if None."""
+    runs_on_kernels: bool = False
+    """Whether compiled kernels do its heavy work: then torch's own operations keep to one CPU thread."""
+
     @abstractmethod
-    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Density at positions.
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        """Return density at points.
 
         Args:
-            positions: (N, 3) scene coordinates; N may be 0.
-            times: (N,) in [0, 1], or None for a scene that stands still.
+            points: N points, with the `footprint` that the field asks for; N may be 0.
         Returns: sigma (N,) float32, at least 0, 1/length; features (N, F) for `color`.
         """
 
@@ -51,6 +60,33 @@ class Field(nn.Module, ABC):
 
         `camera_indices` (N,) tells a field with per-image appearance which image is meant; None asks for the
         appearance used in evaluation.
+        """
+
+
+@runtime_checkable
+class HasAlpha(Protocol):
+    """A field of surfaces, which knows how opaque an interval is: NeuS (Wang et al. 2021), equation 13."""
+
+    def alpha(self, points: Points, directions: Tensor, deltas: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the opacity of intervals around points, and features for `color`.
+
+        Args:
+            points: N points, in the middle of their intervals.
+            directions: (N, 3) unit directions of their rays.
+            deltas: (N,) lengths of the intervals, scene units.
+        Returns: alpha (N,) in [0, 1], features (N, F).
+        """
+
+
+@runtime_checkable
+class HasSignedDistance(Protocol):
+    """A field that knows how far the nearest surface is."""
+
+    def signed_distance(self, points: Points) -> Tensor:
+        """Return distances (N,) to the nearest surface, scene units, negative inside.
+
+        Args:
+            points: N points.
         """
 
 

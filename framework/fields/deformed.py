@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor, nn
 
 from framework.fields.base import MLP, Field
 from framework.fields.nerf import encoded_times
+from framework.geometry.points import Points
 from framework.kernels.contraction import contract_to_unit
 from framework.kernels.frequency import frequency_encoding
 
@@ -36,6 +39,7 @@ class DeformedField(Field):
         super().__init__()
         self.register_buffer("contracted", None if contracted is None else contracted.clone())
         self.canonical = canonical
+        self.runs_on_kernels = canonical.runs_on_kernels
         self.position_frequencies, self.time_frequencies = position_frequencies, time_frequencies
         encoded = 3 + 6 * position_frequencies + 1 + 2 * time_frequencies
         first = min(depth, 5)
@@ -58,8 +62,9 @@ class DeformedField(Field):
         assert times is not None
         return torch.where(times[:, None] == 0, torch.zeros_like(found), found)
 
-    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        return self.canonical.density(positions + self.displacement(positions, times))
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        moved = points.positions + self.displacement(points.positions, points.times)
+        return self.canonical.density(replace(points, positions=moved, times=None))
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         return self.canonical.color(features, directions, camera_indices)

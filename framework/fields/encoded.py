@@ -9,9 +9,13 @@ from framework.encodings.hash_grid import HashGrid
 from framework.encodings.planes import FeaturePlanes
 from framework.fields.appearance import Appearance
 from framework.fields.base import MLP, Field
+from framework.geometry.points import Points
 from framework.kernels.contraction import contract_to_unit
 from framework.kernels.math import split_density, truncated_exp
 from framework.kernels.spherical_harmonics import spherical_harmonics
+
+NUM_FEATURES = 16
+"""Features handed from density to colour in the paper, the first being log-density."""
 
 
 class BoxField(Field):
@@ -26,6 +30,7 @@ class BoxField(Field):
     box: Tensor
     scale: Tensor
     shift: Tensor
+    runs_on_kernels = True
 
     def __init__(self, box: Tensor, encoding: HashGrid | FeaturePlanes, unbounded: bool = False) -> None:
         super().__init__()
@@ -69,8 +74,8 @@ class DensityField(BoxField):
         super().__init__(box, encoding, unbounded)
         self.head = MLP(encoding.num_features, width, 1, bias=False)
 
-    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        features = self.encode(positions, times)
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        features = self.encode(points.positions, points.times)
         return truncated_exp(self.head(features)[:, 0]), features
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
@@ -96,7 +101,7 @@ class EncodedField(BoxField):
         box: Tensor,
         encoding: HashGrid | FeaturePlanes,
         width: int = 64,
-        num_features: int = 16,
+        num_features: int = NUM_FEATURES,
         direction_levels: int = 4,
         unbounded: bool = False,
         appearance: tuple[int, int] | None = None,
@@ -111,8 +116,8 @@ class EncodedField(BoxField):
             inputs += appearance[0]
         self.color_head = MLP(inputs, width, width, 3, bias=False, activation="sigmoid")
 
-    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        return split_density(self.density_head(self.encode(positions, times)))
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        return split_density(self.density_head(self.encode(points.positions, points.times)))
 
     @torch.no_grad()
     def trace(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:

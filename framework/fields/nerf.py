@@ -5,6 +5,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from framework.fields.base import MLP, Field
+from framework.geometry.points import Points
 from framework.kernels.contraction import contract_to_unit
 from framework.kernels.frequency import frequency_encoding
 
@@ -24,6 +25,7 @@ class NeRFField(Field):
     """
 
     contracted: Tensor | None
+    runs_on_kernels = True
 
     def __init__(
         self,
@@ -61,12 +63,13 @@ class NeRFField(Field):
                 if layer.out_features == 1:
                     nn.init.constant_(layer.bias, 0.1)
 
-    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        positions = points.positions
         if self.contracted is not None:
             positions = 2 * contract_to_unit(positions, self.contracted) - 1
         encoded: tuple[Tensor, ...] = (frequency_encoding(positions, self.position_frequencies),)
         if self.time_frequencies is not None:
-            encoded += (encoded_times(times, self.time_frequencies),)
+            encoded += (encoded_times(points.times, self.time_frequencies),)
         hidden = self.after_skip(self.before_skip(*encoded), *encoded)
         return self.sigma_head(hidden).squeeze(-1).float(), hidden
 

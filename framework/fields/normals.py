@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor, nn
 
 from framework.fields.base import MLP, Field
+from framework.geometry.points import Points
 from framework.geometry.rays import Samples
 from framework.kernels.compositing import ray_sum
 from framework.kernels.frequency import frequency_encoding
@@ -14,19 +17,23 @@ from framework.kernels.math import safe_normalize
 FREQUENCIES = 2
 
 
-def density_normals(field: Field, positions: Tensor, times: Tensor | None = None) -> Tensor:
-    """Unit directions (N, 3) in which density falls fastest; 0 where it does not change. Without a gradient.
+def density_normals(field: Field, points: Points) -> Tensor:
+    """Return unit directions (N, 3) in which density falls fastest; 0 where it does not change. Without a gradient.
 
     One more evaluation of the field, whose parameters get no gradient from it.
+
+    Args:
+        field: whose density is looked at.
+        points: N points.
     """
     parameters = [p for p in field.parameters() if p.requires_grad]
     try:
         for parameter in parameters:  # else the kernels would also take the parameters' gradients
             parameter.requires_grad_(False)
         with torch.enable_grad():
-            places = positions.detach().requires_grad_()
-            sigma, _ = field.density(places, times)
-            (gradient,) = torch.autograd.grad(sigma.sum(), places)
+            followed = points.positions.detach().requires_grad_()
+            sigma, _ = field.density(replace(points, positions=followed))
+            (gradient,) = torch.autograd.grad(sigma.sum(), followed)
     finally:
         for parameter in parameters:
             parameter.requires_grad_(True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -66,6 +67,16 @@ class Histogram:
 
 
 @dataclass(frozen=True)
+class CoarseLevel:
+    """An earlier level that says where to look, and is supervised too."""
+
+    field: Any
+    """The field that was sampled (`framework.Field`)."""
+    samples: Samples
+    """Its samples on the same rays, with density and features."""
+
+
+@dataclass(frozen=True)
 class Samples:
     """Packed intervals along R rays: ray r owns the samples [offsets[r], offsets[r + 1]), near to far.
 
@@ -92,6 +103,12 @@ class Samples:
     """(N,) density, where the sampler already evaluated it."""
     features: Tensor | None = None
     """(N, F) the field's features that came with `sigma`."""
+    alpha: Tensor | None = None
+    """(N,) opacity of each interval, of a field that has it instead of density."""
+    early_stop: float = 0.0
+    """Transmittance under which rays were ended: the most that a colour channel can be off by. 0 for none."""
+    coarse: CoarseLevel | None = None
+    """What the samples were drawn by, where it is rendered too."""
     edges: Tensor | None = None
     """(R, S + 1) the intervals' ends in normalised distance, from a sampler that works in it."""
     proposals: tuple[Histogram, ...] = ()
@@ -160,3 +177,7 @@ class Samples:
     def evaluated(self, sigma: Tensor, features: Tensor) -> Samples:
         """The same samples with their density (N,) and features (N, F) attached."""
         return replace(self, sigma=sigma, features=features)
+
+    def with_alpha(self, alpha: Tensor, features: Tensor) -> Samples:
+        """The same samples with the opacity of their intervals (N,) and features (N, F) attached."""
+        return replace(self, alpha=alpha, features=features)

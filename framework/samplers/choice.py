@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from torch import Tensor
 
-from framework.base.config import Range, TrainConfig
+from framework.base.config import Auto, Range, RayConfig
+from framework.base.decisions import Choice
 from framework.base.errors import ConfigError
 from framework.data.scene import Scene
+from framework.fields.base import Field
+from framework.samplers.base import Sampler
+from framework.samplers.hierarchical import HierarchicalSampler
 from framework.samplers.occupancy import MAX_CELLS, OccupancySampler
 from framework.samplers.proposal import ProposalSampler
-from framework.scene.profile import Decision
 
 COARSEST_PROPOSAL = 128
 """Cells along an axis at the finest level of the first proposal; each further one has twice as many."""
@@ -20,7 +24,7 @@ MOST_PROPOSALS = 8
 
 
 @dataclass(frozen=True)
-class SamplingConfig(TrainConfig):
+class SamplingConfig(RayConfig):
     """Settings of a method that can be sampled through an occupancy grid or by proposals."""
 
     RANGES: ClassVar[dict[str, Range]] = {
@@ -35,9 +39,13 @@ class SamplingConfig(TrainConfig):
     sampler: Literal["auto", "occupancy", "proposal"] = "auto"
     """occupancy: march through the box where it is not empty. proposal: small density fields say where to look, in all
     of space, contracted. auto: proposal where there may be something outside the box."""
+    silhouette_cells: bool = True
+    """Where images are transparent, cells of the occupancy grid that one of them shows empty are never sampled."""
+    silhouette_pixels: bool = True
+    """Pixels whose ray meets only such cells are never drawn."""
     grid_resolution: int = 128
     """Cells along an axis of the occupancy grid (occupancy)."""
-    num_steps: int | None = 512
+    num_steps: Auto[int] = 512
     """Steps along the box's diagonal (occupancy)."""
     early_stop: float = 1e-4
     """Transmittance below which the rest of a ray is dropped: the largest error of a colour channel (occupancy)."""
@@ -73,23 +81,44 @@ class HierarchicalConfig(SamplingConfig):
     """Further samples a ray for the fine field, drawn where the coarse one found something (hierarchical)."""
 
 
-def chosen_sampler(config: SamplingConfig, scene: Scene) -> Literal["hierarchical", "occupancy", "proposal"]:
-    """What `auto` becomes."""
-    if config.sampler != "auto":
-        return config.sampler
-    if scene.unbounded:
-        return "proposal"
-    return "hierarchical" if isinstance(config, HierarchicalConfig) else "occupancy"
+def sampler_choice(config: SamplingConfig, unbounded: bool) -> Choice:
+    """Return what `--sampler auto` becomes.
+
+    Args:
+        config: the method's settings.
+        unbounded: there may be something outside the box.
+    """
+    bounded = "hierarchical" if isinstance(config, HierarchicalConfig) else "occupancy"
+    reason = "there may be something outside the box" if unbounded else "the scene ends at its box"
+    return Choice("sampler", "proposal" if unbounded else bounded, reason)
 
 
 def contracted_box(config: SamplingConfig, scene: Scene) -> Tensor | None:
-    """(2, 3) the box around which a method's field contracts all of space; None where it ends at its box."""
-    return scene.box if scene.unbounded and chosen_sampler(config, scene) == "proposal" else None
+    """Return the box around which a method's field contracts all of space; None where it ends at its box.
+
+    Args:
+        config: the settings, decided.
+        scene: facts about the data.
+    """
+    return scene.box if scene.unbounded and config.sampler == "proposal" else None
 
 
-def make_sampler(config: SamplingConfig, scene: Scene) -> OccupancySampler | ProposalSampler:
-    """The sampler that the settings and the scene ask for, where that is not hierarchical."""
-    if chosen_sampler(config, scene) == "proposal":
+def make_sampler(config: SamplingConfig, scene: Scene, make_coarse: Callable[[], Field] | None = None) -> Sampler:
+    """Return the sampler that the settings ask for.
+
+    Args:
+        config: the settings, decided.
+        scene: facts about the data.
+        make_coarse: makes the coarse field of `--sampler hierarchical`.
+    Raises: ConfigError where that is asked for and the method has no such field.
+    """
+    sampler = _sampler(config, scene, make_coarse)
+    sampler.samples_per_step = config.samples_per_batch
+    return sampler
+
+
+def _sampler(config: SamplingConfig, scene: Scene, make_coarse: Callable[[], Field] | None) -> Sampler:
+    if config.sampler == "proposal":
         resolutions = tuple(COARSEST_PROPOSAL << level for level in range(len(config.num_proposal_samples)))
         return ProposalSampler(
             scene.box,
@@ -98,7 +127,10 @@ def make_sampler(config: SamplingConfig, scene: Scene) -> OccupancySampler | Pro
             scene.unbounded,
             endless=scene.unbounded and not scene.has_alpha,
         )
-    assert config.num_steps is not None
+    if isinstance(config, HierarchicalConfig) and str(config.sampler) == "hierarchical":
+        if make_coarse is None:
+            raise ConfigError("--sampler hierarchical: this method has no coarse field")
+        return HierarchicalSampler(make_coarse(), config.num_coarse_samples, config.num_fine_samples)
     return OccupancySampler(
         scene.box,
         config.grid_resolution,
@@ -107,11 +139,3 @@ def make_sampler(config: SamplingConfig, scene: Scene) -> OccupancySampler | Pro
         config.train_early_stop,
         moving=scene.moving,
     )
-
-
-def sampler_decisions(config: SamplingConfig, scene: Scene) -> list[Decision]:
-    """What became of `--sampler auto`."""
-    if config.sampler != "auto":
-        return []
-    reason = "there may be something outside the box" if scene.unbounded else "the scene ends at its box"
-    return [Decision("sampler", chosen_sampler(config, scene), reason)]

@@ -9,15 +9,17 @@ from __future__ import annotations
 import math
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from framework.base.errors import ConfigError, shown
 from framework.fields.base import DensityFunction, Field
+from framework.geometry.points import Points
 from framework.geometry.rays import Rays, Samples
 from framework.kernels import native
 from framework.kernels.given import is_followed
 from framework.kernels.march import March, Occupancy, ReferenceMarch, refresh_occupancy
 from framework.kernels.rows import gather_rows, take_rows
+from framework.samplers.base import Sampler
 
 MAX_CELLS = 512
 """Along an axis of the grid: of 512^3 cells what is known takes 0.8 GB."""
@@ -35,7 +37,7 @@ WAVES = (8, 8, 16, 32, 64, 128)
 """Samples a ray in each wave; the last size repeats."""
 
 
-class OccupancySampler(nn.Module):
+class OccupancySampler(Sampler):
     """March through the occupied cells of a box.
 
     Args:
@@ -130,13 +132,13 @@ class OccupancySampler(nn.Module):
             times = None if rays.times is None else rays.times[wave.owners]
             values = field.trace(wave.positions, times) if traced else None
             traced = values is not None
-            found.append(values or field.density(wave.positions, times))
+            found.append(values or field.density(Points(wave.positions, times)))
             march.advance(found[-1][0])
         if not found:  # no ray meets anything: still the field's own, empty, tensors
-            found.append(field.density(rays.origins[:0], None if rays.times is None else rays.times[:0]))
+            found.append(field.density(Points(rays.origins[:0], None if rays.times is None else rays.times[:0])))
         if not march.waves:
             empty = rays.nears[:0]
-            return Samples(empty, empty, march.finish()[1]).evaluated(*found[0])
+            return Samples(empty, empty, march.finish()[1], early_stop=stop).evaluated(*found[0])
         order, offsets = march.finish()
         waves = march.waves
         columns = [[w.t_starts for w in waves], [w.t_ends for w in waves], [w.owners for w in waves]]
@@ -148,7 +150,7 @@ class OccupancySampler(nn.Module):
         else:
             starts, ends, owners = gather_rows(columns, order)
             sigma, features = (take_rows(torch.cat([values[i] for values in found]), order) for i in (0, 1))
-        return Samples(starts, ends, offsets, owners=owners, sigma=sigma, features=features)
+        return Samples(starts, ends, offsets, owners=owners, sigma=sigma, features=features, early_stop=stop)
 
     # -- keeping the grid up ----------------------------------------------------------------------------------
 
@@ -236,4 +238,4 @@ def _in_chunks(density: DensityFunction, positions: Tensor, times: Tensor | None
     """Density (N,) at positions (N, 3), a chunk at a time: fresh memory of many megabytes costs more than the work."""
     parts = positions.split(CHUNK)
     when = [None] * len(parts) if times is None else times.split(CHUNK)
-    return torch.cat([density(part, t)[0] for part, t in zip(parts, when, strict=True)])
+    return torch.cat([density(Points(part, t))[0] for part, t in zip(parts, when, strict=True)])

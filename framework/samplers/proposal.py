@@ -14,12 +14,15 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
+from framework.base.optimised import Optimised
 from framework.encodings.hash_grid import HashGrid
 from framework.fields.base import DensityFunction, Field
 from framework.fields.encoded import DensityField
 from framework.geometry.bounds import intersect_box
+from framework.geometry.points import Points
 from framework.geometry.rays import Histogram, Rays, Samples
 from framework.kernels.intervals import interval_weights, proposal_excess, resample
+from framework.samplers.base import Sampler
 
 ANNEALING_SLOPE = 10.0
 """b of the annealing of weights: u^(b x / ((b - 1) x + 1)) with x the share of `anneal_steps` done."""
@@ -31,7 +34,7 @@ FARTHEST = 1e10
 """Where an endless ray's last interval ends."""
 
 
-class ProposalSampler(nn.Module):
+class ProposalSampler(Sampler):
     """Two or more levels of proposals, the last of which places the samples.
 
     Args:
@@ -45,6 +48,7 @@ class ProposalSampler(nn.Module):
     """
 
     box: Tensor
+    optimised = Optimised("proposals", learning_rate=1e-2, betas=(0.9, 0.99), eps=1e-15)
 
     def __init__(
         self,
@@ -91,7 +95,7 @@ class ProposalSampler(nn.Module):
             with torch.set_grad_enabled(learning):
                 positions = _positions(rays, middles)
                 when = None if rays.times is None else rays.times.repeat_interleave(here)
-                sigma, _ = proposal.density(positions, when)
+                sigma, _ = proposal.density(Points(positions, when))
                 weights = interval_weights(sigma.view(middles.shape), t)
             proposals.append(Histogram(edges, weights))
             shift = torch.rand(count, device=device) if jitter else torch.full((count,), 0.5, device=device)
@@ -119,6 +123,9 @@ class ProposalSampler(nn.Module):
         x = min(step / max(self.anneal_steps, 1), 1.0)
         self.power = ANNEALING_SLOPE * x / ((ANNEALING_SLOPE - 1) * x + 1)
         self.learning = step < ALWAYS_LEARN_UNTIL or step % LEARN_EVERY == 0
+
+    def losses(self, samples: Samples, weights: Tensor) -> dict[str, Tensor]:
+        return {"interlevel": interlevel_loss(samples, weights)} if samples.proposals else {}
 
     def _ends(self, rays: Rays) -> tuple[Tensor, Tensor]:
         """Where sampling starts and ends on each ray."""

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
-from framework.fields.base import DensityFunction, Field
+from framework.fields.base import Field
 from framework.geometry.rays import Rays, Samples
+from framework.samplers.base import Sampler
 
 LAST_INTERVAL = 1e10
 """The authors' code lets the last sample stand for everything behind it."""
@@ -28,17 +27,19 @@ def samples_from_points(points: Tensor) -> Samples:
     return Samples.regular(points, ends, points)
 
 
-@dataclass(frozen=True)
-class UniformSampler:
-    """`count` samples between near and far on every ray, one in each of `count` equal bins."""
+class UniformSampler(Sampler):
+    """Samples between near and far on every ray, one in each of so many equal bins.
 
-    count: int
+    Args:
+        count: samples on a ray.
+    """
+
+    def __init__(self, count: int) -> None:
+        super().__init__()
+        self.count = count
 
     def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
         edges = torch.linspace(0, 1, self.count + 1, device=rays.nears.device)
         t = torch.lerp(rays.nears[:, None], rays.fars[:, None], edges)
         points = stratified_points(rays, self.count, jitter)
         return Samples.regular(t[:, :-1], t[:, 1:], points)
-
-    def update(self, step: int, density: DensityFunction) -> None:
-        """A uniform sampler knows nothing that could grow old."""

@@ -5,21 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from framework.base.decisions import Decision
 from framework.data.dataset import Dataset
 from framework.data.light import light_spread
-
-
-@dataclass(frozen=True)
-class Decision:
-    """What became of an option that was left to the data."""
-
-    option: str
-    choice: str
-    reason: str
-
-    def line(self) -> str:
-        """One line for people."""
-        return f"  {self.option}: {self.choice}, as {self.reason}"
 
 
 @dataclass(frozen=True)

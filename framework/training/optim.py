@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -10,12 +11,13 @@ from torch import Tensor
 from torch.optim.adam import adam
 
 from framework.base.config import TrainConfig
+from framework.base.optimised import DefersGradient, ParameterGroup, RowChange
 from framework.kernels import native
 from framework.kernels.adam import all_finite, dense_adam, sparse_adam
 from framework.kernels.hash_grid import TableGradient
 from framework.kernels.memory import require, table
 from framework.kernels.planes import PlanesGradient
-from framework.model import Model
+from framework.model import Model, parts
 
 
 class Adam(torch.optim.Optimizer):
@@ -33,7 +35,7 @@ class Adam(torch.optim.Optimizer):
     def __init__(
         self,
         groups: list[dict[str, Any]],
-        deferred: dict[Tensor, TableGradient | PlanesGradient],
+        deferred: Mapping[Any, TableGradient | PlanesGradient],
         lr: float,
         betas: tuple[float, float],
         eps: float,
@@ -85,6 +87,27 @@ class Adam(torch.optim.Optimizer):
             else:
                 self._step_dense(group)
 
+    @torch.no_grad()
+    def change_rows(self, change: RowChange) -> None:
+        """Give a parameter other rows, and its state with them; fresh rows begin with a state of zeros.
+
+        Args:
+            change: which rows stay, and what is added.
+        Raises: ValueError for a parameter that this optimiser does not hold.
+        """
+        parameter = change.parameter
+        if parameter not in self.state:
+            raise ValueError("rows of a parameter were changed that the optimiser does not hold")
+        added = 0 if change.fresh is None else len(change.fresh)
+        rows = parameter.index_select(0, change.kept)
+        parameter.data = rows if change.fresh is None else torch.cat([rows, change.fresh.to(rows)])
+        parameter.grad = None
+        state = self.state[parameter]
+        for name in ("exp_avg", "exp_avg_sq", "seen"):
+            if name in state:
+                kept = state[name].index_select(0, change.kept)
+                state[name] = torch.cat([kept, kept.new_zeros(added, *kept.shape[1:])])
+
     def _step_sparse(self, parameter: Tensor, group: dict[str, Any]) -> None:
         state, waiting = self.state[parameter], self.deferred.get(parameter)
         moments = state["exp_avg"], state["exp_avg_sq"], state["seen"]
@@ -124,20 +147,27 @@ class Adam(torch.optim.Optimizer):
         )
 
 
-def make_optimizer(model: Model, config: TrainConfig) -> Adam:
-    """Adam over the model's parameter groups, each remembering the rate it starts from as `initial_lr`.
+def make_optimizer(model: Model[Any], config: TrainConfig) -> Adam:
+    """Return Adam over the model's parameter groups, each remembering the rate it starts from as `initial_lr`.
 
+    Args:
+        model: says how its parameters are optimised (`Model.groups`).
+        config: the run's settings, which count where a group does not say.
     Raises: ConfigError where the machine has less memory than it takes.
     """
     require(3.0 * 4 * model.size(), "the model's parameters and what Adam keeps of them")
-    groups = []
-    for group in model.param_groups():
-        rate = group.get("lr", config.learning_rate)
-        groups.append({**group, "lr": rate, "initial_lr": rate})
-    deferred: dict[Tensor, TableGradient | PlanesGradient] = {
-        grid.table: grid.deferred for grid in model.sparse_grids if grid.deferred is not None
-    }
+    groups = [_plain(group, config) for group in model.groups()]
+    deferred = {module.table: module.deferred for module in parts(model, DefersGradient) if module.deferred is not None}
     return Adam(groups, deferred, config.learning_rate, (config.adam_beta1, config.adam_beta2), config.adam_eps)
+
+
+def _plain(group: ParameterGroup, config: TrainConfig) -> dict[str, Any]:
+    """Return a group as torch's optimisers take it."""
+    settings = group.settings
+    rate = config.learning_rate if settings.learning_rate is None else settings.learning_rate
+    plain: dict[str, Any] = {"params": list(group.parameters), "name": settings.name, "lr": rate, "initial_lr": rate}
+    named = {"betas": settings.betas, "eps": settings.eps, "schedule": settings.schedule, "sparse": settings.sparse}
+    return plain | {name: value for name, value in named.items() if value is not None}
 
 
 def learning_rate_factor(config: TrainConfig, step: int, progress: float) -> float:

@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from framework.base.config import TrainConfig
 from framework.base.console import say
+from framework.base.decisions import Decision
 from framework.cameras.ndc import NdcCameras
 from framework.data.dataset import Dataset
 from framework.data.pixel_set import PixelSet
-from framework.data.pixels import Background
-from framework.model import Model
-from framework.scene.profile import Decision, SceneProfile
+from framework.data.pixels import training_background
+from framework.model import HasAppearance, LearnsMotion, Model, RefinesPoses, parts
+from framework.samplers.base import SkipsCells
+from framework.samplers.choice import SamplingConfig
+from framework.scene.profile import SceneProfile
 from framework.scene.silhouettes import Silhouettes, pixels_near, visual_hull
 
 
 def profile_of(
-    method: str, config: TrainConfig, model: Model[Any], dataset: Dataset, background: Background
+    method: str, config: TrainConfig, model: Model[Any], dataset: Dataset, decided: Sequence[Decision]
 ) -> SceneProfile:
-    """What the scene needs, and why.
+    """Return what the scene needs, and why.
 
     Args:
-        background: behind transparent pixels in training, as decided.
+        method: its name, for people.
+        config: the run's settings.
+        model: what will be trained.
+        dataset: images to learn from.
+        decided: what the method decided by the data.
     """
     scene, decisions = model.scene, []
     if dataset.opaque is not None and config.masks == "auto":
@@ -29,29 +37,35 @@ def profile_of(
         decisions.append(Decision("masks", "what they do not keep is empty", f"{reason} (else: --masks ignored)"))
     if config.background == "auto":
         reason = f"{'the photographs have' if scene.has_alpha else 'no photograph has'} alpha"
-        decisions.append(Decision("background", background, reason))
-    if model.occupancy_samplers and config.silhouette_cells:
+        decisions.append(Decision("background", training_background(config.background, scene.has_alpha), reason))
+    if isinstance(config, SamplingConfig) and config.silhouette_cells and parts(model, SkipsCells):
         obstacle = _no_silhouettes(dataset)
         outside = "what is outside all of them" if scene.moving else "space outside them"
         choice = "not used" if obstacle else f"{outside} is skipped from the start"
         decisions.append(Decision("silhouettes", choice, obstacle or "alpha shows them"))
-    if scene.moving and not model.learns_motion:
+    if scene.moving and not isinstance(model, LearnsMotion):
         decisions.append(Decision("times", "ignored", f"{method} learns a still scene: what moves blurs"))
-    if scene.appearance_varies and not model.learns_appearance:
+    if scene.appearance_varies and not isinstance(model, HasAppearance):
         decisions.append(Decision("light that differs", "ignored", f"{method} learns one light for all photographs"))
-    if scene.poses == "device" and not model.refines_poses:
+    if scene.poses == "device" and not isinstance(model, RefinesPoses):
         decisions.append(Decision("the device's poses", "not refined", f"{method} takes poses as they are"))
-    return SceneProfile.of(dataset, decisions + model.decisions())
+    return SceneProfile.of(dataset, [*decisions, *decided])
 
 
 def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: bool) -> Dataset:
-    """Empty the occupancy grids by the photographs' silhouettes; the data set without pixels that see nothing else.
+    """Empty the occupancy grids by the images' silhouettes.
 
     Args:
+        config: the run's settings.
+        model: whose samplers are told.
+        dataset: images to learn from.
         fresh: the run begins; else the grids come from a checkpoint and are left as they are.
+    Returns: the data set without pixels that see nothing but emptied cells.
     """
-    samplers = model.occupancy_samplers
-    if not samplers or not config.silhouette_cells or _no_silhouettes(dataset):
+    samplers = parts(model, SkipsCells)
+    if not samplers or not isinstance(config, SamplingConfig) or not config.silhouette_cells:
+        return dataset
+    if _no_silhouettes(dataset) is not None:
         return dataset
     silhouettes, moving = Silhouettes.of(dataset), model.scene.moving
     if fresh:
@@ -62,7 +76,7 @@ def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset
         for sampler, hull in zip(samplers, hulls, strict=True):
             sampler.carve(hull)
     # Of a scene that moves, a pixel that is empty at its time teaches about cells that are full at others.
-    if not config.silhouette_pixels or moving or not all(sampler.any_carved for sampler in samplers):
+    if not config.silhouette_pixels or moving or not all(bool(sampler.carved.any()) for sampler in samplers):
         return dataset
     near = [pixels_near(silhouettes, ~s.carved, s.box, s.resolution) for s in samplers]
     return dataset.drawing(PixelSet.shared(near, 1))

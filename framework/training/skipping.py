@@ -13,8 +13,9 @@ import torch
 from framework.base.device import wait_for
 from framework.data.pixels import draw_batch
 from framework.geometry.rays import Rays
-from framework.model import Model
-from framework.samplers.occupancy import OccupancySampler
+from framework.model import parts
+from framework.ray_model import RayModel
+from framework.samplers.base import SkipsCells
 
 if TYPE_CHECKING:
     from framework.training.trainer import Trainer
@@ -50,9 +51,9 @@ def lines(rungs: list[Rung]) -> list[str]:
 def skip_report(trainer: Trainer) -> list[Rung]:
     """Measure a trained run's rungs on a probe of random training rays. Empty where a method skips nothing."""
     model, rungs = trainer.model, []
-    samplers = model.occupancy_samplers
-    if samplers:
-        rungs += _sampling_rungs(trainer, samplers)
+    samplers = parts(model, SkipsCells)
+    if samplers and isinstance(model, RayModel):
+        rungs += _sampling_rungs(trainer, model, samplers)
     if trainer.optimizer.entries_there:
         share = trainer.optimizer.entries_updated / trainer.optimizer.entries_there
         says = f"parameters that a step does not use: {1 - share:.0%} of each update of the feature tables"
@@ -60,17 +61,17 @@ def skip_report(trainer: Trainer) -> list[Rung]:
     return rungs
 
 
-def _sampling_rungs(trainer: Trainer, samplers: list[OccupancySampler]) -> list[Rung]:
+def _sampling_rungs(trainer: Trainer, model: RayModel[Any], samplers: list[SkipsCells]) -> list[Rung]:
     cells = sum(s.occupied.numel() for s in samplers)
     kept, drawn = trainer.train_set.kept, trainer.train_set.drawn
     carved = sum(int(s.carved.sum()) for s in samplers) / cells
     empty = 1 - sum(int(s.occupied.sum()) for s in samplers) / cells
     rays = draw_batch(trainer.train_set, PROBE_RAYS, "black").rays
-    usual, count = _probe(trainer.model, rays)
+    usual, count = _probe(model, rays)
     with _changed(samplers, early_stop=0.0):
-        unhidden, visible_count = _probe(trainer.model, rays)
+        unhidden, visible_count = _probe(model, rays)
         with _changed(samplers, occupied=True):
-            everywhere, all_count = _probe(trainer.model, rays)
+            everywhere, all_count = _probe(model, rays)
     rungs = [Rung("cells, empty", empty, None, "no switch", f"empty space: {empty:.0%} of the box is never sampled")]
     if carved:
         says = f"{carved:.0%} of the box from the first step on, for the photographs show nothing there"
@@ -107,7 +108,7 @@ def _along_rays(place: str, before: int, after: int, faster: float) -> str:
     return f"{place}: {left_out:.0%} of samples, {a_ray}; renders {faster:.1f} x as fast"
 
 
-def _probe(model: Model[Any], rays: Rays) -> tuple[float, int]:
+def _probe(model: RayModel[Any], rays: Rays) -> tuple[float, int]:
     """Seconds to render the rays, and samples evaluated for them."""
     was_training = model.training
     model.eval()
@@ -123,9 +124,7 @@ def _probe(model: Model[Any], rays: Rays) -> tuple[float, int]:
 
 
 @contextmanager
-def _changed(
-    samplers: list[OccupancySampler], early_stop: float | None = None, occupied: bool = False
-) -> Iterator[None]:
+def _changed(samplers: list[SkipsCells], early_stop: float | None = None, occupied: bool = False) -> Iterator[None]:
     """Samplers without early stop, or with a full grid, for a while."""
     before = [(s.early_stop, s.occupied.clone()) for s in samplers]
     try:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from framework.base.config import RaysPerPixel, TrainConfig
+from framework.base.config import AppearanceConfig, RayConfig, RaysPerPixel, TrainConfig
 from framework.base.device import choose_device
 from framework.base.errors import CheckpointError, ConfigError, NerfloomError, is_out_of_memory
 from framework.base.registry import load_method
@@ -60,9 +60,9 @@ def load_trained(
         run.config,
         machine=machine,
         data=run.config.data if data is None else find_data(data, run.dataparser)[0],
-        rays_per_pixel=rays_per_pixel or run.config.rays_per_pixel,
-        eval_appearance=eval_appearance or run.config.eval_appearance,
     )
+    config = _changed(config, run.method, RayConfig, rays_per_pixel=rays_per_pixel)
+    config = _changed(config, run.method, AppearanceConfig, eval_appearance=eval_appearance)
     run = dataclasses.replace(run, config=config)
     device = choose_device(machine)
     if checkpoint is None:
@@ -76,14 +76,26 @@ def load_trained(
     return Trained(run, model, path, content)
 
 
+def _changed(config: TrainConfig, method: str, kind: type[TrainConfig], **values: Any) -> TrainConfig:
+    """Return settings with those of `values` changed that are not None.
+
+    Raises: ConfigError where a method's settings have none of that kind.
+    """
+    given = {name: value for name, value in values.items() if value is not None}
+    if given and not isinstance(config, kind):
+        flag = next(iter(given)).replace("_", "-")
+        raise ConfigError(f"--{flag} is of no use with {method}: leave it out")
+    return dataclasses.replace(config, **given)
+
+
 def build_model(method: str, config: TrainConfig, scene: Scene) -> Model[Any]:
     """A method's model with fresh parameters.
 
     Raises: ConfigError where the machine has less memory than it takes.
     """
-    kind = load_method(method).model
+    declared = load_method(method)
     try:
-        return kind(config.resolved(), scene)
+        return declared.build(config, scene)
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
             raise

@@ -6,41 +6,41 @@ import math
 import signal
 import time
 from contextlib import closing
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from framework.base.checked import checked
-from framework.base.config import to_plain
+from framework.base.config import RayConfig, TrainConfig, to_plain
 from framework.base.console import say
 from framework.base.device import seed_step, wait_for
 from framework.base.errors import CheckpointError, DivergenceError
-from framework.cameras.cameras import CENTER, subpixels
+from framework.base.registry import load_method
 from framework.data.dataset import Dataset
-from framework.data.error_map import ErrorMap
-from framework.data.pixel_stream import PixelStream
-from framework.data.pixels import Background, Batch, LookUp, composite, draw_batch, training_background
-from framework.evaluation.evaluator import evaluate, evaluation_background, render_view, use_bfloat16
+from framework.data.pixels import composite
+from framework.data.sources import BatchSource, Request, make_source
+from framework.evaluation.evaluator import evaluate, evaluation_background
 from framework.evaluation.metrics import MAX_PSNR
 from framework.evaluation.panels import composed, view_panels
 from framework.kernels.native import torch_on_one_thread
 from framework.scene.profile import SceneProfile
 from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest, save_checkpoint
 from framework.training.curve import Entry, FewImages, Point, in_order, rows
-from framework.training.optim import first_non_finite, make_optimizer, set_learning_rate
+from framework.training.optim import first_non_finite, make_optimizer
 from framework.training.preparation import profile_of, skip_by_silhouettes
 from framework.training.progress import ProgressBar, StepReport, TensorBoard
 from framework.training.run import Run, write_report
 from framework.training.signals import stop_signals
+from framework.training.step import train_step
 from framework.training.trained import build_model, restore_model
 
 STEPS_PER_LOG = 25
 PICTURE_SHARE = 0.1
 """Pictures for TensorBoard are left out where they would take more than this share of the training time."""
+TOLD_SECONDS = 0.5
+"""Preparation that takes longer is said."""
 MAX_BAD_STEPS = 10
 """Non-finite steps in a row after which a run stops."""
 FIRST_SAMPLES_PER_RAY = 256.0
@@ -95,21 +95,25 @@ class Trainer:
         run: method, settings and folder.
         train_set: images to learn from, on the device.
         eval_set: images of the periodic evaluation, or None for none.
+        source: where batches come from; as the model and the settings ask if None.
     """
 
-    def __init__(self, run: Run, train_set: Dataset, eval_set: Dataset | None) -> None:
-        self.run, self.config = run, run.config.resolved()
+    def __init__(
+        self, run: Run, train_set: Dataset, eval_set: Dataset | None, source: BatchSource | None = None
+    ) -> None:
+        self.config: TrainConfig
+        self.config, self.decisions = load_method(run.method).decide(run.config, train_set.scene)
+        self.run = replace(run, config=self.config)
         self.train_set, self.eval_set = train_set, eval_set
         self.device = train_set.device
         torch.manual_seed(self.config.machine.seed)
         self.model = build_model(run.method, self.config, train_set.scene).to(self.device)
         self.optimizer = make_optimizer(self.model, self.config)
-        self.errors = ErrorMap(train_set) if self.config.draw_by_error else None
-        self.stream: PixelStream | None = None
+        self.source = make_source(self.model.batches, train_set, self.config) if source is None else source
         self.state = State()
         self.first_step = 0
-        limit, rays_per_pixel = self.config.max_eval_images, self.config.rays_per_pixel
-        self._few = None if eval_set is None else FewImages(eval_set, limit, rays_per_pixel)
+        limit = self.config.max_eval_images
+        self._few = None if eval_set is None else FewImages(eval_set, limit, self.model.rays_per_pixel)
         self._bad_in_a_row = 0
         self._prepared = False
         self._saved_step: int | None = None
@@ -134,7 +138,7 @@ class Trainer:
             "model": self.model.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "state": vars(self.state),
-            "errors": None if self.errors is None else self.errors.errors,
+            "errors": self.source.state(),
         }
         step, keep_all = self.state.step, not self.config.save_only_latest_checkpoint
         path = save_checkpoint(self.checkpoint_folder, step, content, keep_all, before=self._saved_step)
@@ -153,8 +157,7 @@ class Trainer:
             for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
                 group["initial_lr"] = rate  # a rate given on the command line counts
             self.state = checked(State, checkpoint["state"])
-            if self.errors is not None and checkpoint.get("errors") is not None:
-                self.errors.errors.copy_(checkpoint["errors"])
+            self.source.restore(checkpoint.get("errors"))
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise CheckpointError(f"the checkpoint's optimiser or state does not fit: {error}") from error
         self.first_step = self._saved_step = self.state.step
@@ -178,6 +181,7 @@ class Trainer:
 
         Raises: DivergenceError after ten non-finite steps in a row; the last checkpoint stands.
         """
+        self.prepare()
         enabled = self.config.vis == "tensorboard"
         with (
             stop_signals() as stopped,
@@ -217,79 +221,76 @@ class Trainer:
         return min(done, 1.0)
 
     def profile(self) -> SceneProfile:
-        """What the scene needs, and why."""
-        return profile_of(self.run.method, self.config, self.model, self.train_set, self._background())
+        """Return what the scene needs, and why."""
+        return profile_of(self.run.method, self.config, self.model, self.train_set, self.decisions)
 
-    def _prepare(self) -> None:
-        """What the photographs' silhouettes save. It counts as training time."""
+    def prepare(self) -> None:
+        """Skip what the images' silhouettes show to be empty, once, before the first step.
+
+        It counts as training time, and is said.
+        """
+        if self._prepared:
+            return
         self._prepared = True
         start, fresh = time.perf_counter(), self.state.step == 0
         self.train_set = skip_by_silhouettes(self.config, self.model, self.train_set, fresh)
+        self.source = self.source.drawing_from(self.train_set)
+        seconds = time.perf_counter() - start
         if fresh:
-            self.state.seconds += time.perf_counter() - start
+            self.state.seconds += seconds
+        if seconds >= TOLD_SECONDS:
+            say(f"prepared in {seconds:.1f} s, which count as training")
 
     def train_step(self) -> StepReport:
-        """One batch, one step of Adam."""
-        if not self._prepared:
-            self._prepare()
+        """Draw a batch and take one step, after `prepare`.
+
+        Raises: DivergenceError after ten non-finite steps in a row.
+        """
+        self.prepare()
         with torch_on_one_thread(self.model.runs_on_kernels):
             return self._train_step()
 
     def _train_step(self) -> StepReport:
         state, start = self.state, time.perf_counter()
         seed_step(self.config.machine.seed, state.step)
-        self.model.train()
-        set_learning_rate(self.optimizer, self.config, state.step, self.progress)
-        places = self._places_in_a_pixel()
-        count = max(self._batch_size() // len(places), 1)
-        batch = self._draw(count, places)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=use_bfloat16(self.model)):
-            self.model.before_step(state.step, self.progress)
-            rendered = self.model.render(batch.rays, batch.background.repeat_interleave(len(places), 0))
-            rendered = rendered.per_pixel(len(places))
-            losses = self.model.loss(rendered, batch, state.step)
-        loss = torch.stack(list(losses.values())).sum()
-        self._descend(loss)
-        squares = (rendered.rgb.detach() - batch.rgb).square().mean(-1)
-        if self.errors is not None:
-            self.errors.learn(batch.pixels, squares)
-        mse = float((squares if batch.weights is None else squares * batch.weights).mean())
+        batch = self.source.draw(self._request())
+        result = train_step(self.model, self.optimizer, batch, state.step, self.progress)
+        self._count_bad(result.finite)
+        self.source.learn(batch, result.squared_errors)
+        weights = getattr(batch, "weights", None)
+        mse = float((result.squared_errors if weights is None else result.squared_errors * weights).mean())
         wait_for(self.device)
         seconds = time.perf_counter() - start
-        self._account(batch, rendered.num_samples, mse, seconds)
+        num_rays = len(batch) * getattr(batch, "rays_per_pixel", 1)
+        self._account(num_rays, result.loss.num_samples, mse, seconds)
         return StepReport(
             step=state.step,
             seconds=state.seconds,
             progress=self.progress,
-            losses={name: float(value.detach()) for name, value in losses.items()},
+            losses={name: float(value.detach()) for name, value in result.loss.terms.items()},
             psnr=self._train_psnr(),
-            rays_per_second=len(batch.rays) / seconds,
+            rays_per_second=num_rays / seconds,
             held_out_psnr=state.looks[-1][2] if state.looks else None,
         )
 
-    def _draw(self, count: int, places: Tensor) -> Batch:
-        """`count` pixels to learn from, with a ray through each of the places (K, 2) in them."""
-        return draw_batch(self.train_set, count, self._background(), self.errors, places, self._look_up())
+    def _request(self) -> Request:
+        """Return what the next step draws: rays through pixels' centres at first, later those that pictures are of."""
+        config = self.config
+        if not isinstance(config, RayConfig):
+            return Request(self.state.step, 0)
+        late = self.progress >= config.train_rays_per_pixel_from
+        rays_per_pixel = config.rays_per_pixel if late else 1
+        return Request(self.state.step, max(self._num_rays(config) // rays_per_pixel, 1), rays_per_pixel)
 
-    def _look_up(self) -> LookUp | None:
-        """Where this step's colours come from, if they lie in a file."""
-        if self.train_set.mapped is None:
-            return None
-        self.stream = self.stream or PixelStream(self.train_set, self.config.machine.seed)
-        return partial(self.stream.look_up, self.state.step)
+    def _num_rays(self, config: RayConfig) -> int:
+        samples = self.model.samples_per_step
+        if samples is None:
+            return config.num_rays_per_batch
+        wanted = round(samples / max(self.state.samples_per_ray, 0.1))
+        return min(max(wanted, SMALLEST_BATCH), LARGEST_BATCH)
 
-    def _descend(self, loss: Tensor) -> None:
-        """Backward and step, unless something is not finite: then the step is dropped and counted.
-
-        bfloat16 has float32's range, so no gradient scaling is needed.
-        """
-        self.optimizer.zero_grad(set_to_none=True)
-        finite = bool(torch.isfinite(loss))
-        if finite and loss.requires_grad:
-            loss.backward()
-            finite = self.optimizer.first_bad() is None
-            if finite:
-                self.optimizer.step()
+    def _count_bad(self, finite: bool) -> None:
+        """Count steps that were dropped; too many in a row end the run."""
         self._bad_in_a_row = 0 if finite else self._bad_in_a_row + 1
         self.state.skipped += not finite
         if self._bad_in_a_row >= MAX_BAD_STEPS:
@@ -299,27 +300,12 @@ class Trainer:
                 f"the last good checkpoint is in {self.checkpoint_folder}. Lower --learning-rate, or check the data"
             )
 
-    def _batch_size(self) -> int:
-        samples = self.model.samples_per_batch
-        if samples is None:
-            return self.config.num_rays_per_batch
-        wanted = round(samples / max(self.state.samples_per_ray, 0.1))
-        return min(max(wanted, SMALLEST_BATCH), LARGEST_BATCH)
-
-    def _places_in_a_pixel(self) -> Tensor:
-        """Where rays go through: the centre at first, later the places that pictures are made from."""
-        late = self.progress >= self.config.train_rays_per_pixel_from
-        return subpixels(self.config.rays_per_pixel) if late else CENTER
-
-    def _background(self) -> Background:
-        return training_background(self.config.background, self.model.scene.has_alpha)
-
-    def _account(self, batch: Batch, num_samples: int, mse: float, seconds: float) -> None:
+    def _account(self, num_rays: int, num_samples: int, mse: float, seconds: float) -> None:
         state = self.state
         state.step += 1
         state.seconds += seconds
-        state.rays += len(batch.rays)
-        state.samples_per_ray += 0.2 * (num_samples / max(len(batch.rays), 1) - state.samples_per_ray)
+        state.rays += num_rays
+        state.samples_per_ray += 0.2 * (num_samples / max(num_rays, 1) - state.samples_per_ray)
         if math.isfinite(mse):  # a dropped step's may not be, and a running mean never forgets a NaN
             state.train_mse += max(0.02, 1 / state.step) * (mse - state.train_mse)
 
@@ -350,11 +336,13 @@ class Trainer:
         if step % config.steps_per_eval_image == 0 and config.vis != "none" and affordable:
             index = (step // config.steps_per_eval_image - 1) % len(self.eval_set)
             background = evaluation_background(self.model)
-            view = render_view(self.model, self.eval_set, index, background)
+            start = time.perf_counter()
+            picture = self.model.render_view(self.eval_set.view(index), background)
+            wait_for(self.device)
             target = composite(self.eval_set.image(index).float() / 255, background)
-            panels = view_panels(view.rgb.clamp(0, 1), target, view.depth, view.accumulation)
+            panels = view_panels(picture.rgb.clamp(0, 1), target, picture.median_depth, picture.accumulation)
+            self._picture_seconds += time.perf_counter() - start
             board.image("eval/comparison", composed(panels), step)
-            self._picture_seconds += view.seconds
         every = config.seconds_per_eval_all_images
         if every is None and config.target_psnr is not None:
             every = 15.0

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from framework.fields.base import Field
 from framework.geometry.bounds import intersect_box
+from framework.geometry.points import Points
 from framework.geometry.rays import Rays
 
 Triple = tuple[float, float, float]
@@ -129,7 +130,8 @@ class Solids(ClosedForm):
         super().__init__()
         self.media = media
 
-    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        positions = points.positions
         sigma, color = positions.new_zeros(len(positions)), torch.zeros_like(positions)
         for medium in self.media:
             inside = medium.shape.contains(positions)
@@ -154,7 +156,7 @@ class Solids(ClosedForm):
 
     def _along(self, origins: Tensor, directions: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
         """Density (R, B) and colour (R, B, 3) at distances t (R, B)."""
-        sigma, color = self.density(_points(origins, directions, t))
+        sigma, color = self.density(Points(_points(origins, directions, t)))
         return sigma.view(t.shape), color.view(*t.shape, 3)
 
 
@@ -203,7 +205,8 @@ class Blobs(ClosedForm):
         super().__init__()
         self.gaussians = gaussians
 
-    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        positions = points.positions
         sigma, color = positions.new_zeros(len(positions)), torch.zeros_like(positions)
         for gaussian in self.gaussians:
             own = gaussian.density(positions)
@@ -216,7 +219,7 @@ class Blobs(ClosedForm):
         origins, directions, nears, fars = _double(rays)
         nodes, shares = (torch.from_numpy(v).to(nears) for v in gauss_legendre(PANELS, ORDER))
         t = torch.lerp(nears[:, None], fars[:, None], nodes)
-        sigma, color = self.density(_points(origins, directions, t))
+        sigma, color = self.density(Points(_points(origins, directions, t)))
         in_front = self.optical_depth(rays, t)
         weights = torch.exp(-in_front) * sigma.view(t.shape) * shares * (fars - nears)[:, None]
         spent = self.optical_depth(rays, fars[:, None])[:, 0]

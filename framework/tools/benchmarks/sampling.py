@@ -17,10 +17,12 @@ from torch.nn.functional import normalize
 
 from framework.base.device import seed_step, stream_seed
 from framework.fields.base import Field
+from framework.geometry.points import Points
 from framework.geometry.rays import Rays
-from framework.model import PROPOSAL_ADAM
-from framework.rendering.volume import render_field, render_hierarchical
+from framework.rendering.rendered import Rendered
+from framework.rendering.volume import VolumeRenderer
 from framework.samplers.base import Sampler
+from framework.samplers.hierarchical import HierarchicalSampler
 from framework.samplers.occupancy import OccupancySampler
 from framework.samplers.proposal import ProposalSampler, interlevel_loss
 from framework.samplers.uniform import UniformSampler
@@ -71,24 +73,37 @@ class Counted(Field):
         super().__init__()
         self.field, self.count = field, 0
 
-    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        self.count += len(positions)
-        return self.field.density(positions, times)
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        self.count += len(points)
+        return self.field.density(points)
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         return self.field.color(features, directions, camera_indices)
 
 
+def render(field: Field, sampler: Sampler, rays: Rays, jitter: bool) -> Rendered:
+    """Return what a field shows, by a sampler, over white.
+
+    Args:
+        field: density and colour.
+        sampler: where the field is asked.
+        rays: R rays.
+        jitter: random positions or fixed ones.
+    """
+    return VolumeRenderer().render(rays, sampler.sample(rays, field, jitter), field, WHITE)
+
+
 def sampled(scene: Field, sampler: Sampler, jitter: bool, rays: Rays) -> Picture:
     """By a sampler that asks nothing but the field."""
     field = Counted(scene)
-    return Picture(render_field(field, sampler, rays, WHITE, jitter).rgb, field.count, 0)
+    return Picture(render(field, sampler, rays, jitter).rgb, field.count, 0)
 
 
 def hierarchical(scene: Field, counts: tuple[int, int], rays: Rays) -> Picture:
     """By inverting the distribution that stratified samples found, the field being its own coarse one."""
     coarse, fine = Counted(scene), Counted(scene)
-    return Picture(render_hierarchical(coarse, fine, rays, WHITE, counts, False).rgb, fine.count, coarse.count)
+    sampler = HierarchicalSampler(coarse, *counts)
+    return Picture(render(fine, sampler, rays, False).rgb, fine.count, coarse.count)
 
 
 def proposed(scene: Field, sampler: ProposalSampler, counts: tuple[int, ...], rays: Rays) -> Picture:
@@ -146,12 +161,17 @@ def fitted_proposals(scene: Field, steps: int, seed: int) -> tuple[ProposalSampl
     """Proposals that have learnt a scene by their own loss, and the seconds it took."""
     torch.manual_seed(seed)
     sampler = ProposalSampler(BOX, anneal_steps=steps // 2)
-    optimizer = torch.optim.Adam([{"params": list(sampler.parameters()), **PROPOSAL_ADAM}])
+    how = ProposalSampler.optimised
+    assert how is not None
+    assert how.learning_rate is not None
+    assert how.betas is not None
+    assert how.eps is not None
+    optimizer = torch.optim.Adam(sampler.parameters(), how.learning_rate, how.betas, how.eps)
     start = time.perf_counter()
     for step in range(steps):
         seed_step(seed, step)
         sampler.update(step, scene.density)
-        rendered = render_field(scene, sampler, random_rays(FIT_RAYS, stream_seed(seed, step)), WHITE, True)
+        rendered = render(scene, sampler, random_rays(FIT_RAYS, stream_seed(seed, step)), True)
         assert rendered.samples is not None
         assert rendered.weights is not None
         if rendered.samples.proposals:

@@ -23,9 +23,10 @@ from framework.base.console import say
 from framework.base.device import choose_device
 from framework.base.errors import CheckpointError, ConfigError, DataError
 from framework.base.registry import load_method
+from framework.cameras.view import View
 from framework.data.dataset import DataParser, ParsedScene, Split
-from framework.evaluation.appearance import appearances, fit_appearance, shown_appearance
-from framework.evaluation.evaluator import evaluation_background, render_image
+from framework.evaluation.appearance import appearance_of, fit_appearance, shown_appearance
+from framework.evaluation.evaluator import evaluation_background
 from framework.tools.integrations.nerfbaselines_data import (
     CAMERA_MODELS,
     Frame,
@@ -74,7 +75,7 @@ class NerfloomMethod:
         saved = None if checkpoint is None else Saved.read(Path(checkpoint), self.name)
         overrides = parse_overrides(config_overrides or {})
         flags = from_plain(FrameFlags(), overrides.pop("frame", {}), "config_overrides: frame")
-        config = from_plain(_defaults(self.name, saved), overrides, "config_overrides").resolved()
+        config = from_plain(_defaults(self.name, saved), overrides, "config_overrides")
         self._checkpoint = None if saved is None else saved.folder
         self._loaded_step = None if saved is None else int(saved.content["state"]["step"])
         self._trainer: Trainer | None = None
@@ -106,8 +107,8 @@ class NerfloomMethod:
         return {
             **self.get_method_info(),
             "num_iterations": self._config.max_num_iterations,
-            "batch_size": self._config.num_rays_per_batch,
-            "eval_batch_size": self._config.eval_num_rays_per_chunk,
+            "batch_size": getattr(self._config, "num_rays_per_batch", 1),
+            "eval_batch_size": getattr(self._config, "eval_num_rays_per_chunk", 1),
             "loaded_step": self._loaded_step,
             "loaded_checkpoint": None if self._checkpoint is None else str(self._checkpoint),
             "hparams": flattened(to_plain(self._config)),
@@ -155,15 +156,15 @@ class NerfloomMethod:
             units, and accumulation (H, W), float32.
         """
         cameras = self._frame.placed(cameras_of([camera.item()], ["the camera"])).to(self._model.device)
-        with shown_appearance(self._model, self._vectors((options or {}).get("embedding"))):
-            picture = render_image(self._model, cameras, 0, self._background)
-        found = (picture.rgb.clamp(0, 1), picture.depth / self._frame.placement.scale, picture.accumulation)
+        with shown_appearance(self._model, self._vector((options or {}).get("embedding"))):
+            picture = self._model.render_view(View.of(cameras, 0), self._background)
+        found = (picture.rgb.clamp(0, 1), picture.median_depth / self._frame.placement.scale, picture.accumulation)
         return {name: values.cpu().numpy() for name, values in zip(OUTPUTS, found, strict=True)}
 
     def get_train_embedding(self, index: int) -> np.ndarray | None:
         """(D,) the appearance of training photograph `index`; None of a method that learns none."""
-        found = [module.vectors[index].detach() for module in appearances(self._model)]
-        return torch.cat(found).cpu().numpy() if found else None
+        appearance = appearance_of(self._model)
+        return None if appearance is None else appearance.vectors[index].detach().cpu().numpy()
 
     def optimize_embedding(self, dataset: Handed, *, embedding: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """The appearance of a photograph that was not trained on.
@@ -174,20 +175,17 @@ class NerfloomMethod:
         Returns: `embedding` (D,).
         Raises: NotImplementedError of a method that learns no appearance, which nerfbaselines takes for an answer.
         """
-        if not appearances(self._model):
+        if appearance_of(self._model) is None:
             raise NotImplementedError(f"{self.name} has learnt one appearance for all photographs")
         data = dataset_of(Photographs.of(dataset), self._frame, "ignored").to(self._model.device)
         pixels = torch.arange(len(data.pixels), device=data.device) if data.kept is None else data.kept.pixels()
-        found = fit_appearance(self._model, data, pixels, self._background, self._vectors(embedding))
-        return {"embedding": torch.cat(found).cpu().numpy()}
+        found = fit_appearance(self._model, data, pixels, self._background, self._vector(embedding))
+        assert found is not None
+        return {"embedding": found.cpu().numpy()}
 
-    def _vectors(self, embedding: np.ndarray | None) -> list[Tensor]:
-        """An embedding as one vector for each of the model's appearances; the means of what was learnt if None."""
-        modules = appearances(self._model)
-        if embedding is None:
-            return [module.vectors.detach().mean(0) for module in modules]
-        values = torch.from_numpy(np.array(embedding, np.float32)).to(self._model.device)
-        return list(values.split([module.vectors.shape[1] for module in modules]))
+    def _vector(self, embedding: np.ndarray | None) -> Tensor | None:
+        """Return an embedding as a tensor; None for the mean of what was learnt."""
+        return None if embedding is None else torch.from_numpy(np.array(embedding, np.float32)).to(self._model.device)
 
 
 class InstantNGP(NerfloomMethod):

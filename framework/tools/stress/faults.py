@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 from framework.data.dataset import Dataset
-from framework.data.pixels import Batch
 
 EVERY = 3
 """Batches of which the first is spoiled: often, but not the ten in a row that end a run."""
 
-Spoil = Callable[[Batch, int], Batch]
+Spoil = Callable[[Any, int], Any]
 """From a batch and the step's number to the batch that is learnt from."""
 
 
@@ -26,11 +26,11 @@ def spoiled_pixel(value: float) -> Spoil:
     So many steps cannot but be dropped (`spoiled_batches`): whoever drops fewer has hidden what was wrong.
     """
 
-    def spoil(batch: Batch, step: int) -> Batch:
+    def spoil(batch: Any, step: int) -> Any:
         if step % EVERY:
             return batch
         rgb = batch.rgb.clone()
-        rgb[0] = value
+        rgb.view(-1, 3)[0] = value
         return replace(batch, rgb=rgb)
 
     return spoil

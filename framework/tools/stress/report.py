@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from framework.base.config import to_plain
+from framework.base.registry import load_method
+from framework.data.scene import Scene
 from framework.tools.stress.trial import Budget, shortened
 from framework.tools.stress.verdict import Verdict
 from framework.training.run import Run
@@ -27,9 +29,17 @@ class Result:
     """One for each condition, in their order."""
 
 
-def settings_of(run: Run, budget: Budget) -> dict[str, Any]:
-    """The plain run's settings as plain values, less those that name files and folders of a machine."""
-    config = shortened(run.config, budget).resolved()
+def settings_of(run: Run, budget: Budget, scene: Scene) -> dict[str, Any]:
+    """Return the plain run's settings as plain values, less those that name files and folders of a machine.
+
+    Args:
+        run: the method and its settings.
+        budget: how long it trains.
+        scene: facts about the plain images.
+    """
+    method = load_method(run.method)
+    config = shortened(run.config, budget, method, scene)
+    config, _ = method.decide(config, scene)
     return {name: value for name, value in to_plain(config).items() if not isinstance(getattr(config, name), Path)}
 
 

@@ -15,14 +15,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.base.config import TrainConfig, from_plain
+from framework.base.config import RayConfig, TrainConfig, from_plain
 from framework.base.device import choose_device
 from framework.base.errors import NerfloomError
+from framework.base.registry import load_method
 from framework.data.dataset import Dataset
-from framework.data.pixels import Batch, composite
-from framework.evaluation.evaluator import evaluate, evaluation_background, render_view
+from framework.data.pixels import composite
+from framework.data.scene import Scene
+from framework.data.sources import BatchSource, Request, make_source
+from framework.evaluation.evaluator import evaluate, evaluation_background
 from framework.evaluation.metrics import psnr
 from framework.kernels.adam import all_finite
+from framework.method import Method
 from framework.model import Model
 from framework.tools.stress.conditions import Condition
 from framework.tools.stress.scenes import Views
@@ -65,25 +69,28 @@ class Trial:
     """dB above pictures that show the background alone, which a run has for nothing; None where there is no PSNR."""
 
 
-class StressedTrainer(Trainer):
-    """A trainer whose batches are as a condition wants them.
+class StressedSource(BatchSource):
+    """Batches as a condition wants them.
 
     Args:
-        run: method, settings and folder.
-        train_set: images to learn from, on the device.
+        source: draws them.
         condition: how many rays a step has, and what is wrong with its pixels.
     """
 
-    def __init__(self, run: Run, train_set: Dataset, condition: Condition) -> None:
-        super().__init__(run, train_set, None)
-        self.condition = condition
+    def __init__(self, source: BatchSource, condition: Condition) -> None:
+        self.source, self.condition, self.dataset = source, condition, source.dataset
 
-    def _batch_size(self) -> int:
-        return super()._batch_size() if self.condition.rays is None else self.condition.rays
+    def draw(self, request: Request) -> Any:
+        if self.condition.rays is not None:
+            request = replace(request, num_pixels=max(self.condition.rays // request.rays_per_pixel, 1))
+        batch = self.source.draw(request)
+        return batch if self.condition.spoil is None else self.condition.spoil(batch, request.step)
 
-    def _draw(self, count: int, places: Tensor) -> Batch:
-        batch = super()._draw(count, places)
-        return batch if self.condition.spoil is None else self.condition.spoil(batch, self.state.step)
+    def drawing_from(self, dataset: Dataset) -> StressedSource:
+        return StressedSource(self.source.drawing_from(dataset), self.condition)
+
+    def learn(self, batch: Any, squared_errors: Tensor) -> None:
+        self.source.learn(batch, squared_errors)
 
 
 def attempt(condition: Condition, run: Run, views: Views, budget: Budget) -> Trial:
@@ -103,10 +110,12 @@ def attempt(condition: Condition, run: Run, views: Views, budget: Budget) -> Tri
 
 
 def _trained_and_judged(condition: Condition, run: Run, views: Views, budget: Budget) -> Trial:
-    config = shortened(run.config, budget)
+    method = load_method(run.method)
+    config = shortened(run.config, budget, method, views.train.scene)
     config = from_plain(config, condition.settings(config), condition.name)
     changed = condition.change(views).to(choose_device(config.machine))
-    trainer = StressedTrainer(replace(run, config=config), changed.train, condition)
+    source = StressedSource(make_source(method.model.batches, changed.train, config), condition)
+    trainer = Trainer(replace(run, config=config), changed.train, None, source)
     if (number := trainer.train().stopped_by) is not None:
         raise Stopped(number)
     state = trainer.state
@@ -117,8 +126,15 @@ def _trained_and_judged(condition: Condition, run: Run, views: Views, budget: Bu
     return replace(done, psnr=reached, learnt=reached - blank_psnr(trainer.model, changed.test))
 
 
-def shortened(config: TrainConfig, budget: Budget) -> TrainConfig:
-    """The settings of a short run: the budget, small steps, and nothing written but the last checkpoint."""
+def shortened(config: TrainConfig, budget: Budget, method: Method, scene: Scene) -> TrainConfig:
+    """Return the settings of a short run: the budget, small steps, and nothing written but the last checkpoint.
+
+    Args:
+        config: the run's settings.
+        budget: how long it trains.
+        method: decides how many samples a step has, where that is left to it.
+        scene: facts about the plain images.
+    """
     config = replace(
         config,
         max_num_iterations=budget.steps,
@@ -128,7 +144,9 @@ def shortened(config: TrainConfig, budget: Budget) -> TrainConfig:
         seconds_per_save=float(NEVER),
         steps_per_save=NEVER,
     )
-    samples = config.resolved().samples_per_batch
+    if not isinstance(config, RayConfig):
+        return config
+    samples = method.decide(config, scene)[0].samples_per_batch
     return replace(
         config,
         num_rays_per_batch=min(config.num_rays_per_batch, MOST_RAYS),
@@ -153,8 +171,8 @@ def unsound(trainer: Trainer, test: Dataset) -> str | None:
             return f"the parameter {name} is not finite"
     if not math.isfinite(trainer.state.train_mse):
         return "the running mean of the training error is not finite"
-    view = render_view(trainer.model, test, 0, evaluation_background(trainer.model))
-    for name, values in (("colour", view.rgb), ("depth", view.depth), ("opacity", view.accumulation)):
+    picture = trainer.model.render_view(test.view(0), evaluation_background(trainer.model))
+    for name, values in (("colour", picture.rgb), ("depth", picture.depth), ("opacity", picture.accumulation)):
         if not bool(torch.isfinite(values).all()):
             return f"the {name} of a test view is not finite"
     return None

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from framework.base.config import TrainConfig
-from framework.model import Method
+from framework.method import Method
 from framework.tools.testing import declaration, learning, rendering, storage
 from framework.tools.testing.finding import Finding
 from framework.tools.testing.subject import Subject
@@ -23,17 +23,20 @@ class Check:
     run: Callable[[Subject], str]
     """Says in a line what it found; raises Fault, or lets through what the method raises, where that is wrong."""
     needs: tuple[str, ...] = ()
-    """Checks without which it would only find again what they have found."""
+    """Checks without which it would only find again what they have found, as far as they are made."""
+    rays_only: bool = False
+    """It is made of methods that cast rays only."""
 
 
 CHECKS = (
     Check("config", declaration.check_config),
     Check("summary", declaration.check_summary),
     Check("build", rendering.check_build, ("config",)),
-    Check("render", rendering.check_render, ("build",)),
-    Check("few rays", rendering.check_few_rays, ("render",)),
-    Check("background", rendering.check_background, ("render",)),
-    Check("loss", learning.check_loss, ("render",)),
+    Check("render", rendering.check_render, ("build",), rays_only=True),
+    Check("view", rendering.check_view, ("build", "render")),
+    Check("few rays", rendering.check_few_rays, ("render",), rays_only=True),
+    Check("background", rendering.check_background, ("render", "view")),
+    Check("loss", learning.check_loss, ("render", "view")),
     Check("groups", learning.check_groups, ("build",)),
     Check("gradients", learning.check_gradients, ("loss", "groups")),
     Check("unused parameters", learning.check_unused, ("gradients",)),
@@ -43,8 +46,8 @@ CHECKS = (
     Check("training", learning.check_training, ("gradients",)),
     Check("learning", learning.check_learning, ("training", "background")),
     Check("evaluation", rendering.check_evaluation, ("training",)),
-    Check("chunks", rendering.check_chunks, ("evaluation",)),
-    Check("nan rays", rendering.check_nan_rays, ("chunks",)),
+    Check("chunks", rendering.check_chunks, ("evaluation",), rays_only=True),
+    Check("nan rays", rendering.check_nan_rays, ("chunks",), rays_only=True),
     Check("checkpoint", storage.check_checkpoint, ("training",)),
 )
 """In the order in which they are made."""
@@ -63,9 +66,12 @@ def check_method(method: Method, name: str = "the method", config: TrainConfig |
         wrong all of `CHECKS` are there. What the method raises becomes a finding.
     """
     subject, findings = Subject(method, name, config), dict[str, Finding]()
+    casts_rays = getattr(method.model, "batches", "pixels") == "pixels"
+    made = [check for check in CHECKS if casts_rays or not check.rays_only]
+    names = {check.name for check in made}
     with torch.random.fork_rng(devices=[]), torch.enable_grad():
-        for check in CHECKS:
-            if all(need in findings and findings[need].ok for need in check.needs):
+        for check in made:
+            if all(need in findings and findings[need].ok for need in check.needs if need in names):
                 findings[check.name] = _finding(check, subject)
     return list(findings.values())
 

@@ -22,7 +22,8 @@ def check_config(subject: Subject) -> str:
     # Python itself refuses a dataclass that derives from a frozen one and is not frozen.
     if "__dataclass_fields__" not in vars(kind) and inspect.get_annotations(kind):
         raise Fault(f"{kind.__name__} is no dataclass of its own; write @dataclass(frozen=True) above it")
-    for what, before in (("the settings", config), ("resolved() settings", config.resolved())):
+    decided, _ = subject.method.decide(config, subject.still.scene)
+    for what, before in (("the settings", config), ("decided settings", decided)):
         written = yaml.safe_dump(to_plain(before))
         after = from_plain(subject.method.config, yaml.safe_load(written), "config.yml")
         if after != before:
@@ -36,7 +37,7 @@ def check_config(subject: Subject) -> str:
 
 def check_summary(subject: Subject) -> str:
     """The module has a docstring, whose first line is the method's summary."""
-    module = subject.method.model.__module__
+    module = type(subject.method.config).__module__
     docstring = getattr(sys.modules.get(module), "__doc__", None) or ""
     summary = docstring.strip().split("\n")[0]
     if not summary:

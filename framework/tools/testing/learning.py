@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from framework.cameras.cameras import subpixels
+from framework.model import Loss
 from framework.tools.testing.finding import Fault
 from framework.tools.testing.rendering import require_rendered
-from framework.tools.testing.subject import STEPS, Learner, Subject, total
+from framework.tools.testing.subject import STEPS, Learner, Subject
 from framework.training.optim import first_non_finite
 
 FIRST_STEPS = 3
@@ -30,42 +31,46 @@ def check_loss(subject: Subject) -> str:
     """`loss` returns named scalars that are finite and lead back to the parameters, also of several rays a pixel."""
 
     def look(learner: Learner) -> None:
-        for count in (1, RAYS_PER_PIXEL):
-            _, losses = learner.losses(learner.batch(subpixels(count)))
-            _require_losses(losses, "" if count == 1 else f" of {count} rays a pixel")
+        for count in (1, RAYS_PER_PIXEL) if learner.model.batches == "pixels" else (1,):
+            batch = learner.batch(count)
+            _require_loss(learner.loss(batch), batch, "" if count == 1 else f" of {count} rays a pixel")
 
     subject.on_each_scene(look)
     return "named scalars, finite, with a gradient"
 
 
-def _require_losses(losses: dict[str, Tensor], of: str) -> None:
-    if not isinstance(losses, dict) or not losses:
-        raise Fault(f"the loss{of} is {type(losses).__name__}, or empty; return a dictionary of named scalars")
-    for name, value in losses.items():
+def _require_loss(loss: Loss, batch: Any, of: str) -> None:
+    if not isinstance(loss, Loss):
+        raise Fault(f"the loss{of} is {type(loss).__name__}; return a framework.Loss")
+    if not isinstance(loss.terms, dict) or not loss.terms:
+        raise Fault(f"the loss{of} has {type(loss.terms).__name__}, or none; its terms are a dictionary of scalars")
+    for name, value in loss.terms.items():
         if not isinstance(value, Tensor) or value.ndim:
             shape = tuple(value.shape) if isinstance(value, Tensor) else value
             raise Fault(f"the loss{of} '{name}' is {shape}, not a scalar tensor; take its mean")
         if not bool(torch.isfinite(value)):
             raise Fault(f"the loss{of} '{name}' is {float(value.detach())} in the first step")
-    if not total(losses).requires_grad:
+    if loss.rgb.shape != batch.rgb.shape or loss.rgb.requires_grad:
+        raise Fault(f"the colours that come with the loss{of} must be shaped as the batch's, and detached")
+    if not loss.total.requires_grad:
         raise Fault(f"no loss{of} has a gradient; is something detached, or computed under torch.no_grad()?")
 
 
 def check_groups(subject: Subject) -> str:
-    """`param_groups` holds every parameter exactly once."""
+    """`groups` holds every parameter exactly once."""
 
     def look(learner: Learner) -> None:
         known = {id(parameter): name for name, parameter in learner.model.named_parameters()}
-        held = Counter(id(p) for group in learner.model.param_groups() for p in group["params"])
+        held = Counter(id(p) for group in learner.model.groups() for p in group.parameters)
         if strangers := held.keys() - known.keys():
             raise Fault(
-                f"param_groups() holds tensors that are no parameters of the model, {len(strangers)} of them; "
+                f"groups() holds tensors that are no parameters of the model, {len(strangers)} of them; "
                 "make each an attribute that is a torch.nn.Parameter"
             )
         if twice := [known[key] for key, count in held.items() if count > 1]:
-            raise Fault(f"{_names(twice)} more than once in param_groups()")
+            raise Fault(f"{_names(twice)} more than once in groups()")
         if missing := [name for name, p in learner.model.named_parameters() if p.requires_grad and not held[id(p)]]:
-            raise Fault(f"{_names(missing)} in no group of param_groups(), and never updated")
+            raise Fault(f"{_names(missing)} in no group of groups(), and never updated")
 
     subject.on_each_scene(look)
     return "every parameter is in one group"
@@ -163,9 +168,9 @@ def check_nan_colors(subject: Subject) -> str:
     learner = subject.learner()
     batch = learner.batch()
     rgb = batch.rgb.clone()
-    rgb[0] = torch.nan
-    _, losses = learner.losses(replace(batch, rgb=rgb))
-    if bool(torch.isfinite(total(losses))):
+    rgb.view(-1, 3)[0] = torch.nan
+    loss = learner.loss(replace(batch, rgb=rgb))
+    if bool(torch.isfinite(loss.total)):
         raise Fault("a NaN among a batch's colours leaves the loss finite; let it through, the trainer drops the step")
     return "a NaN in a photograph makes the loss NaN, and the trainer drops the step"
 
@@ -175,11 +180,13 @@ def check_bfloat16(subject: Subject) -> str:
 
     def look(learner: Learner) -> None:
         batch = learner.batch()
-        with torch.autocast("cpu", torch.bfloat16):
-            rendered, losses = learner.losses(batch)
-        require_rendered(rendered, len(batch.rays), "under autocast")
-        _require_losses(losses, " under autocast")
-        learner.backward(losses)
+        if learner.model.batches == "pixels":
+            with torch.autocast("cpu", torch.bfloat16):
+                rendered = learner.rendered(batch.rays, batch.background)
+            require_rendered(rendered, len(batch.rays), "under autocast")
+        loss = learner.loss(batch, bfloat16=True)
+        _require_loss(loss, batch, " under autocast")
+        learner.backward(loss)
         if (bad := first_non_finite(learner.model, learner.optimizer)) is not None:
             raise Fault(f"under autocast {bad} is not finite")
 

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from framework.geometry.rays import Rays
-from framework.model import Model
-from framework.rendering.volume import Rendered
-from framework.samplers.occupancy import OccupancySampler
+from framework.model import Model, parts
+from framework.rendering.rendered import Rendered
+from framework.samplers.base import SkipsCells
 from framework.samplers.proposal import ProposalSampler
 from framework.tools.testing.finding import Fault
-from framework.tools.testing.subject import Learner, Subject
+from framework.tools.testing.subject import STRIDE, Learner, Subject
 
 TOLERANCE = 1e-3
 """Of colours and opacities that should be the same."""
@@ -83,6 +83,25 @@ def _require(value: Tensor, shape: tuple[int, ...], what: str) -> None:
         raise Fault(f"{what} holds a value that is not finite (NaN or infinity)")
 
 
+def check_view(subject: Subject) -> str:
+    """`render_view` fills in every field of Picture, with the right shapes and finite numbers."""
+
+    def look(learner: Learner) -> None:
+        learner.model.train()
+        view, picture = learner.dataset.view(0, STRIDE), learner.picture()
+        size = (view.height, view.width)
+        shapes = {"rgb": (*size, 3), "depth": size, "median_depth": size, "accumulation": size}
+        for name, shape in shapes.items():
+            _require(getattr(picture, name), shape, f"{name} of a picture")
+        if picture.normals is not None:
+            _require(picture.normals, (*size, 3), "normals of a picture")
+        if not learner.model.training:
+            raise Fault("render_view leaves the model in evaluation mode; put it back as it was")
+
+    subject.on_each_scene(look)
+    return "every field of Picture has its shape and is finite"
+
+
 def check_few_rays(subject: Subject) -> str:
     """No rays give an empty picture, and one ray a picture of one pixel."""
 
@@ -105,6 +124,10 @@ def check_few_rays(subject: Subject) -> str:
 def check_background(subject: Subject) -> str:
     """The background shows as far as a ray is not opaque, and where the box is missed altogether."""
     learner = subject.learner()
+    if learner.model.batches == "views":
+        dark, light = (learner.picture(background=value) for value in (0.0, 1.0))
+        _require_change(light.rgb - dark.rgb, light.accumulation[..., None], "a picture")
+        return "it shows as far as pixels are not opaque"
     rays = learner.view().rays
     away = replace(rays, directions=-rays.directions)  # the cameras stand outside the box and look at it
     _require_background(learner, rays, "rays through the box")
@@ -117,26 +140,29 @@ def check_background(subject: Subject) -> str:
 def _require_background(learner: Learner, rays: Rays, what: str) -> Tensor:
     """The opacity (R,) of rays, after a look at what black and white behind them change."""
     dark, light = (learner.show(rays, torch.full((3,), value)) for value in (0.0, 1.0))
-    change, transparency = light.rgb - dark.rgb, 1 - light.accumulation[:, None]
+    _require_change(light.rgb - dark.rgb, light.accumulation[:, None], what)
+    return light.accumulation
+
+
+def _require_change(change: Tensor, accumulation: Tensor, what: str) -> None:
+    """Raises: Fault where colours do not change with the background as far as the opacity says."""
+    transparency = 1 - accumulation
     if not bool(((change - transparency).abs() <= TOLERANCE).all()):
         raise Fault(
             f"{what}: from a black to a white background colours change by {float(change.mean()):.3g} in the mean, and "
             f"1 - accumulation is {float(transparency.mean()):.3g}; rgb must hold (1 - accumulation) * background"
         )
-    return light.accumulation
 
 
 def _ends_at_the_box(model: Model) -> bool:
     """Whether a model's samplers look at nothing outside the box."""
-    marched = any(isinstance(module, OccupancySampler) for module in model.modules())
-    return marched or any(isinstance(m, ProposalSampler) and not m.unbounded for m in model.modules())
+    return bool(parts(model, SkipsCells)) or any(not sampler.unbounded for sampler in parts(model, ProposalSampler))
 
 
 def check_evaluation(subject: Subject) -> str:
     """In evaluation a picture is the same each time."""
     learner = subject.trained
-    view = learner.view()
-    first, second = (learner.show(view.rays, view.background, seed).rgb for seed in (1, 2))
+    first, second = (learner.picture(seed=seed).rgb for seed in (1, 2))
     if not torch.equal(first, second):
         raise Fault(
             f"the same picture differs by up to {float((first - second).abs().max()):.3g} when it is rendered again; "

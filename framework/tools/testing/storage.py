@@ -18,8 +18,7 @@ def check_checkpoint(subject: Subject) -> str:
     """A model that is loaded renders the same picture, and takes the same next step, bit for bit."""
     trained, loaded = subject.trained, subject.learner(seed=SEED + 1)
     _hand_over(trained, loaded)
-    view = trained.view()
-    before, after = (learner.show(view.rays, view.background) for learner in (trained, loaded))
+    before, after = (learner.picture() for learner in (trained, loaded))
     remedy = "what a model remembers must be a parameter or a buffer (register_buffer), so that state_dict() holds it"
     for name in ("rgb", "median_depth", "accumulation"):
         if not torch.equal(getattr(before, name), getattr(after, name)):

@@ -1,0 +1,70 @@
+"""Points at which a field is asked, and how large they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from torch import Tensor
+
+from framework.geometry.rays import Rays, Samples
+
+Footprint = Literal["none", "radius", "gaussian"]
+"""What a field wants to know of a point's size: nothing, the cone's radius there, or the cone's mean and covariance."""
+
+
+@dataclass(frozen=True)
+class Points:
+    """N points in space, at which density is asked for."""
+
+    positions: Tensor
+    """(N, 3) scene coordinates."""
+    times: Tensor | None = None
+    """(N,) in [0, 1] of a moving scene; None for a scene that stands still."""
+    radii: Tensor | None = None
+    """(N,) radius of the pixel's cone at each point, scene units; None where unknown."""
+    covariances: Tensor | None = None
+    """(N, 3) diagonal of the covariance of the cone's interval, squared scene units; None where unknown."""
+
+    def __len__(self) -> int:
+        return self.positions.shape[0]
+
+
+def sample_points(rays: Rays, samples: Samples, footprint: Footprint = "none") -> Points:
+    """Return the points at which a field is asked for N samples of R rays.
+
+    Args:
+        rays: the rays; a footprint needs their `pixel_radii`.
+        samples: intervals along them.
+        footprint: how much of the points' size is computed.
+    Raises: ValueError where a footprint is wanted and the rays have no radius.
+    """
+    times = samples.times(rays)
+    if footprint == "none":
+        return Points(samples.positions(rays), times)
+    if rays.pixel_radii is None:
+        raise ValueError("this field wants to know the size of its points: the rays need pixel_radii")
+    radii = rays.pixel_radii.index_select(0, samples.ray_indices)
+    if footprint == "radius":
+        return Points(samples.positions(rays), times, samples.t * radii)
+    mean_t, along, across = conical_frustums(samples.t_starts, samples.t_ends, radii)
+    directions = rays.directions.index_select(0, samples.ray_indices)
+    squared = directions.square()
+    covariances = along[:, None] * squared + across[:, None] * (1 - squared)
+    return Points(rays.points(samples.ray_indices, mean_t), times, mean_t * radii, covariances)
+
+
+def conical_frustums(t_starts: Tensor, t_ends: Tensor, radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the Gaussians of conical frustums: Mip-NeRF (Barron et al. 2021), equation 7, in its stable form.
+
+    Args:
+        t_starts, t_ends: (N,) distances between which each frustum lies.
+        radii: (N,) radius of the cone at distance 1.
+    Returns: (N,) mean distance, variance along the ray, and variance across it.
+    """
+    middle, half = (t_starts + t_ends) / 2, (t_ends - t_starts) / 2
+    total = 3 * middle.square() + half.square()
+    mean_t = middle + 2 * middle * half.square() / total
+    along = half.square() / 3 - (4 / 15) * half**4 * (12 * middle.square() - half.square()) / total.square()
+    across = radii.square() * (middle.square() / 4 + (5 / 12) * half.square() - (4 / 15) * half**4 / total)
+    return mean_t, along, across

@@ -1,0 +1,48 @@
+"""Coarse-to-fine sampling: NeRF (Mildenhall et al. 2020), section 5.2."""
+
+from __future__ import annotations
+
+import torch
+
+from framework.fields.base import Field
+from framework.geometry.points import sample_points
+from framework.geometry.rays import CoarseLevel, Rays, Samples
+from framework.kernels.intervals import interval_weights
+from framework.samplers.base import Sampler
+from framework.samplers.inverse_cdf import inverse_cdf, uniform_variates
+from framework.samplers.uniform import samples_from_points, stratified_points
+
+
+class HierarchicalSampler(Sampler):
+    """Stratified samples, and more where a coarse field of the sampler's own finds something with them.
+
+    The coarse field is rendered and supervised too (`Samples.coarse`).
+
+    Args:
+        coarse: the field that says where to look.
+        num_coarse: stratified samples on a ray.
+        num_fine: samples drawn between them; the field is asked at all of both.
+    """
+
+    def __init__(self, coarse: Field, num_coarse: int = 64, num_fine: int = 128) -> None:
+        super().__init__()
+        self.coarse, self.num_coarse, self.num_fine = coarse, num_coarse, num_fine
+
+    def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
+        t = stratified_points(rays, self.num_coarse, jitter)
+        samples = samples_from_points(t)
+        samples = samples.evaluated(*self.coarse.density(sample_points(rays, samples, self.coarse.footprint)))
+        assert samples.sigma is not None
+        edges = torch.cat([t, samples.padded(samples.t_ends)[:, -1:]], dim=-1)
+        weights = interval_weights(samples.sigma.detach().view(t.shape), edges)
+        middles = (t[:, 1:] + t[:, :-1]) / 2
+        drawn = inverse_cdf(middles, weights[:, 1:-1], uniform_variates(len(rays), self.num_fine, jitter, t.device))
+        merged = samples_from_points(torch.cat([t, drawn], dim=-1).sort(dim=-1).values)
+        return Samples(
+            merged.t_starts,
+            merged.t_ends,
+            merged.offsets,
+            merged.points,
+            merged.per_ray,
+            coarse=CoarseLevel(self.coarse, samples),
+        )

@@ -18,6 +18,7 @@ from framework.evaluation.images import to_uint8
 from framework.fields.encoded import EncodedField
 from framework.fields.normals import NormalHead, density_normals
 from framework.geometry.bounds import intersect_box
+from framework.geometry.points import Points
 from framework.geometry.rays import Rays
 from framework.kernels.contraction import contract_to_unit
 from framework.kernels.march import March, Occupancy
@@ -290,7 +291,7 @@ def test_a_density_that_is_the_same_everywhere_has_no_normals(backend: str) -> N
     field = EncodedField(CUBE, HashGrid(2, 2, 4, 8, 8), width=16)
     with torch.no_grad():
         field.encoding.table.zero_()
-    found = density_normals(field, torch.rand(5, 3) * 2 - 1)
+    found = density_normals(field, Points(torch.rand(5, 3) * 2 - 1))
     assert found.shape == (5, 3)
     assert not found.any()
 

@@ -14,6 +14,7 @@ from framework.data.data_folder import find_data
 from framework.data.dataset import Dataset
 from framework.evaluation.evaluator import evaluate, evaluation_background
 from framework.rendering.rendered import Picture
+from framework.training.datasets import load_split
 from framework.training.run import Run, config_file, run_folder
 from framework.training.trained import Trained, load_trained
 
@@ -48,8 +49,6 @@ class TrainedRun:
         Raises: DataError where the data is not there any more.
         """
         if split not in self._datasets:
-            from framework.cli.session import load_split
-
             self._datasets[split] = load_split(self.run, split).to(self.model.device)
         return self._datasets[split]
 

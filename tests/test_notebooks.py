@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 FOLDER = Path(__file__).parents[1] / "docs" / "notebooks"
-SMALL = {"max_seconds=10": "max_num_iterations=30, num_steps=64, grid_resolution=16, samples_per_batch=4096, vis='none'"}
+SMALL = {
+    "max_seconds=10": "max_num_iterations=30, num_steps=64, grid_resolution=16, samples_per_batch=4096, vis='none'"
+}
 """What a notebook's settings are exchanged for, so that it takes seconds."""
 
 

@@ -10,9 +10,9 @@ import torch
 from dataparsers.blender import Blender
 from dataparsers.procedural import Procedural
 from framework.base.registry import load_method
-from framework.cli.session import load_split
 from framework.data.dataset import DataParser
 from framework.evaluation.evaluator import evaluate, evaluation_background, render_view
+from framework.training.datasets import load_split
 from framework.training.run import Run, create_folder
 from framework.training.trainer import Trainer
 

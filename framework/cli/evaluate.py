@@ -56,9 +56,9 @@ def _command(arguments: list[str]) -> None:
     from contextlib import nullcontext
 
     from framework.base.console import say
-    from framework.cli.session import load_split
     from framework.evaluation.error_bound import limited_error, measured_error, parse_error
     from framework.evaluation.evaluator import evaluate
+    from framework.training.datasets import load_split
     from framework.training.report import write_evaluation
     from framework.training.trained import load_trained
 

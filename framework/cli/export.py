@@ -87,10 +87,10 @@ def _points(flags: PointFlags, trained: Trained, placement: Placement, path: Pat
         raise ConfigError("--num-points must be at least 1, and --reach at least 0")
     from framework.base.console import say, track
     from framework.base.device import seed_step
-    from framework.cli.session import load_split
     from framework.data.ply import write_points
     from framework.export.points import joined, surface_points
     from framework.ray_model import RayModel
+    from framework.training.datasets import load_split
 
     model = trained.model
     if not isinstance(model, RayModel):
@@ -110,8 +110,8 @@ def _points(flags: PointFlags, trained: Trained, placement: Placement, path: Pat
 
 def _cameras(flags: CameraFlags, trained: Trained, placement: Placement, path: Path) -> None:
     from framework.base.console import say
-    from framework.cli.session import load_split
     from framework.export.cameras import believed, camera_list
+    from framework.training.datasets import load_split
     from framework.training.run import write_json
 
     # With its images: one that could not be read has no camera in the model.

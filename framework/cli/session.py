@@ -7,11 +7,9 @@ from contextlib import contextmanager
 
 from framework.base.console import say
 from framework.base.device import choose_device, peak_memory
-from framework.base.errors import DataError
-from framework.data.dataset import Dataset, Split, load_dataset
-from framework.data.pixel_cache import PixelMemory
 from framework.evaluation.evaluator import evaluate
 from framework.training.checkpoint import FOLDER, list_checkpoints, load_newest
+from framework.training.datasets import first_split, load_split
 from framework.training.lock import sole_user
 from framework.training.machine import kernels
 from framework.training.report import write_evaluation, write_summary
@@ -128,21 +126,3 @@ def _what_is_saved(trainer: Trainer) -> str:
     if not saved:
         return "stopped at once: nothing was saved"
     return f"stopped at once: {saved[-1].name} is what was saved; continue with: ns-train --resume {trainer.run.folder}"
-
-
-def load_split(run: Run, split: Split) -> Dataset:
-    """Parse and decode a split of the run's data."""
-    memory = PixelMemory.of(run.config.cache_limit, run.config.cache_dir)
-    # Masks tell what counts in an evaluation, whatever they mean in training: its figures stay comparable.
-    masks = run.config.masks if split == "train" else "ignored"
-    return load_dataset(run.parse(split), split, memory, masks)
-
-
-def first_split(run: Run, splits: tuple[Split, ...]) -> Dataset | None:
-    """The first of `splits` that can be read; each that cannot is reported. None where none can."""
-    for split in splits:
-        try:
-            return load_split(run, split)
-        except DataError as error:
-            say(f"no '{split}' images to evaluate on: {error}")
-    return None

@@ -47,7 +47,7 @@ TYPES: dict[str, Any] = {
     "d": ctypes.c_double,
 }
 spent: dict[str, float] | None = None
-"""Seconds in each kernel, kept while this is a dictionary (benchmarks/profile_step.py)."""
+"""Seconds in each kernel, kept while this is a dictionary (`ns-bench profile-step`)."""
 
 
 def variant() -> str:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, TypeVar
 
 from torch import Tensor
 
 from framework.base.config import Auto, Range, RayConfig
-from framework.base.decisions import Choice
+from framework.base.decisions import Choice, Decision, fill
 from framework.base.errors import ConfigError
 from framework.data.scene import Scene
 from framework.fields.base import Field
@@ -81,6 +81,9 @@ class HierarchicalConfig(SamplingConfig):
     """Further samples a ray for the fine field, drawn where the coarse one found something (hierarchical)."""
 
 
+SamplingConfigT = TypeVar("SamplingConfigT", bound=SamplingConfig)
+
+
 def sampler_choice(config: SamplingConfig, unbounded: bool) -> Choice:
     """Return what `--sampler auto` becomes.
 
@@ -91,6 +94,16 @@ def sampler_choice(config: SamplingConfig, unbounded: bool) -> Choice:
     bounded = "hierarchical" if isinstance(config, HierarchicalConfig) else "occupancy"
     reason = "there may be something outside the box" if unbounded else "the scene ends at its box"
     return Choice("sampler", "proposal" if unbounded else bounded, reason)
+
+
+def decide_sampler(config: SamplingConfigT, scene: Scene) -> tuple[SamplingConfigT, list[Decision]]:
+    """Decide `--sampler auto` by the scene: `Method.decide` of a method that leaves nothing else open.
+
+    Args:
+        config: the method's settings.
+        scene: facts about the data.
+    """
+    return fill(config, sampler_choice(config, scene.unbounded))
 
 
 def contracted_box(config: SamplingConfig, scene: Scene) -> Tensor | None:

@@ -24,7 +24,6 @@ from dataparsers.record3d import Record3D
 from framework import DataParser, Dataset
 from framework.base.config import from_plain, read_yaml
 from framework.cli.compare import CompareFlags, plan_of
-from framework.cli.session import load_split
 from framework.data.dataset import load_dataset
 from framework.data.mapped_pixels import MappedPixels
 from framework.data.pixel_cache import PixelMemory, pack, unpack
@@ -32,6 +31,7 @@ from framework.data.ply import read_points
 from framework.tools.processing import polycam, record3d
 from framework.tools.processing.photographs import find_photographs, prepare_all
 from framework.training.checkpoint import FOLDER, load_newest
+from framework.training.datasets import load_split
 from framework.training.run import Run, create_folder, read_run
 from framework.training.trained import load_trained
 from framework.training.trainer import Trainer

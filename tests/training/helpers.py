@@ -9,8 +9,8 @@ import torch
 
 from dataparsers.blender import Blender
 from framework.base.registry import load_method
-from framework.cli.session import load_split
 from framework.training.checkpoint import FOLDER, load_newest
+from framework.training.datasets import load_split
 from framework.training.run import Run, create_folder
 from framework.training.trainer import Trainer
 

@@ -17,9 +17,9 @@ from dataparsers.blender import Blender
 from framework import Batch, Method, Model, Rays, Rendered
 from framework.base import registry
 from framework.base.errors import CheckpointError, ConfigError, DivergenceError
-from framework.cli.session import first_split, load_split
 from framework.evaluation.evaluator import evaluate, evaluation_background, render_view
 from framework.training.checkpoint import list_checkpoints, load_checkpoint
+from framework.training.datasets import first_split, load_split
 from framework.training.run import create_folder
 from framework.training.signals import stop_signals
 from framework.training.trainer import Trainer

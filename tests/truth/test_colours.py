@@ -11,10 +11,10 @@ import torch
 from PIL import Image
 
 from dataparsers.blender import Blender
-from framework.cli.session import load_split
 from framework.data.dataset import Dataset, load_dataset
 from framework.data.pixels import gather_batch, gather_colors_reference
 from framework.evaluation.evaluator import evaluate, evaluation_background
+from framework.training.datasets import load_split
 from framework.training.run import Run
 from tests.test_nerfacto import captured
 from tests.training.helpers import tiny_run, tiny_trainer

@@ -9,14 +9,13 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from framework import Field, Method, Model, Rays, Rendered, Scene
+from framework import Field, Method, Points, Scene
 from framework.encodings.hash_grid import HashGrid
 from framework.fields.base import MLP
 from framework.geometry.bounds import to_unit_box
 from framework.kernels.contraction import contract_to_unit
 from framework.kernels.math import truncated_exp
 from framework.kernels.spherical_harmonics import spherical_harmonics
-from framework.rendering.volume import render_field
 from framework.samplers import choice
 
 DIRECTION_LEVELS = 4
@@ -24,14 +23,16 @@ DIRECTION_LEVELS = 4
 
 
 @dataclass(frozen=True)
-class DenseGridConfig(choice.SamplingConfig):
-    """Settings of dense-grid. Each field is a flag, and the string under it is its help."""
+class DenseGridConfig(
+    choice.SamplingConfig,
+    max_num_iterations=20_000,
+    samples_per_batch=2**15,
+    learning_rate=1e-2,
+    adam_beta2=0.95,
+    adam_eps=1e-15,
+):
+    """Settings of dense-grid. Each field is a flag, and the string under it is its help; above are changed defaults."""
 
-    max_num_iterations: int = 20_000
-    samples_per_batch: int | None = 2**15
-    learning_rate: float = 1e-2
-    adam_beta2: float = 0.95
-    adam_eps: float = 1e-15
     num_levels: int = 8
     """Grids, each finer than the one before."""
     features_per_level: int = 2
@@ -56,6 +57,7 @@ class DenseGridField(Field):
     """
 
     box: Tensor
+    runs_on_kernels = True  # nearly all of its work is in compiled kernels, none in torch's own operations
 
     def __init__(self, config: DenseGridConfig, box: Tensor, contracted: bool) -> None:
         super().__init__()
@@ -73,8 +75,8 @@ class DenseGridField(Field):
         self.density_head = MLP(self.grids.num_features, width, 1 + num_features, bias=False)
         self.color_head = MLP(num_features + DIRECTION_LEVELS**2, width, 3, bias=False, activation="sigmoid")
 
-    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        unit = (contract_to_unit if self.contracted else to_unit_box)(positions, self.box)
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        unit = (contract_to_unit if self.contracted else to_unit_box)(points.positions, self.box)
         values = self.density_head(self.grids(unit))
         return truncated_exp(values[:, 0]), values[:, 1:]
 
@@ -82,20 +84,16 @@ class DenseGridField(Field):
         return self.color_head(features, spherical_harmonics(directions, DIRECTION_LEVELS)).float()
 
 
-class DenseGridModel(Model[DenseGridConfig]):
-    """A field, and a sampler that the scene chooses: an occupancy grid for one in a box, else proposals."""
-
-    def __init__(self, config: DenseGridConfig, scene: Scene) -> None:
-        super().__init__(config, scene)
-        contracted = choice.contracted_box(config, scene) is not None
-        self.field = DenseGridField(config, scene.box, contracted)
-        self.sampler = choice.make_sampler(config, scene)
-
-    def render(self, rays: Rays, background: Tensor) -> Rendered:
-        return render_field(self.field, self.sampler, rays, background, jitter=self.training)
-
-    def before_step(self, step: int, progress: float) -> None:
-        self.sampler.update(step, self.field.density)
+def make_field(config: DenseGridConfig, scene: Scene) -> DenseGridField:
+    """Return the field for a scene."""
+    return DenseGridField(config, scene.box, contracted=choice.contracted_box(config, scene) is not None)
 
 
-METHOD = Method(DenseGridModel, DenseGridConfig(), paper="none", interface=1)
+METHOD = Method(
+    DenseGridConfig(),
+    paper="none",
+    field=make_field,
+    sampler=choice.make_sampler,  # an occupancy grid for a scene in a box, else proposals
+    decide=choice.decide_sampler,
+    interface=2,
+)

@@ -315,7 +315,7 @@ BUGS = (
     Bug(
         "evaluation-takes-masks-for-empty",
         "masks",
-        "framework/cli/session.py",
+        "framework/training/datasets.py",
         'masks = run.config.masks if split == "train" else "ignored"',
         "masks = run.config.masks",
         "of an object cut out by masks, the background is judged: PSNR of another thing",

@@ -1,11 +1,7 @@
-"""Poses that ns-process-data found beside those of a COLMAP model of the same photographs, by name.
-
-python benchmarks/poses.py --processed OUT --model DIR/sparse/0
-"""
+"""Poses found by ns-process-data beside those of a COLMAP model of the same images, matched by name."""
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 from typing import Any
@@ -13,22 +9,22 @@ from typing import Any
 import numpy as np
 import torch
 
+from framework.base.errors import DataError
 from framework.geometry.alignment import pose_errors
 from framework.tools.processing.colmap import read_model
 from framework.tools.processing.transforms import opengl_pose
 
 
-def main() -> None:
-    """Prints JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--processed", type=Path, required=True, help="folder with transforms.json")
-    parser.add_argument("--model", type=Path, required=True, help="folder with cameras.bin, images.bin, points3D.bin")
-    arguments = parser.parse_args()
-    print(json.dumps(compare(arguments.processed, arguments.model), indent=2))
-
-
 def compare(processed: Path, model_folder: Path) -> dict[str, Any]:
-    """Median and largest errors, and how many of the model's photographs have a pose in the processed folder."""
+    """Compare poses, once the best similarity between the two sets is taken out.
+
+    Args:
+        processed: folder with transforms.json, as ns-process-data writes it.
+        model_folder: folder with cameras.bin, images.bin and points3D.bin.
+    Returns: median and largest errors, angles in degrees and centres relative to the extent of the cameras; how many of
+        the model's images have a pose in the processed folder; and the summary of the processing.
+    Raises: DataError where the two have no image in common.
+    """
     transforms = json.loads((processed / "transforms.json").read_text())
     found = {
         frame.get("source_path", Path(frame["file_path"]).name): np.array(frame["transform_matrix"])
@@ -37,6 +33,8 @@ def compare(processed: Path, model_folder: Path) -> dict[str, Any]:
     model = read_model(lambda _: None, model_folder)
     given = {name: opengl_pose(world_to_camera) for name, (_, _, world_to_camera) in model.images.items()}
     names = sorted(found.keys() & given.keys())
+    if not names:
+        raise DataError(f"{processed} and {model_folder} have no image in common; both name images by their files")
     errors = pose_errors(
         torch.from_numpy(np.stack([found[name] for name in names])),
         torch.from_numpy(np.stack([given[name] for name in names])),
@@ -51,7 +49,3 @@ def compare(processed: Path, model_folder: Path) -> dict[str, Any]:
         "largest_center_relative_to_extent": float(errors.distances.max()),
         "processing": json.loads(summary.read_text()) if summary.is_file() else None,
     }
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,115 @@
+"""What each part of instant-ngp is worth: trained with one part switched off, or on, in turn.
+
+Every variant is trained with every seed, the variants in turn, so that a machine whose speed drifts treats them alike.
+Reported are seconds of training to the target PSNR on validation views and the final PSNR on all test views: means over
+seeds, with the standard deviation of a single run.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from itertools import pairwise
+from pathlib import Path
+from statistics import fmean, stdev
+from typing import Any
+
+from framework.base.child import python_command
+from framework.base.console import say
+from framework.kernels import native
+from framework.tools.benchmarks.children import output_of
+from framework.training.machine import machine
+
+VARIANTS: dict[str, list[str]] = {
+    "as it is": [],
+    "no visual hull (cells and pixels)": ["--silhouette-cells", "False"],
+    "pixels that see background alone are drawn": ["--silhouette-pixels", "False"],
+    "pixels drawn by error": ["--draw-by-error", "True"],
+    "hidden samples evaluated": ["--train-early-stop", "0"],
+    "early stop in training at 1e-4": ["--train-early-stop", "1e-4"],
+    "sparse updates of the tables": ["--sparse-updates", "True"],
+    "dense updates of the tables": ["--sparse-updates", "False"],
+    "finest level not by the images' size, but 2048": ["--max-resolution", "2048"],
+    "no view dependence": ["--view-dependence", "False"],
+    "one ray a pixel": ["--rays-per-pixel", "1"],
+}
+VIEWS = 4
+"""Validation views of the learning curve."""
+CURVE_POINTS = 9
+"""Evaluations on those views during a run."""
+
+
+def measure(data: Path, seconds: float, seeds: int, target: float) -> dict[str, Any]:
+    """Train every variant with every seed, and print a line for each run and each variant.
+
+    Args:
+        data: folder of the data set.
+        seconds: seconds of training of each run.
+        seeds: runs of each variant.
+        target: PSNR, dB, the time to which is reported.
+    Returns: what was asked for and a row for each variant, as plain data.
+    """
+    runs: dict[str, list[tuple[float | None, float]]] = {name: [] for name in VARIANTS}
+    for seed in range(seeds):
+        for name, switches in VARIANTS.items():
+            runs[name].append(train(data, seconds, seed, target, switches))
+            say(f"seed {seed}  {name}: {runs[name][-1]}")
+    rows = [summary(name, found) for name, found in runs.items()]
+    for row in rows:
+        say(str(row))
+    asked = {"seconds": seconds, "seeds": seeds, "target, dB": target}
+    return {"machine": machine(), "kernels": native.variant(), **asked, "rows": rows}
+
+
+def train(data: Path, seconds: float, seed: int, target: float, switches: list[str]) -> tuple[float | None, float]:
+    """Train one variant, and evaluate it on all test views.
+
+    Args:
+        data: folder of the data set.
+        seconds: seconds of training.
+        seed: seed of the run.
+        target: PSNR, dB.
+        switches: flags of ns-train that make the variant.
+    Returns: seconds to the target, None where it was not met, and the final PSNR, dB.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        command = python_command("framework.cli.train", "instant-ngp", "--data", data)
+        command += ["--max-seconds", str(seconds), "--machine.seed", str(seed), "--vis", "none"]
+        command += ["--seconds-per-eval-all-images", str(seconds / CURVE_POINTS), "--max-eval-images", str(VIEWS)]
+        output_of([*command, "--output-dir", folder, *switches])
+        config = next(Path(folder).rglob("config.yml"))
+        points = [p for p in json.loads((config.parent / "learning_curve.json").read_text()) if p["full"]]
+        curve = [(0.0, 0.0)] + [(p["seconds"], p["psnr"]) for p in points]
+        final = Path(folder) / "all.json"
+        output_of(python_command("framework.cli.evaluate", "--load-config", config, "--output-path", final))
+        return crossing(curve, target), json.loads(final.read_text())["results"]["psnr"]
+
+
+def crossing(curve: list[tuple[float, float]], target: float) -> float | None:
+    """Find when a curve first meets a target, between its points by straight lines.
+
+    Args:
+        curve: (seconds, PSNR) in the order of time.
+        target: PSNR, dB.
+    Returns: seconds; None where the target is not met.
+    """
+    for (t0, p0), (t1, p1) in pairwise(curve):
+        if p1 >= target > p0:
+            return t0 + (t1 - t0) * (target - p0) / (p1 - p0)
+    return None
+
+
+def summary(name: str, found: list[tuple[float | None, float]]) -> dict[str, Any]:
+    """Average a variant's runs over seeds.
+
+    Args:
+        name: the variant.
+        found: seconds to the target and final PSNR of each run, as from `train`.
+    """
+    times, psnrs = [t for t, _ in found if t is not None], [p for _, p in found]
+    return {
+        "variant": name,
+        "seconds to the target": round(fmean(times), 1) if len(times) == len(found) else None,
+        "test PSNR, dB": round(fmean(psnrs), 3),
+        "standard deviation of a run, dB": round(stdev(psnrs), 3) if len(psnrs) > 1 else None,
+    }

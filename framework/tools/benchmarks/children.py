@@ -1,0 +1,22 @@
+"""Measurements in processes of their own, where what ran before leaves nothing behind."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Sequence
+
+from framework.base.errors import NerfloomError
+
+
+def output_of(command: Sequence[str]) -> str:
+    """Run a command to its end and return what it prints on standard output.
+
+    Args:
+        command: a program and its arguments, as from `python_command`.
+    Raises: NerfloomError with the last line of its standard error where it fails.
+    """
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        said = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
+        raise NerfloomError(f"a process of the benchmark failed: {said[-1]}")
+    return done.stdout

@@ -1,0 +1,143 @@
+"""What refining camera poses mends: the embedded scene with its training poses disturbed.
+
+Every training camera is turned by an angle about a random axis and moved by a share of its distance from the scene's
+middle in a random direction. Four runs: exact poses; disturbed poses as they are; disturbed poses refined, by SO3xR3
+and by SE3. Reported are the errors of the poses before and after, once the best similarity between them and the true
+ones is taken out, and the PSNR on test views, whose cameras are brought into the frame of the disturbed poses by a
+similarity.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from framework.base.console import say
+from framework.base.errors import ConfigError
+from framework.base.registry import load_dataparser, load_method
+from framework.cameras.cameras import Cameras
+from framework.cameras.refinement import PoseRefinement
+from framework.data.dataset import Dataset, load_dataset
+from framework.evaluation.evaluator import evaluate
+from framework.geometry.alignment import align_cameras, pose_errors
+from framework.kernels.math import cross_matrix
+from framework.training.machine import machine
+from framework.training.run import Run, create_folder
+from framework.training.trainer import Trainer
+
+SCENE = "procedural"
+"""Data format of the embedded scene."""
+
+
+def measure(method: str, seconds: float, degrees: float, percent: float) -> dict[str, Any]:
+    """Train a method on exact, disturbed and refined poses, and print a line for each run.
+
+    Args:
+        method: name of the method.
+        seconds: seconds of training of each run.
+        degrees: angle by which each camera is turned.
+        percent: distance by which each camera is moved, in percent of its distance from the origin.
+    Returns: what was asked for and a row for each run, as plain data.
+    """
+    embedded = load_dataparser(SCENE)()
+    exact, test = (load_dataset(embedded.parse(None, split), split) for split in ("train", "test"))
+    cameras = disturb(exact.cameras, degrees, percent / 100)
+    scene = replace(exact.scene, camera_to_worlds=cameras.camera_to_worlds)
+    disturbed = replace(exact, cameras=cameras, scene=scene)
+    rows = []
+    for name, data, optimizer in (
+        ("exact poses", exact, "off"),
+        ("disturbed", disturbed, "off"),
+        ("disturbed, refined by SO3xR3", disturbed, "SO3xR3"),
+        ("disturbed, refined by SE3", disturbed, "SE3"),
+    ):
+        trainer = trained(method, data, seconds, optimizer)
+        rows.append({"run": name, **errors(trainer, data, exact, test)})
+        say(str(rows[-1]))
+    asked = {"seconds": seconds, "degrees": degrees, "percent": percent, "method": method}
+    return {"machine": machine(), **asked, "rows": rows}
+
+
+def disturb(cameras: Cameras, degrees: float, share: float) -> Cameras:
+    """Turn cameras about random axes, and move them in random directions.
+
+    Args:
+        cameras: N cameras.
+        degrees: angle of each turn.
+        share: length of each move, relative to the camera's distance from the origin.
+    """
+    draws = torch.Generator().manual_seed(0)
+    count, angle = len(cameras), math.radians(degrees)
+    axes, steps = (torch.nn.functional.normalize(torch.randn(count, 3, generator=draws), dim=-1) for _ in range(2))
+    turns = torch.linalg.matrix_exp(cross_matrix(angle * axes))
+    centres = cameras.camera_to_worlds[:, :, 3]
+    moved = centres + share * centres.norm(dim=-1, keepdim=True) * steps
+    turned = turns @ cameras.camera_to_worlds[:, :, :3]
+    return replace(cameras, camera_to_worlds=torch.cat([turned, moved[:, :, None]], dim=-1))
+
+
+def trained(method: str, data: Dataset, seconds: float, camera_optimizer: str) -> Trainer:
+    """Train a method on a data set in memory.
+
+    Args:
+        method: name of the method.
+        data: training images with cameras.
+        seconds: seconds of training.
+        camera_optimizer: how poses are refined, as by the flag of that name.
+    Raises: ConfigError for a method that refines no poses.
+    """
+    config: Any = load_method(method).config
+    if not hasattr(config, "camera_optimizer"):
+        raise ConfigError(f"--method {method}: it does not refine poses, for it has no --camera-optimizer")
+    config = replace(config, max_seconds=seconds, camera_optimizer=camera_optimizer, vis="none")
+    with tempfile.TemporaryDirectory() as folder:
+        run = Run(method, config, SCENE, load_dataparser(SCENE)(), Path(folder) / "run")
+        create_folder(run)
+        trainer = Trainer(run, data, None)
+        trainer.train()
+    return trainer
+
+
+def errors(trainer: Trainer, data: Dataset, exact: Dataset, test: Dataset) -> dict[str, float]:
+    """Compute the errors of a run's poses, and its PSNR.
+
+    Args:
+        trainer: the run at its end.
+        data: training images with the poses that it was given.
+        exact: training images with the true poses.
+        test: test images with the true poses.
+    """
+    refinement = next((m for m in trainer.model.modules() if isinstance(m, PoseRefinement)), None)
+    found = data.cameras if refinement is None else refinement.refined(data.cameras)
+    truth = exact.cameras.camera_to_worlds
+    before, after = pose_errors(data.cameras.camera_to_worlds, truth), pose_errors(found.camera_to_worlds, truth)
+    carried = carry(test.cameras, truth, data.cameras.camera_to_worlds)  # from there the model carries them on
+    return {
+        "median angle before, degrees": round(before.median_angle, 4),
+        "median angle after, degrees": round(after.median_angle, 4),
+        "median centre error before, of the extent": round(before.median_distance, 6),
+        "median centre error after, of the extent": round(after.median_distance, 6),
+        "test PSNR, dB": round(evaluate(trainer.model, replace(test, cameras=carried)).results["psnr"], 2),
+        "steps": trainer.state.step,
+    }
+
+
+def carry(cameras: Cameras, truth: Tensor, given: Tensor) -> Cameras:
+    """Bring cameras from the frame of the true poses into that of other poses.
+
+    Args:
+        cameras: in the frame of `truth`.
+        truth: (N, 3, 4) true poses.
+        given: (N, 3, 4) the other poses of the same cameras.
+    """
+    scale, rotation, translation = align_cameras(truth, given)
+    poses = cameras.camera_to_worlds.double()
+    centres = scale * (poses[:, :, 3] @ rotation.T) + translation
+    moved = torch.cat([rotation @ poses[:, :, :3], centres[:, :, None]], dim=-1)
+    return replace(cameras, camera_to_worlds=moved.float())

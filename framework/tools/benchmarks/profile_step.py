@@ -1,0 +1,50 @@
+"""Where the time of a training step goes: to each compiled kernel, and to Python and torch."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from framework.base.console import say
+from framework.kernels import native
+from framework.tools.benchmarks.workload import endless_trainer
+from framework.training.machine import machine
+
+MEASURED = 200
+"""Steps over which times are averaged."""
+
+
+def measure(data: Path, method: str, steps: int, max_seconds: float) -> dict[str, Any]:
+    """Train a method, measure `MEASURED` steps more, and print a line for each kernel.
+
+    Args:
+        data: folder of the data set.
+        method: name of the method.
+        steps: steps before the measurement: until then the occupancy grid has found what is empty.
+        max_seconds: seconds of training for which the method chooses its settings.
+    Returns: ms a step in all and by kernel, as plain data.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        trainer = endless_trainer(method, data, max_seconds, Path(folder))
+        for _ in range(steps):
+            trainer.train_step()
+        native.spent = {}
+        start = time.perf_counter()
+        for _ in range(MEASURED):
+            trainer.train_step()
+        step = (time.perf_counter() - start) / MEASURED * 1e3
+    kernels = {name: seconds / MEASURED * 1e3 for name, seconds in native.spent.items()}
+    native.spent = None
+    kernels["Python and torch"] = step - sum(kernels.values())
+    parts = dict(sorted(kernels.items(), key=lambda item: -item[1]))
+    for name, spent in parts.items():
+        say(f"{name:28s} {spent:6.2f} ms  {spent / step:6.1%}")
+    say(f"{'a step':28s} {step:6.2f} ms  {native.variant()}")
+    return {
+        "machine": machine(),
+        "kernels": native.variant(),
+        "ms per step": round(step, 2),
+        "ms": {name: round(spent, 3) for name, spent in parts.items()},
+    }

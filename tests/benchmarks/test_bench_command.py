@@ -1,0 +1,79 @@
+"""ns-bench: every benchmark is listed, helped and reached, and says in one line what it refuses."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from framework.cli.bench import KINDS, USAGE, main
+from tests.cli.helpers import called
+from tests.conftest import Refused
+
+
+def test_help_lists_every_benchmark_in_a_line_without_torch() -> None:
+    shown = "from framework.cli.bench import main; sys.argv[1:] = ['--help']; main()"
+    code = f"import sys; {shown}; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    *lines, torch_is_loaded = done.stdout.splitlines()
+    assert torch_is_loaded == "False"
+    assert lines[: len(USAGE.splitlines())] == USAGE.splitlines()
+    listed = [line.split()[0] for line in lines if line.startswith("  ")]
+    assert listed == list(KINDS)
+    assert all(len(line) <= 120 for line in lines)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_every_benchmark_shows_its_flags(name: str) -> None:
+    done = called("ns-bench", name, "--help")
+    assert done.returncode == 0
+    flags = {"poses": "--processed", "contention": "--output", "cache": "--output"}
+    assert flags.get(name, "--output-dir") in done.stdout
+
+
+def test_bad_input_is_refused_in_a_line(shared_tiny: Path, tmp_path: Path, refused: Refused) -> None:
+    output = ("--output", tmp_path / "c.json")
+    assert "there is no benchmark 'contenton'. Did you mean 'contention'?" in refused(main, "contenton")
+    assert "no such folder" in refused(main, "contention", "--data", tmp_path / "none", *output)
+    assert "no condition is called 'loop3'" in refused(
+        main, "contention", "--data", shared_tiny, "--rows", "loop3", *output
+    )
+    in_a_file = ("--output-dir", shared_tiny / "transforms_train.json" / "below")
+    assert "cannot write" in refused(main, "ablation", "--data", shared_tiny, *in_a_file)
+    asked = ("--method", "instant-ngp", "--output-dir", tmp_path)
+    assert "has no --camera-optimizer" in refused(main, "pose-refinement", *asked)
+
+
+@pytest.mark.slow  # hundreds of steps of a whole instant-ngp
+def test_a_profile_adds_up(shared_tiny: Path, tmp_path: Path) -> None:
+    done = called("ns-bench", "profile-step", "--data", shared_tiny, "--steps", 2, "--output-dir", tmp_path)
+    assert done.returncode == 0, done.stderr
+    content = json.loads((tmp_path / "profile-instant-ngp.json").read_text())
+    assert sum(content["ms"].values()) == pytest.approx(content["ms per step"], abs=0.1)
+    assert content["ms"]["Python and torch"] > 0
+
+
+@pytest.mark.slow  # four processes of their own
+def test_contention_is_measured_alone_and_beside(shared_tiny: Path, tmp_path: Path) -> None:
+    flags = ["--data", shared_tiny, "--rows", "one loop", "--seconds", 0.3, "--work", "training"]
+    done = called("ns-bench", "contention", *flags, "--output", tmp_path / "c.json")
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "c.json").read_text())["training"]
+    assert [row["beside"] for row in rows] == ["nothing", "one loop", "one loop, OMP_WAIT_POLICY=PASSIVE"]
+    assert rows[0]["share"] == [1.0]
+    for row in rows:
+        assert row["a second"][0] > 0
+        assert row["longest, s"][0] + 0.001 > row["median, s"][0] > 0  # they are rounded
+
+
+@pytest.mark.slow  # three processes of their own
+def test_the_cache_is_measured(tmp_path: Path) -> None:
+    size = ["--images", 4, "--width", 160, "--height", 96, "--limit", 0.1, "--seconds", 1]
+    done = called("ns-bench", "cache", *size, "--folder", tmp_path, "--output", tmp_path / "out" / "c.json")
+    assert done.returncode == 0, done.stderr
+    content = json.loads((tmp_path / "out" / "c.json").read_text())
+    assert content["large, from a file"]["pixels MB"] == pytest.approx(4 * 160 * 96 * 3 / 1e6, abs=0.05)
+    assert content["small, in memory"]["share of time waiting for pixels"] == 0
+    assert content["large, from a file"]["share of time waiting for pixels"] > 0
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]

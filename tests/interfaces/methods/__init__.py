@@ -1,0 +1,1 @@
+"""Throw-away methods of kinds that no built-in method is."""

@@ -1,0 +1,70 @@
+"""Surface: a signed distance, whose intervals are as opaque as NeuS says (Wang et al. 2021, equation 13)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from framework import Field, Method, Points, Scene
+from framework.fields.base import MLP
+from framework.kernels.frequency import frequency_encoding
+from framework.kernels.spherical_harmonics import spherical_harmonics
+from framework.samplers.choice import SamplingConfig, decide_sampler, make_sampler
+
+
+@dataclass(frozen=True)
+class SurfaceConfig(SamplingConfig, max_num_iterations=2_000, samples_per_batch=2**13, learning_rate=5e-3):
+    """Settings of surface."""
+
+    sharpness: float = 20.0
+    """Inverse of the width in which a surface turns opaque at first, 1/length."""
+
+
+class SurfaceField(Field):
+    """A signed distance around a ball, and colour; opaque where the distance changes its sign.
+
+    Args:
+        radius: of the ball that it is at first, scene units.
+        sharpness: inverse of the width in which it turns opaque at first.
+    """
+
+    def __init__(self, radius: float, sharpness: float) -> None:
+        super().__init__()
+        self.radius = radius
+        self.trunk = MLP(3 + 6 * 4, 64, 64, 17)
+        self.head = MLP(16 + 16, 64, 3, activation="sigmoid")
+        self.log_sharpness = nn.Parameter(torch.tensor(sharpness).log())
+
+    def shape(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """Return signed distances (N,) and features (N, 16) at positions (N, 3)."""
+        values = self.trunk(frequency_encoding(positions, 4)).float()
+        return positions.norm(dim=-1) - self.radius + 0.1 * values[:, 0], values[:, 1:]
+
+    def signed_distance(self, points: Points) -> Tensor:
+        return self.shape(points.positions)[0]
+
+    def alpha(self, points: Points, directions: Tensor, deltas: Tensor) -> tuple[Tensor, Tensor]:
+        reach = directions * (deltas / 2)[:, None]
+        inverse_width = self.log_sharpness.exp()
+        ends = [self.shape(points.positions + side * reach)[0] * inverse_width for side in (-1, 1)]
+        # 1 - sigmoid(b) / sigmoid(a) in logarithms, in which neither underflows.
+        closed = -torch.expm1((nn.functional.logsigmoid(ends[1]) - nn.functional.logsigmoid(ends[0])).clamp(max=0))
+        return closed, self.shape(points.positions)[1]
+
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        distances, features = self.shape(points.positions)
+        inverse_width = self.log_sharpness.exp()
+        return inverse_width * torch.sigmoid(-inverse_width * distances), features  # as opaque as it can get
+
+    def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
+        return self.head(features, spherical_harmonics(directions)).float()
+
+
+def make_field(config: SurfaceConfig, scene: Scene) -> SurfaceField:
+    """Return a ball of a quarter of the box's width."""
+    return SurfaceField(float((scene.box[1] - scene.box[0]).min()) / 4, config.sharpness)
+
+
+METHOD = Method(SurfaceConfig(), paper="none", field=make_field, sampler=make_sampler, decide=decide_sampler)

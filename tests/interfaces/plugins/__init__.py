@@ -1,0 +1,1 @@
+"""Plugins that bring one part each, for an existing method."""

@@ -1,0 +1,53 @@
+"""Methods of new kinds are trained by the unchanged trainer, evaluated and rendered by the unchanged commands."""
+
+import json
+from pathlib import Path
+
+import imageio.v3 as imageio
+import pytest
+
+from framework.base.registry import load_method
+from framework.tools.testing import check_method
+from tests.cli.helpers import called
+from tests.interfaces.conftest import HERE
+
+METHODS = ("discs", "cones", "surface")
+FLAGS = {
+    "discs": "--max-num-iterations 250 --learning-rate 0.05",
+    "cones": "--max-num-iterations 150 --num-rays-per-batch 256",
+    "surface": "--max-num-iterations 150 --samples-per-batch 4096 --grid-resolution 16 --num-steps 64",
+}
+SCENE = "procedural --size 24 --num-train 8"
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_each_is_at_most_80_lines(name: str) -> None:
+    assert len((HERE / "methods" / f"{name}.py").read_text().splitlines()) <= 80
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_each_is_trained_evaluated_and_rendered_by_the_commands(name: str, tmp_path: Path) -> None:
+    done = called(
+        "ns-train", name, *FLAGS[name].split(), "--vis", "none", "--output-dir", tmp_path,
+        "--timestamp", "t", "--experiment-name", "e", *SCENE.split(),
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    folder = tmp_path / "e" / name / "t"
+    results = json.loads((folder / "eval.json").read_text())["results"]
+    assert results["psnr"] > {"discs": 13, "cones": 14, "surface": 14}[name], results
+    assert called("ns-eval", folder, "--output-path", tmp_path / "again.json").returncode == 0
+    again = json.loads((tmp_path / "again.json").read_text())["results"]["psnr"]
+    assert again == pytest.approx(results["psnr"], abs=1e-4)
+    orbit = tmp_path / "orbit.gif"
+    flags = ["--output-path", orbit, "--num-frames", "3", "--downscale-factor", "2"]
+    assert called("ns-render", "orbit", "--load-config", folder / "config.yml", *flags).returncode == 0
+    assert imageio.imread(orbit).shape[0] == 3
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_each_keeps_what_every_method_must(name: str) -> None:
+    """As far as it goes for its kind: the checks of rays are left out where none is cast."""
+    findings = check_method(load_method(name), name)
+    failed = [finding.line() for finding in findings if not finding.ok]
+    assert failed == []
+    assert ("chunks" in {finding.check for finding in findings}) == (name != "discs")

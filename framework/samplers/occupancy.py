@@ -12,10 +12,11 @@ import torch
 from torch import Tensor
 
 from framework.base.errors import ConfigError, shown
-from framework.fields.base import DensityFunction, Field
+from framework.fields.base import DensityFunction, Field, HasAlpha
 from framework.geometry.points import Points
 from framework.geometry.rays import Rays, Samples
 from framework.kernels import native
+from framework.kernels.alpha import alpha_depth
 from framework.kernels.given import is_followed
 from framework.kernels.march import March, Occupancy, ReferenceMarch, refresh_occupancy
 from framework.kernels.rows import gather_rows, take_rows
@@ -114,7 +115,7 @@ class OccupancySampler(Sampler):
     # -- sampling ---------------------------------------------------------------------------------------------
 
     def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
-        """Samples in occupied cells, as far as light gets; densities and features attached.
+        """Samples in occupied cells, as far as light gets; densities, or opacities, and features attached.
 
         What is dropped could have changed a colour channel by at most `early_stop`, or `train_early_stop`.
 
@@ -126,18 +127,23 @@ class OccupancySampler(Sampler):
         stop = self.train_early_stop if self.training else self.early_stop
         compiled = native.usable(rays.origins, rays.directions, self.box)
         march = (March if compiled else ReferenceMarch)(rays, self.occupancy, self.step_size, self.cone, shift, stop)
-        traced = torch.is_grad_enabled()
+        surface = field if isinstance(field, HasAlpha) else None
+        traced = torch.is_grad_enabled() and surface is None
         found: list[tuple[Tensor, ...]] = []
         while (wave := march.wave(WAVES[min(len(found), len(WAVES) - 1)])) is not None:
             times = None if rays.times is None else rays.times[wave.owners]
+            points, deltas = Points(wave.positions, times), wave.t_ends - wave.t_starts
+            if surface is not None:  # marched by the density that stops as much light in each interval
+                found.append(surface.alpha(points, rays.directions.index_select(0, wave.owners), deltas))
+                march.advance(alpha_depth(found[-1][0].detach()) / deltas)
+                continue
             values = field.trace(wave.positions, times) if traced else None
             traced = values is not None
-            found.append(values or field.density(Points(wave.positions, times)))
+            found.append(values or field.density(points))
             march.advance(found[-1][0])
-        if not found:  # no ray meets anything: still the field's own, empty, tensors
-            found.append(field.density(Points(rays.origins[:0], None if rays.times is None else rays.times[:0])))
-        if not march.waves:
-            empty = rays.nears[:0]
+        if not march.waves:  # no ray meets anything: still the field's own, empty, tensors
+            nothing, empty = rays[:0], rays.nears[:0]
+            found.append(field.density(Points(nothing.origins, nothing.times)))
             return Samples(empty, empty, march.finish()[1], early_stop=stop).evaluated(*found[0])
         order, offsets = march.finish()
         waves = march.waves
@@ -150,7 +156,8 @@ class OccupancySampler(Sampler):
         else:
             starts, ends, owners = gather_rows(columns, order)
             sigma, features = (take_rows(torch.cat([values[i] for values in found]), order) for i in (0, 1))
-        return Samples(starts, ends, offsets, owners=owners, sigma=sigma, features=features, early_stop=stop)
+        samples = Samples(starts, ends, offsets, owners=owners, early_stop=stop)
+        return samples.evaluated(sigma, features) if surface is None else samples.with_alpha(sigma, features)
 
     # -- keeping the grid up ----------------------------------------------------------------------------------
 

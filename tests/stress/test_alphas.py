@@ -90,7 +90,7 @@ def test_a_thousand_thin_opacities_are_not_lost(backend: str) -> None:
 @backends()
 @pytest.mark.parametrize("alpha", [1.0, 1 - 2.0**-24, 1 - 2.0**-13])
 def test_what_is_opaque_hides_what_is_behind_and_can_learn(backend: str, alpha: float) -> None:
-    """As much as LEAK gets through, and the gradient of 1 / (1 - alpha) is finite: the colour's own, by what follows."""
+    """As much as LEAK gets through, and the gradient of 1 / (1 - alpha) is finite."""
     rays, samples, alphas, rgb = row([[0.25, alpha, 0.5]], requires_grad=True)
     out = volume_render(rays, samples, alphas, rgb, BACKGROUND, is_alpha=True)
     exact = alphas.detach().double()

@@ -23,16 +23,21 @@ class Rays:
     """(R, 3) start points, scene units."""
     directions: Tensor
     """(R, 3) unit directions."""
-    nears: Tensor
-    """(R,) distance at which sampling starts."""
-    fars: Tensor
-    """(R,) distance at which sampling ends."""
+    nears: Tensor = None  # type: ignore[assignment]
+    """(R,) distance at which sampling starts; 0 if not given."""
+    fars: Tensor = None  # type: ignore[assignment]
+    """(R,) distance at which sampling ends; if not given infinite, for samplers that end with a box."""
     pixel_radii: Tensor | None = None
     """(R,) radius of the pixel's cone at distance 1 (Mip-NeRF, section 3.1)."""
     times: Tensor | None = None
     """(R,) time in [0, 1] of a moving scene."""
     camera_indices: Tensor | None = None
     """(R,) which training camera the ray belongs to."""
+
+    def __post_init__(self) -> None:
+        for name, value in (("nears", 0.0), ("fars", torch.inf)):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, self.origins.new_full(self.origins.shape[:1], value))
 
     def __len__(self) -> int:
         return self.origins.shape[0]

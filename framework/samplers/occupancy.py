@@ -113,17 +113,19 @@ class OccupancySampler(Sampler):
 
     # -- sampling ---------------------------------------------------------------------------------------------
 
-    def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
+    def sample(self, rays: Rays, field: Field, jitter: bool, early_stop: float | None = None) -> Samples:
         """Samples in occupied cells, as far as light gets; densities and features attached.
 
-        What is dropped could have changed a colour channel by at most `early_stop`, or `train_early_stop`.
+        What is dropped could have changed a colour channel by at most `early_stop`: what is given here, or the
+        sampler's own, `train_early_stop` while training.
 
         Raises: ValueError where the rays ask for a gradient, which marched samples do not carry.
         """
         if is_followed(rays.origins, rays.directions):
             raise ValueError("marched samples carry no gradient to rays: detach these, or take a ProposalSampler")
         shift = torch.rand(len(rays), device=rays.origins.device) if jitter else None
-        stop = self.train_early_stop if self.training else self.early_stop
+        own = self.train_early_stop if self.training else self.early_stop
+        stop = own if early_stop is None else early_stop
         compiled = native.usable(rays.origins, rays.directions, self.box)
         march = (March if compiled else ReferenceMarch)(rays, self.occupancy, self.step_size, self.cone, shift, stop)
         traced = torch.is_grad_enabled()

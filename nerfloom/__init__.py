@@ -1,8 +1,8 @@
 """Nerfloom in a notebook or a script: `import nerfloom` and a few lines.
 
-`load` a run, render its views, evaluate it, `train` another (docs/notebooks). For a radiance field and a training loop of
-your own (docs/plug-and-play.md): a grid of what is occupied, samples where light gets, and what they add up to. Names
-are imported when they are used, so that `import nerfloom` costs nothing.
+`load` a run, render its views, evaluate it, `train` another (docs/notebooks). For a radiance field and a training loop
+of your own (docs/plug-and-play.md): a grid of what is occupied, samples where light gets, and what they add up to.
+Names are imported when they are used, so that `import nerfloom` costs nothing.
 """
 
 from __future__ import annotations

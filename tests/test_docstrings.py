@@ -21,14 +21,12 @@ FOLDERS = ("framework", "methods", "dataparsers", "nerfloom")
 FILES = sorted(file.relative_to(ROOT).as_posix() for folder in FOLDERS for file in (ROOT / folder).rglob("*.py"))
 NOT_YET: tuple[str, ...] = (
     "dataparsers",
-    "framework/cameras",
     "framework/cli",
     "framework/data",
     "framework/encodings",
     "framework/evaluation",
     "framework/export",
     "framework/fields",
-    "framework/geometry",
     "framework/kernels",
     "framework/model.py",
     "framework/rendering",
@@ -154,8 +152,8 @@ def _text_problems(name: str, text: str | None, is_function: bool) -> Iterator[s
         yield f"{name}: the first line is no whole sentence with a full stop: {first}"
     if rest and rest[0]:
         yield f"{name}: no empty line follows the first"
-    if not re.match(r"[A-Z0-9`'\"]", first):
-        yield f"{name}: the first line starts with neither a capital letter nor code: {first}"
+    if not re.match(r"[A-Z0-9(`'\"]", first):
+        yield f"{name}: the first line starts with neither a capital letter, a shape nor code: {first}"
     if FRAGMENTS.fullmatch(word) or (is_function and DETERMINERS.fullmatch(word)):
         yield f"{name}: the first line is no sentence of its own: {first}"
     if is_function and re.fullmatch(r"[A-Z]\w*[a-rtv-z]s", word):  # not Pass, not Focus

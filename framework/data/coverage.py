@@ -33,8 +33,8 @@ def unreachable_pixels(cameras: Cameras) -> Tensor:
     for index, kind in enumerate(_kinds(cameras)):
         if kind not in known:
             parts = cameras.image_pixels(index).split(BLOCK) if _doubtful(cameras, index) else ()
-            found = [pixels[~_reached(cameras, index, pixels)] for pixels in parts]
-            known[kind] = torch.cat([none, *found]) - cameras.offsets[index]
+            valid = [pixels[~_reached(cameras, index, pixels)] for pixels in parts]
+            known[kind] = torch.cat([none, *valid]) - cameras.offsets[index]
         lost.append(known[kind] + cameras.offsets[index])
     return torch.cat(lost)
 
@@ -86,7 +86,7 @@ def _doubtful(cameras: Cameras, index: int) -> bool:
     columns, rows = columns.repeat(2, 1)[:, 0], rows.repeat_interleave(2, 0)[:, 0]
     x, y, seen = cameras.look(torch.full((4,), index, device=width.device), columns, rows)
     if cameras.distortion is None:
-        return not bool(seen.found.all())
+        return not bool(seen.valid.all())
     return not bool((torch.hypot(x, y) < SURE * cameras.distortion.bounds[index, 0]).all())
 
 
@@ -95,11 +95,11 @@ def _reached(cameras: Cameras, index: int, pixels: Tensor) -> Tensor:
     within, width = pixels - cameras.offsets[index], cameras.widths[index]
     columns, rows = within % width, within // width
     if cameras.distortion is None:
-        return cameras.look(torch.full_like(pixels, index), columns, rows)[2].found
+        return cameras.look(torch.full_like(pixels, index), columns, rows)[2].valid
     x = (columns + 0.5 - cameras.cx[index]) / cameras.fx[index]
     y = (rows + 0.5 - cameras.cy[index]) / cameras.fy[index]
     distance, (inner, outer) = torch.hypot(x, y), cameras.distortion.bounds[index]
     reached = distance < SURE * inner
     doubtful = ~reached & (distance <= outer)
-    found = cameras.look(torch.full_like(pixels, index)[doubtful], columns[doubtful], rows[doubtful])[2].found
-    return reached.masked_scatter(doubtful, found)
+    valid = cameras.look(torch.full_like(pixels, index)[doubtful], columns[doubtful], rows[doubtful])[2].valid
+    return reached.masked_scatter(doubtful, valid)

@@ -22,7 +22,6 @@ FILES = sorted(file.relative_to(ROOT).as_posix() for folder in FOLDERS for file 
 NOT_YET: tuple[str, ...] = (
     "dataparsers",
     "framework/cli",
-    "framework/data",
     "framework/encodings",
     "framework/evaluation",
     "framework/export",
@@ -31,7 +30,6 @@ NOT_YET: tuple[str, ...] = (
     "framework/model.py",
     "framework/rendering",
     "framework/samplers",
-    "framework/scene",
     "framework/tools/__init__.py",
     "framework/tools/benchmarks",
     "framework/tools/comparison",

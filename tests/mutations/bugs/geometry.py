@@ -271,8 +271,8 @@ BUGS = (
         "silhouettes-of-masked",
         "occupancy",
         "framework/scene/silhouettes.py",
-        "opaque |= ~kept  # who knows what is there",
-        "opaque &= kept  # who knows what is there",
+        "opaque |= ~kept  # nothing is known about these",
+        "opaque &= kept  # nothing is known about these",
         "what a mask hides is carved away",
     ),
     Bug(

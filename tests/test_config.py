@@ -68,7 +68,7 @@ def test_numbers_as_yaml_writes_them() -> None:
         ("method: !!int ''", "is not plain YAML"),
         ("method: !!bool perhaps", "is not plain YAML"),
         ("method: !!timestamp now", "is not plain YAML"),
-        ("method: &a instant-ngp\nexperiment_name: *a", "an alias (*name) stands for something else"),
+        ("method: &a instant-ngp\nexperiment_name: *a", "it has an alias (*name)"),
         ("method: instant-ngp\nmachine: {seed: 18446744073709551616}", "'seed' is 18446744073709551616; it must be"),
         ('method: instant-ngp\ndata: "a\\0b"', r"'data' is 'a\x00b'; it must be Path"),
         ('method: instant-ngp\n"a\\nb": 4', r"unknown key 'a\nb'"),
@@ -94,7 +94,7 @@ def test_bad_recipes_are_refused_in_one_line(tmp_path: Path, text: str, words: s
 @pytest.mark.parametrize("sign", ["", "-"])
 def test_numbers_of_more_digits_than_python_writes(tmp_path: Path, sign: str) -> None:
     path = tmp_path / "recipe.yml"
-    refused = {"0x" + 5000 * "f": "a huge whole number; it must be int", "1" + 300 * ":1" + ".0": "is not plain YAML"}
+    refused = {"0x" + 5000 * "f": "a huge integer; it must be int", "1" + 300 * ":1" + ".0": "is not plain YAML"}
     for number, words in refused.items():
         path.write_text(f"method: instant-ngp\nmax_eval_images: {sign}{number}")
         with pytest.raises(ConfigError, match=words):

@@ -94,8 +94,8 @@ def test_a_mask_that_cannot_be_used_is_named(tmp_path: Path) -> None:
     for masks, message in (
         ([tmp_path / "none.png", None, None], r"mask .*none\.png does not exist"),
         ([tmp_path / "broken.png", None, None], r"mask .*broken\.png is not a readable image"),
-        ([wide, None, None], r"mask .*wide\.png is 45x20 pixels, but its photograph is 30x20"),
-        (black, "masks of split 'train' leave no pixel"),
+        ([wide, None, None], r"mask .*wide\.png is 45x20 pixels, but its image is 30x20"),
+        (black, "masks of split 'train' keep no pixel"),
     ):
         with pytest.raises(DataError, match=message):
             load_dataset(parsed(list(scene.image_paths), SIZES, masks), "train")

@@ -121,9 +121,9 @@ def test_damaged_photographs_in_our_words_and_thumbnails_with_a_warning(tmp_path
     flags = ("--data", capture, "--output-dir", tmp_path / "out", "--max-num-iterations", 1, "--max-eval-images", 0)
     for number, (content, words) in enumerate(
         (
-            (whole[: len(whole) * 2 // 3], "it is damaged or cut short; copy it again"),
+            (whole[: len(whole) * 2 // 3], "it is damaged or truncated; copy it again"),
             (b"", "the file is empty; copy it again"),
-            (b"no image", "what it holds is no image, or its beginning is damaged; copy it again"),
+            (b"no image", "its content is no image, or its beginning is damaged; copy it again"),
         )
     ):
         first.write_bytes(content)

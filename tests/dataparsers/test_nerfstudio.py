@@ -363,7 +363,7 @@ BAD = {
     "zero focal length": (put(fl_x=0.0), "frame 0: 'fl_x' is 0.0; it must be a number above zero"),
     "negative focal length": (frame(fl_y=-5), "frame 4: 'fl_y' is -5; it must be a number above zero"),
     "nan focal length": (put(fl_x=math.nan), "frame 0: 'fl_x' is nan"),
-    "huge focal length": (put(fl_x=10**400), "frame 0: 'fl_x' is a huge whole number"),
+    "huge focal length": (put(fl_x=10**400), "frame 0: 'fl_x' is a huge integer"),
     "text focal length": (put(fl_x="long"), "frame 0: 'fl_x' is 'long'"),
     "no focal length": (lambda c: [c.pop("fl_x"), c.pop("fl_y")], "frame 0: there is neither 'fl_x' nor 'camera_ang"),
     "flat angle": (lambda c: [c.pop("fl_x"), c.update(camera_angle_x=4.0)], "'camera_angle_x' is 4.0"),

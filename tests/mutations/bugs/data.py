@@ -332,8 +332,8 @@ BUGS = (
         "opaque-alpha-of-masks",
         "masks",
         "framework/data/pixels.py",
-        "torch.where(shown[:, None], rgb, behind), shown * (1.0 if alpha is None else alpha)",
-        "rgb, shown * (1.0 if alpha is None else alpha)",
+        "torch.where(opaque[:, None], rgb, behind), opaque * (1.0 if alpha is None else alpha)",
+        "rgb, opaque * (1.0 if alpha is None else alpha)",
         "what masks cut away keeps its colour in training",
     ),
     Bug(
@@ -389,8 +389,8 @@ BUGS = (
         "cache-ignores-changes",
         "data",
         "framework/data/pixel_cache.py",
-        "about = (str(file.resolve()), stat.st_size, stat.st_mtime_ns)",
-        "about = (str(file.resolve()),)",
+        "identity = (str(file.resolve()), stat.st_size, stat.st_mtime_ns)",
+        "identity = (str(file.resolve()),)",
         "photographs that were edited are read as they were when first decoded",
     ),
     Bug(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import torch
 from torch import Tensor
 
 from framework.geometry.rays import Rays, Samples
@@ -63,8 +64,11 @@ def conical_frustums(t_starts: Tensor, t_ends: Tensor, radii: Tensor) -> tuple[T
     Returns: (N,) mean distance, variance along the ray, and variance across it.
     """
     middle, half = (t_starts + t_ends) / 2, (t_ends - t_starts) / 2
-    total = 3 * middle.square() + half.square()
-    mean_t = middle + 2 * middle * half.square() / total
-    along = half.square() / 3 - (4 / 15) * half**4 * (12 * middle.square() - half.square()) / total.square()
-    across = radii.square() * (middle.square() / 4 + (5 / 12) * half.square() - (4 / 15) * half**4 / total)
+    # In the share that half is of the middle, which is at most 1: half^4 overflows where an interval has no end.
+    there = middle > 0
+    squared = torch.where(there, half / torch.where(there, middle, torch.ones_like(middle)), 0.0).square()
+    total = 3 + squared
+    mean_t = middle * (1 + 2 * squared / total)
+    along = half.square() * (1 / 3 - (4 / 15) * squared * (12 - squared) / total.square())
+    across = (radii * middle).square() * (1 / 4 + (5 / 12) * squared - (4 / 15) * squared.square() / total)
     return mean_t, along, across

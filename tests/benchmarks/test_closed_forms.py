@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from framework.geometry.points import Points
 from framework.geometry.rays import Rays
 from framework.tools.benchmarks.closed_forms import (
     BOX,
@@ -58,7 +59,7 @@ def by_quadrature(scene: ClosedForm, rays: Rays, jumps: bool) -> Light:
     for o, d, near, far in zip(rays.origins, rays.directions, rays.nears, rays.fars, strict=True):
 
         def at(t: Tensor, o: Tensor = o, d: Tensor = d) -> tuple[Tensor, Tensor]:
-            return scene.density(o + t[:, None] * d)
+            return scene.density(Points(o + t[:, None] * d))
 
         ends = near + (far - near) * torch.linspace(0, 1, POINTS + 1, dtype=F64)
         if jumps:
@@ -96,7 +97,7 @@ def test_truth_is_what_dense_quadrature_finds(name: str) -> None:
 def test_scenes_lie_in_their_box_and_have_colours(name: str) -> None:
     draws = torch.Generator().manual_seed(0)
     positions = (torch.rand(200_000, 3, generator=draws) * 2 - 1) * 2
-    sigma, color = scenes()[name].density(positions)
+    sigma, color = scenes()[name].density(Points(positions))
     outside = ((positions < BOX[0]) | (positions > BOX[1])).any(-1)
     assert sigma.dtype == torch.float32
     assert sigma[outside].max().item() < 1e-5

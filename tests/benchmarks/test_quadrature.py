@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from framework.fields.base import Field
+from framework.geometry.points import Points
 from framework.geometry.rays import Rays
 from framework.samplers.proposal import ProposalSampler
 from framework.samplers.uniform import UniformSampler
@@ -194,8 +195,8 @@ def test_pictures(tmp_path: Path) -> None:
 class Unsure(Field):
     """NaN everywhere."""
 
-    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        return positions.new_full((len(positions),), torch.nan), positions
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        return points.positions.new_full((len(points),), torch.nan), points.positions
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         return features

@@ -7,6 +7,7 @@ from framework.encodings.hash_grid import HashGrid
 from framework.fields.base import Field
 from framework.fields.encoded import EncodedField
 from framework.fields.nerf import NeRFField
+from framework.geometry.points import Points
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 
@@ -26,7 +27,7 @@ def test_shapes_types_and_gradients(kind: str, count: int, half: bool) -> None:
     positions = torch.rand(count, 3) * 3 - 1.5
     directions = torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
     with torch.autocast("cpu", torch.bfloat16, enabled=half):
-        sigma, features = field.density(positions)
+        sigma, features = field.density(Points(positions))
         rgb = field.color(features, directions)
     assert sigma.shape == (count,)
     assert rgb.shape == (count, 3)
@@ -50,5 +51,5 @@ def test_the_papers_parameter_count() -> None:
 
 def test_density_starts_alive() -> None:
     """A ReLU density that is zero everywhere would never learn."""
-    sigma, _ = make("nerf").density(torch.rand(2000, 3) * 3 - 1.5)
+    sigma, _ = make("nerf").density(Points(torch.rand(2000, 3) * 3 - 1.5))
     assert (sigma > 0).float().mean() > 0.1

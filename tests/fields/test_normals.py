@@ -7,14 +7,15 @@ from framework.encodings.hash_grid import HashGrid
 from framework.fields.base import Field
 from framework.fields.encoded import EncodedField
 from framework.fields.normals import NormalHead, density_normals, normal_penalties
+from framework.geometry.points import Points
 from framework.geometry.rays import Samples
 
 
 class Ball(Field):
     """Denser towards the middle."""
 
-    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        return torch.exp(-positions.square().sum(-1)), positions
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        return torch.exp(-points.positions.square().sum(-1)), points.positions
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         raise AssertionError
@@ -22,13 +23,13 @@ class Ball(Field):
 
 def test_a_balls_normals_point_outwards() -> None:
     positions = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
-    found = density_normals(Ball(), positions)
+    found = density_normals(Ball(), Points(positions))
     torch.testing.assert_close(found, positions / positions.norm(dim=-1, keepdim=True))
     assert not found.requires_grad
 
 
 def test_in_the_middle_there_is_none() -> None:
-    assert density_normals(Ball(), torch.zeros(1, 3)).tolist() == [[0, 0, 0]]
+    assert density_normals(Ball(), Points(torch.zeros(1, 3))).tolist() == [[0, 0, 0]]
 
 
 def test_asking_for_normals_teaches_the_field_nothing() -> None:
@@ -38,18 +39,13 @@ def test_asking_for_normals_teaches_the_field_nothing() -> None:
     torch.nn.init.normal_(field.encoding.table)
     positions = torch.rand(20, 3) * 2 - 1
     with torch.no_grad():
-        normals = density_normals(field, positions)
+        normals = density_normals(field, Points(positions))
     assert field.encoding.deferred is not None
     assert field.encoding.deferred.parts == []
     assert all(p.grad is None and p.requires_grad for p in field.parameters())
     step = 1e-3
-    numeric = torch.stack(
-        [
-            field.density(positions + step * axis)[0].detach() - field.density(positions - step * axis)[0].detach()
-            for axis in torch.eye(3)
-        ],
-        dim=-1,
-    )
+    ends = [[field.density(Points(positions + sign * step * axis))[0] for sign in (1, -1)] for axis in torch.eye(3)]
+    numeric = torch.stack([(ahead - behind).detach() for ahead, behind in ends], dim=-1)
     agreement = -(normals * numeric / numeric.norm(dim=-1, keepdim=True)).sum(-1)
     assert agreement.median() > 0.99  # cells are small: some differences straddle a face
 
@@ -72,7 +68,7 @@ def test_the_head_learns_a_balls_normals() -> None:
     samples = Samples.regular(torch.zeros(256, 1), torch.ones(256, 1))
     for _ in range(150):
         positions = torch.rand(256, 3) * 2 - 1
-        found = density_normals(ball, positions)
+        found = density_normals(ball, Points(positions))
         predicted = head(positions, positions)
         loss = normal_penalties(predicted, found, -positions, torch.ones(256), samples)["normals"].mean()
         optimizer.zero_grad()

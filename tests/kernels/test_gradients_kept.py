@@ -13,6 +13,7 @@ import framework
 from framework.cameras.cameras import Cameras, subpixels
 from framework.data.pixels import gather_colors, gather_colors_reference
 from framework.fields.base import Field
+from framework.geometry.points import Points
 from framework.geometry.rays import Rays, Samples
 from framework.kernels.compositing import composite, composite_reference, distortion, distortion_reference
 from framework.kernels.contraction import contract_to_unit, contract_to_unit_reference
@@ -220,8 +221,8 @@ def test_the_gradient_is_the_references(name: str, given: str) -> None:
 
 
 class Fog(Field):
-    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        return positions.square().sum(-1), positions
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        return points.positions.square().sum(-1), points.positions
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         return features

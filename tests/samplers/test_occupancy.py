@@ -5,6 +5,7 @@ import torch
 
 from framework.fields.base import Field
 from framework.geometry.bounds import intersect_box
+from framework.geometry.points import Points
 from framework.geometry.rays import Rays, Samples
 from framework.rendering.volume import volume_render
 from framework.samplers.occupancy import WARM_UP_STEPS, OccupancySampler
@@ -23,9 +24,9 @@ def random_rays(count: int, seed: int = 0, near: float = 0.0) -> Rays:
 
 
 def ball_density(radius: float, sigma: float = 50.0):
-    def density(positions: torch.Tensor, times: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
-        inside = positions.norm(dim=-1) < radius
-        return inside * sigma, positions
+    def density(points: Points) -> tuple[torch.Tensor, torch.Tensor]:
+        inside = points.positions.norm(dim=-1) < radius
+        return inside * sigma, points.positions
 
     return density
 
@@ -33,8 +34,8 @@ def ball_density(radius: float, sigma: float = 50.0):
 class Transparent(Field):
     """Nothing anywhere: every candidate is a sample."""
 
-    def density(self, positions: torch.Tensor, times: torch.Tensor | None = None):
-        return torch.zeros(len(positions)), positions
+    def density(self, points: Points):
+        return torch.zeros(len(points)), points.positions
 
     def color(self, features, directions, camera_indices=None):
         return features
@@ -89,9 +90,9 @@ class CountingField(Field):
         self.weight = torch.nn.Parameter(torch.randn(3, 4, generator=torch.Generator().manual_seed(0)) * 3)
         self.asked: list[torch.Tensor] = []
 
-    def density(self, positions: torch.Tensor, times: torch.Tensor | None = None):
-        self.asked.append(positions.detach())
-        features = (positions @ self.weight).sin()
+    def density(self, points: Points):
+        self.asked.append(points.positions.detach())
+        features = (points.positions @ self.weight).sin()
         return 8 * features[:, 0].clamp(min=0) ** 2, features
 
     def color(self, features, directions, camera_indices=None):
@@ -103,7 +104,7 @@ class TracingField(CountingField):
 
     def trace(self, positions: torch.Tensor, times: torch.Tensor | None = None):
         with torch.no_grad():
-            sigma, features = self.density(positions)
+            sigma, features = self.density(Points(positions))
         return sigma, features, positions * 2
 
     def retrace(self, positions, times, features, memory):
@@ -122,7 +123,7 @@ def test_waves_without_early_stop_equal_one_evaluation(kind) -> None:
     waves = sampler.sample(rays, field, jitter=False)
     assert sum(len(a) for a in field.asked) == len(candidates)
     assert torch.cat(field.asked).unique(dim=0).shape[0] == len(candidates)  # nothing twice
-    sigma, features = field.density(candidates.positions(rays), None)
+    sigma, features = field.density(Points(candidates.positions(rays)))
     torch.testing.assert_close(waves.sigma, sigma)
     torch.testing.assert_close(waves.features, features)
     torch.testing.assert_close(waves.t_starts, candidates.t_starts)
@@ -203,10 +204,10 @@ def test_state_survives_a_checkpoint() -> None:
 def test_a_cell_that_is_full_for_a_short_while_stays() -> None:
     """A ball that is there for a twentieth of the time: its cells are kept, and cells that are never full are not."""
 
-    def density(positions: torch.Tensor, times: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
-        assert times is not None
-        there = (positions.norm(dim=-1) < 0.6) & (times < 0.05)
-        return there.float() * 100, positions
+    def density(points: Points) -> tuple[torch.Tensor, torch.Tensor]:
+        assert points.times is not None
+        there = (points.positions.norm(dim=-1) < 0.6) & (points.times < 0.05)
+        return there.float() * 100, points.positions
 
     box = torch.tensor([[-1.0] * 3, [1.0] * 3])
     sampler = OccupancySampler(box, 16, 64, moving=True)

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from framework.fields.base import Field
+from framework.geometry.points import Points
 from framework.geometry.rays import Rays
-from framework.rendering.volume import render_field
+from framework.rendering.volume import Rendered, VolumeRenderer
 from framework.samplers.proposal import ProposalSampler, from_disparity, interlevel_loss, to_disparity
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
@@ -22,9 +23,9 @@ class Wall(Field):
         super().__init__()
         self.low, self.high = low, high
 
-    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        inside = (positions[:, 0] > self.low) & (positions[:, 0] < self.high)
-        return 200.0 * inside, positions
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        x = points.positions[:, 0]
+        return 200.0 * ((x > self.low) & (x < self.high)), points.positions
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         return torch.full_like(features, 0.5)
@@ -35,6 +36,11 @@ def rays_along_x(count: int, near: float = 0.05, far: float = 1000.0) -> Rays:
     origins = torch.cat([torch.full((count, 1), -0.9), torch.rand(count, 2) - 0.5], dim=-1)
     directions = torch.tensor([[1.0, 0.0, 0.0]]).expand(count, 3)
     return Rays(origins, directions, torch.full((count,), near), torch.full((count,), far))
+
+
+def shown(field: Field, sampler: ProposalSampler, rays: Rays, background: float, jitter: bool) -> Rendered:
+    samples = sampler.sample(rays, field, jitter)
+    return VolumeRenderer().render(rays, samples, field, torch.full((3,), background))
 
 
 def test_disparity_is_inverted_and_continuous() -> None:
@@ -79,7 +85,7 @@ def test_proposals_learn_where_the_wall_is(unbounded: bool) -> None:
 
     def depth_error() -> float:
         with torch.no_grad():
-            found = render_field(wall, sampler.eval(), rays, torch.zeros(3), False).median_depth
+            found = shown(wall, sampler.eval(), rays, 0.0, jitter=False).median_depth
         return (found - 1.2).abs().median().item()
 
     def share_inside() -> float:
@@ -90,7 +96,7 @@ def test_proposals_learn_where_the_wall_is(unbounded: bool) -> None:
     losses = []
     for step in range(150):
         sampler.train().update(step, wall.density)
-        rendered = render_field(wall, sampler, rays, torch.zeros(3), True)
+        rendered = shown(wall, sampler, rays, 0.0, jitter=True)
         assert rendered.samples is not None
         assert rendered.weights is not None
         loss = interlevel_loss(rendered.samples, rendered.weights)
@@ -124,12 +130,7 @@ def test_annealing_is_the_papers() -> None:
 
 def test_light_that_no_wall_stops_ends_in_the_last_interval_of_an_unbounded_ray() -> None:
     """The sky is learnt as matter far away: whatever density is there is opaque over an endless interval."""
-    rendered = render_field(
-        Wall(0.3, 1e9),
-        ProposalSampler(BOX, (16, 8, 4), unbounded=True, endless=True),
-        rays_along_x(5),
-        torch.ones(3),
-        False,
-    )
+    sampler = ProposalSampler(BOX, (16, 8, 4), unbounded=True, endless=True)
+    rendered = shown(Wall(0.3, 1e9), sampler, rays_along_x(5), 1.0, jitter=False)
     torch.testing.assert_close(rendered.accumulation, torch.ones(5))
     torch.testing.assert_close(rendered.rgb, torch.full((5, 3), 0.5))

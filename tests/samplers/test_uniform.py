@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from framework.fields.base import Field
+from framework.geometry.points import Points
 from framework.geometry.rays import Rays
 from framework.samplers.uniform import LAST_INTERVAL, UniformSampler, samples_from_points, stratified_points
 
@@ -11,7 +12,7 @@ from framework.samplers.uniform import LAST_INTERVAL, UniformSampler, samples_fr
 class Unseen(Field):
     """A uniform sampler does not look."""
 
-    def density(self, positions: torch.Tensor, times: torch.Tensor | None = None):
+    def density(self, points: Points):
         raise AssertionError
 
     def color(self, features, directions, camera_indices=None):

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from framework.encodings.hash_grid import HashGrid
 from framework.fields.encoded import EncodedField
+from framework.geometry.points import Points
 from framework.kernels.march import refresh_occupancy
 from framework.kernels.math import MAX_LOG_DENSITY, split_density, truncated_exp
 from framework.samplers.occupancy import OccupancySampler
@@ -103,7 +104,7 @@ def test_a_field_whose_density_has_run_away_can_come_back(backend: str, bfloat16
         field.density_head[0].weight.fill_(1.0)
         last.fill_(1e3)
     with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
-        sigma, _ = field.density(torch.rand(7, 3) * 2 - 1)
+        sigma, _ = field.density(Points(torch.rand(7, 3) * 2 - 1))
     assert sigma.dtype == torch.float32
     assert sigma.tolist() == pytest.approx([math.exp(MAX_LOG_DENSITY)] * 7, rel=1e-6)
     sigma.sum().backward()
@@ -180,7 +181,7 @@ def test_a_cell_that_was_nan_once_recovers(backend: str) -> None:
     sampler = OccupancySampler(BOX, resolution=8, num_steps=32)
     sampler.density_grid.fill_(math.nan)
     torch.manual_seed(0)
-    sampler.update(8, lambda positions, times: (torch.full((len(positions),), 5.0), positions))
+    sampler.update(8, lambda points: (torch.full((len(points),), 5.0), points.positions))
     visited = ~sampler.density_grid.isnan()
     assert 0 < int(visited.sum()) < 8**3
     assert bool((sampler.density_grid[visited] == 5).all())

@@ -22,7 +22,7 @@ from framework.kernels.compositing import distortion, distortion_reference
 from framework.kernels.planes import PlanesLayout, plane_band
 from framework.rendering.losses import depth_error, mean_squared_error
 from framework.samplers.proposal import interlevel_loss
-from methods.kplanes import KPlanes, KPlanesConfig, _squared_steps
+from methods.kplanes import METHOD, KPlanes, KPlanesConfig, _squared_steps
 from methods.tensorf import _variation
 from tests.images import parsed
 from tests.kernels.compiled import relative_error
@@ -154,7 +154,8 @@ def moving_planes(monkeypatch: pytest.MonkeyPatch) -> KPlanes:
     config = KPlanesConfig(
         base_resolution=6, num_scales=2, time_resolution=5, features_per_scale=4, grid_resolution=8, num_steps=16
     )
-    model = KPlanes(config, scene)
+    model = METHOD.build(config, scene)
+    assert isinstance(model, KPlanes)
 
     def whole(self: FeaturePlanes, group: int, index: int) -> Tensor:
         return plane_band(self.table, self.layout, group, index, 0, self.layout.shape(group, index)[0], self.deferred)

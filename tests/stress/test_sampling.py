@@ -9,10 +9,11 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from framework.fields.base import Field
+from framework.geometry.points import Points
 from framework.geometry.rays import Rays
 from framework.kernels.intervals import resample
 from framework.kernels.march import March, Occupancy, ReferenceMarch
-from framework.rendering.volume import render_field
+from framework.rendering.volume import VolumeRenderer
 from framework.samplers.inverse_cdf import inverse_cdf
 from framework.samplers.proposal import FARTHEST, ProposalSampler, distances, half_edge, interlevel_loss
 from tests.kernels.test_march import walk
@@ -137,8 +138,8 @@ def test_a_nan_weight_in_front_is_seen_in_new_intervals(backend: str) -> None:
 class Ball(Field):
     """Half opaque, around the origin."""
 
-    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        return 2.0 * (positions.norm(dim=-1) < 0.7), positions
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        return 2.0 * (points.positions.norm(dim=-1) < 0.7), points.positions
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         return torch.full_like(features, 0.5)
@@ -180,7 +181,7 @@ def test_proposals_from_zero_to_infinity(backend: str, unbounded: bool, jitter: 
     sampler = ProposalSampler(BOX, (24, 12, 8), (16, 32), unbounded, endless, log2_table_size=10)
     sampler.train().update(0, Ball().density)
     rays = some_rays(16, 0.0, math.inf)
-    found = render_field(Ball(), sampler, rays, torch.ones(3), jitter)
+    found = VolumeRenderer().render(rays, sampler.sample(rays, Ball(), jitter), Ball(), torch.ones(3))
     samples = found.samples
     assert samples is not None
     assert found.weights is not None

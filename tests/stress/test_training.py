@@ -15,13 +15,14 @@ from torch import Tensor, nn
 from framework.base.config import TrainConfig
 from framework.base.errors import ConfigError
 from framework.encodings.hash_grid import HashGrid
-from framework.evaluation.evaluator import evaluation_background, render_view
+from framework.evaluation.evaluator import evaluation_background
 from framework.fields.base import Field
 from framework.fields.encoded import EncodedField
 from framework.fields.nerf import NeRFField
 from framework.geometry.rays import Rays
 from framework.kernels.adam import sparse_adam
-from framework.rendering.volume import Rendered, render_field
+from framework.rendering.rendered import Rendered
+from framework.rendering.volume import VolumeRenderer
 from framework.samplers.uniform import UniformSampler
 from framework.training.optim import Adam
 from framework.training.trainer import State, Trainer
@@ -102,9 +103,9 @@ def test_a_long_run_of_equal_gradients_takes_equal_steps(backend: str, seen: flo
 
 @pytest.mark.entry(3)
 def test_counts_and_means_after_a_hundred_thousand_steps() -> None:
-    run, batch = SimpleNamespace(state=State()), SimpleNamespace(rays=range(4097))
+    run = SimpleNamespace(state=State())
     for _ in range(100_000):
-        Trainer._account(run, batch, 3 * 4097, 0.01, 1e-3)  # type: ignore[arg-type]
+        Trainer._account(run, 4097, 3 * 4097, 0.01, 1e-3)  # type: ignore[arg-type]
     state = run.state
     assert state.step == 100_000
     assert state.rays == 409_700_000
@@ -230,7 +231,9 @@ def test_density_wakes_up_for_plain_photographs(backend: str, kind: str, photogr
     optimizer = torch.optim.Adam(field.parameters(), lr=1e-2)
     errors = []
     for _ in range(60):
-        out = render_field(field, UniformSampler(16), looking_inwards(64), torch.zeros(3), True)
+        rays = looking_inwards(64)
+        samples = UniformSampler(16).sample(rays, field, True)
+        out = VolumeRenderer().render(rays, samples, field, torch.zeros(3))
         loss = (out.rgb - photographs).square().mean()
         optimizer.zero_grad()
         loss.backward()
@@ -280,7 +283,7 @@ def test_rays_begin_and_end_alike_in_training_and_evaluation(shared_tiny: Path, 
 
     trainer.model.render = spy
     trainer.train_step()
-    render_view(trainer.model, trainer.eval_set, 0, evaluation_background(trainer.model))
+    trainer.model.render_view(trainer.eval_set.view(0), evaluation_background(trainer.model))
     assert {training for training, _, _ in seen} == {True, False}
     assert {(*nears, *fars) for _, nears, fars in seen} == {(scene.near, scene.far)}
 
@@ -298,8 +301,8 @@ def test_a_depth_map_does_not_depend_on_the_chunks(backend: str, kind: str, shar
     views = []
     for chunk in (57, 8192):
         trainer.model.config = dataclasses.replace(trainer.model.config, eval_num_rays_per_chunk=chunk)
-        views.append(render_view(trainer.model, trainer.eval_set, 0, evaluation_background(trainer.model)))
-    apart = (views[0].depth - views[1].depth).abs()
-    assert views[0].depth.unique().numel() > 1
+        views.append(trainer.model.render_view(trainer.eval_set.view(0), evaluation_background(trainer.model)))
+    apart = (views[0].median_depth - views[1].median_depth).abs()
+    assert views[0].median_depth.unique().numel() > 1
     assert (apart > 1e-3).float().mean().item() <= 0.01
     torch.testing.assert_close(views[0].accumulation, views[1].accumulation, rtol=0, atol=1e-4)

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 import torch
 
-# The tests' processes share the cores (pytest -n auto), and small tensors gain nothing by a second thread. Where threads
-# are the point, tests ask for them.
+# Processes of tests share the cores (pytest -n auto), and small tensors gain nothing by a second thread. Tests that are
+# about threads ask for them.
 torch.set_num_threads(1)
 
 

@@ -166,8 +166,8 @@ def _load(kind: Kind, name: str) -> Any:
             loaded = getattr(loaded, part)
     except (Exception, SystemExit) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
-        if isinstance(error, ImportError) and (error.name or "").split(".")[0] == "framework":
-            reason += f". It looks written for an older plugin interface: {CHANGED}"
+        if _looks_old(error):
+            reason += f". It seems to be written for plugin interface 1, and this is {INTERFACE[kind]}: {CHANGED}"
         raise ConfigError(f"{title} cannot be loaded: {reason}") from error
     interface, ours = getattr(loaded, "interface", INTERFACE[kind]), INTERFACE[kind]
     if interface != ours:
@@ -175,6 +175,13 @@ def _load(kind: Kind, name: str) -> Any:
         remedy = "upgrade nerfloom" if newer else CHANGED
         raise ConfigError(f"{title} was written for plugin interface {interface}, and this is {ours}; {remedy}")
     return loaded
+
+
+def _looks_old(error: BaseException) -> bool:
+    """Return whether a plugin failed as one does that was written for the interface before."""
+    if isinstance(error, ImportError):
+        return (error.name or "").split(".")[0] == "framework"
+    return isinstance(error, TypeError) and "Method.__init__()" in str(error)
 
 
 def load_method(name: str) -> Method:

@@ -7,6 +7,7 @@ being skipped while a step through it would be nearly transparent.
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -16,8 +17,9 @@ from framework.fields.base import DensityFunction, Field
 from framework.geometry.rays import Rays, Samples
 from framework.kernels import native
 from framework.kernels.given import is_followed
+from framework.kernels.kept import Waves
 from framework.kernels.march import March, Occupancy, ReferenceMarch, refresh_occupancy
-from framework.kernels.rows import gather_rows, take_rows
+from framework.kernels.rows import gather_rows
 
 MAX_CELLS = 512
 """Along an axis of the grid: of 512^3 cells what is known takes 0.8 GB."""
@@ -124,30 +126,26 @@ class OccupancySampler(nn.Module):
         stop = self.train_early_stop if self.training else self.early_stop
         compiled = native.usable(rays.origins, rays.directions, self.box)
         march = (March if compiled else ReferenceMarch)(rays, self.occupancy, self.step_size, self.cone, shift, stop)
-        traced = torch.is_grad_enabled()
-        found: list[tuple[Tensor, ...]] = []
-        while (wave := march.wave(WAVES[min(len(found), len(WAVES) - 1)])) is not None:
-            times = None if rays.times is None else rays.times[wave.owners]
-            values = field.trace(wave.positions, times) if traced else None
-            traced = values is not None
-            found.append(values or field.density(wave.positions, times))
-            march.advance(found[-1][0])
-        if not found:  # no ray meets anything: still the field's own, empty, tensors
-            found.append(field.density(rays.origins[:0], None if rays.times is None else rays.times[:0]))
-        if not march.waves:
-            empty = rays.nears[:0]
-            return Samples(empty, empty, march.finish()[1]).evaluated(*found[0])
+
+        def density(positions: Tensor, owners: Tensor) -> tuple[Tensor, ...]:
+            return field.density(positions, None if rays.times is None else rays.times[owners])
+
+        evaluated = Waves()
+        while (wave := march.wave(WAVES[min(len(march.waves), len(WAVES) - 1)])) is not None:
+            march.advance(evaluated.evaluate(len(wave.owners), partial(density, wave.positions, wave.owners))[0])
         order, offsets = march.finish()
+        if not march.waves:  # no ray meets anything: still the field's own, empty, tensors
+            empty = rays.nears[:0]
+            return Samples(empty, empty, offsets).evaluated(*density(rays.origins[:0], order))
         waves = march.waves
         columns = [[w.t_starts for w in waves], [w.t_ends for w in waves], [w.owners for w in waves]]
-        if traced:
-            columns += [[w.positions for w in waves], [values[1] for values in found], [values[2] for values in found]]
-            starts, ends, owners, positions, features, memory = gather_rows(columns, order)
-            times = None if rays.times is None else rays.times[owners]
-            sigma, features = field.retrace(positions, times, features, memory)
-        else:
-            starts, ends, owners = gather_rows(columns, order)
-            sigma, features = (take_rows(torch.cat([values[i] for values in found]), order) for i in (0, 1))
+        starts, ends, owners = gather_rows(columns, order)
+
+        def chosen() -> tuple[Tensor, ...]:
+            (positions,) = gather_rows([[w.positions for w in waves]], order)
+            return density(positions, owners)
+
+        sigma, features = evaluated.choose(order, chosen)
         return Samples(starts, ends, offsets, owners=owners, sigma=sigma, features=features)
 
     # -- keeping the grid up ----------------------------------------------------------------------------------

@@ -40,19 +40,35 @@ def sample_points(rays: Rays, samples: Samples, footprint: Footprint = "none") -
         footprint: how much of the points' size is computed.
     Raises: ValueError where a footprint is wanted and the rays have no radius.
     """
-    times = samples.times(rays)
+    owners = samples.ray_indices
+    return interval_points(rays, owners, samples.t_starts, samples.t_ends, samples.positions(rays), footprint)
+
+
+def interval_points(
+    rays: Rays, owners: Tensor, t_starts: Tensor, t_ends: Tensor, positions: Tensor, footprint: Footprint
+) -> Points:
+    """Return the points at which a field is asked for N intervals of R rays.
+
+    Args:
+        rays: the rays; a footprint needs their `pixel_radii`.
+        owners: (N,) int64, the ray of each interval.
+        t_starts, t_ends: (N,) distances between which each lies.
+        positions: (N, 3) where the field is asked, but for Gaussians, which have a mean of their own.
+        footprint: how much of the points' size is computed.
+    Raises: ValueError where a footprint is wanted and the rays have no radius.
+    """
+    times = None if rays.times is None else rays.times[owners]
     if footprint == "none":
-        return Points(samples.positions(rays), times)
+        return Points(positions, times)
     if rays.pixel_radii is None:
         raise ValueError("this field wants to know the size of its points: the rays need pixel_radii")
-    radii = rays.pixel_radii.index_select(0, samples.ray_indices)
+    radii = rays.pixel_radii.index_select(0, owners)
     if footprint == "radius":
-        return Points(samples.positions(rays), times, samples.t * radii)
-    mean_t, along, across = conical_frustums(samples.t_starts, samples.t_ends, radii)
-    directions = rays.directions.index_select(0, samples.ray_indices)
-    squared = directions.square()
+        return Points(positions, times, (t_starts + t_ends) / 2 * radii)
+    mean_t, along, across = conical_frustums(t_starts, t_ends, radii)
+    squared = rays.directions.index_select(0, owners).square()
     covariances = along[:, None] * squared + across[:, None] * (1 - squared)
-    return Points(rays.points(samples.ray_indices, mean_t), times, mean_t * radii, covariances)
+    return Points(rays.points(owners, mean_t), times, mean_t * radii, covariances)
 
 
 def conical_frustums(t_starts: Tensor, t_ends: Tensor, radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:

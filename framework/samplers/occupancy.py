@@ -20,7 +20,7 @@ from framework.kernels import native
 from framework.kernels.alpha import alpha_depth
 from framework.kernels.given import is_followed
 from framework.kernels.kept import Waves
-from framework.kernels.march import March, Occupancy, ReferenceMarch, refresh_occupancy
+from framework.kernels.march import March, Occupancy, ReferenceMarch, Wave, refresh_occupancy
 from framework.kernels.rows import gather_rows
 from framework.samplers.base import Sampler
 
@@ -132,17 +132,16 @@ class OccupancySampler(Sampler):
         compiled = native.usable(rays.origins, rays.directions, self.box)
         march = (March if compiled else ReferenceMarch)(rays, self.occupancy, self.step_size, self.cone, shift, stop)
 
-        def evaluate(owners: Tensor, starts: Tensor, ends: Tensor, positions: Tensor) -> tuple[Tensor, ...]:
-            points = interval_points(rays, owners, starts, ends, positions, field.footprint)
+        def evaluate(wave: Wave) -> tuple[Tensor, Tensor]:
+            points = interval_points(rays, wave.owners, wave, wave.positions, field.footprint)
             if surface is None:
                 return field.density(points)
-            return surface.alpha(points, rays.directions.index_select(0, owners), ends - starts)
+            return surface.alpha(points, rays.directions.index_select(0, wave.owners), wave.t_ends - wave.t_starts)
 
         surface = field if isinstance(field, HasAlpha) else None
         evaluated = Waves()
         while (wave := march.wave(WAVES[min(len(march.waves), len(WAVES) - 1)])) is not None:
-            intervals = wave.owners, wave.t_starts, wave.t_ends, wave.positions
-            stopping = evaluated.evaluate(len(wave.owners), partial(evaluate, *intervals))[0]
+            stopping = evaluated.evaluate(len(wave.owners), partial(evaluate, wave))[0]
             if surface is not None:  # marched by the density that stops as much light in each interval
                 stopping = alpha_depth(stopping.detach()) / (wave.t_ends - wave.t_starts)
             march.advance(stopping)
@@ -150,14 +149,14 @@ class OccupancySampler(Sampler):
         if not march.waves:  # no ray meets anything: still the field's own, empty, tensors
             empty = rays.nears[:0]
             samples = Samples(empty, empty, offsets, owners=order, early_stop=stop)
-            return _attached(samples, surface, *evaluate(order, empty, empty, rays.origins[:0]))
+            return _attached(samples, surface, *evaluate(Wave(empty, empty, order, rays.origins[:0])))
         waves = march.waves
         columns = [[w.t_starts for w in waves], [w.t_ends for w in waves], [w.owners for w in waves]]
         starts, ends, owners = gather_rows(columns, order)
 
-        def chosen() -> tuple[Tensor, ...]:
+        def chosen() -> tuple[Tensor, Tensor]:
             (positions,) = gather_rows([[w.positions for w in waves]], order)
-            return evaluate(owners, starts, ends, positions)
+            return evaluate(Wave(starts, ends, owners, positions))
 
         samples = Samples(starts, ends, offsets, owners=owners, early_stop=stop)
         return _attached(samples, surface, *evaluated.choose(order, chosen))

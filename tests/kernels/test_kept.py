@@ -3,6 +3,7 @@
 import math
 import threading
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from framework.fields.base import MLP, Field
 from framework.fields.deformed import DeformedField
 from framework.fields.encoded import DensityField, EncodedField
 from framework.fields.nerf import NeRFField
+from framework.geometry.points import Points
 from framework.kernels import kept, native
 from framework.kernels.frequency import frequency_encoding
 from framework.kernels.hash_grid import hash_grid
@@ -29,6 +31,11 @@ COUNTS = (40, 0, 25, 25)
 Density = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
+def at(field: Field, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Return what a field has at positions."""
+    return field.density(Points(positions, times))
+
+
 class Plugin(nn.Module):
     """A hash grid and networks, which a subclass puts together in a way of its own."""
 
@@ -39,8 +46,8 @@ class Plugin(nn.Module):
         self.first, self.second = MLP(6, 8, 5), MLP(6, 8, 5)
         self.linear = nn.Linear(6, 6)
 
-    def density(self, positions: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
-        features = self.features(positions / 2 + 0.5)
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        features = self.features(points.positions / 2 + 0.5)
         return features.square().sum(-1), features
 
     def features(self, unit: Tensor) -> Tensor:
@@ -232,7 +239,7 @@ def compare(field: nn.Module, density: Density, order: Tensor) -> set[str]:
 def test_a_field_is_differentiated_and_not_evaluated_again(name: str) -> None:
     torch.manual_seed(0)
     field = OURS[name]()
-    ran = compare(field, field.density, chosen())
+    ran = compare(field, partial(at, field), chosen())
     assert ran == set()
 
 
@@ -241,7 +248,7 @@ def test_a_field_is_differentiated_and_not_evaluated_again(name: str) -> None:
 def test_an_unusual_field_is_right_all_the_same(name: str) -> None:
     torch.manual_seed(0)
     field = UNUSUAL[name]()
-    compare(field, field.density, chosen())
+    compare(field, partial(at, field), chosen())
 
 
 @needs_kernels
@@ -250,7 +257,7 @@ def test_what_is_unusual_is_computed() -> None:
     torch.manual_seed(0)
     for name in ("sorted", "chunks", "in place"):
         field = UNUSUAL[name]()
-        assert "hash_grid_forward" in compare(field, field.density, chosen()), name
+        assert "hash_grid_forward" in compare(field, partial(at, field), chosen()), name
 
 
 @needs_kernels
@@ -261,10 +268,10 @@ def test_chance_is_not_repeated() -> None:
 
     def density(positions: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
         last.append(positions + 0.1 * torch.randn(positions.shape))
-        return field.density(last[-1])
+        return at(field, last[-1])
 
     found, _, _ = in_waves(density, chosen())
-    for value, true in zip(found, field.density(last[-1]), strict=True):
+    for value, true in zip(found, at(field, last[-1]), strict=True):
         torch.testing.assert_close(value, true)
 
 
@@ -274,16 +281,16 @@ def test_as_many_codes_as_samples_are_not_taken_for_them(count: int) -> None:
     torch.manual_seed(0)
     field, positions, waves = Codes(count), torch.rand(20, 3), Waves()
     order = torch.arange(20).flip(0)[:count]
-    waves.evaluate(20, lambda: field.density(positions, positions[:, 0]))
-    found = waves.choose(order, lambda: field.density(positions[order], positions[order, 0]))
-    torch.testing.assert_close(found[0], field.density(positions, positions[:, 0])[0][order])
+    waves.evaluate(20, lambda: at(field, positions, positions[:, 0]))
+    found = waves.choose(order, lambda: at(field, positions[order], positions[order, 0]))
+    torch.testing.assert_close(found[0], at(field, positions, positions[:, 0])[0][order])
 
 
 @pytest.mark.parametrize("count", [0, 1, sum(COUNTS)])
 def test_however_many_are_chosen(count: int) -> None:
     torch.manual_seed(0)
     field = EncodedField(BOX, grid())
-    found, _, ran = in_waves(field.density, chosen(count))
+    found, _, ran = in_waves(partial(at, field), chosen(count))
     assert [len(value) for value in found] == [count, count]
     assert all(value.requires_grad for value in found)
     assert ran <= ({"hash_grid_forward", "mlp_forward"} if count == 0 else set())
@@ -293,7 +300,7 @@ def test_the_tables_gradient_waits_once() -> None:
     """The optimiser gets the gradient of what was chosen, and no other."""
     torch.manual_seed(0)
     field, order = EncodedField(BOX, grid(sparse=True)), chosen()
-    found, _, _ = in_waves(field.density, order)
+    found, _, _ = in_waves(partial(at, field), order)
     (found[0].sum() + found[1].square().sum()).backward()
     deferred = field.encoding.deferred
     assert deferred is not None
@@ -348,7 +355,7 @@ def test_without_gradients_rows_are_selected() -> None:
     field, positions = EncodedField(BOX, grid()), torch.rand(30, 3)
     with torch.no_grad():
         waves = Waves()
-        sigma, _ = waves.evaluate(30, lambda: field.density(positions))
+        sigma, _ = waves.evaluate(30, lambda: at(field, positions))
         found, _ = waves.choose(torch.arange(30).flip(0), lambda: pytest.fail("nothing is left to evaluate"))
     assert not found.requires_grad
     assert torch.equal(found, sigma.flip(0))
@@ -359,7 +366,7 @@ def test_waves_build_no_graph() -> None:
     """But for the first, which shows whether the field's operations are ours."""
     torch.manual_seed(0)
     field, waves = EncodedField(BOX, grid()), Waves()
-    found = [waves.evaluate(30, lambda: field.density(torch.rand(30, 3)))[0].requires_grad for _ in range(3)]
+    found = [waves.evaluate(30, lambda: at(field, torch.rand(30, 3)))[0].requires_grad for _ in range(3)]
     assert found == [True, False, False]
 
 
@@ -367,11 +374,11 @@ def test_waves_build_no_graph() -> None:
 def test_parameters_that_were_changed_meanwhile_count() -> None:
     torch.manual_seed(0)
     field, waves, positions = EncodedField(BOX, grid()), Waves(), torch.rand(30, 3)
-    waves.evaluate(30, lambda: field.density(positions))
+    waves.evaluate(30, lambda: at(field, positions))
     with torch.no_grad():
         field.encoding.table.mul_(2)
-    found, _ = waves.choose(torch.arange(30), lambda: field.density(positions))
-    assert torch.equal(found, field.density(positions)[0])
+    found, _ = waves.choose(torch.arange(30), lambda: at(field, positions))
+    assert torch.equal(found, at(field, positions)[0])
 
 
 class Broken(Exception):
@@ -386,11 +393,11 @@ def test_an_error_leaves_nothing_behind(stage: str) -> None:
     positions = torch.rand(30, 3)
 
     def broken() -> tuple[Tensor, ...]:
-        field.density(positions)
+        at(field, positions)
         raise Broken
 
     if stage != "first wave":
-        waves.evaluate(30, lambda: field.density(positions))
+        waves.evaluate(30, lambda: at(field, positions))
     with pytest.raises(Broken):
         waves.choose(torch.arange(30), broken) if stage == "choosing" else waves.evaluate(30, broken)
     assert torch.is_grad_enabled()
@@ -404,16 +411,16 @@ def test_another_thread_is_left_alone() -> None:
     elsewhere: list[Tensor] = []
 
     def density(positions: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
-        thread = threading.Thread(target=lambda: elsewhere.append(other.density(positions)[0].detach()))
+        thread = threading.Thread(target=lambda: elsewhere.append(at(other, positions)[0].detach()))
         thread.start()
         thread.join()
-        return field.density(positions)
+        return at(field, positions)
 
     ran = compare(field, density, chosen())
     assert not native.available() or ran == {"hash_grid_forward", "mlp_forward"}  # the other's
     order, positions = chosen(), torch.cat(inputs()[0])
-    torch.testing.assert_close(torch.cat(elsewhere[: len(COUNTS)]), other.density(positions)[0])
-    torch.testing.assert_close(elsewhere[len(COUNTS)], other.density(positions[order])[0])
+    torch.testing.assert_close(torch.cat(elsewhere[: len(COUNTS)]), at(other, positions)[0])
+    torch.testing.assert_close(elsewhere[len(COUNTS)], at(other, positions[order])[0])
 
 
 def test_waves_within_a_wave() -> None:
@@ -424,10 +431,10 @@ def test_waves_within_a_wave() -> None:
     def density(positions: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
         waves, parts = Waves(), positions.chunk(2)
         for part in parts:
-            waves.evaluate(len(part), lambda part=part: inner.density(part))
+            waves.evaluate(len(part), lambda part=part: at(inner, part))
         order = torch.arange(len(positions)).flip(0)
-        sigma, _ = waves.choose(order, lambda: inner.density(positions[order]))
-        mine, features = outer.density(positions)
+        sigma, _ = waves.choose(order, lambda: at(inner, positions[order]))
+        mine, features = at(outer, positions)
         return mine + sigma.flip(0), features
 
     compare(nn.ModuleList([inner, outer]), density, chosen())
@@ -438,7 +445,7 @@ def test_nan_is_kept() -> None:
     field = EncodedField(BOX, grid())
 
     def density(positions: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
-        return field.density(torch.where(positions[:, :1] > 0.5, math.nan, positions))
+        return at(field, torch.where(positions[:, :1] > 0.5, math.nan, positions))
 
     found, seen, ran = in_waves(density, chosen())
     assert ran == set()

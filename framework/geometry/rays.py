@@ -115,6 +115,7 @@ class Samples:
 
     @property
     def num_rays(self) -> int:
+        """R."""
         return self.offsets.shape[0] - 1
 
     @property

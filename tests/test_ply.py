@@ -53,7 +53,10 @@ BAD = {
     "endless line": (b"ply\nformat ascii 1.0\ncomment " + 5000 * b"a", "its header has no 'end_header'"),
     "unknown format": (header("middle_endian"), "its format is 'middle_endian'"),
     "no z": (header("ascii", 2, "float x,float y"), "vertices must have the properties x, y and z"),
-    "x twice": (header("ascii", 2, "float x,float x,float y,float z"), "vertices must have the properties x, y and z, each once"),
+    "x twice": (
+        header("ascii", 2, "float x,float x,float y,float z"),
+        "vertices must have the properties x, y and z, each once",
+    ),
     "a list": (header("ascii", 2, "list uchar int x"), "is not supported"),
     "unknown type": (header("ascii", 2, "quad x"), "property 'quad x'"),
     "negative count": (header("ascii", -2), "'vertex' comes first"),

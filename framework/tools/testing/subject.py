@@ -69,7 +69,7 @@ class Learner:
         seed_step(SEED, self.done)
         count = min(self.config.num_rays_per_batch, RAYS)
         background = training_background(self.config.background, self.dataset.scene.has_alpha)
-        return draw_batch(self.dataset, count, background, places=places)
+        return draw_batch(self.dataset, count, background, subpixels=places)
 
     def rendered(self, rays: Rays, background: Tensor) -> Rendered:
         """The picture of rays as the next step sees it."""

@@ -11,7 +11,9 @@ import pytest
 import framework
 
 ROOT = Path(__file__).parents[1]
-FILES = sorted(file for folder in ("nerfloom", "framework", "methods", "dataparsers") for file in (ROOT / folder).rglob("*.py"))
+FILES = sorted(
+    file for folder in ("nerfloom", "framework", "methods", "dataparsers") for file in (ROOT / folder).rglob("*.py")
+)
 
 
 def named(file: Path) -> str:

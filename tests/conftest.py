@@ -17,7 +17,9 @@ import numpy as np
 import pytest
 import torch
 
-torch.set_num_threads(2)
+# Processes of tests share the cores (pytest -n auto), and small tensors gain nothing by a second thread. Tests that are
+# about threads ask for them.
+torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -96,6 +98,15 @@ def edit_json(tiny: Path) -> EditJson:
         file.write_text(json.dumps(content))
 
     return edit
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    """Torch and the kernels share their work out over two threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
 
 
 Refused = Callable[..., str]

@@ -63,7 +63,7 @@ def test_subpixels_are_a_turned_grid(count: int) -> None:
 
 @pytest.mark.parametrize("count", [0, 2, 5, 15])
 def test_no_other_number_of_subpixels(count: int) -> None:
-    with pytest.raises(ValueError, match="the square of a whole number"):
+    with pytest.raises(ValueError, match="must be a square number"):
         subpixels(count)
 
 

@@ -111,7 +111,7 @@ def of_parts(config: Any, *kinds: type) -> Method:
 
 
 class LightField(Model[TinyConfig]):
-    """Colour and opacity of a ray by two layers: learns from pixels, and is no RayModel."""
+    """Colour and opacity of a ray by two layers, from where it passes the origin: learns from pixels, and is no RayModel."""
 
     batches: ClassVar[Literal["pixels", "views"]] = "pixels"
 
@@ -120,7 +120,8 @@ class LightField(Model[TinyConfig]):
         self.net = nn.Sequential(nn.Linear(6, 64), nn.ReLU(), nn.Linear(64, 4))
 
     def shown(self, rays: Rays, background: Tensor) -> tuple[Tensor, Tensor]:
-        values = torch.sigmoid(self.net(torch.cat([rays.origins, rays.directions], dim=-1)).float())
+        nearest = rays.origins - (rays.origins * rays.directions).sum(-1, keepdim=True) * rays.directions
+        values = torch.sigmoid(self.net(torch.cat([nearest, rays.directions], dim=-1)).float())
         opacity = values[:, 3:]
         return opacity * values[:, :3] + (1 - opacity) * background, opacity[:, 0]
 

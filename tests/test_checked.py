@@ -52,13 +52,13 @@ def test_what_is_no_dictionary_is_refused(values: Any) -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"box": BOX[0]}, r"box has the shape \(3,\)"),
+        ({"box": BOX[0]}, r"box has shape \(3,\)"),
         ({"box": BOX.to_sparse()}, "box"),
         ({"box": BOX.long()}, "box"),
         ({"box": "cube"}, "Scene.box is 'cube'"),
-        ({"box": BOX * torch.nan}, "beyond measure"),
-        ({"box": BOX * 1e38}, "beyond measure"),
-        ({"box": 0 * BOX}, "no size"),
+        ({"box": BOX * torch.nan}, "empty or too large"),
+        ({"box": BOX * 1e38}, "empty or too large"),
+        ({"box": 0 * BOX}, "empty or too large"),
         ({"far": 0.0}, "far 0.0"),
         ({"near": float("nan")}, "near nan"),
         ({"image_size": 2**62}, "images of 4611686018427387904 pixels"),
@@ -66,9 +66,9 @@ def test_what_is_no_dictionary_is_refused(values: Any) -> None:
         ({"moving": 1}, "Scene.moving is 1"),
         ({"poses": "guessed"}, "Scene.poses is 'guessed'"),
         ({"poses": BOX}, "Scene.poses is "),
-        ({"num_cameras": 6}, "6 cameras, which do not fit"),
-        ({"num_cameras": 10**12, "camera_to_worlds": None}, "1000000000000 cameras"),
-        ({"camera_to_worlds": POSES[:, :2]}, "5 cameras, which do not fit"),
+        ({"num_cameras": 6}, "number of cameras, 6, does not match"),
+        ({"num_cameras": 10**12, "camera_to_worlds": None}, "number of cameras, 1000000000000"),
+        ({"camera_to_worlds": POSES[:, :2]}, "number of cameras, 5, does not match"),
     ],
 )
 def test_scenes_that_cannot_be_are_refused(changes: dict[str, Any], words: str) -> None:

@@ -116,5 +116,5 @@ def test_impossible_cameras_are_refused(params: list[float], words: str) -> None
 
 @pytest.mark.parametrize("size", [(0, 480), (640, 2**64 - 1)])
 def test_impossible_sizes_are_refused(size: tuple[int, int]) -> None:
-    with pytest.raises(DataError, match=f"cannot be: {size[0]}x{size[1]} pixels"):
+    with pytest.raises(DataError, match=f"is invalid: {size[0]}x{size[1]} pixels"):
         from_colmap("PINHOLE", [500.0, 500.0, 320.0, 240.0], *size)

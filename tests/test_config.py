@@ -1,12 +1,17 @@
 """Settings: to YAML and back, and wrong ones refused by name."""
 
+import contextlib
 import dataclasses
+import io
+import typing
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import tyro
 import yaml
 
-from framework.base.config import TrainConfig, from_plain, to_plain
+from framework.base.config import RayConfig, TrainConfig, from_plain, to_plain
 from framework.base.errors import ConfigError
 from framework.base.registry import load_method, registered
 from framework.training.run import read_run
@@ -47,7 +52,7 @@ def test_every_methods_config_survives_yaml(method: str) -> None:
 )
 def test_wrong_values_are_named(values: dict, words: str) -> None:
     with pytest.raises(ConfigError) as error:
-        from_plain(TrainConfig(), values, "file.yml")
+        from_plain(RayConfig(), values, "file.yml")
     assert words in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -68,7 +73,7 @@ def test_numbers_as_yaml_writes_them() -> None:
         ("method: !!int ''", "is not plain YAML"),
         ("method: !!bool perhaps", "is not plain YAML"),
         ("method: !!timestamp now", "is not plain YAML"),
-        ("method: &a instant-ngp\nexperiment_name: *a", "an alias (*name) stands for something else"),
+        ("method: &a instant-ngp\nexperiment_name: *a", "it has an alias (*name)"),
         ("method: instant-ngp\nmachine: {seed: 18446744073709551616}", "'seed' is 18446744073709551616; it must be"),
         ('method: instant-ngp\ndata: "a\\0b"', r"'data' is 'a\x00b'; it must be Path"),
         ('method: instant-ngp\n"a\\nb": 4', r"unknown key 'a\nb'"),
@@ -94,7 +99,7 @@ def test_bad_recipes_are_refused_in_one_line(tmp_path: Path, text: str, words: s
 @pytest.mark.parametrize("sign", ["", "-"])
 def test_numbers_of_more_digits_than_python_writes(tmp_path: Path, sign: str) -> None:
     path = tmp_path / "recipe.yml"
-    refused = {"0x" + 5000 * "f": "a huge whole number; it must be int", "1" + 300 * ":1" + ".0": "is not plain YAML"}
+    refused = {"0x" + 5000 * "f": "a huge integer; it must be int", "1" + 300 * ":1" + ".0": "is not plain YAML"}
     for number, words in refused.items():
         path.write_text(f"method: instant-ngp\nmax_eval_images: {sign}{number}")
         with pytest.raises(ConfigError, match=words):
@@ -137,3 +142,51 @@ RECIPES = [p for p in (Path(__file__).parents[1] / "configs").glob("*.yml") if n
 @pytest.mark.parametrize("path", sorted(RECIPES), ids=lambda p: p.name)
 def test_the_recipes_of_this_repository_load(path: Path) -> None:
     assert read_run(path).method in registered("methods")
+
+
+# -- defaults changed by class keywords ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Settings(RayConfig, learning_rate=0.25, samples_per_batch=64, lr_schedule="cosine"):
+    """Inherited settings with other defaults."""
+
+    own: int = 3
+    """A setting of its own."""
+
+
+@dataclass(frozen=True)
+class More(Settings, learning_rate=0.5, own=4):
+    """The same once more."""
+
+
+def test_class_keywords_change_defaults_and_nothing_else() -> None:
+    assert (Settings().learning_rate, Settings().samples_per_batch, Settings().lr_schedule) == (0.25, 64, "cosine")
+    assert (More().learning_rate, More().own, More().samples_per_batch) == (0.5, 4, 64)
+    assert (RayConfig().learning_rate, RayConfig().samples_per_batch) == (5e-4, None)
+    changed = {"learning_rate": 0.25, "samples_per_batch": 64, "lr_schedule": "cosine", "own": 3}
+    assert to_plain(Settings()) == to_plain(RayConfig()) | changed
+
+
+def test_class_keywords_keep_type_order_and_help() -> None:
+    hints, inherited = typing.get_type_hints(More), typing.get_type_hints(RayConfig)
+    for name in ("learning_rate", "samples_per_batch", "lr_schedule"):
+        assert hints[name] == inherited[name]
+    assert hints["own"] is int
+    names = [field.name for field in dataclasses.fields(RayConfig)]
+    assert [field.name for field in dataclasses.fields(More)] == [*names, "own"]
+    with pytest.raises(ConfigError, match="must be one of constant, exponential"):
+        from_plain(More(), {"lr_schedule": "linear"}, "text")
+    shown = io.StringIO()
+    with pytest.raises(SystemExit), contextlib.redirect_stdout(shown):
+        tyro.cli(More, args=["--help"])
+    text = " ".join(shown.getvalue().replace("│", " ").split())
+    assert "Adam's learning rate at the start. (default: 0.5)" in text
+    assert "A setting of its own. (default: 4)" in text
+
+
+def test_a_class_keyword_that_is_no_setting_is_refused() -> None:
+    with pytest.raises(TypeError, match="Wrong inherits no setting 'learning_rat'"):
+
+        class Wrong(TrainConfig, learning_rat=1.0):
+            pass

@@ -18,7 +18,7 @@ def by_brute_force(camera: Cameras) -> torch.Tensor:
     flat = torch.arange(int(camera.offsets[-1]))
     indices = torch.searchsorted(camera.offsets, flat, right=True) - 1
     within = flat - camera.offsets[indices]
-    found = camera.look(indices, within % camera.widths[indices], within // camera.widths[indices])[2].found
+    found = camera.look(indices, within % camera.widths[indices], within // camera.widths[indices])[2].valid
     return flat[~found]
 
 

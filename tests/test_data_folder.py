@@ -20,7 +20,7 @@ def test_a_part_of_a_data_folder_stands_for_it(part: str, shared_tiny: Path) -> 
 def test_what_is_called_otherwise_stands_for_itself(tiny: Path) -> None:
     """Photographs that happen to lie in a data folder are not what was trained on before."""
     shutil.copytree(tiny / "train", tiny / "new photographs")
-    with pytest.raises(DataError, match="there are 10 photographs, but no camera poses"):
+    with pytest.raises(DataError, match="there are 10 images, but no camera poses"):
         find_data(tiny / "new photographs")
     (tiny / "other.json").write_text("{}")
     with pytest.raises(DataError, match=r"as a transforms\.json: --data .*other\.json nerfstudio$"):
@@ -32,7 +32,7 @@ def advised(path: Path) -> list[str]:
     """The words of the command in what is said of a path."""
     with pytest.raises(DataError) as error:
         find_data(path)
-    return shlex.split(str(error.value).partition("Find them first: ")[2].partition(" (then: ")[0])
+    return shlex.split(str(error.value).partition("Estimate them first: ")[2].partition(" (then: ")[0])
 
 
 def test_photographs_and_videos_get_a_command_to_paste(tiny: Path, tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ def write_deep_png(path: Path, channels: int, size: int = 20) -> None:
 @pytest.mark.parametrize("channels", [1, 3, 4])
 def test_sixteen_bits_a_channel_are_refused_not_cut(tmp_path: Path, channels: int) -> None:
     write_deep_png(tmp_path / "deep.png", channels)
-    with pytest.raises(DataError, match=r"deep\.png has more than 8 bits a channel; convert it"):
+    with pytest.raises(DataError, match=r"deep\.png has more than 8 bits per channel; convert it"):
         read_image(tmp_path / "deep.png")
 
 
@@ -166,7 +166,7 @@ def test_missing_files_are_counted_once_and_all_missing_is_an_error(
     said = capsys.readouterr().err
     assert said.count("split 'val': 3 of 4 images are missing and skipped") == 1
     assert str(paths[0]) in said
-    with pytest.raises(DataError, match="split 'test' has no image: its data lists 1, of which none exists"):
+    with pytest.raises(DataError, match="split 'test' has no image: none of the 1 files listed in the data exists"):
         existing(paths[:1], "test")
 
 
@@ -214,6 +214,6 @@ def test_arrays_of_both_kinds_become_one_and_an_opaque_alpha_is_dropped() -> Non
 def test_arrays_that_are_no_images_and_masks_that_leave_nothing_are_refused() -> None:
     with pytest.raises(DataError, match=r"image 1 is float64 \(3, 4, 3\); it must be uint8"):
         from_arrays([noise(4, 3, 0), noise(4, 3, 1) / 255])
-    with pytest.raises(DataError, match="the masks leave no pixel"):
+    with pytest.raises(DataError, match="the masks keep no pixel"):
         from_arrays([noise(4, 3, 0)], [np.zeros((3, 4), bool)])
     assert from_arrays([noise(4, 3, 0)], [np.ones((3, 4), bool)]).kept is None

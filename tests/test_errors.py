@@ -58,8 +58,8 @@ SHOWN = {
     "text": ("a'b", '"a\'b"'),
     "list": ([1, 2.5, "x"], "[1, 2.5, 'x']"),
     "names": ({"b": 1, "a": None}, "{'a': None, 'b': 1}"),
-    "huge": (10**400, "a huge whole number"),
-    "more digits than Python writes": (-(16**5000), "a huge whole number"),
+    "huge": (10**400, "a huge integer"),
+    "more digits than Python writes": (-(16**5000), "a huge integer"),
     "those in a list": ([16**5000], "a list that cannot be written"),
     "deep": (nested(900), "[[[[...]]]]"),
 }

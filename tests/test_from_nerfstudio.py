@@ -40,7 +40,10 @@ def test_every_flag_that_is_named_exists() -> None:
         (["--pipeline.model.max_res=4096"], "here it is --max-resolution"),
         (["--pipeline.model.predict-normals", "True"], "here it is --predict-normals"),
         (["--pipeline.model.near-plane", "0.1"], "here it is --near"),
-        (["--pipeline.model.collider-params", "1"], "none does this; ns-train nerfacto --help lists them"),
+        (
+            ["--pipeline.model.collider-params", "1"],
+            "there is no equivalent flag; ns-train nerfacto --help lists all flags",
+        ),
         (["--pipeline.datamanager.train-num-rays-per-batch", "64"], "here it is --num-rays-per-batch"),
         (["--pipeline.datamanager.dataparser.downscale-factor", "2"], "here it is --downscale-factor"),
         (["--optimizers.fields.optimizer.lr", "1e-3"], "here it is --learning-rate"),
@@ -51,7 +54,7 @@ def test_every_flag_that_is_named_exists() -> None:
         (["--machine.num-devices", "2"], "a run is one process on one device"),
         (["--load-step", "1000"], "here it is --load-checkpoint"),
         (["blender-data"], "here the data format is called 'blender'"),
-        (["nuscenes-data"], "is not read here"),
+        (["nuscenes-data"], "is not supported here"),
     ],
 )
 def test_flags_and_formats(flags: list[str], answer: str, shared_tiny: Path, refused: Refused) -> None:

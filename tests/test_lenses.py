@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from framework.cameras.cameras import Cameras, subpixels
-from framework.geometry.lenses import LENSES, Distortion, bend, panorama, straighten, unproject
+from framework.geometry.lenses import LENSES, Distortion, distort, panorama, undistort, unproject
 from tests.kernels.compiled import needs_kernels
 
 GOPRO = [-0.23, 0.04, 1.2e-3, -8e-4, 6e-3, 0.02, -0.01, 1e-3, 5e-4]
@@ -157,7 +157,7 @@ def test_the_jacobian_is_autograds() -> None:
     x, y = torch.randn(2, 50, dtype=torch.float64, generator=torch.Generator().manual_seed(2)) * 0.4
     x.requires_grad_()
     y.requires_grad_()
-    u, v, (uu, uv, vv) = bend(x, y, coefficients)
+    u, v, (uu, uv, vv) = distort(x, y, coefficients)
     ux, uy = torch.autograd.grad(u.sum(), (x, y), retain_graph=True)
     vx, vy = torch.autograd.grad(v.sum(), (x, y))
     for found, expected in ((uu, ux), (uv, uy), (uv, vx), (vv, vy)):
@@ -190,9 +190,9 @@ def test_newton_finds_the_one_root_of_any_lens() -> None:
     radius = share * every.reach.clamp(max=3)[:, None]
     x, y = (radius * angle.cos()).reshape(-1), (radius * angle.sin()).reshape(-1)
     index = torch.arange(400).repeat_interleave(50)
-    u, v, _ = bend(x, y, coefficients[index])
-    found_x, found_y, found = straighten(u, v, every[index])
-    again_u, again_v, (uu, uv, vv) = bend(found_x, found_y, coefficients[index])
+    u, v, _ = distort(x, y, coefficients[index])
+    found_x, found_y, found = undistort(u, v, every[index])
+    again_u, again_v, (uu, uv, vv) = distort(found_x, found_y, coefficients[index])
     places = torch.hypot(again_u - u, again_v - v) / (1 + torch.hypot(u, v))
     points = torch.hypot(found_x - x, found_y - y)
     inner = (share < 0.99).repeat(400)  # at the edge the Jacobian vanishes: places 1e-9 apart are points 1e-4 apart
@@ -215,7 +215,7 @@ def test_beyond_the_turning_point_there_is_no_ray() -> None:
     x, y = distance * angle.cos(), distance * angle.sin()
     index = torch.zeros(len(x), dtype=torch.long)
     seen = unproject("opencv", x, y, Distortion.of("opencv", torch.tensor([lens], dtype=torch.float64))[index])
-    assert torch.equal(seen.found, distance < edge)
+    assert torch.equal(seen.valid, distance < edge)
     assert seen.directions.isfinite().all()
     assert seen.spread.isfinite().all()
     torch.testing.assert_close(seen.directions.norm(dim=-1), torch.ones_like(x))
@@ -312,5 +312,5 @@ def test_a_lens_stays_with_its_cameras(model: str, lens: list[float]) -> None:
 def test_coefficients_must_fit_the_model() -> None:
     with pytest.raises(ValueError, match="fisheye takes 4 distortion coefficients, not 9"):
         cameras("fisheye", GOPRO)
-    with pytest.raises(ValueError, match="no camera model 'fish'"):
+    with pytest.raises(ValueError, match="unknown camera model 'fish'"):
         cameras("fish")

@@ -15,7 +15,7 @@ from framework.data.masks import read_mask
 from framework.data.pixel_cache import PixelMemory
 from framework.data.pixel_set import PixelSet
 from framework.data.pixels import composite, draw_batch
-from framework.evaluation.evaluator import evaluate, evaluation_background, render_view
+from framework.evaluation.evaluator import evaluate, evaluation_background
 from framework.evaluation.metrics import psnr, ssim
 from framework.scene.profile import SceneProfile
 from framework.scene.silhouettes import Silhouettes
@@ -94,8 +94,8 @@ def test_a_mask_that_cannot_be_used_is_named(tmp_path: Path) -> None:
     for masks, message in (
         ([tmp_path / "none.png", None, None], r"mask .*none\.png does not exist"),
         ([tmp_path / "broken.png", None, None], r"mask .*broken\.png is not a readable image"),
-        ([wide, None, None], r"mask .*wide\.png is 45x20 pixels, but its photograph is 30x20"),
-        (black, "masks of split 'train' leave no pixel"),
+        ([wide, None, None], r"mask .*wide\.png is 45x20 pixels, but its image is 30x20"),
+        (black, "masks of split 'train' keep no pixel"),
     ):
         with pytest.raises(DataError, match=message):
             load_dataset(parsed(list(scene.image_paths), SIZES, masks), "train")
@@ -136,7 +136,7 @@ def test_ignored_pixels_do_not_count_in_evaluation(shared_tiny: Path, tmp_path: 
     assert found.results["psnr"] != plain.results["psnr"]
     background = evaluation_background(model)
     target = composite(data.image(1).float() / 255, background)
-    rgb = render_view(model, data, 1, background).rgb.clamp(0, 1)
+    rgb = model.render_view(data.view(1), background).rgb.clamp(0, 1)
     kept = some.kept_of(1)
     assert kept is not None
     assert found.per_image[0]["psnr"] == pytest.approx(psnr(rgb[kept], target[kept]), abs=1e-4)

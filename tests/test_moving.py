@@ -7,10 +7,11 @@ from typing import Any
 import pytest
 import torch
 
+from framework.cameras.view import View
 from framework.data.pixels import composite
-from framework.evaluation.evaluator import render_image
 from framework.fields.deformed import DeformedField
 from framework.fields.nerf import NeRFField
+from framework.geometry.points import Points
 from framework.scene.silhouettes import Silhouettes, visual_hull
 from framework.training.trainer import Trainer
 from tests.training.helpers import tiny_run, tiny_trainer
@@ -53,7 +54,7 @@ def mean_squared_error(trainer: Trainer) -> float:
     photographs, white = trainer.train_set, torch.ones(3)
     errors = []
     for index in (0, len(photographs) // 2):
-        image = render_image(trainer.model, photographs.cameras, index, white, photographs.times)
+        image = trainer.model.render_view(photographs.view(index), white)
         photograph = composite(photographs.image(index).float() / 255, white)
         errors.append((image.rgb - photograph).square().mean())
     return float(torch.stack(errors).mean())
@@ -68,7 +69,7 @@ def test_colours_follow_time(name: str, shared_tiny: Path, tmp_path: Path) -> No
     cameras, white = trainer.train_set.cameras, torch.ones(3)
     found = []
     for time in (0.0, 1.0):
-        image = render_image(trainer.model, cameras, 0, white, torch.full((len(cameras),), time))
+        image = trainer.model.render_view(dataclasses.replace(View.of(cameras, 0), time=time), white)
         ball = image.accumulation > 0.5  # over white, what shines through changes neither difference
         assert ball.float().mean() > 0.05
         found.append(image.rgb[ball].mean(0))
@@ -80,7 +81,7 @@ def test_colours_follow_time(name: str, shared_tiny: Path, tmp_path: Path) -> No
 def test_what_is_deformed_learns_to_move(name: str, shared_tiny: Path, tmp_path: Path) -> None:
     """What is only deformed keeps its colours, as in the paper: so a change of colour is learnt as displacement."""
     trainer = moving_trainer(name, shared_tiny, tmp_path, max_num_iterations=60)
-    field, positions = trainer.model.fine, torch.rand(100, 3)
+    field, positions = trainer.model.field, torch.rand(100, 3)
     small = field.displacement(positions, torch.ones(100)).abs().max()
     before = mean_squared_error(trainer)
     trainer.train()
@@ -111,12 +112,12 @@ def test_nothing_is_displaced_at_time_zero() -> None:
     moved = field.displacement(positions, times)
     assert bool((moved[times == 0] == 0).all())
     assert bool((moved[times > 0] != 0).all())
-    sigma, features = field.density(positions, times)
-    expected, known = canonical.density(positions + moved)
+    sigma, features = field.density(Points(positions, times))
+    expected, known = canonical.density(Points(positions + moved))
     torch.testing.assert_close(sigma, expected)
     torch.testing.assert_close(features, known)
     with pytest.raises(ValueError, match="needs the times"):
-        field.density(positions)
+        field.density(Points(positions))
 
 
 def test_a_moving_scene_keeps_its_pixels_and_its_union_of_cells(shared_tiny: Path, tmp_path: Path) -> None:

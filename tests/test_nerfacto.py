@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from framework.evaluation.evaluator import evaluate, render_image
+from framework.evaluation.evaluator import evaluate
 from framework.fields.appearance import Appearance
 from framework.training.trainer import Trainer
 from tests.training.helpers import tiny_run, tiny_trainer
@@ -60,7 +60,7 @@ def test_what_is_asked_for_is_done_and_not_called_a_decision(shared_tiny: Path, 
     trainer = captured(shared_tiny, tmp_path, facts, **asked)
     assert not {"contraction", "distortion loss", "appearance features", "pose refinement"} & chosen(trainer).keys()
     assert trainer.model.poses is None
-    assert not trainer.model.unbounded
+    assert not trainer.model.field.unbounded
 
 
 @pytest.mark.parametrize("unbounded", [True, False])
@@ -75,8 +75,7 @@ def test_it_learns(unbounded: bool, shared_tiny: Path, tmp_path: Path) -> None:
 def test_gradients_fade_towards_the_camera(shared_tiny: Path, tmp_path: Path) -> None:
     """Moving a scene to a tenth of the distance scales its gradients by a hundredth, values being the same."""
     trainer = captured(shared_tiny, tmp_path, {"unbounded": True})
-    model = trainer.model
-    assert model.scales_gradients
+    assert trainer.model.renderer.unit_length is not None
     from framework.kernels.math import scale_gradient
 
     values = torch.ones(3, 2, requires_grad=True)
@@ -126,7 +125,7 @@ def test_normals_are_learnt_and_shown(shared_tiny: Path, tmp_path: Path) -> None
     trainer = captured(shared_tiny, tmp_path, {}, predict_normals=True, max_num_iterations=150)
     trainer.train()
     assert {"normals", "orientation"} <= trainer.train_step().losses.keys()
-    image = render_image(trainer.model, trainer.train_set.cameras, 0, torch.ones(3))
+    image = trainer.model.render_view(trainer.train_set.view(0), torch.ones(3))
     assert image.normals is not None
     middle = image.accumulation > 0.95
     agreement = (image.normals * (2 * image.rgb - 1)).sum(-1)[middle]

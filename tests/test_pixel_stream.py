@@ -14,7 +14,7 @@ from framework.data.error_map import ErrorMap
 from framework.data.pixel_cache import PixelMemory
 from framework.data.pixel_set import PixelSet
 from framework.data.pixel_stream import PixelStream
-from framework.data.pixels import Batch, draw_batch, draw_pixels
+from framework.data.pixels import PixelBatch, draw_batch, draw_pixels
 from framework.training.checkpoint import load_checkpoint
 from tests.images import write_noise
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
@@ -30,13 +30,15 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Dataset]:
     return load_dataset(scene, "train"), load_dataset(scene, "train", PixelMemory(0, folder / "cache"))
 
 
-def batch(data: Dataset, step: int, count: int, stream: PixelStream | None, errors: ErrorMap | None = None) -> Batch:
+def batch(
+    data: Dataset, step: int, count: int, stream: PixelStream | None, errors: ErrorMap | None = None
+) -> PixelBatch:
     seed_step(SEED, step)
     look_up = None if stream is None else partial(stream.look_up, step)
     return draw_batch(data, count, "random", errors, look_up=look_up)
 
 
-def assert_same(one: Batch, two: Batch) -> None:
+def assert_same(one: PixelBatch, two: PixelBatch) -> None:
     assert torch.equal(one.pixels, two.pixels)
     assert torch.equal(one.rgb, two.rgb)
     assert torch.equal(one.rays.directions, two.rays.directions)

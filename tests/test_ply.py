@@ -49,20 +49,23 @@ def test_no_points(tmp_path: Path) -> None:
 BAD = {
     "empty": (b"", "not a PLY file"),
     "an image": (b"\x89PNG\r\n\x1a\n" + 100 * b"\0", "not a PLY file"),
-    "no end": (b"ply\nformat ascii 1.0\n", "its header has no end"),
-    "endless line": (b"ply\nformat ascii 1.0\ncomment " + 5000 * b"a", "its header has no end"),
+    "no end": (b"ply\nformat ascii 1.0\n", "its header has no 'end_header'"),
+    "endless line": (b"ply\nformat ascii 1.0\ncomment " + 5000 * b"a", "its header has no 'end_header'"),
     "unknown format": (header("middle_endian"), "its format is 'middle_endian'"),
-    "no z": (header("ascii", 2, "float x,float y"), "with the properties x, y and z"),
-    "x twice": (header("ascii", 2, "float x,float x,float y,float z"), "with the properties x, y and z, each once"),
-    "a list": (header("ascii", 2, "list uchar int x"), "lists are not read"),
-    "unknown type": (header("ascii", 2, "quad x"), "the property 'quad x'"),
+    "no z": (header("ascii", 2, "float x,float y"), "vertices must have the properties x, y and z"),
+    "x twice": (
+        header("ascii", 2, "float x,float x,float y,float z"),
+        "vertices must have the properties x, y and z, each once",
+    ),
+    "a list": (header("ascii", 2, "list uchar int x"), "is not supported"),
+    "unknown type": (header("ascii", 2, "quad x"), "property 'quad x'"),
     "negative count": (header("ascii", -2), "'vertex' comes first"),
     "faces first": (header("ascii").replace(b"element v", b"element face 3\nelement v"), "'face' comes first"),
-    "more than there is": (header("binary_little_endian", 10**12) + 24 * b"\0", "is cut off"),
-    "more than there is, ascii": (header("ascii", 10**12) + b"1 2 3\n", "is cut off"),
-    "cut off": (header("binary_little_endian", 3) + 24 * b"\0", "is cut off"),
+    "more than there is": (header("binary_little_endian", 10**12) + 24 * b"\0", "is truncated"),
+    "more than there is, ascii": (header("ascii", 10**12) + b"1 2 3\n", "is truncated"),
+    "truncated": (header("binary_little_endian", 3) + 24 * b"\0", "is truncated"),
     "short line": (header("ascii") + b"1 2 3\n1 2\n   \n", "point 1 has 2 values instead of 3"),
-    "words": (header("ascii") + b"1 2 3\nx y z\n", "point 1 is not made of numbers"),
+    "words": (header("ascii") + b"1 2 3\nx y z\n", "a value of point 1 is not a number"),
 }
 
 

@@ -11,7 +11,7 @@ from dataparsers.blender import Blender
 from dataparsers.procedural import Procedural
 from framework.base.registry import load_method
 from framework.data.dataset import DataParser
-from framework.evaluation.evaluator import evaluate, evaluation_background, render_view
+from framework.evaluation.evaluator import evaluate, evaluation_background
 from framework.training.datasets import load_split
 from framework.training.run import Run, create_folder
 from framework.training.trainer import Trainer
@@ -38,13 +38,13 @@ def test_the_embedded_scene_in_colour_and_depth(tmp_path: Path) -> None:
     psnr = evaluate(trainer.model, test_set, max_images=8).results["psnr"]
     errors, opacity_errors = [], []
     for index in range(0, 16, 2):
-        view = render_view(trainer.model, test_set, index, evaluation_background(trainer.model))
+        view = trainer.model.render_view(test_set.view(index), evaluation_background(trainer.model))
         path = parser.parse(None, "test").image_paths[index]
         with np.load(path.with_name(f"{path.stem}_geometry.npz")) as geometry:
             truth = torch.from_numpy(geometry["depth"])
         alpha = test_set.image(index)[..., 3].float() / 255
         solid = torch.isfinite(truth) & (alpha == 1)
-        errors.append((view.depth - truth)[solid].abs())
+        errors.append((view.median_depth - truth)[solid].abs())
         opacity_errors.append((view.accumulation - alpha).abs())
     depth = torch.cat(errors).median().item()
     opacity = torch.cat([e.flatten() for e in opacity_errors]).mean().item()

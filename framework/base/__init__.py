@@ -1,1 +1,1 @@
-"""Settings, messages, the machine and names: what everything else stands on."""
+"""Configs, error messages, devices and the registry of names, on which all other rooms build."""

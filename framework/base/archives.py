@@ -1,4 +1,4 @@
-"""Zip files, in which torch and numpy keep arrays: a small one may stand for more than memory holds."""
+"""Zip files, the container of PyTorch's checkpoints and of numpy's .npz: a small file may expand beyond memory."""
 
 from __future__ import annotations
 
@@ -8,9 +8,13 @@ from typing import BinaryIO
 
 
 def unfolded_size(file: Path | BinaryIO) -> int:
-    """Bytes that a zip file's entries take together once they are read, as its list of them says.
+    """Return the uncompressed size in bytes of all entries of a zip file, as its directory states it.
 
-    Raises: zipfile.BadZipFile where it is none; what is damaged brings other errors too.
+    Args:
+        file: path, or binary file open for reading.
+
+    Raises:
+        zipfile.BadZipFile: if `file` is not a zip file. A damaged one may raise other errors.
     """
     with zipfile.ZipFile(file) as archive:
         return sum(entry.file_size for entry in archive.infolist())

@@ -1,4 +1,4 @@
-"""numpy's files of a single array (.npy), as far as they are as long as they say."""
+"""Reading of .npy files that may be damaged."""
 
 from __future__ import annotations
 
@@ -8,21 +8,25 @@ import numpy as np
 
 
 def read_array(path: Path) -> np.ndarray:
-    """The array of a .npy file.
+    """Read the array of a .npy file.
 
-    No more memory is asked for than the file has bytes, whatever its header claims.
+    The memory allocated is at most the size of the file, whatever shape the header claims.
 
-    Raises: OSError where it cannot be read; ValueError, and whatever else numpy raises, where it is no such file, is
-        cut short, or would have to run code.
+    Args:
+        path: the file.
+
+    Raises:
+        OSError: if the file cannot be read.
+        ValueError: if it is not a .npy file, is truncated, or holds pickled objects. numpy may raise other errors.
     """
     with path.open("rb") as file:
         start = file.read(12)
-    # Version 1 counts its header's bytes by two bytes; later ones by four, and numpy makes room for as many.
+    # Version 1 stores the header's length in two bytes, later versions in four; numpy allocates that many bytes.
     if start[6:7] > b"\1" and int.from_bytes(start[8:], "little") > path.stat().st_size:
         raise ValueError("it is shorter than its header")
-    with np.errstate(over="ignore"):  # a claimed shape's product
-        found = np.load(path, mmap_mode="r", allow_pickle=False)  # a mapping longer than the file is refused
-    if not isinstance(found, np.ndarray):
-        found.close()
+    with np.errstate(over="ignore"):  # the product of the claimed shape
+        array = np.load(path, mmap_mode="r", allow_pickle=False)  # numpy refuses a mapping longer than the file
+    if not isinstance(array, np.ndarray):
+        array.close()
         raise ValueError("it holds several arrays")
-    return np.array(found)  # copied: whoever cuts a mapped file short kills the process that reads on
+    return np.array(array)  # a copy: if another process truncated a mapped file, reading it would kill this one

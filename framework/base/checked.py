@@ -1,4 +1,4 @@
-"""Dataclasses from values out of files that nobody has checked: each value must be what its field says."""
+"""Construction of dataclasses from untrusted values, with each value checked against its field's type."""
 
 from __future__ import annotations
 
@@ -12,25 +12,35 @@ T = TypeVar("T")
 
 
 def checked(kind: type[T], values: Any) -> T:
-    """A dataclass made of a dictionary.
+    """Construct a dataclass from a dictionary of field values.
 
-    Raises: ValueError that says which value is missing, unknown, or not of its field's type.
+    Args:
+        kind: the dataclass.
+        values: the field values by name; anything but a dictionary is refused.
+
+    Raises:
+        ValueError: if `values` is no dictionary, or a value is missing, unknown or not of its field's type.
     """
     if not isinstance(values, dict):
-        raise ValueError(f"{kind.__name__} is {shown(values)}; it must be names and values")
+        raise ValueError(f"{kind.__name__} is {shown(values)}; it must be a mapping of names to values")
     try:
-        made = kind(**values)
+        instance = kind(**values)
     except TypeError as error:
         raise ValueError(str(error)) from error
     for name, hint in typing.get_type_hints(kind).items():
-        value = getattr(made, name)
+        value = getattr(instance, name)
         if not is_of(value, hint):
             raise ValueError(f"{kind.__name__}.{name} is {shown(value)}; it must be {shown(hint)}")
-    return made
+    return instance
 
 
 def is_of(value: Any, hint: Any) -> bool:
-    """Whether a value is of an annotated type: a class, or a union, literals or a tuple of such; True is no number."""
+    """Return whether `value` is of the annotated type `hint`.
+
+    Args:
+        value: any object.
+        hint: a class, or a union, `Literal` or tuple of classes. A bool does not count as a number.
+    """
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (Union, types.UnionType):
         return any(is_of(value, argument) for argument in arguments)

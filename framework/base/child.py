@@ -1,33 +1,34 @@
-"""A command of ours in another process, with the package that this process runs.
+"""Running a module of this package in a child process, with the package that this process has imported.
 
-`python -m` would put the working folder first on the path, where a file framework.py, or a checkout without compiled
-kernels, would be taken for the package. So children run this file, which knows where the package lies.
+`python -m` would put the working directory first on `sys.path`, where a file framework.py, or a checkout without
+compiled kernels, would be imported instead. So a child process runs this file, which finds its own package.
 """
 
 import sys
 from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[1]
-"""The folder of this package."""
+"""Directory of this package."""
 
 
 def python_command(module: str, *arguments: object) -> list[str]:
-    """The words that run a module of this package as a program, whatever folder they are run in.
+    """Return the command line that runs a module of this package as a program, from any working directory.
 
     Args:
-        module: its full name, as in framework.cli.train.
+        module: full name of the module, such as framework.cli.train.
+        arguments: command-line arguments, converted to strings.
     """
     return [sys.executable, str(Path(__file__).resolve()), module, *map(str, arguments)]
 
 
 def _use_this_package() -> None:
-    """Let imports find this package: the path has the folder of this file, and may lack the one of the package."""
+    """Make imports find this package: Python puts this file's directory on the path, not the package's parent."""
     here = Path(__file__).resolve().parent
-    sys.path[:] = [place for place in sys.path if not place or Path(place).resolve() != here]
+    sys.path[:] = [entry for entry in sys.path if not entry or Path(entry).resolve() != here]
     from importlib.util import find_spec
 
-    found = find_spec(PACKAGE.name)
-    if found is None or found.origin is None or Path(found.origin).resolve().parent != PACKAGE:
+    spec = find_spec(PACKAGE.name)
+    if spec is None or spec.origin is None or Path(spec.origin).resolve().parent != PACKAGE:
         sys.path.insert(0, str(PACKAGE.parent))
 
 

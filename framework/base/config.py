@@ -1,6 +1,6 @@
-"""Settings: one flat frozen dataclass a method, to and from plain YAML.
+"""Configs of methods: flat frozen dataclasses, read from and written to plain YAML.
 
-This module imports neither torch nor any method, so that the command line answers at once.
+This module imports neither PyTorch nor any method, so that the command line starts at once.
 """
 
 from __future__ import annotations
@@ -38,31 +38,31 @@ else:
 AUTO: Any = None
 """The default of an `Auto` setting."""
 Range = tuple[float, float]
-"""The least and the largest value of a setting, both allowed."""
+"""Minimum and maximum of a setting, both allowed."""
 AT_LEAST_0: Range = (0, math.inf)
 SMALLEST_EPS = 1e-37
-"""Least epsilon of Adam: float32, in which it is added, holds little less, and without one a gradient of 0 is 0 / 0."""
+"""Minimum epsilon of Adam, close to the smallest normal float32. Without epsilon, a gradient of 0 gives 0 / 0."""
 
 
 @dataclass(frozen=True)
 class MachineConfig:
-    """Where the run happens."""
+    """The device of a run, its threads and its seed."""
 
     seed: int = 42
-    """Random seed. The same seed, processor and thread count give the same bits; a GPU's sums differ in rounding."""
+    """Random seed. The same seed, CPU and thread count give the same bits; on a GPU, sums differ in rounding."""
     device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
-    """Device to train on; auto takes CUDA where it is present."""
+    """Device to train on; auto: CUDA if available, else the CPU."""
     num_threads: int | None = None
-    """Processor threads; all cores if not given."""
+    """CPU threads; all cores if not given."""
 
     def __post_init__(self) -> None:
         if not -(2**63) <= self.seed < 2**63:
-            raise ConfigError(f"--machine.seed is {shown(self.seed)}; it must be a number of 64 bits")
+            raise ConfigError(f"--machine.seed is {shown(self.seed)}; it must be an integer of 64 bits")
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """What every method can be told. A method's config derives from this and changes the defaults."""
+    """Settings of every method. A method's config derives from this class and changes defaults."""
 
     RANGES: ClassVar[dict[str, Range]] = {
         "max_num_iterations": (1, math.inf),
@@ -74,67 +74,70 @@ class TrainConfig:
         "max_eval_images": AT_LEAST_0,
         "lr_warmup_steps": AT_LEAST_0,
     }
-    """What numbers may be, by name: a method's config names its own, and may change those of others. None, where it is
-    allowed, is in every range; of several numbers each must be in it."""
+    """Allowed range of each numeric setting. A method's config adds its own, and may override these. None, where it
+    is allowed, is in every range; of a tuple, each number must be in the range."""
     data: Path | None = None
-    """Folder of the data set. The embedded scene if not given."""
+    """Folder of the data set; the embedded scene if not given."""
     cache_limit: float | None = None
-    """MB (1e6 bytes) of a split's decoded pixels that memory may hold; more goes to disk. If None, half of memory."""
+    """Memory for a split's decoded pixels, MB (1e6 bytes); more goes to disk. Half of memory if not given."""
     cache_dir: Path | None = None
-    """Folder of decoded pixels that memory may not hold; nerfloom in the user's cache folder if not given."""
+    """Folder of decoded pixels on disk; nerfloom in the user's cache folder if not given."""
     output_dir: Path = Path("outputs")
-    """Folder under which the run's folder is made."""
+    """Folder in which the run's folder is created."""
     experiment_name: str | None = None
-    """First part of the run's folder; the data folder's name if not given."""
+    """First part of the run folder's path; the data folder's name if not given."""
     timestamp: str | None = None
-    """Last part of the run's folder; date and time if not given."""
+    """Last part of the run folder's path; date and time if not given."""
     max_num_iterations: int = 30_000
     """Stop after this many steps."""
     max_seconds: float | None = None
-    """Stop after this many seconds of training; evaluation and saving do not count."""
+    """Stop after this many seconds of training; evaluation and saving are not counted."""
     target_psnr: float | None = None
-    """Stop once the periodic evaluation over all images reaches this PSNR, dB."""
+    """Stop when a periodic evaluation of all validation images reaches this PSNR, dB."""
     steps_per_save: int = 2_000
     """Steps between checkpoints."""
     seconds_per_save: float = 60.0
-    """A checkpoint is written at the latest after this many seconds of training."""
+    """Maximum seconds of training between checkpoints."""
     save_only_latest_checkpoint: bool = True
     """Keep the two newest checkpoints, not all."""
     steps_per_eval_image: int = 500
-    """Steps between renders of one evaluation image for TensorBoard; fewer where they would slow training by 10 %."""
+    """Steps between renders of one held-out image for TensorBoard; more if they would slow training by 10 %."""
     steps_per_eval_all_images: int = 10_000
-    """Steps between evaluations over all images of the validation split; a few of them are looked at more often."""
+    """Steps between evaluations of all validation images; a few of them are evaluated more often."""
     seconds_per_eval_all_images: float | None = None
-    """Seconds of training between evaluations over all images; 15 if --target-psnr is given and this is not."""
+    """Seconds of training between evaluations of all images; 15 if --target-psnr is given and this is not."""
     max_eval_images: int | None = None
-    """Evaluate at most this many images, evenly spread; all if not given, none for 0."""
+    """Maximum number of evaluated images, evenly spaced; all if not given, none if 0."""
     vis: Literal["tensorboard", "none"] = "tensorboard"
-    """Where curves and pictures go during training."""
+    """Where training curves and rendered images are written."""
     mixed_precision: bool | None = None
-    """bfloat16 networks, float32 density and compositing. If not given: where the device multiplies bfloat16 fast."""
+    """Networks in bfloat16, density and compositing in float32. If not given: if the device multiplies bfloat16
+    fast."""
     load_dir: Path | None = None
     """Start from the newest checkpoint in this folder."""
     load_checkpoint: Path | None = None
     """Start from this checkpoint."""
     learning_rate: float = 5e-4
-    """Adam's learning rate at the start."""
+    """Initial learning rate of Adam."""
     lr_schedule: Literal["constant", "exponential", "cosine", "hold-exponential"] = "exponential"
     """Learning rate over the budget (steps or seconds, whichever is further spent); hold-: constant for half of it."""
     lr_final: float = 0.1
-    """Learning rate at the end of the budget, as a share of the first."""
+    """Learning rate at the end of the budget, as a fraction of the initial one."""
     lr_warmup_steps: int = 0
     """Steps over which the learning rate rises from zero."""
     adam_beta1: float = 0.9
-    """Adam's decay of the mean gradient."""
+    """Adam's decay rate of the mean gradient."""
     adam_beta2: float = 0.999
-    """Adam's decay of the squared gradient."""
+    """Adam's decay rate of the mean squared gradient."""
     adam_eps: float = 1e-8
     """Adam's epsilon."""
     masks: Literal["auto", "ignored", "empty"] = "auto"
-    """What masks say in training of pixels that they do not keep: nothing, or that nothing is there, as around an
-    object that was cut out. auto: the latter if they take away over half of all pixels, not the same of each image."""
+    """Meaning of masked-out pixels in training. ignored: nothing is known about them; empty: nothing is there, as
+    around an object that was cut out; auto: empty if masks remove over half of all pixels, not the same of each
+    image."""
     background: Literal["auto", "random", "white", "black"] = "auto"
-    """Behind transparent pixels in training; auto: random if images have alpha. Evaluation is over white, or black."""
+    """Colour behind transparent pixels in training; auto: random if images have alpha. Evaluation uses white or
+    black."""
     machine: MachineConfig = field(default_factory=MachineConfig)
     """Seed, device and threads."""
 
@@ -176,7 +179,7 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class RayConfig(TrainConfig):
-    """What every method that casts rays can be told."""
+    """Settings of every method that casts rays."""
 
     RANGES: ClassVar[dict[str, Range]] = {
         "num_rays_per_batch": (1, 2**20),
@@ -184,32 +187,32 @@ class RayConfig(TrainConfig):
         "samples_per_batch": (1, 2**24),
         "train_rays_per_pixel_from": (0, 1),
     }
-    """What these numbers may be."""
+    """Allowed ranges."""
     num_rays_per_batch: int = 4_096
-    """Rays in a training step."""
+    """Rays per training step."""
     rays_per_pixel: RaysPerPixel = 1
-    """Rays of which a pixel of a picture is the mean, as a camera sees areas, not points. More: closer, and slower."""
+    """Rays averaged for a pixel, which covers an area, not a point. More rays are more accurate and slower."""
     train_rays_per_pixel_from: float = 1.0
-    """Share of the budget after which training too averages that many rays; until then it uses one."""
+    """Share of the budget after which training averages as many rays per pixel; before, it uses one."""
     samples_per_batch: int | None = None
-    """Let the number of rays follow, so that a step evaluates about this many samples."""
+    """Samples per training step; the number of rays is adjusted to reach about this many."""
     draw_by_error: bool = False
-    """Draw half of the pixels where the error was large lately, with weights that keep the mean loss as it is."""
+    """Draw half of the pixels in proportion to their recent error, with weights that keep the mean loss unbiased."""
     eval_num_rays_per_chunk: int = 8_192
-    """Rays rendered at once in evaluation. It changes memory and speed, never the picture."""
+    """Rays rendered at once in evaluation. This changes memory and speed, never the result."""
 
 
 @dataclass(frozen=True)
 class AppearanceConfig(TrainConfig):
-    """What a method can be told that gives each image an appearance of its own."""
+    """Settings of a method that learns an appearance for each image."""
 
     eval_appearance: Literal["mean", "half"] = "mean"
-    """Appearance of held-out images: the mean of all, or optimised on the left half, the right half being judged
-    (NeRF-W's protocol)."""
+    """Appearance of held-out images: the mean of the training images', or optimised on the left half of each image,
+    with the right half evaluated (NeRF-W's protocol)."""
 
 
 def _check_range(name: str, value: Any, least: float, most: float) -> None:
-    """Refuse a setting, or one of several numbers in it, that is NaN, less than `least` or more than `most`."""
+    """Refuse a setting, or a tuple of settings, with a number that is NaN, below `least` or above `most`."""
     for number in value if isinstance(value, tuple) else (value,):
         if number is not None and not least <= number <= most:
             allowed = f"at least {least}" if most == math.inf else f"from {least} to {most}"
@@ -221,7 +224,11 @@ def _flag(name: str) -> str:
 
 
 def to_plain(value: Any) -> Any:
-    """A config as numbers, strings, lists and dictionaries, fit for the safe YAML dumper."""
+    """Convert a config to numbers, strings, lists and dictionaries, which the safe YAML dumper writes.
+
+    Args:
+        value: a config, or a value of one.
+    """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, Path):
@@ -232,12 +239,15 @@ def to_plain(value: Any) -> Any:
 
 
 def from_plain(default: T, values: dict[str, Any], where: str) -> T:
-    """`default` (a dataclass instance) with the given fields replaced.
+    """Return a config with some fields replaced.
 
     Args:
-        values: plain values, as read from YAML.
-        where: what to call the source in messages.
-    Raises: ConfigError for an unknown key (naming the nearest) or a value of the wrong type.
+        default: instance of a dataclass.
+        values: plain values by field name, as read from YAML.
+        where: name of the source in error messages.
+
+    Raises:
+        ConfigError: for an unknown key, with the nearest valid one, or a value of the wrong type.
     """
     hints = typing.get_type_hints(type(default))
     known = {f.name for f in dataclasses.fields(default)}  # type: ignore[arg-type]
@@ -255,7 +265,7 @@ def from_plain(default: T, values: dict[str, Any], where: str) -> T:
 
 
 def _convert(value: Any, hint: Any, where: str) -> Any:
-    """`value` as the type that `hint` asks for."""
+    """Convert a plain value to the type `hint`."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (Union, types.UnionType):
         if value is None and type(None) in arguments:
@@ -287,23 +297,27 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
 
 
 def _is_count(value: Any) -> bool:
-    """Whether a value is an integer that processors count with; True and False are none, though Python thinks so."""
+    """Return whether a value is an integer of at most 64 bits; bool, which Python counts as an integer, is not."""
     return isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """The safe loader without aliases: a few lines of them can stand for more than memory holds."""
+    """PyYAML's safe loader without aliases: a few lines of them can expand beyond memory."""
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
-            raise yaml.YAMLError("an alias (*name) stands for something else; write it out")
+            raise yaml.YAMLError("it has an alias (*name); write the value out")
         return super().compose_node(parent, index)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """A YAML file that holds a mapping, read by the safe loader, without aliases.
+    """Read a YAML file that holds a mapping, by the safe loader and without aliases.
 
-    Raises: ConfigError where it is missing, not YAML, or not a mapping.
+    Args:
+        path: the file.
+
+    Raises:
+        ConfigError: if the file is missing, is not YAML or does not hold a mapping.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -314,7 +328,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from error
     except ConfigError:
         raise
-    except Exception as error:  # besides YAMLError: bad text, dates and nesting; `!!float ''` is an IndexError
+    except Exception as error:  # not only YAMLError: bad text, dates and nesting raise others, `!!float ''` IndexError
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ConfigError(f"{path} is not plain YAML: {reason}") from error
     if not isinstance(values, dict):

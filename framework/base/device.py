@@ -1,4 +1,4 @@
-"""Where a run computes, and in which precision."""
+"""The device and the numerical precision of a run, and its random streams."""
 
 from __future__ import annotations
 
@@ -15,13 +15,17 @@ from framework.base.config import MachineConfig
 from framework.base.errors import ConfigError
 
 MOST_THREADS = 1024
-"""That a file of settings may ask for: where the system refuses to start as many, OpenMP ends the process."""
+"""Maximum number of threads of a config. OpenMP ends the process if the system refuses to start that many."""
 
 
 def choose_device(machine: MachineConfig) -> torch.device:
-    """The device asked for, with its threads set.
+    """Return the device of a config, and set its number of CPU threads.
 
-    Raises: ConfigError where this machine does not have it, or the number of threads is none.
+    Args:
+        machine: the device type and the number of threads.
+
+    Raises:
+        ConfigError: if this machine lacks the device, or the number of threads is out of range.
     """
     if machine.num_threads is not None:
         if not 1 <= machine.num_threads <= MOST_THREADS:
@@ -36,44 +40,53 @@ def choose_device(machine: MachineConfig) -> torch.device:
 
 
 def has_bfloat16(device: torch.device) -> bool:
-    """Whether the device multiplies bfloat16 matrices in hardware."""
+    """Return whether `device` multiplies bfloat16 matrices in hardware."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported()
     return device.type == "cpu" and bool({"amx_bf16", "avx512_bf16"} & processor_features())
 
 
 def exact(values: Tensor) -> Tensor:
-    """Values in float64: on the processor where their device, MPS, has none, else where they are."""
+    """Return `values` in float64: on the CPU if their device is MPS, which lacks float64, else on their own device."""
     return (values.cpu() if values.device.type == "mps" else values).double()
 
 
 @cache
 def processor_features() -> frozenset[str]:
-    """Instruction sets of this processor, in Linux's names; elsewhere what torch found of AVX2 and AVX-512."""
+    """Return the CPU's instruction sets by Linux's names; elsewhere, AVX2 and AVX-512 if PyTorch detects them."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
-        found = {"AVX2": {"avx2", "fma"}, "AVX512": {"avx2", "fma", "avx512f", "avx512bw", "avx512dq", "avx512vl"}}
-        return frozenset(found.get(torch.backends.cpu.get_cpu_capability(), ()))
+        levels = {"AVX2": {"avx2", "fma"}, "AVX512": {"avx2", "fma", "avx512f", "avx512bw", "avx512dq", "avx512vl"}}
+        return frozenset(levels.get(torch.backends.cpu.get_cpu_capability(), ()))
     return next((frozenset(line.split(":", 1)[1].split()) for line in lines if line.startswith("flags")), frozenset())
 
 
 def seed_step(seed: int, step: int) -> None:
-    """Give step `step` its own random stream.
+    """Seed PyTorch's generators for one step.
 
-    Every draw is then a function of (seed, step): a resumed run repeats an uninterrupted one bit for bit, and
-    what an evaluation between two steps draws does not matter.
+    Every random number is then a function of (seed, step): a resumed run has the same bits as an uninterrupted one, and
+    random numbers drawn by an evaluation between two steps have no effect.
+
+    Args:
+        seed: the run's seed.
+        step: the step's number.
     """
     number = stream_seed(seed, step)
     torch.default_generator.manual_seed(number)
-    if torch.cuda.is_initialized():  # torch.manual_seed would note every call for a CUDA that may come later
+    if torch.cuda.is_initialized():  # before that, torch.manual_seed would queue every call until CUDA starts
         torch.cuda.manual_seed_all(number)
     if torch.backends.mps.is_available():
         torch.mps.manual_seed(number)
 
 
 def stream_seed(seed: int, step: int) -> int:
-    """A well mixed 63-bit number: the seed of the random stream of one step."""
+    """Return the seed of the random stream of one step, a well mixed integer of 63 bits.
+
+    Args:
+        seed: the run's seed.
+        step: the step's number.
+    """
     state = 0x9E3779B97F4A7C15
     for value in (seed, step):
         state = ((state ^ (value & 0xFFFFFFFFFFFFFFFF)) * 0xBF58476D1CE4E5B9) & 0xFFFFFFFFFFFFFFFF
@@ -82,7 +95,14 @@ def stream_seed(seed: int, step: int) -> int:
 
 
 def peak_memory(device: torch.device) -> int:
-    """Most memory held so far, bytes: the device's on CUDA, else the process's; 0 where the system does not tell."""
+    """Return the peak memory use in bytes.
+
+    Args:
+        device: for CUDA, the peak is the device's; otherwise it is the process's.
+
+    Returns:
+        The peak, or 0 if the system does not report it.
+    """
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
     try:
@@ -94,20 +114,20 @@ def peak_memory(device: torch.device) -> int:
 
 
 def wait_for(device: torch.device) -> None:
-    """Let pending work end, so that a clock can be read."""
+    """Wait until all pending work on `device` has finished, so that a time can be measured."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
 
 def machine_memory() -> float:
-    """Bytes of memory that this machine, or the container around this process, has; infinity where neither is told."""
+    """Return the memory in bytes of this machine or of the container around this process; infinity if unknown."""
     try:
-        found = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+        limit = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     except (AttributeError, ValueError, OSError):  # Windows
-        found = math.inf
+        limit = math.inf
     for file in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
         try:
-            found = min(found, float(Path(file).read_text()))
+            limit = min(limit, float(Path(file).read_text()))
         except (OSError, ValueError):  # "max"
             continue
-    return found
+    return limit

@@ -1,11 +1,11 @@
-"""Methods that people ask for by name and that live elsewhere: how to get them, and what comes closest here."""
+"""Methods that users ask for by name and that other projects provide: where to get them, and the closest one here."""
 
 from __future__ import annotations
 
 _NERFSTUDIO = "it is a method of nerfstudio (pip install nerfstudio, ns-train {name})"
 _PLUGIN = "it is a plugin of nerfstudio (pip install git+https://github.com/{repository}, ns-train {name})"
-_GAUSSIANS = "Gaussians are drawn, not sampled along rays, which is all that is done here"
-_SURFACES = "surfaces are not learnt here yet"
+_GAUSSIANS = "Gaussians are rasterised, and all methods here sample along rays"
+_SURFACES = "no method here learns surfaces yet"
 _LARGER = "here it is 'nerfacto' with larger settings:"
 _ZIP_NERF = "the authors' code is https://github.com/jonbarron/camp_zipnerf; 'nerfacto' comes closest here"
 _MIP_NERF = "the authors' code is https://github.com/google/mipnerf; 'vanilla-nerf' comes closest here"
@@ -27,15 +27,15 @@ ELSEWHERE: dict[str, str] = {
     "mip-nerf": _MIP_NERF,
     "mipnerf": _MIP_NERF,
     "nerf": "here it is called 'vanilla-nerf'",
-    "instant-ngp-bounded": "here it is called 'instant-ngp', and the scene's profile tells whether it is bounded",
+    "instant-ngp-bounded": "here it is called 'instant-ngp', and the scene's profile says whether it is bounded",
     "nerfacto-big": f"{_LARGER} --max-resolution 4096 --log2-table-size 21 --hidden-width 128",
     "nerfacto-huge": f"{_LARGER} --max-resolution 8192 --log2-table-size 21 --hidden-width 256",
     "splatfacto-big": f"{_GAUSSIANS}; {_NERFSTUDIO.format(name='splatfacto-big')}",
-    "semantic-nerfw": "here 'nerfacto' learns appearance where light differs; semantics are not learnt",
-    "nerfplayer-nerfacto": "for scenes that move there are 'kplanes' and 'dnerf'",
-    "nerfplayer-ngp": "for scenes that move there are 'kplanes' and 'dnerf'",
-    "depth-nerfacto": "here 'nerfacto' does that where the photographs come with depth images",
+    "semantic-nerfw": "here 'nerfacto' learns appearance if the light differs between images; none learns semantics",
+    "nerfplayer-nerfacto": "for moving scenes there are 'kplanes' and 'dnerf'",
+    "nerfplayer-ngp": "for moving scenes there are 'kplanes' and 'dnerf'",
+    "depth-nerfacto": "here 'nerfacto' does that if the images come with depth images",
     "k-planes": "here it is called 'kplanes'",
     "d-nerf": "here it is called 'dnerf'",
 }
-"""Name -> how to get it. A method that is registered under the name comes first."""
+"""Name -> how to get the method. A registered method of the same name takes precedence."""

@@ -1,4 +1,4 @@
-"""Errors a user can act on: one line that says what, where and what to do."""
+"""Errors that a user can act on: one line that says what is wrong, where, and what to do."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ from collections.abc import Iterable
 from typing import Any
 
 LONGEST_MESSAGE = 2000
-"""Characters of an error; what a damaged file holds may be longer than a screen."""
+"""Maximum number of characters of an error message. Text quoted from a damaged file may be longer than a screen."""
 
 
 class NerfloomError(ValueError):
-    """Base of every error that the command line prints as one line, without a traceback.
+    """Base class of the errors that the command line prints as one line, without a traceback.
 
-    It is one line by construction, whatever the names and values out of files are that it speaks of.
+    Args:
+        message: the text. Line breaks and control characters, as names read from files may have, are escaped, and text
+            beyond `LONGEST_MESSAGE` characters is cut off.
     """
 
     def __init__(self, message: str) -> None:
@@ -23,7 +25,7 @@ class NerfloomError(ValueError):
 
 
 class DataError(NerfloomError):
-    """The data set cannot be used as it is: missing, unreadable or contradictory input."""
+    """The data set cannot be used: input is missing, unreadable or contradictory."""
 
 
 class ConfigError(NerfloomError):
@@ -31,25 +33,30 @@ class ConfigError(NerfloomError):
 
 
 class CheckpointError(NerfloomError):
-    """A checkpoint cannot be read or does not fit the model."""
+    """A checkpoint cannot be read, or does not fit the model."""
 
 
 class DivergenceError(NerfloomError):
-    """Training met non-finite values too many times in a row to go on."""
+    """Training met non-finite values in too many consecutive steps."""
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether memory was asked for that there is not: Python's own error, or one of torch's, which has many."""
-    said = str(error)
+    """Return whether `error` is an out-of-memory error, Python's own or one of the several that PyTorch raises."""
+    text = str(error)
     return isinstance(error, MemoryError) or (
-        isinstance(error, RuntimeError) and ("out of memory" in said or "allocate memory" in said)
+        isinstance(error, RuntimeError) and ("out of memory" in text or "allocate memory" in text)
     )
 
 
 def nearest(name: str, candidates: Iterable[str]) -> str:
-    """A hint naming the candidates closest to a misspelt `name`, or listing all of them.
+    """Return a hint that names the candidates closest to a misspelt name, or lists all of them.
 
-    Returns: a sentence such as ``Did you mean 'instant-ngp'?``.
+    Args:
+        name: the misspelt name.
+        candidates: valid names.
+
+    Returns:
+        A sentence such as ``Did you mean 'instant-ngp'?``.
     """
     candidates = sorted(candidates)
     close = difflib.get_close_matches(name, candidates, n=3, cutoff=0.5)
@@ -59,7 +66,7 @@ def nearest(name: str, candidates: Iterable[str]) -> str:
 
 
 def printable(text: str) -> str:
-    """Text that stays on its line and does nothing to a terminal: what cannot be printed stands there escaped."""
+    """Return `text` with unprintable characters, line breaks among them, escaped, so that a terminal shows it as is."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
@@ -72,11 +79,11 @@ _BRIEF.maxstring = _BRIEF.maxother = _BRIEF.maxlong = 60
 
 
 def shown(value: Any) -> str:
-    """A value for a message: one short line whatever it holds, however deep and however large it is."""
+    """Return a short `repr` of `value` for a message: one line of at most 60 characters, for any size or nesting."""
     if isinstance(value, int) and abs(value) >= 10**30:
-        return "a huge whole number"
+        return "a huge integer"
     try:
         text = printable(_BRIEF.repr(value))
-    except ValueError:  # Python writes no whole number of thousands of digits
+    except ValueError:  # Python refuses to write integers of thousands of digits
         text = f"a {type(value).__name__} that cannot be written"
     return text if len(text) <= 60 else f"{text[:57]}..."

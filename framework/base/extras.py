@@ -1,4 +1,4 @@
-"""Advice on installing optional packages, by their own names, which pip finds from a clone as well."""
+"""Commands that install optional packages, by the packages' own names, so that they work in a clone too."""
 
 from __future__ import annotations
 
@@ -10,16 +10,23 @@ EXTRAS: dict[str, dict[str, str]] = {
     "plots": {"matplotlib": "matplotlib"},
     "lpips": {"lpips": "lpips", "torchvision": "torchvision"},
 }
-"""Extra of pyproject.toml -> the module that is imported, and what pip calls its package."""
+"""Extra of pyproject.toml -> {module that is imported: name of its package for pip}."""
 
 
 def missing(extra: str) -> str | None:
-    """How to install what an extra lacks, as in "pip install lpips torchvision"; None where everything is there."""
+    """Return the command that installs the missing packages of an extra.
+
+    Args:
+        extra: a key of `EXTRAS`.
+
+    Returns:
+        A command such as "pip install lpips torchvision", or None if every package is installed.
+    """
     absent = [package for module, package in EXTRAS[extra].items() if find_spec(module) is None]
     return f"pip install {' '.join(absent)}" if absent else None
 
 
 def reinstall() -> str:
-    """How to install this package once more, with its kernels built."""
+    """Return the command that reinstalls this package and builds its kernels."""
     root = Path(__file__).resolve().parents[2]
     return f"pip install -e {root}" if (root / "setup.py").is_file() else "pip install --force-reinstall nerfloom"

@@ -1,4 +1,4 @@
-"""Names that users of nerfstudio type, and ours for them: plain data, and one answer a word."""
+"""Flags, subcommands and configs of nerfstudio, and the answers that tell its users what to use here."""
 
 from __future__ import annotations
 
@@ -37,29 +37,29 @@ SETTINGS = {
     "max-steps": "--max-num-iterations",
     "load-step": "--load-checkpoint",
 }
-"""The end of a flag of nerfstudio's -> the flag that does it here. Flags of the same name need no entry."""
+"""Last part of a nerfstudio flag -> the equivalent flag here. Flags of the same name need no entry."""
 CAMERA_SETTINGS = {"lr": "--camera-learning-rate"}
-"""The same where the flag is about the cameras' optimiser."""
+"""As `SETTINGS`, for flags of the camera optimiser."""
 SECTIONS = {
-    "viewer": "there is no viewer; --vis tensorboard shows pictures and curves, and ns-render makes animations",
-    "logging": "leave it out; --vis tensorboard or none is all there is to say",
-    "optimizers": "Adam is the one optimiser, with --learning-rate, --lr-schedule and --lr-final",
-    "pipeline": "flags have no sections here, and none does this; ns-train {method} --help lists them",
-    "trainer": "flags have no sections here, and none does this; ns-train {method} --help lists them",
+    "viewer": "there is no viewer; --vis tensorboard shows images and curves, and ns-render renders videos",
+    "logging": "leave it out; the choice here is --vis tensorboard or none",
+    "optimizers": "Adam is the only optimiser, with --learning-rate, --lr-schedule and --lr-final",
+    "pipeline": "there is no equivalent flag; ns-train {method} --help lists all flags",
+    "trainer": "there is no equivalent flag; ns-train {method} --help lists all flags",
     "machine": "a run is one process on one device: --machine.device-type",
-    "steps-per-eval-batch": "leave it out; --steps-per-eval-all-images evaluates whole photographs",
-    "use-grad-scaler": "leave it out; bfloat16 needs none",
-    "gradient-accumulation-steps": "a larger --num-rays-per-batch does the same",
+    "steps-per-eval-batch": "leave it out; --steps-per-eval-all-images evaluates whole images",
+    "use-grad-scaler": "leave it out; bfloat16 needs no gradient scaling",
+    "gradient-accumulation-steps": "a larger --num-rays-per-batch has the same effect",
     "project-name": "the run's folder is named by --experiment-name",
     "relative-model-dir": "checkpoints are in the run's folder nerfstudio_models",
-    "load-scheduler": "leave it out; a checkpoint brings the schedule",
+    "load-scheduler": "leave it out; a checkpoint includes the schedule",
     "log-gradients": "leave it out; a step that is not finite is dropped and counted",
-    "prompt": "nothing here is made from words",
+    "prompt": "no method here uses text prompts",
     "start-paused": "leave it out; there is no viewer",
 }
-"""The beginning of a flag of nerfstudio's -> what to say where no flag does it here."""
+"""First part of a nerfstudio flag -> the answer if there is no equivalent flag here."""
 VIEWERS = ("viewer", "viewer_legacy", "viewer_beta", "wandb", "comet")
-"""Values of nerfstudio's --vis, alone or joined by +, that ours does not take."""
+"""Values of nerfstudio's --vis, alone or joined by +, that are not available here."""
 FORMATS = {
     "blender-data": "blender",
     "colmap-data": "colmap",
@@ -68,55 +68,56 @@ FORMATS = {
     "nerfstudio-data": "nerfstudio",
     "phototourism-data": "phototourism",
 }
-"""nerfstudio's data subcommands -> our data formats."""
+"""Data subcommand of nerfstudio -> data format here."""
 NO_FORMATS = (
     "arkitscenes-data", "dycheck-data", "mill19-data", "minimal-parser", "nerfosr-data", "nuscenes-data",
     "scannet-data", "scannetpp-data", "sdfstudio-data", "sitcoms3d-data",
 )  # fmt: skip
-"""nerfstudio's data subcommands of which there is no format here."""
-_MESH = "meshes are not made here; 'pointcloud' writes points and normals, of which other programs make meshes"
-_OTHER_POSES = "export its cameras in COLMAP's format, and give that folder to ns-train --data; no processing is needed"
+"""Data subcommands of nerfstudio without a data format here."""
+_MESH = "there is no mesh export; 'pointcloud' writes points and normals, from which other programs reconstruct meshes"
+_OTHER_POSES = "export its cameras in COLMAP's format, and pass that folder to ns-train --data; no processing is needed"
 KINDS = {
-    "camera-path": "paths of nerfstudio's viewer are not read; there are 'orbit', 'interpolate' and 'time'",
+    "camera-path": "camera paths of nerfstudio's viewer are not supported; there are 'orbit', 'interpolate' and 'time'",
     "spiral": "there are 'orbit', 'interpolate' and 'time'",
-    "dataset": "ns-eval RUN_FOLDER --render-output-path DIR renders the held-out photographs",
+    "dataset": "ns-eval RUN_FOLDER --render-output-path DIR renders the held-out images",
     "poisson": _MESH,
     "tsdf": _MESH,
     "marching-cubes": _MESH,
-    "gaussian-splat": "there are no Gaussians here; 'pointcloud' writes points",
+    "gaussian-splat": "no method here has Gaussians; 'pointcloud' writes points",
     "metashape": _OTHER_POSES,
     "realitycapture": _OTHER_POSES,
     "odm": _OTHER_POSES,
-    "aria": "it is not read here",
+    "aria": "it is not supported here",
 }
-"""Subcommands of nerfstudio's ns-render, ns-export and ns-process-data that are none of ours -> what to do here."""
+"""Subcommand of nerfstudio's ns-render, ns-export or ns-process-data without an equivalent here -> what to use
+instead."""
 
 
 def vis_answer(value: str) -> str | None:
-    """The answer to a value of --vis that nerfstudio has and we have not; None for any other."""
+    """Return the answer to `value`, a value of nerfstudio's --vis that is not available here; None for any other."""
     foreign = set(value.split("+")) & set(VIEWERS)
     return f"--vis {value} is nerfstudio's; {SECTIONS['viewer']}" if foreign else None
 
 
 def flag_answer(flag: str, method: str, known: Collection[str]) -> str | None:
-    """The answer to a flag that nerfstudio has and we have not; None for any other.
+    """Return the answer to a flag of nerfstudio that does not exist here; None for any other flag.
 
     Args:
-        flag: as it was typed, perhaps with =VALUE.
-        method: which is trained.
-        known: our flags for it, with their dashes.
+        flag: the flag as typed, possibly with =VALUE.
+        method: name of the method to be trained.
+        known: flags of this method, with their dashes.
     """
     name = flag.removeprefix("--").partition("=")[0].replace("_", "-")
     beginning = name.partition(".")[0]
     if f"--{name}" in known or (beginning not in SECTIONS and name not in SETTINGS):
         return None
-    ours = _ours(name)
+    ours = _equivalent(name)
     answer = f"here it is {ours}" if ours in known else SECTIONS.get(beginning, "{method} has no such flag")
     return f"--{name} is nerfstudio's; {answer.format(method=method)}"
 
 
-def _ours(name: str) -> str:
-    """The flag that would do here what nerfstudio's of this name does."""
+def _equivalent(name: str) -> str:
+    """Return the flag that is equivalent to a nerfstudio flag."""
     settings = SETTINGS | (CAMERA_SETTINGS if name.startswith("optimizers.camera") else {})
     parts = name.split(".")
     ends = [".".join(parts[start:]) for start in range(len(parts))]
@@ -124,18 +125,27 @@ def _ours(name: str) -> str:
 
 
 def format_answer(name: str) -> str | None:
-    """The answer to a data subcommand of nerfstudio's; None for any other word."""
+    """Return the answer to a data subcommand of nerfstudio; None for any other word.
+
+    Args:
+        name: the word that a user typed as data format.
+    """
     if name in FORMATS:
         return f"'{name}' is nerfstudio's; here the data format is called '{FORMATS[name]}'"
     if name in NO_FORMATS:
-        return f"'{name}' is nerfstudio's, and is not read here; 'nerfstudio', a transforms.json, is easily written"
+        return (
+            f"'{name}' is nerfstudio's, and is not supported here; convert the data to 'nerfstudio', a transforms.json"
+        )
     return None
 
 
 def config_answer(text: str) -> str | None:
-    """The answer to a YAML file's text where it is a config.yml of nerfstudio's; None for any other.
+    """Return the answer to a config.yml of nerfstudio; None for any other file.
 
-    It is searched for the method and the data, and never loaded, for that would make its Python objects.
+    The text is searched for the method and the data. It is never loaded, which would construct its Python objects.
+
+    Args:
+        text: content of a YAML file.
     """
     if not text.startswith("!!python/object:nerfstudio."):
         return None
@@ -143,4 +153,4 @@ def config_answer(text: str) -> str | None:
     data = re.search(r"^data: (?:&\w+ )?!!python/object/apply:pathlib\.\w+\n((?:- .+\n)+)", text, re.MULTILINE)
     parts = re.findall(r"^- ['\"]?(.+?)['\"]?$", data[1], re.MULTILINE) if data else ["DIR"]
     train = f"ns-train {method[1] if method else 'METHOD'} --data {shlex.quote('/'.join(parts).replace('//', '/'))}"
-    return f"is nerfstudio's; its Python objects are not loaded, and its checkpoints are of other networks: {train}"
+    return f"is nerfstudio's; it cannot be loaded, and its checkpoints are of other networks; train anew: {train}"

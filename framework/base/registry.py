@@ -1,6 +1,6 @@
-"""Names of methods and data formats. Nothing behind a name is imported until it is asked for.
+"""The registry of methods and data formats by name. A module is imported only when its name is asked for.
 
-Built-in and third-party ones are registered alike, by entry points of the installed package:
+Built-in and third-party entries are registered in the same way, by entry points of the installed package:
 
     [project.entry-points."nerfloom.methods"]
     my-method = "my_package.my_method:METHOD"      # a framework.Method
@@ -8,7 +8,7 @@ Built-in and third-party ones are registered alike, by entry points of the insta
     [project.entry-points."nerfloom.dataparsers"]
     my-format = "my_package.my_format:MyFormat"    # a framework.DataParser
 
-What is not installed is registered by the environment, for a shell's or a script's lifetime:
+Code that is not installed is registered by environment variables:
 
     NERFLOOM_METHODS="my-method=my_file:METHOD,other=..."  NERFLOOM_DATAPARSERS="my-format=my_file:MyFormat"
 """
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 Kind = Literal["methods", "dataparsers"]
 INTERFACE: dict[Kind, int] = {"methods": 2, "dataparsers": 1}
-"""Version of what plugins rely on (docs/plugins.md). A change that breaks them raises it."""
+"""Version of the interface that plugins use (docs/plugins.md). A change that breaks plugins raises it."""
 CHANGED = "docs/plugins.md, 'From interface 1 to 2', says what to change"
 """What to tell of methods that were written for the version before."""
 VARIABLES = {"methods": "NERFLOOM_METHODS", "dataparsers": "NERFLOOM_DATAPARSERS"}
@@ -45,30 +45,40 @@ CALLED = {"methods": "method", "dataparsers": "data format"}
 
 @dataclass(frozen=True)
 class Entry:
-    """What stands behind a name."""
+    """A registered method or data format.
+
+    Args:
+        name: the name that users type.
+        module: full name of the module to import.
+        attribute: name of the object in the module.
+    """
 
     name: str
     module: str
     attribute: str
     package: str
-    """The distribution that registers it, or the environment variable."""
+    """Distribution that registers it, or the environment variable."""
     problem: str | None = None
-    """Why it cannot be used, where that is known before it is imported."""
+    """Reason why it cannot be used, if that is known before the import."""
 
 
 @cache
 def registered(kind: Kind) -> dict[str, Entry]:
-    """Entries by name. One that two packages register for different things stays, with a `problem`.
+    """Return all entries of a kind by name, sorted. One that two packages register differently has a `problem`.
 
-    Raises: ConfigError where the environment variable cannot be read.
+    Args:
+        kind: methods or data formats.
+
+    Raises:
+        ConfigError: if the environment variable cannot be parsed.
     """
-    found: dict[str, Entry] = {}
-    for entry in (*_installed(kind), *_of_environment(kind)):
-        other = found.setdefault(entry.name, entry)
+    entries: dict[str, Entry] = {}
+    for entry in (*_installed(kind), *_from_environment(kind)):
+        other = entries.setdefault(entry.name, entry)
         if (other.module, other.attribute) != (entry.module, entry.attribute):
-            both = f"it is registered by both {other.package} and {entry.package}; uninstall or rename one of them"
-            found[entry.name] = replace(other, problem=both)
-    return dict(sorted(found.items()))
+            conflict = f"it is registered by both {other.package} and {entry.package}; uninstall or rename one of them"
+            entries[entry.name] = replace(other, problem=conflict)
+    return dict(sorted(entries.items()))
 
 
 def _installed(kind: Kind) -> Iterator[Entry]:
@@ -76,7 +86,7 @@ def _installed(kind: Kind) -> Iterator[Entry]:
         yield _entry(point.name, point.value, point.dist.name if point.dist else "an unknown package")
 
 
-def _of_environment(kind: Kind) -> Iterator[Entry]:
+def _from_environment(kind: Kind) -> Iterator[Entry]:
     variable = VARIABLES[kind]
     for item in filter(None, (part.strip() for part in os.environ.get(variable, "").split(","))):
         name, _, value = (part.strip() for part in item.partition("="))
@@ -93,7 +103,7 @@ def _entry(name: str, value: str, package: str) -> Entry:
 
 
 def summary(entry: Entry) -> str:
-    """The first line of the docstring of the module behind an entry, read without importing it; or what is wrong."""
+    """Return the first line of the docstring of the module of `entry`, read without importing it, or what is wrong."""
     if entry.problem is not None:
         return f"({entry.problem})"
     path = _source(entry.module)
@@ -107,7 +117,7 @@ def summary(entry: Entry) -> str:
 
 
 def _source(module: str) -> Path | None:
-    """The file a module would be imported from. Only the top-level package is asked, for asking imports parents."""
+    """Return the file of a module. Only the top-level package is looked up: a full lookup would import its parents."""
     top, *rest = module.split(".")
     try:
         spec = importlib.util.find_spec(top)
@@ -126,23 +136,28 @@ def _source(module: str) -> Path | None:
 
 
 def entry_of(kind: Kind, name: str) -> Entry:
-    """What a name is registered for.
+    """Return the entry registered for a name.
 
-    Raises: ConfigError for an unknown name, with the nearest, or with where a known method lives that is not ours.
+    Args:
+        kind: methods or data formats.
+        name: the name that a user typed.
+
+    Raises:
+        ConfigError: for an unknown name, with the nearest valid one, or where to get a method of another project.
     """
-    known = registered(kind)
-    if name in known:
-        return known[name]
+    entries = registered(kind)
+    if name in entries:
+        return entries[name]
     if kind == "methods" and name in ELSEWHERE:
         raise ConfigError(f"Nerfloom has no method '{name}': {ELSEWHERE[name]}")
     if kind == "dataparsers" and (answer := format_answer(name)) is not None:
         raise ConfigError(answer)
-    raise ConfigError(f"unknown {CALLED[kind]} '{name}'. {nearest(name, known)}")
+    raise ConfigError(f"unknown {CALLED[kind]} '{name}'. {nearest(name, entries)}")
 
 
 def _load(kind: Kind, name: str) -> Any:
     entry = entry_of(kind, name)
-    what = f"{CALLED[kind]} '{name}' of {entry.package}"
+    title = f"{CALLED[kind]} '{name}' of {entry.package}"
     if entry.problem is not None:
         raise ConfigError(f"{CALLED[kind]} '{name}' cannot be used: {entry.problem}")
     try:
@@ -151,22 +166,33 @@ def _load(kind: Kind, name: str) -> Any:
             loaded = getattr(loaded, part)
     except (Exception, SystemExit) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
-        if isinstance(error, ImportError) and (error.name or "").split(".")[0] == "framework":
-            reason += f". It looks written for an older plugin interface: {CHANGED}"
-        raise ConfigError(f"{what} cannot be loaded: {reason}") from error
+        if _looks_old(error):
+            reason += f". It seems to be written for plugin interface 1, and this is {INTERFACE[kind]}: {CHANGED}"
+        raise ConfigError(f"{title} cannot be loaded: {reason}") from error
     interface, ours = getattr(loaded, "interface", INTERFACE[kind]), INTERFACE[kind]
     if interface != ours:
         newer = isinstance(interface, int) and interface > ours
         remedy = "upgrade nerfloom" if newer else CHANGED
-        raise ConfigError(f"{what} was written for plugin interface {interface}, and this is {ours}; {remedy}")
+        raise ConfigError(f"{title} was written for plugin interface {interface}, and this is {ours}; {remedy}")
     return loaded
+
+
+def _looks_old(error: BaseException) -> bool:
+    """Return whether a plugin failed as one does that was written for the interface before."""
+    if isinstance(error, ImportError):
+        return (error.name or "").split(".")[0] == "framework"
+    return isinstance(error, TypeError) and "Method.__init__()" in str(error)
 
 
 def load_method(name: str) -> Method:
     """Import a method by name.
 
-    Raises: ConfigError for an unknown name, where its module cannot be imported, or where it is no method of this
-        plugin interface.
+    Args:
+        name: a registered name.
+
+    Raises:
+        ConfigError: for an unknown name, or if its module cannot be imported or holds no method of this plugin
+            interface.
     """
     from framework.method import Method
 
@@ -180,8 +206,12 @@ def load_method(name: str) -> Method:
 def load_dataparser(name: str) -> type[DataParser]:
     """Import a data format by name.
 
-    Raises: ConfigError for an unknown name, where its module cannot be imported, or where it is no data format of this
-        plugin interface.
+    Args:
+        name: a registered name.
+
+    Raises:
+        ConfigError: for an unknown name, or if its module cannot be imported or holds no data format of this plugin
+            interface.
     """
     from framework.data.dataset import DataParser
 

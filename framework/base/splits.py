@@ -3,4 +3,4 @@
 from typing import Literal
 
 Split = Literal["train", "val", "test"]
-"""Images to learn from, to look at while training, and to judge by."""
+"""Images to train on, to evaluate during training, and to evaluate after it."""

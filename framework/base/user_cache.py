@@ -1,4 +1,4 @@
-"""Where files that can be made again are kept between runs."""
+"""The folder of files that can be created again."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def cache_folder() -> Path:
-    """NERFLOOM_CACHE, else `nerfloom` in XDG_CACHE_HOME, else in ~/.cache."""
+    """Return the cache folder: NERFLOOM_CACHE, else `nerfloom` in XDG_CACHE_HOME, else in ~/.cache."""
     if "NERFLOOM_CACHE" in os.environ:
         return Path(os.environ["NERFLOOM_CACHE"])
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nerfloom"

@@ -1,1 +1,1 @@
-"""Cameras and their poses: from pixels to rays and back."""
+"""Cameras and their poses: rays of pixels, and projections of points."""

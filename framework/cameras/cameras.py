@@ -1,7 +1,7 @@
-"""Cameras: from a pixel to a ray.
+"""Cameras: the rays of pixels, and the projection of points.
 
-Conventions: OpenGL axes (x right, y up, the camera looks down -z); pixel (column, row) = (0, 0) is the top left
-one and its centre lies at (0.5, 0.5); `camera_to_worlds` maps camera to scene coordinates.
+Conventions: OpenGL axes (x right, y up, the camera looks along -z); pixel (column, row) = (0, 0) is the top left one,
+and its centre lies at (0.5, 0.5); `camera_to_worlds` maps camera to scene coordinates.
 """
 
 from __future__ import annotations
@@ -16,27 +16,28 @@ import torch
 from torch import Tensor
 
 from framework.base.errors import DataError
-from framework.geometry.lenses import BENDING, Distortion, Seen, project, unproject
+from framework.geometry.lenses import DISTORTED, Distortion, LensRays, project, unproject
 from framework.geometry.lenses import LENSES as LENSES
 from framework.geometry.rays import Rays
 from framework.kernels import native
 from framework.kernels.given import check_indices, is_followed
 
 ROTATION_TOLERANCE = 1e-3
+"""Maximum deviation of a pose's rotation matrix from an orthonormal one."""
 LARGEST_SIDE = 10**9
-"""Pixels beyond which no image's width or height is believed, though files may have room for 2^64."""
+"""Maximum width or height of an image that a file may state, pixels; file formats have room for 2^64."""
 CENTER = torch.zeros(1, 2)
-"""The one place in a pixel that is its centre, as columns and rows from there."""
-COMPILED = ("pinhole", *BENDING)
-"""The models whose rays are compiled, in the order of the kernel's numbers."""
+"""The pixel's centre as the only sample position, in columns and rows from the centre."""
+COMPILED = ("pinhole", *DISTORTED)
+"""Models whose rays are compiled, in the order of the kernel's enumeration."""
 
 
 @dataclass(frozen=True)
 class Cameras:
-    """M cameras of one model. Intrinsics are in pixels of the images they go with.
+    """M cameras of one model. Intrinsics are in pixels of the corresponding images.
 
-    What a focal length is per unit of depends on the model: pixels per tangent (pinhole, opencv), per radian (fisheye,
-    equirectangular: `lenses.panorama` gives those of a whole one), per scene unit (orthographic).
+    The unit of a focal length depends on the model: pixels per tangent (pinhole, opencv), per radian (fisheye, and
+    equirectangular, for which `lenses.panorama` gives the values), or per scene unit (orthographic).
     """
 
     camera_to_worlds: Tensor
@@ -54,13 +55,13 @@ class Cameras:
     heights: Tensor
     """(M,) int64 image heights."""
     model: str = "pinhole"
-    """Name of the projection, a key of `LENSES`."""
+    """Projection, a key of `LENSES`."""
     lens: Tensor | None = None
-    """(M, K) distortion coefficients, in the order of `LENSES[model]`; None for all zero."""
+    """(M, K) distortion coefficients, in the order of `LENSES[model]`; None if all are zero."""
 
     def __post_init__(self) -> None:
         if self.model not in LENSES:
-            raise ValueError(f"there is no camera model '{self.model}'; there are {', '.join(LENSES)}")
+            raise ValueError(f"unknown camera model '{self.model}'. Known: {', '.join(LENSES)}")
         names = LENSES[self.model]
         if self.lens is not None and self.lens.shape[-1] != len(names):
             raise ValueError(f"{self.model} takes {len(names)} distortion coefficients, not {self.lens.shape[-1]}")
@@ -69,23 +70,26 @@ class Cameras:
         return self.camera_to_worlds.shape[0]
 
     def __getitem__(self, index: Tensor | slice) -> Cameras:
-        """The cameras chosen by a slice, a mask or an index tensor."""
+        """Return the cameras selected by a slice, a mask or an index tensor."""
         return self._map(lambda values: values[index])
 
     def to(self, device: torch.device | str) -> Cameras:
-        """The same cameras on `device`."""
+        """Return the cameras on `device`."""
         return self._map(lambda values: values.to(device))
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> Cameras:
-        """The same cameras with every tensor changed."""
-        known = {f.name: getattr(self, f.name) for f in fields(self)}
-        changed: dict[str, Any] = {name: change(value) for name, value in known.items() if isinstance(value, Tensor)}
+        """Apply a function to every tensor."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        changed: dict[str, Any] = {name: change(value) for name, value in values.items() if isinstance(value, Tensor)}
         return replace(self, **changed)
 
     def scaled(self, factor: float) -> Cameras:
-        """The cameras of images resized by `factor` (2.0 = twice as wide).
+        """Return the cameras of resized images.
 
-        Sizes are rounded down as images are when reduced by a whole number.
+        Sizes are rounded down, as those of images reduced by an integer factor are.
+
+        Args:
+            factor: new size over old size; 2.0 doubles the width.
         """
         intrinsics = {name: getattr(self, name) * factor for name in ("fx", "fy", "cx", "cy")}
         sizes = {name: (getattr(self, name) * factor + 1e-6).long() for name in ("widths", "heights")}
@@ -100,24 +104,26 @@ class Cameras:
         far: float,
         times: Tensor | None = None,
     ) -> Rays:
-        """Rays through pixel centres.
+        """Return the rays of pixels given by camera, column and row.
 
         Args:
             camera_indices: (R,) camera of each ray.
-            columns, rows: (R,) pixel indices; may be fractional.
-            near, far: the distances between which the scene lies.
+            columns, rows: (R,) coordinates of the pixels; integers are pixel centres, and fractions are allowed.
+            near, far: distances at which the rays start and end.
             times: (M,) time of each camera.
-        Returns: R rays with unit directions, pixel radii, times and camera indices.
+
+        Returns:
+            R rays with unit directions, pixel radii, times and camera indices.
         """
-        x, y, seen = self.look(camera_indices, columns, rows)
+        x, y, rays = self.look(camera_indices, columns, rows)
         poses = self.camera_to_worlds[camera_indices]
         origins = poses[:, :, 3]
-        # Products and sums rather than a matrix product, which autocast would round to bfloat16.
-        directions = (poses[:, :, :3] * seen.directions[:, None, :]).sum(-1)
+        # Products and sums, because autocast would round a matrix product to bfloat16.
+        directions = (poses[:, :, :3] * rays.directions[:, None, :]).sum(-1)
         if self.model == "orthographic":
             origins = origins + poses[:, :, 0] * x[:, None] - poses[:, :, 1] * y[:, None]
-        # Mip-NeRF sets the radius to 2 / sqrt(12) pixels. That of parallel rays is the same at all distances.
-        pixel_radii = 2 / 12**0.5 / self.fx[camera_indices] * seen.spread
+        # Mip-NeRF's radius is 2 / sqrt(12) pixels. For parallel rays, the radius is the same at all distances.
+        pixel_radii = 2 / 12**0.5 / self.fx[camera_indices] * rays.spread
         return Rays(
             origins=origins,
             directions=directions,
@@ -128,10 +134,15 @@ class Cameras:
             camera_indices=camera_indices,
         )
 
-    def look(self, camera_indices: Tensor, columns: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Seen]:
-        """What pixels (R,) show, in their camera's frame, and whether they show anything.
+    def look(self, camera_indices: Tensor, columns: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, LensRays]:
+        """Return the image-plane coordinates of pixels, and their directions in the camera's frame.
 
-        Returns: normalised image coordinates x and y (R,), and what is seen there.
+        Args:
+            camera_indices: (R,) camera of each pixel.
+            columns, rows: (R,) coordinates of the pixels, as `rays` takes them.
+
+        Returns:
+            Normalised image coordinates x and y (R,), and the rays there.
         """
         x = (columns + 0.5 - self.cx[camera_indices]) / self.fx[camera_indices]
         y = (rows + 0.5 - self.cy[camera_indices]) / self.fy[camera_indices]
@@ -139,14 +150,16 @@ class Cameras:
         return x, y, unproject(self.model, x, y, lenses)
 
     def project(self, points: Tensor, camera: int | Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Where cameras show points: the inverse of `rays`.
+        """Project points to pixels; the inverse of `rays`.
 
         Args:
             points: (N, 3) scene coordinates.
-            camera: index of the camera, or (N,) of one for each point.
-        Returns: columns, rows (N,) as `rays` takes them, whole numbers being pixels' centres, also outside the image;
-            and (N,) bool whether the point is in front of the camera and within its lens's reach. Elsewhere columns
-            and rows are finite, and mean nothing.
+            camera: index of one camera, or (N,) of one for each point.
+
+        Returns:
+            columns and rows (N,) as `rays` takes them, also outside the image, and (N,) bool, whether the point lies in
+            front of the camera and within the lens's reach. Where it does not, columns and rows are finite but
+            meaningless.
         """
         indices = torch.as_tensor(camera, device=points.device).expand(len(points))
         poses = self.camera_to_worlds[indices]
@@ -157,59 +170,68 @@ class Cameras:
 
     @cached_property
     def distortion(self) -> Distortion | None:
-        """How the lenses bend, where the model has it."""
-        if self.model not in BENDING:
+        """The lenses' distortion, or None for a model without."""
+        if self.model not in DISTORTED:
             return None
         lens = self.fx.new_zeros(len(self), len(LENSES[self.model])) if self.lens is None else self.lens
         return Distortion.of(self.model, lens)
 
     @cached_property
     def offsets(self) -> Tensor:
-        """(M + 1,) where each camera's pixels start when those of all are counted through, row by row."""
+        """(M + 1,) index of each camera's first pixel, when all pixels are numbered consecutively, row by row."""
         sizes = (self.widths * self.heights).cumsum(0)
         return torch.cat([torch.zeros_like(sizes[:1]), sizes])
 
     def pixel_rays(
-        self, flat: Tensor, near: float, far: float, times: Tensor | None = None, places: Tensor = CENTER
+        self, flat: Tensor, near: float, far: float, times: Tensor | None = None, subpixels: Tensor = CENTER
     ) -> Rays:
-        """Rays through pixels.
+        """Return the rays of pixels given by consecutive number.
 
         Args:
-            flat: (P,) int64 which pixels, counted through all images.
-            near, far: the distances between which the scene lies.
+            flat: (P,) int64 numbers of the pixels, counted through all images.
+            near, far: distances at which the rays start and end.
             times: (M,) time of each camera.
-            places: (K, 2) where in a pixel, columns and rows from its centre.
-        Returns: P * K rays, those of a pixel together; with a gradient for poses and intrinsics that ask for one.
-        Raises: IndexError where there is no such pixel.
+            subpixels: (K, 2) positions in a pixel, in columns and rows from its centre.
+
+        Returns:
+            P * K rays, those of a pixel consecutive, with a gradient for poses and intrinsics that require one.
+
+        Raises:
+            IndexError: if a number exceeds the number of pixels.
         """
-        numbers = self.camera_to_worlds, self.fx, self.fy, self.cx, self.cy, places
+        numbers = self.camera_to_worlds, self.fx, self.fy, self.cx, self.cy, subpixels
         if self.model in COMPILED and native.usable(*numbers) and not is_followed(*numbers, self.lens):
-            return self._pixel_rays_compiled(flat, near, far, times, places)
+            return self._pixel_rays_compiled(flat, near, far, times, subpixels)
         check_indices(flat, int(self.offsets[-1]) if flat.device.type == "cpu" else 0, "pixels")
-        return self.pixel_rays_reference(flat, near, far, times, places)
+        return self.pixel_rays_reference(flat, near, far, times, subpixels)
 
     def pixel_rays_reference(
-        self, flat: Tensor, near: float, far: float, times: Tensor | None = None, places: Tensor = CENTER
+        self, flat: Tensor, near: float, far: float, times: Tensor | None = None, subpixels: Tensor = CENTER
     ) -> Rays:
-        """As `pixel_rays`, in torch, for any camera and device."""
+        """Compute `pixel_rays` in PyTorch, for any camera and device.
+
+        `flat`, `near`, `far`, `times` and `subpixels` are as in `pixel_rays`.
+        """
         indices = torch.searchsorted(self.offsets, flat, right=True) - 1
         within, widths = flat - self.offsets[indices], self.widths[indices]
-        places = places.to(self.fx)
-        columns = ((within % widths)[:, None] + places[:, 0]).reshape(-1)
-        rows = ((within // widths)[:, None] + places[:, 1]).reshape(-1)
-        return self.rays(indices.repeat_interleave(len(places)), columns, rows, near, far, times)
+        subpixels = subpixels.to(self.fx)
+        columns = ((within % widths)[:, None] + subpixels[:, 0]).reshape(-1)
+        rows = ((within // widths)[:, None] + subpixels[:, 1]).reshape(-1)
+        return self.rays(indices.repeat_interleave(len(subpixels)), columns, rows, near, far, times)
 
-    def _pixel_rays_compiled(self, flat: Tensor, near: float, far: float, times: Tensor | None, places: Tensor) -> Rays:
-        images, count = len(self), len(flat) * len(places)
+    def _pixel_rays_compiled(
+        self, flat: Tensor, near: float, far: float, times: Tensor | None, subpixels: Tensor
+    ) -> Rays:
+        images, count = len(self), len(flat) * len(subpixels)
         origins, directions, radii = torch.empty(count, 3), torch.empty(count, 3), torch.empty(count)
         indices = torch.empty(count, dtype=torch.int64)
-        poses, widths, places = self.camera_to_worlds.contiguous(), self.widths.contiguous(), places.contiguous()
+        poses, widths, subpixels = self.camera_to_worlds.contiguous(), self.widths.contiguous(), subpixels.contiguous()
         numbers = {name: getattr(self, name).contiguous() for name in ("fx", "fy", "cx", "cy")}
         distortion = None if self.distortion is None else self.distortion.table
         _camera_rays(
             COMPILED.index(self.model),
             native.pointer(flat, "pixel indices", (len(flat),), torch.int64), len(flat),
-            native.pointer(places, "places in a pixel", (len(places), 2)), len(places),
+            native.pointer(subpixels, "subpixels", (len(subpixels), 2)), len(subpixels),
             native.pointer(self.offsets, "offsets", (images + 1,), torch.int64), images,
             native.pointer(widths, "widths", (images,), torch.int64),
             native.pointer(poses, "poses", (images, 3, 4)),
@@ -228,33 +250,40 @@ class Cameras:
         )
 
     def image_pixels(self, index: int) -> Tensor:
-        """(H * W,) the pixels of one image, row by row, counted through all images."""
+        """Return the numbers (H * W,) of the pixels of image `index`, row by row, counted through all images."""
         start, end = self.offsets[index : index + 2].tolist()
         return torch.arange(start, end, device=self.fx.device)
 
 
 def subpixels(count: int) -> Tensor:
-    """(count, 2) places in a pixel whose mean colour stands for the pixel's: columns and rows from its centre.
+    """Return positions in a pixel, whose mean colour is the pixel's: columns and rows (count, 2) from its centre.
 
-    For count = n^2 a square grid, turned so that no two share a row or a column: edges near the axes, where steps show
-    most, take count + 1 levels instead of n + 1. The "rotated grid" of graphics hardware is that of n = 2.
+    For count = n^2, the positions form a square grid, rotated so that no two share a row or a column. Edges close to
+    horizontal or vertical, where aliasing is most visible, then have count + 1 levels instead of n + 1. For n = 2 it is
+    the "rotated grid" of graphics hardware.
 
-    Raises: ValueError where the count is not a square.
+    Args:
+        count: number of positions, a square number.
+
+    Raises:
+        ValueError: if `count` is not a square number.
     """
     side = math.isqrt(count)
     if side * side != count or count < 1:
-        raise ValueError(f"{count} rays a pixel: it must be the square of a whole number")
+        raise ValueError(f"{count} rays per pixel; it must be a square number")
     steps = torch.arange(count)
     rows = (steps + 1) * side % (count + 1) - 1
     return (torch.stack([steps, rows], dim=-1) + 0.5) / count - 0.5
 
 
 def join_cameras(parts: Sequence[Cameras]) -> Cameras:
-    """All cameras of one or more parts, in their order.
+    """Concatenate cameras. A mixture of pinhole and opencv becomes opencv, without distortion for pinhole.
 
-    pinhole and opencv become opencv, pinhole being the one without distortion.
+    Args:
+        parts: one or more sets of cameras.
 
-    Raises: DataError where the models cannot be one.
+    Raises:
+        DataError: if the models cannot be combined.
     """
     models = {part.model for part in parts}
     if models == {"opencv", "pinhole"}:
@@ -263,7 +292,7 @@ def join_cameras(parts: Sequence[Cameras]) -> Cameras:
         model = parts[0].model
     else:
         raise DataError(
-            f"the cameras are of different models ({', '.join(sorted(models))}), which one scene cannot mix; "
+            f"the cameras are of different models ({', '.join(sorted(models))}), and a scene must have one; "
             "convert the images to one model, for example with 'colmap image_undistorter'"
         )
     joined: dict[str, Any] = {
@@ -273,10 +302,9 @@ def join_cameras(parts: Sequence[Cameras]) -> Cameras:
     }
     if all(part.lens is None for part in parts):
         return Cameras(**joined, model=model)
-    straight = len(LENSES[model])
+    count = len(LENSES[model])
     lenses = [
-        part.fx.new_zeros(len(part), straight) if part.model != model or part.lens is None else part.lens
-        for part in parts
+        part.fx.new_zeros(len(part), count) if part.model != model or part.lens is None else part.lens for part in parts
     ]
     return Cameras(**joined, model=model, lens=torch.cat(lenses))
 
@@ -289,8 +317,10 @@ def check_pose(pose: Tensor, where: str) -> None:
 
     Args:
         pose: (4, 4) or (3, 4) camera-to-world matrix.
-        where: what to call it in the message.
-    Raises: DataError that names `where` and what is wrong.
+        where: name of the pose in the message.
+
+    Raises:
+        DataError: with `where` and what is wrong.
     """
     if pose.shape not in ((4, 4), (3, 4)):
         raise DataError(f"{where}: the pose has shape {tuple(pose.shape)}; a 4x4 matrix is needed")
@@ -300,7 +330,7 @@ def check_pose(pose: Tensor, where: str) -> None:
     error = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max().item()
     if pose.shape[0] == 4:
         error = max(error, (pose[3] - torch.tensor([0.0, 0.0, 0.0, 1.0])).abs().max().item())
-    if not error <= ROTATION_TOLERANCE or torch.linalg.det(rotation).item() < 0:  # NaN where squares overflow
+    if not error <= ROTATION_TOLERANCE or torch.linalg.det(rotation).item() < 0:  # NaN if squares overflow
         raise DataError(
             f"{where}: the pose is not rigid (its rotation is off an orthonormal, right-handed one by {error:.2g}); "
             "remove scale, shear or mirroring from the matrix"

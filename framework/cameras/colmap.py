@@ -1,4 +1,4 @@
-"""COLMAP's camera models as ours. Both count pixels from the image's corner, so that centres lie at 0.5."""
+"""Conversion of COLMAP's camera models. COLMAP too measures pixels from the image's corner, with centres at 0.5."""
 
 from __future__ import annotations
 
@@ -21,11 +21,18 @@ PARAMETERS: dict[str, tuple[str, str]] = {
     "RADIAL_FISHEYE": ("fisheye", "f cx cy k1 k2"),
     "OPENCV_FISHEYE": ("fisheye", "fx fy cx cy k1 k2 k3 k4"),
 }
-"""COLMAP's name -> our model, and what its parameters are, in their order."""
+"""COLMAP's model -> projection of `LENSES`, and the names of COLMAP's parameters in their order."""
 
 
 class Intrinsics(NamedTuple):
-    """What a `Cameras` is told of one camera."""
+    """Intrinsics of one camera, as `Cameras` takes them.
+
+    Args:
+        fx: horizontal focal length, pixels.
+        fy: vertical focal length, pixels.
+        cx: principal point's column, pixels.
+        cy: principal point's row, pixels.
+    """
 
     model: str
     """A key of `LENSES`."""
@@ -34,22 +41,24 @@ class Intrinsics(NamedTuple):
     cx: float
     cy: float
     lens: tuple[float, ...]
-    """As many coefficients as `LENSES[model]` names."""
+    """Distortion coefficients, in the order of `LENSES[model]`."""
 
 
 def from_colmap(model_name: str, params: Sequence[float], width: int, height: int) -> Intrinsics:
-    """One of COLMAP's cameras as ours; an opencv one without distortion is a pinhole.
+    """Convert one of COLMAP's cameras; an opencv camera without distortion becomes a pinhole camera.
 
     Args:
-        model_name: such as "SIMPLE_RADIAL".
+        model_name: COLMAP's name of the model, such as "SIMPLE_RADIAL".
         params: its parameters in COLMAP's order.
-        width, height: of the images, pixels.
-    Raises: DataError where the model is not one of `PARAMETERS`, or its numbers make no camera.
+        width, height: size of the images, pixels.
+
+    Raises:
+        DataError: if the model is not one of `PARAMETERS`, or its parameters are invalid.
     """
     if model_name not in PARAMETERS:
         raise DataError(
             f"COLMAP's camera model {model_name} is not supported (supported are {', '.join(PARAMETERS)}); "
-            "convert the images to pinhole ones with 'colmap image_undistorter'"
+            "undistort the images with 'colmap image_undistorter'"
         )
     model, listed = PARAMETERS[model_name]
     names = listed.split()
@@ -61,7 +70,7 @@ def from_colmap(model_name: str, params: Sequence[float], width: int, height: in
     if not finite or min(fx, fy, width, height) <= 0 or max(width, height) > LARGEST_SIDE:
         numbers = " ".join(f"{name}={value:g}" for name, value in values.items())
         raise DataError(
-            f"a COLMAP camera of model {model_name} cannot be: {width}x{height} pixels, {numbers}; "
+            f"a COLMAP camera of model {model_name} is invalid: {width}x{height} pixels, {numbers}; "
             "sizes and focal lengths must be positive, and every number finite"
         )
     lens = tuple(values.get(name, 0.0) for name in LENSES[model])

@@ -1,4 +1,4 @@
-"""Camera poses that are learnt along with the scene, where they were only estimated."""
+"""Optimisation of estimated camera poses together with the scene."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from framework.geometry.rays import Rays
 from framework.kernels.math import cross_matrix
 
 Group = Literal["SO3xR3", "SE3"]
+"""Parameterisation of a small rigid motion."""
 
 
 class PoseRefinement(nn.Module):
-    """A small rigid motion for each training camera, in the scene's frame; none at first.
+    """A small rigid motion for each training camera, in the scene's frame; initially the identity.
 
     Args:
-        count: cameras.
-        group: SO3xR3: the camera turns about its own centre, and its centre is moved. SE3: one screw motion about the
-            scene's origin.
-        given: (count, 3, 4) the poses that are refined. Together they may drift, along with all that is learnt; other
-            cameras then follow by the similarity that takes the given ones to the refined ones. Without them, other
-            cameras are left where they are.
+        count: number of cameras.
+        group: SO3xR3: the camera is rotated about its own centre, and the centre is translated. SE3: one screw motion
+            about the scene's origin.
+        given: (count, 3, 4) the poses to be refined. All of them together may drift along with the scene; other cameras
+            then follow by the similarity transform from given to refined poses. If None, other cameras stay unchanged.
     """
 
     given: Tensor | None
@@ -39,29 +39,29 @@ class PoseRefinement(nn.Module):
         self.tangents = nn.Parameter(torch.zeros(count, 6))
 
     def motions(self) -> Tensor:
-        """(M, 3, 4) rotations and translations: the exponentials of (M, 6) translations and rotation vectors."""
-        move, turn = self.tangents[:, :3], self.tangents[:, 3:]
-        generator = torch.cat([cross_matrix(turn), move[:, :, None]], dim=-1)
+        """Return the motions (M, 3, 4), exponentials of the (M, 6) translations and rotation vectors."""
+        translation, rotation = self.tangents[:, :3], self.tangents[:, 3:]
+        generator = torch.cat([cross_matrix(rotation), translation[:, :, None]], dim=-1)
         if self.group == "SO3xR3":
-            # The matrix exponential has a value and a gradient at zero, where Rodrigues' formula has 0 / 0.
-            return torch.cat([torch.linalg.matrix_exp(generator[:, :, :3]), move[:, :, None]], dim=-1)
+            # The matrix exponential has a value and a gradient at zero, where Rodrigues' formula is 0 / 0.
+            return torch.cat([torch.linalg.matrix_exp(generator[:, :, :3]), translation[:, :, None]], dim=-1)
         return torch.linalg.matrix_exp(nn.functional.pad(generator, (0, 0, 0, 1)))[:, :3]
 
     def forward(self, rays: Rays) -> Rays:
-        """The rays of training cameras as they are believed to be; those of others where they then are."""
+        """Move the rays of training cameras by their refinements, and those of other cameras by the common drift."""
         if rays.camera_indices is None:
             return self.carried(rays)
-        # Not `motions[camera_indices]`, whose gradient is added up in whatever order threads come.
+        # Not `motions[camera_indices]`: the order of summation of its gradient depends on the threads.
         motions = nn.functional.embedding(rays.camera_indices, self.motions().flatten(1)).view(-1, 3, 4)
-        turned = (motions[:, :, :3] * rays.directions[:, None]).sum(-1)
+        directions = (motions[:, :, :3] * rays.directions[:, None]).sum(-1)
         origins = rays.origins
         if self.group == "SE3":
             origins = (motions[:, :, :3] * origins[:, None]).sum(-1)
-        return replace(rays, origins=origins + motions[:, :, 3], directions=turned)
+        return replace(rays, origins=origins + motions[:, :, 3], directions=directions)
 
     @torch.no_grad()
     def carried(self, rays: Rays) -> Rays:
-        """Rays of the given poses' frame as rays of the refined poses'; lengths change with the scale between them."""
+        """Transform `rays` from the given poses' frame to the refined poses'; lengths are scaled too."""
         if self.given is None:
             return rays
         refined = self._moved(self.given)
@@ -77,12 +77,12 @@ class PoseRefinement(nn.Module):
 
     @torch.no_grad()
     def refined(self, cameras: Cameras) -> Cameras:
-        """The training cameras (M) where they are believed to be."""
+        """Return the training `cameras` (M) with refined poses."""
         return replace(cameras, camera_to_worlds=self._moved(cameras.camera_to_worlds))
 
     def _moved(self, poses: Tensor) -> Tensor:
         motions = self.motions()
-        # Products and sums rather than a matrix product, which autocast would round to bfloat16.
+        # Products and sums, because autocast would round a matrix product to bfloat16.
         moved = (motions[:, :, :3, None] * poses[:, None]).sum(2)
         centres = moved[:, :, 3:] if self.group == "SE3" else poses[:, :, 3:]
         return torch.cat([moved[:, :, :3], centres + motions[:, :, 3:]], dim=-1)

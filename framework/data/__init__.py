@@ -1,1 +1,1 @@
-"""From files to pixels: images, masks, depths, caches, and batches drawn from them."""
+"""Data sets: reading of images, masks and depths, caches of decoded pixels, and batches."""

@@ -1,4 +1,4 @@
-"""Images with poses: what a data parser delivers, and what batches are drawn from."""
+"""Images with poses: the output of a data parser, and the data set from which batches are drawn."""
 
 from __future__ import annotations
 
@@ -32,48 +32,48 @@ from framework.data.pixel_set import PixelSet
 from framework.data.scene import PoseSource, Scene
 
 Masks = Literal["auto", "ignored", "empty"]
-"""What masks say of the pixels that they do not keep: nothing, or that nothing is there."""
+"""Meaning of masked-out pixels: nothing is known about them, or nothing is there."""
 
 
 @dataclass(frozen=True)
 class ParsedScene:
-    """M images of one split, still on disk."""
+    """M images of one split, not decoded yet."""
 
     image_paths: tuple[Path, ...]
-    """M files."""
+    """M image files."""
     cameras: Cameras
-    """M cameras, with the sizes of the images as stored."""
+    """M cameras, for the stored sizes of the images."""
     box: Tensor
-    """(2, 3) corners of the part of space that matters."""
+    """(2, 3) corners of the region of interest."""
     near: float
-    """Distance from a camera at which the scene may start."""
+    """Distance from a camera at which the scene starts."""
     far: float
     """Distance from a camera at which the scene ends."""
     times: Tensor | None = None
-    """(M,) in [0, 1], for a moving scene."""
+    """(M,) time of each image in [0, 1]; None for a static scene."""
     transform: Tensor | None = None
-    """(3, 4) from the input's frame to the scene's, applied before `scale`; the identity if None."""
+    """(3, 4) rigid transform from the input's frame to the scene's, applied before `scale`; None for the identity."""
     scale: float = 1.0
     """Scene units per unit of the input."""
     downscale_factor: int = 1
-    """Images are reduced by this whole number when they are loaded."""
+    """Integer factor by which images are reduced when they are loaded."""
     mask_paths: tuple[Path | None, ...] | None = None
-    """M images, white where a photograph is to be learnt from and black where it is not; None where there is none."""
+    """M mask files, white for pixels to train on and black for others; None for an image without mask."""
     points: Tensor | None = None
     """(K, 3) sparse points on surfaces, scene coordinates."""
     unbounded: bool = False
-    """There may be something to see outside `box`."""
+    """Whether there may be visible content outside `box`."""
     poses: PoseSource = "exact"
-    """Where the cameras' poses come from."""
+    """Source of the cameras' poses."""
     appearance_varies: bool = False
-    """Light, exposure or camera differ between the photographs."""
+    """Whether light, exposure or camera differ between images."""
     depth_paths: tuple[Path | None, ...] | None = None
-    """M images of depth along the camera's axis, 0 where it is unknown; None where there is none."""
+    """M files of depth along the camera's axis, 0 where unknown; None for an image without depth."""
     depth_unit: float = 0.001
-    """Units of the input that a step of a depth image stands for: metres, of one in millimetres."""
+    """Units of the input per unit of a stored depth: 0.001 for an input in metres and depths in millimetres."""
 
     def __getitem__(self, index: Tensor) -> ParsedScene:
-        """The images chosen by an index tensor."""
+        """Return the images selected by an index tensor."""
         chosen = index.tolist()
         return replace(
             self,
@@ -89,65 +89,68 @@ class DataParser(ABC):
     """A data format. Subclasses are frozen dataclasses whose fields are the format's flags."""
 
     interface: ClassVar[int] = 1
-    """The version of the plugin interface it was written for (`registry.INTERFACE`)."""
+    """Version of the plugin interface for which the format was written (`registry.INTERFACE`)."""
 
     @classmethod
     @abstractmethod
     def recognizes(cls, path: Path) -> bool:
-        """Whether the folder `path` looks like this format. Cheap, and never raises."""
+        """Return whether the folder `path` looks like this format. Must be fast and must not raise."""
 
     @abstractmethod
     def parse(self, path: Path | None, split: Split) -> ParsedScene:
         """Read one split.
 
         Args:
-            path: the data folder, or None where the user named none.
-            split: which images.
-        Raises: DataError that says what is wrong with which file.
+            path: the data folder, or None if the user gave none.
+            split: the split to read.
+
+        Raises:
+            DataError: with the file and what is wrong with it.
         """
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """M decoded images: uint8 until a batch is made, in memory or in a file."""
+    """M decoded images, stored as uint8 in memory or in a file."""
 
     pixels: Tensor
-    """(P, 3) or (P, 4) uint8, image after image, row by row; the fourth channel is straight alpha."""
+    """(P, 3) or (P, 4) uint8 pixels, image after image, row by row; the fourth channel is straight alpha."""
     cameras: Cameras
-    """M cameras at the images' size."""
+    """M cameras, for the sizes of the decoded images."""
     times: Tensor | None
-    """(M,) time of each image."""
+    """(M,) time of each image; None for a static scene."""
     names: tuple[str, ...]
-    """M file names, without folder."""
+    """M file names, without directory."""
     scene: Scene
-    """What methods are told."""
+    """Description of the scene for methods."""
     transform: Tensor
     """(3, 4) from the input's frame to the scene's."""
     scale: float
     """Scene units per unit of the input."""
     drawn: PixelSet | None = None
-    """Pixels that are worth drawing, counted through all images; None for all."""
+    """Pixels from which batches are drawn, counted through all images; None for all."""
     kept: PixelSet | None = None
-    """Pixels that no mask ignores and a ray leads to; None for all."""
+    """Pixels that have a ray and are not masked out; None for all."""
     opaque: PixelSet | None = None
-    """What masks leave, where all that they cut away is empty: pixels that show nothing else have alpha 0."""
+    """Pixels that masks keep, if the masked-out ones are empty, with alpha 0; otherwise None."""
     light: Tensor | None = None
-    """(M, 3, Q) `appearance.light_of` each image, where it is known; None of images with alpha of their own."""
+    """(M, 3, Q) `light.light_of` each image; None if unknown, or if images have an alpha channel."""
     depths: Tensor | None = None
-    """(P,) float16 depth of each pixel along its camera's axis, scene units, 0 where unknown; None for all."""
+    """(P,) float16 depth of each pixel along its camera's axis, scene units, 0 where unknown; None if there are
+    none."""
     mapped: MappedPixels | None = None
-    """The file that `pixels` lie in, where they are too many for memory; they then stay on the processor."""
+    """The file of `pixels`, if they exceed the memory limit; they then stay on the CPU."""
 
     def __len__(self) -> int:
         return len(self.cameras)
 
     @property
     def device(self) -> torch.device:
-        """Where batches are made."""
+        """The device of batches."""
         return self.cameras.fx.device
 
     def image(self, index: int) -> Tensor:
-        """Image `index` as (H, W, 3 or 4) uint8, the fourth where the scene has alpha."""
+        """Return image `index` as (H, W, 3 or 4) uint8, with alpha if the scene has it."""
         height, width = int(self.cameras.heights[index]), int(self.cameras.widths[index])
         start, end = self.cameras.offsets[index : index + 2].tolist()
         pixels = self.pixels[start:end]
@@ -156,8 +159,8 @@ class Dataset:
             self.mapped.drop(start, end)
         pixels = pixels.to(self.device)
         if self.opaque is not None:
-            shown = self.opaque.mask(start, end)
-            alpha = pixels[:, 3] * shown if pixels.shape[1] == 4 else shown * pixels.new_tensor(255)
+            opaque = self.opaque.mask(start, end)
+            alpha = pixels[:, 3] * opaque if pixels.shape[1] == 4 else opaque * pixels.new_tensor(255)
             pixels = torch.cat([pixels[:, :3], alpha[:, None].to(torch.uint8)], dim=-1)
         return pixels.view(height, width, -1)
 
@@ -171,14 +174,18 @@ class Dataset:
         return View.of(self.cameras, index, self.times, stride)
 
     def kept_of(self, index: int) -> Tensor | None:
-        """(H, W) bool: which pixels of image `index` no mask ignores; None where no image has ignored ones."""
+        """Return which pixels of image `index` are kept, (H, W) bool, or None if all pixels of the data set are."""
         if self.kept is None:
             return None
         start, end = self.cameras.offsets[index : index + 2].tolist()
         return self.kept.mask(start, end).view(int(self.cameras.heights[index]), -1)
 
     def drawing(self, pixels: PixelSet) -> Dataset:
-        """The same data, of which only these pixels are drawn, as far as they were until now; all of those if none."""
+        """Return the data set with `drawn` restricted to some pixels, or unchanged if none of them is in `drawn`.
+
+        Args:
+            pixels: pixels to draw from.
+        """
         pixels = pixels.to(self.pixels.device)
         if self.drawn is not None:
             pixels = PixelSet.shared([pixels, self.drawn], 2)
@@ -187,7 +194,7 @@ class Dataset:
         return replace(self, drawn=pixels if self.mapped is not None else pixels.listed())
 
     def to(self, device: torch.device | str) -> Dataset:
-        """The same data on `device`."""
+        """Return the data set on `device`."""
         return replace(
             self,
             pixels=self.pixels if self.mapped is not None else self.pixels.to(device),
@@ -201,14 +208,21 @@ class Dataset:
 
 
 def existing(paths: Sequence[Path], split: str) -> Tensor:
-    """Indices of the files that exist; the missing ones are reported once, by count and first name.
+    """Return the indices of files that exist, and report the number of missing ones and the first.
 
-    Raises: DataError where none exists.
+    Args:
+        paths: files.
+        split: name of the split in messages.
+
+    Raises:
+        DataError: if no file exists.
     """
     missing = [path for path in paths if not path.is_file()]
     if len(missing) == len(paths):
-        first = f"; the first would be {missing[0]}" if missing else ""
-        raise DataError(f"split '{split}' has no image: its data lists {len(paths)}, of which none exists{first}")
+        first = f"; the first is {missing[0]}" if missing else ""
+        raise DataError(
+            f"split '{split}' has no image: none of the {len(paths)} files listed in the data exists{first}"
+        )
     if missing:
         say(f"split '{split}': {len(missing)} of {len(paths)} images are missing and skipped, the first {missing[0]}")
     return torch.tensor([index for index, path in enumerate(paths) if path.is_file()])
@@ -219,12 +233,16 @@ def load_dataset(
 ) -> Dataset:
     """Decode the images of a split.
 
-    Unreadable images are skipped and reported; an image whose size is not its camera's is an error.
+    Unreadable images are skipped and reported.
 
     Args:
-        memory: how much may be held in memory; half of the machine's if None.
-        masks: what they say of the pixels that they do not keep; auto: as `cuts_out` finds.
-    Raises: DataError for a size that does not fit, or where no image is left.
+        parsed: output of a data parser.
+        split: name of the split in messages.
+        memory: memory limit and cache folder; if None, half of the machine's memory and the user's cache folder.
+        masks: meaning of masked-out pixels; auto: decided by `cuts_out`.
+
+    Raises:
+        DataError: if an image's size differs from its camera's, or no image is readable.
     """
     factor = parsed.downscale_factor
     cameras = parsed.cameras if factor == 1 else parsed.cameras.scaled(1 / factor)
@@ -237,15 +255,17 @@ def load_dataset(
 
 
 def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "ignored") -> Dataset:
-    """A data set of images whose pixels are there already (`decoding.from_arrays`).
+    """Construct a data set from decoded images.
 
     Args:
-        parsed: what else is known of those images, the cameras being at their size. Of its files only depth images are
-            read; of the others, which need not exist, the names are kept.
-        decoded: their pixels.
-        split: what to call them in messages.
-        masks: what they say of the pixels that they do not keep; auto: as `cuts_out` finds.
-    Raises: DataError where a lens has no ray for any pixel, or a depth image cannot be used.
+        parsed: the parsed scene of those images, with cameras for their decoded sizes. Depth images are read; of all
+            other files, which need not exist, only the names are used.
+        decoded: the pixels (`decoding.decode` or `decoding.from_arrays`).
+        split: name of the split in messages.
+        masks: meaning of masked-out pixels; auto: decided by `cuts_out`.
+
+    Raises:
+        DataError: if no pixel has a ray, or a depth image is invalid.
     """
     cameras = parsed.cameras
     kept, opaque, light = decoded.kept, None, None if decoded.pixels.shape[1] == 4 else decoded.light
@@ -263,17 +283,17 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         poses=parsed.poses,
         warped=isinstance(cameras, NdcCameras),
         has_depth=parsed.depth_paths is not None and decoded.mapped is None,
-        # Of an object cut out of its surroundings, each side has a light of its own.
+        # `light` is None for an object that is cut out: each of its sides is lit differently.
         appearance_varies=parsed.appearance_varies or (light is not None and light_spread(light) > APPEARANCE_STOPS),
         camera_to_worlds=cameras.camera_to_worlds,
     )
     depths = _depths(parsed, cameras, decoded.mapped is not None)
     names = tuple(path.name for path in parsed.image_paths)
-    reached = pixels_with_rays(cameras, names, split)
-    if reached is not None:
-        kept = reached if kept is None else PixelSet.shared([kept, reached], 2)
+    visible = pixels_with_rays(cameras, names, split)
+    if visible is not None:
+        kept = visible if kept is None else PixelSet.shared([kept, visible], 2)
         if not len(kept):
-            raise DataError(f"split '{split}': masks leave only pixels that the lens has no ray for")
+            raise DataError(f"split '{split}': masks keep only pixels for which the lens has no ray")
     return Dataset(
         pixels=decoded.pixels,
         cameras=cameras,
@@ -292,9 +312,13 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
 
 
 def cuts_out(kept: PixelSet, cameras: Cameras) -> bool:
-    """Whether masks look as if they cut an object out of its surroundings, rather than hide what disturbs.
+    """Return whether masks cut an object out of its surroundings, rather than hide parts of the images.
 
-    They ignore more than half of all pixels, and not the same ones of every photograph, as the rim of a lens would be.
+    They do if they remove more than half of all pixels, and not the same ones of every image, as for the rim of a lens.
+
+    Args:
+        kept: pixels that the masks keep.
+        cameras: cameras of the images.
     """
     ends = cameras.offsets.tolist()
     if len(kept) > ends[-1] / 2:
@@ -307,6 +331,6 @@ def _depths(parsed: ParsedScene, cameras: Cameras, in_file: bool) -> Tensor | No
     if parsed.depth_paths is None:
         return None
     if in_file:
-        say("the depth images are not used, as the photographs are too many for memory")
+        say("the depth images are not used, because the images exceed the memory limit")
         return None
     return read_depths(parsed.depth_paths, cameras, parsed.depth_unit * parsed.scale)

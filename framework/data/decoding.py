@@ -1,6 +1,7 @@
-"""From image files to pixels: each image is decoded straight into its place, in memory or in the cache's file.
+"""Decoding of image files, each directly to its final position in memory or in the cache's file.
 
-So loading takes the memory of the set, or of nothing where it goes to a file, and of the few images being decoded.
+Loading therefore takes memory for the pixels of the data set (none if they go to a file) and for the few images being
+decoded.
 """
 
 from __future__ import annotations
@@ -27,45 +28,56 @@ from framework.data.pixel_set import PixelSet
 from framework.data.pixel_store import MemoryStore, PixelStore, drop_fourth, move
 
 WORKERS = min(os.cpu_count() or 1, 8)
-"""Images that are decoded at once: each holds several times its pixels meanwhile."""
+"""Images decoded at once; each takes several times the memory of its pixels meanwhile."""
 
 
 @dataclass(frozen=True)
 class ImageFiles:
-    """The M images of a split, to be decoded."""
+    """The M image files of a split.
+
+    Args:
+        split: name of the split in messages.
+        images: M paths.
+    """
 
     split: str
     images: tuple[Path, ...]
     masks: tuple[Path | None, ...]
-    """M masks; None where a photograph has none."""
+    """M paths of masks; None for an image without mask."""
     sizes: tuple[tuple[int, int], ...]
-    """M widths and heights after reduction."""
+    """M widths and heights after reduction, pixels."""
     factor: int
-    """Images are reduced by this whole number."""
+    """Integer factor by which images are reduced."""
 
 
 @dataclass(frozen=True)
 class Decoded:
-    """The images that could be read."""
+    """The pixels of the readable images of a split."""
 
     pixels: Tensor
-    """(P, 3 or 4) uint8; four where a pixel is not opaque."""
+    """(P, 3 or 4) uint8 pixels; four channels if any pixel is not opaque."""
     left: Tensor
-    """(M',) int64 which images of the split they are."""
+    """(M',) int64 indices of the readable images in the split."""
     light: Tensor
-    """(M', 3, Q) `light_of` each."""
+    """(M', 3, Q) `light_of` each image."""
     kept: PixelSet | None
-    """What masks do not ignore; None where they ignore nothing."""
+    """Pixels that are not masked out; None for all."""
     mapped: MappedPixels | None
-    """The file that `pixels` lie in; None where they are in memory."""
+    """The file of `pixels`; None if they are in memory."""
 
 
 def decode(files: ImageFiles, memory: PixelMemory) -> Decoded:
-    """Decode images into memory, or into a file where they take more than `memory` allows and none has them already.
+    """Decode images into memory or, if they exceed the limit, into a file, unless an earlier run has written it.
 
     Unreadable images are skipped and reported.
 
-    Raises: DataError for an image whose size is not as stated, a mask that cannot be used, no image left, a full disk.
+    Args:
+        files: the images.
+        memory: memory limit and cache folder.
+
+    Raises:
+        DataError: if an image has another size than stated, a mask is invalid, no image is readable, or the disk is
+            full.
     """
     with ThreadPoolExecutor(WORKERS) as pool:
         channels = 4 if any(pool.map(may_be_transparent, files.images)) else 3
@@ -77,26 +89,28 @@ def decode(files: ImageFiles, memory: PixelMemory) -> Decoded:
         return _decoded(files, facts, torch.from_numpy(store.finish(shape[0] * shape[1])).view(shape), None)
     numbers = [files.factor, *(side for sides in files.sizes for side in sides)]
     path = cache_path(memory.folder, [*files.images, *files.masks], numbers)
-    found = unpack(path)
-    if found is None:
+    cached = unpack(path)
+    if cached is None:
         say(
-            f"split '{files.split}': {size / MB:,.0f} MB of pixels are more than the {memory.limit / MB:,.0f} MB that "
-            f"may be in memory (--cache-limit): decoding them once into {path}"
+            f"split '{files.split}': {size / MB:,.0f} MB of pixels exceed the limit of {memory.limit / MB:,.0f} MB "
+            f"(--cache-limit): decoding them once into {path}"
         )
-        found = _write(files, path, size, channels)
+        cached = _write(files, path, size, channels)
     else:
-        say(f"split '{files.split}': pixels decoded by an earlier run are read from {path}")
-    mapped = MappedPixels(path, int(found["pixels"]), int(found["channels"]), memory.limit)
-    return _decoded(files, found, mapped.pixels, mapped)
+        say(f"split '{files.split}': using the pixels that an earlier run decoded into {path}")
+    mapped = MappedPixels(path, int(cached["pixels"]), int(cached["channels"]), memory.limit)
+    return _decoded(files, cached, mapped.pixels, mapped)
 
 
 def from_arrays(images: Sequence[np.ndarray], masks: Sequence[np.ndarray] | None = None) -> Decoded:
-    """Images that are in memory already, as if they had been decoded.
+    """Return images given as arrays in the form of decoded ones.
 
     Args:
-        images: M arrays (H, W, 3 or 4) uint8, the fourth channel being straight alpha.
-        masks: M arrays (H, W) bool, true where to learn from; None where that is everywhere.
-    Raises: DataError for an array of another kind, or where the masks leave no pixel.
+        images: M arrays (H, W, 3 or 4) uint8; the fourth channel is straight alpha.
+        masks: M arrays (H, W) bool, true for pixels to train on; None for all.
+
+    Raises:
+        DataError: if an array has another type or shape, or the masks keep no pixel.
     """
     for index, image in enumerate(images):
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4):
@@ -107,22 +121,22 @@ def from_arrays(images: Sequence[np.ndarray], masks: Sequence[np.ndarray] | None
     if masks is not None:
         kept = PixelSet.of_mask(torch.from_numpy(np.concatenate([mask.reshape(-1) for mask in masks])))
         if not len(kept):
-            raise DataError("the masks leave no pixel; they must be true where to learn from")
+            raise DataError("the masks keep no pixel; they must be true for pixels to train on")
         kept = None if len(kept) == len(pixels) else kept
-    used: Sequence[np.ndarray | None] = [None] * len(images) if masks is None else masks
-    light = np.stack([light_of(image, mask) for image, mask in zip(images, used, strict=True)])
+    optional_masks: Sequence[np.ndarray | None] = [None] * len(images) if masks is None else masks
+    light = np.stack([light_of(image, mask) for image, mask in zip(images, optional_masks, strict=True)])
     return Decoded(pixels, torch.arange(len(images)), torch.from_numpy(light), kept, None)
 
 
 def _channels(image: np.ndarray, count: int) -> np.ndarray:
-    """An image (H, W, 3 or 4) with three or four channels; it is opaque where it does not say."""
+    """Return an image (H, W, 3 or 4) with `count` channels; a missing alpha channel is opaque."""
     if image.shape[2] >= count:
         return image[..., :count]
     return np.concatenate([image, np.full((*image.shape[:2], 1), 255, np.uint8)], axis=-1)
 
 
 def _write(files: ImageFiles, path: Path, size: int, channels: int) -> dict[str, np.ndarray]:
-    """Decode into a file, which gets its name only when it is whole."""
+    """Decode into a temporary file, and rename it when it is complete."""
     store = temporary_store(path, size)
     try:
         facts = _fill(files, store, channels)
@@ -138,16 +152,16 @@ def _write(files: ImageFiles, path: Path, size: int, channels: int) -> dict[str,
 
 @dataclass(frozen=True)
 class _Image:
-    """What is remembered of an image besides its pixels."""
+    """Properties of a decoded image."""
 
     opaque: bool
     light: np.ndarray
     kept: PixelSet | None
-    """Counted from its own first pixel."""
+    """Pixels that its mask keeps, counted from its own first pixel."""
 
 
 def _fill(files: ImageFiles, store: PixelStore, channels: int) -> dict[str, np.ndarray]:
-    """Decode all images into a store, those that can be read one after the other; returns what was found."""
+    """Decode all images into a store, the readable ones without gaps; return the arrays that `pack` stores."""
     counts = [width * height for width, height in files.sizes]
     starts = [0, *accumulate(counts)]
 
@@ -179,7 +193,7 @@ def _fill(files: ImageFiles, store: PixelStore, channels: int) -> dict[str, np.n
 
 
 def _kept_runs(files: ImageFiles, left: dict[int, _Image], total: int) -> dict[str, np.ndarray]:
-    """What the masks leave of all images, as runs; nothing where they leave everything."""
+    """Return the runs of pixels that the masks keep in all images; an empty dictionary if they keep all."""
     if not any(image.kept is not None for image in left.values()):
         return {}
     starts, lengths, first = [], [], 0
@@ -193,22 +207,22 @@ def _kept_runs(files: ImageFiles, left: dict[int, _Image], total: int) -> dict[s
     runs = {"kept_starts": torch.cat(starts).numpy(), "kept_lengths": torch.cat(lengths).numpy()}
     used = runs["kept_lengths"].sum()
     if used == 0:
-        raise DataError(f"the masks of split '{files.split}' leave no pixel; they must be white where to learn from")
+        raise DataError(f"the masks of split '{files.split}' keep no pixel; they must be white for pixels to train on")
     return runs if used < total else {}
 
 
 def _decode_one(files: ImageFiles, index: int, store: PixelStore, start: int, channels: int) -> _Image | DataError:
-    """Put an image into its place; the error where it cannot be read."""
+    """Decode an image to its position in the store; return the error if it is unreadable."""
     path, mask_path, (width, height) = files.images[index], files.masks[index], files.sizes[index]
     try:
         image = read_image(path, files.factor)
     except DataError as error:
         return error
     if image.shape[:2] != (height, width):
-        found = f"{image.shape[1] * files.factor}x{image.shape[0] * files.factor}"
+        actual = f"{image.shape[1] * files.factor}x{image.shape[0] * files.factor}"
         expected = f"{width * files.factor}x{height * files.factor}"
-        remedy = "resize it, or take it out of the data"
-        raise DataError(f"{path} is {found} pixels, but its camera is for {expected}, as others' are: {remedy}")
+        remedy = "resize it, or remove it from the data"
+        raise DataError(f"{path} is {actual} pixels, but its camera is for {expected}: {remedy}")
     mask = None if mask_path is None else read_mask(mask_path, width, height)
     store.write(start * channels, np.ascontiguousarray(image[..., :channels]).reshape(-1))
     opaque = channels == 3 or bool((image[..., 3] == 255).all())

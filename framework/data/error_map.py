@@ -1,4 +1,4 @@
-"""Draw training pixels where the error still is, without changing what the loss is on average."""
+"""Sampling of training pixels in proportion to their error, with weights that keep the expected loss unchanged."""
 
 from __future__ import annotations
 
@@ -9,67 +9,70 @@ from framework.base.device import exact
 from framework.data.dataset import Dataset
 
 TILE = 8
-"""Pixels along an edge of the squares that share one figure."""
+"""Side of the square tiles that share one error, pixels."""
 EVENLY = 0.5
-"""Share of the draws that does not look at the error, so that no weight exceeds 2."""
-MEMORY = 0.8
-"""What is kept of a square's figure when it is seen again."""
+"""Share of the probability that is uniform, so that no weight exceeds 2."""
+DECAY = 0.8
+"""Share of a tile's old error when it is updated."""
 
 
 class ErrorMap:
-    """The squared error lately seen in each square of 8 x 8 pixels of a data set's photographs.
+    """Running mean of the squared error of each tile of 8 x 8 pixels of a data set's images.
 
     Args:
-        dataset: M photographs.
+        dataset: M images.
     """
 
     def __init__(self, dataset: Dataset) -> None:
         self.dataset = dataset
         cameras = dataset.cameras
         self.columns = (cameras.widths + TILE - 1) // TILE
-        """(M,) squares in a row of each photograph."""
+        """(M,) number of tiles in a row of each image."""
         counts = self.columns * ((cameras.heights + TILE - 1) // TILE)
         self.first = counts.cumsum(0) - counts
-        """(M,) each photograph's first square."""
+        """(M,) index of each image's first tile."""
         self.errors = torch.ones(int(counts.sum()), device=dataset.device)
-        """Mean over a pixel's channels. What was never seen counts as entirely wrong."""
+        """(T,) mean over a pixel's channels; 1, the largest possible, for tiles without a sample yet."""
 
     def squares(self, pixels: Tensor) -> Tensor:
-        """The square of each of the pixels (R,), counted through all photographs."""
+        """Return the index of the tile of each of the `pixels` (R,), counted through all images."""
         dataset = self.dataset
         images = torch.searchsorted(dataset.cameras.offsets, pixels, right=True) - 1
         within, widths = pixels - dataset.cameras.offsets[images], dataset.cameras.widths[images]
         return self.first[images] + within // widths // TILE * self.columns[images] + within % widths // TILE
 
     def draw(self, candidates: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        """`count` of the candidates (M,), and what to multiply their losses by: see `choose`."""
-        taken, weights = self.choose(candidates, count)
-        return candidates[taken], weights
+        """Return `count` of the `candidates` (M,) and the weights (count,) of their losses, selected by `choose`."""
+        selected, weights = self.choose(candidates, count)
+        return candidates[selected], weights
 
     def choose(self, candidates: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        """Which `count` of the candidates to take, and what to multiply their losses by.
+        """Select pixels by systematic resampling.
 
-        Systematic resampling: a candidate is taken count / M times its share on average, its share being 1 in the
-        mean; its weight is 1 over that share. So the weighted mean of any function over those taken is, in
-        expectation, its mean over all candidates, whatever the errors are.
+        A candidate is selected count / M times its share on average, where the shares have mean 1, and its weight is 1
+        over its share. The expectation of the weighted mean of any function over the selected pixels is therefore its
+        mean over all candidates, whatever the errors.
 
         Args:
-            candidates: (M,) pixels, drawn evenly.
-        Returns: places among the candidates (count,) and weights (count,), at most 1 / EVENLY.
+            candidates: (M,) pixels, drawn uniformly.
+            count: number of pixels to select.
+
+        Returns:
+            Indices of the selected candidates (count,), and weights (count,), at most 1 / EVENLY.
         """
         errors = self.errors[self.squares(candidates)]
         share = EVENLY + (1 - EVENLY) * errors / errors.mean().clamp(min=1e-12)
         ends = exact(share).cumsum(0) * (count / len(candidates))
-        places = torch.arange(count, device=ends.device) + torch.rand_like(ends[0])
-        taken = torch.searchsorted(ends, places, right=True).clamp(max=len(candidates) - 1).to(share.device)
-        return taken, 1 / share[taken]
+        positions = torch.arange(count, device=ends.device) + torch.rand_like(ends[0])
+        selected = torch.searchsorted(ends, positions, right=True).clamp(max=len(candidates) - 1).to(share.device)
+        return selected, 1 / share[selected]
 
     def learn(self, pixels: Tensor, errors: Tensor) -> None:
-        """Remember the squared errors (R,) that the pixels (R,) had; what is not finite is left out."""
+        """Update the tiles of `pixels` (R,) with their squared `errors` (R,); non-finite errors are ignored."""
         finite = torch.isfinite(errors)
         squares, errors = self.squares(pixels[finite]), errors[finite]
         sums, counts = torch.zeros_like(self.errors), torch.zeros_like(self.errors)
         sums.index_add_(0, squares, errors)
         counts.index_add_(0, squares, torch.ones_like(errors))
-        seen = counts > 0
-        self.errors[seen] += (1 - MEMORY) * (sums[seen] / counts[seen] - self.errors[seen])
+        updated = counts > 0
+        self.errors[updated] += (1 - DECAY) * (sums[updated] / counts[updated] - self.errors[updated])

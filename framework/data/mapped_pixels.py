@@ -1,4 +1,4 @@
-"""Pixels that lie in a file and are read through a mapping, of which only a part is ever in the process's memory."""
+"""Pixels in a memory-mapped file, of which only a bounded part is held in memory."""
 
 from __future__ import annotations
 
@@ -11,22 +11,23 @@ import torch
 from torch import Tensor
 
 SLICE = 64_000_000
-"""Bytes of the file that are looked at before what was read of them is dropped, at most."""
+"""Maximum number of bytes of the file that are read before their pages are dropped."""
 SMALLEST_SLICE = 2**20
+"""Minimum of the same number."""
 
 
 class MappedPixels:
     """The pixels of a file.
 
-    Pages of a file that were read count as the process's memory until they are dropped, or until the system needs
-    them. So whoever reads goes through the file in order, and drops what lies behind. Dropping takes nothing away: a
-    page that is read again comes from the system's cache, or from the disk.
+    Pages of a mapped file count as the process's memory until they are dropped, or until the system reclaims them.
+    Readers therefore go through the file in order and drop the pages behind them. A dropped page that is read again
+    comes from the system's cache or from the disk.
 
     Args:
         path: a file that begins with the pixels.
-        count: how many; P.
-        channels: C.
-        limit: bytes of pixels that may be in memory; an eighth of it is a slice of the file.
+        count: number of pixels P.
+        channels: number of channels C.
+        limit: bytes of pixels allowed in memory; an eighth of it is the size of a slice.
     """
 
     def __init__(self, path: Path, count: int, channels: int, limit: float) -> None:
@@ -34,17 +35,17 @@ class MappedPixels:
         self.slice = int(min(max(limit / 8, SMALLEST_SLICE), SLICE))
         """Bytes that are read before pages are dropped."""
         with path.open("rb") as file:
-            # Read-only: a mapping that could be written to would have to fit into memory with all others.
+            # Read-only: the system would reserve memory for a writable private mapping.
             self._map = mmap.mmap(file.fileno(), count * channels, access=mmap.ACCESS_READ)
         self._stored = np.frombuffer(self._map, np.uint8).reshape(count, channels)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch knows no read-only tensors, and says so
+            warnings.simplefilter("ignore")  # PyTorch warns that it has no read-only tensors
             self.pixels: Tensor = torch.from_numpy(self._stored)
             """(P, C) uint8 over the mapping; never written to."""
 
     def drop(self, first: int = 0, last: int | None = None) -> None:
-        """Let go of the memory of the pixels first .. last - 1; of all if not given."""
-        if not hasattr(self._map, "madvise"):  # Windows takes pages back by itself
+        """Release the memory of the pixels from `first` to `last` - 1, by default all."""
+        if not hasattr(self._map, "madvise"):  # Windows reclaims pages by itself
             return
         channels = self._stored.shape[1]
         start = first * channels // mmap.PAGESIZE * mmap.PAGESIZE
@@ -53,9 +54,13 @@ class MappedPixels:
             self._map.madvise(mmap.MADV_DONTNEED, start, end - start)
 
     def take(self, flat: np.ndarray) -> np.ndarray:
-        """Stored colours (R, C) of the pixels `flat` (R,) int64, which ascend.
+        """Return the stored colours (R, C) of pixels in ascending order.
 
-        numpy, not torch: it lets Python's lock go and takes one thread, so that a step goes on meanwhile.
+        The implementation uses numpy, which releases Python's global lock and takes one thread, so that training
+        continues meanwhile.
+
+        Args:
+            flat: (R,) int64 numbers of the pixels, ascending.
         """
         out = np.empty((len(flat), self._stored.shape[1]), np.uint8)
         start, pixels = 0, max(self.slice // self._stored.shape[1], 1)
@@ -68,7 +73,7 @@ class MappedPixels:
         return out
 
     def look_up(self, flat: Tensor) -> Tensor:
-        """Stored colours (R, C) of any pixels (R,), read in the file's order."""
+        """Return the stored colours (R, C) of the pixels `flat` (R,), read in the file's order."""
         order = np.argsort(flat.numpy(), kind="stable")
         out = np.empty((len(flat), self._stored.shape[1]), np.uint8)
         out[order] = self.take(flat.numpy()[order])

@@ -1,4 +1,4 @@
-"""Masks of photographs: white where they are to be learnt from, black where they are not."""
+"""Masks of images: white for pixels to train on, black for others."""
 
 from __future__ import annotations
 
@@ -11,16 +11,24 @@ from framework.base.errors import DataError
 from framework.data.image_files import Content, unreadable
 
 THRESHOLD = 128
-"""The least grey that counts as white."""
+"""Minimum grey value that counts as white."""
 
 
 def read_mask(path: Path, width: int, height: int) -> np.ndarray:
-    """Which pixels of a photograph of width x height are to be used, (H, W) bool.
+    """Read the mask of an image.
 
-    A mask may be larger or smaller than its photograph by a whole number, but for the rest that is cut off when images
-    are reduced; then a pixel has the value of the nearest.
+    The mask may be larger or smaller than the image by an integer factor, apart from the remainder that is cut off when
+    images are reduced; each pixel then takes the nearest value.
 
-    Raises: DataError that names the file, where it is missing, unreadable or of another size.
+    Args:
+        path: the mask's file.
+        width, height: size of the image, pixels.
+
+    Returns:
+        (H, W) bool, true for pixels to train on.
+
+    Raises:
+        DataError: if the file is missing, unreadable or of another size.
     """
     if not path.is_file():
         raise DataError(f"the mask {path} does not exist")
@@ -32,19 +40,19 @@ def read_mask(path: Path, width: int, height: int) -> np.ndarray:
         raise DataError(f"the mask {path} has no pixel")
     used = grey >= THRESHOLD
     down, up = round(used.shape[1] / width), round(width / used.shape[1])
-    if _times(used.shape, (height, width), down):
-        places = [np.arange(n) * down + down // 2 for n in (height, width)]
-    elif _times((height, width), used.shape, up):
-        places = [np.arange(n) // up for n in (height, width)]
+    if _is_multiple(used.shape, (height, width), down):
+        indices = [np.arange(n) * down + down // 2 for n in (height, width)]
+    elif _is_multiple((height, width), used.shape, up):
+        indices = [np.arange(n) // up for n in (height, width)]
     else:
         raise DataError(
-            f"the mask {path} is {used.shape[1]}x{used.shape[0]} pixels, but its photograph is {width}x{height}; "
-            "the one must be a whole number of times the other"
+            f"the mask {path} is {used.shape[1]}x{used.shape[0]} pixels, but its image is {width}x{height}; "
+            "one must be an integer multiple of the other"
         )
-    rows, columns = (np.minimum(at, size - 1) for at, size in zip(places, used.shape, strict=True))
+    rows, columns = (np.minimum(index, size - 1) for index, size in zip(indices, used.shape, strict=True))
     return used[np.ix_(rows, columns)]
 
 
-def _times(large: tuple[int, ...], small: tuple[int, ...], factor: int) -> bool:
-    """Whether a size is `factor` times another, but for a rest."""
+def _is_multiple(large: tuple[int, ...], small: tuple[int, ...], factor: int) -> bool:
+    """Return whether a size is `factor` times another, apart from a remainder."""
     return all(abs(a - b * factor) < factor for a, b in zip(large, small, strict=True))

@@ -1,8 +1,8 @@
-"""The cache of decoded pixels: image sets that are larger than memory may hold are decoded once, into a file.
+"""The cache of decoded pixels: data sets that exceed the memory limit are decoded once, into a file.
 
-A file is the pixels (P, C) uint8, then a .npz with what else was found while decoding, its length, and `MAGIC`. It gets
-its name only when it is whole. Its name is a hash of what it was made from, so it is never out of date; files of images
-that have changed since are not removed.
+A file holds the pixels (P, C) uint8, then an uncompressed .npz with the other results of decoding, its length, and
+`MAGIC`. It is renamed to its final name when it is complete. The name is a hash of everything that the pixels depend
+on, so a file is never out of date; files for images that have changed since are not removed.
 """
 
 from __future__ import annotations
@@ -24,40 +24,53 @@ from framework.base.user_cache import cache_folder
 from framework.data.pixel_store import FileStore
 
 FORMAT = 1
-"""Raised whenever the file, or what is decoded into it, changes."""
+"""Version of the format; raised whenever the file's layout or the decoded values change."""
 MAGIC = b"NERFLOOM"
+"""Last bytes of a complete file."""
 MB = 1_000_000
+"""Bytes of a megabyte."""
 
 
 @dataclass(frozen=True)
 class PixelMemory:
-    """How much of a split's pixels may be held in memory, and where they lie if they are more."""
+    """The memory limit for a split's pixels, and the folder for pixels that exceed it."""
 
     limit: float
-    """Bytes."""
+    """Limit, bytes."""
     folder: Path
-    """Where cached pixels are kept."""
+    """Folder of cached pixels."""
 
     @classmethod
     def of(cls, limit: float | None = None, folder: Path | None = None) -> PixelMemory:
-        """From the settings: the limit in MB, half of the machine's memory if None; the user's cache folder if None."""
+        """Construct from settings.
+
+        Args:
+            limit: limit in MB; half of the machine's memory if None.
+            folder: cache folder; the user's if None.
+        """
         return cls(machine_memory() / 2 if limit is None else limit * MB, folder or cache_folder())
 
 
 def cache_path(folder: Path, files: list[Path | None], numbers: list[int]) -> Path:
-    """The name of the pixels made from files: their absolute paths, sizes and times of change, and what else counts."""
+    """Return the path of the cached pixels of image files.
+
+    Args:
+        folder: the cache folder.
+        files: files that the pixels depend on, identified by absolute path, size and time of modification.
+        numbers: other numbers that the pixels depend on.
+    """
     digest = hashlib.blake2b(repr((FORMAT, numbers)).encode(), digest_size=16)
     for file in files:
-        about: tuple[object, ...] = (None,)
+        identity: tuple[object, ...] = (None,)
         if file is not None and file.is_file():
             stat = file.stat()
-            about = (str(file.resolve()), stat.st_size, stat.st_mtime_ns)
-        digest.update(repr(about).encode())
+            identity = (str(file.resolve()), stat.st_size, stat.st_mtime_ns)
+        digest.update(repr(identity).encode())
     return folder / f"pixels-{digest.hexdigest()}.bin"
 
 
 def pack(facts: dict[str, np.ndarray]) -> bytes:
-    """What stands behind the pixels."""
+    """Return the bytes that follow the pixels in a file: the arrays `facts`, their length and `MAGIC`."""
     content = io.BytesIO()
     np.savez(content, **facts)  # type: ignore[arg-type]
     values = content.getvalue()
@@ -65,7 +78,7 @@ def pack(facts: dict[str, np.ndarray]) -> bytes:
 
 
 def unpack(path: Path) -> dict[str, np.ndarray] | None:
-    """What stands behind the pixels of a file; None where there is no such file, or it is not whole."""
+    """Read the arrays that follow the pixels in the file `path`; None if it does not exist or is incomplete."""
     try:
         with path.open("rb") as file:
             size = file.seek(-16, os.SEEK_END)
@@ -74,40 +87,51 @@ def unpack(path: Path) -> dict[str, np.ndarray] | None:
                 return None
             file.seek(size - length)
             packed = file.read(length)
-        if unfolded_size(io.BytesIO(packed)) > length:  # `pack` compresses nothing
+        if unfolded_size(io.BytesIO(packed)) > length:  # `pack` does not compress
             return None
         with np.load(io.BytesIO(packed), allow_pickle=False) as content:
             facts = {name: content[name] for name in content.files}
-        whole = size - length == int(facts["pixels"]) * int(facts["channels"])
+        complete = size - length == int(facts["pixels"]) * int(facts["channels"])
     except Exception:  # numpy, zipfile and zlib raise ValueError, EOFError, KeyError, BadZipFile, zlib.error and more
         return None
-    return facts if whole else None
+    return facts if complete else None
 
 
 def temporary_store(path: Path, size: int) -> FileStore:
-    """A file beside `path` to write `size` bytes to, once what killed processes left there is removed.
+    """Create a file beside `path`, after removing files that killed processes left there.
 
-    Raises: DataError where there is no room.
+    Args:
+        path: final path of the file.
+        size: size in bytes.
+
+    Raises:
+        DataError: if the disk has not enough space.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        for remnant in path.parent.glob(f".pixels-*.{_host()}.*.tmp"):
-            if not _alive(remnant.name.split(".")[-2]):
-                remnant.unlink(missing_ok=True)
+        for leftover in path.parent.glob(f".pixels-*.{_host()}.*.tmp"):
+            if not _alive(leftover.name.split(".")[-2]):
+                leftover.unlink(missing_ok=True)
         return FileStore(path.with_name(f".{path.stem}.{_host()}.{os.getpid()}.tmp"), size)
     except OSError as error:
         raise no_room(path.parent, size, error) from error
 
 
 def no_room(folder: Path, size: int, error: OSError) -> DataError:
-    """The error where `size` bytes could not be written."""
+    """Return the error for a failed write.
+
+    Args:
+        folder: the cache folder.
+        size: number of bytes that were to be written.
+        error: the system's error.
+    """
     try:
         free = f", where {shutil.disk_usage(folder).free / MB:,.0f} MB are free"
     except OSError:
         free = ""
     return DataError(
         f"cannot write decoded pixels: {size / MB:,.0f} MB are needed in {folder}{free} ({error.strerror}); "
-        "make room, name another --cache-dir, or raise --cache-limit if memory has room for them"
+        "free some space, choose another --cache-dir, or raise --cache-limit if memory suffices"
     )
 
 
@@ -116,7 +140,7 @@ def _host() -> str:
 
 
 def _alive(process: str) -> bool:
-    """Whether this machine runs a process of that number; taken for granted where it cannot be asked harmlessly."""
+    """Return whether a process of this number runs; True on systems where a test could harm it."""
     if os.name != "posix" or not process.isdecimal():
         return True
     try:

@@ -1,4 +1,4 @@
-"""Some of a data set's pixels, kept as runs: what is cut out of photographs costs its outline, not its area."""
+"""Sets of a data set's pixels, stored as runs: their size depends on the outline of a region, not on its area."""
 
 from __future__ import annotations
 
@@ -13,30 +13,40 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class PixelSet:
-    """N runs of neighbouring pixels, counted through all images; K pixels in all, in ascending order."""
+    """N runs of consecutive pixels, counted through all images: K pixels in ascending order."""
 
     starts: Tensor
     """(N,) int64 first pixel of each run, ascending."""
     before: Tensor
-    """(N + 1,) int64 how many pixels lie in the runs before each; the last is K."""
+    """(N + 1,) int64 number of pixels in the runs before each run; the last entry is K."""
     every: Tensor | None = None
-    """(K,) the pixels one by one, where there is memory for them: four times as fast to draw from."""
+    """(K,) all pixels, if memory suffices; sampling from this list is four times as fast."""
 
     @classmethod
     def of_runs(cls, starts: Tensor, lengths: Tensor) -> PixelSet:
-        """Runs that are in order, and neither overlap nor are empty."""
+        """Construct from runs in ascending order, neither overlapping nor empty.
+
+        Args:
+            starts: (N,) int64 first pixel of each run.
+            lengths: (N,) int64 number of pixels of each run.
+        """
         return cls(starts, torch.cat([torch.zeros_like(starts[:1]), lengths]).cumsum(0) if len(starts) else _none(1))
 
     @classmethod
     def of_mask(cls, mask: Tensor, first: int = 0) -> PixelSet:
-        """Where `mask` (of any shape) is true, its first element being pixel `first`."""
+        """Construct from the true elements of a mask.
+
+        Args:
+            mask: bool, of any shape.
+            first: pixel of the mask's first element.
+        """
         edges = torch.nn.functional.pad(mask.reshape(-1).to(torch.int8), (1, 1)).diff()
         starts = (edges == 1).nonzero().squeeze(-1)
         return cls.of_runs(starts + first, (edges == -1).nonzero().squeeze(-1) - starts)
 
     @classmethod
     def of_pixels(cls, pixels: Tensor) -> PixelSet:
-        """The pixels (K,), ascending."""
+        """Construct from `pixels` (K,), ascending."""
         first = torch.ones(len(pixels), dtype=torch.bool, device=pixels.device)
         first[1:] = pixels.diff() > 1
         ends = torch.cat([first.nonzero().squeeze(-1), torch.tensor([len(pixels)], device=pixels.device)])
@@ -44,23 +54,28 @@ class PixelSet:
 
     @classmethod
     def joined(cls, sets: Iterable[PixelSet]) -> PixelSet:
-        """All of some sets that follow each other."""
+        """Concatenate `sets`, each of which lies behind the one before."""
         pairs = [(part.starts, part.before.diff()) for part in sets]
         starts, lengths = (torch.cat(column) for column in zip(*pairs, strict=True))
         return cls.of_runs(starts, lengths)
 
     @classmethod
     def shared(cls, sets: Sequence[PixelSet], at_least: int) -> PixelSet:
-        """Pixels that lie in at least so many of the sets: 1 is their union, the number of sets what all share."""
+        """Return the pixels that are in several sets.
+
+        Args:
+            sets: one or more sets.
+            at_least: the number of sets in which a pixel must be: 1 for the union, len(sets) for the intersection.
+        """
         starts = torch.cat([part.starts for part in sets])
         ends = torch.cat([part.starts + part.before.diff() for part in sets])
-        places, order = torch.cat([ends, starts]).sort(stable=True)  # of a run's end and another's start, the end first
+        boundaries, order = torch.cat([ends, starts]).sort(stable=True)  # at equal positions, ends before starts
         depth = torch.where(order < len(ends), -1, 1).cumsum(0)
-        within = torch.zeros_like(places, dtype=torch.bool)
-        within[:-1] = (depth[:-1] >= at_least) & (places.diff() > 0)
-        first, last = places[within], places[1:][within[:-1]]
+        inside = torch.zeros_like(boundaries, dtype=torch.bool)
+        inside[:-1] = (depth[:-1] >= at_least) & (boundaries.diff() > 0)
+        first, last = boundaries[inside], boundaries[1:][inside[:-1]]
         opens, closes = torch.ones_like(first, dtype=torch.bool), torch.ones_like(first, dtype=torch.bool)
-        opens[1:] = first[1:] != last[:-1]  # pieces that touch are one run
+        opens[1:] = first[1:] != last[:-1]  # adjacent intervals form one run
         closes[:-1] = opens[1:]
         return cls.of_runs(first[opens], last[closes] - first[opens])
 
@@ -73,25 +88,25 @@ class PixelSet:
 
     @cached_property
     def _ends(self) -> Tensor:
-        """(N + 1,) where the run before each begins to be over; 0 before the first."""
+        """(N + 1,) first pixel behind the run before each run; 0 before the first."""
         return torch.cat([torch.zeros_like(self.before[:1]), self.starts + self.before.diff()])
 
     def to(self, device: torch.device | str) -> PixelSet:
-        """The same pixels on `device`."""
-        known = (getattr(self, f.name) for f in fields(self))
-        return PixelSet(*(None if values is None else values.to(device) for values in known))  # type: ignore[arg-type]
+        """Return the set on `device`."""
+        values = (getattr(self, f.name) for f in fields(self))
+        return PixelSet(*(None if values is None else values.to(device) for values in values))  # type: ignore[arg-type]
 
     def listed(self) -> PixelSet:
-        """The same pixels, which are also kept one by one."""
+        """Return the set with the list of all its pixels in `every`."""
         every = self.pixels()
         small = len(every) == 0 or int(every[-1]) < 2**31
         return replace(self, every=every.to(torch.int32) if small else every)
 
     def at(self, ranks: Tensor) -> Tensor:
-        """(R,) int64 the pixels that are the `ranks`-th (R,) of the set, from 0."""
+        """Return the pixels (R,) int64 of given `ranks` (R,) in the set, counted from 0."""
         if self.every is not None:
             return self.every[ranks].long()
-        if ranks.device.type == "cpu":  # numpy takes one thread: a background thread must not wake torch's
+        if ranks.device.type == "cpu":  # numpy takes one thread; a background thread must not start PyTorch's
             return torch.from_numpy(self._at(ranks.numpy()))
         runs = torch.searchsorted(self.before, ranks, right=True) - 1
         return self.starts[runs] + ranks - self.before[runs]
@@ -102,16 +117,16 @@ class PixelSet:
         return starts[runs] + (ranks - before[runs])
 
     def contains(self, pixels: Tensor) -> Tensor:
-        """(R,) bool: which of the pixels (R,) int64 are in the set."""
+        """Return which of the `pixels` (R,) int64 are in the set, (R,) bool."""
         return pixels < self._ends[torch.searchsorted(self.starts, pixels, right=True)]
 
     def pixels(self) -> Tensor:
-        """(K,) int64 all of them."""
+        """Return all pixels, (K,) int64."""
         shift = (self.starts - self.before[:-1]).repeat_interleave(self.before.diff())
         return shift.add_(torch.arange(len(self), device=self.starts.device))
 
     def mask(self, first: int, last: int) -> Tensor:
-        """(last - first,) bool: which of the pixels first .. last - 1 are in the set."""
+        """Return which of the pixels from `first` to `last` - 1 are in the set, (last - first,) bool."""
         ends = self.starts + self.before.diff()
         low = int(torch.searchsorted(ends, first, right=True))
         high = int(torch.searchsorted(self.starts, last))

@@ -1,4 +1,4 @@
-"""Where decoded images are written to, each in its place: an array in memory, or a file."""
+"""Destinations of decoded images: an array in memory, or a file."""
 
 from __future__ import annotations
 
@@ -11,48 +11,51 @@ from typing import BinaryIO, Protocol
 
 import numpy as np
 
-PIECE = 2**24
-"""Bytes that are moved at once."""
+CHUNK = 2**24
+"""Bytes moved at once."""
 
 
 class PixelStore(Protocol):
-    """Bytes that are written and read by place; several threads may do so at once."""
+    """Bytes that are written and read by position, possibly by several threads at once."""
 
     def write(self, start: int, values: np.ndarray) -> None:
-        """Put uint8 values (N,) at byte `start`."""
+        """Write uint8 `values` (N,) at byte `start`."""
 
     def read(self, start: int, count: int) -> np.ndarray:
-        """A copy, (count,) uint8, of what stands at byte `start`."""
+        """Return a copy (count,) uint8 of `count` bytes at byte `start`."""
 
 
-class MemoryStore:
+class MemoryStore(PixelStore):
     """An array of `size` bytes in memory."""
 
     def __init__(self, size: int) -> None:
         self._values = np.empty(size, np.uint8)
 
     def write(self, start: int, values: np.ndarray) -> None:
-        """As `PixelStore.write`."""
         self._values[start : start + len(values)] = values
 
     def read(self, start: int, count: int) -> np.ndarray:
-        """As `PixelStore.read`."""
         return self._values[start : start + count].copy()
 
     def finish(self, size: int) -> np.ndarray:
-        """The first `size` bytes, (size,) uint8; the rest is given back."""
+        """Return the first `size` bytes as (size,) uint8, and free the rest."""
         if size < len(self._values):
-            self._values.resize(size, refcheck=False)  # in place: a copy would need the memory twice
+            self._values.resize(size, refcheck=False)  # in place: a copy would need twice the memory
         return self._values
 
 
-class FileStore:
-    """A new file of `size` bytes.
+class FileStore(PixelStore):
+    """A new file.
 
     It is written to, not mapped: on a full disk a write fails, where a mapping would kill the process. Its space is
-    taken at once where the system can, so that a full disk is known before anything is decoded.
+    allocated at once if the system can, so that a full disk is noticed before anything is decoded.
 
-    Raises: OSError where there is no room.
+    Args:
+        path: the file to create.
+        size: its size in bytes.
+
+    Raises:
+        OSError: if the disk has not enough space.
     """
 
     def __init__(self, path: Path, size: int) -> None:
@@ -65,22 +68,26 @@ class FileStore:
             if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
                 self.discard()
                 raise
-            # else a file system that cannot: it will be seen while writing
+            # otherwise the file system cannot allocate, and a full disk is noticed while writing
 
     def write(self, start: int, values: np.ndarray) -> None:
-        """As `PixelStore.write`. Raises: OSError."""
         with self._lock:
             self._file.seek(start)
             self._file.write(np.ascontiguousarray(values).data)
 
     def read(self, start: int, count: int) -> np.ndarray:
-        """As `PixelStore.read`."""
         with self._lock:
             self._file.seek(start)
             return np.frombuffer(self._file.read(count), np.uint8)
 
     def finish(self, size: int, ending: bytes, path: Path) -> None:
-        """Cut the file at `size` bytes, write `ending` behind, and give it its name once it is safe on the disk."""
+        """Complete the file and rename it, once its content is safe on the disk.
+
+        Args:
+            size: bytes to keep.
+            ending: bytes to append.
+            path: final path.
+        """
         with self._lock:
             self._file.truncate(size)
             self._file.seek(size)
@@ -92,20 +99,20 @@ class FileStore:
 
     def discard(self) -> None:
         """Remove the file."""
-        with suppress(OSError):  # closing writes what is left, and may find no room for it
+        with suppress(OSError):  # closing flushes buffers, which fails on a full disk
             self._file.close()
         self.path.unlink(missing_ok=True)
 
 
 def move(store: PixelStore, source: int, target: int, count: int) -> None:
-    """Move `count` bytes towards the beginning."""
-    for done in range(0, count if target < source else 0, PIECE):
-        store.write(target + done, store.read(source + done, min(PIECE, count - done)))
+    """Move `count` bytes from position `source` to an earlier position `target` of `store`."""
+    for done in range(0, count if target < source else 0, CHUNK):
+        store.write(target + done, store.read(source + done, min(CHUNK, count - done)))
 
 
 def drop_fourth(store: PixelStore, pixels: int) -> None:
-    """Turn the first `pixels` groups of four bytes into as many of three, in place."""
-    for done in range(0, pixels, PIECE // 4):
-        count = min(PIECE // 4, pixels - done)
-        four = store.read(4 * done, 4 * count).reshape(-1, 4)
-        store.write(3 * done, np.ascontiguousarray(four[:, :3]).reshape(-1))
+    """Convert the first `pixels` pixels of `store` from four channels to three, in place."""
+    for done in range(0, pixels, CHUNK // 4):
+        count = min(CHUNK // 4, pixels - done)
+        rgba = store.read(4 * done, 4 * count).reshape(-1, 4)
+        store.write(3 * done, np.ascontiguousarray(rgba[:, :3]).reshape(-1))

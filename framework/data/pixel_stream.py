@@ -1,9 +1,9 @@
 """Colours of future batches, read ahead from a file in the file's order.
 
-Which pixels a step draws is a function of (seed, step) alone (`device.seed_step`), so they can be drawn long before.
-The pixels of many steps are drawn, sorted, and read from front to back once, in a thread of its own, while training
-goes on with those of the steps before. So each batch is what it would be with all pixels in memory, to the bit, however
-far is read ahead; a resumed run need not know where an earlier one had read.
+The pixels of a step are a function of (seed, step) alone (`device.seed_step`), so they can be drawn long before the
+step. A thread draws and sorts the pixels of many steps and reads them from front to back, while training continues with
+those of earlier steps. Each batch has the same bits as with all pixels in memory, however far is read ahead, and a
+resumed run does not depend on what an earlier one had read.
 """
 
 from __future__ import annotations
@@ -19,54 +19,64 @@ from framework.base.device import stream_seed
 from framework.data.dataset import Dataset
 
 MOST_STEPS = 64
-"""Steps whose pixels are read at once, at most."""
+"""Maximum number of steps whose pixels are read together."""
 FIRST_STEPS = 4
-"""Those of the first reading, for which training waits; each later one is twice as long."""
+"""Number of steps of the first block, for which training waits; each later block has twice as many."""
 MARGIN = 1.25
-"""Pixels are read for batches this much larger than the last, which may grow meanwhile."""
+"""Ratio of the pixels read per step to the last batch's, as batches may grow meanwhile."""
 BYTES = 32
-"""Memory that reading a pixel takes, with a reserve: 8 for its number and place, 3 or 4 for its colour, the rest for
-what is in work."""
-PIECE = 2**16
-"""Pixels in work at once."""
+"""Memory per pixel that is read, bytes: 8 for number and position, 3 or 4 for the colour, the rest for temporary
+arrays."""
+CHUNK = 2**16
+"""Number of pixels processed at once."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """What was read for some steps."""
+    """The colours read for some steps."""
 
     first: int
-    """The first step."""
+    """First step."""
     colors: Tensor
-    """(steps, R, C) uint8: what each step draws first."""
+    """(steps, R, C) uint8 colours of the first R pixels of each step."""
 
     def holds(self, step: int) -> bool:
-        """Whether it was read for a step."""
+        """Return whether the block contains step `step`."""
         return self.first <= step < self.first + len(self.colors)
 
 
 class PixelStream:
-    """Reads ahead what training will draw.
+    """A reader of the colours that training will draw.
 
     Args:
-        dataset: whose pixels lie in a file. `drawn` must not change any more.
-        seed: the run's.
-    Raises: ValueError where the pixels are in memory.
+        dataset: a data set whose pixels are in a file. `drawn` must not change afterwards.
+        seed: the run's seed.
+
+    Raises:
+        ValueError: if the pixels are in memory.
     """
 
     def __init__(self, dataset: Dataset, seed: int) -> None:
         if dataset.mapped is None:
-            raise ValueError("the data set's pixels are in memory: there is nothing to read ahead")
+            raise ValueError("the data set's pixels are in memory, so they cannot be read ahead")
         self.mapped, self.drawn, self.seed = dataset.mapped, dataset.drawn, seed
         self.total = len(dataset.pixels) if self.drawn is None else len(self.drawn)
         self.capacity = self.mapped.slice // BYTES
-        """Pixels that may be read at once."""
+        """Maximum number of pixels read together."""
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="pixels")
         self._block: Block | None = None
         self._next: Future[Block] | None = None
 
     def look_up(self, step: int, flat: Tensor) -> Tensor:
-        """Stored colours (R, C) uint8 of the pixels `flat` (R,) that step `step` drew, in the order of drawing."""
+        """Return the stored colours of the pixels drawn in a step.
+
+        Args:
+            step: the step's number.
+            flat: (R,) numbers of the pixels, in the order in which they were drawn.
+
+        Returns:
+            (R, C) uint8.
+        """
         if self._block is None or not self._block.holds(step):
             self._block = self._read(step, len(flat))
         ready = self._block.colors[step - self._block.first]
@@ -75,7 +85,7 @@ class PixelStream:
         return torch.cat([ready, self.mapped.look_up(flat[len(ready) :])])
 
     def _read(self, step: int, count: int) -> Block:
-        """The block of a step that draws `count` pixels; the one after it is begun."""
+        """Return the block of a step that draws `count` pixels, and start to read the next block."""
         block = None if self._next is None else self._next.result()
         if block is None or not block.holds(step):
             block = self._begin(step, FIRST_STEPS, count).result()
@@ -84,31 +94,36 @@ class PixelStream:
         return block
 
     def _begin(self, first: int, steps: int, count: int) -> Future[Block]:
-        """Read for so many steps from `first` on, or for as many as fit, in the thread."""
+        """Start to read a block of `steps` steps, or of as many as fit, in the thread."""
         count = max(min(count, self.capacity), 1)
         return self._reader.submit(self.read, first, max(min(steps, self.capacity // count), 1), count)
 
     def read(self, first: int, steps: int, count: int) -> Block:
-        """What the steps first .. first + steps - 1 draw, if they draw `count` pixels each.
+        """Return the colours of the pixels that some steps draw.
 
-        A number holds a pixel's rank among those worth drawing and, in its low bits, whose it is; so one sort in place
-        tells both what to read next and where to put it.
+        An integer holds a pixel's rank among `drawn` and, in its low bits, the position of its colour in the block; one
+        in-place sort then gives both the order of reading and the positions.
+
+        Args:
+            first: the first step.
+            steps: number of steps.
+            count: number of pixels per step.
         """
-        places = steps * count
-        bits, generator = places.bit_length(), torch.Generator()
-        numbers = np.empty(places, np.int64)
+        total = steps * count
+        bits, generator = total.bit_length(), torch.Generator()
+        numbers = np.empty(total, np.int64)
         for index in range(steps):
             generator.manual_seed(stream_seed(self.seed, first + index))
             part = numbers[index * count : (index + 1) * count]
             part[:] = torch.randint(self.total, (count,), generator=generator).numpy()
         numbers <<= bits
-        numbers |= np.arange(places)
+        numbers |= np.arange(total)
         numbers.sort()
-        colors = np.empty((places, self.mapped.pixels.shape[1]), np.uint8)
-        for start in range(0, places, PIECE):
-            piece = numbers[start : start + PIECE]
-            flat = piece >> bits
+        colors = np.empty((total, self.mapped.pixels.shape[1]), np.uint8)
+        for start in range(0, total, CHUNK):
+            chunk = numbers[start : start + CHUNK]
+            flat = chunk >> bits
             if self.drawn is not None:
                 flat = self.drawn.at(torch.from_numpy(flat)).numpy()
-            colors[piece & ((1 << bits) - 1)] = self.mapped.take(flat)
+            colors[chunk & ((1 << bits) - 1)] = self.mapped.take(flat)
         return Block(first, torch.from_numpy(colors).view(steps, count, -1))

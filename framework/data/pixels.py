@@ -1,4 +1,4 @@
-"""Batches of training pixels, drawn without building any ray that is not used."""
+"""Batches of training pixels; rays are computed only for the pixels drawn."""
 
 from __future__ import annotations
 
@@ -19,28 +19,29 @@ from framework.kernels import native
 from framework.kernels.given import check_indices, is_followed
 
 Background = Literal["random", "white", "black"]
+"""Kind of background."""
 LookUp = Callable[[Tensor], Tensor]
-"""From pixels (R,) int64 to their stored colours (R, 3 or 4) uint8."""
+"""Function from pixels (R,) int64 to their stored colours (R, 3 or 4) uint8."""
 
 
 @dataclass(frozen=True)
 class PixelBatch:
-    """R pixels to learn from."""
+    """R pixels to train on."""
 
     pixels: Tensor
-    """(R,) int64 which they are, counted through all images."""
+    """(R,) int64 numbers of the pixels, counted through all images."""
     rays: Rays
-    """R * K rays, those of a pixel together; through its centre where K is 1."""
+    """R * K rays, those of a pixel consecutive; if K is 1, through the pixel's centre."""
     rgb: Tensor
     """(R, 3) colours over `background`."""
     background: Tensor
-    """(R, 3) what shows where a photograph is transparent."""
+    """(R, 3) colours behind transparent pixels."""
     alpha: Tensor | None
-    """(R,) opacity, where the photographs have it."""
+    """(R,) opacity, if the images have alpha."""
     distances: Tensor | None = None
-    """(R,) along the pixel's ray to what a depth image shows, 0 where unknown, where there are such images."""
+    """(R,) measured distance along the pixel's ray, 0 where unknown; None without depth images."""
     weights: Tensor | None = None
-    """(R,) what each pixel's loss is multiplied by, where they were not drawn evenly; 1 in the mean."""
+    """(R,) factors of the pixels' losses, with mean 1, if the pixels were not drawn uniformly."""
 
     def __len__(self) -> int:
         return self.pixels.shape[0]
@@ -71,28 +72,39 @@ class ViewBatch:
 
 
 def training_background(asked: Background | Literal["auto"], has_alpha: bool) -> Background:
-    """What is behind transparent pixels in training: as asked for; of "auto", random where photographs have alpha."""
+    """Return the background behind transparent pixels in training.
+
+    Args:
+        asked: the configured background; "auto" is random for images with alpha, else black.
+        has_alpha: whether the images have alpha.
+    """
     if asked != "auto":
         return asked
     return "random" if has_alpha else "black"
 
 
 def background_colors(kind: Background, count: int, device: torch.device) -> Tensor:
-    """(count, 3) colours in [0, 1]; "random" draws a new one for each pixel, so that no fixed colour can be learnt."""
+    """Return background colours (count, 3) in [0, 1].
+
+    Args:
+        kind: "random" is another colour for each pixel, so that no fixed background can be learnt.
+        count: number of pixels.
+        device: device of the result.
+    """
     if kind == "random":
         return torch.rand(count, 3, device=device)
     return torch.full((count, 3), 1.0 if kind == "white" else 0.0, device=device)
 
 
 def composite(rgba: Tensor, background: Tensor) -> Tensor:
-    """Straight-alpha colours (R, 4) over `background` (R, 3); colours (R, 3) as they are."""
+    """Composite straight-alpha colours `rgba` (R, 4) over `background` (R, 3); colours (R, 3) stay unchanged."""
     if rgba.shape[-1] == 3:
         return rgba
     return rgba[..., :3] * rgba[..., 3:] + background * (1 - rgba[..., 3:])
 
 
 def draw_pixels(dataset: Dataset, count: int) -> Tensor:
-    """`count` pixels, each of those worth drawing being equally likely, with replacement, by torch's generator."""
+    """Draw `count` pixels of `dataset` uniformly from those to be drawn, with replacement, by PyTorch's generator."""
     device = dataset.pixels.device
     if dataset.drawn is None:
         return torch.randint(len(dataset.pixels), (count,), device=device)
@@ -104,36 +116,47 @@ def draw_batch(
     count: int,
     background: Background,
     errors: ErrorMap | None = None,
-    places: Tensor = CENTER,
+    subpixels: Tensor = CENTER,
     look_up: LookUp | None = None,
 ) -> PixelBatch:
-    """`count` pixels worth drawing with what they should show: evenly, or also where `errors` are large.
+    """Draw a batch of pixels.
 
-    A ray goes through each of the `places` (K, 2) in a pixel (`Cameras.pixel_rays`). Pixels that lie in a file are
-    asked for by `look_up`, all that are drawn and in the order of drawing (`PixelStream.look_up`).
+    Args:
+        dataset: the training images.
+        count: number of pixels R.
+        background: kind of background.
+        errors: draw in proportion to these errors; uniformly if None.
+        subpixels: (K, 2) positions in a pixel through which its rays pass, as in `Cameras.pixel_rays`.
+        look_up: for pixels in a file, returns the stored colours of all drawn pixels, in the order of drawing
+            (`PixelStream.look_up`).
     """
-    # Drawn before anything else is: what is drawn from is then known to who only knows the seed.
+    # Pixels are drawn before any other random number, so that `PixelStream` can predict them from the seed.
     flat, stored = draw_pixels(dataset, count if errors is None else 2 * count), None
     if dataset.mapped is not None:
         stored = (look_up or dataset.mapped.look_up)(flat).to(dataset.device)
         flat = flat.to(dataset.device)
     behind = background_colors(background, count, dataset.device)
     if errors is None:
-        return gather_batch(dataset, flat, behind, places, stored)
-    taken, weights = errors.choose(flat, count)
-    stored = None if stored is None else stored[taken]
-    return replace(gather_batch(dataset, flat[taken], behind, places, stored), weights=weights)
+        return gather_batch(dataset, flat, behind, subpixels, stored)
+    selected, weights = errors.choose(flat, count)
+    stored = None if stored is None else stored[selected]
+    return replace(gather_batch(dataset, flat[selected], behind, subpixels, stored), weights=weights)
 
 
 def gather_batch(
-    dataset: Dataset, flat: Tensor, behind: Tensor, places: Tensor = CENTER, stored: Tensor | None = None
+    dataset: Dataset, flat: Tensor, behind: Tensor, subpixels: Tensor = CENTER, stored: Tensor | None = None
 ) -> PixelBatch:
-    """The pixels `flat` (R,), counted through all images, over the background `behind` (R, 3).
+    """Construct a batch of given pixels.
 
-    Their stored colours (R, 3 or 4) are looked up where `stored` does not give them.
+    Args:
+        dataset: the images.
+        flat: (R,) numbers of the pixels, counted through all images.
+        behind: (R, 3) background colours.
+        subpixels: (K, 2) positions in a pixel through which its rays pass.
+        stored: (R, 3 or 4) uint8 stored colours; looked up if None.
     """
     scene = dataset.scene
-    rays = dataset.cameras.pixel_rays(flat, scene.near, scene.far, dataset.times, places)
+    rays = dataset.cameras.pixel_rays(flat, scene.near, scene.far, dataset.times, subpixels)
     if stored is None and dataset.mapped is not None:
         stored = dataset.mapped.look_up(flat.cpu()).to(dataset.device)
     if stored is None:
@@ -141,8 +164,8 @@ def gather_batch(
     else:
         rgb, alpha = gather_colors(stored, torch.arange(len(flat), device=flat.device), behind)
     if dataset.opaque is not None:
-        shown = dataset.opaque.contains(flat)
-        rgb, alpha = torch.where(shown[:, None], rgb, behind), shown * (1.0 if alpha is None else alpha)
+        opaque = dataset.opaque.contains(flat)
+        rgb, alpha = torch.where(opaque[:, None], rgb, behind), opaque * (1.0 if alpha is None else alpha)
     return PixelBatch(flat, rays, rgb, behind, alpha, _distances(dataset, flat, rays))
 
 
@@ -157,17 +180,24 @@ def _distances(dataset: Dataset, flat: Tensor, rays: Rays) -> Tensor | None:
 
 
 def gather_colors_reference(pixels: Tensor, flat: Tensor, behind: Tensor) -> tuple[Tensor, Tensor | None]:
-    """As `gather_colors`, in torch, on any device."""
+    """Compute `gather_colors` of `pixels`, `flat` and `behind` in PyTorch, on any device."""
     rgba = pixels[flat].float() / 255
     return composite(rgba, behind), rgba[:, 3] if rgba.shape[-1] == 4 else None
 
 
 def gather_colors(pixels: Tensor, flat: Tensor, behind: Tensor) -> tuple[Tensor, Tensor | None]:
-    """Colours (R, 3) of the pixels `flat` (R,) over `behind` (R, 3), and opacities (R,) where there are any.
+    """Return the colours of pixels over a background.
 
-    `pixels` (P, 3 or 4) are uint8, straight alpha.
+    Args:
+        pixels: (P, 3 or 4) uint8 stored pixels; the fourth channel is straight alpha.
+        flat: (R,) numbers of the pixels.
+        behind: (R, 3) background colours.
 
-    Raises: IndexError where there is no such pixel.
+    Returns:
+        Colours (R, 3), and opacities (R,), or None for three channels.
+
+    Raises:
+        IndexError: if a number exceeds the number of pixels.
     """
     if not native.usable(behind) or is_followed(behind):
         check_indices(flat, len(pixels), "pixels")

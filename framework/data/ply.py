@@ -1,4 +1,4 @@
-"""Points of a PLY file (Turk 1994): ascii or binary, whatever else the file holds about them."""
+"""Points in PLY files (Turk 1994), ascii or binary, with any other properties."""
 
 from __future__ import annotations
 
@@ -16,20 +16,25 @@ TYPES = {
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "float32": "f4", "float64": "f8",
 }  # fmt: skip
-"""PLY's names of types, of both generations, to numpy's."""
+"""PLY's names of types, old and new, to numpy's."""
 ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+"""PLY's formats, to numpy's prefixes of byte order."""
 LONGEST_HEADER = 1000
-"""Lines. A file without `end_header` is given up on after these."""
+"""Maximum number of lines of a header."""
 LONGEST_LINE = 1000
-"""Bytes of a line of the header."""
+"""Maximum number of bytes of a line of the header."""
 
 
 def read_points(file: Path) -> Tensor:
-    """(K, 3) float64 positions of the vertices; those that are not finite are left out.
+    """Read the positions of the vertices (K, 3), float64; those that are not finite are left out.
 
-    No more memory is taken than the file has bytes for, whatever count its header claims.
+    The memory allocated is bounded by the size of the file, whatever count its header claims.
 
-    Raises: DataError where the file cannot be read, is no PLY file, has no positions or is cut off.
+    Args:
+        file: path of the PLY file.
+
+    Raises:
+        DataError: if the file cannot be read, is not a PLY file, lacks positions or is truncated.
     """
     try:
         with file.open("rb") as stream:
@@ -40,7 +45,7 @@ def read_points(file: Path) -> Tensor:
 
 
 def _header(stream: BinaryIO, file: Path) -> tuple[str, int, list[tuple[str, str]]]:
-    """Key of `ORDERS`, number of vertices, and the name and numpy type of each of their properties."""
+    """Return the key of `ORDERS`, the number of vertices, and the name and numpy type of each of their properties."""
     if stream.readline(LONGEST_LINE).strip() != b"ply":
         raise DataError(f"{file} is not a PLY file: its first line is not 'ply'")
     order, count, element = "", -1, ""
@@ -56,28 +61,32 @@ def _header(stream: BinaryIO, file: Path) -> tuple[str, int, list[tuple[str, str
             if element == "vertex" and words[2].isdecimal() and len(words[2]) < 19:
                 count = int(words[2])
             elif count < 0 and words[2] != "0":
-                raise DataError(f"{file}: its vertices must be its first element, and counted; '{element}' comes first")
+                raise DataError(
+                    f"{file}: vertices must be the first element, with their number; '{element}' comes first"
+                )
         elif words[:1] == ["property"] and element == "vertex":
             if len(words) != 3 or words[1] not in TYPES:
-                raise DataError(f"{file}: a vertex has the property '{' '.join(words[1:])}'; lists are not read")
+                raise DataError(
+                    f"{file}: property '{' '.join(words[1:])}' of the vertices is not supported; it must be a number"
+                )
             columns.append((words[2], TYPES[words[1]]))
     else:
-        raise DataError(f"{file} is not a PLY file: its header has no end")
+        raise DataError(f"{file} is not a PLY file: its header has no 'end_header'")
     names = [name for name, _ in columns]
     if order not in ORDERS:
         raise DataError(f"{file}: its format is '{order}'; known: {', '.join(ORDERS)}")
     if count < 0 or not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
-        raise DataError(f"{file}: it must list vertices with the properties x, y and z, each once")
+        raise DataError(f"{file}: vertices must have the properties x, y and z, each once")
     return order, count, columns
 
 
 def _positions(stream: BinaryIO, file: Path, order: str, count: int, columns: list[tuple[str, str]]) -> Tensor:
     start = stream.tell()
-    left = file.stat().st_size - start
+    remaining = file.stat().st_size - start
     row = np.dtype([(name, ORDERS[order] + kind) for name, kind in columns])
-    smallest = 2 * len(columns) if order == "ascii" else row.itemsize  # a digit and what parts it from the next
-    if count * smallest > left + 1:
-        raise DataError(f"{file} is cut off: it announces {count} points, for which its {left} bytes are too few")
+    smallest = 2 * len(columns) if order == "ascii" else row.itemsize  # a digit and a separator
+    if count * smallest > remaining + 1:
+        raise DataError(f"{file} is truncated: its header states {count} points, and {remaining} bytes follow")
     if order == "ascii":
         axes = _ascii_axes(stream, file, count, [name for name, _ in columns])
     else:
@@ -88,7 +97,7 @@ def _positions(stream: BinaryIO, file: Path, order: str, count: int, columns: li
 
 
 def _ascii_axes(stream: BinaryIO, file: Path, count: int, names: list[str]) -> list[np.ndarray]:
-    """The (count,) x, y and z."""
+    """Return the coordinates x, y and z, (count,) each."""
     columns = [names.index(axis) for axis in "xyz"]
     points = np.empty((3, count))
     for index in range(count):
@@ -98,14 +107,21 @@ def _ascii_axes(stream: BinaryIO, file: Path, count: int, names: list[str]) -> l
         try:
             points[:, index] = [float(words[column]) for column in columns]
         except ValueError as error:
-            raise DataError(f"{file}: point {index} is not made of numbers") from error
+            raise DataError(f"{file}: a value of point {index} is not a number") from error
     return list(points)
 
 
 def write_points(file: Path, positions: Tensor, colors: Tensor, normals: Tensor | None = None) -> None:
-    """Write a binary PLY file of points (K, 3), colours (K, 3) in [0, 1] and, where there are any, normals (K, 3).
+    """Write points to a binary PLY file.
 
-    Raises: OSError where it cannot be written.
+    Args:
+        file: path of the PLY file.
+        positions: (K, 3).
+        colors: (K, 3) in [0, 1].
+        normals: (K, 3) unit vectors, or None.
+
+    Raises:
+        OSError: if the file cannot be written.
     """
     columns: list[tuple[str, str, str, np.ndarray]] = []
     for names, values in (("xyz", positions), (("nx", "ny", "nz"), normals)):

@@ -1,4 +1,4 @@
-"""What a method is told about the scene it is to learn."""
+"""The description of a scene that methods receive."""
 
 from __future__ import annotations
 
@@ -13,60 +13,71 @@ from framework.base.checked import checked
 from framework.base.errors import shown
 
 PoseSource = Literal["exact", "photographs", "device"]
-MOST_CAMERAS, LARGEST_SIZE, FARTHEST = 10**7, 10**9, 1e9
-"""Cameras, pixels of an image's side and scene units of what is believed of a scene that comes out of a file."""
+"""Source of the cameras' poses: known exactly, estimated from the images, or tracked by the device that took them."""
+MOST_CAMERAS = 10**7
+"""Maximum number of cameras of a scene read from a file."""
+LARGEST_SIZE = 10**9
+"""Maximum side of an image of a scene read from a file, pixels."""
+FARTHEST = 1e9
+"""Maximum coordinate of the box of a scene read from a file, scene units."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Facts read from the data before anything is trained."""
+    """Properties of the data, read before training."""
 
     box: Tensor
-    """(2, 3) smallest and largest corner of the part of space that matters, scene units."""
+    """(2, 3) minimum and maximum corner of the region of interest, scene units."""
     near: float
-    """Distance from a camera at which the scene may start."""
+    """Distance from a camera at which the scene starts."""
     far: float
     """Distance from a camera at which the scene ends."""
     num_cameras: int
-    """Training images."""
+    """Number of training images."""
     has_alpha: bool
-    """The photographs tell what is background."""
+    """Whether the images tell what is background."""
     moving: bool
-    """The photographs have times."""
+    """Whether the images have times."""
     image_size: int
-    """The longer side of the largest training image, pixels."""
+    """Longer side of the largest training image, pixels."""
     unbounded: bool = False
-    """There may be something to see outside `box`."""
+    """Whether there may be visible content outside `box`."""
     poses: PoseSource = "exact"
-    """Where the cameras' poses come from: known; found in the photographs; or tracked by the device that took them."""
+    """Source of the cameras' poses."""
     warped: bool = False
-    """Rays are those of normalised device coordinates, whose lengths and angles are not the scene's."""
+    """Whether rays are in normalised device coordinates, whose lengths and angles are not the scene's."""
     has_depth: bool = False
-    """The photographs come with depth images."""
+    """Whether the images come with depth images."""
     appearance_varies: bool = False
-    """Light, exposure or camera differ between the photographs."""
+    """Whether light, exposure or camera differ between images."""
     camera_to_worlds: Tensor | None = None
-    """(num_cameras, 3, 4) the training cameras' poses as they are given."""
+    """(num_cameras, 3, 4) given poses of the training cameras."""
 
     @classmethod
     def of(cls, facts: Any) -> Scene:
-        """From facts out of a file.
+        """Construct a scene from `facts` read from a file, the fields' values by name.
 
-        Raises: ValueError where they are none that a scene can have.
+        Raises:
+            ValueError: if the values cannot be those of a scene.
         """
         scene = checked(cls, facts)
         box, poses, count = scene.box, scene.camera_to_worlds, scene.num_cameras
         if box.shape != (2, 3) or box.dtype != torch.float32 or box.layout != torch.strided:
-            raise ValueError(f"the scene's box has the shape {tuple(box.shape)}; it must be two corners")
+            raise ValueError(
+                f"the scene's box has shape {tuple(box.shape)} and type {box.dtype}; it must be (2, 3) and float32"
+            )
         if not bool((box.abs() < FARTHEST).all()) or not bool((box[0] < box[1]).all()):
-            raise ValueError("the scene's box has no size, or is beyond measure")
+            raise ValueError("the scene's box is empty or too large")
         if not 1 <= count <= MOST_CAMERAS or (poses is not None and poses.shape != (count, 3, 4)):
-            raise ValueError(f"the scene has {shown(count)} cameras, which do not fit its poses")
+            raise ValueError(f"the scene's number of cameras, {shown(count)}, does not match its poses")
         if not 0 <= scene.near < scene.far < math.inf or not 1 <= scene.image_size <= LARGEST_SIZE:
-            raise ValueError(f"near {scene.near}, far {scene.far}, images of {shown(scene.image_size)} pixels")
+            raise ValueError(
+                f"the scene has near {scene.near}, far {scene.far} and images of {shown(scene.image_size)} pixels; "
+                "near must be less than far, and sizes positive"
+            )
         return scene
 
     def to(self, device: torch.device | str) -> Scene:
-        """The same facts on `device`."""
+        """Return the scene on `device`."""
         given = None if self.camera_to_worlds is None else self.camera_to_worlds.to(device)
         return replace(self, box=self.box.to(device), camera_to_worlds=given)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from framework.base.device import wait_for
 from framework.base.errors import ConfigError
 from framework.data.dataset import Dataset
-from framework.evaluation.evaluator import evaluation_background, spread
+from framework.evaluation.evaluator import evaluation_background, spread, timed_view
 from framework.model import Model, parts
 from framework.samplers.base import StopsEarly
 
@@ -58,9 +56,8 @@ def measured_error(model: Model[Any], dataset: Dataset, bound: float) -> tuple[f
         views = []
         for place, stop in enumerate((0.0, bound)):
             with limited_error(model, stop):
-                start = time.perf_counter()
-                views.append(model.render_view(dataset.view(index), background))
-                wait_for(model.device)
-                times[place] += time.perf_counter() - start
+                picture, seconds = timed_view(model, dataset.view(index), background)
+            views.append(picture)
+            times[place] += seconds
         worst = max(worst, float((views[0].rgb - views[1].rgb).abs().max()))
     return worst, times[0] / times[1]

@@ -17,7 +17,7 @@ from framework.base.config import AppearanceConfig
 from framework.base.console import track
 from framework.base.device import wait_for
 from framework.base.errors import DataError
-from framework.cameras.view import every
+from framework.cameras.view import View, every
 from framework.data.dataset import Dataset
 from framework.data.pixels import composite
 from framework.evaluation.appearance import appearance_of, fitted_appearance, right_half
@@ -75,6 +75,20 @@ def views_to_judge(dataset: Dataset, half: bool = False) -> list[int]:
         half: whether only the right half counts.
     """
     return [index for index in range(len(dataset)) if _shows_something(dataset, index, half)]
+
+
+def timed_view(model: Model, view: View, background: Tensor) -> tuple[Picture, float]:
+    """Render a view; return the picture, and the seconds that it took.
+
+    Args:
+        model: the trained model.
+        view: the camera, on the model's device.
+        background: (3,) colour behind what is not opaque.
+    """
+    start = time.perf_counter()
+    picture = model.render_view(view, background)
+    wait_for(model.device)
+    return picture, time.perf_counter() - start
 
 
 @dataclass(frozen=True)
@@ -141,10 +155,7 @@ def evaluate(
     for index in track(chosen, title, total=len(chosen)):
         target = composite(dataset.image(index).float() / 255, background)
         with fitted_appearance(model, dataset, index, background) if half else nullcontext():
-            start = time.perf_counter()
-            picture = model.render_view(dataset.view(index), background)
-            wait_for(model.device)
-            spent = time.perf_counter() - start
+            picture, spent = timed_view(model, dataset.view(index), background)
         rgb = picture.rgb.clamp(0, 1)
         if round_to_uint8:
             rgb = (rgb * 255).round() / 255

@@ -1,1 +1,1 @@
-"""Rays, boxes, lenses and similarities: pure functions of tensors."""
+"""Rays, boxes, lenses and similarity transforms, as pure functions of tensors."""

@@ -1,4 +1,4 @@
-"""Where the scene is: boxes, how rays cross them, and the contraction of unbounded space."""
+"""Boxes: their intersection with rays, unit coordinates, and the contraction of unbounded space."""
 
 from __future__ import annotations
 
@@ -7,15 +7,17 @@ from torch import Tensor
 
 
 def intersect_box(origins: Tensor, directions: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
-    """Distances at which rays enter and leave an axis-aligned box (slab method, Kay and Kajiya 1986).
+    """Return the distances at which rays enter and leave an axis-aligned box (slab method, Kay and Kajiya 1986).
 
-    A ray parallel to a face stays in or out of that slab; one that starts inside enters at 0. A ray that
-    misses, or only touches, gets enter = leave = 0: an interval without length.
+    A ray parallel to a face is inside or outside that slab along its whole length; a ray that starts inside the box
+    enters at 0. For a ray that misses the box, or only touches it, both distances are 0: an interval of length 0.
 
     Args:
         origins, directions: (R, 3).
-        box: (2, 3) smallest and largest corner.
-    Returns: enter (R,), leave (R,), with 0 <= enter <= leave.
+        box: (2, 3) minimum and maximum corner.
+
+    Returns:
+        enter (R,) and leave (R,), with 0 <= enter <= leave.
     """
     parallel = directions == 0
     safe = torch.where(parallel, torch.ones_like(directions), directions)
@@ -32,24 +34,36 @@ def intersect_box(origins: Tensor, directions: Tensor, box: Tensor) -> tuple[Ten
 
 
 def to_unit_box(positions: Tensor, box: Tensor) -> Tensor:
-    """Scene coordinates (N, 3) to [0, 1]^3 inside `box` (2, 3)."""
+    """Map positions from a box to the unit cube.
+
+    Args:
+        positions: (N, 3) scene coordinates.
+        box: (2, 3) minimum and maximum corner.
+
+    Returns:
+        (N, 3), in [0, 1]^3 for positions inside the box.
+    """
     return (positions - box[0]) / (box[1] - box[0])
 
 
 def contract(positions: Tensor) -> Tensor:
-    """All of space into the ball of radius 2: x inside the unit ball, (2 - 1/|x|) x/|x| outside.
+    """Map all of space into the ball of radius 2: x inside the unit ball, (2 - 1/|x|) x/|x| outside.
 
-    mip-NeRF 360 (Barron et al. 2022), equation 10. Far away x is divided by its largest coordinate before it is
-    squared, so that the norm stays finite; max(1, |x|) keeps value and gradient finite at the origin. Infinite
-    coordinates are taken for the largest finite ones.
+    mip-NeRF 360 (Barron et al. 2022), equation 10. Far from the origin, x is divided by its largest coordinate before
+    it is squared, so that the norm stays finite; max(1, |x|) keeps value and gradient finite at the origin. Infinite
+    coordinates are replaced by the largest finite number.
 
     Args:
         positions: (..., 3).
-    Returns: (..., 3) with norm at most 2.
+
+    Returns:
+        (..., 3) with norm at most 2.
     """
     limit = torch.finfo(positions.dtype).max
     finite = positions.clamp(-limit, limit)
-    largest = finite.detach().abs().amax(-1, keepdim=True).clamp(min=1)  # the result is the same whatever divides x
+    largest = (
+        finite.detach().abs().amax(-1, keepdim=True).clamp(min=1)
+    )  # detached: the result does not depend on the divisor
     scaled = finite / largest
     norm = (scaled * scaled).sum(-1, keepdim=True).clamp(min=1).sqrt()
     return scaled * ((2 - 1 / (largest * norm)) / norm)

@@ -1,7 +1,7 @@
-"""What a ray is, and what a sample on a ray is.
+"""Rays, and samples along them.
 
-Letters used everywhere: R rays, N samples (of all rays together), S samples on one ray, t distance along a
-ray in scene units, sigma density in 1/length, T transmittance, w weight.
+Letters used in all modules: R rays, N samples (of all rays together), S samples on one ray, t distance along a ray in
+scene units, sigma density in 1/length, T transmittance, w weight.
 """
 
 from __future__ import annotations
@@ -17,53 +17,66 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Rays:
-    """A batch of R rays. Every field is indexed by ray; optional fields are None where unknown."""
+    """A batch of R rays. Every field is indexed by ray; optional fields are None if unknown."""
 
     origins: Tensor
-    """(R, 3) start points, scene units."""
+    """(R, 3) origins, scene units."""
     directions: Tensor
     """(R, 3) unit directions."""
-    nears: Tensor
-    """(R,) distance at which sampling starts."""
-    fars: Tensor
-    """(R,) distance at which sampling ends."""
+    nears: Tensor = None  # type: ignore[assignment]
+    """(R,) distance at which sampling starts; 0 if not given."""
+    fars: Tensor = None  # type: ignore[assignment]
+    """(R,) distance at which sampling ends; if not given infinite, for samplers that end with a box."""
     pixel_radii: Tensor | None = None
     """(R,) radius of the pixel's cone at distance 1 (Mip-NeRF, section 3.1)."""
     times: Tensor | None = None
     """(R,) time in [0, 1] of a moving scene."""
     camera_indices: Tensor | None = None
-    """(R,) which training camera the ray belongs to."""
+    """(R,) index of the training camera."""
+
+    def __post_init__(self) -> None:
+        for name, value in (("nears", 0.0), ("fars", torch.inf)):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, self.origins.new_full(self.origins.shape[:1], value))
 
     def __len__(self) -> int:
         return self.origins.shape[0]
 
     def __getitem__(self, index: Tensor | slice) -> Rays:
-        """The rays chosen by a slice, a mask or an index tensor."""
+        """Return the rays selected by a slice, a mask or an index tensor."""
         return self._map(lambda values: values[index])
 
     def to(self, device: torch.device | str) -> Rays:
-        """The same rays on `device`."""
+        """Return the rays on `device`."""
         return self._map(lambda values: values.to(device))
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> Rays:
-        """The same rays with every field that is known changed."""
-        known = {f.name: getattr(self, f.name) for f in fields(self)}
-        return replace(self, **{name: change(values) for name, values in known.items() if values is not None})
+        """Apply a function to every field that is not None."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{name: change(values) for name, values in values.items() if values is not None})
 
     def points(self, ray_indices: Tensor, t: Tensor) -> Tensor:
-        """Positions (N, 3) at distances `t` (N,) along the rays `ray_indices` (N,)."""
+        """Return positions along rays.
+
+        Args:
+            ray_indices: (N,) index of the ray of each position.
+            t: (N,) distances along the rays.
+
+        Returns:
+            (N, 3) positions.
+        """
         origins = self.origins.index_select(0, ray_indices)
         return torch.addcmul(origins, self.directions.index_select(0, ray_indices), t[:, None])
 
 
 @dataclass(frozen=True)
 class Histogram:
-    """What a proposal believed of R rays: B intervals each, and how much of the light each stops."""
+    """A proposal's estimate for R rays: B intervals each, with the share of the light that each interval stops."""
 
     edges: Tensor
-    """(R, B + 1) sorted, in a proposal sampler's normalised distance: 0 at the near and 1 at the far end."""
+    """(R, B + 1) sorted edges in the proposal sampler's normalised distance: 0 at the near end and 1 at the far end."""
     weights: Tensor
-    """(R, B)."""
+    """(R, B) weights of the intervals."""
 
 
 @dataclass(frozen=True)
@@ -80,29 +93,29 @@ class CoarseLevel:
 class Samples:
     """Packed intervals along R rays: ray r owns the samples [offsets[r], offsets[r + 1]), near to far.
 
-    One layout serves every sampler: an empty ray costs nothing, and a sampler that puts S samples on each
-    ray sets `per_ray`, so that `padded` may view its values as (R, S).
+    All samplers use this layout: a ray without samples takes no space, and a sampler that puts S samples on each ray
+    sets `per_ray`, so that `padded` can view values as (R, S).
 
-    A sampler that has to know the density in order to sample (waves that stop where transmittance is spent)
-    hands over what it evaluated in `sigma` and `features`, gradients attached, so nothing is evaluated twice.
+    A sampler that evaluates the density in order to sample (in waves that stop when the transmittance is spent) returns
+    the results in `sigma` and `features`, gradients attached, so that nothing is evaluated twice.
     """
 
     t_starts: Tensor
-    """(N,) distance where each interval starts."""
+    """(N,) distance at the start of each interval."""
     t_ends: Tensor
-    """(N,) distance where each interval ends."""
+    """(N,) distance at the end of each interval."""
     offsets: Tensor
-    """(R + 1,) int64 start of each ray's samples; the last entry is N."""
+    """(R + 1,) int64 index of each ray's first sample; the last entry is N."""
     points: Tensor | None = None
-    """(N,) distance at which the field is evaluated; the middle of the interval if None."""
+    """(N,) distance at which the field is evaluated; if None, the middle of the interval."""
     per_ray: int | None = None
     """S if every ray has exactly S samples."""
     owners: Tensor | None = None
-    """(N,) `ray_indices`, where they are known already."""
+    """(N,) `ray_indices`, if the sampler has them."""
     sigma: Tensor | None = None
-    """(N,) density, where the sampler already evaluated it."""
+    """(N,) density, if the sampler evaluated it."""
     features: Tensor | None = None
-    """(N, F) the field's features that came with `sigma`."""
+    """(N, F) the field's features evaluated together with `sigma`."""
     alpha: Tensor | None = None
     """(N,) opacity of each interval, of a field that has it instead of density."""
     early_stop: float = 0.0
@@ -110,13 +123,19 @@ class Samples:
     coarse: CoarseLevel | None = None
     """What the samples were drawn by, where it is rendered too."""
     edges: Tensor | None = None
-    """(R, S + 1) the intervals' ends in normalised distance, from a sampler that works in it."""
+    """(R, S + 1) ends of the intervals in normalised distance, from samplers that use it."""
     proposals: tuple[Histogram, ...] = ()
-    """What these were drawn by, where it is still being learnt: gradients attached."""
+    """Histograms from which the samples were drawn, gradients attached, if the proposals are being trained."""
 
     @classmethod
     def regular(cls, t_starts: Tensor, t_ends: Tensor, points: Tensor | None = None) -> Samples:
-        """S samples on each of R rays, from (R, S) tensors."""
+        """Return samples with the same number S on each of R rays.
+
+        Args:
+            t_starts: (R, S) distance at the start of each interval.
+            t_ends: (R, S) distance at the end of each interval.
+            points: (R, S) distance at which the field is evaluated; if None, the middle of the interval.
+        """
         num_rays, per_ray = t_starts.shape
         offsets = torch.arange(num_rays + 1, device=t_starts.device) * per_ray
         flat = None if points is None else points.reshape(-1)
@@ -127,6 +146,7 @@ class Samples:
 
     @property
     def num_rays(self) -> int:
+        """The number R of rays."""
         return self.offsets.shape[0] - 1
 
     @property
@@ -136,7 +156,7 @@ class Samples:
 
     @cached_property
     def ray_indices(self) -> Tensor:
-        """(N,) the ray that owns each sample."""
+        """(N,) index of the ray of each sample."""
         if self.owners is not None:
             return self.owners
         rays = torch.arange(self.num_rays, device=self.offsets.device)
@@ -144,7 +164,7 @@ class Samples:
 
     @cached_property
     def places(self) -> Tensor:
-        """(N,) how many samples stand in front of each on its ray."""
+        """(N,) number of samples in front of each sample on its ray."""
         return torch.arange(len(self), device=self.offsets.device) - self.offsets[:-1][self.ray_indices]
 
     @property
@@ -160,22 +180,28 @@ class Samples:
     def padded(self, values: Tensor) -> Tensor:
         """View per-sample `values` (N, ...) as (R, S, ...).
 
-        Raises: ValueError where the rays have different numbers of samples.
+        Raises:
+            ValueError: if the rays have different numbers of samples.
         """
         if self.per_ray is None:
             raise ValueError("padded() needs the same number of samples on every ray")
         return values.reshape(self.num_rays, self.per_ray, *values.shape[1:])
 
     def positions(self, rays: Rays) -> Tensor:
-        """(N, 3) where the field is evaluated."""
+        """Return the positions (N, 3) on `rays` at which the field is evaluated."""
         return rays.points(self.ray_indices, self.t)
 
     def times(self, rays: Rays) -> Tensor | None:
-        """(N,) time of each sample, or None for a scene that stands still."""
+        """Return the time (N,) of each sample on `rays`, or None for a static scene."""
         return None if rays.times is None else rays.times[self.ray_indices]
 
     def evaluated(self, sigma: Tensor, features: Tensor) -> Samples:
-        """The same samples with their density (N,) and features (N, F) attached."""
+        """Return the samples with density and features attached.
+
+        Args:
+            sigma: (N,) density.
+            features: (N, F) the field's features.
+        """
         return replace(self, sigma=sigma, features=features)
 
     def with_alpha(self, alpha: Tensor, features: Tensor) -> Samples:

@@ -9,6 +9,8 @@ disparity beyond for an unbounded scene, evenly throughout for a bounded one.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import torch
@@ -80,42 +82,17 @@ class ProposalSampler(Sampler):
 
     def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
         """The last level's samples; with a gradient for the proposals in the steps in which they learn."""
-        nears, fars = self._ends(rays)
-        count, device = len(rays), nears.device
-        edges = torch.linspace(0, 1, self.counts[0] + 1, device=device).expand(count, -1)
-        if jitter:  # the inner edges move together by up to half an interval either way
-            moved = edges + (torch.rand(count, 1, device=device) - 0.5) / self.counts[0]
-            edges = torch.cat([edges[:, :1], moved[:, 1:-1], edges[:, -1:]], dim=-1)
         learning = self.learning and self.training and torch.is_grad_enabled()
-        proposals: list[Histogram] = []
-        power = self.power if self.training else 1.0
-        for (here, following), proposal in zip(pairwise(self.counts), self.proposals, strict=True):
-            t = self.distances(edges, nears, fars)
-            middles = (t[:, 1:] + t[:, :-1]) / 2
-            with torch.set_grad_enabled(learning):
-                positions = _positions(rays, middles)
-                when = None if rays.times is None else rays.times.repeat_interleave(here)
-                sigma, _ = proposal.density(Points(positions, when))
-                weights = interval_weights(sigma.view(middles.shape), t)
-            proposals.append(Histogram(edges, weights))
-            shift = torch.rand(count, device=device) if jitter else torch.full((count,), 0.5, device=device)
-            edges = resample(edges, weights.detach(), shift, following, power, PADDING / here)
-        t = self.distances(edges, nears, fars)
-        points = (t[:, 1:] + t[:, :-1]) / 2
-        ends = t[:, 1:]
-        if self.endless:
-            ends = torch.cat([ends[:, :-1], torch.full_like(ends[:, :1], FARTHEST)], dim=-1)
-        regular = Samples.regular(t[:, :-1], ends, points)
-        owners = torch.arange(count, device=device).repeat_interleave(self.counts[-1])
-        return Samples(
-            regular.t_starts,
-            regular.t_ends,
-            regular.offsets,
-            regular.points,
-            regular.per_ray,
-            owners=owners,
-            edges=edges,
-            proposals=tuple(proposals) if learning else (),
+        nears, fars = self._ends(rays)
+        return propose(
+            replace(rays, nears=nears, fars=fars),
+            [proposal.density for proposal in self.proposals],
+            self.counts,
+            self.scale if self.unbounded else None,
+            jitter=jitter,
+            power=self.power if self.training else 1.0,
+            learning=learning,
+            endless=self.endless,
         )
 
     def update(self, step: int, density: DensityFunction) -> None:
@@ -135,12 +112,70 @@ class ProposalSampler(Sampler):
         near = torch.minimum(torch.maximum(enter, rays.nears), leave)
         return near, torch.maximum(torch.minimum(leave, rays.fars), near)
 
-    def distances(self, edges: Tensor, nears: Tensor, fars: Tensor) -> Tensor:
-        """Distances (R, B) of normalised ones between the rays' ends (R,)."""
-        if not self.unbounded:
-            return torch.lerp(nears[:, None], fars[:, None], edges)
-        near, far = (to_disparity(t / self.scale)[:, None] for t in (nears, fars))
-        return self.scale * from_disparity(torch.lerp(near, far, edges))
+
+def propose(
+    rays: Rays,
+    densities: Sequence[DensityFunction],
+    counts: Sequence[int],
+    scale: float | None,
+    *,
+    jitter: bool,
+    power: float,
+    learning: bool,
+    endless: bool,
+) -> Samples:
+    """Samples of the last level, each level being drawn by the densities of the one before.
+
+    Args:
+        rays: R rays, sampled from near to far.
+        densities: of each level but the last.
+        counts: intervals of each level, then samples: one more than there are densities.
+        scale: see `distances`.
+        jitter: random positions, or fixed ones.
+        power: which weights are raised to before they are drawn by: less than 1 flattens them.
+        learning: keep what the densities found, gradients attached, in `Samples.proposals`.
+        endless: the last interval has no end.
+    """
+    nears, fars = rays.nears, rays.fars
+    count, device = len(rays), nears.device
+    edges = torch.linspace(0, 1, counts[0] + 1, device=device, dtype=nears.dtype).expand(count, -1)
+    if jitter:  # the inner edges move together by up to half an interval either way
+        moved = edges + (torch.rand(count, 1, device=device) - 0.5) / counts[0]
+        edges = torch.cat([edges[:, :1], moved[:, 1:-1], edges[:, -1:]], dim=-1)
+    proposals: list[Histogram] = []
+    for (here, following), density in zip(pairwise(counts), densities, strict=True):
+        t = distances(edges, nears, fars, scale)
+        middles = (t[:, 1:] + t[:, :-1]) / 2
+        with torch.set_grad_enabled(learning):
+            positions = _positions(rays, middles)
+            when = None if rays.times is None else rays.times.repeat_interleave(here)
+            sigma, _ = density(Points(positions, when))
+            weights = interval_weights(sigma.view(middles.shape), t)
+        proposals.append(Histogram(edges, weights))
+        shift = torch.rand(count, device=device) if jitter else torch.full((count,), 0.5, device=device)
+        edges = resample(edges, weights.detach(), shift, following, power, PADDING / here)
+    t = distances(edges, nears, fars, scale)
+    ends = t[:, 1:]
+    if endless:
+        ends = torch.cat([ends[:, :-1], torch.full_like(ends[:, :1], FARTHEST)], dim=-1)
+    return replace(
+        Samples.regular(t[:, :-1], ends, (t[:, 1:] + t[:, :-1]) / 2),
+        owners=torch.arange(count, device=device).repeat_interleave(counts[-1]),
+        edges=edges,
+        proposals=tuple(proposals) if learning else (),
+    )
+
+
+def distances(edges: Tensor, nears: Tensor, fars: Tensor, scale: float | None) -> Tensor:
+    """Distances (R, B) of normalised ones `edges` (R, B) between the rays' ends (R,).
+
+    Args:
+        scale: the distance up to which they are even, being in disparity beyond; None for even ones throughout.
+    """
+    if scale is None:
+        return torch.lerp(nears[:, None], fars[:, None], edges)
+    near, far = (to_disparity(t / scale)[:, None] for t in (nears, fars))
+    return scale * from_disparity(torch.lerp(near, far, edges))
 
 
 def half_edge(box: Tensor) -> float:

@@ -15,8 +15,8 @@ LAST_INTERVAL = 1e10
 
 def stratified_points(rays: Rays, count: int, jitter: bool) -> Tensor:
     """(R, count) distances, one in each of `count` equal bins: random in its bin, or its middle."""
-    shape = (len(rays), count)
-    within = torch.rand(shape, device=rays.nears.device) if jitter else torch.full(shape, 0.5, device=rays.nears.device)
+    within = rays.nears.new_full((len(rays), count), 0.5)
+    within = torch.rand_like(within) if jitter else within
     fraction = (torch.arange(count, device=rays.nears.device) + within) / count
     return torch.lerp(rays.nears[:, None], rays.fars[:, None], fraction)
 
@@ -39,7 +39,7 @@ class UniformSampler(Sampler):
         self.count = count
 
     def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
-        edges = torch.linspace(0, 1, self.count + 1, device=rays.nears.device)
+        edges = torch.linspace(0, 1, self.count + 1, device=rays.nears.device, dtype=rays.nears.dtype)
         t = torch.lerp(rays.nears[:, None], rays.fars[:, None], edges)
         points = stratified_points(rays, self.count, jitter)
         return Samples.regular(t[:, :-1], t[:, 1:], points)

@@ -1,1 +1,1 @@
-"""What the images show: the profile of a scene, and space that silhouettes show to be empty."""
+"""Properties of a scene found in its images: the profile, and space that silhouettes show to be empty."""

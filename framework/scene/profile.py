@@ -1,4 +1,4 @@
-"""What a scene needs and what it can do without: facts read from its data, and the decisions that follow."""
+"""The profile of a scene: properties of its data, and the decisions that follow from them."""
 
 from __future__ import annotations
 
@@ -12,28 +12,35 @@ from framework.data.light import light_spread
 
 @dataclass(frozen=True)
 class SceneProfile:
-    """Facts about the photographs, and what was decided by them."""
+    """Properties of the images, and decisions based on them."""
 
     images: int
-    """Photographs to learn from."""
+    """Number of training images."""
     width: int
-    """Of the largest photograph, pixels."""
+    """Width of the largest image, pixels."""
     height: int
+    """Height of the largest image, pixels."""
     moving: bool
-    """The photographs have times."""
+    """Whether the images have times."""
     transparent: float | None
-    """Share of pixels that are fully transparent; None where no photograph has alpha."""
+    """Share of fully transparent pixels; None if no image has alpha."""
     ignored: float | None
-    """Share of pixels that are not learnt from: masks ignore them, or no ray leads there; None for none."""
+    """Share of pixels that are masked out or have no ray; None if there are none."""
     light: float | None
-    """By how many stops light differs between the photographs (`appearance.light_spread`); None with alpha."""
+    """Spread of the light between images, in stops (`light.light_spread`); None with alpha."""
     camera: str
-    """The cameras' model."""
+    """Model of the cameras."""
     decisions: tuple[Decision, ...]
+    """Decisions on options that were left open."""
 
     @classmethod
     def of(cls, dataset: Dataset, decisions: list[Decision]) -> SceneProfile:
-        """Look at the data."""
+        """Compute the profile of training data.
+
+        Args:
+            dataset: the training images.
+            decisions: the decisions to list.
+        """
         cameras, alpha = dataset.cameras, dataset.scene.has_alpha
         kept, total = dataset.kept, int(dataset.cameras.offsets[-1])
         transparent = sum(int((dataset.image(index)[..., 3] == 0).sum()) for index in range(len(dataset) * alpha))
@@ -50,7 +57,7 @@ class SceneProfile:
         )
 
     def lines(self) -> list[str]:
-        """For people."""
+        """Return the profile as lines of text."""
         alpha = "no alpha" if self.transparent is None else f"alpha ({self.transparent:.0%} of pixels transparent)"
         motion = "moving" if self.moving else "still"
         facts = f"scene: {self.images} images of {self.width} x {self.height}, {self.camera} camera, {alpha}, {motion}"
@@ -61,5 +68,5 @@ class SceneProfile:
         return [facts, *(decision.line() for decision in self.decisions)]
 
     def as_plain(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the profile as a dictionary for JSON."""
         return asdict(self)

@@ -1,7 +1,7 @@
-"""What transparent photographs say before anything is trained: the visual hull (Laurentini 1994).
+"""Visual hulls (Laurentini 1994): space that transparent images show to be empty before training.
 
-A point of the scene that some photograph shows as fully transparent is empty. So a cell of space whose image in one
-photograph holds no opaque pixel can be skipped for good, and so can the pixels whose ray meets no other cell.
+A point that is fully transparent in some image is empty. Therefore a cell of space whose projection into one image has
+no opaque pixel can be skipped for good, and so can the pixels whose ray meets no other cell.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from framework.data.pixel_set import PixelSet
 from framework.kernels.silhouettes import Photograph, hold_balls, opaque_sums, pixels_near_balls
 
 COARSEST = 8
-"""Cells along an edge of the cubes that are looked at first."""
+"""Maximum side of the first cubes tested, cells."""
 
 
 class _Counts(Sequence[Tensor]):
-    """The sums of a data set's photographs, of which only the last that was asked for is remembered."""
+    """The cumulative sums of a data set's images, of which only the last requested is kept in memory."""
 
     def __init__(self, dataset: Dataset) -> None:
         self._dataset, self._last = dataset, (-1, torch.empty(0))
@@ -37,25 +37,25 @@ class _Counts(Sequence[Tensor]):
         if self._last[0] != image:
             opaque, kept = self._dataset.image(image)[..., 3] > 0, self._dataset.kept_of(image)
             if kept is not None:
-                opaque |= ~kept  # who knows what is there
+                opaque |= ~kept  # nothing is known about these
             self._last = image, opaque_sums(opaque)
         return self._last[1]
 
 
 @dataclass(frozen=True)
 class Silhouettes:
-    """Which pixels of M photographs are not fully transparent."""
+    """The pixels of M images that are not fully transparent."""
 
     dataset: Dataset
-    """Photographs with alpha, through pinhole cameras."""
+    """Images with alpha, and pinhole cameras."""
     sums: Sequence[Tensor]
-    """M tensors (H + 1, W + 1) int32: how many such pixels lie above and left of a pixel's corner."""
+    """M tensors (H + 1, W + 1) int32: number of such pixels above and to the left of a pixel's corner."""
 
     @classmethod
     def of(cls, dataset: Dataset) -> Silhouettes:
-        """Count every photograph once, so that any square of pixels is four look-ups.
+        """Sum up each image of `dataset`, so that the count in any rectangle of pixels takes four look-ups.
 
-        Where the photographs are too many for memory, so are the counts: each is then made when it is asked for.
+        If the images exceed the memory limit, so do the sums; they are then computed each time they are requested.
         """
         counts = _Counts(dataset)
         return cls(dataset, counts if dataset.mapped is not None else tuple(counts))
@@ -64,7 +64,7 @@ class Silhouettes:
         return len(self.sums)
 
     def photograph(self, image: int) -> Photograph:
-        """A photograph's camera and sums."""
+        """Return camera and sums of image `image`."""
         cameras = self.dataset.cameras
         fx, fy, cx, cy = (float(values[image]) for values in (cameras.fx, cameras.fy, cameras.cx, cameras.cy))
         return Photograph(cameras.camera_to_worlds[image].contiguous(), fx, fy, cx, cy, self.sums[image])
@@ -72,17 +72,19 @@ class Silhouettes:
 
 @torch.no_grad()
 def visual_hull(silhouettes: Silhouettes, box: Tensor, resolution: int, moving: bool = False) -> Tensor:
-    """Cells of a box that no photograph shows to be empty, from coarse to fine.
+    """Return the cells of a box that no image shows to be empty, by refinement from coarse to fine.
 
-    Of a scene that moves, cells are dropped that every photograph shows to be empty, and whose neighbours are too: the
-    margin is for what moves between the times of the photographs.
+    For a moving scene, a cell is dropped if every image shows it and its neighbours to be empty; the margin of one cell
+    allows for motion between the times of the images.
 
     Args:
-        silhouettes: of the training photographs.
-        box: (2, 3).
-        resolution: n, cells along each axis.
-        moving: what one photograph shows to be empty may be full at another's time.
-    Returns: (n^3,) bool, the cell's index being (x n + y) n + z.
+        silhouettes: silhouettes of the training images.
+        box: (2, 3) minimum and maximum corner.
+        resolution: number n of cells along each axis.
+        moving: whether space that one image shows to be empty may be occupied at another image's time.
+
+    Returns:
+        (n^3,) bool; the index of a cell is (x n + y) n + z.
     """
     size = min(COARSEST, 1 << (resolution - 1).bit_length())
     count = -(-resolution // size)
@@ -111,7 +113,14 @@ def visual_hull(silhouettes: Silhouettes, box: Tensor, resolution: int, moving: 
 
 @torch.no_grad()
 def pixels_near(silhouettes: Silhouettes, hull: Tensor, box: Tensor, resolution: int) -> PixelSet:
-    """Pixels, counted through all photographs, that may see a cell of the hull. Other rays see background alone."""
+    """Return the pixels that may see a cell of the hull, counted through all images; all others see only background.
+
+    Args:
+        silhouettes: silhouettes of the images.
+        hull: (n^3,) bool, as `visual_hull` returns it.
+        box: (2, 3) minimum and maximum corner.
+        resolution: number n of cells along each axis.
+    """
     cells = hull.nonzero().squeeze(-1)
     corner = torch.stack([cells // resolution**2, cells // resolution % resolution, cells % resolution], dim=-1)
     centers = box[0] + (corner + 0.5) * (box[1] - box[0]) / resolution

@@ -21,7 +21,7 @@ from framework.base.registry import load_method
 from framework.data.dataset import Dataset
 from framework.data.pixels import composite
 from framework.data.sources import BatchSource, Request, make_source
-from framework.evaluation.evaluator import evaluate, evaluation_background
+from framework.evaluation.evaluator import evaluate, evaluation_background, timed_view
 from framework.evaluation.metrics import MAX_PSNR
 from framework.evaluation.panels import composed, view_panels
 from framework.kernels.native import torch_on_one_thread
@@ -336,12 +336,10 @@ class Trainer:
         if step % config.steps_per_eval_image == 0 and config.vis != "none" and affordable:
             index = (step // config.steps_per_eval_image - 1) % len(self.eval_set)
             background = evaluation_background(self.model)
-            start = time.perf_counter()
-            picture = self.model.render_view(self.eval_set.view(index), background)
-            wait_for(self.device)
+            picture, seconds = timed_view(self.model, self.eval_set.view(index), background)
             target = composite(self.eval_set.image(index).float() / 255, background)
             panels = view_panels(picture.rgb.clamp(0, 1), target, picture.median_depth, picture.accumulation)
-            self._picture_seconds += time.perf_counter() - start
+            self._picture_seconds += seconds
             board.image("eval/comparison", composed(panels), step)
         every = config.seconds_per_eval_all_images
         if every is None and config.target_psnr is not None:

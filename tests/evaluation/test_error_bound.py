@@ -23,7 +23,7 @@ def test_what_is_no_bound(text: str) -> None:
 def test_the_bound_is_kept_and_the_setting_restored(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", evaluated=True, max_num_iterations=150)
     trainer.train()
-    sampler = trainer.model.occupancy_samplers[0]
+    sampler = trainer.model.sampler
     before = sampler.early_stop
     assert trainer.eval_set is not None
     worst, _ = measured_error(trainer.model, trainer.eval_set, 0.2)

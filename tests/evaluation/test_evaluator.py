@@ -8,14 +8,20 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.base.config import TrainConfig
+from framework.base.config import RayConfig
 from framework.cameras.cameras import Cameras, subpixels
-from framework.data.pixels import Batch, draw_batch
+from framework.cameras.view import View
+from framework.data.pixels import PixelBatch
 from framework.data.scene import Scene
-from framework.evaluation.evaluator import evaluation_background, render_image
-from framework.geometry.rays import Rays
-from framework.model import Model
-from framework.rendering.volume import Rendered
+from framework.data.sources import PixelSource, Request
+from framework.evaluation.evaluator import evaluation_background
+from framework.fields.base import Field
+from framework.geometry.points import Points
+from framework.geometry.rays import Rays, Samples
+from framework.ray_model import RayModel
+from framework.rendering.rendered import Rendered
+from framework.rendering.renderer import Renderer
+from framework.samplers.uniform import UniformSampler
 from tests.training.helpers import tiny_trainer
 
 SIZE = 12
@@ -26,15 +32,25 @@ def inside(x: Tensor, y: Tensor) -> Tensor:
     return ((x - 0.01).square() + (y + 0.02).square() < 0.2**2).float()
 
 
-class Disc(Model[TrainConfig]):
+class Nothing(Field):
+    """Asked by nobody: the renderer draws without it."""
+
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        raise AssertionError
+
+    def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
+        raise AssertionError
+
+
+class Disc(Renderer):
     """White where `inside`, and the background elsewhere."""
 
-    def __init__(self, config: TrainConfig) -> None:
-        super().__init__(config, Scene(torch.zeros(2, 3), 0, 9, 1, True, False, SIZE))
+    def __init__(self) -> None:
+        super().__init__()
         self.anything = torch.nn.Parameter(torch.zeros(1))
         self.seen: list[int] = []
 
-    def render(self, rays: Rays, background: Tensor) -> Rendered:
+    def render(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
         assert rays.camera_indices is None
         self.seen.append(len(rays))
         x, y = (-rays.directions[:, i] / rays.directions[:, 2] for i in (0, 1))
@@ -43,14 +59,19 @@ class Disc(Model[TrainConfig]):
         return Rendered(rgb, white, white, white, 0)
 
 
+def disc(config: RayConfig) -> RayModel[RayConfig]:
+    scene = Scene(torch.zeros(2, 3), 0.0, 9.0, 1, True, False, SIZE)
+    return RayModel(config, scene, Nothing(), UniformSampler(1), Disc())
+
+
 def picture(rays_per_pixel: int, chunk: int = 8192) -> Tensor:
     one = [torch.tensor([v]) for v in (20.0, 20.0, SIZE / 2, SIZE / 2)]
     cameras = Cameras(torch.eye(4)[None, :3], *one, torch.tensor([SIZE]), torch.tensor([SIZE]))
-    config = replace(TrainConfig(), rays_per_pixel=rays_per_pixel, eval_num_rays_per_chunk=chunk)
-    model = Disc(config)
-    image = render_image(model, cameras, 0, torch.full((3,), 0.25))
-    assert sum(model.seen) == SIZE**2 * rays_per_pixel
-    assert max(model.seen) <= max(chunk, rays_per_pixel)
+    model = disc(RayConfig(rays_per_pixel=rays_per_pixel, eval_num_rays_per_chunk=chunk))
+    image = model.render_view(View.of(cameras, 0), torch.full((3,), 0.25))
+    seen = model.renderer.seen
+    assert image.num_rays == sum(seen) == SIZE**2 * rays_per_pixel
+    assert max(seen) <= max(chunk, rays_per_pixel)
     return image.rgb
 
 
@@ -70,16 +91,15 @@ def test_chunks_change_nothing(chunk: int) -> None:
     torch.testing.assert_close(picture(4, chunk), picture(4), rtol=0, atol=0)
 
 
-def test_training_averages_the_same_rays_late_in_the_budget(
-    shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_training_averages_the_same_rays_late_in_the_budget(shared_tiny: Path, tmp_path: Path) -> None:
     settings = {"max_num_iterations": 8, "rays_per_pixel": 4, "train_rays_per_pixel_from": 0.5}
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", **settings)
-    batches: list[Batch] = []
+    batches: list[PixelBatch] = []
 
-    def recording(*arguments: Any) -> Batch:
-        batches.append(draw_batch(*arguments))
-        return batches[-1]
+    class Recording(PixelSource):
+        def draw(self, request: Request) -> PixelBatch:
+            batches.append(super().draw(request))
+            return batches[-1]
 
     backgrounds: list[Tensor] = []
     render = trainer.model.render
@@ -88,7 +108,8 @@ def test_training_averages_the_same_rays_late_in_the_budget(
         backgrounds.append(background)
         return render(rays, background)
 
-    monkeypatch.setattr("framework.training.trainer.draw_batch", recording)
+    trainer.prepare()
+    trainer.source = Recording(trainer.train_set, "random", trainer.config.machine.seed)
     trainer.model.render = watched
     trainer.train()
     scene = trainer.train_set.scene
@@ -107,11 +128,10 @@ def test_means_over_pixels_are_means() -> None:
 
     rays = made().over(made())
     rays.accumulation[4:7] = 0  # of the second pixel only the last ray meets anything
-    pixels = rays.per_pixel(4)
-    assert pixels.num_samples == 10
+    assert rays.num_samples == 10
     assert rays.coarse is not None
-    assert pixels.coarse is not None
-    for one, two in ((pixels, rays), (pixels.coarse, rays.coarse)):
+    pixels, coarse = rays.to_pixels(4), rays.coarse.to_pixels(4)
+    for one, two in ((pixels, rays), (coarse, rays.coarse)):
         torch.testing.assert_close(one.rgb, torch.stack([two.rgb[i : i + 4].mean(0) for i in (0, 4, 8)]))
         torch.testing.assert_close(one.accumulation, two.accumulation.view(3, 4).mean(1))
         torch.testing.assert_close(one.median_depth, two.median_depth.view(3, 4).sort(1).values[:, 1])
@@ -119,7 +139,9 @@ def test_means_over_pixels_are_means() -> None:
             share, depth = two.accumulation[group], two.depth[group]
             torch.testing.assert_close(one.depth[pixel], (share * depth).sum() / share.sum())
     torch.testing.assert_close(pixels.depth[1], rays.depth[7])
-    assert rays.per_pixel(1) is rays
+    alone = rays.to_pixels(1)
+    for name in ("rgb", "depth", "median_depth", "accumulation"):
+        assert getattr(alone, name) is getattr(rays, name)
 
 
 @pytest.mark.parametrize(
@@ -136,6 +158,6 @@ def test_means_over_pixels_are_means() -> None:
     ],
 )
 def test_pictures_are_over_what_training_was_over(asked: Any, alpha: bool, expected: float) -> None:
-    model = Disc(TrainConfig(background=asked))
+    model = disc(RayConfig(background=asked))
     model.scene = replace(model.scene, has_alpha=alpha)
     assert evaluation_background(model).tolist() == [expected] * 3

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.mutations.bug import Bug
-from tests.mutations.copy import Copy, make_copy
+from tests.mutations.copy import PACKAGES, Copy, make_copy
 from tests.mutations.forks import Tester
 from tests.mutations.plugin import FAILED, ORDER, RECORD
 from tests.mutations.reach import Reach, digests, read_record
@@ -53,7 +53,7 @@ def record(copy: Copy, folder: Path, files: Sequence[str], processes: int) -> Re
     except ImportError as error:
         raise TestsFail("the tests' lines are recorded by coverage.py: pip install coverage") from error
     folder.mkdir()
-    sources = "\n    ".join(str(copy.root / name) for name in ("framework", "methods", "dataparsers"))
+    sources = "\n    ".join(str(copy.root / name) for name in PACKAGES)
     (folder / "coveragerc").write_text(f"[run]\ndata_file = {folder / 'lines'}\nsource =\n    {sources}\n")
     words = [str(copy.python), "-m", "pytest", *PYTEST, *FAST, "-n", str(processes), *files]
     done = subprocess.run(

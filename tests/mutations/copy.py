@@ -20,7 +20,7 @@ from pathlib import Path
 from tests.mutations.plugin import CONTEXT
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("framework", "methods", "dataparsers")
+PACKAGES = ("nerfloom", "framework", "methods", "dataparsers")
 LEFT_OUT = shutil.ignore_patterns(
     ".git", ".venv", "__pycache__", ".*_cache", ".hypothesis", "outputs", "build", "dist", "shared"
 )

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "plugin-method"
-PACKAGES = ("framework", "methods", "dataparsers")
+PACKAGES = ("nerfloom", "framework", "methods", "dataparsers")
 SOURCES = ("pyproject.toml", "setup.py", "README.md", "LICENSE", *PACKAGES)
 BUILT = shutil.ignore_patterns("__pycache__", "lib", "build", "*.egg-info")
 SMALL = "--max-resolution 32 --grid-resolution 16 --num-steps 64 --samples-per-batch 4096"

@@ -5,8 +5,9 @@ from dataclasses import dataclass, replace
 
 from torch import Tensor
 
-from framework import Method, Rays, Rendered
-from methods.instant_ngp import InstantNGP, InstantNGPConfig
+from framework import RayModel, Rays, Rendered
+from methods import instant_ngp
+from methods.instant_ngp import InstantNGPConfig
 
 
 @dataclass(frozen=True)
@@ -17,10 +18,8 @@ class SickConfig(InstantNGPConfig):
     """In training, colours of batches of at most so many rays are NaN."""
 
 
-class Sick(InstantNGP):
+class Sick(RayModel[SickConfig]):
     """Sick in small batches."""
-
-    config: SickConfig
 
     def render(self, rays: Rays, background: Tensor) -> Rendered:
         rendered = super().render(rays, background)
@@ -29,4 +28,4 @@ class Sick(InstantNGP):
         return rendered
 
 
-METHOD = Method(Sick, SickConfig(), paper="none")
+METHOD = replace(instant_ngp.METHOD, config=SickConfig(), model=Sick, paper="none")

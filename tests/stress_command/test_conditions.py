@@ -11,10 +11,12 @@ from framework.base.config import from_plain
 from framework.base.errors import ConfigError
 from framework.base.registry import load_method
 from framework.cli.stress import USAGE
+from framework.data.sources import make_source
 from framework.tools.stress.conditions import CONDITIONS, PLAIN, Condition, select
 from framework.tools.stress.scenes import ball_views
-from framework.tools.stress.trial import MOST_RAYS, MOST_SAMPLES, Budget, StressedTrainer, shortened
-from framework.training.run import create_folder
+from framework.tools.stress.trial import MOST_RAYS, MOST_SAMPLES, Budget, StressedSource, shortened
+from framework.training.run import Run, create_folder
+from framework.training.trainer import Trainer
 from tests.training.helpers import tiny_run
 
 BALL = ball_views()
@@ -85,27 +87,31 @@ def test_each_has_settings_that_are_accepted_or_refused(condition: Condition) ->
 
 def test_short_runs_take_small_steps() -> None:
     for method in ("vanilla-nerf", "instant-ngp"):
-        config = shortened(load_method(method).config, Budget(7, 1.5))
+        loaded = load_method(method)
+        config = shortened(loaded.config, Budget(7, 1.5), loaded, BALL.train.scene)
         assert (config.max_num_iterations, config.max_seconds, config.vis) == (7, 1.5, "none")
         assert config.num_rays_per_batch == MOST_RAYS
         assert config.samples_per_batch == (None if method == "vanilla-nerf" else MOST_SAMPLES)
+
+
+def stressed(run: Run, condition: Condition) -> Trainer:
+    """A trainer on the ball, of whose batches the condition is made."""
+    create_folder(run)
+    source = StressedSource(make_source("pixels", BALL.train, run.config), condition)
+    return Trainer(run, BALL.train, None, source)
 
 
 @pytest.mark.parametrize(("name", "rays"), [("1-ray", 1), ("8192-rays", 8192)])
 def test_a_step_has_so_many_rays(name: str, rays: int, tmp_path: Path) -> None:
     """Also of a method whose rays follow its samples, and which sends four through a pixel."""
     run, condition = tiny_run("instant-ngp", Path("none"), tmp_path, train_rays_per_pixel_from=0.0), BY_NAME[name]
-    create_folder(run)
-    run = replace(run, config=from_plain(run.config, condition.settings(run.config), name))
-    trainer = StressedTrainer(run, BALL.train, condition)
+    trainer = stressed(replace(run, config=from_plain(run.config, condition.settings(run.config), name)), condition)
     trainer.train_step()
     assert trainer.state.rays == rays
 
 
 def test_spoiled_batches_are_dropped_and_counted(tmp_path: Path) -> None:
-    run = tiny_run("instant-ngp", Path("none"), tmp_path)
-    create_folder(run)
-    trainer = StressedTrainer(run, BALL.train, BY_NAME["nan-pixels"])
+    trainer = stressed(tiny_run("instant-ngp", Path("none"), tmp_path), BY_NAME["nan-pixels"])
     for _ in range(6):
         trainer.train_step()
     assert trainer.state.skipped == 2

@@ -11,7 +11,8 @@ import torch
 
 from framework.base.checked import checked
 from framework.base.registry import load_method, registered
-from framework.evaluation.evaluator import Measured, evaluate, evaluation_background, every, render_view
+from framework.cameras.view import every
+from framework.evaluation.evaluator import Measured, evaluate, evaluation_background
 from framework.evaluation.metrics import psnr
 from framework.training.checkpoint import load_checkpoint
 from framework.training.curve import (
@@ -97,8 +98,8 @@ def test_a_look_is_what_its_pixels_say(shared_tiny: Path, tmp_path: Path) -> Non
     assert (found.psnr, found.ssim) == (whole.results["psnr"], whole.results["ssim"])
     assert (found.images, found.pixel_stride, found.full) == (2, 1, False)
     background = evaluation_background(model)
-    full = render_view(model, dataset, 0, background)
-    part = render_view(model, dataset, 0, background, stride=3)
+    full = model.render_view(dataset.view(0), background)
+    part = model.render_view(dataset.view(0, stride=3), background)
     for name in ("rgb", "depth", "accumulation"):  # bfloat16 products differ by the number of rays
         torch.testing.assert_close(getattr(part, name), every(getattr(full, name), 3), atol=2e-2, rtol=0)
     assert part.rgb.shape == (7, 7, 3)

@@ -28,7 +28,7 @@ def test_facts_and_decisions_of_photographs_with_alpha(shared_tiny: Path, tmp_pa
     finest = trainer.model.field.encoding.layout.resolutions[-1]  # type: ignore[union-attr]
     assert found["finest cells along an axis"][0] == str(finest)
     trainer.train()
-    assert trainer.model.occupancy_samplers[0].any_carved  # as announced
+    assert bool(trainer.model.sampler.carved.any())  # as announced
 
 
 def test_times_that_a_still_method_ignores_are_announced(shared_tiny: Path, tmp_path: Path) -> None:
@@ -56,7 +56,7 @@ def test_without_alpha_the_background_is_black_and_no_silhouette_used(shared_tin
     assert decisions(found)["silhouettes"] == ("not used", "no photograph has alpha")
     assert found.profile().transparent is None
     found.train_step()
-    assert not found.model.occupancy_samplers[0].any_carved  # as announced
+    assert not bool(found.model.sampler.carved.any())  # as announced
 
 
 def test_what_the_user_decided_is_not_called_a_decision(shared_tiny: Path, tmp_path: Path) -> None:
@@ -94,8 +94,8 @@ def test_drawing_by_error_is_resumed_with_the_same_bits(shared_tiny: Path, tmp_p
     second = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "second", load_dir=first.checkpoint_folder, **settings)
     second.restore_as_configured()
     second.train()
-    assert whole.errors is not None
-    assert second.errors is not None
-    assert torch.equal(whole.errors.errors, second.errors.errors)
-    assert len(whole.errors.errors.unique()) > 2  # something was learnt
+    assert whole.source.errors is not None
+    assert second.source.errors is not None
+    assert torch.equal(whole.source.errors.errors, second.source.errors.errors)
+    assert len(whole.source.errors.errors.unique()) > 2  # something was learnt
     assert_same_bits(tensors(whole), tensors(second))

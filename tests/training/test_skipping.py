@@ -18,7 +18,7 @@ def test_the_report_tells_what_was_skipped(shared_tiny: Path, tmp_path: Path) ->
     assert_same_bits(before, tensors(trainer))  # looking changes nothing
     assert len(rungs) == 6
     assert all(0 <= rung.skipped <= 1 for rung in rungs.values())
-    sampler = trainer.model.occupancy_samplers[0]
+    sampler = trainer.model.sampler
     assert rungs["cells, empty"].skipped == pytest.approx(1 - sampler.occupied_share)
     assert rungs["cells, outside the visual hull"].skipped == pytest.approx(sampler.carved.float().mean().item())
     assert rungs["steps along a ray, in empty cells"].skipped > 0.1
@@ -39,7 +39,7 @@ def test_every_switch_switches(shared_tiny: Path, tmp_path: Path) -> None:
     off = {"silhouette_cells": False, "sparse_updates": False}
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=10, **off)
     trainer.train()
-    assert not trainer.model.occupancy_samplers[0].any_carved
+    assert not bool(trainer.model.sampler.carved.any())
     assert trainer.train_set.drawn is None
     assert {rung.name for rung in skip_report(trainer)} == {
         "steps along a ray, in empty cells",
@@ -50,7 +50,7 @@ def test_every_switch_switches(shared_tiny: Path, tmp_path: Path) -> None:
         "instant-ngp", shared_tiny, tmp_path / "cells", max_num_iterations=1, silhouette_pixels=False
     )
     cells_only.train()
-    assert cells_only.model.occupancy_samplers[0].any_carved
+    assert bool(cells_only.model.sampler.carved.any())
     assert cells_only.train_set.drawn is None
 
 
@@ -63,12 +63,14 @@ def test_methods_that_skip_nothing_report_nothing(shared_tiny: Path, tmp_path: P
 def test_carved_cells_stay_empty(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=80)
     trainer.train()
-    sampler = trainer.model.occupancy_samplers[0]
+    sampler = trainer.model.sampler
     carved = sampler.carved.clone()
     assert 0 < carved.float().mean() < 1
     assert not bool((sampler.occupied & carved).any())
     torch.manual_seed(0)
     for step in (96, 128, 512, 528):
-        sampler.update(step, lambda x, t: (torch.full((len(x),), 1e3), x))  # a field that is opaque everywhere
+        sampler.update(
+            step, lambda points: (torch.full((len(points),), 1e3), points.positions)
+        )  # a field that is opaque everywhere
     assert not bool((sampler.occupied & carved).any())
     assert bool(sampler.occupied.any())

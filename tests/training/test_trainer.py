@@ -14,16 +14,17 @@ import torch
 from torch import Tensor
 
 from dataparsers.blender import Blender
-from framework import Batch, Method, Model, Rays, Rendered
+from framework import Loss, Model, PixelBatch, RayModel, Rays, Rendered
 from framework.base import registry
 from framework.base.errors import CheckpointError, ConfigError, DivergenceError
-from framework.evaluation.evaluator import evaluate, evaluation_background, render_view
+from framework.evaluation.evaluator import evaluate, evaluation_background
 from framework.training.checkpoint import list_checkpoints, load_checkpoint
 from framework.training.datasets import first_split, load_split
 from framework.training.run import create_folder
 from framework.training.signals import stop_signals
 from framework.training.trainer import Trainer
-from methods.instant_ngp import InstantNGP, InstantNGPConfig
+from methods import instant_ngp
+from methods.instant_ngp import InstantNGPConfig
 from tests.training.helpers import TINY, assert_same_bits, tensors, tiny_run, tiny_trainer
 
 KINDS = list(TINY)
@@ -170,22 +171,20 @@ class SickConfig(InstantNGPConfig):
     where: str = "loss"
 
 
-class Sick(InstantNGP):
+class Sick(RayModel[SickConfig]):
     """Its loss or its gradients are NaN at the chosen steps."""
 
-    config: SickConfig
-
-    def loss(self, rendered: Rendered, batch: Batch, step: int) -> dict[str, Tensor]:
-        losses = super().loss(rendered, batch, step)
+    def loss(self, batch: PixelBatch, step: int) -> Loss:
+        loss = super().loss(batch, step)
         if step in self.config.bad_steps:
             if self.config.where == "loss":
-                losses["rgb"] = losses["rgb"] * math.nan
+                loss.terms["rgb"] = loss.terms["rgb"] * math.nan
             else:  # finite loss, NaN gradient: sqrt at 0
-                losses["sick"] = (self.field.density_head[0].weight * 0).sum().sqrt()
-        return losses
+                loss.terms["sick"] = (self.field.density_head[0].weight * 0).sum().sqrt()
+        return loss
 
 
-METHOD = Method(Sick, SickConfig(), paper="none")
+METHOD = dataclasses.replace(instant_ngp.METHOD, config=SickConfig(), model=Sick, paper="none")
 
 
 @pytest.fixture
@@ -244,8 +243,8 @@ def test_a_picture_does_not_depend_on_the_chunks(kind: str, shared_tiny: Path, t
         for _ in range(5):
             trainer.train_step()
         assert trainer.eval_set is not None
-        view = render_view(trainer.model, trainer.eval_set, 0, evaluation_background(trainer.model))
-        pictures.append((view.rgb, view.depth))
+        view = trainer.model.render_view(trainer.eval_set.view(0), evaluation_background(trainer.model))
+        pictures.append((view.rgb, view.median_depth))
     torch.testing.assert_close(pictures[0][0], pictures[1][0], atol=2e-3, rtol=0)  # bfloat16 products differ by size
     assert isinstance(trainer.model, Model)
 

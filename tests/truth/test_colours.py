@@ -81,7 +81,8 @@ def test_a_photograph_with_alpha_is_judged_over_white_and_one_without_over_black
     ):
         trainer = captured(shared_tiny, tmp_path / f"{has_alpha} {asked}", {"has_alpha": has_alpha}, background=asked)
         assert evaluation_background(trainer.model).tolist() == [expected] * 3
-        assert trainer._background() == {True: "random", False: "black"}[has_alpha] if asked == "auto" else asked
+        trained_over = asked if asked != "auto" else {True: "random", False: "black"}[has_alpha]
+        assert trainer.source.background == trained_over
 
 
 def test_what_is_judged_of_a_photograph_with_alpha_is_how_it_looks_over_white(folder: Path, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from framework.geometry.points import Points
 from framework.geometry.rays import Rays
 from framework.samplers.occupancy import OccupancySampler
 from methods.tensorf import MARGIN
@@ -67,8 +68,8 @@ def test_cells_are_asked_for_where_they_are() -> None:
     used = sampler()
     torch.manual_seed(0)
 
-    def density(places: Tensor, times: Tensor | None) -> tuple[Tensor, Tensor]:
-        return 100.0 * a_corner(places), places
+    def density(points: Points) -> tuple[Tensor, Tensor]:
+        return 100.0 * a_corner(points.positions), points.positions
 
     for step in range(8, 257, 8):
         used.update(step, density)

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch import Tensor
 
-from framework.evaluation import evaluator
+from framework import Picture, RayModel, View
 from framework.training.trained import load_trained
 from tests.cli.helpers import TINY_NGP
 from tests.conftest import EditJson
@@ -22,13 +23,13 @@ def rendered(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """What each picture was asked to show; each picture is of another grey."""
     asked: list[dict[str, Any]] = []
 
-    def render_image(model: Any, cameras: Any, index: int, background: Any, times: Any = None) -> Any:
-        time = None if times is None else float(times[index])
-        asked.append({"pose": cameras.camera_to_worlds[index], "fx": float(cameras.fx[index]), "time": time})
-        height, width = int(cameras.heights[index]), int(cameras.widths[index])
-        return evaluator.RenderedImage(torch.full((height, width, 3), 0.1 * index), torch.ones(1), torch.ones(1), 0.1)
+    def render_view(model: Any, view: View, background: Tensor) -> Picture:
+        grey = torch.full((view.height, view.width, 3), 0.1 * (len(asked) % FRAMES))
+        camera = view.camera
+        asked.append({"pose": camera.camera_to_worlds[0], "fx": float(camera.fx[0]), "time": view.time})
+        return Picture(grey, *[torch.ones(view.height, view.width)] * 3)
 
-    monkeypatch.setattr(evaluator, "render_image", render_image)
+    monkeypatch.setattr(RayModel, "render_view", render_view)
     return asked
 
 

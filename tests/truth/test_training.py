@@ -14,13 +14,16 @@ from framework.base.config import MachineConfig
 from framework.base.registry import load_method
 from framework.data.dataset import Dataset
 from framework.data.pixel_set import PixelSet
-from framework.data.pixels import Batch, draw_batch
+from framework.data.pixels import PixelBatch, draw_batch
 from framework.data.scene import Scene
+from framework.data.sources import PixelSource, Request
 from framework.evaluation.appearance import fitted_appearance
-from framework.evaluation.evaluator import evaluate, render_view
+from framework.evaluation.evaluator import evaluate
 from framework.fields.base import Field
+from framework.geometry.points import Points
 from framework.geometry.rays import Rays, Samples
-from framework.rendering.volume import Rendered, shade, volume_render
+from framework.rendering.rendered import Rendered
+from framework.rendering.volume import shade, volume_render
 from framework.samplers.choice import SamplingConfig, make_sampler
 from framework.samplers.occupancy import OccupancySampler
 from framework.training.trainer import Trainer
@@ -64,8 +67,8 @@ def test_the_rate_falls_over_the_budget_that_is_further_spent(
 class Fog(Field):
     """The same density everywhere."""
 
-    def density(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        return torch.full((len(positions),), 10.0), torch.zeros(len(positions), 1)
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        return torch.full((len(points),), 10.0), torch.zeros(len(points), 1)
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         return torch.ones(len(features), 3)
@@ -74,7 +77,8 @@ class Fog(Field):
 @pytest.mark.parametrize(("training", "stop"), [(False, 1e-4), (True, 1e-2)])
 def test_rays_end_where_the_mode_says(training: bool, stop: float) -> None:
     """By what `--early-stop` and `--train-early-stop` are said to be, through the settings."""
-    config = dataclasses.replace(load_method("instant-ngp").config.resolved(), early_stop=1e-4, train_early_stop=1e-2)
+    method = load_method("instant-ngp")
+    config, _ = method.decide(dataclasses.replace(method.config, early_stop=1e-4, train_early_stop=1e-2), SCENE)
     assert isinstance(config, SamplingConfig)
     config = dataclasses.replace(config, num_steps=400, grid_resolution=8)
     sampler = make_sampler(config, SCENE).train(training)
@@ -124,7 +128,7 @@ def shown(trainer: Trainer, dataset: Dataset) -> Tensor:
     """The model's picture of the first view in the light that is found for it."""
     background = torch.ones(3)
     with fitted_appearance(trainer.model, dataset, 0, background):
-        return render_view(trainer.model, dataset, 0, background).rgb
+        return trainer.model.render_view(dataset.view(0), background).rgb
 
 
 @pytest.mark.usefixtures("_soon_fitted")
@@ -168,20 +172,20 @@ def test_training_is_not_said_to_take_longer_than_it_does(shared_tiny: Path, tmp
     assert 0 < trainer.state.seconds < time.perf_counter() - begun
 
 
-def test_the_seed_and_the_step_decide_what_is_drawn(
-    shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_seed_and_the_step_decide_what_is_drawn(shared_tiny: Path, tmp_path: Path) -> None:
     """From the same parameters on, too: repeats of a comparison differ by their seeds."""
     drawn: list[Tensor] = []
 
-    def noted(*arguments: Any) -> Batch:
-        batch = draw_batch(*arguments)
-        drawn.append(batch.pixels)
-        return batch
+    class Noting(PixelSource):
+        def draw(self, request: Request) -> PixelBatch:
+            batch = super().draw(request)
+            drawn.append(batch.pixels)
+            return batch
 
-    monkeypatch.setattr("framework.training.trainer.draw_batch", noted)
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         trainer = tiny_trainer("vanilla-nerf", shared_tiny, tmp_path / name, machine=MachineConfig(seed=seed))
+        trainer.prepare()
+        trainer.source = Noting(trainer.train_set, "random", seed)
         trainer.train_step()
         trainer.train_step()
     first, second, again, _, other, _ = drawn
@@ -222,7 +226,8 @@ def test_each_group_has_the_rate_and_the_schedule_that_it_names(shared_tiny: Pat
 
 @pytest.mark.parametrize(("seconds", "size"), [(20.0, 16), (60.0, 16), (120.0, 17), (300.0, 18), (None, 18)])
 def test_longer_runs_of_instant_ngp_get_larger_tables(seconds: float | None, size: int) -> None:
-    config: Any = dataclasses.replace(load_method("instant-ngp").config, max_seconds=seconds).resolved()
+    method = load_method("instant-ngp")
+    config, _ = method.decide(dataclasses.replace(method.config, max_seconds=seconds), SCENE)
     assert config.log2_table_size == size
     assert config.sparse_updates == (size >= 17)
 
@@ -240,7 +245,7 @@ def test_a_pixel_is_several_rays_from_the_share_of_the_budget_on_that_is_asked_f
         before = trainer.state.rays
         trainer.train_step()
         counts.append(trainer.state.rays - before)
-        assert len(trainer._places_in_a_pixel()) == (4 if step + 1 >= 5 else 1)
+        assert trainer._request().rays_per_pixel == (4 if step + 1 >= 5 else 1)
     assert counts == [128] * 10  # fewer pixels, of as many rays
 
 
@@ -254,9 +259,9 @@ def test_what_is_near_a_camera_learns_little(
     trainer = captured(shared_tiny, tmp_path, {"unbounded": True, "near": 0.05})
     given: list[tuple[Samples, Tensor]] = []
 
-    def noted(field: Field, rays: Rays, samples: Samples, background: Tensor, factors: Tensor) -> Rendered:
+    def noted(rays: Rays, samples: Samples, field: Field, background: Tensor, factors: Tensor) -> Rendered:
         given.append((samples, factors))
-        return shade(field, rays, samples, background, factors)
+        return shade(rays, samples, field, background, factors)
 
     monkeypatch.setattr("methods.nerfacto.shade", noted)
     trainer.train_step()
@@ -280,7 +285,9 @@ def test_light_is_gathered_in_normalised_distance(shared_tiny: Path, tmp_path: P
     apart = (middles[:, :, None] - middles[:, None]).abs()
     pairs = (weights[:, :, None] * weights[:, None] * apart).sum((1, 2))
     expected = 0.5 * (pairs + (weights.square() * edges.diff(dim=-1)).sum(-1) / 3).mean()
-    assert float(model.loss(rendered, batch, 0)["distortion"].detach()) == pytest.approx(float(expected), rel=1e-3)
+    assert float(model.regularizers(rendered, batch, 0)["distortion"].detach()) == pytest.approx(
+        float(expected), rel=1e-3
+    )
 
 
 @pytest.mark.parametrize(("has_alpha", "opacity"), [(False, 1.0), (True, 0.0)])

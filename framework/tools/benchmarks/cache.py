@@ -135,7 +135,7 @@ def train(trainer: Trainer, seconds: float) -> dict[str, Any]:
         "training": {**status("VmHWM"), **most},
         "steps": state.step,
         "rays per second": round((state.rays - rays) / measured),
-        "rays in the last step": round((trainer.config.samples_per_batch or 0) / state.samples_per_ray),
+        "rays in the last step": round((trainer.model.samples_per_step or 0) / state.samples_per_ray),
         "share of time waiting for pixels": round((waited[0] - wait) / measured, 4),
         "psnr of batches": round(-10 * math.log10(state.train_mse), 2),
     }

@@ -16,7 +16,7 @@ from PIL import Image
 
 from framework.base.console import say, track
 from framework.base.errors import DataError
-from framework.data.data_folder import PHOTOGRAPHS
+from framework.data.data_folder import IMAGE_SUFFIXES
 from framework.data.image_files import Content, unreadable
 
 _JPEG = (".jpg", ".jpeg")
@@ -64,12 +64,12 @@ def find_photographs(folder: Path, leave_out: Iterable[Path] = ()) -> list[Path]
     found = []
     for path in folder.rglob("*"):
         relative = path.relative_to(folder)
-        if path.suffix.lower() not in PHOTOGRAPHS or any(part.startswith(".") for part in relative.parts):
+        if path.suffix.lower() not in IMAGE_SUFFIXES or any(part.startswith(".") for part in relative.parts):
             continue
         if path.is_file() and not any(path.resolve().is_relative_to(other) for other in others):
             found.append(relative)
     if not found:
-        raise DataError(f"--data {folder} has no image (looked for {', '.join(PHOTOGRAPHS)})")
+        raise DataError(f"--data {folder} has no image (looked for {', '.join(IMAGE_SUFFIXES)})")
     return sorted(found, key=natural_order)
 
 

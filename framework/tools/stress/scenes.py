@@ -109,7 +109,7 @@ def ball_dataset(positions: Tensor, field_of_view: float) -> Dataset:
 def photograph(cameras: Cameras) -> Tensor:
     """(P, 4) uint8 what cameras see of the ball, image after image: means over pixels, straight alpha."""
     flat = torch.arange(int(cameras.offsets[-1]))
-    rays = cameras.pixel_rays(flat, 0.0, 1.0, places=subpixels(RAYS_PER_PIXEL))
+    rays = cameras.pixel_rays(flat, 0.0, 1.0, subpixels=subpixels(RAYS_PER_PIXEL))
     normals, hits = trace(rays.origins.double(), rays.directions.double())
     weights = hits.double().view(-1, RAYS_PER_PIXEL, 1)
     sums = ((0.5 + 0.5 * normals).view(-1, RAYS_PER_PIXEL, 3) * weights).sum(1)

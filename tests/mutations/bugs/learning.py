@@ -127,8 +127,8 @@ BUGS = (
         "error-weights-lost",
         "drawing",
         "framework/data/error_map.py",
-        "return taken, 1 / share[taken]",
-        "return taken, torch.ones_like(share[taken])",
+        "return selected, 1 / share[selected]",
+        "return selected, torch.ones_like(share[selected])",
         "--draw-by-error minimises another loss than was asked for",
     ),
     Bug(
@@ -271,8 +271,8 @@ BUGS = (
         "light-of-transparent",
         "methods",
         "framework/data/light.py",
-        "use = use & (seen[:, 3] == 255)",
-        "use = use & (seen[:, 3] >= 0)",
+        "usable = usable & (pixels[:, 3] == 255)",
+        "usable = usable & (pixels[:, 3] >= 0)",
         "what is transparent decides what light there was",
     ),
     Bug(

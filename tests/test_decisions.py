@@ -1,0 +1,77 @@
+"""Settings that are left to the data: filled in where they are open, and reported then alone."""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import pytest
+
+from framework.base.config import AUTO, Auto, TrainConfig
+from framework.base.decisions import Choice, Decision, fill, is_open
+from framework.base.registry import load_method, registered
+from tests.truth.test_training import SCENE
+
+
+@dataclass(frozen=True)
+class OpenConfig(TrainConfig):
+    """Three settings that the data may decide."""
+
+    num_cells: Auto[int] = AUTO
+    """Cells."""
+    fancy: Auto[bool] = AUTO
+    """Whether fancy."""
+    shape: Literal["auto", "ball", "box"] = "auto"
+    """Of what it is."""
+
+
+CHOICES = (
+    Choice("num_cells", 7, "there are seven"),
+    Choice("fancy", False, "nobody asked", "fanciness"),
+    Choice("shape", "ball", "it is round", shown="a ball"),
+)
+
+
+def test_what_is_open_is_filled_in_and_reported() -> None:
+    config, made = fill(OpenConfig(), *CHOICES)
+    assert (config.num_cells, config.fancy, config.shape) == (7, False, "ball")
+    assert made == [
+        Decision("num cells", "7", "there are seven"),
+        Decision("fanciness", "off", "nobody asked"),
+        Decision("shape", "a ball", "it is round"),
+    ]
+    assert made[0].line() == "  num cells: 7, as there are seven"
+
+
+def test_what_is_given_stays_and_is_not_reported() -> None:
+    """Also what Python takes for false, which is not open."""
+    given = OpenConfig(num_cells=0, shape="box", learning_rate=0.3)
+    config, made = fill(given, *CHOICES)
+    assert config == dataclasses.replace(given, fancy=False)
+    assert [decision.option for decision in made] == ["fanciness"]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.0, "0"), (2e-3, "0.002"), (True, "on"), (2**15, "32768"), ("SO3xR3", "SO3xR3")]
+)
+def test_values_are_shown_as_people_write_them(value: Any, text: str) -> None:
+    assert Choice("some_setting", value, "it is so").decision().choice == text
+
+
+def test_filling_in_twice_changes_nothing() -> None:
+    once, _ = fill(OpenConfig(), *CHOICES)
+    assert fill(once, *CHOICES) == (once, [])
+
+
+@pytest.mark.parametrize("method", registered("methods"))
+@pytest.mark.parametrize("facts", [{}, {"unbounded": True, "appearance_varies": True, "poses": "device"}])
+def test_every_method_decides_once(method: str, facts: dict) -> None:
+    """What was decided is complete and stands: read from a run's config.yml, it is not decided anew."""
+    loaded, scene = load_method(method), dataclasses.replace(SCENE, **facts)
+    config, _ = loaded.decide(loaded.config, scene)
+    assert not [
+        name for name in ("sampler", "camera_optimizer", "log2_table_size") if is_open(getattr(config, name, 0))
+    ]
+    changed = dataclasses.replace(config, max_seconds=7.0)
+    again, made = loaded.decide(changed, dataclasses.replace(SCENE, unbounded=not scene.unbounded))
+    assert again == changed
+    assert [decision for decision in made if decision.choice != "left out"] == []

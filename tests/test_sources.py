@@ -1,0 +1,88 @@
+"""Where batches come from: whole images, and what a source carries over to a changed data set."""
+
+import pytest
+import torch
+
+from framework.base.device import seed_step
+from framework.base.registry import load_method
+from framework.data.dataset import Dataset, load_dataset
+from framework.data.pixel_set import PixelSet
+from framework.data.sources import PixelSource, Request, ViewSource, make_source
+from tests.images import write_noise
+
+SIZES = [(20, 10), (7, 30), (16, 16)]
+
+
+@pytest.fixture(scope="module", params=[3, 4], ids=["rgb", "rgba"])
+def images(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("images")
+    return load_dataset(write_noise(folder, SIZES, channels=request.param, suffix=".png"), "train")
+
+
+def test_a_view_is_a_whole_image_over_its_background(images: Dataset) -> None:
+    source = ViewSource(images, "random")
+    drawn = []
+    for step in range(40):
+        seed_step(3, step)
+        batch = source.draw(Request(step, 0))
+        drawn.append(batch.index)
+        width, height = SIZES[batch.index]
+        assert batch.rgb.shape == (height, width, 3)
+        assert len(batch) == height * width
+        assert (batch.view.height, batch.view.width) == (height, width)
+        pose = images.cameras.camera_to_worlds[batch.index]
+        assert torch.equal(batch.view.camera.camera_to_worlds[0], pose)
+        truth = images.image(batch.index).double() / 255
+        if truth.shape[-1] == 3:
+            assert batch.alpha is None
+            expected = truth
+        else:
+            alpha = truth[..., 3:]
+            torch.testing.assert_close(batch.alpha.double(), alpha[..., 0])
+            expected = truth[..., :3] * alpha + batch.background.double() * (1 - alpha)
+        torch.testing.assert_close(batch.rgb.double(), expected, atol=1e-6, rtol=0)
+    assert set(drawn) == {0, 1, 2}
+
+
+def test_the_seed_and_the_step_decide_which_view_is_drawn(images: Dataset) -> None:
+    def drawn(seed: int) -> list[tuple[int, list[float]]]:
+        found = []
+        for step in range(12):
+            seed_step(seed, step)
+            batch = ViewSource(images, "random").draw(Request(step, 0))
+            found.append((batch.index, batch.background.tolist()))
+        return found
+
+    assert drawn(1) == drawn(1)
+    assert drawn(1) != drawn(2)
+    assert len({tuple(background) for _, background in drawn(1)}) == 12
+
+
+@pytest.mark.parametrize(("background", "value"), [("white", 1.0), ("black", 0.0)])
+def test_a_fixed_background_is_the_same_in_every_view(images: Dataset, background: str, value: float) -> None:
+    source = ViewSource(images, background)
+    assert all(source.draw(Request(step, 0)).background.tolist() == [value] * 3 for step in range(3))
+
+
+def test_a_source_is_made_as_the_model_asks(images: Dataset) -> None:
+    config = load_method("instant-ngp").config
+    views, pixels = (make_source(kind, images, config) for kind in ("views", "pixels"))
+    assert isinstance(views, ViewSource)
+    assert isinstance(pixels, PixelSource)
+    assert views.background == pixels.background == ("random" if images.scene.has_alpha else "black")
+
+
+def test_what_was_learnt_of_errors_goes_along_to_a_changed_data_set(images: Dataset) -> None:
+    source = PixelSource(images, "black", 0, by_error=True)
+    batch = source.draw(Request(0, 50))
+    source.learn(batch, torch.full((50,), 9.0))
+    learnt = source.state()
+    assert learnt is not None
+    assert len(learnt.unique()) > 1
+    some = PixelSet.of_mask(torch.arange(len(images.pixels)) % 2 == 0)
+    changed = source.drawing_from(images.drawing(some))
+    assert changed.state() is learnt
+    assert bool((changed.draw(Request(1, 200)).pixels % 2 == 0).all())
+    other = PixelSource(images, "black", 0, by_error=True)
+    other.restore(learnt)
+    assert torch.equal(other.state(), learnt)

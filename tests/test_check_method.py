@@ -111,7 +111,7 @@ def of_parts(config: Any, *kinds: type) -> Method:
 
 
 class LightField(Model[TinyConfig]):
-    """Colour and opacity of a ray by two layers, from where it passes the origin: learns from pixels, and is no RayModel."""
+    """Colour and opacity of rays by two layers: learns from pixels, and is no RayModel."""
 
     batches: ClassVar[Literal["pixels", "views"]] = "pixels"
 

@@ -144,9 +144,9 @@ BUGS = (
     Bug(
         "held-out-as-first-camera",
         "evaluation",
-        "framework/evaluation/evaluator.py",
-        "model.render(replace(rays, camera_indices=None), background)",
-        "model.render(rays, background)",
+        "framework/ray_model.py",
+        "self.render(replace(rays, camera_indices=None), background)",
+        "self.render(rays, background)",
         "held-out photographs get the appearance and the pose of training photographs of the same number",
     ),
     Bug(

@@ -1,1 +1,1 @@
-"""Data formats: one file each."""
+"""Data formats, one file or package each."""

@@ -16,8 +16,9 @@ from framework import Cameras, DataError, DataParser, ParsedScene
 from framework.data.dataset import Split, existing, image_size
 
 TRANSFORMS = "transforms_train.json"
+"""File by which the format is recognised."""
 SMALLEST_ANGLE = 1e-6
-"""Radians. Below, the focal length grows beyond what float32 can tell from infinity."""
+"""Minimum field of view, radians; for a smaller one the focal length exceeds the range of float32."""
 
 
 @dataclass(frozen=True)
@@ -25,13 +26,13 @@ class Blender(DataParser):
     """Flags of the blender format."""
 
     downscale_factor: int = 1
-    """Reduce images by this whole number."""
+    """Integer factor by which images are reduced."""
     scale_factor: float = 1.0
-    """Multiply camera positions, and so the scene, by this."""
+    """Factor of camera positions, and thus of the scene."""
     half_size: float = 1.5
-    """Half the edge of the box around the origin that holds the scene, in the input's units."""
+    """Half the side of the cube around the origin that holds the scene, in the input's units."""
     near: float = 2.0
-    """Distance from a camera at which the scene may start, in the input's units."""
+    """Distance from a camera at which the scene starts, in the input's units."""
     far: float = 6.0
     """Distance from a camera at which the scene ends, in the input's units."""
 
@@ -44,15 +45,15 @@ class Blender(DataParser):
         if path is None:
             raise DataError("the blender format needs a folder: --data DIR")
         if self.downscale_factor < 1:
-            raise DataError(f"--downscale-factor is {self.downscale_factor}; it must be a whole number from 1")
+            raise DataError(f"--downscale-factor is {self.downscale_factor}; it must be an integer of at least 1")
         file = path / f"transforms_{split}.json"
         content = read_json(file)
         frames = content.get("frames")
         if not isinstance(frames, list) or not frames:
             raise DataError(f"{file} lists no frames")
-        where = [f"{file}: frame {index}" for index in range(len(frames))]
-        paths = [_image_path(path, frame, place) for frame, place in zip(frames, where, strict=True)]
-        poses = torch.stack([read_pose(frame, place) for frame, place in zip(frames, where, strict=True)])
+        labels = [f"{file}: frame {index}" for index in range(len(frames))]
+        paths = [_image_path(path, frame, label) for frame, label in zip(frames, labels, strict=True)]
+        poses = torch.stack([read_pose(frame, label) for frame, label in zip(frames, labels, strict=True)])
         keep = existing(paths, split)
         width, height = image_size([paths[index] for index in keep.tolist()])
         scene = ParsedScene(
@@ -61,7 +62,7 @@ class Blender(DataParser):
             box=torch.tensor([[-1.0], [1.0]]).expand(2, 3) * self.half_size * self.scale_factor,
             near=self.near * self.scale_factor,
             far=self.far * self.scale_factor,
-            times=read_times(frames, where),
+            times=read_times(frames, labels),
             scale=self.scale_factor,
             downscale_factor=self.downscale_factor,
         )
@@ -83,7 +84,7 @@ class Blender(DataParser):
 
 
 def has_times(file: Path) -> bool:
-    """Whether the first frame of a transforms file has a time. Never raises."""
+    """Return whether the first frame of the transforms file `file` has a time. Never raises."""
     try:
         frames = json.loads(file.read_text(encoding="utf-8")).get("frames")
         return isinstance(frames, list) and bool(frames) and isinstance(frames[0], dict) and "time" in frames[0]
@@ -91,14 +92,14 @@ def has_times(file: Path) -> bool:
         return False
 
 
-def _image_path(folder: Path, frame: Any, where: str) -> Path:
-    """Blender writes paths without an ending."""
-    path = folder / file_name(frame.get("file_path") if isinstance(frame, dict) else None, "file_path", where)
+def _image_path(folder: Path, frame: Any, labels: str) -> Path:
+    """Return the path of a frame's image; Blender writes paths without a suffix."""
+    path = folder / file_name(frame.get("file_path") if isinstance(frame, dict) else None, "file_path", labels)
     return path if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".webp") else path.with_name(path.name + ".png")
 
 
 def _focal_length(content: dict[str, Any], width: int, file: Path) -> float:
-    """In pixels, from the horizontal field of view."""
+    """Return the focal length in pixels, from the horizontal field of view."""
     angle = content.get("camera_angle_x")
     if not isinstance(angle, (int, float)) or isinstance(angle, bool) or not SMALLEST_ANGLE < angle < math.pi:
         raise DataError(f"{file}: 'camera_angle_x' is {shown(angle)}; it must be an angle between 0 and pi radians")

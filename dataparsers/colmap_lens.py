@@ -1,4 +1,4 @@
-"""COLMAP's camera models as this framework's: intrinsics, sizes, and one lens model for all."""
+"""Conversion of COLMAP's cameras: intrinsics, sizes, and one lens model for all."""
 
 from __future__ import annotations
 
@@ -16,42 +16,48 @@ from framework.cameras.colmap import PARAMETERS, Intrinsics, from_colmap
 
 @dataclass(frozen=True)
 class Lenses:
-    """What M images were taken with."""
+    """Intrinsics of M images."""
 
     intrinsics: Tensor
     """(M, 4) float64 fx, fy, cx, cy in pixels of an image of `sizes`."""
     sizes: Tensor
     """(M, 2) int64 width and height."""
     model: str
-    """A key of `LENSES`."""
+    """Projection, a key of `LENSES`."""
     lens: Tensor
-    """(M, K) coefficients."""
+    """(M, K) distortion coefficients."""
 
 
 def lenses_of(cameras: Sequence[SparseCamera], names: Sequence[str], where: str) -> Lenses:
-    """The cameras (M) of images called `names`, of a reconstruction in the folder `where`.
+    """Convert the cameras of M images to one lens model.
 
-    Raises: DataError that names an image whose camera model is not known, or cannot be mixed with another's.
+    Args:
+        cameras: M cameras.
+        names: M names of the images.
+        where: folder of the reconstruction, for messages.
+
+    Raises:
+        DataError: if the camera model of an image is not supported, or cannot be combined with another's.
     """
-    found: list[Intrinsics] = []
+    converted: list[Intrinsics] = []
     for camera, name in zip(cameras, names, strict=True):
         try:
-            found.append(from_colmap(camera.model, camera.params, camera.width, camera.height))
+            converted.append(from_colmap(camera.model, camera.params, camera.width, camera.height))
         except DataError as error:
             command = "" if camera.model in PARAMETERS else f", as in: {_command(where)}"
             raise DataError(f"{where}: image {name!r}: {error}{command}") from error
-    models = [camera.model for camera in found]
-    # Without distortion an opencv camera is a pinhole, and the other way round.
+    models = [camera.model for camera in converted]
+    # A pinhole camera is an opencv camera without distortion.
     model = next((kind for kind in models if kind != "pinhole"), "pinhole")
-    lens = torch.zeros(len(found), len(LENSES[model]))
-    for row, own in enumerate(found):
-        if own.model not in (model, "pinhole") or (model == "fisheye" and own.model == "pinhole"):
+    lens = torch.zeros(len(converted), len(LENSES[model]))
+    for row, current in enumerate(converted):
+        if current.model not in (model, "pinhole") or (model == "fisheye" and current.model == "pinhole"):
             raise DataError(
-                f"{where}: image {names[row]!r} has a {own.model} camera and image {names[models.index(model)]!r} a "
-                f"{model} one, which one scene cannot mix; convert the images: {_command(where)}"
+                f"{where}: image {names[row]!r} has a {current.model} camera and image "
+                f"{names[models.index(model)]!r} a {model} one; convert the images to one model: {_command(where)}"
             )
-        lens[row, : len(own.lens)] = torch.tensor(own.lens)
-    intrinsics = torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in found], dtype=torch.float64)
+        lens[row, : len(current.lens)] = torch.tensor(current.lens)
+    intrinsics = torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in converted], dtype=torch.float64)
     return Lenses(intrinsics, torch.tensor([[c.width, c.height] for c in cameras]), model, lens)
 
 

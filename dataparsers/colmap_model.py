@@ -1,4 +1,4 @@
-"""A COLMAP reconstruction: which one of a folder's, and its cameras, poses and sparse points.
+"""COLMAP reconstructions: selection of one, and its cameras, poses and sparse points.
 
 Schönberger and Frahm 2016.
 """
@@ -19,47 +19,54 @@ from framework.base.console import say
 from framework.cameras.cameras import check_pose
 from framework.data.dataset import one_line
 
-PLACES = ("sparse", "colmap/sparse")
-"""Where reconstructions are looked for, each there itself or in a folder of its own below."""
+LOCATIONS = ("sparse", "colmap/sparse")
+"""Folders searched for reconstructions: each itself, and its subfolders."""
 FILES = ("cameras", "images", "points3D")
+"""Files of a reconstruction, without suffix."""
 SHORTEST_TRACK = 3
-"""Images that must have seen a sparse point; two can agree on a wrong one."""
+"""Minimum number of images that observe a sparse point; two can agree on a wrong one."""
 LARGEST_ERROR = 2.0
-"""Pixels that a sparse point may be off by, on average."""
+"""Maximum mean reprojection error of a sparse point, pixels."""
 
 
 @dataclass(frozen=True)
 class SparseCamera:
-    """A camera as COLMAP has it."""
+    """A camera in COLMAP's terms."""
 
     model: str
     """COLMAP's name of the projection."""
     params: tuple[float, ...]
-    """In COLMAP's order."""
+    """Parameters in COLMAP's order."""
     width: int
-    """Of the photographs it was fitted to, pixels."""
+    """Width of the images, pixels."""
     height: int
+    """Height of the images, pixels."""
 
 
 @dataclass(frozen=True)
 class SparseModel:
-    """M registered images, by sorted name."""
+    """A reconstruction of M registered images, sorted by name."""
 
     names: tuple[str, ...]
-    """M paths below the folder of images."""
+    """M paths relative to the images' folder."""
     poses: Tensor
     """(M, 4, 4) float64 camera-to-world, OpenGL axes."""
     cameras: tuple[SparseCamera, ...]
     """The camera of each image."""
     points: Tensor
-    """(K, 3) float64 sparse points that several images agree on."""
+    """(K, 3) float64 sparse points confirmed by several images."""
 
 
-def find_models(path: Path, places: tuple[str, ...] = PLACES) -> list[Path]:
-    """The reconstructions of the first of some places that has any, by name. Never raises."""
-    for place in places:
+def find_models(path: Path, locations: tuple[str, ...] = LOCATIONS) -> list[Path]:
+    """Return the reconstructions in the first location that has any, sorted by name. Never raises.
+
+    Args:
+        path: the data folder.
+        locations: subfolders to search.
+    """
+    for location in locations:
         try:
-            folders = [path / place, *sorted(path.joinpath(place).iterdir())]
+            folders = [path / location, *sorted(path.joinpath(location).iterdir())]
             kinds = ("bin", "txt")
             models = [folder for folder in folders if any((folder / f"images.{kind}").is_file() for kind in kinds)]
         except OSError:
@@ -69,21 +76,23 @@ def find_models(path: Path, places: tuple[str, ...] = PLACES) -> list[Path]:
     return []
 
 
-def choose_model(path: Path, place: str | None, flag: str = "--colmap-path") -> Path:
-    """The reconstruction to read: of several the one with the most images, which is said.
+def choose_model(path: Path, location: str | None, flag: str = "--colmap-path") -> Path:
+    """Return the folder of the reconstruction to read; of several, report and use the one with the most images.
 
     Args:
         path: the data folder.
-        place: where to look below it, or None for the usual places.
-        flag: what sets `place`, for messages.
-    Raises: DataError where there is none.
+        location: subfolder to search; None for the default ones.
+        flag: the flag that sets `location`, for messages.
+
+    Raises:
+        DataError: if there is none.
     """
-    places = PLACES if place is None else (place,)
-    models = find_models(path, places)
+    locations = LOCATIONS if location is None else (location,)
+    models = find_models(path, locations)
     if not models:
         raise DataError(
-            f"{path} has no COLMAP reconstruction: no images.bin or images.txt in {', '.join(places)} or a folder "
-            f"below; run COLMAP, or name its folder with {flag}"
+            f"{path} has no COLMAP reconstruction: no images.bin or images.txt in {', '.join(locations)} or a folder "
+            f"below; run COLMAP, or set its folder with {flag}"
         )
     counts = [count_images(model) for model in models]
     best = counts.index(max(counts))
@@ -96,18 +105,22 @@ def choose_model(path: Path, place: str | None, flag: str = "--colmap-path") -> 
 
 
 def read_model(folder: Path) -> SparseModel:
-    """Read a reconstruction, binary or text, through pycolmap.
+    """Read a reconstruction, binary or text, with pycolmap.
 
-    Raises: DataError where a file is missing, damaged or contradicts another, where no image has a pose, or where
-        pycolmap is not installed.
+    Args:
+        folder: folder of the reconstruction.
+
+    Raises:
+        DataError: if a file is missing, damaged or contradicts another, no image has a pose, or pycolmap is not
+            installed.
     """
     if not any(all((folder / f"{name}.{kind}").is_file() for name in FILES) for kind in ("bin", "txt")):
-        raise DataError(f"{folder} is not a whole COLMAP model: it needs {', '.join(FILES)}, all .bin or all .txt")
+        raise DataError(f"{folder} is not a complete COLMAP model: it needs {', '.join(FILES)}, all .bin or all .txt")
     check_binary(folder)
     try:
         import pycolmap
     except ImportError as error:
-        raise DataError(f"reading {folder} needs pycolmap, which is not there: pip install pycolmap") from error
+        raise DataError(f"reading {folder} needs pycolmap, which is not installed: pip install pycolmap") from error
     try:
         model = pycolmap.Reconstruction(str(folder))
         images = sorted((model.images[number] for number in model.reg_image_ids()), key=lambda image: image.name)
@@ -116,16 +129,18 @@ def read_model(folder: Path) -> SparseModel:
         cameras = tuple(_camera(model.cameras[image.camera_id]) for image in images)
         points = _points(model)
     except Exception as error:  # pycolmap raises IndexError, ValueError, RuntimeError, UnicodeDecodeError and more
-        raise DataError(f"{folder} cannot be read: its files are damaged or do not fit ({one_line(error)})") from error
+        raise DataError(
+            f"{folder} cannot be read: its files are damaged or inconsistent ({one_line(error)})"
+        ) from error
     if not images:
-        raise DataError(f"{folder} has no image with a pose; COLMAP did not succeed in registering any")
+        raise DataError(f"{folder} has no image with a pose; COLMAP could not register any")
     for name, pose in zip(names, poses, strict=True):
         _check(name, pose, folder)
     return SparseModel(names, torch.stack(poses), cameras, points)
 
 
 def _camera_to_world(image: Any) -> Tensor:
-    """(4, 4) float64, OpenGL axes, from the inverse with OpenCV's (y down, looking along +z)."""
+    """Return the camera-to-world matrix (4, 4) float64, OpenGL axes; COLMAP stores the inverse with OpenCV's axes."""
     pose = image.cam_from_world
     pose = pose() if callable(pose) else pose  # a property before pycolmap 3.12, a method since
     world_to_camera = torch.from_numpy(pose.matrix()).double()
@@ -141,14 +156,14 @@ def _camera(camera: Any) -> SparseCamera:
 
 
 def _points(model: Any) -> Tensor:
-    """(K, 3) float64 points that enough images agree on."""
-    found = [
+    """Return the sparse points (K, 3) float64 that enough images confirm."""
+    confirmed = [
         torch.from_numpy(point.xyz)
         for point in model.points3D.values()
-        # The error is -1 where nobody computed it.
+        # The error is -1 if it was not computed.
         if point.track.length() >= SHORTEST_TRACK and point.error <= LARGEST_ERROR
     ]
-    points = torch.stack(found) if found else torch.zeros(0, 3, dtype=torch.float64)
+    points = torch.stack(confirmed) if confirmed else torch.zeros(0, 3, dtype=torch.float64)
     return points[torch.isfinite(points).all(-1)]
 
 

@@ -1,4 +1,4 @@
-"""D-NeRF scenes: as NeRF-Synthetic, with a `time` from 0 to 1 in every frame.
+"""D-NeRF scenes: as NeRF-Synthetic, with a `time` from 0 to 1 in each frame.
 
 Pumarola et al. 2021.
 """
@@ -24,5 +24,5 @@ class DNeRF(Blender):
     def parse(self, path: Path | None, split: Split) -> ParsedScene:
         scene = super().parse(path, split)
         if scene.times is None:
-            raise DataError(f"{path}: no frame has a 'time'; for a scene that stands still use the blender format")
+            raise DataError(f"{path}: no frame has a 'time'; for a static scene, use the blender format")
         return scene

@@ -1,4 +1,4 @@
-"""LLFF scenes: poses and depth bounds in poses_bounds.npy, beside the photographs (Mildenhall et al. 2019)."""
+"""LLFF scenes: poses and depth bounds in poses_bounds.npy, beside the images (Mildenhall et al. 2019)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dataparsers.captured import ENDINGS, REDUCED, Captured, Photographs, captured_scene, checked_box, has_transforms
+from dataparsers.captured import REDUCED, SUFFIXES, Captured, PosedImages, captured_scene, checked_box, has_transforms
 from dataparsers.colmap_model import find_models
 from dataparsers.masks import find_masks
 from framework import DataError, ParsedScene
@@ -20,11 +20,14 @@ from framework.cameras.poses import Placement
 from framework.data.dataset import Split, one_line
 
 POSES = "poses_bounds.npy"
+"""File of poses and depth bounds."""
 BOUNDS = f"the depth bounds of {POSES}"
+"""Subject of error messages about the depth bounds."""
 NEAR_SHARE = 0.9
-"""Rays start at this share of the smallest depth: of the points it was taken from, a few were nearer."""
+"""Near distance as a fraction of the smallest depth bound: the bound is a percentile of depths, and a few are
+smaller."""
 FORWARD = 0.7
-"""Least cosine between a viewing direction and the mean of all in a scene that is seen from one side (45 degrees)."""
+"""Minimum cosine between a viewing direction and the mean direction in a forward-facing scene (45 degrees)."""
 
 
 @dataclass(frozen=True)
@@ -32,15 +35,15 @@ class Llff(Captured):
     """Flags of the llff format."""
 
     images_path: str = "images"
-    """Where the photographs are, below the data folder; reduced ones are beside it, as in images_8."""
+    """Folder of the images in the data folder; reduced ones are in folders beside it, such as images_8."""
     masks_path: str = "masks"
-    """Where masks are, below the data folder: white where a photograph is to be learnt from."""
+    """Folder of masks in the data folder: white for pixels to train on."""
     use_bounds: bool = True
-    """Take from the file's depth bounds where rays start, unless `near` is farther, and of a scene that is seen from
-    one side the box: all that lies between the bounds, times `scene_scale`."""
+    """Use the file's depth bounds: rays start there, unless `near` is larger, and the box of a forward-facing scene
+    holds everything between the bounds, times `scene_scale`."""
     ndc: bool = False
-    """Learn in normalised device coordinates, for scenes that are seen from one side: all out to infinity is in the
-    box, and near, far and scene_scale count for nothing. Depths are then such coordinates' too."""
+    """Train in normalised device coordinates, for forward-facing scenes: the box holds everything out to infinity,
+    near, far and scene_scale have no effect, and depths are in these coordinates."""
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
@@ -51,7 +54,7 @@ class Llff(Captured):
             raise DataError("the llff format needs a folder: --data DIR")
         names = _image_names(path / self.images_path)
         poses, intrinsics, sizes, bounds = read_poses_bounds(path / POSES, len(names))
-        photographs = Photographs(
+        images = PosedImages(
             folder=path,
             paths=tuple(path / self.images_path / name for name in names),
             names=tuple(names),
@@ -60,7 +63,7 @@ class Llff(Captured):
             sizes=sizes,
             masks=find_masks(path / self.masks_path, names),
         )
-        scene = captured_scene(self, photographs, split)
+        scene = captured_scene(self, images, split)
         placed = Placement(_transform(scene).double(), scene.scale).poses(poses)
         corners, bounds = corner_directions(placed, intrinsics, sizes), bounds * scene.scale
         if self.ndc:
@@ -68,17 +71,18 @@ class Llff(Captured):
         return self._bounded(scene, placed, corners, bounds) if self.use_bounds else scene
 
     def _bounded(self, scene: ParsedScene, poses: Tensor, corners: Tensor, bounds: Tensor) -> ParsedScene:
-        """A scene whose near, and whose box if it is seen from one side, are those of the file.
+        """Return the scene with the file's near distance and, if it is forward-facing, with the file's box.
 
         Args:
-            poses: (M, 3, 4) of all photographs, scene coordinates.
-            corners: (M, 4, 3) as `corner_directions` gives them.
-            bounds: (M, 2) scene units.
+            scene: the scene as placed by the flags.
+            poses: (M, 3, 4) camera-to-world of all images, scene coordinates.
+            corners: (M, 4, 3) as `corner_directions` returns them.
+            bounds: (M, 2) smallest and largest depth, scene units.
         """
         near = max(self.near or 0.0, NEAR_SHARE * float(bounds[:, 0].min()))
         if near >= self.far:
             raise DataError(
-                f"--far {self.far} is nearer than what {POSES} says to be near; raise it, or --use-bounds False"
+                f"--far {self.far} is less than the near bound in {POSES}; raise it, or set --use-bounds False"
             )
         scene = replace(scene, near=near)
         if not faces_forward(poses):
@@ -93,23 +97,27 @@ def read_poses_bounds(file: Path, count: int) -> tuple[Tensor, Tensor, Tensor, T
     """Read poses_bounds.npy: M rows of a 3x5 matrix [down, right, back, position, (height, width, focal)], near, far.
 
     Args:
-        count: how many images there are.
-    Returns: (M, 4, 4) float64 camera-to-world, OpenGL axes; (M, 4) fx, fy, cx, cy; (M, 2) int64 width and height that
-        those are for; (M, 2) least and greatest depth, the input's units.
-    Raises: DataError where the file is missing, damaged, or of another number of images.
+        file: the file.
+        count: number of images M.
+
+    Returns:
+        Camera-to-world matrices (M, 4, 4) float64, OpenGL axes; fx, fy, cx, cy (M, 4); width and height (M, 2) int64
+        that these refer to; smallest and largest depth (M, 2), in the input's units.
+
+    Raises:
+        DataError: if the file is missing, damaged, or for another number of images.
     """
     try:
         table = read_array(file)
     except OSError as error:
         raise DataError(f"cannot read {file}: {error.strerror or one_line(error)}") from error
     except Exception as error:  # numpy raises ValueError, EOFError, SyntaxError, OverflowError and more
-        raise DataError(f"{file} is not an array of numpy: {one_line(error)}") from error
+        raise DataError(f"{file} is not a numpy array: {one_line(error)}") from error
     if table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind not in "fiu":
         raise DataError(f"{file} holds an array of shape {table.shape}; it must be numbers of shape (images, 17)")
     if len(table) != count:
         raise DataError(
-            f"{file} has poses of {len(table)} images, but there are {count}: which is whose cannot be told; "
-            "remove the images without a pose"
+            f"{file} has poses of {len(table)} images, but there are {count} images; remove those without a pose"
         )
     values = torch.from_numpy(table.astype(np.float64))
     bounds = values[:, 15:]
@@ -121,11 +129,13 @@ def read_poses_bounds(file: Path, count: int) -> tuple[Tensor, Tensor, Tensor, T
         check_pose(poses[row], f"{file}: row {row}")
         height, width, focal = camera[row].tolist()
         if not (1 <= height < 1e6 and 1 <= width < 1e6 and 0 < focal < 1e9):
-            raise DataError(f"{file}: row {row}: height, width and focal length are {height}, {width} and {focal}")
+            raise DataError(
+                f"{file}: row {row}: height {height}, width {width} or focal length {focal} is out of range"
+            )
         near, far = bounds[row].tolist()
         if not 0 < near < far < float("inf"):
             raise DataError(
-                f"{file}: row {row}: the depth bounds are {near} and {far}; they must be rising and positive"
+                f"{file}: row {row}: the depth bounds are {near} and {far}; they must be positive and ascending"
             )
     height, width, focal = camera.unbind(-1)
     intrinsics = torch.stack([focal, focal, width / 2, height / 2], dim=-1)
@@ -133,19 +143,19 @@ def read_poses_bounds(file: Path, count: int) -> tuple[Tensor, Tensor, Tensor, T
 
 
 def faces_forward(poses: Tensor) -> bool:
-    """Whether cameras (M, 3, 4) look the same way, more or less."""
+    """Return whether the cameras with `poses` (M, 3, 4) all look in about the same direction."""
     back = poses[:, :, 2]
     mean = back.mean(0)
     return bool(((back @ mean) >= FORWARD * mean.norm()).all()) and bool(mean.norm() > 0)
 
 
 def corner_directions(poses: Tensor, intrinsics: Tensor, sizes: Tensor) -> Tensor:
-    """(M, 4, 3) directions through the corners of M pinhole cameras' images, 1 long along their axes.
+    """Return directions (M, 4, 3) through the corners of the images of M pinhole cameras, of depth 1.
 
     Args:
         poses: (M, 3, 4) camera-to-world.
-        intrinsics: (M, 4) fx, fy, cx, cy in pixels.
-        sizes: (M, 2) width and height in pixels.
+        intrinsics: (M, 4) fx, fy, cx, cy, pixels.
+        sizes: (M, 2) width and height, pixels.
     """
     sides = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]])
     x, y = ((sides * sizes[:, None] - intrinsics[:, None, 2:]) / intrinsics[:, None, :2]).unbind(-1)
@@ -153,7 +163,7 @@ def corner_directions(poses: Tensor, intrinsics: Tensor, sizes: Tensor) -> Tenso
 
 
 def _in_ndc(scene: ParsedScene, poses: Tensor, corners: Tensor, nears: Tensor) -> ParsedScene:
-    """A scene in normalised device coordinates: all that is seen is in its box, so nothing is outside."""
+    """Return the scene in normalised device coordinates, where everything visible is in the box."""
     ndc = find_ndc(poses, corners, nears)
     box = checked_box(ndc_box(ndc, poses, corners).float(), BOUNDS)
     cameras = NdcCameras(**{f.name: getattr(scene.cameras, f.name) for f in fields(scene.cameras)}, ndc=ndc)
@@ -166,13 +176,14 @@ def _transform(scene: ParsedScene) -> Tensor:
 
 
 def _image_names(root: Path) -> list[str]:
-    """The images in a folder by sorted name, or where that has none, in the first of the reduced ones beside it.
+    """Return the sorted names of the images in a folder or, if there are none, in the first folder of reduced ones.
 
-    Raises: DataError where there is none.
+    Raises:
+        DataError: if there are no images.
     """
     folders = [root if step == 1 else root.with_name(f"{root.name}_{step}") for step in REDUCED]
     for folder in folders:
-        names = sorted(file.name for file in folder.glob("*") if file.suffix in ENDINGS)
+        names = sorted(file.name for file in folder.glob("*") if file.suffix in SUFFIXES)
         if names:
             return names
-    raise DataError(f"{root.parent} has no images: none is in {', '.join(folder.name for folder in folders)}")
+    raise DataError(f"{root.parent} has no images in {', '.join(folder.name for folder in folders)}")

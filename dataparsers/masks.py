@@ -1,4 +1,4 @@
-"""Masks beside photographs: which file is the mask of which image."""
+"""Masks in a folder beside the images: the mask of each image."""
 
 from __future__ import annotations
 
@@ -10,26 +10,28 @@ from framework.base.console import say
 
 
 def find_masks(root: Path, names: Sequence[str]) -> tuple[Path | None, ...] | None:
-    """The masks of M images; None where no image has one.
+    """Return the masks of M images, or None if no image has one.
 
-    A mask is called as its image, or as that with .png after it (COLMAP) or instead of its ending.
+    A mask has the name of its image, with .png appended to it (COLMAP), or with .png in place of its suffix.
 
     Args:
-        root: the folder of masks at full size; reduced ones are in folders beside it, as in masks_2.
-        names: M image names below the folder of images.
-    Returns: files below `root`, even where only reduced ones are there.
+        root: folder of masks at full size; reduced ones are in folders beside it, such as masks_2.
+        names: M names of images, relative to the images' folder.
+
+    Returns:
+        Files in `root`, even if only reduced ones exist; None for an image without mask.
     """
-    there: set[str] = set()
+    existing: set[str] = set()
     for step in REDUCED:
         folder = root if step == 1 else root.with_name(f"{root.name}_{step}")
-        there |= {file.relative_to(folder).as_posix() for file in folder.rglob("*")}
+        existing |= {file.relative_to(folder).as_posix() for file in folder.rglob("*")}
     masks = []
     for name in names:
         candidates = (name, f"{name}.png", PurePath(name).with_suffix(".png").as_posix())
-        masks.append(next((root / candidate for candidate in candidates if candidate in there), None))
+        masks.append(next((root / candidate for candidate in candidates if candidate in existing), None))
     without = [name for name, mask in zip(names, masks, strict=True) if mask is None]
     if len(without) == len(masks):
         return None
     if without:
-        say(f"{root}: {len(without)} of {len(masks)} images have no mask and are used whole, the first {without[0]}")
+        say(f"{root}: {len(without)} of {len(masks)} images have no mask and are used without, the first {without[0]}")
     return tuple(masks)

@@ -1,4 +1,4 @@
-"""Captures as nerfstudio and instant-ngp write them: one transforms.json with poses and intrinsics."""
+"""Captures in nerfstudio's and instant-ngp's format: one transforms.json with poses and intrinsics."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from dataparsers.captured import (
-    ENDINGS,
+    SUFFIXES,
     Captured,
     Division,
-    Photographs,
+    PosedImages,
     captured_scene,
     checked_box,
     from_original,
@@ -28,9 +28,13 @@ from framework.data.dataset import Split
 from framework.data.ply import read_points
 
 TRANSFORMS = "transforms.json"
+"""File by which the format is recognised."""
 EvalMode = Literal["interval", "fraction", "filename", "all"]
+"""Rule by which images are held out."""
 PERSPECTIVE = ("opencv", ("k1", "k2", "p1", "p2", "k3", "", "", "", "k4"))
+"""Projection, and the file's names of its coefficients in the order of `LENSES`."""
 FISHEYE = ("fisheye", ("k1", "k2", "k3", "k4"))
+"""The same for a fisheye lens."""
 CAMERA_MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     **dict.fromkeys(("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), PERSPECTIVE),
     **dict.fromkeys(("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), FISHEYE),
@@ -39,9 +43,10 @@ CAMERA_MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     "ORTHOGRAPHIC": ("orthographic", ()),
     "ORTHOPHOTO": ("orthographic", ()),
 }
-"""`camera_model` -> our projection, and under which name the file has each coefficient of `LENSES`; '' for none."""
-NGP_SCALE, NGP_OFFSET = 0.33, [0.5, 0.5, 0.5]
-"""instant-ngp's unit cube: it puts a position x of the file at `scale * x + offset` unless the file has its own."""
+"""`camera_model` -> projection, and the file's name of each coefficient of `LENSES`; '' if it has none."""
+NGP_SCALE = 0.33
+NGP_OFFSET = [0.5, 0.5, 0.5]
+"""instant-ngp maps a position x of the file to `scale * x + offset` in its unit cube; these are its defaults."""
 
 
 @dataclass(frozen=True)
@@ -49,13 +54,13 @@ class Nerfstudio(Captured):
     """Flags of the nerfstudio format."""
 
     eval_mode: EvalMode = "interval"
-    """How photographs are held out: every so many-th (--eval-interval); a fraction (--train-split-fraction); those
-    with eval, val or test in their name (filename); or none, all being in every split. A file's own train_filenames,
-    val_filenames and test_filenames go before all of these but the last."""
+    """Rule by which images are held out: at an interval (--eval-interval); a fraction of them (--train-split-fraction);
+    those with eval, val or test in their name (filename); or none, with all images in every split. The file's own
+    train_filenames, val_filenames and test_filenames take precedence over all rules but the last."""
     train_split_fraction: float = 0.9
-    """Which part of the photographs to train on, spread evenly, with --eval-mode fraction."""
+    """Fraction of images to train on, evenly spaced, with --eval-mode fraction."""
     depth_unit_scale_factor: float = 0.001
-    """Units of the input that a step of a depth image stands for: metres, of one in millimetres."""
+    """Units of the input per unit of a stored depth: 0.001 for an input in metres and depths in millimetres."""
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
@@ -70,9 +75,9 @@ class Nerfstudio(Captured):
             raise DataError(f"--depth-unit-scale-factor is {self.depth_unit_scale_factor}; it must be above zero")
         file = path if path.suffix == ".json" else path / TRANSFORMS
         content = read_json(file)
-        photographs = _photographs(file, content)
-        lists = {} if self.eval_mode == "all" else _lists(file, content, photographs.names)
-        scene = captured_scene(self, photographs, split, self._division(split, lists))
+        images = _posed_images(file, content)
+        lists = {} if self.eval_mode == "all" else _lists(file, content, images.names)
+        scene = captured_scene(self, images, split, self._division(split, lists))
         scene = replace(scene, depth_unit=self.depth_unit_scale_factor)
         return _from_original(_with_cube(scene, content, file, self.scene_scale), content, file)
 
@@ -88,88 +93,89 @@ class Nerfstudio(Captured):
         return None
 
 
-def _photographs(file: Path, content: dict[str, Any]) -> Photographs:
+def _posed_images(file: Path, content: dict[str, Any]) -> PosedImages:
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise DataError(f"{file} lists no frames")
-    where = [f"{file}: frame {index}" for index in range(len(frames))]
-    for frame, place in zip(frames, where, strict=True):
+    labels = [f"{file}: frame {index}" for index in range(len(frames))]
+    for frame, label in zip(frames, labels, strict=True):
         if not isinstance(frame, dict):
-            raise DataError(f"{place} is {shown(frame)}; it must be an object with 'file_path'")
-    placed = list(zip(frames, where, strict=True))
-    written = [file_name(frame.get("file_path"), "file_path", place) for frame, place in placed]
+            raise DataError(f"{label} is {shown(frame)}; it must be an object with 'file_path'")
+    placed = list(zip(frames, labels, strict=True))
+    written = [file_name(frame.get("file_path"), "file_path", label) for frame, label in placed]
     paths = [_image(file.parent / name) for name in written]
-    sizes = _sizes(frames, content, where, paths)
+    sizes = _sizes(frames, content, labels, paths)
     model, keys = _camera_model(file, content, frames)
     cameras = [
-        _intrinsics(frame, content, size, model, place)
-        for frame, size, place in zip(frames, sizes.tolist(), where, strict=True)
+        _intrinsics(frame, content, size, model, label)
+        for frame, size, label in zip(frames, sizes.tolist(), labels, strict=True)
     ]
-    lens = [[_number(frame, content, key, place) or 0.0 for key in keys] for frame, place in placed]
-    return Photographs(
+    lens = [[_number(frame, content, key, label) or 0.0 for key in keys] for frame, label in placed]
+    return PosedImages(
         folder=file.parent,
         paths=tuple(paths),
         names=tuple(str(PurePosixPath(name)) for name in written),
-        poses=torch.stack([read_pose(frame, place, torch.float64) for frame, place in placed]),
+        poses=torch.stack([read_pose(frame, label, torch.float64) for frame, label in placed]),
         intrinsics=torch.tensor(cameras, dtype=torch.float64),
         sizes=sizes,
         model=model,
         lens=torch.tensor(lens) if keys else None,
-        masks=_companions(file.parent, frames, "mask_path", where),
-        depths=_companions(file.parent, frames, "depth_file_path", where),
-        times=read_times(frames, where),
+        masks=_companions(file.parent, frames, "mask_path", labels),
+        depths=_companions(file.parent, frames, "depth_file_path", labels),
+        times=read_times(frames, labels),
         points=_points(file, content),
     )
 
 
 def _value(frame: dict[str, Any], content: dict[str, Any], key: str) -> Any:
-    """A frame's own value, else the file's for all; None where neither has one."""
+    """Return a frame's own value, else the file's value for all frames; None if both are missing."""
     own = frame.get(key)
     return content.get(key) if own is None else own
 
 
-def _number(frame: dict[str, Any], content: dict[str, Any], key: str, where: str) -> float | None:
+def _number(frame: dict[str, Any], content: dict[str, Any], key: str, labels: str) -> float | None:
     value = _value(frame, content, key)
-    return None if value is None else number(value, key, where)
+    return None if value is None else number(value, key, labels)
 
 
-def _side(frame: dict[str, Any], content: dict[str, Any], key: str, where: str) -> int | None:
+def _side(frame: dict[str, Any], content: dict[str, Any], key: str, labels: str) -> int | None:
     value = _value(frame, content, key)
-    return None if value is None else side(value, key, where)
+    return None if value is None else side(value, key, labels)
 
 
 def _image(path: Path) -> Path:
-    """The file meant by a path that may lack its ending."""
-    if path.suffix in ENDINGS or path.is_file():
+    """Return the file of a path that may lack its suffix."""
+    if path.suffix in SUFFIXES or path.is_file():
         return path
-    complete = [path.with_name(path.name + ending) for ending in ENDINGS]
-    return next((other for other in complete if other.is_file()), complete[0])
+    complete = [path.with_name(path.name + ending) for ending in SUFFIXES]
+    return next((alternative for alternative in complete if alternative.is_file()), complete[0])
 
 
 def _companions(
-    folder: Path, frames: list[dict[str, Any]], key: str, where: list[str]
+    folder: Path, frames: list[dict[str, Any]], key: str, labels: list[str]
 ) -> tuple[Path | None, ...] | None:
-    """Files that go with the frames' images; None for frames without, and where no frame has one."""
+    """Return files that belong to the frames' images; None for a frame without, and None if no frame has one."""
     named = [frame.get(key) for frame in frames]
     if all(name is None for name in named):
         return None
     return tuple(
-        None if name is None else folder / file_name(name, key, place) for name, place in zip(named, where, strict=True)
+        None if name is None else folder / file_name(name, key, label)
+        for name, label in zip(named, labels, strict=True)
     )
 
 
-def _sizes(frames: list[dict[str, Any]], content: dict[str, Any], where: list[str], paths: list[Path]) -> Tensor:
-    """(M, 2) int64 width and height that intrinsics are for: as the file says, else those of the images."""
-    stated = [[_side(frame, content, key, place) for key in "wh"] for frame, place in zip(frames, where, strict=True)]
+def _sizes(frames: list[dict[str, Any]], content: dict[str, Any], labels: list[str], paths: list[Path]) -> Tensor:
+    """Return width and height (M, 2) int64 that intrinsics refer to: those in the file, else those of the images."""
+    stated = [[_side(frame, content, key, label) for key in "wh"] for frame, label in zip(frames, labels, strict=True)]
     if any(None in size for size in stated):
         found = image_sizes(paths).tolist()
-        stated = [other if None in size else size for size, other in zip(stated, found, strict=True)]
+        stated = [alternative if None in size else size for size, alternative in zip(stated, found, strict=True)]
     return torch.tensor(stated)
 
 
 def _camera_model(file: Path, content: dict[str, Any], frames: list[dict[str, Any]]) -> tuple[str, tuple[str, ...]]:
-    """The projection of all frames, and the names of its coefficients in the file."""
-    if content.get("is_fisheye") is True:  # instant-ngp's word for it
+    """Return the projection of all frames, and the names of its coefficients in the file."""
+    if content.get("is_fisheye") is True:  # instant-ngp's key
         return FISHEYE
     given = [_value(frame, content, "camera_model") or "PERSPECTIVE" for frame in frames]
     named = {name if isinstance(name, str) else shown(name) for name in given}
@@ -177,20 +183,20 @@ def _camera_model(file: Path, content: dict[str, Any], frames: list[dict[str, An
         raise DataError(f"{file}: unknown camera_model '{shown(name)[1:-1]}'. {nearest(name, CAMERA_MODELS)}")
     found = {CAMERA_MODELS[name] for name in named}
     if len(found) > 1:
-        raise DataError(f"{file} mixes the camera models {' and '.join(sorted(named))}; make a file of each")
+        raise DataError(f"{file} mixes the camera models {' and '.join(sorted(named))}; split it into a file for each")
     return found.pop()
 
 
 def _intrinsics(
-    frame: dict[str, Any], content: dict[str, Any], size: list[int], model: str, where: str
+    frame: dict[str, Any], content: dict[str, Any], size: list[int], model: str, labels: str
 ) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy in pixels of an image of `size`; the principal point is its centre where it is not given."""
-    fx, fy = (_focal(frame, content, axis, length, where) for axis, length in zip("xy", size, strict=True))
-    if model == "equirectangular":  # the file's focal length is half the width of a whole panorama, ours one radian
+    """Return fx, fy, cx, cy in pixels of an image of `size`; the default principal point is its centre."""
+    fx, fy = (_focal(frame, content, axis, length, labels) for axis, length in zip("xy", size, strict=True))
+    if model == "equirectangular":  # in the file, half the width of a whole panorama; here, pixels per radian
         fx, fy = (fx or fy or size[0] / 2) / math.pi, (fy or fx or size[1]) / math.pi
     elif fx is None and fy is None:
-        raise DataError(f"{where}: there is neither 'fl_x' nor 'camera_angle_x', and so no focal length")
-    cx, cy = (_number(frame, content, key, where) for key in ("cx", "cy"))
+        raise DataError(f"{labels}: there is no focal length, neither 'fl_x' nor 'camera_angle_x'")
+    cx, cy = (_number(frame, content, key, labels) for key in ("cx", "cy"))
     return (
         fx or fy or 0.0,
         fy or fx or 0.0,
@@ -199,33 +205,33 @@ def _intrinsics(
     )
 
 
-def _focal(frame: dict[str, Any], content: dict[str, Any], axis: str, length: int, where: str) -> float | None:
-    """Focal length in pixels along an image's axis of `length`; None where the file does not say."""
-    for source in (frame, content):  # a frame's own angle goes before the focal length of all
+def _focal(frame: dict[str, Any], content: dict[str, Any], axis: str, length: int, labels: str) -> float | None:
+    """Return the focal length in pixels along an axis of `length` pixels; None if the file does not state it."""
+    for source in (frame, content):  # a frame's own angle takes precedence over the focal length of all frames
         if source.get(f"fl_{axis}") is not None:
-            return number(source[f"fl_{axis}"], f"fl_{axis}", where, positive=True)
+            return number(source[f"fl_{axis}"], f"fl_{axis}", labels, positive=True)
         name = f"camera_angle_{axis}"
         if source.get(name) is not None:
-            angle = number(source[name], name, where, positive=True)
+            angle = number(source[name], name, labels, positive=True)
             if not 1e-6 < angle < math.pi:
-                raise DataError(f"{where}: '{name}' is {angle}; it must be an angle between 0 and pi radians")
+                raise DataError(f"{labels}: '{name}' is {angle}; it must be an angle between 0 and pi radians")
             return 0.5 * length / math.tan(0.5 * angle)
     return None
 
 
 def _points(file: Path, content: dict[str, Any]) -> Tensor | None:
-    """Sparse points, which are in the frame of the poses."""
+    """Return the sparse points, in the frame of the poses."""
     if content.get("ply_file_path") is None:
         return None
     path = file.parent / file_name(content["ply_file_path"], "ply_file_path", str(file))
     if not path.is_file():
-        say(f"{path} is missing: going on without its sparse points")
+        say(f"{path} does not exist; continuing without sparse points")
         return None
     return read_points(path)
 
 
 def _lists(file: Path, content: dict[str, Any], names: tuple[str, ...]) -> dict[str, set[str]]:
-    """Split -> names of its photographs, of the splits for which the file has a list."""
+    """Return split -> names of its images, for the splits that the file lists."""
     lists = {}
     for split in ("train", "val", "test"):
         key = f"{split}_filenames"
@@ -237,7 +243,7 @@ def _lists(file: Path, content: dict[str, Any], names: tuple[str, ...]) -> dict[
         lists[split] = {str(PurePosixPath(file_name(name, key, str(file)))) for name in listed}
         unknown = sorted(lists[split] - set(names))
         if unknown:
-            raise DataError(f"{file}: '{key}' lists {shown(unknown[0])}, which is no frame's file_path")
+            raise DataError(f"{file}: '{key}' lists {shown(unknown[0])}, which is not the file_path of any frame")
     return lists
 
 
@@ -246,19 +252,19 @@ def _sorted(names: list[str]) -> Tensor:
 
 
 def _listed(names: list[str], split: Split, lists: dict[str, set[str]]) -> Tensor:
-    """By the file's own lists. val and test stand in for each other; train is all that is not held out."""
-    other: Split = "test" if split == "val" else "val"
+    """Select by the file's own lists. val and test substitute for each other; train is all that is not held out."""
+    alternative: Split = "test" if split == "val" else "val"
     if split == "train" and split not in lists:
         held = lists.get("val", set()) | lists.get("test", set())
         wanted = set(names) - held
     else:
-        wanted = lists.get(split, lists.get(other, set()))
+        wanted = lists.get(split, lists.get(alternative, set()))
     order = _sorted(names)
     return order[torch.tensor([names[index] in wanted for index in order.tolist()])]
 
 
 def _fraction(names: list[str], split: Split, fraction: float) -> Tensor:
-    """The first, the last and evenly many between them to train on; the others held out."""
+    """Select evenly spaced images, first and last included, to train on; the others are held out."""
     count = len(names)
     training = torch.zeros(count, dtype=torch.bool)
     training[torch.linspace(0, count - 1, math.ceil(count * fraction), dtype=torch.float64).long()] = True
@@ -272,10 +278,10 @@ def _by_name(names: list[str], split: Split) -> Tensor:
 
 
 def _with_cube(scene: ParsedScene, content: dict[str, Any], file: Path, scene_scale: float) -> ParsedScene:
-    """Where instant-ngp's `aabb_scale` is given, its cube instead of the one around the scene's origin.
+    """Return the scene with instant-ngp's cube as box, if `aabb_scale` is given.
 
-    The cube keeps its centre and its size through placing, `aabb_scale / scale` units of the file along an edge,
-    but not its turn: its edges are parallel to the axes of the scene.
+    Placement transforms the cube's centre and its side, `aabb_scale / scale` in the file's units, but does not rotate
+    the cube: its edges are parallel to the axes of the scene.
     """
     if content.get("aabb_scale") is None or scene.transform is None:
         return scene
@@ -290,14 +296,14 @@ def _with_cube(scene: ParsedScene, content: dict[str, Any], file: Path, scene_sc
 
 
 def _from_original(scene: ParsedScene, content: dict[str, Any], file: Path) -> ParsedScene:
-    """With a transform from what the file was made from, rather than from the file, so that exports come out there.
+    """Return the scene with a transform from the frame that the file was made from, so that exports are in that frame.
 
-    The file's frame is `applied_scale * (applied_transform @ x)` of that.
+    The file's frame is `applied_scale * (applied_transform @ x)` of the original.
     """
     matrix, scale, name = content.get("applied_transform"), content.get("applied_scale"), f"{file}: 'applied_transform'"
     applied = torch.eye(4, dtype=torch.float64) if matrix is None else rigid(matrix, name, name)
     scale = 1.0 if scale is None else number(scale, "applied_scale", str(file), positive=True)
     scene = from_original(scene, applied, scale)
     if scene.transform is None or not bool(scene.transform.isfinite().all()) or not 0 < scene.scale < math.inf:
-        raise DataError(f"{file}: 'applied_transform' and 'applied_scale' lead too far away")
+        raise DataError(f"{file}: 'applied_transform' and 'applied_scale' give a transform out of range")
     return scene

@@ -1,7 +1,7 @@
-"""Phototourism collections: photographs of a landmark by many people, split by a .tsv (Jin et al. 2020).
+"""Phototourism collections: images of a landmark by many people, split by a .tsv (Jin et al. 2020).
 
-NeRF in the Wild (Martin-Brualla et al. 2021) states which photographs it learnt from in such a file: a line each with
-`filename`, `id`, `split` and `dataset`; those without `id` have no pose.
+NeRF in the Wild (Martin-Brualla et al. 2021) lists its training images in such a file: a line each with `filename`,
+`id`, `split` and `dataset`; images without `id` have no pose.
 """
 
 from __future__ import annotations
@@ -14,12 +14,13 @@ import torch
 from torch import Tensor
 
 from dataparsers.captured import Captured, captured_scene, has_transforms
-from dataparsers.colmap import read_photographs
+from dataparsers.colmap import read_images
 from dataparsers.colmap_model import choose_model, find_models
 from framework import DataError, ParsedScene
 from framework.data.dataset import Split
 
 SPARSE = "dense/sparse"
+"""Folder of the reconstruction in the data folder."""
 
 
 @dataclass(frozen=True)
@@ -27,11 +28,11 @@ class Phototourism(Captured):
     """Flags of the phototourism format."""
 
     colmap_path: str = SPARSE
-    """Where the reconstruction is, below the data folder."""
+    """Folder of the reconstruction in the data folder."""
     images_path: str = "dense/images"
-    """Where the photographs are, below the data folder."""
+    """Folder of the images in the data folder."""
     masks_path: str = "dense/masks"
-    """Where masks are, below the data folder: white where a photograph is to be learnt from."""
+    """Folder of masks in the data folder: white for pixels to train on."""
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
@@ -43,28 +44,28 @@ class Phototourism(Captured):
             raise DataError("the phototourism format needs a folder: --data DIR")
         tables = _tables(path)
         if len(tables) != 1:
-            found = f"{', '.join(file.name for file in tables)} are there" if tables else "there is none"
-            raise DataError(f"{path}: one .tsv says which photographs are in which split, but {found}")
+            found = f"there are {', '.join(file.name for file in tables)}" if tables else "there is none"
+            raise DataError(f"{path}: the splits must be listed in one .tsv, but {found}")
         splits = read_splits(tables[0])
         model = choose_model(path, self.colmap_path)
-        photographs = read_photographs(path, model, self.images_path, self.masks_path)
-        listed = [index for index, name in enumerate(photographs.names) if name in splits]
+        images = read_images(path, model, self.images_path, self.masks_path)
+        listed = [index for index, name in enumerate(images.names) if name in splits]
         if not listed:
-            raise DataError(f"{tables[0]} lists none of the {len(photographs.names)} images of {model}")
+            raise DataError(f"{tables[0]} lists none of the {len(images.names)} images of {model}")
         wanted = "train" if split == "train" else "test"
 
         def division(names: list[str]) -> Tensor:
             chosen = [index for index, name in enumerate(names) if splits[name] == wanted]
             if not chosen:
-                raise DataError(f"{tables[0]}: none of the {len(names)} images that are there is of split '{wanted}'")
+                raise DataError(f"{tables[0]}: none of the {len(names)} existing images is of split '{wanted}'")
             return torch.tensor(chosen)
 
-        scene = captured_scene(self, photographs[torch.tensor(listed)], split, division)
+        scene = captured_scene(self, images[torch.tensor(listed)], split, division)
         return replace(scene, appearance_varies=True)
 
 
 def _tables(path: Path) -> list[Path]:
-    """The .tsv files of a folder. Never raises."""
+    """Return the .tsv files of a folder. Never raises."""
     try:
         return sorted(path.glob("*.tsv"))
     except OSError:
@@ -72,9 +73,13 @@ def _tables(path: Path) -> list[Path]:
 
 
 def read_splits(file: Path) -> dict[str, str]:
-    """File name to train or test, of the photographs with a pose.
+    """Return file name -> train or test, for the images with a pose.
 
-    Raises: DataError where the file cannot be read, lacks a column, or names another split.
+    Args:
+        file: the .tsv file.
+
+    Raises:
+        DataError: if the file cannot be read, lacks a column, or has another split.
     """
     try:
         with file.open(encoding="utf-8", newline="") as handle:
@@ -82,7 +87,7 @@ def read_splits(file: Path) -> dict[str, str]:
     except OSError as error:
         raise DataError(f"cannot read {file}: {error.strerror}") from error
     except (ValueError, csv.Error) as error:
-        raise DataError(f"{file} is not a table of columns between tabs: {error}") from error
+        raise DataError(f"{file} is not a tab-separated table: {error}") from error
     splits: dict[str, str] = {}
     for line, row in enumerate(rows, start=2):
         name, number, split = row.get("filename"), row.get("id"), row.get("split")

@@ -1,4 +1,4 @@
-"""Polycam's raw exports: keyframes/corrected_images, or images, and a JSON of the same name for each camera."""
+"""Polycam's raw exports: keyframes/corrected_images, or images, with a JSON file of the same name for each camera."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from pathlib import Path
 
 import torch
 
-from dataparsers.captured import ENDINGS, Captured, Photographs, captured_scene, from_original, has_transforms
+from dataparsers.captured import SUFFIXES, Captured, PosedImages, captured_scene, from_original, has_transforms
 from dataparsers.reading import number, read_json, rigid, side
 from framework import DataError, ParsedScene
 from framework.data.dataset import Split
 from framework.data.scene import PoseSource
 
 CAMERAS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
-"""Folders in `keyframes` of cameras and their images, the better first: those that Polycam has refined."""
+"""Folders of cameras and images in `keyframes`, the ones refined by Polycam first."""
 Z_UP = torch.tensor([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-"""From Polycam's axes, y being up, to ours, z being up: as nerfstudio turns them."""
+"""Rotation from Polycam's axes (y up) to the scene's (z up), as in nerfstudio."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Polycam(Captured):
 
     poses: PoseSource = "device"
     depth_unit_scale_factor: float = 0.001
-    """Metres that a step of a depth image stands for."""
+    """Metres per unit of a stored depth."""
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
@@ -39,7 +39,7 @@ class Polycam(Captured):
         pairs = [pair for pair in CAMERAS if _is_pair(path, *pair)]
         if not pairs:
             raise DataError(f"{path} has no keyframes/cameras with keyframes/images; export Polycam's raw data")
-        photographs = _photographs(path / "keyframes", *pairs[0])
+        photographs = _posed_images(path / "keyframes", *pairs[0])
         scene = captured_scene(self, photographs, split)
         return replace(from_original(scene, Z_UP), depth_unit=self.depth_unit_scale_factor)
 
@@ -48,10 +48,10 @@ def _is_pair(path: Path, cameras: str, images: str) -> bool:
     return (path / "keyframes" / cameras).is_dir() and (path / "keyframes" / images).is_dir()
 
 
-def _photographs(folder: Path, cameras: str, images: str) -> Photographs:
+def _posed_images(folder: Path, cameras: str, images: str) -> PosedImages:
     files = sorted((folder / cameras).glob("*.json"))
     if not files:
-        raise DataError(f"{folder / cameras} holds no .json of a camera")
+        raise DataError(f"{folder / cameras} holds no camera (.json)")
     poses, intrinsics, sizes = [], [], []
     for file in files:
         content = read_json(file)
@@ -61,7 +61,7 @@ def _photographs(folder: Path, cameras: str, images: str) -> Photographs:
         intrinsics.append(focal + [number(content.get(key), key, str(file)) for key in ("cx", "cy")])
         sizes.append([side(content.get(key), key, str(file)) for key in ("width", "height")])
     depths = tuple(_depth(folder / "depth" / f"{file.stem}.png") for file in files)
-    return Photographs(
+    return PosedImages(
         folder=folder,
         paths=tuple(_image(folder / images, file.stem) for file in files),
         names=tuple(file.stem for file in files),
@@ -73,9 +73,9 @@ def _photographs(folder: Path, cameras: str, images: str) -> Photographs:
 
 
 def _image(folder: Path, stem: str) -> Path:
-    usual = folder / f"{stem}.jpg"
-    others = (folder / f"{stem}{ending}" for ending in ENDINGS)
-    return usual if usual.is_file() else next((file for file in others if file.is_file()), usual)
+    default = folder / f"{stem}.jpg"
+    alternatives = (folder / f"{stem}{suffix}" for suffix in SUFFIXES)
+    return default if default.is_file() else next((file for file in alternatives if file.is_file()), default)
 
 
 def _depth(file: Path) -> Path | None:

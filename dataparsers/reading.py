@@ -1,4 +1,4 @@
-"""Values out of files that nobody has checked: refused in one line that says which file and which entry."""
+"""Validation of values read from untrusted files: errors name the file and the entry in one line."""
 
 from __future__ import annotations
 
@@ -15,14 +15,20 @@ from framework import DataError
 from framework.base.errors import shown as shown
 from framework.cameras.cameras import LARGEST_SIDE, check_pose
 
-LONGEST_NAME, LONGEST_PATH = 250, 3000
-"""Bytes of a file's or folder's name, and of all on the way to a file; most systems allow 255, and 4096 in all."""
+LONGEST_NAME = 250
+"""Maximum length of a file's or folder's name, bytes; most systems allow 255."""
+LONGEST_PATH = 3000
+"""Maximum length of a path, bytes; most systems allow 4096."""
 
 
 def read_json(file: Path) -> dict[str, Any]:
-    """A JSON file that holds an object.
+    """Read a JSON file that holds an object.
 
-    Raises: DataError where it is missing, not JSON, or something else.
+    Args:
+        file: the file.
+
+    Raises:
+        DataError: if the file is missing, is not JSON or does not hold an object.
     """
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
@@ -31,26 +37,36 @@ def read_json(file: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise DataError(f"{file} is not JSON: {error}") from error
     if not isinstance(content, dict):
-        raise DataError(f"{file} must hold a JSON object: names and values between braces")
+        raise DataError(f"{file} must hold a JSON object: names and values in braces")
     return content
 
 
 def read_pose(frame: Any, where: str, dtype: torch.dtype = torch.float32) -> Tensor:
-    """The frame's (4, 4) camera-to-world matrix, checked.
+    """Return the camera-to-world matrix (4, 4) of a frame.
 
-    Raises: DataError where it is absent, of another shape, not finite or not rigid.
+    Args:
+        frame: the frame's JSON object.
+        where: name of the frame in messages.
+        dtype: type of the result.
+
+    Raises:
+        DataError: if the matrix is missing, of another shape, not finite or not rigid.
     """
     matrix = frame.get("transform_matrix") if isinstance(frame, dict) else None
     return rigid(matrix, f"{where}: 'transform_matrix'", where, dtype)
 
 
 def rigid(matrix: Any, name: str, where: str, dtype: torch.dtype = torch.float64) -> Tensor:
-    """A (4, 4) rigid motion from three or four rows of four numbers.
+    """Return a rigid motion (4, 4) from three or four rows of four numbers.
 
     Args:
-        name: what to call the matrix where it is none.
-        where: what to call it where it is a wrong one.
-    Raises: DataError where it is of another shape, not finite or not rigid.
+        matrix: the rows.
+        name: name of the matrix in the message if it is no matrix.
+        where: name of the pose in the message if it is invalid.
+        dtype: type of the result.
+
+    Raises:
+        DataError: if the matrix is of another shape, not finite or not rigid.
     """
     try:
         pose = torch.tensor(matrix, dtype=dtype)
@@ -61,53 +77,68 @@ def rigid(matrix: Any, name: str, where: str, dtype: torch.dtype = torch.float64
 
 
 def read_times(frames: list[Any], where: list[str]) -> Tensor | None:
-    """(M,) times in [0, 1], or None where no frame has a time.
+    """Return the times (M,) of frames in [0, 1], or None if no frame has a time.
 
-    Raises: DataError where only some have one, or it is no number from 0 to 1.
+    Args:
+        frames: the frames' JSON objects.
+        where: their names in messages.
+
+    Raises:
+        DataError: if only some frames have a time, or one is not a number from 0 to 1.
     """
     if not any("time" in frame for frame in frames):
         return None
-    for frame, place in zip(frames, where, strict=True):
+    for frame, label in zip(frames, where, strict=True):
         time = frame.get("time")
         if not isinstance(time, (int, float)) or isinstance(time, bool) or not 0 <= time <= 1:
-            raise DataError(f"{place}: 'time' is {shown(time)}; it must be a number from 0 to 1")
+            raise DataError(f"{label}: 'time' is {shown(time)}; it must be a number from 0 to 1")
     return torch.tensor([float(frame["time"]) for frame in frames])
 
 
 def number(value: Any, name: str, where: str, positive: bool = False) -> float:
-    """A finite number, and where `positive` one above zero.
+    """Return a finite number.
 
     Args:
-        value: what the file has there, None where it has nothing.
-        name, where: what to call the entry, and the file with the frame, in the message.
-    Raises: DataError where it is anything else.
+        value: the entry's value; None if it is missing.
+        name: name of the entry in the message.
+        where: name of the file and frame in the message.
+        positive: whether the number must be positive.
+
+    Raises:
+        DataError: if the value is not such a number.
     """
-    wanted = "a number above zero" if positive else "a number"
-    real = isinstance(value, (int, float)) and not isinstance(value, bool)
+    expected = "a number above zero" if positive else "a number"
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     try:
-        result = float(value) if real else math.nan
+        result = float(value) if is_number else math.nan
     except OverflowError:
         result = math.inf
     if not math.isfinite(result) or (positive and result <= 0):
-        raise DataError(f"{where}: '{name}' is {shown(value)}; it must be {wanted}")
+        raise DataError(f"{where}: '{name}' is {shown(value)}; it must be {expected}")
     return result
 
 
 def side(value: Any, name: str, where: str) -> int:
-    """An image's width or height in whole pixels.
+    """Return the width or height of an image, in whole pixels.
 
-    Raises: DataError where it is no number, or none that an image can have.
+    `value`, `name` and `where` are as in `number`.
+
+    Raises:
+        DataError: if the value is not a number, or not a possible size of an image.
     """
     length = number(value, name, where, positive=True)
     if not 1 <= length <= LARGEST_SIDE:
-        raise DataError(f"{where}: '{name}' is {shown(value)}; no image has such a side")
+        raise DataError(f"{where}: '{name}' is {shown(value)}; it must be from 1 to {LARGEST_SIDE} pixels")
     return round(length)
 
 
 def numbers(value: Any, count: int, name: str, where: str) -> list[float]:
-    """A list of that many finite numbers.
+    """Return a list of `count` finite numbers.
 
-    Raises: DataError where it is anything else.
+    `value`, `name` and `where` are as in `number`.
+
+    Raises:
+        DataError: if the value is not such a list.
     """
     if not isinstance(value, list) or len(value) != count:
         raise DataError(f"{where}: '{name}' is {shown(value)}; it must be a list of {count} numbers")
@@ -115,9 +146,12 @@ def numbers(value: Any, count: int, name: str, where: str) -> list[float]:
 
 
 def file_name(value: Any, name: str, where: str) -> str:
-    """The name of a file as a JSON entry gives it.
+    """Return the name of a file given by a JSON entry.
 
-    Raises: DataError where it is absent, no text, or a name that no file can have.
+    `value`, `name` and `where` are as in `number`.
+
+    Raises:
+        DataError: if the value is missing, not text, or not a possible name of a file.
     """
     if not isinstance(value, str) or not value:
         raise DataError(f"{where}: '{name}' is missing")
@@ -128,9 +162,9 @@ def file_name(value: Any, name: str, where: str) -> str:
 
 
 def _fits(path: Path) -> bool:
-    """Whether a file may be asked for by such a path, be it there or not."""
+    """Return whether the path may be passed to the system, whether the file exists or not."""
     try:
         longest = max(len(os.fsencode(part)) for part in path.parts)
         return longest <= LONGEST_NAME and len(os.fsencode(path)) <= LONGEST_PATH
-    except UnicodeEncodeError:  # half of a character
+    except UnicodeEncodeError:  # a lone surrogate
         return False

@@ -91,9 +91,9 @@ def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, li
         sampler_choice(config, scene.unbounded),
         Choice("log2_table_size", log2_table_size, suits),
         Choice("num_steps", num_steps, suits, "steps along the box's diagonal"),
-        Choice("detail", detail, suits, "finest cells a pixel"),
         Choice("samples_per_batch", samples, suits, "samples a step"),
     )
+    config, _ = fill(config, Choice("detail", detail, suits))  # told with the resolution that follows from it
     finest = 2 ** (config.detail * scene.image_size - 1).bit_length()
     pays = config.log2_table_size >= SPARSE_FROM
     config, more = fill(

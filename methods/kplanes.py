@@ -90,17 +90,6 @@ class ExplicitField(BoxField):
         features = self.encode(points.positions, points.times)
         return truncated_exp(self.density_head(features)[:, 0]), features
 
-    @torch.no_grad()
-    def trace(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        sigma, features = self.density(Points(positions, times))
-        return sigma, features, features[:, :0]
-
-    def retrace(
-        self, positions: Tensor, times: Tensor | None, features: Tensor, memory: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        features = self.encode(positions, times, known=features)
-        return truncated_exp(self.density_head(features)[:, 0]), features
-
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         basis = self.basis(spherical_harmonics(directions)).view(len(features), 3, features.shape[1])
         return torch.sigmoid((basis * features[:, None]).sum(-1).float())

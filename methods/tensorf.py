@@ -137,17 +137,6 @@ class TensorField(Field):
         unit = self._unit(points.positions)
         return self._sigma(self.density_factors(unit), unit), unit
 
-    @torch.no_grad()
-    def trace(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        unit = self._unit(positions)
-        components = self.density_factors(unit)
-        return self._sigma(components, unit), unit, components
-
-    def retrace(
-        self, positions: Tensor, times: Tensor | None, features: Tensor, memory: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        return self._sigma(self.density_factors(features, known=memory), features), features
-
     @staticmethod
     def _sigma(components: Tensor, unit: Tensor) -> Tensor:
         """Density of summed components, and none outside the box, which may have shrunk."""

@@ -9,8 +9,11 @@ import torch
 from torch import Tensor, nn
 
 from framework.geometry.rays import Rays, Samples
-from framework.samplers.occupancy import WARM_UP_STEPS, OccupancySampler
+from framework.samplers.occupancy import OccupancySampler
 from nerfloom.functions import DensityOnly, SigmaFunction, as_density, check_rays
+
+FILL_STEPS = 1025
+"""Training steps whose updates fill a grid: those that visit all cells, and three times as many beside what is full."""
 
 
 class OccupancyGrid(nn.Module):
@@ -85,7 +88,7 @@ class OccupancyGrid(nn.Module):
 
     def fill(self, sigma_fn: SigmaFunction) -> None:
         """Look at all cells, for a field that has been trained already. Arguments as for `update`."""
-        for step in range(WARM_UP_STEPS):
+        for step in range(FILL_STEPS):
             self.update(step, sigma_fn)
 
     def carve(self, kept: Tensor) -> None:

@@ -11,7 +11,9 @@ import pytest
 import framework
 
 ROOT = Path(__file__).parents[1]
-FILES = sorted(file for folder in ("framework", "methods", "dataparsers") for file in (ROOT / folder).rglob("*.py"))
+FILES = sorted(
+    file for folder in ("nerfloom", "framework", "methods", "dataparsers") for file in (ROOT / folder).rglob("*.py")
+)
 
 
 def named(file: Path) -> str:
@@ -36,7 +38,12 @@ def imports(node: ast.AST) -> set[str]:
 
 
 def test_the_framework_knows_no_method_and_no_format() -> None:
-    unknown = {"framework": {"methods", "dataparsers"}, "methods": {"dataparsers"}, "dataparsers": set()}
+    unknown = {
+        "nerfloom": {"methods", "dataparsers"},  # the registry finds them by name
+        "framework": {"nerfloom", "methods", "dataparsers"},
+        "methods": {"nerfloom", "dataparsers"},
+        "dataparsers": {"nerfloom"},
+    }
     found = {
         f"{named(file)} imports {name}"
         for file in FILES

@@ -2,7 +2,7 @@
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 
@@ -48,6 +48,13 @@ def test_what_is_given_stays_and_is_not_reported() -> None:
     config, made = fill(given, *CHOICES)
     assert config == dataclasses.replace(given, fancy=False)
     assert [decision.option for decision in made] == ["fanciness"]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.0, "0"), (2e-3, "0.002"), (True, "on"), (2**15, "32768"), ("SO3xR3", "SO3xR3")]
+)
+def test_values_are_shown_as_people_write_them(value: Any, text: str) -> None:
+    assert Choice("some_setting", value, "it is so").decision().choice == text
 
 
 def test_filling_in_twice_changes_nothing() -> None:

@@ -1,6 +1,6 @@
-"""The embedded scene: solids with exact depth and normals, rendered in seconds when no data is given.
+"""The embedded scene: solids with exact depth and normals, rendered in seconds, used if no data is given.
 
-It is written once, in the blender format, to the user's cache folder (NERFLOOM_CACHE, else XDG_CACHE_HOME, else
+It is rendered once, in the blender format, to the user's cache folder (NERFLOOM_CACHE, else XDG_CACHE_HOME, else
 ~/.cache), and read from there.
 """
 
@@ -16,7 +16,7 @@ from framework.base.user_cache import cache_folder
 from framework.data.dataset import Split
 
 VERSION = 1
-"""Raised whenever the scene's look changes, so that old caches are not read."""
+"""Version of the scene's appearance; raised whenever it changes, so that old caches are not used."""
 
 
 @dataclass(frozen=True)
@@ -26,26 +26,26 @@ class Procedural(DataParser):
     size: int = 200
     """Width and height of the images, pixels."""
     num_train: int = 80
-    """Training images."""
+    """Number of training images."""
     moving: bool = False
-    """The variant that changes with time."""
+    """Use the moving variant of the scene."""
     scene_seed: int = 0
     """Seed of the camera positions."""
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
-        return False  # it has no folder of its own
+        return False  # it has no data folder
 
     def parse(self, path: Path | None, split: Split) -> ParsedScene:
         if path is not None:
-            raise DataError(f"the embedded scene reads no data: leave out --data {path}")
+            raise DataError(f"the embedded scene reads no data; leave out --data {path}")
         if self.size < 1 or self.num_train < 1:
             raise DataError("--size and --num-train must be at least 1")
-        return Blender().parse(self._written(), split)
+        return Blender().parse(self._rendered_folder(), split)
 
-    def _written(self) -> Path:
-        """The scene's folder, rendered first where it is not in the cache."""
-        from dataparsers.procedural.views import write_dataset  # only where something is to be rendered
+    def _rendered_folder(self) -> Path:
+        """Return the scene's folder; render the scene first if it is not in the cache."""
+        from dataparsers.procedural.views import write_dataset  # only if it must be rendered
 
         kind = "moving" if self.moving else "static"
         folder = cache_folder() / f"procedural-v{VERSION}-{kind}-{self.size}px-{self.num_train}-seed{self.scene_seed}"

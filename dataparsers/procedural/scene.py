@@ -1,9 +1,9 @@
-"""The embedded scene: solids with procedural textures under a sun, traced in closed form.
+"""The embedded scene: solids with procedural textures in sunlight, ray traced in closed form.
 
-World units are scene units with z up; everything lies strictly inside +-1.4. Depth, normals and occupancy are
-exact (limited by the floating point type of the rays), so the scene is also the truth of the accuracy tests.
-Colours are display values in [0, 1], as a PNG stores them. Vectors are (3, R) inside this file; the public
-functions take and give (R, 3).
+Coordinates are scene units with z up; everything lies strictly inside +-1.4. Depth, normals and occupancy are exact up
+to rounding in the floating point type of the rays, so the scene is also the ground truth of the accuracy tests. Colours
+are display values in [0, 1], as stored in a PNG. Vectors are (3, R) in this file; the public functions take and return
+(R, 3).
 """
 
 from __future__ import annotations
@@ -20,33 +20,40 @@ from torch import Tensor
 from dataparsers.procedural.shapes import Box, Cylinder, Shape, Sphere, Torus, dot
 
 Colour = tuple[float, float, float]
+"""Red, green and blue."""
 _CREAM, _SAND, _SLATE = (0.90, 0.85, 0.74), (0.62, 0.50, 0.35), (0.035, 0.075, 0.115)
 _RED, _TEAL, _OCHRE, _BRASS = (0.60, 0.045, 0.05), (0.0, 0.20, 0.24), (0.80, 0.38, 0.045), (0.45, 0.26, 0.08)
 
 
 def smoothstep(low: float, high: float, x: Tensor) -> Tensor:
-    """0 below `low`, 1 above `high`, a cubic between them; falling where high < low."""
+    """Interpolate smoothly from 0 to 1 by a cubic.
+
+    Args:
+        low: argument below which the result is 0.
+        high: argument above which the result is 1. If `high` is less than `low`, the function decreases.
+        x: arguments, of any shape.
+    """
     t = ((x - low) / (high - low)).clamp(0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
 
 def mix(a: Tensor, b: Tensor, weight: Tensor) -> Tensor:
-    """From a (weight 0) to b (weight 1)."""
+    """Interpolate linearly from `a` (`weight` 0) to `b` (`weight` 1)."""
     return a + (b - a) * weight
 
 
 def _blend(a: Colour, b: Colour, weight: Tensor) -> Tensor:
-    """Colour (3, R) between two colours, weight (R,) in [0, 1]."""
+    """Return colours (3, R) between two colours, for weights (R,) in [0, 1]."""
     return torch.stack([x + (y - x) * weight for x, y in zip(a, b, strict=True)])
 
 
 def _wave(x: Tensor, sharpness: float) -> Tensor:
-    """A square wave of period 2 pi with soft flanks, in [-1, 1]."""
+    """Return a square wave of period 2 pi with linear flanks, in [-1, 1]."""
     return (x.sin() * sharpness).clamp(-1.0, 1.0)
 
 
 def _plinth_texture(p: Tensor) -> Tensor:
-    """A fine checker floor inside a ring of tick marks, and a fluted rim."""
+    """Return a fine checkerboard inside a ring of tick marks, and a fluted rim."""
     radius = (p[0] ** 2 + p[1] ** 2).sqrt()
     angle = torch.atan2(p[1], p[0])
     cells = _wave(p[0] * (math.pi / 0.08), 8.0) * _wave(p[1] * (math.pi / 0.08), 8.0)
@@ -58,7 +65,7 @@ def _plinth_texture(p: Tensor) -> Tensor:
 
 
 def _make_glyphs(cells: int = 3) -> Tensor:
-    """Ink (6, 7 cells, 7 cells) of the six box faces: mirrored 5x5 signs like a small unknown alphabet."""
+    """Return the ink (6, 7 cells, 7 cells) of the six faces of the box: mirrored 5x5 glyphs of an invented alphabet."""
     half = np.random.default_rng(7).random((6, cells, cells, 5, 3)) < 0.55
     signs = np.concatenate([half, half[..., 1::-1]], axis=-1)
     padded = np.pad(signs, ((0, 0), (0, 0), (0, 0), (1, 1), (1, 1)))
@@ -70,7 +77,7 @@ _GLYPHS = _make_glyphs()
 
 
 def _box_texture(p: Tensor, half: float) -> Tensor:
-    """Rows of glyphs; between texel centres the ink is interpolated, so it is a continuous function."""
+    """Return rows of glyphs; ink is interpolated between texel centres, so that the texture is continuous."""
     axis = p.abs().argmax(0)
     face = axis * 2 + (p.gather(0, axis[None])[0] > 0)
     u, v = torch.where(axis == 0, p[1], p[0]), torch.where(axis == 2, p[1], p[2])
@@ -88,14 +95,14 @@ def _box_texture(p: Tensor, half: float) -> Tensor:
 
 
 def _ring_texture(p: Tensor, major: float) -> Tensor:
-    """Stripes that wind around the tube like a twisted rope."""
+    """Return stripes that wind around the tube like a twisted rope."""
     along = torch.atan2(p[2], p[0])
     around = torch.atan2(p[1], (p[0] ** 2 + p[2] ** 2).sqrt() - major)
     return _blend(_OCHRE, _CREAM, 0.5 + 0.5 * _wave(16.0 * along + 2.0 * around, 4.0))
 
 
 def _bob_texture(p: Tensor) -> Tensor:
-    """A level set pattern of the gyroid, a smooth labyrinth."""
+    """Return the pattern of a gyroid's level set, a smooth labyrinth."""
     x, y, z = p * 60.0
     value = x.sin() * y.cos() + y.sin() * z.cos() + z.sin() * x.cos()
     return _blend(_SLATE, _CREAM, smoothstep(-0.3, 0.3, value))
@@ -105,13 +112,21 @@ def _bob_texture(p: Tensor) -> Tensor:
 
 
 class Part(NamedTuple):
-    """One solid: `shape` turned by `yaw` (radians, about z) and put at `centre` when time is 0."""
+    """One solid, as placed at time 0.
+
+    Args:
+        shape: the solid around its own origin.
+        centre: position of its origin, scene units.
+        yaw: rotation about z, radians.
+        texture: function from positions (3, R) around its origin to albedo (3, R).
+        gloss: strength of the specular reflection; 0 is matte, with the same colour from every direction.
+    """
 
     shape: Shape
     centre: tuple[float, float, float]
     yaw: float
     texture: Callable[[Tensor], Tensor]
-    gloss: float  # strength of the mirror-like reflection; 0 is matte, the same colour from everywhere
+    gloss: float
 
 
 _TOP = -0.45  # height of the plinth's upper face
@@ -142,13 +157,14 @@ _LIGHT_SPREAD = 0.07  # half width of the penumbra per unit distance
 
 
 class Hit(NamedTuple):
-    """What R rays meet first.
+    """The first surfaces that R rays hit.
 
-    depth: (R,) distance along the unit direction in scene units, inf where nothing is hit.
-    normals: (R, 3) outward unit normals in world axes, zero where nothing is hit.
-    rgb: (R, 3) display colour in [0, 1], zero where nothing is hit.
-    hit: (R,) bool, the alpha of a single ray.
-    part: (R,) int64 index into `PARTS`, -1 where nothing is hit.
+    Args:
+        depth: (R,) distance along the unit direction in scene units, inf without hit.
+        normals: (R, 3) outward unit normals in world axes, zero without hit.
+        rgb: (R, 3) display colour in [0, 1], zero without hit.
+        hit: (R,) bool, the alpha of a single ray.
+        part: (R,) int64 index into `PARTS`, -1 without hit.
     """
 
     depth: Tensor
@@ -159,7 +175,7 @@ class Hit(NamedTuple):
 
 
 class _Pose(NamedTuple):
-    """Where a part is at some time: centre (3, 1 or R), cosine and sine of the yaw (1 or R,)."""
+    """Pose of a part at some time: centre (3, 1 or R), cosine and sine of the yaw (1 or R,)."""
 
     centre: Tensor
     cosine: Tensor
@@ -176,7 +192,7 @@ class _Pose(NamedTuple):
 
 
 def _poses(time: float | Tensor, like: Tensor) -> list[_Pose]:
-    """Pose of every part. The ball runs along an arc in two bounces and the box turns; the others stand still."""
+    """Return the pose of every part. The ball moves along an arc in two bounces, and the box rotates."""
     t = torch.as_tensor(time, dtype=like.dtype, device=like.device).reshape(-1)
     poses = []
     for name, part in PARTS.items():
@@ -192,14 +208,14 @@ def _poses(time: float | Tensor, like: Tensor) -> list[_Pose]:
 
 
 def _lines(pose: _Pose, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """The rays' points nearest to the part's centre, (3, R) from the centre, and their ray parameters (R,)."""
+    """Return the rays' points closest to the part's centre, (3, R) relative to it, and their ray parameters (R,)."""
     relative = origins - pose.centre
     nearest = -dot(relative, directions)
     return relative + nearest * directions, nearest
 
 
 def _first_hits(poses: list[_Pose], origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """Depth (R,) and index of the part (R,) of (3, 1 or R) origins and (3, R) directions."""
+    """Return depth (R,) and index of the part (R,) for origins (3, 1 or R) and directions (3, R)."""
     depth = torch.full_like(directions[0], math.inf)
     which = torch.full_like(depth, -1, dtype=torch.int64)
     for index, (part, pose) in enumerate(zip(PARTS.values(), poses, strict=True)):
@@ -215,7 +231,7 @@ def _first_hits(poses: list[_Pose], origins: Tensor, directions: Tensor) -> tupl
 
 
 def _distance(poses: list[_Pose], p: Tensor) -> Tensor:
-    """Signed distance (R,) of points (3, R) to the scene, negative inside a solid."""
+    """Return the signed distance (R,) of points (3, R) to the scene, negative inside a solid."""
     distances = (
         part.shape.distance(pose.to_local(p - pose.centre)) for part, pose in zip(PARTS.values(), poses, strict=True)
     )
@@ -223,11 +239,11 @@ def _distance(poses: list[_Pose], p: Tensor) -> Tensor:
 
 
 def _sunlight(poses: list[_Pose], p: Tensor) -> Tensor:
-    """Visible fraction (R,) of the sun from points (3, R): soft, from how near the light ray passes each part."""
+    """Return the visible fraction (R,) of the sun at points (3, R), from the distance of the ray to each part."""
     visible = torch.ones_like(p[0])
     light = p.new_tensor(LIGHT)[:, None].expand_as(p)
     for (name, part), pose in zip(PARTS.items(), poses, strict=True):
-        if name == "plinth":  # everything else stands on it and the light comes from above
+        if name == "plinth":  # it casts no shadow on the other parts, which are above it
             continue
         offset, nearest = _lines(pose, p, light)
         reach = part.shape.bound + _LIGHT_SPREAD * nearest.clamp(min=0.0)
@@ -243,7 +259,7 @@ def _sunlight(poses: list[_Pose], p: Tensor) -> Tensor:
 
 
 def _surroundings(d: Tensor) -> Tensor:
-    """Light (3, R) that arrives from unit directions (3, R): a studio sky with two soft lamps over warm ground."""
+    """Return the light (3, R) from unit directions (3, R): a studio sky with two soft lamps over warm ground."""
     sky = _blend((0.75, 0.72, 0.68), (0.16, 0.30, 0.52), smoothstep(0.0, 0.9, d[2]))
     light = mix(sky, d.new_tensor(_GROUND)[:, None], smoothstep(0.05, -0.15, d[2]))
     side = d.new_tensor((0.60, 0.62, 0.50))[:, None]
@@ -252,17 +268,17 @@ def _surroundings(d: Tensor) -> Tensor:
 
 
 def _shade(poses: list[_Pose], p: Tensor, normal: Tensor, view: Tensor, which: Tensor) -> Tensor:
-    """Display colour (3, R) of surface points (3, R) seen along unit `view` directions (3, R)."""
+    """Return display colours (3, R) of surface points (3, R) seen along unit `view` directions (3, R)."""
     albedo, gloss = torch.zeros_like(p), torch.zeros_like(p[0])
     for index, (part, pose) in enumerate(zip(PARTS.values(), poses, strict=True)):
-        mine = (which == index).nonzero()[:, 0]
-        local = pose.pick(mine)
-        albedo[:, mine] = part.texture(local.to_local(p[:, mine] - local.centre))
-        gloss[mine] = part.gloss
+        selected = (which == index).nonzero()[:, 0]
+        local = pose.pick(selected)
+        albedo[:, selected] = part.texture(local.to_local(p[:, selected] - local.centre))
+        gloss[selected] = part.gloss
     outside = p + 1e-3 * normal
     sun = _sunlight(poses, outside)
     facing = dot(normal, p.new_tensor(LIGHT)[:, None]).clamp(min=0.0)
-    # Ambient occlusion: how much less room there is along the normal than over an open plane.
+    # Ambient occlusion: free distance along the normal, relative to that above a plane.
     rooms = [(_distance(poses, p + h * normal) / h).clamp(0.0, 1.0) for h in (0.06, 0.2)]
     room = rooms[0] + rooms[1]
     ambient = _blend(_GROUND, _SKY, 0.5 + 0.5 * normal[2]) * (0.15 + 0.425 * room)
@@ -276,37 +292,48 @@ def _shade(poses: list[_Pose], p: Tensor, normal: Tensor, view: Tensor, which: T
     sparkle = (dot(n, halfway) / dot(halfway, halfway).sqrt()).clamp(min=0.0) ** 90 * sun[shiny]
     mirror = _surroundings(v - 2.0 * slope * n) * fresnel + 1.2 * sparkle
     light[:, shiny] += g * mirror * (0.3 + 0.35 * room[shiny])
-    return (1.0 - (-1.35 * light).exp()).sqrt()  # a soft shoulder, then display gamma
+    return (1.0 - (-1.35 * light).exp()).sqrt()  # compression of highlights, then display gamma
 
 
 def trace_rows(origins: Tensor, directions: Tensor, time: float | Tensor, colour: bool = True) -> Hit:
-    """`trace` on rows: origins (3, 1 or R), directions (3, R); normals and rgb come out as (3, R)."""
+    """Compute `trace` with vectors stored as rows.
+
+    Args:
+        origins: (3, 1 or R).
+        directions: (3, R) unit vectors.
+        time: in [0, 1], a number or (R,).
+        colour: whether to compute colours; otherwise they are zero.
+
+    Returns:
+        As `trace`, but normals and rgb as (3, R).
+    """
     poses = _poses(time, directions)
     depth, which = _first_hits(poses, origins, directions)
     normals, rgb = torch.zeros_like(directions), torch.zeros_like(directions)
-    found = (which >= 0).nonzero()[:, 0]
-    poses = [pose.pick(found) for pose in poses]
-    view, part = directions[:, found], which[found]
-    p = (origins if origins.shape[1] == 1 else origins[:, found]) + depth[found] * view
+    rays = (which >= 0).nonzero()[:, 0]
+    poses = [pose.pick(rays) for pose in poses]
+    view, part = directions[:, rays], which[rays]
+    p = (origins if origins.shape[1] == 1 else origins[:, rays]) + depth[rays] * view
     n = torch.zeros_like(p)
     for index, (solid, pose) in enumerate(zip(PARTS.values(), poses, strict=True)):
-        mine = (part == index).nonzero()[:, 0]
-        local = pose.pick(mine)
-        n[:, mine] = local.to_world(solid.shape.normal(local.to_local(p[:, mine] - local.centre)))
-    normals[:, found] = n
+        selected = (part == index).nonzero()[:, 0]
+        local = pose.pick(selected)
+        n[:, selected] = local.to_world(solid.shape.normal(local.to_local(p[:, selected] - local.centre)))
+    normals[:, rays] = n
     if colour:
-        rgb[:, found] = _shade(poses, p, n, view, part)
+        rgb[:, rays] = _shade(poses, p, n, view, part)
     return Hit(depth, normals, rgb, which >= 0, which)
 
 
 @torch.no_grad()
 def trace(origins: Tensor, directions: Tensor, time: float | Tensor = 0.0) -> Hit:
-    """First surface along rays.
+    """Return the first surface along each ray.
 
-    origins: (R, 3) outside of the solids (a ray that starts inside a solid does not see that solid).
-    directions: (R, 3) unit vectors of the same floating point type, which is the type of the computation:
-        float64 is exact to about 1e-9, float32 to about 1e-5.
-    time: in [0, 1], one number or (R,); 0 is the static scene.
+    Args:
+        origins: (R, 3) outside of the solids; a ray that starts inside a solid does not hit that solid.
+        directions: (R, 3) unit vectors of the same floating point type, in which everything is computed: float64 is
+            exact to about 1e-9, float32 to about 1e-5.
+        time: in [0, 1], a number or (R,); 0 is the static scene.
     """
     hit = trace_rows(origins.T.contiguous(), directions.T.contiguous(), time)
     return hit._replace(normals=hit.normals.T.contiguous(), rgb=hit.rgb.T.contiguous())
@@ -314,6 +341,11 @@ def trace(origins: Tensor, directions: Tensor, time: float | Tensor = 0.0) -> Hi
 
 @torch.no_grad()
 def inside(points: Tensor, time: float | Tensor = 0.0) -> Tensor:
-    """Whether points (N, 3) in scene units lie inside a solid at `time` (a number or (N,)): (N,) bool."""
+    """Return whether points lie inside a solid, (N,) bool.
+
+    Args:
+        points: (N, 3) scene units.
+        time: in [0, 1], a number or (N,).
+    """
     p = points.T.contiguous()
     return _distance(_poses(time, p), p) < 0.0

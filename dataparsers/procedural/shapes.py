@@ -1,7 +1,7 @@
-"""Solids around their own origin, met by rays in closed form.
+"""Solids around their own origin, intersected with rays in closed form.
 
-Vectors are stored as (3, R), one contiguous row per axis: elementwise arithmetic on rows is several times faster
-than reductions over a last axis of length 3.
+Vectors are stored as (3, R), one contiguous row per axis: elementwise arithmetic on rows is several times faster than
+reductions over a last axis of length 3.
 """
 
 from __future__ import annotations
@@ -15,32 +15,41 @@ from torch import Tensor
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
-    """Dot products (R,) of (3, R) vectors."""
+    """Return the dot products (R,) of vectors `a` and `b` (3, R)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 class Shape(Protocol):
     """A solid around the origin. Points, offsets and directions are (3, R), distances and parameters (R,).
 
-    A line is `offset + t * direction`, where `offset` is its point nearest to the origin (so it is perpendicular
-    to the unit `direction`): starting from there keeps every quadratic and quartic below well conditioned.
+    A line is `offset + t * direction`, where `offset` is its point closest to the origin (perpendicular to the unit
+    `direction`); with this origin, all quadratics and quartics below are well conditioned.
     """
 
     @property
     def bound(self) -> float:
-        """Radius of a sphere around the origin that holds the solid."""
+        """Radius of a sphere around the origin that contains the solid."""
 
     def distance(self, p: Tensor) -> Tensor:
-        """Signed distance to the surface, negative inside."""
+        """Return the signed distance of points `p` to the surface, negative inside."""
 
     def normal(self, p: Tensor) -> Tensor:
-        """Outward unit normal (3, R) at points on the surface."""
+        """Return the outward unit normals (3, R) at points `p` on the surface."""
 
     def enter(self, offset: Tensor, direction: Tensor, start: Tensor) -> Tensor:
-        """Smallest parameter above `start` at which the line enters the solid; inf where there is none."""
+        """Return the smallest parameter above `start` at which the line enters the solid; inf if there is none.
+
+        Args:
+            offset, direction: the lines.
+            start: parameters at which the lines start.
+        """
 
     def closest(self, offset: Tensor, direction: Tensor) -> tuple[Tensor, ...]:
-        """Parameters of the line's points that come nearest to the solid, or are deepest inside it."""
+        """Return the parameters of the points closest to the solid, or deepest inside it.
+
+        Args:
+            offset, direction: the lines.
+        """
 
 
 def _enter_interval(near: Tensor, far: Tensor, start: Tensor) -> Tensor:
@@ -48,8 +57,8 @@ def _enter_interval(near: Tensor, far: Tensor, start: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Sphere:
-    """A ball."""
+class Sphere(Shape):
+    """A ball of radius `radius`."""
 
     radius: float
 
@@ -72,10 +81,10 @@ class Sphere:
 
 
 @dataclass(frozen=True)
-class Box:
-    """A cube with faces across the axes."""
+class Box(Shape):
+    """A cube with axis-aligned faces; `half` is half its edge length."""
 
-    half: float  # half the edge length of a cube
+    half: float
 
     @property
     def bound(self) -> float:
@@ -104,11 +113,11 @@ class Box:
 
 
 @dataclass(frozen=True)
-class Cylinder:
-    """A solid cylinder around z."""
+class Cylinder(Shape):
+    """A solid cylinder around z with radius `radius` and half height `half`."""
 
     radius: float
-    half: float  # half the height; the axis is z
+    half: float
 
     @property
     def bound(self) -> float:
@@ -128,7 +137,7 @@ class Cylinder:
         return torch.where(cap, torch.stack([zero, zero, p[2].sign()]), side)
 
     def enter(self, offset: Tensor, direction: Tensor, start: Tensor) -> Tensor:
-        a = (direction[0] ** 2 + direction[1] ** 2).clamp(min=1e-20)  # a vertical line: a very long interval
+        a = (direction[0] ** 2 + direction[1] ** 2).clamp(min=1e-20)  # for vertical lines, a very long interval
         b = offset[0] * direction[0] + offset[1] * direction[1]
         c = offset[0] ** 2 + offset[1] ** 2 - self.radius**2
         discriminant = b * b - a * c
@@ -146,12 +155,18 @@ class Cylinder:
 
 
 @dataclass(frozen=True)
-class Torus:
-    """A ring around y, or its upper half."""
+class Torus(Shape):
+    """A ring around y, or its upper half.
+
+    Args:
+        major: radius of the circle in the middle of the tube.
+        minor: radius of the tube.
+        half: whether to keep only the part with z > 0, an arch whose feet are inside another solid.
+    """
 
     major: float
     minor: float
-    half: bool = False  # only the part with z > 0: an arch whose feet stand in another solid
+    half: bool = False
 
     @property
     def bound(self) -> float:
@@ -168,7 +183,7 @@ class Torus:
         return outward / dot(outward, outward).sqrt()
 
     def _quartic(self, offset: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Coefficients of t^4 + p t^2 + q t + r, negative inside; there is no cubic term from the nearest point."""
+        """Return p, q, r of t^4 + p t^2 + q t + r, negative inside; from the closest point, there is no cubic term."""
         square = dot(offset, offset)
         k = square + self.major**2 - self.minor**2
         four = 4.0 * self.major**2
@@ -177,7 +192,10 @@ class Torus:
 
     @staticmethod
     def _extremes(p: Tensor, q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """First minimum, maximum, second minimum of the quartic: roots of t^3 + p/2 t + q/4, equal if only one."""
+        """Return the first minimum, the maximum and the second minimum of the quartic; all equal if there is only one.
+
+        They are the roots of t^3 + p/2 t + q/4.
+        """
         third, half = p / 6.0, q / 8.0
         discriminant = half**2 + third**3
         u = half.abs() + discriminant.clamp(min=1e-30).sqrt()
@@ -200,17 +218,17 @@ class Torus:
             return ((t * t + p) * t + q) * t + r
 
         first, middle, second = self._extremes(p, q)
-        # Between a point outside and a minimum inside the quartic falls through zero exactly once: the entry.
+        # Between a point outside and a minimum inside, the quartic decreases through zero exactly once, at the entry.
         low1 = torch.maximum(-((self.bound * 1.001) ** 2 - dot(offset, offset)).clamp(min=0.0).sqrt(), start)
         low2 = torch.maximum(middle, start)
         in1 = (low1 < first) & (value(first) < 0.0) & (value(low1) > 0.0)
         in2 = (low2 < second) & (value(second) < 0.0) & (value(low2) > 0.0)
-        found = (in1 | in2).nonzero()[:, 0]
-        low, high = torch.where(in1, low1, low2)[found], torch.where(in1, first, second)[found]
-        root = _falling_root(p[found], q[found], r[found], low, high)
-        if self.half:  # the missing half can hide nothing: a ray through it to the arch meets the plinth first
-            root = torch.where(offset[2][found] + root * direction[2][found] > 0.0, root, math.inf)
-        return torch.full_like(p, math.inf).index_copy(0, found, root)
+        rays = (in1 | in2).nonzero()[:, 0]
+        low, high = torch.where(in1, low1, low2)[rays], torch.where(in1, first, second)[rays]
+        root = _falling_root(p[rays], q[rays], r[rays], low, high)
+        if self.half:  # the missing half cannot occlude: a ray through it to the arch hits the plinth first
+            root = torch.where(offset[2][rays] + root * direction[2][rays] > 0.0, root, math.inf)
+        return torch.full_like(p, math.inf).index_copy(0, rays, root)
 
     def closest(self, offset: Tensor, direction: Tensor) -> tuple[Tensor, ...]:
         p, q, _ = self._quartic(offset, direction)
@@ -219,11 +237,11 @@ class Torus:
 
 
 def _falling_root(p: Tensor, q: Tensor, r: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Root of t^4 + p t^2 + q t + r between `low` (positive there) and `high` (negative), by guarded Newton."""
+    """Return the root of t^4 + p t^2 + q t + r between `low` (positive) and `high` (negative), by guarded Newton."""
     t = 0.5 * (low + high)
     for _ in range(24 if p.dtype == torch.float64 else 12):
         value = ((t * t + p) * t + q) * t + r
         low, high = torch.where(value > 0.0, t, low), torch.where(value > 0.0, high, t)
         step = t - value / ((4.0 * t * t + 2.0 * p) * t + q)
-        t = torch.where((step >= low) & (step <= high), step, 0.5 * (low + high))  # a root found is a bound itself
+        t = torch.where((step >= low) & (step <= high), step, 0.5 * (low + high))  # an exact root is a bound itself
     return t

@@ -1,4 +1,4 @@
-"""Views of the embedded scene, and the data set made of them."""
+"""Views of the embedded scene, and the data set that consists of them."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from torch import Tensor
 from dataparsers.procedural.scene import trace_rows
 
 CAMERA_ANGLE = 0.6911
-"""Horizontal field of view, radians: NeRF-Synthetic's."""
+"""Horizontal field of view, radians, as in NeRF-Synthetic."""
 RADIUS = 4.0
 """Distance of the cameras from the origin, scene units."""
 SUPERSAMPLE = 3
 """Rays along each side of a pixel."""
-# Below torch's threshold for splitting one operation over threads: the parallelism is over views instead.
+# Below PyTorch's threshold for splitting an operation over threads, as views are rendered in parallel.
 _CHUNK_RAYS = 32_000
 
 
 def _camera_rays(
     camera_to_world: npt.ArrayLike, camera_angle_x: float, size: tuple[int, int], x: Tensor, y: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Origin (3, 1) and unit directions (3, R) of rays through pixel coordinates x, y (R,)."""
+    """Return origin (3, 1) and unit directions (3, R) of rays through pixel coordinates x, y (R,)."""
     pose = torch.as_tensor(np.asarray(camera_to_world, dtype=np.float64)).to(x)
     focal = 0.5 * size[0] / math.tan(0.5 * camera_angle_x)
     u, v = (x - 0.5 * size[0]) / focal, (0.5 * size[1] - y) / focal
@@ -42,7 +42,7 @@ def _camera_rays(
 
 
 def _pixel_grid(size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Column and row (H W,) of every pixel, float64."""
+    """Return column and row (H W,) of every pixel, float64."""
     row, column = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in size[::-1]), indexing="ij")
     return column.flatten(), row.flatten()
 
@@ -50,7 +50,7 @@ def _pixel_grid(size: tuple[int, int]) -> tuple[Tensor, Tensor]:
 def _render_geometry(
     camera_to_world: npt.ArrayLike, camera_angle_x: float, size: tuple[int, int], time: float
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Depth (H, W) and normals (H, W, 3) at the pixel centres, computed in float64."""
+    """Return depth (H, W) and normals (H, W, 3) at the pixel centres, computed in float64."""
     column, row = _pixel_grid(size)
     depth, normals = [], []
     for x, y in zip(column.split(_CHUNK_RAYS), row.split(_CHUNK_RAYS), strict=True):
@@ -67,7 +67,7 @@ def _render_geometry(
 def _render_rgba(
     camera_to_world: npt.ArrayLike, camera_angle_x: float, size: tuple[int, int], time: float, supersample: int
 ) -> npt.NDArray[np.uint8]:
-    """Straight colour and coverage (H, W, 4) from supersample^2 float32 rays on a regular grid in every pixel."""
+    """Return straight colour and coverage (H, W, 4) from supersample^2 float32 rays on a grid in every pixel."""
     column, row = (c.float() for c in _pixel_grid(size))
     image = torch.zeros(4, column.numel())
     steps = (torch.arange(supersample, dtype=torch.float32) + 0.5) / supersample
@@ -91,19 +91,21 @@ def render_view(
     supersample: int = SUPERSAMPLE,
     geometry: bool = True,
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32] | None, npt.NDArray[np.float32] | None]:
-    """One view of the scene.
+    """Render one view of the scene.
 
     Args:
-        camera_to_world: (3, 4) or (4, 4), OpenGL axes (x right, y up, looking down -z), outside of the solids.
-        camera_angle_x: horizontal field of view in radians; the focal length is the same vertically and the
-            principal point is the image centre; pixel centres are at +0.5.
-        width, height: pixels.
+        camera_to_world: (3, 4) or (4, 4), OpenGL axes (x right, y up, looking along -z), outside of the solids.
+        camera_angle_x: horizontal field of view in radians. The vertical focal length is the same, the principal point
+            is the image centre, and pixel centres are at +0.5.
+        width, height: size of the image, pixels.
         time: in [0, 1].
         supersample: rays along each side of a pixel.
-        geometry: compute depth and normals too.
-    Returns: rgba (H, W, 4) uint8 with straight colour and the covered fraction of the pixel, depth (H, W) float32
-        along the rays through the pixel centres (inf for background) and world normals (H, W, 3) float32 there, or
-        None for both.
+        geometry: whether to compute depth and normals.
+
+    Returns:
+        rgba (H, W, 4) uint8, straight colour and covered fraction of the pixel; depth (H, W) float32 along the rays
+        through the pixel centres, inf for background; and world normals (H, W, 3) float32 there. Depth and normals are
+        None without `geometry`.
     """
     size = (width, height)
     rgba = _render_rgba(camera_to_world, camera_angle_x, size, time, supersample)
@@ -113,7 +115,12 @@ def render_view(
 
 
 def camera_pose(azimuth: float, elevation: float) -> npt.NDArray[np.float64]:
-    """Camera-to-world (4, 4) at RADIUS from the origin, looking at it; angles in radians."""
+    """Return the camera-to-world matrix (4, 4) of a camera that looks at the origin from distance `RADIUS`.
+
+    Args:
+        azimuth: angle around z, radians.
+        elevation: angle above the horizon, radians.
+    """
     back = np.array(
         [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
     )
@@ -124,10 +131,15 @@ def camera_pose(azimuth: float, elevation: float) -> npt.NDArray[np.float64]:
 
 
 def camera_poses(split: str, count: int, seed: int) -> list[npt.NDArray[np.float64]]:
-    """Poses of a split: training cameras jittered over the upper sphere, test cameras on an orbit between them.
+    """Return the poses of a split: training cameras jittered over the upper hemisphere, test cameras on an orbit.
 
-    Training and validation cameras are a Fibonacci lattice from 5 degrees under the horizon to 75 above it, turned
-    and jittered by the seed; test cameras circle once while they rise and sink.
+    Training and validation cameras are a Fibonacci lattice from 5 degrees below the horizon to 75 above it, rotated and
+    jittered by the seed; test cameras circle once while their elevation oscillates.
+
+    Args:
+        split: train, val or test.
+        count: number of cameras.
+        seed: seed of rotation and jitter.
     """
     turns = np.arange(count) / count
     if split == "test":
@@ -137,7 +149,7 @@ def camera_poses(split: str, count: int, seed: int) -> list[npt.NDArray[np.float
     heights = low + (high - low) * (np.arange(count) + random.uniform(0.2, 0.8, count)) / count
     golden = math.pi * (3.0 - math.sqrt(5.0))
     azimuths = random.uniform(0, 2 * math.pi) + golden * np.arange(count) + random.uniform(-0.2, 0.2, count)
-    order = random.permutation(count)  # of a moving scene, each time is then seen from high and from low
+    order = random.permutation(count)  # so that a moving scene is seen from high and low at all times
     return [camera_pose(azimuths[index], math.asin(heights[index])) for index in order]
 
 
@@ -150,19 +162,21 @@ def write_dataset(
     seed: int = 0,
     progress: Callable[[Any, str, int], Any] = lambda jobs, title, total: jobs,
 ) -> None:
-    """Write a data set in NeRF-Synthetic's format, complete or not at all.
+    """Write a data set in NeRF-Synthetic's format, completely or not at all.
 
-    For each split `transforms_{split}.json` and RGBA images; for val and test also `r_000_geometry.npz` with the
-    exact depth (H, W) along the ray, inf for background, and the world normals (H, W, 3).
+    Each split has `transforms_{split}.json` and RGBA images; val and test also have `r_000_geometry.npz` with the exact
+    depth (H, W) along the ray, inf for background, and the world normals (H, W, 3).
 
     Args:
-        folder: where it goes. If it appears meanwhile, what is there is kept.
-        size: width and height, pixels.
-        counts: images of each split, train, val and test.
-        moving: each frame has a time; else the scene stands still at time 0.
-        seed: of the camera positions. The same seed gives the same bytes.
-        progress: wraps the iteration over views, with a title and their number.
-    Raises: OSError where it cannot be written.
+        folder: folder to create. If another process creates it meanwhile, its content is kept.
+        size: width and height of the images, pixels.
+        counts: number of images of the splits train, val and test.
+        moving: whether each frame has a time; otherwise the scene is static, at time 0.
+        seed: seed of the camera positions. The same seed gives the same bytes.
+        progress: wrapper of the iteration over views, called with the iterable, a title and the number of views.
+
+    Raises:
+        OSError: if the folder cannot be written.
     """
     counts = counts or {"train": 80, "val": 8, "test": 16}
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -176,7 +190,7 @@ def write_dataset(
         try:
             temporary.rename(folder)
         except OSError:
-            if not folder.is_dir():  # else another process was faster, with the same bytes
+            if not folder.is_dir():  # otherwise another process was faster, with the same bytes
                 raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -185,7 +199,7 @@ def write_dataset(
 def _lay_out(
     folder: Path, split: str, count: int, moving: bool, seed: int
 ) -> list[tuple[Path, npt.NDArray[np.float64], float]]:
-    """Write a split's json, and return the file, pose and time of each of its views."""
+    """Write the JSON file of a split, and return the file, pose and time of each view."""
     (folder / split).mkdir(parents=True, exist_ok=True)
     frames, jobs = [], []
     for index, pose in enumerate(camera_poses(split, count, seed)):

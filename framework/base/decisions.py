@@ -45,8 +45,9 @@ class Choice:
 
     def decision(self) -> Decision:
         """Return the record of this choice."""
-        texts = {True: "on", False: "off"}
-        shown = texts[self.value] if isinstance(self.value, bool) else f"{self.value}"
+        shown = f"{self.value:g}" if isinstance(self.value, float) else f"{self.value}"
+        if isinstance(self.value, bool):
+            shown = "on" if self.value else "off"
         return Decision(self.option or self.setting.replace("_", " "), self.shown or shown, self.reason)
 
 

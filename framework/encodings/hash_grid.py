@@ -40,6 +40,6 @@ class HashGrid(nn.Module):
         self.deferred = TableGradient(self.layout) if sparse else None
         self.num_features = num_levels * features_per_level
 
-    def forward(self, positions: Tensor, known: Tensor | None = None) -> Tensor:
-        """Positions (N, 3) in [0, 1] to features (N, L * F), which may be `known` already (see `hash_grid`)."""
-        return hash_grid(positions, self.table, self.layout, self.deferred, known)
+    def forward(self, positions: Tensor) -> Tensor:
+        """Positions (N, 3) in [0, 1] to features (N, L * F)."""
+        return hash_grid(positions, self.table, self.layout, self.deferred)

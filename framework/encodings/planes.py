@@ -50,9 +50,9 @@ class FeaturePlanes(nn.Module):
         self.optimised = Optimised("tables", sparse=True) if sparse else None
         self.deferred = PlanesGradient(self.layout) if sparse else None
 
-    def forward(self, positions: Tensor, known: Tensor | None = None) -> Tensor:
-        """Positions (N, D) in [0, 1] to features (N, G * F), which may be `known` already (see `planes`)."""
-        return planes(positions, self.table, self.layout, self.deferred, known)
+    def forward(self, positions: Tensor) -> Tensor:
+        """Positions (N, D) in [0, 1] to features (N, G * F)."""
+        return planes(positions, self.table, self.layout, self.deferred)
 
     def random_band(self, group: int, index: int) -> Tensor:
         """Some neighbouring rows (at most vertices / 16, along the first axis, F) of a factor, for regularisers.

@@ -38,22 +38,6 @@ class Field(nn.Module, ABC):
         Returns: sigma (N,) float32, at least 0, 1/length; features (N, F) for `color`.
         """
 
-    def trace(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Density without gradient, and what `retrace` needs to attach one later.
-
-        For samplers that must know density before they know which samples they keep: tracing costs one evaluation,
-        and the gradient is computed for what is kept, all at once.
-
-        Returns: sigma (N,), features (N, F), memory (N, M); or None where the field does not offer it.
-        """
-        return None
-
-    def retrace(
-        self, positions: Tensor, times: Tensor | None, features: Tensor, memory: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """What `density` gives at `positions`, gradients included, from what `trace` gave there."""
-        raise NotImplementedError
-
     @abstractmethod
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         """Colour (N, 3) in [0, 1] of `features` (N, F) seen along unit `directions` (N, 3).
@@ -119,11 +103,8 @@ class MLP(nn.Sequential):
         self.bias = bias
         self.activation = activation
 
-    def forward(self, *inputs: Tensor, known: Tensor | None = None) -> Tensor:
-        """(N, D_i) parts, which stand side by side, to (N, outputs).
-
-        `known` is the result where it has been computed already (see `mlp`).
-        """
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """(N, D_i) parts, which stand side by side, to (N, outputs)."""
         layers = [layer for layer in self if isinstance(layer, nn.Linear)]
         biases = [layer.bias for layer in layers] if self.bias else None
-        return mlp(inputs, [layer.weight for layer in layers], self.activation, biases, known)
+        return mlp(inputs, [layer.weight for layer in layers], self.activation, biases)

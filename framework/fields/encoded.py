@@ -47,8 +47,8 @@ class BoxField(Field):
             return contract_to_unit(positions, self.box)
         return torch.addcmul(self.shift, positions, self.scale)
 
-    def encode(self, positions: Tensor, times: Tensor | None, known: Tensor | None = None) -> Tensor:
-        """Features (N, E) at positions (N, 3), which may be `known` already.
+    def encode(self, positions: Tensor, times: Tensor | None) -> Tensor:
+        """Features (N, E) at positions (N, 3).
 
         Raises: ValueError where the encoding wants times and there are none.
         """
@@ -57,7 +57,7 @@ class BoxField(Field):
             if times is None:
                 raise ValueError("this field changes with time: it needs the times of its positions")
             unit = torch.cat([unit, times[:, None].to(unit)], dim=-1)
-        return self.encoding(unit, known=known)
+        return self.encoding(unit)
 
 
 class DensityField(BoxField):
@@ -118,17 +118,6 @@ class EncodedField(BoxField):
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
         return split_density(self.density_head(self.encode(points.positions, points.times)))
-
-    @torch.no_grad()
-    def trace(self, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        encoded = self.encode(positions, times)
-        features = self.density_head(encoded)
-        return truncated_exp(features[:, 0]), features, encoded
-
-    def retrace(
-        self, positions: Tensor, times: Tensor | None, features: Tensor, memory: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        return split_density(self.density_head(self.encode(positions, times, known=memory), known=features))
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         inputs = [features]

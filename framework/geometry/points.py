@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -31,6 +31,22 @@ class Points:
         return self.positions.shape[0]
 
 
+class Intervals(Protocol):
+    """Intervals along rays, as `Samples` are, and as a march hands them out."""
+
+    @property
+    def t_starts(self) -> Tensor:
+        """(N,) where they start."""
+
+    @property
+    def t_ends(self) -> Tensor:
+        """(N,) where they end."""
+
+    @property
+    def t(self) -> Tensor:
+        """(N,) where the field is asked."""
+
+
 def sample_points(rays: Rays, samples: Samples, footprint: Footprint = "none") -> Points:
     """Return the points at which a field is asked for N samples of R rays.
 
@@ -40,19 +56,34 @@ def sample_points(rays: Rays, samples: Samples, footprint: Footprint = "none") -
         footprint: how much of the points' size is computed.
     Raises: ValueError where a footprint is wanted and the rays have no radius.
     """
-    times = samples.times(rays)
+    return interval_points(rays, samples.ray_indices, samples, samples.positions(rays), footprint)
+
+
+def interval_points(
+    rays: Rays, owners: Tensor, intervals: Intervals, positions: Tensor, footprint: Footprint
+) -> Points:
+    """Return the points at which a field is asked for N intervals of R rays.
+
+    Args:
+        rays: the rays; a footprint needs their `pixel_radii`.
+        owners: (N,) int64, the ray of each interval.
+        intervals: N intervals.
+        positions: (N, 3) where the field is asked, but for Gaussians, which have a mean of their own.
+        footprint: how much of the points' size is computed.
+    Raises: ValueError where a footprint is wanted and the rays have no radius.
+    """
+    times = None if rays.times is None else rays.times[owners]
     if footprint == "none":
-        return Points(samples.positions(rays), times)
+        return Points(positions, times)
     if rays.pixel_radii is None:
         raise ValueError("this field wants to know the size of its points: the rays need pixel_radii")
-    radii = rays.pixel_radii.index_select(0, samples.ray_indices)
+    radii = rays.pixel_radii.index_select(0, owners)
     if footprint == "radius":
-        return Points(samples.positions(rays), times, samples.t * radii)
-    mean_t, along, across = conical_frustums(samples.t_starts, samples.t_ends, radii)
-    directions = rays.directions.index_select(0, samples.ray_indices)
-    squared = directions.square()
+        return Points(positions, times, intervals.t * radii)
+    mean_t, along, across = conical_frustums(intervals.t_starts, intervals.t_ends, radii)
+    squared = rays.directions.index_select(0, owners).square()
     covariances = along[:, None] * squared + across[:, None] * (1 - squared)
-    return Points(rays.points(samples.ray_indices, mean_t), times, mean_t * radii, covariances)
+    return Points(rays.points(owners, mean_t), times, mean_t * radii, covariances)
 
 
 def conical_frustums(t_starts: Tensor, t_ends: Tensor, radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from framework.geometry.bounds import contract
-from framework.kernels import native
+from framework.kernels import kept, native
 from framework.kernels.given import is_followed
 
 
@@ -29,7 +29,7 @@ def contract_to_unit(positions: Tensor, box: Tensor) -> Tensor:
     Returns: (N, 3).
     """
     if native.usable(positions, box) and not is_followed(box):
-        return _Contract.apply(positions.contiguous(), (box[0] + box[1]) / 2, 2 / (box[1] - box[0]))
+        return _Contract.apply(positions.contiguous(), box)
     return contract_to_unit_reference(positions, box)
 
 
@@ -39,22 +39,27 @@ _backward = native.function("contract_positions_backward", "ppppqpi")
 
 class _Contract(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, positions: Tensor, centre: Tensor, scale: Tensor) -> Tensor:
-        count, out = len(positions), torch.empty_like(positions)
-        _forward(
-            native.pointer(positions, "positions", (count, 3)), native.pointer(centre, "the centre", (3,)),
-            native.pointer(scale, "the scale", (3,)), count, out.data_ptr(), native.threads(),
-        )  # fmt: skip
+    def forward(ctx: Any, positions: Tensor, box: Tensor) -> Tensor:
+        centre, scale = (box[0] + box[1]) / 2, 2 / (box[1] - box[0])
+
+        def compute() -> Tensor:
+            count, out = len(positions), torch.empty_like(positions)
+            _forward(
+                native.pointer(positions, "positions", (count, 3)), native.pointer(centre, "the centre", (3,)),
+                native.pointer(scale, "the scale", (3,)), count, out.data_ptr(), native.threads(),
+            )  # fmt: skip
+            return out
+
         ctx.save_for_backward(positions, centre, scale)
-        return out
+        return kept.result(("contract_to_unit", *box.flatten().tolist()), (positions,), (), compute)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
         positions, centre, scale = ctx.saved_tensors
         out, grad = torch.empty_like(positions), grad.contiguous()
         _backward(
             positions.data_ptr(), centre.data_ptr(), scale.data_ptr(), native.pointer(grad, "gradient", grad.shape),
             len(positions), out.data_ptr(), native.threads(),
         )  # fmt: skip
-        return out, None, None
+        return out, None

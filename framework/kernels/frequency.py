@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.kernels import native
+from framework.kernels import kept, native
 
 MAX_FREQUENCIES = 32
 """Of which an encoding may be made: from float32 the sines of the last ones are noise long before."""
@@ -36,9 +36,14 @@ class _FrequencyEncoding(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor, num_frequencies: int, include_input: bool) -> Tensor:
         count, dims = x.shape
-        rows = x.new_empty(count, dims * (2 * num_frequencies + include_input))
         address = native.pointer(x, "the input", (count, dims))
-        _forward(address, count, dims, num_frequencies, include_input, rows.data_ptr(), native.threads())
+
+        def compute() -> Tensor:
+            out = x.new_empty(count, dims * (2 * num_frequencies + include_input))
+            _forward(address, count, dims, num_frequencies, include_input, out.data_ptr(), native.threads())
+            return out
+
+        rows = kept.result(("frequency_encoding", num_frequencies, include_input), (x,), (), compute)
         ctx.save_for_backward(rows)
         ctx.settings = dims, num_frequencies, include_input
         return rows

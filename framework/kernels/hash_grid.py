@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from framework.base.errors import ConfigError, shown
-from framework.kernels import native
+from framework.kernels import kept, native
 from framework.kernels.adam import all_finite
 from framework.kernels.deferred import Parts, waiting
 
@@ -207,21 +207,21 @@ class _HashGrid(torch.autograd.Function):
         table: Tensor,
         later: Tensor | None,
         layout: HashGridLayout,
-        known: Tensor | None,
     ) -> Tensor:
         count, features = len(positions), table.shape[1]
         points = native.pointer(positions, "positions", (count, 3))
         entries = native.pointer(table, "the hash table", (layout.num_entries, features))
-        if known is not None:
-            out = known.view_as(known)
-        else:
+
+        def compute() -> Tensor:
             out = positions.new_empty(count, layout.num_levels * features)
             _forward(
                 points, count, entries, features, *layout.arrays, layout.num_levels, out.data_ptr(), native.threads()
             )
+            return out
+
         ctx.save_for_backward(positions, table)
         ctx.layout = layout
-        return out
+        return kept.result(("hash_grid", layout), (positions,), (table,), compute)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -242,7 +242,7 @@ class _HashGrid(torch.autograd.Function):
                 positions.data_ptr(), count, table.data_ptr(), incoming, features, *layout.arrays,
                 layout.num_levels, grad_positions.data_ptr(), native.threads(),
             )  # fmt: skip
-        return grad_positions, grad_table, grad if ctx.needs_input_grad[2] else None, None, None
+        return grad_positions, grad_table, grad if ctx.needs_input_grad[2] else None, None
 
 
 def hash_grid(
@@ -250,7 +250,6 @@ def hash_grid(
     table: Tensor,
     layout: HashGridLayout,
     deferred: TableGradient | None = None,
-    known: Tensor | None = None,
 ) -> Tensor:
     """Multiresolution hash encoding.
 
@@ -259,7 +258,6 @@ def hash_grid(
         table: (E, F) entries of all levels, E = layout.num_entries.
         layout: resolutions and offsets.
         deferred: where a compiled backward pass that asks for the table's gradient leaves it, autograd getting none.
-        known: (N, L * F) the result, where it was computed before without a gradient: only the backward pass is left.
     Returns: (N, L * F) features in the table's type. First derivatives only; see `hash_grid_reference`.
     Raises: ValueError where a shape does not fit the layout.
     """
@@ -273,5 +271,5 @@ def hash_grid(
         if deferred is not None and table.requires_grad:
             later = waiting(table, positions, layout.num_levels * table.shape[1], deferred.parts)
             table = table.detach()
-        return _HashGrid.apply(positions, table, later, layout, known)
+        return _HashGrid.apply(positions, table, later, layout)
     return hash_grid_reference(positions, table, layout)

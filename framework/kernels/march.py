@@ -99,6 +99,11 @@ class Wave:
     positions: Tensor
     """(N, 3) the middles."""
 
+    @property
+    def t(self) -> Tensor:
+        """(N,) distances of the middles."""
+        return (self.t_starts + self.t_ends) / 2
+
 
 class March:
     """Rays on their way through the grid: `wave` and `advance` in turn until `wave` returns None, then `finish`.

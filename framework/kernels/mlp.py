@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import linear
 
-from framework.kernels import native
+from framework.kernels import kept, native
 
 T = TypeVar("T")
 Activation = Literal["none", "relu", "sigmoid"]
@@ -49,17 +49,18 @@ class _MLP(torch.autograd.Function):
     """The compiled network. Its backward pass computes hidden layers again, and skips samples without a gradient."""
 
     @staticmethod
-    def forward(ctx: Any, plan: _Plan, known: Tensor | None, *tensors: Tensor) -> Tensor:
+    def forward(ctx: Any, plan: _Plan, *tensors: Tensor) -> Tensor:
         call = _Call(plan, tensors)
-        if known is not None:
-            out = known.view_as(known)
-        else:
+
+        def compute() -> Tensor:
             out = tensors[0].new_empty(call.count, call.outputs)
             run = _forward_bf16 if plan.bf16 else _forward
             run(*call.arguments, CODES[plan.activation], out.data_ptr(), native.threads())
+            return out
+
         ctx.save_for_backward(*tensors)
         ctx.plan = plan
-        return out
+        return kept.result(("mlp", plan), tensors[: plan.inputs], tensors[plan.inputs :], compute)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -69,7 +70,7 @@ class _MLP(torch.autograd.Function):
         grad = grad.contiguous()
         grads = [
             torch.empty_like(tensor) if wanted or index >= plan.inputs else None
-            for index, (tensor, wanted) in enumerate(zip(tensors, ctx.needs_input_grad[2:], strict=True))
+            for index, (tensor, wanted) in enumerate(zip(tensors, ctx.needs_input_grad[1:], strict=True))
         ]
         addresses = [None if g is None else g.data_ptr() for g in grads]
         of_inputs, of_weights, of_biases = plan.split(addresses)
@@ -79,7 +80,7 @@ class _MLP(torch.autograd.Function):
             native.pointers(of_inputs), native.pointers(of_weights),
             native.pointers(of_biases or [None] * plan.layers), native.threads(),
         )  # fmt: skip
-        return None, None, *grads
+        return None, *grads
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,6 @@ def mlp(
     weights: Sequence[Tensor],
     activation: Activation = "none",
     biases: Sequence[Tensor] | None = None,
-    known: Tensor | None = None,
 ) -> Tensor:
     """A small network.
 
@@ -134,7 +134,6 @@ def mlp(
         weights: (out, in) of each layer, as torch's Linear stores them.
         activation: of the output; ReLU stands between layers.
         biases: (out,) of each layer, or None for none.
-        known: the result, where it was computed before without a gradient: only the backward pass is left.
 
     Under autocast the compiled products are of bfloat16, summed in float32, where the processor has instructions for
     that, and of float32 elsewhere.
@@ -150,5 +149,5 @@ def mlp(
     if small and native.usable(*inputs, *weights, *(biases or ())):
         tensors = [x.contiguous() for x in (*inputs, *weights, *(biases or ()))]
         bf16 = torch.is_autocast_enabled("cpu") and native.has("mlp_forward_bf16")
-        return _MLP.apply(_Plan(len(inputs), len(weights), activation, bf16), known, *tensors)
+        return _MLP.apply(_Plan(len(inputs), len(weights), activation, bf16), *tensors)
     return mlp_reference(inputs, weights, activation, biases)

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from framework.base.errors import ConfigError, shown
-from framework.kernels import memory, native
+from framework.kernels import kept, memory, native
 from framework.kernels.adam import all_finite, sparse_adam
 from framework.kernels.deferred import Parts, waiting
 
@@ -206,16 +206,15 @@ class _Planes(torch.autograd.Function):
         table: Tensor,
         later: Tensor | None,
         layout: PlanesLayout,
-        known: Tensor | None,
     ) -> Tensor:
-        if known is not None:
-            out = known.view_as(known)
-        else:
+        def compute() -> Tensor:
             out = positions.new_empty(len(positions), layout.num_groups * table.shape[1])
             _forward(*_arguments(positions, table, layout), out.data_ptr(), native.threads())
+            return out
+
         ctx.save_for_backward(positions, table)
         ctx.layout = layout
-        return out
+        return kept.result(("planes", layout), (positions,), (table,), compute)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -231,7 +230,7 @@ class _Planes(torch.autograd.Function):
         if ctx.needs_input_grad[1]:
             of_table = torch.zeros_like(table)
             _add_to(of_table, positions, table, grad, ctx.layout)
-        return of_positions, of_table, grad if ctx.needs_input_grad[2] else None, None, None
+        return of_positions, of_table, grad if ctx.needs_input_grad[2] else None, None
 
 
 def _add_to(total: Tensor, positions: Tensor, table: Tensor, grad: Tensor, layout: PlanesLayout) -> None:
@@ -294,7 +293,6 @@ def planes(
     table: Tensor,
     layout: PlanesLayout,
     deferred: PlanesGradient | None = None,
-    known: Tensor | None = None,
 ) -> Tensor:
     """Factorised features.
 
@@ -303,7 +301,6 @@ def planes(
         table: (E, F) entries of all planes, E = layout.num_entries.
         layout: resolutions and offsets.
         deferred: where a compiled backward pass that asks for the table's gradient leaves it, autograd getting none.
-        known: (N, G * F) the result, where it was computed before without a gradient: only the backward pass is left.
     Returns: (N, G * F), group by group. First derivatives only where compiled; see `planes_reference`.
     Raises: ValueError where a shape does not fit the layout.
     """
@@ -317,5 +314,5 @@ def planes(
         if deferred is not None and table.requires_grad:
             later = waiting(table, positions, layout.num_groups * table.shape[1], deferred.parts)
             table = table.detach()
-        return _Planes.apply(positions, table, later, layout, known)
+        return _Planes.apply(positions, table, later, layout)
     return planes_reference(positions, table, layout)

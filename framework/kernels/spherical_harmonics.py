@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.kernels import native
+from framework.kernels import kept, native
 from framework.kernels.given import is_followed
 
 MAX_LEVELS = 4
@@ -27,11 +27,15 @@ def spherical_harmonics(directions: Tensor, levels: int = 4) -> Tensor:
     if not 1 <= levels <= MAX_LEVELS:
         raise ValueError(f"spherical harmonics have 1 to {MAX_LEVELS} levels, not {levels}")
     if native.usable(directions) and not is_followed(directions):
-        out = directions.new_empty(len(directions), levels**2)
-        directions = directions.contiguous()
-        address = native.pointer(directions, "directions", (len(directions), 3))
-        _compiled(address, len(directions), levels, out.data_ptr(), native.threads())
-        return out
+        rows = directions.contiguous()
+
+        def compute() -> Tensor:
+            out = rows.new_empty(len(rows), levels**2)
+            address = native.pointer(rows, "directions", (len(rows), 3))
+            _compiled(address, len(rows), levels, out.data_ptr(), native.threads())
+            return out
+
+        return kept.result(("spherical_harmonics", levels), (rows,), (), compute)
     return spherical_harmonics_reference(directions, levels)
 
 

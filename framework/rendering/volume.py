@@ -47,7 +47,7 @@ def evaluated(rays: Rays, samples: Samples, field: Field) -> Samples:
         samples: N samples.
         field: what is sampled.
     """
-    if samples.sigma is not None and samples.features is not None:
+    if samples.features is not None and (samples.sigma is not None or samples.alpha is not None):
         return samples
     points = sample_points(rays, samples, field.footprint)
     if isinstance(field, HasAlpha):

@@ -14,7 +14,7 @@ from framework.base.errors import ConfigError
 from framework.data.scene import Scene
 from framework.fields.base import Field
 from framework.samplers.base import Sampler
-from framework.samplers.hierarchical import HierarchicalSampler
+from framework.samplers.hierarchical import LEAST_COARSE, HierarchicalSampler
 from framework.samplers.occupancy import MAX_CELLS, OccupancySampler
 from framework.samplers.proposal import ProposalSampler
 
@@ -67,7 +67,7 @@ class HierarchicalConfig(SamplingConfig):
     """Settings of a method that can also be sampled as NeRF is, by a coarse field for a fine one."""
 
     RANGES: ClassVar[dict[str, Range]] = {
-        "num_coarse_samples": (1, 2**14),
+        "num_coarse_samples": (LEAST_COARSE, 2**14),
         "num_fine_samples": (1, 2**14),
     }
     """What these numbers may be."""

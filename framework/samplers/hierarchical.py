@@ -12,6 +12,9 @@ from framework.samplers.base import Sampler
 from framework.samplers.inverse_cdf import inverse_cdf, uniform_variates
 from framework.samplers.uniform import samples_from_points, stratified_points
 
+LEAST_COARSE = 3
+"""Stratified samples on a ray, of which those between the first and the last say where to look."""
+
 
 class HierarchicalSampler(Sampler):
     """Stratified samples, and more where a coarse field of the sampler's own finds something with them.
@@ -22,10 +25,13 @@ class HierarchicalSampler(Sampler):
         coarse: the field that says where to look.
         num_coarse: stratified samples on a ray.
         num_fine: samples drawn between them; the field is asked at all of both.
+    Raises: ValueError for fewer than 3 stratified samples, which have none in the middle to say where to look.
     """
 
     def __init__(self, coarse: Field, num_coarse: int = 64, num_fine: int = 128) -> None:
         super().__init__()
+        if num_coarse < LEAST_COARSE:
+            raise ValueError(f"{num_coarse} stratified samples cannot say where to look: at least {LEAST_COARSE} can")
         self.coarse, self.num_coarse, self.num_fine = coarse, num_coarse, num_fine
 
     def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:

@@ -7,18 +7,21 @@ being skipped while a step through it would be nearly transparent.
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from framework.base.errors import ConfigError, shown
-from framework.fields.base import DensityFunction, Field
-from framework.geometry.points import Points
+from framework.fields.base import DensityFunction, Field, HasAlpha
+from framework.geometry.points import Points, interval_points
 from framework.geometry.rays import Rays, Samples
 from framework.kernels import native
+from framework.kernels.alpha import alpha_depth
 from framework.kernels.given import is_followed
-from framework.kernels.march import March, Occupancy, ReferenceMarch, refresh_occupancy
-from framework.kernels.rows import gather_rows, take_rows
+from framework.kernels.kept import Waves
+from framework.kernels.march import March, Occupancy, ReferenceMarch, Wave, refresh_occupancy
+from framework.kernels.rows import gather_rows
 from framework.samplers.base import Sampler
 
 MAX_CELLS = 512
@@ -128,31 +131,35 @@ class OccupancySampler(Sampler):
         stop = own if early_stop is None else early_stop
         compiled = native.usable(rays.origins, rays.directions, self.box)
         march = (March if compiled else ReferenceMarch)(rays, self.occupancy, self.step_size, self.cone, shift, stop)
-        traced = torch.is_grad_enabled()
-        found: list[tuple[Tensor, ...]] = []
-        while (wave := march.wave(WAVES[min(len(found), len(WAVES) - 1)])) is not None:
-            times = None if rays.times is None else rays.times[wave.owners]
-            values = field.trace(wave.positions, times) if traced else None
-            traced = values is not None
-            found.append(values or field.density(Points(wave.positions, times)))
-            march.advance(found[-1][0])
-        if not found:  # no ray meets anything: still the field's own, empty, tensors
-            found.append(field.density(Points(rays.origins[:0], None if rays.times is None else rays.times[:0])))
-        if not march.waves:
-            empty = rays.nears[:0]
-            return Samples(empty, empty, march.finish()[1], early_stop=stop).evaluated(*found[0])
+
+        def evaluate(wave: Wave) -> tuple[Tensor, Tensor]:
+            points = interval_points(rays, wave.owners, wave, wave.positions, field.footprint)
+            if surface is None:
+                return field.density(points)
+            return surface.alpha(points, rays.directions.index_select(0, wave.owners), wave.t_ends - wave.t_starts)
+
+        surface = field if isinstance(field, HasAlpha) else None
+        evaluated = Waves()
+        while (wave := march.wave(WAVES[min(len(march.waves), len(WAVES) - 1)])) is not None:
+            stopping = evaluated.evaluate(len(wave.owners), partial(evaluate, wave))[0]
+            if surface is not None:  # marched by the density that stops as much light in each interval
+                stopping = alpha_depth(stopping.detach()) / (wave.t_ends - wave.t_starts)
+            march.advance(stopping)
         order, offsets = march.finish()
+        if not march.waves:  # no ray meets anything: still the field's own, empty, tensors
+            empty = rays.nears[:0]
+            samples = Samples(empty, empty, offsets, owners=order, early_stop=stop)
+            return _attached(samples, surface, *evaluate(Wave(empty, empty, order, rays.origins[:0])))
         waves = march.waves
         columns = [[w.t_starts for w in waves], [w.t_ends for w in waves], [w.owners for w in waves]]
-        if traced:
-            columns += [[w.positions for w in waves], [values[1] for values in found], [values[2] for values in found]]
-            starts, ends, owners, positions, features, memory = gather_rows(columns, order)
-            times = None if rays.times is None else rays.times[owners]
-            sigma, features = field.retrace(positions, times, features, memory)
-        else:
-            starts, ends, owners = gather_rows(columns, order)
-            sigma, features = (take_rows(torch.cat([values[i] for values in found]), order) for i in (0, 1))
-        return Samples(starts, ends, offsets, owners=owners, sigma=sigma, features=features, early_stop=stop)
+        starts, ends, owners = gather_rows(columns, order)
+
+        def chosen() -> tuple[Tensor, Tensor]:
+            (positions,) = gather_rows([[w.positions for w in waves]], order)
+            return evaluate(Wave(starts, ends, owners, positions))
+
+        samples = Samples(starts, ends, offsets, owners=owners, early_stop=stop)
+        return _attached(samples, surface, *evaluated.choose(order, chosen))
 
     # -- keeping the grid up ----------------------------------------------------------------------------------
 
@@ -225,6 +232,11 @@ class OccupancySampler(Sampler):
         corner = torch.stack([cells // n**2, cells // n % n, cells % n], dim=-1)
         corner = (corner + torch.randint(-1, 2, corner.shape, device=cells.device)).clamp(0, n - 1)
         return (corner[:, 0] * n + corner[:, 1]) * n + corner[:, 2]
+
+
+def _attached(samples: Samples, surface: HasAlpha | None, stopping: Tensor, features: Tensor) -> Samples:
+    """Return samples with their density, or with the opacity of a surface's intervals, and features."""
+    return samples.evaluated(stopping, features) if surface is None else samples.with_alpha(stopping, features)
 
 
 def _over_time(density: DensityFunction, positions: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from framework.cameras.cameras import Cameras
 from framework.cameras.poses import Placement
 from framework.cameras.refinement import PoseRefinement
 from framework.cli.export import main
@@ -52,6 +53,17 @@ def test_cameras_are_those_of_the_input(
         torch.testing.assert_close(torch.tensor(found[name]), torch.tensor(frame["transform_matrix"])[:3])
 
 
+class Refining(torch.nn.Module):
+    """A model of which no more is known than that it refines poses."""
+
+    def __init__(self, poses: PoseRefinement) -> None:
+        super().__init__()
+        self.poses = poses
+
+    def refined_cameras(self, cameras: Cameras) -> Cameras:
+        return self.poses.refined(cameras)
+
+
 def test_placement_is_undone_and_refinement_kept() -> None:
     torch.manual_seed(0)
     turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.3, 0.1], [0.3, 0, 0.2], [-0.1, -0.2, 0]]).double())
@@ -62,13 +74,11 @@ def test_placement_is_undone_and_refinement_kept() -> None:
     poses = torch.cat([rotations, torch.randn(3, 3, 1).double()], -1)
     torch.testing.assert_close(placement.original_poses(placement.poses(poses)), poses)
 
-    from framework.cameras.cameras import Cameras
-
     numbers = torch.ones(3)
     cameras = Cameras(placement.poses(poses).float(), *[numbers] * 4, *[numbers.long()] * 2)  # type: ignore[arg-type]
     refinement = PoseRefinement(3)
     torch.nn.init.constant_(refinement.tangents, 0.1)
-    listed = camera_list(believed(torch.nn.Sequential(refinement), cameras), ["a", "b", "c"], placement)
+    listed = camera_list(believed(Refining(refinement), cameras), ["a", "b", "c"], placement)
     moved = torch.tensor([row["transform"] for row in listed])
     # Each camera's centre is moved by 0.1 along each axis of the scene, which is 4 times as much in the input.
     shift = (moved[:, :, 3] - poses[:, :, 3].float()).norm(dim=-1)

@@ -208,7 +208,7 @@ def test_binary_files_cut_short_are_refused_by_name(folder: Path, name: str, sha
     as_binary(model)
     whole = (model / name).read_bytes()
     (model / name).write_bytes(whole[: int(len(whole) * share)])
-    with pytest.raises(DataError, match=rf"{name} is cut short") as error:
+    with pytest.raises(DataError, match=rf"{name} is truncated") as error:
         Colmap().parse(folder, "train")
     assert "\n" not in str(error.value)
 
@@ -230,7 +230,7 @@ def test_garbage_is_refused(folder: Path, name: str, content: bytes, kind: str) 
 def test_a_model_without_one_of_its_files(folder: Path, name: str) -> None:
     model = folder / "sparse" / "0"
     (model / f"{name}.txt").unlink()
-    with pytest.raises(DataError, match=r"not a whole COLMAP model|has no COLMAP reconstruction"):
+    with pytest.raises(DataError, match=r"not a complete COLMAP model|has no COLMAP reconstruction"):
         Colmap().parse(folder, "train")
 
 

@@ -67,9 +67,9 @@ def test_a_reconstruction_at_the_usual_place_is_colmaps(folder: Path, capture: C
         ("filename\tid\tsplit\tdataset\np00.png\n", "line 2 lacks one of the columns"),
         ("filename\tid\tsplit\tdataset\np00.png\t1\tmine\tb\n", "line 2: the split is 'mine'"),
         ("filename\tid\tsplit\tdataset\nx.png\t1\ttrain\tb\n", "lists none of the 10 images"),
-        ("filename\tid\tsplit\tdataset\np00.png\t1\ttest\tb\n", "none of the 1 images .* split 'train'"),
+        ("filename\tid\tsplit\tdataset\np00.png\t1\ttest\tb\n", "none of the 1 existing images .* split 'train'"),
         ("", "lists none of the 10 images"),
-        ("\xff\xfe\x00", "is not a table"),
+        ("\xff\xfe\x00", "is not a tab-separated table"),
     ],
 )
 def test_bad_tables_are_refused(folder: Path, text: str, words: str) -> None:
@@ -82,7 +82,7 @@ def test_bad_tables_are_refused(folder: Path, text: str, words: str) -> None:
 
 def test_one_table_is_needed(folder: Path) -> None:
     (folder / "other.tsv").touch()
-    with pytest.raises(DataError, match=r"gate\.tsv, other\.tsv are there"):
+    with pytest.raises(DataError, match=r"there are gate\.tsv, other\.tsv"):
         Phototourism().parse(folder, "train")
     for file in folder.glob("*.tsv"):
         file.unlink()

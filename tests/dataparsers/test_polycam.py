@@ -85,7 +85,7 @@ BAD = {
     "zero focal length": (lambda c: c.update(fx=0), "'fx' is 0; it must be a number above zero"),
     "no centre": (lambda c: c.pop("cx"), "'cx' is None"),
     "no height": (lambda c: c.pop("height"), "'height' is None; it must be a number above zero"),
-    "endless height": (lambda c: c.update(height=1e300), "'height' is 1e.300; no image has such a side"),
+    "endless height": (lambda c: c.update(height=1e300), "'height' is 1e.300; it must be from 1"),
 }
 
 
@@ -108,7 +108,7 @@ def test_bad_folders_and_flags(capture: Path, tmp_path: Path) -> None:
         Polycam(depth_unit_scale_factor=0).parse(capture, "train")
     for file in (capture / "keyframes" / "cameras").iterdir():
         file.unlink()
-    with pytest.raises(DataError, match=r"holds no \.json of a camera"):
+    with pytest.raises(DataError, match=r"holds no camera"):
         Polycam().parse(capture, "train")
 
 

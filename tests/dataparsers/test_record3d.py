@@ -92,16 +92,16 @@ def pose(index: int, value: Any) -> Any:
 
 
 BAD = {
-    "no poses": (lambda c: c.pop("poses"), "'poses' must list the camera's poses"),
+    "no poses": (lambda c: c.pop("poses"), "'poses' must be a list of the camera's poses"),
     "short pose": (lambda c: c["poses"][4].pop(), "pose 4: 'poses' is .*; it must be a list of 7 numbers"),
     "nan pose": (pose(5, math.nan), "pose 4: 'poses' is nan"),
     "zero quaternion": (lambda c: c["poses"].__setitem__(4, 7 * [0]), "pose 4 has a quaternion of length 0"),
     "no K": (lambda c: c.pop("K"), "'K' is None; it must be a list of 9 numbers"),
-    "singular K": (lambda c: c["K"].__setitem__(0, 0.0), "'K' is .*; it must be a camera's matrix"),
+    "singular K": (lambda c: c["K"].__setitem__(0, 0.0), "'K' is .*; it must be an intrinsic matrix"),
     "K by rows": (lambda c: c.update(K=[FX, 0, CX, 0, FY, CY, 0, 0, 1]), "'K' is .* column by column"),
     "no width": (lambda c: c.pop("w"), "'w' is None; it must be a number above zero"),
-    "endless width": (lambda c: c.update(w=1e300), "'w' is 1e.300; no image has such a side"),
-    "other shape": (lambda c: c.update(w=HEIGHT, h=WIDTH), "is 20x15 pixels, but its camera is for the shape of 30x40"),
+    "endless width": (lambda c: c.update(w=1e300), "'w' is 1e.300; it must be from 1"),
+    "other shape": (lambda c: c.update(w=HEIGHT, h=WIDTH), "is 20x15 pixels, but its camera is for 30x40"),
 }
 
 

@@ -106,18 +106,6 @@ def test_threads_agree_and_repeat_bit_for_bit() -> None:
         assert all(torch.equal(a, b) for a, b in zip(found[threads], found[1], strict=True))
 
 
-def test_a_known_result_is_taken_and_gets_the_gradient() -> None:
-    inputs, weights = network((6,), (8, 5), 40)
-    leaves = [t.requires_grad_() for t in (*inputs, *weights)]
-    result = mlp(leaves[:1], leaves[1:])
-    direction = torch.randn(40, 5)
-    expected = torch.autograd.grad((result * direction).sum(), leaves)
-    again = mlp(leaves[:1], leaves[1:], known=result.detach())
-    assert torch.equal(again, result)
-    for a, b in zip(torch.autograd.grad((again * direction).sum(), leaves), expected, strict=True):
-        torch.testing.assert_close(a, b)
-
-
 def test_gradcheck_and_second_derivatives_of_the_reference() -> None:
     torch.manual_seed(0)
     leaves = [torch.randn(4, 3, dtype=torch.float64, requires_grad=True)]

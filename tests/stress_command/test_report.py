@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 from framework.tools.stress.report import Result, markdown, notes, settings_of, table
+from framework.tools.stress.scenes import ball_views
 from framework.tools.stress.trial import Budget
 from framework.tools.stress.verdict import Outcome, Verdict
 from tests.training.helpers import tiny_run
@@ -52,7 +53,8 @@ def test_markdown() -> None:
 
 
 def test_settings_are_those_of_the_short_run_without_folders(tmp_path: Path) -> None:
-    found = settings_of(tiny_run("instant-ngp", tmp_path / "data", tmp_path / "run"), Budget(7, None))
+    run = tiny_run("instant-ngp", tmp_path / "data", tmp_path / "run")
+    found = settings_of(run, Budget(7, None), ball_views().train.scene)
     assert found["max_num_iterations"] == 7
     assert found["num_levels"] == 4
     assert found["machine"]["seed"] == 42

@@ -1,0 +1,44 @@
+"""`import nerfloom` costs nothing, and everything in it says what it is."""
+
+import inspect
+import subprocess
+import sys
+
+import pytest
+
+import nerfloom
+
+
+def test_the_import_loads_neither_torch_nor_methods() -> None:
+    code = (
+        "import sys, nerfloom; "
+        "print(sorted({name.split('.')[0] for name in sys.modules} & {'torch', 'numpy', 'methods', 'dataparsers'})); "
+        "nerfloom.Rays; print('torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["[]", "True"]
+
+
+def test_every_name_is_found_and_documented() -> None:
+    assert {"OccupancyGrid", "sample", "render", "Rays", "Samples"} <= set(nerfloom.__all__)
+    for name in nerfloom.__all__:
+        thing = getattr(nerfloom, name)
+        assert thing.__name__ == name
+        assert name in dir(nerfloom)
+        assert inspect.getdoc(thing), name
+        members = vars(thing).items() if inspect.isclass(thing) else ()
+        for member, value in members:
+            if not member.startswith("_") and (inspect.isfunction(value) or isinstance(value, property)):
+                assert inspect.getdoc(value), f"{name}.{member}"
+
+
+def test_type_checkers_see_the_same_names() -> None:
+    """What stands under TYPE_CHECKING is the table of `__getattr__`."""
+    source = inspect.getsource(nerfloom)
+    for name, home in nerfloom._HOMES.items():
+        assert f"    from {home} import {name} as {name}\n" in source
+
+
+def test_an_unknown_name_is_refused() -> None:
+    with pytest.raises(AttributeError, match="module 'nerfloom' has no attribute 'Nonsense'"):
+        _ = nerfloom.Nonsense

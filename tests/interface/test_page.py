@@ -1,0 +1,46 @@
+"""docs/plug-and-play.md says what is so: its code runs, in the order in which it stands, and does what it is for."""
+
+import re
+
+import pytest
+import torch
+
+from tests.interface.test_examples import ROOT, differences
+
+PAGE = (ROOT / "docs" / "plug-and-play.md").read_text()
+
+
+def blocks(language: str) -> list[str]:
+    """The page's code in a language, and where it stands, so that a traceback names the line."""
+    found = re.finditer(rf"^```{language}\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+    return ["\n" * PAGE[: match.start(1)].count("\n") + match[1] for match in found]
+
+
+def test_its_code_runs() -> None:
+    torch.manual_seed(0)
+    names: dict = {}
+    for block in blocks("python"):
+        exec(compile(block, "docs/plug-and-play.md", "exec"), names)
+    losses = names["losses"]
+    assert sum(losses[-20:]) < sum(losses[:20]) / 10
+    assert names["error"] < 0.02
+    assert 0.5 < names["skipped"] < 1
+    assert names["surface"].shape == (1000, 3)
+    assert names["features"].shape == (1000, 16)
+    hit = (names["colors"] < 0.5).any(-1)
+    assert ((names["ball"].accumulation > 0.5) == hit).float().mean() > 0.98
+    assert 0.01 < names["picture"].accumulation.mean() < 0.5
+    assert names["fine"].per_ray == 192
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in names["proposal"].layers.parameters())
+
+
+def test_it_shows_the_lines_that_change() -> None:
+    (shown,) = blocks("diff")
+    assert shown.strip().splitlines() == differences()
+
+
+@pytest.mark.parametrize("name", sorted(set(re.findall(r"nerfloom\.(\w+)\(", PAGE))))
+def test_it_names_what_there_is(name: str) -> None:
+    import nerfloom
+
+    assert name in nerfloom.__all__

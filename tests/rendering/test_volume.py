@@ -1,0 +1,146 @@
+"""The volume renderer: what it asks a field, that it asks nothing twice, and density and opacity shown alike."""
+
+from typing import ClassVar
+
+import pytest
+import torch
+from torch import Tensor
+
+from framework.fields.base import Field
+from framework.geometry.points import Footprint, Points
+from framework.geometry.rays import Rays
+from framework.rendering.rendered import Rendered
+from framework.rendering.volume import VolumeRenderer, shade
+from framework.samplers.base import Sampler
+from framework.samplers.occupancy import OccupancySampler
+from framework.samplers.proposal import ProposalSampler
+from framework.samplers.uniform import UniformSampler
+
+BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
+
+
+class Cloud(Field):
+    """Smooth density around the origin, coloured by where it is; remembers what it was asked."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.thickness = torch.nn.Parameter(torch.tensor(8.0))
+        self.asked: list[Points] = []
+        self.cameras: Tensor | None = None
+
+    def sigma(self, positions: Tensor) -> Tensor:
+        return self.thickness * torch.exp(-4 * positions.square().sum(-1))
+
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        self.asked.append(points)
+        return self.sigma(points.positions), points.positions
+
+    def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
+        self.cameras = camera_indices
+        return 0.5 + 0.25 * features + 0.25 * directions
+
+
+class Opaque(Cloud):
+    """The same as opacities of intervals; its density, which a grid is filled by, is twice as large."""
+
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        sigma, features = super().density(points)
+        return 2 * sigma, features
+
+    def alpha(self, points: Points, directions: Tensor, deltas: Tensor) -> tuple[Tensor, Tensor]:
+        torch.testing.assert_close(directions.norm(dim=-1), torch.ones(len(points)))
+        self.asked.append(points)
+        return -torch.expm1(-self.sigma(points.positions) * deltas), points.positions
+
+
+class Sized(Cloud):
+    footprint: ClassVar[Footprint] = "gaussian"
+
+
+def some_rays(count: int, near: float = 1.5, far: float = 4.5) -> Rays:
+    generator = torch.Generator().manual_seed(0)
+    origins = 3 * torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    towards = torch.rand(count, 3, generator=generator) - 0.5 - origins
+    directions = torch.nn.functional.normalize(towards, dim=-1)
+    ends = torch.full((count,), near), torch.full((count,), far)
+    return Rays(origins, directions, *ends, torch.full((count,), 1e-2), camera_indices=torch.arange(count) % 3)
+
+
+def shown(field: Field, sampler: Sampler, rays: Rays) -> Rendered:
+    background = torch.tensor([0.1, 0.2, 0.3])
+    return VolumeRenderer().render(rays, sampler.sample(rays, field, False), field, background)
+
+
+SAMPLERS = {
+    "uniform": UniformSampler(48),
+    "occupancy": OccupancySampler(BOX, 8, 64, early_stop=0.0, train_early_stop=0.0),
+    "early stop": OccupancySampler(BOX, 8, 64, early_stop=0.2, train_early_stop=0.2),
+}
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_opacity_is_shown_like_the_density_that_it_is_of(name: str) -> None:
+    """Colours, depths, where rays end and the gradient; the density that is twice as large is not looked at."""
+    rays, found = some_rays(50), []
+    for field in (Cloud(), Opaque()):
+        rendered = shown(field, SAMPLERS[name], rays)
+        assert len(field.asked) == len({id(points) for points in field.asked})
+        assert sum(map(len, field.asked)) >= rendered.num_samples
+        rendered.rgb.sum().backward()
+        assert field.thickness.grad is not None
+        found.append((rendered, field.thickness.grad, sum(map(len, field.asked))))
+    (by_density, slope, asked), (by_alpha, other_slope, also_asked) = found
+    assert asked == also_asked  # nothing twice, and the same waves
+    for value in ("rgb", "depth", "accumulation", "weights"):
+        torch.testing.assert_close(getattr(by_alpha, value), getattr(by_density, value), rtol=1e-4, atol=1e-5)
+    assert torch.equal(by_alpha.median_depth, by_density.median_depth)
+    assert by_alpha.error_bound == by_density.error_bound == (0.2 if name == "early stop" else 0.0)
+    torch.testing.assert_close(other_slope, slope, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+@pytest.mark.parametrize("kind", [Cloud, Opaque])
+def test_rays_that_meet_nothing_show_the_background(kind: type[Cloud], name: str) -> None:
+    for rays in (some_rays(4, near=9.0, far=9.0), some_rays(0)):
+        rendered = shown(kind(), SAMPLERS[name], rays)
+        torch.testing.assert_close(rendered.rgb, torch.tensor([0.1, 0.2, 0.3]).expand(len(rays), 3))
+        torch.testing.assert_close(rendered.depth, rays.fars)
+
+
+def test_what_a_sampler_has_evaluated_is_not_evaluated_again() -> None:
+    field, rays = Cloud(), some_rays(20)
+    samples = SAMPLERS["occupancy"].sample(rays, field, False)
+    asked = len(field.asked)
+    VolumeRenderer().render(rays, samples, field, torch.ones(3))
+    assert len(field.asked) == asked > 0
+
+
+def test_opacity_is_asked_once_around_the_points_of_the_samples() -> None:
+    field, rays = Opaque(), some_rays(5)
+    sampler = UniformSampler(16)
+    shown(field, sampler, rays)
+    (points,) = field.asked
+    torch.testing.assert_close(points.positions, sampler.sample(rays, field, False).positions(rays))
+
+
+@pytest.mark.parametrize("sampler", [UniformSampler(16), ProposalSampler(BOX, (8, 8, 4), log2_table_size=8)])
+def test_a_field_that_asks_for_sizes_is_given_them(sampler: Sampler) -> None:
+    field, rays = Sized(), some_rays(5)
+    rendered = shown(field, sampler.eval(), rays)
+    (points,) = field.asked
+    assert points.covariances is not None
+    assert points.covariances.shape == (rendered.num_samples, 3)
+    assert bool((points.covariances >= 0).all())
+
+
+def test_each_sample_has_the_camera_of_its_ray() -> None:
+    field, rays = Cloud(), some_rays(4)
+    shown(field, UniformSampler(2), rays)
+    assert field.cameras is not None
+    assert field.cameras.tolist() == [0, 0, 1, 1, 2, 2, 0, 0]
+
+
+def test_samples_that_nobody_evaluated_are_refused() -> None:
+    field, rays = Cloud(), some_rays(2)
+    with pytest.raises(ValueError, match="density and features are attached"):
+        shade(rays, UniformSampler(4).sample(rays, field, False), field, torch.ones(3))

@@ -33,7 +33,6 @@ NOT_YET: tuple[str, ...] = (
     "framework/tools/benchmarks",
     "framework/tools/comparison",
     "framework/tools/integrations",
-    "framework/tools/processing",
     "framework/tools/stress",
     "framework/tools/testing",
     "framework/training",

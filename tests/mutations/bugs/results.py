@@ -412,7 +412,7 @@ BUGS = (
     Bug(
         "exif-turn-inverted",
         "process-data",
-        "framework/tools/processing/photographs.py",
+        "framework/tools/processing/images.py",
         "6: Image.Transpose.ROTATE_270",
         "6: Image.Transpose.ROTATE_90",
         "upright photographs of phones come out head down",

@@ -30,7 +30,6 @@ NOT_YET: tuple[str, ...] = (
     "framework/samplers",
     "framework/tools/__init__.py",
     "framework/tools/benchmarks",
-    "framework/tools/integrations",
     "framework/tools/stress",
     "framework/tools/testing",
     "framework/training",

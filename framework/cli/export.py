@@ -116,7 +116,7 @@ def _cameras(flags: CameraFlags, trained: Trained, placement: Placement, path: P
 
     # With its images: one that could not be read has no camera in the model.
     dataset = load_split(trained.run, "train").to(trained.model.device)
-    cameras = believed(trained.model, dataset.cameras)
+    cameras = refined_cameras(trained.model, dataset.cameras)
     write_json(path, camera_list(cameras, dataset.names, placement))
     say(f"{len(cameras)} cameras: {path}")
 

@@ -110,7 +110,7 @@ def _points(flags: PointFlags, trained: Trained, placement: Placement, path: Pat
 
 def _cameras(flags: CameraFlags, trained: Trained, placement: Placement, path: Path) -> None:
     from framework.base.console import say
-    from framework.export.cameras import believed, camera_list
+    from framework.export.cameras import camera_list, refined_cameras
     from framework.training.datasets import load_split
     from framework.training.run import write_json
 

@@ -12,7 +12,7 @@ from framework.cameras.poses import Placement
 from framework.model import Model, RefinesPoses
 
 
-def believed(model: Model[Any], cameras: Cameras) -> Cameras:
+def refined_cameras(model: Model[Any], cameras: Cameras) -> Cameras:
     """Return a run's training cameras, refined where the model has refined them.
 
     Args:

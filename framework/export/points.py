@@ -54,13 +54,17 @@ def surface_points(model: RayModel[Any], dataset: Dataset, count: int, reach: fl
         positions = rays.origins + depth[:, None] * rays.directions
         selected = (out.accumulation >= OPAQUE) & (depth < rays.fars) & positions.isfinite().all(-1)
         if reach is not None:
-            kept &= ((positions - middle).abs() <= reach * half).all(-1)
-        normals = None if out.normals is None else safe_normalize(out.normals.float())[kept].cpu()
-        yield SurfacePoints(positions[kept].cpu(), out.rgb.float().clamp(0, 1)[kept].cpu(), normals)
+            selected &= ((positions - middle).abs() <= reach * half).all(-1)
+        normals = None if out.normals is None else safe_normalize(out.normals.float())[selected].cpu()
+        yield SurfacePoints(positions[selected].cpu(), out.rgb.float().clamp(0, 1)[selected].cpu(), normals)
 
 
 def joined(parts: Iterator[SurfacePoints]) -> SurfacePoints:
-    """All points of some parts."""
+    """Return the points of several parts in one.
+
+    Args:
+        parts: at least one.
+    """
     found = list(parts)
     whole = SurfacePoints(torch.cat([p.positions for p in found]), torch.cat([p.colors for p in found]), None)
     if any(part.normals is None for part in found):

@@ -197,7 +197,7 @@ class NerfloomMethod:
         """
         if appearance_of(self._model) is None:
             raise NotImplementedError(f"{self.name} has learnt one appearance for all photographs")
-        data = dataset_of(Photographs.of(dataset), self._frame, "ignored").to(self._model.device)
+        data = dataset_of(ArrayImages.of(dataset), self._frame, "ignored").to(self._model.device)
         pixels = torch.arange(len(data.pixels), device=data.device) if data.kept is None else data.kept.pixels()
         found = fit_appearance(self._model, data, pixels, self._background, self._vector(embedding))
         assert found is not None

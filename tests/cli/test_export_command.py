@@ -78,7 +78,7 @@ def test_placement_is_undone_and_refinement_kept() -> None:
     cameras = Cameras(placement.poses(poses).float(), *[numbers] * 4, *[numbers.long()] * 2)  # type: ignore[arg-type]
     refinement = PoseRefinement(3)
     torch.nn.init.constant_(refinement.tangents, 0.1)
-    listed = camera_list(believed(Refining(refinement), cameras), ["a", "b", "c"], placement)
+    listed = camera_list(refined_cameras(Refining(refinement), cameras), ["a", "b", "c"], placement)
     moved = torch.tensor([row["transform"] for row in listed])
     # Each camera's centre is moved by 0.1 along each axis of the scene, which is 4 times as much in the input.
     shift = (moved[:, :, 3] - poses[:, :, 3].float()).norm(dim=-1)

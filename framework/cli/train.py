@@ -106,6 +106,7 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
     import tyro
 
     from framework.base.registry import load_dataparser
+    from framework.cli.flag_groups import grouped_flags
     from framework.data.data_folder import find_data
     from framework.training.run import run_folder
 
@@ -143,6 +144,7 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
         args=flags,
         default=both(run.config, parser),
         config=options,
+        registry=grouped_flags(run.method, run.config, named, parser),
     )
     config = dataclasses.replace(parsed.method, data=data)
     folder = run_folder(run.method, config) if fresh else run.folder

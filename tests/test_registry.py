@@ -197,7 +197,7 @@ def test_formats_that_fail_do_not_stop_others(
     assert find_data(shared_tiny) == (shared_tiny, "blender")
     printed = capsys.readouterr()
     assert "data format 'burning' failed to examine" in printed.out + printed.err
-    assert "the disk is on fire; it is left out" in (printed.out + printed.err).replace("\n", " ")
+    assert "the disk is on fire; it is ignored" in (printed.out + printed.err).replace("\n", " ")
     assert "data format 'never' of NERFLOOM_DATAPARSERS cannot be loaded" in (printed.out + printed.err)
 
 

@@ -1,4 +1,4 @@
-"""What is given: rays, and a user's functions of positions; and what is said where they are not as they should be.
+"""Calls a user's functions of positions, and checks the rays that are given and the tensors that are returned.
 
 A function is called with the positions alone where the rays have no times, and with the times behind them where they
 have. Whatever else it needs (camera indices, lengths of intervals) it can take from the samples around it.
@@ -26,7 +26,7 @@ UNIT = 1e-3
 
 
 class DensityOnly(Field):
-    """A function of positions as a field without colour, for samplers, which ask for nothing but density.
+    """Makes a function of positions a field without colour, for samplers, which ask for nothing but density.
 
     Args:
         sigma_fn: see `SigmaFunction`; None for a field that is empty everywhere.
@@ -48,9 +48,12 @@ class DensityOnly(Field):
 
 
 def as_density(sigma_fn: SigmaFunction) -> DensityFunction:
-    """A user's function as samplers call it: with times or None, and with (empty) features beside the density.
+    """Wrap a user's function as samplers call it: with times or None, and with (empty) features beside the density.
 
-    The density is float32, or float64 where it is that already.
+    Args:
+        sigma_fn: see `SigmaFunction`.
+    Returns: a function whose density is float32, or float64 where it is that already. It raises ValueError where
+        `sigma_fn` returns another shape than (N,).
     """
 
     def density(points: Points) -> tuple[Tensor, Tensor]:
@@ -65,14 +68,15 @@ def as_density(sigma_fn: SigmaFunction) -> DensityFunction:
 def evaluate(
     function: RgbFunction, what: str, rays: Rays, samples: Samples
 ) -> tuple[Tensor, Tensor, Mapping[str, Tensor]]:
-    """Colours (N, 3), density or alpha (N,), and further properties by name of N samples, gradients included.
+    """Evaluate a user's function at N samples, gradients included.
 
     Args:
         function: see `RgbFunction`.
         what: the name of what it returns beside colours, for errors: "sigma" or "alpha".
         rays: whose samples these are. The positions have a gradient to them, with t held fixed.
         samples: where to evaluate.
-    Raises: ValueError where a result is not of the shape it should be.
+    Returns: colours (N, 3), density or alpha (N,), and further properties (N, ...) by name.
+    Raises: ValueError where a result is of another shape.
     """
     times = samples.times(rays)
     arguments = samples.positions(rays), rays.directions.index_select(0, samples.ray_indices)
@@ -80,29 +84,36 @@ def evaluate(
     extras: Mapping[str, Tensor] = rest[0] if rest else {}
     check_shape(rgb, (len(samples), 3), f"rgb_{what}_fn returned rgb")
     check_shape(values, (len(samples),), f"rgb_{what}_fn returned {what}")
-    for name, found in extras.items():
-        check_shape(found, (len(samples), *getattr(found, "shape", ())[1:]), f"rgb_{what}_fn returned {name}")
+    for name, property_ in extras.items():
+        shape = (len(samples), *getattr(property_, "shape", ())[1:])
+        check_shape(property_, shape, f"rgb_{what}_fn returned {name}")
     return rgb, values, extras
 
 
 def check_shape(values: Any, shape: tuple[int, ...], what: str) -> None:
-    """Check that a function has returned a tensor of the shape that was asked for.
+    """Check that a function has returned a tensor of the shape that it must have.
 
+    Args:
+        values: what was returned.
+        shape: which it must have.
+        what: which function returned what, for the error.
     Raises: ValueError that names `what`, both shapes, and what to do. A density of shape (N, 1) instead of (N,) would
         otherwise become one for each pair of samples, silently.
     """
-    found = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
-    if found != shape:
-        hint = ": squeeze its last dimension" if found == (*shape, 1) else ""
-        raise ValueError(f"{what} of shape {found}; it must be a tensor of shape {shape}{hint}")
+    actual = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
+    if actual != shape:
+        hint = ": squeeze its last dimension" if actual == (*shape, 1) else ""
+        raise ValueError(f"{what} of shape {actual}; it must be a tensor of shape {shape}{hint}")
 
 
 def check_rays(rays: Rays) -> None:
     """Check that rays are (R, 3) and their directions of length 1, so that t is a distance.
 
-    Lengths are looked at on a CPU alone: elsewhere that would wait for the device.
+    Lengths are checked on a CPU only: elsewhere that would wait for the device.
 
-    Raises: ValueError.
+    Args:
+        rays: R rays.
+    Raises: ValueError that names the first property that is wrong, or the ray whose direction is worst.
     """
     for name in ("origins", "directions"):
         shape = tuple(getattr(rays, name).shape)
@@ -121,5 +132,5 @@ def check_rays(rays: Rays) -> None:
 
 
 def at_least_float32(values: Tensor) -> Tensor:
-    """The values in float32, or in float64 where they are that already."""
+    """Convert values (N, ...) of lower precision to float32."""
     return values if values.dtype == torch.float64 else values.float()

@@ -1,4 +1,4 @@
-"""From samples to what is seen: a user's colours and densities, or alphas, composited over a background."""
+"""Composites a user's colours and densities, or alphas, over a background."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from nerfloom.functions import RgbFunction, at_least_float32, check_rays, evalua
 
 @dataclass(frozen=True)
 class Rendering:
-    """What is seen along R rays, of N samples."""
+    """Holds what N samples along R rays add up to."""
 
     rgb: Tensor
     """(R, 3) colour over the background."""
@@ -61,17 +61,17 @@ def render(
     if samples.num_rays != len(rays):
         raise ValueError(f"the samples are of {samples.num_rays} rays, but there are {len(rays)}")
     if rgb_alpha_fn is None and rgb_sigma_fn is not None:
-        rgb, sigma, given = evaluate(rgb_sigma_fn, "sigma", rays, samples)
+        rgb, sigma, properties = evaluate(rgb_sigma_fn, "sigma", rays, samples)
         intervals = samples
     elif rgb_alpha_fn is not None and rgb_sigma_fn is None:
-        rgb, alpha, given = evaluate(rgb_alpha_fn, "alpha", rays, samples)
+        rgb, alpha, properties = evaluate(rgb_alpha_fn, "alpha", rays, samples)
         intervals, sigma = unit_intervals(samples, alpha)
     else:
         raise ValueError("render needs either rgb_sigma_fn or rgb_alpha_fn")
-    seen = volume_render(rays, intervals, sigma, rgb, torch.as_tensor(background, device=rgb.device))
-    assert seen.weights is not None
-    extras = {name: accumulate(samples, seen.weights, values) for name, values in given.items()}
-    return Rendering(seen.rgb, seen.depth, seen.median_depth, seen.accumulation, seen.weights, extras)
+    summed = volume_render(rays, intervals, sigma, rgb, torch.as_tensor(background, device=rgb.device))
+    assert summed.weights is not None
+    extras = {name: accumulate(samples, summed.weights, values) for name, values in properties.items()}
+    return Rendering(summed.rgb, summed.depth, summed.median_depth, summed.accumulation, summed.weights, extras)
 
 
 def accumulate(samples: Samples, weights: Tensor, values: Tensor) -> Tensor:

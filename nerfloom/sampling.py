@@ -1,4 +1,4 @@
-"""Other ways to choose samples, as functions: evenly, by the inverse CDF of weights, and by proposals."""
+"""Chooses samples without a grid: evenly, by the inverse CDF of weights, or by proposals."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from nerfloom.functions import DensityOnly, SigmaFunction, as_density, check_ray
 
 
 def clip_to_box(rays: Rays, box: Tensor | Sequence[Sequence[float]]) -> Rays:
-    """The rays between where they enter and leave a box; of length 0 where they miss it.
+    """Clip rays to where they enter and leave a box; a ray that misses it gets length 0.
 
     Args:
         rays: R rays, near and far ends being kept where they are inside.
@@ -31,7 +31,7 @@ def clip_to_box(rays: Rays, box: Tensor | Sequence[Sequence[float]]) -> Rays:
 
 
 def sample_uniform(rays: Rays, count: int, *, jitter: bool = False) -> Samples:
-    """Samples in bins of equal length between near and far: NeRF (Mildenhall et al. 2020), equation 2.
+    """Sample rays in bins of equal length between near and far: NeRF (Mildenhall et al. 2020), equation 2.
 
     Args:
         rays: R rays with near and far ends.
@@ -45,7 +45,7 @@ def sample_uniform(rays: Rays, count: int, *, jitter: bool = False) -> Samples:
 
 
 def sample_inverse_cdf(rays: Rays, samples: Samples, weights: Tensor, count: int, *, jitter: bool = False) -> Samples:
-    """The same samples and `count` more on each ray, where the weights are: NeRF, section 5.2.
+    """Add `count` samples to each ray where the weights are: NeRF, section 5.2.
 
     Each stands for what is nearer to it than to the others, so that they share the ray from near to far between them.
 
@@ -77,7 +77,7 @@ def sample_proposals(
     scale: float | None = None,
     power: float = 1.0,
 ) -> Samples:
-    """Samples where small density fields propose them: mip-NeRF 360 (Barron et al. 2022), section 3.
+    """Sample rays where small density fields propose it: mip-NeRF 360 (Barron et al. 2022), section 3.
 
     With gradients enabled the proposals' own are attached to the result: add `interlevel_loss(samples, weights)`, of
     the weights that were rendered, to the loss, and they learn to bound these from above.
@@ -105,9 +105,6 @@ def sample_proposals(
 
 
 def _check_ends(rays: Rays) -> None:
-    """Check that rays end, where they were given no far ends.
-
-    Raises: ValueError.
-    """
+    """Check that no ray's far end is infinite, which it is if it was not given."""
     if bool(rays.fars.isinf().any()):
         raise ValueError("a ray ends nowhere: give Rays its fars, or nerfloom.clip_to_box(rays, box)")

@@ -1,4 +1,4 @@
-"""Samples where there is something, and where light gets: an occupancy grid, and marching with an early stop."""
+"""Skips empty space by an occupancy grid, and what is hidden by marching with an early stop."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FILL_STEPS = 1025
 
 
 class OccupancyGrid(nn.Module):
-    """Which cells of a box are not empty: Instant-NGP's grid (Mueller et al. 2022, appendix E.2).
+    """Records which cells of a box are not empty: Instant-NGP's grid (Mueller et al. 2022, appendix E.2).
 
     It has buffers and no parameters: as a part of a model it is saved with it and moves to its device. As long as
     nothing is known of a cell, it is taken for occupied.
@@ -73,10 +73,10 @@ class OccupancyGrid(nn.Module):
         return self.marcher.occupied.view(3 * (self.marcher.resolution,))
 
     def update(self, step: int, sigma_fn: SigmaFunction) -> None:
-        """Look at some cells and mark anew which are occupied: every 8 steps at first, every 16 later.
+        """Evaluate the density in some cells and mark anew which are occupied: every 8 steps at first, every 16 later.
 
-        To be called before each training step. By step 256 each cell was looked at four times, but that of those found
-        empty only one in eight is looked at again.
+        To be called before each training step. By step 256 all cells have been visited, those that are not empty four
+        times.
 
         Args:
             step: number of the training step, from 0.
@@ -87,12 +87,21 @@ class OccupancyGrid(nn.Module):
         self.marcher.update(step, as_density(sigma_fn))
 
     def fill(self, sigma_fn: SigmaFunction) -> None:
-        """Look at all cells, for a field that has been trained already. Arguments as for `update`."""
+        """Evaluate the density in all cells, for a field that has been trained already.
+
+        Args:
+            sigma_fn: as for `update`.
+        Raises: ValueError where `sigma_fn` returns another shape.
+        """
         for step in range(FILL_STEPS):
             self.update(step, sigma_fn)
 
     def carve(self, kept: Tensor) -> None:
-        """Cells outside `kept`, (n, n, n) bool along x, y, z, are known to be empty, and stay so for good."""
+        """Mark cells as empty for good, whatever updates say of them.
+
+        Args:
+            kept: (n, n, n) bool along x, y, z; False where a cell is empty.
+        """
         self.marcher.carve(kept.reshape(-1).to(self.marcher.occupied.device))
 
 
@@ -104,7 +113,7 @@ def sample(
     early_stop: float = 1e-4,
     jitter: bool = False,
 ) -> Samples:
-    """Samples in occupied cells, as far as light gets.
+    """Sample rays in occupied cells, as far as light gets.
 
     Rays are marched in waves, from near to far; a ray whose transmittance has fallen below `early_stop` is not followed
     any further. What is behind could have changed a colour channel in [0, 1] by at most `early_stop`. For what the
@@ -119,7 +128,8 @@ def sample(
             a teacher as 1e-4, and faster.
         jitter: each ray's steps begin at a random share of one (training); else at 0 (evaluation).
     Returns: packed samples of R rays, ray by ray and from near to far.
-    Raises: ValueError where rays, times or what `sigma_fn` returns are not as they should be.
+    Raises: ValueError where rays are of another shape or length, rays or the grid alone know of times, or `sigma_fn`
+        returns another shape.
     """
     check_rays(rays)
     if rays.times is None and grid.moving:
@@ -128,5 +138,5 @@ def sample(
         raise ValueError("the rays have times, but the grid is of a still scene: OccupancyGrid(..., moving=True)")
     with torch.no_grad():
         stop = 0.0 if sigma_fn is None else early_stop
-        found = grid.marcher.sample(rays, DensityOnly(sigma_fn), jitter, stop)
-    return replace(found, sigma=None, features=None)
+        samples = grid.marcher.sample(rays, DensityOnly(sigma_fn), jitter, stop)
+    return replace(samples, sigma=None, features=None)

@@ -11,9 +11,8 @@ import pytest
 import framework
 
 ROOT = Path(__file__).parents[1]
-FILES = sorted(
-    file for folder in ("nerfloom", "framework", "methods", "dataparsers") for file in (ROOT / folder).rglob("*.py")
-)
+PACKAGES = ("nerfloom", "framework", "methods", "dataparsers")
+FILES = sorted(file for package in PACKAGES for file in (ROOT / package).rglob("*.py"))
 
 
 def named(file: Path) -> str:

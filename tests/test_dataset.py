@@ -17,7 +17,7 @@ from framework.data.dataset import assemble, existing, image_size, load_dataset,
 from framework.data.decoding import from_arrays
 from framework.data.masks import read_mask
 from framework.data.pixels import background_colors, composite
-from framework.tools.processing.photographs import prepare
+from framework.tools.processing.images import prepare
 from tests.images import noise, parsed, write_mask
 
 

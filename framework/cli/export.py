@@ -110,13 +110,13 @@ def _points(flags: PointFlags, trained: Trained, placement: Placement, path: Pat
 
 def _cameras(flags: CameraFlags, trained: Trained, placement: Placement, path: Path) -> None:
     from framework.base.console import say
-    from framework.export.cameras import believed, camera_list
+    from framework.export.cameras import camera_list, refined_cameras
     from framework.training.datasets import load_split
     from framework.training.run import write_json
 
     # With its images: one that could not be read has no camera in the model.
     dataset = load_split(trained.run, "train").to(trained.model.device)
-    cameras = believed(trained.model, dataset.cameras)
+    cameras = refined_cameras(trained.model, dataset.cameras)
     write_json(path, camera_list(cameras, dataset.names, placement))
     say(f"{len(cameras)} cameras: {path}")
 

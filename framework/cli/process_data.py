@@ -150,8 +150,8 @@ def _process(flags: OutputFlags) -> None:
 
 def _find_poses(flags: ColmapFlags) -> None:
     from framework.tools.processing import colmap
+    from framework.tools.processing.images import find_images
     from framework.tools.processing.output import claim
-    from framework.tools.processing.photographs import find_photographs
     from framework.tools.processing.pipeline import process
     from framework.tools.processing.video import open_video, write_frames
 
@@ -168,7 +168,7 @@ def _find_poses(flags: ColmapFlags) -> None:
         say(f"video: {len(sources)} frames taken, in {seconds['reading the video']:.1f} s")
     else:
         folder = flags.data
-        sources = find_photographs(folder, [flags.output_dir, *([] if masks is None else [masks])])
+        sources = find_images(folder, [flags.output_dir, *([] if masks is None else [masks])])
         claim(flags.output_dir, flags.data, flags.overwrite)
     process(folder, sources, flags, masks, isinstance(flags, VideoFlags), seconds)
 

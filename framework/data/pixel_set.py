@@ -93,8 +93,8 @@ class PixelSet:
 
     def to(self, device: torch.device | str) -> PixelSet:
         """Return the set on `device`."""
-        values = (getattr(self, f.name) for f in fields(self))
-        return PixelSet(*(None if values is None else values.to(device) for values in values))  # type: ignore[arg-type]
+        tensors = (getattr(self, f.name) for f in fields(self))
+        return PixelSet(*(None if values is None else values.to(device) for values in tensors))  # type: ignore[arg-type]
 
     def listed(self) -> PixelSet:
         """Return the set with the list of all its pixels in `every`."""

@@ -1,1 +1,1 @@
-"""What a trained run leaves for other programs, in the frame and units of its input."""
+"""Exports of a trained run for other programs, in the frame and units of its input."""

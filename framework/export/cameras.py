@@ -1,4 +1,4 @@
-"""The training cameras, where they are believed to be after training."""
+"""Export of the training cameras, with refined poses."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from framework.cameras.poses import Placement
 from framework.model import Model, RefinesPoses
 
 
-def believed(model: Model[Any], cameras: Cameras) -> Cameras:
+def refined_cameras(model: Model[Any], cameras: Cameras) -> Cameras:
     """Return a run's training cameras, refined where the model has refined them.
 
     Args:
@@ -23,12 +23,12 @@ def believed(model: Model[Any], cameras: Cameras) -> Cameras:
 
 
 def camera_list(cameras: Cameras, names: Sequence[str], placement: Placement) -> list[dict[str, Any]]:
-    """File names with camera-to-world matrices (3 x 4, OpenGL axes) of the input's frame, as nerfstudio lists them.
+    """Return file names and camera-to-world matrices (3 x 4, OpenGL axes) in the input's frame, in nerfstudio's format.
 
     Args:
-        cameras: M, in the scene's frame.
+        cameras: M cameras in the scene's frame.
         names: M file names.
-        placement: of the input in the scene.
+        placement: the transform from the input's frame to the scene's.
     """
     poses: Tensor = placement.original_poses(cameras.camera_to_worlds.double().cpu())
     return [{"file_path": name, "transform": pose} for name, pose in zip(names, poses.tolist(), strict=True)]

@@ -1,4 +1,4 @@
-"""A point cloud of what the training cameras see: where half of each ray's light is gone."""
+"""Export of a point cloud of what the training cameras see, at the median depth of each ray."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from framework.kernels.math import safe_normalize
 from framework.ray_model import RayModel
 
 OPAQUE = 0.5
-"""Rays less opaque than this end in no surface."""
+"""Minimum opacity of a ray that ends on a surface."""
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,11 @@ class SurfacePoints:
     """K points on surfaces, scene coordinates."""
 
     positions: Tensor
-    """(K, 3)."""
+    """(K, 3) positions."""
     colors: Tensor
-    """(K, 3) in [0, 1], as seen from where they were found."""
+    """(K, 3) colours in [0, 1], as seen from the respective camera."""
     normals: Tensor | None
-    """(K, 3) unit, of a method that has them."""
+    """(K, 3) unit normals, if the method has them."""
 
 
 @torch.no_grad()
@@ -36,11 +36,11 @@ def surface_points(model: RayModel[Any], dataset: Dataset, count: int, reach: fl
     """Points that random training pixels show, chunk by chunk; fewer than `count` where rays end in nothing.
 
     Args:
-        model: in evaluation mode.
+        model: the model in evaluation mode.
         dataset: the training split, on the model's device.
-        count: rays.
-        reach: points farther from the box's middle than this many of its half edges, along any axis, are left out;
-            None keeps all.
+        count: number of rays.
+        reach: maximum distance of a point from the box's centre along each axis, in half edges of the box; None keeps
+            all points.
     """
     background, scene, box = evaluation_background(model), model.scene, model.scene.box.to(model.device)
     middle, half = box.mean(0), (box[1] - box[0]) / 2
@@ -52,15 +52,19 @@ def surface_points(model: RayModel[Any], dataset: Dataset, count: int, reach: fl
             out = model.render(rays, background)
         depth = out.median_depth.float()
         positions = rays.origins + depth[:, None] * rays.directions
-        kept = (out.accumulation >= OPAQUE) & (depth < rays.fars) & positions.isfinite().all(-1)
+        selected = (out.accumulation >= OPAQUE) & (depth < rays.fars) & positions.isfinite().all(-1)
         if reach is not None:
-            kept &= ((positions - middle).abs() <= reach * half).all(-1)
-        normals = None if out.normals is None else safe_normalize(out.normals.float())[kept].cpu()
-        yield SurfacePoints(positions[kept].cpu(), out.rgb.float().clamp(0, 1)[kept].cpu(), normals)
+            selected &= ((positions - middle).abs() <= reach * half).all(-1)
+        normals = None if out.normals is None else safe_normalize(out.normals.float())[selected].cpu()
+        yield SurfacePoints(positions[selected].cpu(), out.rgb.float().clamp(0, 1)[selected].cpu(), normals)
 
 
 def joined(parts: Iterator[SurfacePoints]) -> SurfacePoints:
-    """All points of some parts."""
+    """Return the points of several parts in one.
+
+    Args:
+        parts: at least one.
+    """
     found = list(parts)
     whole = SurfacePoints(torch.cat([p.positions for p in found]), torch.cat([p.colors for p in found]), None)
     if any(part.normals is None for part in found):

@@ -52,8 +52,8 @@ class Rays:
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> Rays:
         """Apply a function to every field that is not None."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return replace(self, **{name: change(values) for name, values in values.items() if values is not None})
+        tensors = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{name: change(values) for name, values in tensors.items() if values is not None})
 
     def points(self, ray_indices: Tensor, t: Tensor) -> Tensor:
         """Return positions along rays.

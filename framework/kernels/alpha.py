@@ -1,4 +1,4 @@
-"""Compositing of alphas: the share of light that each sample stops, as of a surface (NeuS, Wang et al. 2021, eq. 10).
+"""Composites alphas, the share of light that each sample stops, as of a surface (NeuS, Wang et al. 2021, eq. 10).
 
     T_i = prod_{j < i} (1 - alpha_j)            transmittance in front of a sample
     w_i = T_i alpha_i                           weight
@@ -18,10 +18,14 @@ from framework.kernels.compositing import Composited, composite
 
 
 def alpha_depth(alpha: Tensor) -> Tensor:
-    """Optical depth (N,) = -log(1 - alpha), at least float32; finite at 1, as is its gradient. NaN stays NaN.
+    """Compute the optical depth (N,) -log(1 - alpha), which is finite at 1, as is its gradient; NaN stays NaN.
 
     An alpha within sqrt(eps) of 1 (3.5e-4 in float32) is taken for 1 - sqrt(eps), with the gradient of the identity.
     Nearer to 1 the gradient of the sums, whose rounding 1 / (1 - alpha) multiplies, would lose its digits.
+
+    Args:
+        alpha: (N,) in [0, 1].
+    Returns: float32, or float64 where alpha is that.
     """
     alpha = alpha if alpha.dtype == torch.float64 else alpha.float()
     most = 1 - torch.finfo(alpha.dtype).eps ** 0.5
@@ -29,14 +33,20 @@ def alpha_depth(alpha: Tensor) -> Tensor:
 
 
 def unit_intervals(samples: Samples, alpha: Tensor) -> tuple[Samples, Tensor]:
-    """The samples as intervals of length 1, t as it was, and the density (N,) that stops in each what `alpha` does."""
+    """Turn alphas into densities over intervals of length 1, which stop the same share of light.
+
+    Args:
+        samples: N samples.
+        alpha: (N,) in [0, 1].
+    Returns: the samples with such intervals and with t as it was, and their density (N,).
+    """
     depth = alpha_depth(alpha)
     t = samples.t
     return replace(samples, t_starts=torch.zeros_like(t), t_ends=torch.ones_like(t), points=t), depth
 
 
 def composite_alpha(samples: Samples, alpha: Tensor, rgb: Tensor, background: Tensor, fars: Tensor) -> Composited:
-    """Colour, opacity and depth of R rays from N packed samples with alphas.
+    """Composite N packed samples with alphas to colour, opacity and depth of R rays.
 
     Weights are within sqrt(eps) of their alpha's dtype (3.5e-4 in float32) of the products above.
 

@@ -226,7 +226,7 @@ class ReferenceMarch:
         self.rays = rays
         self.t_starts, self.t_ends, self.offsets = candidates(rays, occupancy, step, cone, shift)
         self.counts = self.offsets[1:] - self.offsets[:-1]
-        self.spent = torch.zeros(len(rays), device=rays.origins.device)
+        self.spent = rays.origins.new_zeros(len(rays))
         self.budget = -math.log(early_stop) if early_stop > 0 else math.inf
         self.alive = self.counts.nonzero().squeeze(-1)
         self.handed_out = 0
@@ -250,7 +250,7 @@ class ReferenceMarch:
     def advance(self, sigma: Tensor) -> None:
         """As `March.advance`."""
         wave = self.waves[-1]
-        tau = optical_depth(sigma.detach().float(), wave.t_ends - wave.t_starts)
+        tau = optical_depth(sigma.detach().to(self.spent.dtype), wave.t_ends - wave.t_starts)
         before = self.spent[wave.owners] + segmented_sum(tau, self.places)
         self.reached.append((~(before >= self.budget)).to(torch.uint8))
         self.spent.index_add_(0, wave.owners, tau)

@@ -124,7 +124,7 @@ def propose(
     learning: bool,
     endless: bool,
 ) -> Samples:
-    """Samples of the last level, each level being drawn by the densities of the one before.
+    """Draw samples in levels, each by the densities of the one before, and return those of the last.
 
     Args:
         rays: R rays, sampled from near to far.
@@ -167,9 +167,11 @@ def propose(
 
 
 def distances(edges: Tensor, nears: Tensor, fars: Tensor, scale: float | None) -> Tensor:
-    """Distances (R, B) of normalised ones `edges` (R, B) between the rays' ends (R,).
+    """Convert normalised distances (R, B) to distances along rays (R, B).
 
     Args:
+        edges: (R, B) in [0, 1].
+        nears, fars: (R,) the rays' ends, where edges of 0 and 1 lie.
         scale: the distance up to which they are even, being in disparity beyond; None for even ones throughout.
     """
     if scale is None:

@@ -36,7 +36,7 @@ def test_two_methods_one_that_fails_and_a_second_call(shared_tiny: Path, tmp_pat
     again = run("ns-compare", "--methods", NGP, KPLANES, *flags)
     assert again.returncode == 0, again.stderr
     assert "[1/2]" in again.stderr
-    assert again.stderr.count("done before") == 1
+    assert again.stderr.count("already finished") == 1
     kept = {path: when for path, when in before.items() if "instant-ngp" in str(path)}
     assert kept
     assert all(path.stat().st_mtime_ns == when for path, when in kept.items())
@@ -48,8 +48,8 @@ def test_two_methods_one_that_fails_and_a_second_call(shared_tiny: Path, tmp_pat
 @pytest.mark.parametrize(
     ("flags", "reason"),
     [
-        (("--methods", "kplanes"), "say how long each method trains"),
-        (("--max-seconds", 1), "--methods names no method"),
+        (("--methods", "kplanes"), "set how long each method trains"),
+        (("--max-seconds", 1), "--methods is empty"),
         (("--methods", "kplanez", "--max-seconds", 1), "Did you mean 'kplanes'"),
         (("--methods", "kplanes", "--max-seconds", 1, "--data", "/no/such/folder"), "there is no such folder"),
         (("--load-config",), "--load-config needs a file"),

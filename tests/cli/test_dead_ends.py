@@ -137,10 +137,10 @@ def test_output_over_the_input(tmp_path: Path, refused: Refused) -> None:
     folder = tmp_path / "scan" / "images"
     folder.mkdir(parents=True)
     Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(folder / "0.jpg")
-    for data, words in ((folder, "overlaps what is written"), (folder.parent, "is the folder that --data names")):
+    for data, words in ((folder, "overlaps the files written"), (folder.parent, "is the same folder as --data")):
         said = refused(process_data.main, "images", "--data", data, "--output-dir", folder.parent)
         assert words in said
         assert said.endswith(f"--output-dir {tmp_path / 'scan-processed'}")
     shutil.move(folder, folder.with_name("raw"))  # beside what is written: nothing is in danger
     said = refused(process_data.main, "images", "--data", folder.with_name("raw"), "--output-dir", folder.parent)
-    assert "holds 'raw' but no transforms.json; name a new folder, or give --overwrite" in said
+    assert "holds 'raw' but no transforms.json; choose a new folder, or use --overwrite" in said

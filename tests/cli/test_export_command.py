@@ -12,7 +12,7 @@ from framework.cameras.poses import Placement
 from framework.cameras.refinement import PoseRefinement
 from framework.cli.export import main
 from framework.data.ply import read_points, write_points
-from framework.export.cameras import believed, camera_list
+from framework.export.cameras import camera_list, refined_cameras
 from tests.conftest import Refused
 from tests.training.helpers import tiny_trainer
 
@@ -78,12 +78,12 @@ def test_placement_is_undone_and_refinement_kept() -> None:
     cameras = Cameras(placement.poses(poses).float(), *[numbers] * 4, *[numbers.long()] * 2)  # type: ignore[arg-type]
     refinement = PoseRefinement(3)
     torch.nn.init.constant_(refinement.tangents, 0.1)
-    listed = camera_list(believed(Refining(refinement), cameras), ["a", "b", "c"], placement)
+    listed = camera_list(refined_cameras(Refining(refinement), cameras), ["a", "b", "c"], placement)
     moved = torch.tensor([row["transform"] for row in listed])
     # Each camera's centre is moved by 0.1 along each axis of the scene, which is 4 times as much in the input.
     shift = (moved[:, :, 3] - poses[:, :, 3].float()).norm(dim=-1)
     torch.testing.assert_close(shift, torch.full((3,), 4 * 0.1 * math.sqrt(3)), rtol=1e-4, atol=1e-4)
-    same = camera_list(believed(torch.nn.Linear(1, 1), cameras), ["a", "b", "c"], placement)
+    same = camera_list(refined_cameras(torch.nn.Linear(1, 1), cameras), ["a", "b", "c"], placement)
     torch.testing.assert_close(torch.tensor([row["transform"] for row in same]), poses.float(), rtol=1e-5, atol=1e-5)
 
 

@@ -32,7 +32,7 @@ def test_labels_that_differ_have_folders_that_differ() -> None:
 
 @pytest.mark.parametrize(
     ("text", "reason"),
-    [("", "an empty name"), ("kplane", "Did you mean 'kplanes'"), ('kplanes "open', "cannot be read: No closing")],
+    [("", "an empty name"), ("kplane", "Did you mean 'kplanes'"), ('kplanes "open', "is invalid: No closing")],
 )
 def test_what_is_no_contender(text: str, reason: str) -> None:
     with pytest.raises(ConfigError, match=reason):
@@ -41,12 +41,12 @@ def test_what_is_no_contender(text: str, reason: str) -> None:
 
 def test_words_are_those_of_a_shell() -> None:
     assert split_words("--scale-factor 2 'a b'", "--data-flags") == ("--scale-factor", "2", "a b")
-    with pytest.raises(ConfigError, match='--data-flags: "\'open" cannot be read: No closing'):
+    with pytest.raises(ConfigError, match='--data-flags: "\'open" is invalid: No closing'):
         split_words("'open", "--data-flags")
 
 
 def test_conditions_must_end_somewhere() -> None:
-    with pytest.raises(ConfigError, match="say how long each method trains"):
+    with pytest.raises(ConfigError, match="set how long each method trains"):
         replace(CONDITIONS, max_seconds=None)
     for nothing in ({"max_seconds": 0.0}, {"max_num_iterations": 0}, {"target_psnr": float("nan")}):
         with pytest.raises(ConfigError, match="must be more than 0"):
@@ -87,7 +87,7 @@ def test_jobs_go_seed_by_seed(tmp_path: Path) -> None:
     ]
     with pytest.raises(ConfigError, match="'kplanes' twice"):
         Plan((Contender.of("kplanes"), Contender.of("kplanes")), CONDITIONS, 1, tmp_path)
-    with pytest.raises(ConfigError, match="names no method"):
+    with pytest.raises(ConfigError, match="--methods is empty"):
         Plan((), CONDITIONS, 1, tmp_path)
     with pytest.raises(ConfigError, match="--repeats is 0"):
         Plan((Contender.of("kplanes"),), CONDITIONS, 0, tmp_path)

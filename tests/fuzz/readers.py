@@ -29,7 +29,7 @@ from framework.data.mapped_pixels import MappedPixels
 from framework.data.pixel_cache import PixelMemory, pack, unpack
 from framework.data.ply import read_points
 from framework.tools.processing import polycam, record3d
-from framework.tools.processing.photographs import find_photographs, prepare_all
+from framework.tools.processing.images import find_images, prepare_all
 from framework.training.checkpoint import FOLDER, load_newest
 from framework.training.datasets import load_split
 from framework.training.run import Run, create_folder, read_run
@@ -173,7 +173,7 @@ def write_photographs(folder: Path) -> None:
 
 
 def read_photographs(folder: Path, scratch: Path) -> None:
-    sources = find_photographs(folder)
+    sources = find_images(folder)
     photographs, unreadable = prepare_all(folder, sources, scratch / "images")
     require(len(photographs) + len(unreadable) == len(sources), "a photograph that nobody speaks of")
     for photograph in photographs:

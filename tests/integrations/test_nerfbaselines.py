@@ -30,7 +30,7 @@ from framework.tools.integrations.nerfbaselines import (
     TensoRF,
     VanillaNeRF,
 )
-from framework.tools.integrations.nerfbaselines_data import Frame, FrameFlags, Photographs, cameras_of, dataset_of
+from framework.tools.integrations.nerfbaselines_data import ArrayImages, Frame, FrameFlags, cameras_of, dataset_of
 from framework.tools.integrations.nerfbaselines_settings import flattened, parse_overrides
 from framework.tools.integrations.nerfbaselines_spec import SPECS
 from tests.conftest import ball_view
@@ -236,7 +236,7 @@ def test_a_blender_scene_is_the_one_that_its_files_make(shared_tiny: Path) -> No
         "images": [iio.imread(path) for path in paths],
         "image_paths": list(map(str, paths)),
     }
-    photographs = Photographs.of(data)
+    photographs = ArrayImages.of(data)
     found = dataset_of(photographs, Frame.of(photographs, FrameFlags(half_size=1.5)), "ignored")
     expected = load_dataset(Blender().parse(shared_tiny, "train"), "train")
     assert torch.equal(found.pixels, expected.pixels)
@@ -306,7 +306,7 @@ def test_masks_say_where_to_learn(kind: str) -> None:
         "padded": np.pad(used, ((0, 0), (0, 3), (0, 5)), constant_values=True),
         "channel": list(used[..., None]),
     }[kind]
-    photographs = Photographs.of({**handed(3), "masks": masks})
+    photographs = ArrayImages.of({**handed(3), "masks": masks})
     data = dataset_of(photographs, Frame.of(photographs, FrameFlags()), "ignored")
     assert data.kept is not None
     assert np.array_equal(data.kept.mask(0, len(data.pixels)).numpy(), used.reshape(-1))
@@ -316,7 +316,7 @@ def test_masks_count_under_their_first_name_too() -> None:
     used = np.random.default_rng(0).random((COUNT, SIZE, SIZE)) < 0.6
     data = handed(3)
     del data["masks"]
-    kept = Photographs.of({**data, "sampling_masks": list(used)}).decoded.kept
+    kept = ArrayImages.of({**data, "sampling_masks": list(used)}).decoded.kept
     assert kept is not None
     assert np.array_equal(kept.mask(0, used.size).numpy(), used.reshape(-1))
 
@@ -325,18 +325,18 @@ def test_a_capture_is_placed_and_its_rays_start_before_its_points() -> None:
     """Cameras at 4 from a ball: the nearest of its points are 3 away, and positions come to lie within [-1, 1]."""
     around = np.random.default_rng(0).normal(size=(500, 3))
     points = around / np.linalg.norm(around, axis=-1, keepdims=True)
-    photographs = Photographs.of({**handed(3), "points3D_xyz": points})
+    photographs = ArrayImages.of({**handed(3), "points3D_xyz": points})
     frame = Frame.of(photographs, FrameFlags())
     assert frame.unbounded
     placed = frame.placed(photographs.cameras).camera_to_worlds[:, :, 3]
     assert float(placed.abs().max()) == pytest.approx(1, abs=1e-5)
     assert frame.near == pytest.approx(0.5 * 3 * frame.placement.scale, rel=0.1)
-    bounded = Frame.of(Photographs.of(handed(3)), FrameFlags())
+    bounded = Frame.of(ArrayImages.of(handed(3)), FrameFlags())
     assert bounded.near == pytest.approx(0.9 * 2 * bounded.placement.scale, rel=1e-5)
 
 
 def test_a_box_is_as_large_as_what_lies_between_the_depths_unless_told() -> None:
-    photographs = Photographs.of(handed())
+    photographs = ArrayImages.of(handed())
     assert torch.allclose(Frame.of(photographs, FrameFlags()).box, torch.tensor([[-2.0] * 3, [2.0] * 3]), atol=1e-4)
     told = Frame.of(photographs, FrameFlags(half_size=1.25))
     assert torch.allclose(told.box, torch.tensor([[-1.25] * 3, [1.25] * 3]), atol=1e-4)
@@ -348,14 +348,14 @@ def test_a_box_is_as_large_as_what_lies_between_the_depths_unless_told() -> None
 
 def test_bad_data_are_refused() -> None:
     with pytest.raises(DataError, match="colours are linear"):
-        Photographs.of(handed(color_space="linear"))
+        ArrayImages.of(handed(color_space="linear"))
     with pytest.raises(DataError, match=r"000\.png is 16x15 pixels, but its camera is for 16x16"):
-        Photographs.of({**handed(), "images": [image[1:] for image in handed()["images"]]})
+        ArrayImages.of({**handed(), "images": [image[1:] for image in handed()["images"]]})
     with pytest.raises(DataError, match="it must be uint8"):
-        Photographs.of({**handed(), "images": [image / 255 for image in handed()["images"]]})
+        ArrayImages.of({**handed(), "images": [image / 255 for image in handed()["images"]]})
     scaled = handed()["cameras"].poses * 2
     with pytest.raises(DataError, match=r"000\.png: the pose is not rigid"):
-        Photographs.of({**handed(), "cameras": cameras(scaled, SIZE)})
+        ArrayImages.of({**handed(), "cameras": cameras(scaled, SIZE)})
 
 
 # -- settings ---------------------------------------------------------------------------------------------------
@@ -487,12 +487,12 @@ def test_a_method_without_appearances_says_so() -> None:
 
 
 def test_misuse_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="needs photographs to learn from, or a checkpoint"):
+    with pytest.raises(ConfigError, match="needs training images or a checkpoint"):
         InstantNGP()
     with pytest.raises(CheckpointError, match="holds no checkpoint"):
         InstantNGP(checkpoint=str(tmp_path))
     method = start(InstantNGP, handed())
-    with pytest.raises(ConfigError, match="step 3 is not the next one, which is 0"):
+    with pytest.raises(ConfigError, match="step 3 is not the next step, 0"):
         method.train_iteration(3)
     method.save(str(tmp_path))
     with pytest.raises(CheckpointError, match="is a checkpoint of instant-ngp, not of kplanes"):

@@ -2,6 +2,7 @@
 
 import difflib
 import importlib.util
+import os
 import re
 import subprocess
 import sys
@@ -66,5 +67,6 @@ def test_both_learn(file: Path, shared_tiny: Path, capsys: pytest.CaptureFixture
 
 def test_as_a_script(shared_tiny: Path) -> None:
     words = [sys.executable, str(SKIPPING), "--data", str(shared_tiny), "--seconds", "0.5"]
-    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(words, capture_output=True, text=True, check=True, env=environment)
     assert re.match(r"[\d,]+ rays/s, [1-9]\d* steps, PSNR [\d.]+ dB on 3 test images\n", done.stdout)

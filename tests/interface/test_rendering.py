@@ -37,7 +37,7 @@ def by_hand(samples: Samples, alpha: Tensor, values: Tensor, behind: Tensor) -> 
     return torch.stack(rows)
 
 
-def given(values: Tensor, sigma: Tensor, **extras: Tensor) -> Callable[..., tuple]:
+def evaluated(values: Tensor, sigma: Tensor, **extras: Tensor) -> Callable[..., tuple]:
     """A field that has been evaluated already."""
     return lambda positions, directions: (values, sigma, extras)
 
@@ -56,9 +56,9 @@ def test_values_are_those_of_the_product_formula(case, kind: str) -> None:
     rays, samples, sigma, rgb, background = case
     alpha = -torch.expm1(-sigma * samples.deltas)
     semantics = torch.randn(len(samples), 2, 5, dtype=F64)
-    chosen = {"rgb_sigma_fn": given(rgb, sigma, semantics=semantics, gloss=rgb[:, 0])}
+    chosen = {"rgb_sigma_fn": evaluated(rgb, sigma, semantics=semantics, gloss=rgb[:, 0])}
     if kind == "alpha":
-        chosen = {"rgb_alpha_fn": given(rgb, alpha, semantics=semantics, gloss=rgb[:, 0])}
+        chosen = {"rgb_alpha_fn": evaluated(rgb, alpha, semantics=semantics, gloss=rgb[:, 0])}
     found = nerfloom.render(rays, samples, background=background, **chosen)
     nothing = torch.zeros(10, dtype=F64)
     wanted = {
@@ -85,7 +85,7 @@ def test_gradients_are_those_of_finite_differences(case, kind: str) -> None:
     extra = torch.randn(len(samples), 2, dtype=F64)
 
     def rendered(values: Tensor, rgb: Tensor, extra: Tensor, background: Tensor) -> tuple[Tensor, ...]:
-        function = given(rgb, values, extra=extra)
+        function = evaluated(rgb, values, extra=extra)
         chosen = {f"rgb_{kind}_fn": function}
         found = nerfloom.render(rays, samples, background=background, **chosen)
         return found.rgb, found.accumulation, found.weights, found.extras["extra"]
@@ -102,7 +102,7 @@ def test_the_compiled_kernel_gives_the_same_gradients(case) -> None:
         rays = nerfloom.Rays(*(getattr(rays, name).to(dtype) for name in ("origins", "directions", "nears", "fars")))
         samples = Samples(samples.t_starts.to(dtype), samples.t_ends.to(dtype), samples.offsets)
         leaves = [value.to(dtype).clone().requires_grad_() for value in (sigma, rgb, rgb[:, :2])]
-        found = nerfloom.render(rays, samples, given(leaves[1], leaves[0], own=leaves[2]), background.to(dtype))
+        found = nerfloom.render(rays, samples, evaluated(leaves[1], leaves[0], own=leaves[2]), background.to(dtype))
         total = found.rgb.square().sum() + found.accumulation.square().sum() + found.extras["own"].square().sum()
         return [*torch.autograd.grad(total, leaves), found.rgb.detach()]
 
@@ -140,7 +140,7 @@ def test_rays_have_the_gradient_of_finite_differences(case) -> None:
 @pytest.mark.parametrize("background", [0.5, (0.5, 0.5, 0.5), torch.full((3,), 0.5), torch.full((4, 3), 0.5)])
 def test_backgrounds(case, background) -> None:
     rays, samples, sigma, rgb, _ = case
-    found = nerfloom.render(rays, samples, given(rgb, sigma), background)
+    found = nerfloom.render(rays, samples, evaluated(rgb, sigma), background)
     wanted = by_hand(samples, -torch.expm1(-sigma * samples.deltas), rgb, torch.full((3,), 0.5, dtype=F64))
     torch.testing.assert_close(found.rgb, wanted)
 
@@ -148,7 +148,7 @@ def test_backgrounds(case, background) -> None:
 def test_a_sum_under_detached_weights_teaches_the_property_alone(case) -> None:
     rays, samples, sigma, rgb, _ = case
     sigma, features = sigma.requires_grad_(), torch.rand(len(samples), 7, dtype=F64, requires_grad=True)
-    found = nerfloom.render(rays, samples, given(rgb, sigma))
+    found = nerfloom.render(rays, samples, evaluated(rgb, sigma))
     total = nerfloom.accumulate(samples, found.weights.detach(), features)
     assert total.shape == (4, 7)
     (gradient,) = torch.autograd.grad(total.sum(), features)
@@ -196,15 +196,15 @@ def test_a_sphere_by_its_signed_distance() -> None:
 def test_what_is_wrong_is_said(case) -> None:
     rays, samples, sigma, rgb, _ = case
     with pytest.raises(ValueError, match=r"rgb_sigma_fn returned sigma of shape \(11, 1\).*\(11,\): squeeze"):
-        nerfloom.render(rays, samples, given(rgb, sigma[:, None]))
+        nerfloom.render(rays, samples, evaluated(rgb, sigma[:, None]))
     with pytest.raises(ValueError, match=r"rgb_alpha_fn returned rgb of shape \(11, 2\)"):
-        nerfloom.render(rays, samples, rgb_alpha_fn=given(rgb[:, :2], sigma))
+        nerfloom.render(rays, samples, rgb_alpha_fn=evaluated(rgb[:, :2], sigma))
     with pytest.raises(ValueError, match=r"returned gloss of shape \(4,\); it must be a tensor of shape \(11,\)"):
-        nerfloom.render(rays, samples, given(rgb, sigma, gloss=sigma[:4]))
+        nerfloom.render(rays, samples, evaluated(rgb, sigma, gloss=sigma[:4]))
     with pytest.raises(ValueError, match="returned gloss of shape float"):
-        nerfloom.render(rays, samples, given(rgb, sigma, gloss=1.0))
-    for functions in ({}, {"rgb_sigma_fn": given(rgb, sigma), "rgb_alpha_fn": given(rgb, sigma)}):
+        nerfloom.render(rays, samples, evaluated(rgb, sigma, gloss=1.0))
+    for functions in ({}, {"rgb_sigma_fn": evaluated(rgb, sigma), "rgb_alpha_fn": evaluated(rgb, sigma)}):
         with pytest.raises(ValueError, match="either rgb_sigma_fn or rgb_alpha_fn"):
             nerfloom.render(rays, samples, **functions)
     with pytest.raises(ValueError, match="samples are of 4 rays, but there are 2"):
-        nerfloom.render(rays[:2], samples, given(rgb, sigma))
+        nerfloom.render(rays[:2], samples, evaluated(rgb, sigma))

@@ -22,7 +22,7 @@ def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
     return request.param
 
 
-def seen(rays: nerfloom.Rays, name: str, grid: nerfloom.OccupancyGrid, early_stop: float) -> tuple[Tensor, int]:
+def picture(rays: nerfloom.Rays, name: str, grid: nerfloom.OccupancyGrid, early_stop: float) -> tuple[Tensor, int]:
     """Colours (R, 3) and the number of samples."""
     sigma_fn, rgb_sigma_fn = functions(name)
     samples = nerfloom.sample(rays, sigma_fn, grid, early_stop=early_stop)
@@ -37,7 +37,7 @@ def test_it_is_dense_quadrature_within_the_stated_bound(name: str) -> None:
     truth = dense_quadrature(rays, functions(name)[1], grid.step_size)
     all_steps = int(steps_through_box(rays, grid.step_size)[1].sum())
     for early_stop in (0.0, 1e-4, 1e-2, 0.3):
-        color, count = seen(rays, name, grid, early_stop)
+        color, count = picture(rays, name, grid, early_stop)
         error = (color.double() - truth).abs().max().item()
         print(f"{name}, early stop {early_stop}: {count} of {all_steps} samples, colour off by {error:.1e}")
         # A step whose middle lies within rounding of a jump of density may fall on its other side.
@@ -51,9 +51,9 @@ def test_the_early_stop_keeps_its_bound_exactly(name: str) -> None:
     """Of the same steps, so that nothing but the stop differs."""
     rays, grid = random_rays(2000, seed=1), nerfloom.OccupancyGrid(BOX, 32, STEPS)
     grid.fill(functions(name)[0])
-    whole, count = seen(rays, name, grid, 0.0)
+    whole, count = picture(rays, name, grid, 0.0)
     for early_stop in (1e-4, 1e-2, 0.3):
-        color, fewer = seen(rays, name, grid, early_stop)
+        color, fewer = picture(rays, name, grid, early_stop)
         assert (color - whole).abs().max() <= early_stop + 1e-6
         assert fewer <= count
     assert fewer < 0.9 * count or name == "fog"
@@ -69,7 +69,7 @@ def test_a_grid_that_was_filled_skips_what_is_empty(name: str, least: float, mos
     dense = dense_quadrature(rays, functions(name)[1], grid.step_size)
     truth = scenes()[name].truth(rays, BACKGROUND).color
     grid.fill(functions(name)[0])
-    color, count = seen(rays, name, grid, 1e-4)
+    color, count = picture(rays, name, grid, 1e-4)
     skipped = 1 - count / int(steps_through_box(rays, grid.step_size)[1].sum())
     errors = [(one.double() - other).square().mean().sqrt().item() for one, other in ((color, truth), (dense, truth))]
     print(f"{name}: {skipped:.1%} skipped, colour off by {errors[0]:.1e} rms, of dense quadrature {errors[1]:.1e}")
@@ -100,7 +100,7 @@ def test_updates_keep_a_grid_up() -> None:
     assert bool(grid.occupied[3, 8, 8])
 
 
-def test_near_and_far_ends_are_those_of_the_box_where_they_are_not_given() -> None:
+def test_near_and_far_ends_are_those_of_the_box_where_they_are_not_evaluated() -> None:
     rays, grid = random_rays(100, seed=3), nerfloom.OccupancyGrid(BOX, 8, 64)
     clipped = nerfloom.clip_to_box(rays, BOX)
     free = nerfloom.Rays(rays.origins, rays.directions)
@@ -112,6 +112,18 @@ def test_near_and_far_ends_are_those_of_the_box_where_they_are_not_given() -> No
         torch.testing.assert_close(found[0].t_starts, other.t_starts)
     half = nerfloom.Rays(rays.origins, rays.directions, fars=(clipped.nears + clipped.fars) / 2)
     assert len(nerfloom.sample(half, None, grid)) == pytest.approx(len(found[0]) / 2, rel=0.02)
+
+
+def test_rays_may_be_of_float64() -> None:
+    """The reference marches them; samples are those of float32 but for steps that lie on a face within rounding."""
+    rays, grid = random_rays(300, seed=7), nerfloom.OccupancyGrid(BOX, 32, 128)
+    double = nerfloom.Rays(rays.origins.double(), rays.directions.double())
+    grid.fill(functions("nested")[0])
+    one, other = (nerfloom.sample(given, functions("nested")[0], grid, early_stop=0.1) for given in (rays, double))
+    assert other.t_starts.dtype == torch.float64
+    assert abs(len(one) - len(other)) < 0.01 * len(one)
+    pictures = [nerfloom.render(r, s, functions("nested")[1]).rgb.double() for r, s in ((rays, one), (double, other))]
+    assert (pictures[0] - pictures[1]).abs().mean() < 1e-3
 
 
 def test_jitter_moves_each_rays_steps_together() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from framework.tools.processing.pair_matching import match
-from framework.tools.processing.retrieval import all_pairs, looks_of, sequential_pairs, similar_pairs
+from framework.tools.processing.retrieval import all_pairs, global_descriptors, sequential_pairs, similar_pairs
 
 
 def test_all_and_neighbouring_pairs() -> None:
@@ -18,7 +18,7 @@ def test_photographs_of_the_same_place_are_found() -> None:
     draws = np.random.default_rng(0)
     places = [draws.integers(0, 255, (300, 128)).astype(np.uint8) for _ in range(3)]
     photographs = [places[i % 3][draws.permutation(300)[:150]] for i in range(12)]
-    pairs = similar_pairs(looks_of(photographs), 3)
+    pairs = similar_pairs(global_descriptors(photographs), 3)
     assert {(i % 3, j % 3) for i, j in pairs} == {(0, 0), (1, 1), (2, 2)}
     assert len(pairs) == 3 * 6
 
@@ -28,8 +28,8 @@ def test_a_photograph_without_features_is_in_no_pair() -> None:
     photographs = [draws.integers(0, 255, (50, 128)).astype(np.uint8) for _ in range(3)] + [
         np.zeros((0, 128), np.uint8)
     ]
-    assert similar_pairs(looks_of(photographs), 5) == [(0, 1), (0, 2), (1, 2)]
-    assert looks_of([]).shape[0] == 0
+    assert similar_pairs(global_descriptors(photographs), 5) == [(0, 1), (0, 2), (1, 2)]
+    assert global_descriptors([]).shape[0] == 0
 
 
 def test_features_match_their_noisy_selves() -> None:

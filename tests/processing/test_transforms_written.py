@@ -72,5 +72,5 @@ def test_a_folder_with_something_in_it_is_refused_unless_it_may_be_replaced(tmp_
     inner.mkdir()
     with pytest.raises(DataError, match="would remove"):
         claim(output, inner, True)
-    with pytest.raises(DataError, match="name a folder of its own"):
+    with pytest.raises(DataError, match="choose another folder"):
         check_apart(data, data)

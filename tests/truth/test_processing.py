@@ -49,7 +49,7 @@ def without_colmap(monkeypatch: pytest.MonkeyPatch, camera: str, order: list[str
     monkeypatch.setattr(pipeline, "_extract", extract)
     monkeypatch.setattr(pipeline, "_match", lambda *_: "exhaustive")
     monkeypatch.setattr(pipeline, "_reconstruct", reconstruct)
-    monkeypatch.setattr(pipeline, "run_apart", lambda work, arguments, *_: work(None, *arguments))
+    monkeypatch.setattr(pipeline, "run_in_child", lambda work, arguments, *_: work(None, *arguments))
 
 
 @pytest.mark.parametrize("model", WRITABLE)

@@ -1,1 +1,1 @@
-"""Several methods on one data set, under the same conditions: runs, figures, report."""
+"""Comparison of several methods on one data set, under the same conditions: runs, measurements, report."""

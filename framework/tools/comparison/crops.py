@@ -1,4 +1,4 @@
-"""The same part of the same view by every contender, beside the photograph and with its error."""
+"""Crops of the same view by every contender, beside the held-out image and with their error."""
 
 from __future__ import annotations
 
@@ -14,44 +14,59 @@ import numpy as np
 from framework.evaluation.images import error_map
 
 VIEWS = 3
-"""Views shown."""
+"""Maximum number of views shown."""
 CROP_SHARE = 4
-"""A crop's edge is this part of the picture's shorter side."""
+"""Ratio of the image's shorter side to the side of a crop."""
 LEAST_CROP = 32
-"""Pixels of a crop's edge at least, where the picture has them."""
-PHOTOGRAPH = "_photograph.png"
-"""How a photograph's file ends; its render's ends in .png alone."""
+"""Minimum side of a crop, pixels, if the image is large enough."""
+IMAGE_SUFFIX = "_photograph.png"
+"""End of the file name of a held-out image; that of its render ends in .png only."""
 
 
 @dataclass(frozen=True)
 class Strip:
-    """One view by one contender, as data URIs of PNGs."""
+    """One view by one contender, as data URIs of PNGs.
+
+    Args:
+        label: the contender's label.
+        whole: the render.
+        crop: the crop of the render.
+    """
 
     label: str
     whole: str
     crop: str
     error: str
-    """Of the crop: black, red, yellow, white."""
+    """The crop's error, in black, red, yellow, white."""
 
 
 @dataclass(frozen=True)
 class View:
-    """One view by all."""
+    """One view by all contenders, as data URIs of PNGs.
+
+    Args:
+        name: name of the view.
+        crop: the crop of the held-out image.
+        strips: renders of the contenders.
+    """
 
     name: str
-    photograph: str
-    """With the crop's place framed."""
+    image: str
+    """The held-out image, with the crop framed."""
     crop: str
     strips: tuple[Strip, ...]
 
 
 def views(folders: Sequence[tuple[str, Path]], count: int = VIEWS) -> list[View]:
-    """Some views that all contenders have rendered, evenly spread.
+    """Return some views that all contenders have rendered, evenly spaced.
 
     Args:
-        folders: label and folder of renders and their photographs of each contender.
+        folders: each contender's label and folder of renders and held-out images.
+        count: maximum number of views.
     """
-    names = [{file.name.removesuffix(PHOTOGRAPH) for file in folder.glob("*" + PHOTOGRAPH)} for _, folder in folders]
+    names = [
+        {file.name.removesuffix(IMAGE_SUFFIX) for file in folder.glob("*" + IMAGE_SUFFIX)} for _, folder in folders
+    ]
     shared = sorted(set.intersection(*names)) if names else []
     count = min(count, len(shared))
     chosen = [shared[index * len(shared) // count] for index in range(count)]
@@ -60,16 +75,16 @@ def views(folders: Sequence[tuple[str, Path]], count: int = VIEWS) -> list[View]
 
 def _view(name: str, folders: Sequence[tuple[str, Path]]) -> View | None:
     try:
-        photograph = np.asarray(iio.imread(folders[0][1] / (name + PHOTOGRAPH)))[..., :3]
+        image = np.asarray(iio.imread(folders[0][1] / (name + IMAGE_SUFFIX)))[..., :3]
         renders = [np.asarray(iio.imread(folder / f"{name}.png"))[..., :3] for _, folder in folders]
     except (OSError, ValueError):
         return None
-    if {render.shape for render in renders} != {photograph.shape}:
+    if {render.shape for render in renders} != {image.shape}:
         return None
-    wrong = np.mean([np.abs(render.astype(float) - photograph).mean(-1) for render in renders], axis=0)
-    top, left, edge = worst_square(wrong)
-    part = (slice(top, top + edge), slice(left, left + edge))
-    framed = photograph.copy()
+    errors = np.mean([np.abs(render.astype(float) - image).mean(-1) for render in renders], axis=0)
+    top, left, side = worst_square(errors)
+    part = (slice(top, top + side), slice(left, left + side))
+    framed = image.copy()
     for rows in (part[0].start, part[0].stop - 1):
         framed[rows, part[1]] = (255, 0, 160)
     for columns in (part[1].start, part[1].stop - 1):
@@ -77,26 +92,30 @@ def _view(name: str, folders: Sequence[tuple[str, Path]]) -> View | None:
     return View(
         name,
         data_uri(framed),
-        data_uri(photograph[part]),
+        data_uri(image[part]),
         tuple(
-            Strip(label, data_uri(render), data_uri(render[part]), data_uri(error_map(render[part], photograph[part])))
+            Strip(label, data_uri(render), data_uri(render[part]), data_uri(error_map(render[part], image[part])))
             for (label, _), render in zip(folders, renders, strict=True)
         ),
     )
 
 
-def worst_square(wrong: np.ndarray) -> tuple[int, int, int]:
-    """Top, left and edge of the square with the largest sum of errors (H, W) in it."""
-    height, width = wrong.shape
-    edge = min(max(min(height, width) // CROP_SHARE, LEAST_CROP), height, width)
-    sums = np.pad(wrong, ((1, 0), (1, 0))).cumsum(0).cumsum(1)
-    inside = sums[edge:, edge:] - sums[:-edge, edge:] - sums[edge:, :-edge] + sums[:-edge, :-edge]
+def worst_square(errors: np.ndarray) -> tuple[int, int, int]:
+    """Return top, left and side of the square crop with the largest sum of errors.
+
+    Args:
+        errors: (H, W).
+    """
+    height, width = errors.shape
+    side = min(max(min(height, width) // CROP_SHARE, LEAST_CROP), height, width)
+    sums = np.pad(errors, ((1, 0), (1, 0))).cumsum(0).cumsum(1)
+    inside = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
     top, left = np.unravel_index(int(inside.argmax()), inside.shape)
-    return int(top), int(left), edge
+    return int(top), int(left), side
 
 
 def data_uri(image: np.ndarray) -> str:
-    """(H, W, 3) uint8 as a PNG that a page can hold."""
+    """Return `image` (H, W, 3) uint8 as the data URI of a PNG."""
     file = io.BytesIO()
     iio.imwrite(file, image, extension=".png")
     return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode()

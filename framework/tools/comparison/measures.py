@@ -1,4 +1,4 @@
-"""Figures of finished runs, read from their folders; and what several seeds say together."""
+"""Measurements of finished runs, read from their folders, and their statistics over several seeds."""
 
 from __future__ import annotations
 
@@ -15,64 +15,85 @@ from typing import Any
 from framework.tools.comparison.plan import Conditions, Job
 
 SAME_TIME = 0.01
-"""Relative difference below which two times are the same: runs end with the step in which their seconds do."""
+"""Relative difference below which two times count as equal: runs end with the step in which their time is up."""
 Curve = tuple[tuple[float, float], ...]
-"""(seconds of training, PSNR on the validation views), in order."""
+"""Pairs (seconds of training, PSNR on the validation views), in order."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """One run's figures."""
+    """Measurements of one run.
+
+    Args:
+        method: name of the method.
+        seed: seed of the run.
+        ssim: mean SSIM over all evaluated views.
+        lpips: mean LPIPS over all evaluated views; None if it was not computed.
+        steps: steps of training.
+        parameters: number of parameters.
+        skipped_steps: steps dropped because of non-finite values.
+        curve: the learning curve.
+        machine: description of the machine.
+        folder: folder of the run.
+        lpips_note: how LPIPS was computed, or why not.
+    """
 
     label: str
-    """The contender."""
+    """Label of the contender."""
     method: str
     seed: int
     psnr: float
-    """Of the final model, mean over all views judged, dB."""
+    """Mean PSNR of the final model over all evaluated views, dB."""
     ssim: float | None
     lpips: float | None
     views: int
-    """How many were judged."""
+    """Number of evaluated views."""
     steps: int
     seconds: float
-    """Of training."""
+    """Seconds of training."""
     rays_per_second: float
-    """In training."""
+    """Rays per second of training."""
     render_seconds: float
-    """An image."""
+    """Seconds per rendered image."""
     peak_memory_bytes: int
-    """In training."""
+    """Peak memory in training, bytes."""
     parameters: int
     skipped_steps: int
     curve: Curve
     seconds_to: dict[int, float]
-    """Whole dB on the curve -> seconds after which it was reached."""
+    """Integer PSNR, dB -> seconds after which the curve reached it."""
     decisions: tuple[str, ...]
-    """What the scene's profile decided."""
+    """Decisions of the scene's profile."""
     skipped: tuple[str, ...]
-    """What the run skipped."""
+    """Work that the run skipped."""
     machine: dict[str, Any]
     command: str
-    """That trained it."""
+    """The training command."""
     folder: str
     lpips_note: str
 
     def as_plain(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the measurements as a dictionary for JSON."""
         return {**asdict(self), "seconds_to": {str(level): s for level, s in self.seconds_to.items()}}
 
 
 def measure(job: Job, conditions: Conditions) -> Measured | None:
-    """A finished job's figures; None for one that is not finished."""
+    """Return the measurements of a job, or None if it is not finished.
+
+    Args:
+        job: the job.
+        conditions: the conditions of the comparison.
+    """
     summary, evaluation = read_json(job.folder / "summary.json"), read_json(job.evaluation)
     if not isinstance(summary, dict) or not isinstance(evaluation, dict):
         return None
     results = evaluation["results"]
     points = read_json(job.folder / "learning_curve.json") or []
-    full = [p for p in points if p.get("full", True) and p["psnr"] is not None]  # looks at a few images do not compare
+    full = [
+        p for p in points if p.get("full", True) and p["psnr"] is not None
+    ]  # evaluations of a few images are not comparable
     curve = tuple((float(p["seconds"]), float(p["psnr"])) for p in full)
-    profile, rungs = (
+    profile, skips = (
         read_json(job.folder / "scene_profile.json") or {},
         read_json(job.folder / "skip_report.json") or [],
     )
@@ -94,16 +115,16 @@ def measure(job: Job, conditions: Conditions) -> Measured | None:
         curve=curve,
         seconds_to=whole_levels(curve),
         decisions=tuple(f"{d['option']}: {d['choice']}, as {d['reason']}" for d in profile.get("decisions", [])),
-        skipped=tuple(f"{rung['skipped']:.1%} of {rung['name']}" for rung in rungs),
+        skipped=tuple(f"{skip['skipped']:.1%} of {skip['name']}" for skip in skips),
         machine=summary["machine"],
-        command=shlex.join(["ns-train", job.contender.method, *_told(job, conditions)]),
+        command=shlex.join(["ns-train", job.contender.method, *_user_flags(job, conditions)]),
         folder=str(job.folder),
         lpips_note=evaluation["lpips"],
     )
 
 
-def _told(job: Job, conditions: Conditions) -> list[str]:
-    """The flags that a user would give to get the same training: without those that name the comparison's folders."""
+def _user_flags(job: Job, conditions: Conditions) -> list[str]:
+    """Return the flags with which a user gets the same training, without those that name the comparison's folders."""
     flags = [*job.contender.flags, *conditions.data_flags, "--machine.seed", str(job.seed)]
     for name in ("data", "max_seconds", "max_num_iterations", "target_psnr"):
         value = getattr(conditions, name)
@@ -112,7 +133,7 @@ def _told(job: Job, conditions: Conditions) -> list[str]:
 
 
 def read_json(path: Path) -> Any:
-    """Its content; None where it is missing or no JSON."""
+    """Return the content of the JSON file `path`, or None if it is missing or invalid."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -120,8 +141,16 @@ def read_json(path: Path) -> Any:
 
 
 def whole_levels(curve: Curve) -> dict[int, float]:
-    """When a curve first reached each whole dB, between its points by straight lines; the first point's level counts
-    as reached there, for what was before it was not measured."""
+    """Return when a curve first reached each integer PSNR, interpolated linearly between its points.
+
+    The level of the first point counts as reached there, as nothing was measured before.
+
+    Args:
+        curve: the learning curve.
+
+    Returns:
+        Integer PSNR, dB -> seconds.
+    """
     reached: dict[int, float] = {}
     if not curve:
         return reached
@@ -137,46 +166,58 @@ def whole_levels(curve: Curve) -> dict[int, float]:
 
 @dataclass(frozen=True)
 class Row:
-    """A contender's figures over its seeds: means, and the standard deviation of a single run where there are two."""
+    """Measurements of a contender over its seeds: means, and the standard deviation of a single run.
+
+    Args:
+        label: label of the contender.
+        runs: its finished runs.
+    """
 
     label: str
     runs: tuple[Measured, ...]
     failures: tuple[str, ...]
-    """Why other runs of it failed."""
+    """Reasons of failures of its other runs."""
 
     def mean(self, name: str) -> float | None:
-        """Of a figure of `Measured`; None where a run lacks it."""
+        """Return the mean of the measurement `name` of `Measured`, or None if a run lacks it."""
         values = [getattr(run, name) for run in self.runs]
         return None if not values or None in values else fmean(values)
 
     def deviation(self, name: str) -> float | None:
-        """Of a single run; None for fewer than two."""
+        """Return the standard deviation of the measurement `name`, or None for fewer than two runs."""
         values = [getattr(run, name) for run in self.runs]
         return None if len(values) < 2 or None in values else stdev(values)
 
     def seconds_to(self, level: int) -> float | None:
-        """Mean seconds to a whole dB; None where a run did not reach it, or had passed it when it was first judged."""
+        """Return the mean seconds to the PSNR `level`, or None if a run did not reach it or started above it."""
         values = [run.seconds_to.get(level) for run in self.runs]
-        found = [value for value in values if value is not None]
-        return fmean(found) if found and len(found) == len(values) else None
+        reached = [value for value in values if value is not None]
+        return fmean(reached) if reached and len(reached) == len(values) else None
 
 
 def rows_of(labels: Sequence[str], runs: Sequence[Measured], failures: dict[str, list[str]]) -> list[Row]:
-    """A row for each contender, in the order given."""
+    """Return a row for each contender.
+
+    Args:
+        labels: labels of the contenders, in the order of the rows.
+        runs: measurements of all finished runs.
+        failures: label -> reasons of failures.
+    """
     return [
         Row(label, tuple(run for run in runs if run.label == label), tuple(failures.get(label, ()))) for label in labels
     ]
 
 
 def pareto(points: Sequence[tuple[float, float]]) -> list[bool]:
-    """Which points (cost, quality) no other one beats: at most the cost and at least the quality, one of them strictly.
+    """Return which points are on the Pareto front: no other has at most the cost and at least the quality.
 
     Args:
-        points: cost, less being better, those within `SAME_TIME` being the same; quality, more being better.
+        points: pairs (cost, quality): lower cost is better, and costs within `SAME_TIME` are equal; higher quality is
+            better. Another point must be strictly better in one of the two.
     """
 
-    def beaten(cost: float, quality: float) -> bool:
-        as_cheap = [(c, q) for c, q in points if c <= cost * (1 + SAME_TIME)]
-        return any(q > quality or (q == quality and c < cost * (1 - SAME_TIME)) for c, q in as_cheap)
+    def dominated(cost: float, quality: float) -> bool:
+        no_costlier = [(c, q) for c, q in points if c <= cost * (1 + SAME_TIME)]
+        return any(q > quality or (q == quality and c < cost * (1 - SAME_TIME)) for c, q in no_costlier)
 
-    return [not beaten(*point) for point in points]
+    return [not dominated(*point) for point in points]

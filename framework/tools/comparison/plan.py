@@ -1,4 +1,4 @@
-"""What is compared with what, under which conditions; and the commands that do it."""
+"""The plan of a comparison: contenders, conditions, and the commands of each run."""
 
 from __future__ import annotations
 
@@ -16,35 +16,47 @@ from framework.base.registry import entry_of
 from framework.training.run import write_json
 
 FIRST_SEED = 42
+"""Seed of the first run of each contender; the others follow it."""
 CURVE_POINTS = 12
-"""Evaluations during a run, which its learning curve is made of."""
+"""Number of evaluations during a run, the points of its learning curve."""
 
 
 def split_words(text: str, flag: str) -> tuple[str, ...]:
-    """The words of what a flag was given, as a shell has them.
+    """Split the value of a flag into words as a shell does.
 
-    Raises: ConfigError where quotes do not close.
+    Args:
+        text: the value.
+        flag: name of the flag, for messages.
+
+    Raises:
+        ConfigError: if a quote is not closed.
     """
     try:
         return tuple(shlex.split(text))
     except ValueError as error:
-        raise ConfigError(f"{flag}: {shown(text)} cannot be read: {error}") from error
+        raise ConfigError(f"{flag}: {shown(text)} is invalid: {error}") from error
 
 
 @dataclass(frozen=True)
 class Contender:
-    """A method with flags of its own."""
+    """A method with its own flags.
+
+    Args:
+        method: name of the method.
+        flags: its flags.
+    """
 
     label: str
-    """As the user wrote it: a method's name, and its flags behind it."""
+    """The method's name and its flags, as the user wrote them."""
     method: str
     flags: tuple[str, ...]
 
     @classmethod
     def of(cls, text: str) -> Contender:
-        """From a name, or a name and flags, as in "vanilla-nerf --sampler occupancy".
+        """Construct from `text`: a name, or a name and flags, such as "vanilla-nerf --sampler occupancy".
 
-        Raises: ConfigError for an unknown method, or quotes that do not close.
+        Raises:
+            ConfigError: for an unknown method, or a quote that is not closed.
         """
         words = split_words(text, "--methods")
         if not words:
@@ -54,33 +66,38 @@ class Contender:
 
     @property
     def slug(self) -> str:
-        """A folder's name: readable, and different for different labels."""
+        """Name of the contender's folder: readable, and different for different labels."""
         readable = re.sub(r"[^a-z0-9]+", "-", self.label.lower()).strip("-")[:48]
         return readable if readable == self.label else f"{readable}-{zlib.crc32(self.label.encode()):08x}"
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """What is the same for every run of a comparison."""
+    """Settings shared by all runs of a comparison."""
 
     data: str | None
-    """The data's folder, absolute; the embedded scene if None."""
+    """Absolute path of the data folder; None for the embedded scene."""
     data_flags: tuple[str, ...]
-    """Of the data format."""
+    """Flags of the data format."""
     max_seconds: float | None
+    """Seconds of training."""
     max_num_iterations: int | None
+    """Steps of training."""
     target_psnr: float | None
+    """PSNR on the validation views at which training stops, dB."""
     num_threads: int | None
+    """CPU threads; None for all."""
     device_type: str
+    """Device of training and evaluation."""
     curve_images: int
-    """Views of the learning curve."""
+    """Maximum number of views of the learning curve."""
     max_eval_images: int | None
-    """Views of the final evaluation; all if None."""
+    """Maximum number of views of the final evaluation; None for all."""
 
     def __post_init__(self) -> None:
         if self.max_seconds is None and self.max_num_iterations is None and self.target_psnr is None:
             raise ConfigError(
-                "say how long each method trains: --max-seconds 120, --max-num-iterations 5000, or --target-psnr 30"
+                "set how long each method trains: --max-seconds 120, --max-num-iterations 5000, or --target-psnr 30"
             )
         for name in ("max_seconds", "max_num_iterations", "target_psnr"):
             value = getattr(self, name)
@@ -90,7 +107,7 @@ class Conditions:
             raise ConfigError("--curve-images and --max-eval-images must be at least 1")
 
     def budget(self) -> str:
-        """For people: how long each method trains."""
+        """Return a description of how long each method trains."""
         parts = [
             (self.max_seconds, f"{self.max_seconds:g} s of training" if self.max_seconds else ""),
             (self.max_num_iterations, f"{self.max_num_iterations} steps"),
@@ -101,40 +118,45 @@ class Conditions:
 
 @dataclass(frozen=True)
 class Job:
-    """One contender with one seed."""
+    """One contender with one seed.
+
+    Args:
+        contender: the contender.
+        seed: the seed.
+    """
 
     contender: Contender
     seed: int
     runs: Path
-    """The folder of all runs."""
+    """Folder of all runs."""
 
     @property
     def folder(self) -> Path:
-        """The run's own."""
+        """Folder of this run."""
         return self.runs / self.contender.slug / self.contender.method / f"seed-{self.seed}"
 
     @property
     def log(self) -> Path:
-        """What the run's commands printed."""
+        """File of the output of the run's commands."""
         return self.runs / self.contender.slug / f"seed-{self.seed}.log"
 
     @property
     def evaluation(self) -> Path:
-        """Of the final model, on all views."""
+        """File of the results of the final model on all views."""
         return self.folder / "eval_all.json"
 
     @property
     def pictures(self) -> Path:
-        """Renders and comparisons of all views."""
+        """Folder of renders and comparisons of all views."""
         return self.folder / "views"
 
     @property
     def title(self) -> str:
-        """For people."""
+        """Description of the job for messages."""
         return f"{self.contender.label}, seed {self.seed}"
 
     def train_command(self, conditions: Conditions) -> list[str]:
-        """The command that trains; that goes on with training where there is something to go on with."""
+        """Return the command that trains under `conditions`, or resumes training if the run has started."""
         start = python_command("framework.cli.train")
         if (self.folder / "config.yml").exists():
             return [*start, "--resume", str(self.folder)]
@@ -151,11 +173,11 @@ class Job:
         flags += ["--machine.device-type", c.device_type, "--machine.seed", str(self.seed)]
         flags += ["--output-dir", str(self.runs), "--experiment-name", self.contender.slug]
         flags += ["--timestamp", self.folder.name]
-        # A contender's own flags come last, so that they count where both say something.
+        # A contender's own flags come last, so that they take precedence.
         return [*start, self.contender.method, *flags, *self.contender.flags, *c.data_flags]
 
     def eval_command(self, conditions: Conditions) -> list[str]:
-        """The command that evaluates the trained model."""
+        """Return the command that evaluates the trained model under `conditions`."""
         command = python_command("framework.cli.evaluate", "--load-config", self.folder / "config.yml")
         command += ["--output-path", str(self.evaluation), "--render-output-path", str(self.pictures)]
         command += ["--device-type", conditions.device_type]
@@ -166,38 +188,44 @@ class Job:
 
 @dataclass(frozen=True)
 class Plan:
-    """A comparison."""
+    """A comparison.
+
+    Args:
+        contenders: the contenders.
+        conditions: the conditions shared by all runs.
+    """
 
     contenders: tuple[Contender, ...]
     conditions: Conditions
     repeats: int
-    """Seeds for each contender."""
+    """Number of seeds for each contender."""
     folder: Path
-    """Where everything goes."""
+    """Output folder."""
 
     def __post_init__(self) -> None:
         labels = [contender.label for contender in self.contenders]
         if not labels:
-            raise ConfigError("--methods names no method, as in --methods instant-ngp kplanes")
-        twice = sorted({label for label in labels if labels.count(label) > 1})
-        if twice:
-            raise ConfigError(f"--methods names {', '.join(map(repr, twice))} twice; --repeats is for that")
+            raise ConfigError("--methods is empty; list methods, as in --methods instant-ngp kplanes")
+        duplicates = sorted({label for label in labels if labels.count(label) > 1})
+        if duplicates:
+            raise ConfigError(f"--methods has {', '.join(map(repr, duplicates))} twice; use --repeats for several runs")
         if self.repeats < 1:
             raise ConfigError(f"--repeats is {self.repeats}; it must be at least 1")
 
     def jobs(self) -> list[Job]:
-        """All runs, seed by seed, so that every contender has a first result early."""
+        """Return all runs, seed by seed, so that every contender has a first result early."""
         seeds = range(FIRST_SEED, FIRST_SEED + self.repeats)
         return [Job(contender, seed, self.folder / "runs") for seed in seeds for contender in self.contenders]
 
     def claim_folder(self) -> None:
-        """Write down the conditions, so that a later call goes on under the same ones.
+        """Write the conditions, so that a later call continues under the same ones.
 
-        Raises: ConfigError where the folder holds a comparison under others, or cannot be written.
+        Raises:
+            ConfigError: if the folder holds a comparison under other conditions, or cannot be written.
         """
-        path, wanted = self.folder / "conditions.json", json.loads(json.dumps(asdict(self.conditions)))
+        path, conditions = self.folder / "conditions.json", json.loads(json.dumps(asdict(self.conditions)))
         if path.exists():
-            differing = _differences(_read(path), wanted)
+            differing = _differences(_read(path), conditions)
             if differing:
                 raise ConfigError(
                     f"{self.folder} holds a comparison under other conditions ({differing}); "
@@ -206,19 +234,19 @@ class Plan:
             return
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            write_json(path, wanted)
+            write_json(path, conditions)
         except OSError as error:
             raise ConfigError(f"cannot write {self.folder}: {error.strerror}") from error
 
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path} cannot be read: {error}; remove it, or choose another --output-dir") from error
-    return found if isinstance(found, dict) else {}
+    return content if isinstance(content, dict) else {}
 
 
-def _differences(there: dict[str, Any], wanted: dict[str, Any]) -> str:
-    names = [name for name in wanted if there.get(name) != wanted[name]]
-    return ", ".join(f"{name} {there.get(name)}, not {wanted[name]}" for name in names)
+def _differences(previous: dict[str, Any], conditions: dict[str, Any]) -> str:
+    names = [name for name in conditions if previous.get(name) != conditions[name]]
+    return ", ".join(f"{name} {previous.get(name)}, not {conditions[name]}" for name in names)

@@ -1,4 +1,4 @@
-"""Time against error: every contender's learning curve and where it ended, as one SVG."""
+"""Plots of PSNR against time: each contender's learning curve and final result, as one SVG."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Any
 from framework.tools.comparison.measures import Row, pareto
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f")
-"""Okabe and Ito's, which colour-blind people tell apart."""
+"""Okabe and Ito's colours, which colour-blind readers can distinguish."""
 MISSING = "without plots: pip install matplotlib"
-"""What to say where matplotlib is not installed."""
+"""Message if matplotlib is not installed."""
 
 
 def available() -> bool:
-    """Whether plots can be drawn."""
+    """Return whether matplotlib is installed."""
     try:
         import matplotlib as matplotlib
     except ImportError:
@@ -24,14 +24,21 @@ def available() -> bool:
 
 
 def color_of(index: int) -> str:
-    """The colour of the contender at a place in the list."""
+    """Return the colour of the contender with index `index`."""
     return COLORS[index % len(COLORS)]
 
 
 def time_against_error(rows: Sequence[Row]) -> str:
-    """PSNR against seconds of training, with learning curves, and against seconds an image; the Pareto front in both.
+    """Plot PSNR against seconds of training, and against seconds per rendered image, with the Pareto front in both.
 
-    Curves are of the views judged during training, ends (with a bar of a standard deviation) of all.
+    Curves are on the views evaluated during training; the final points, with a bar of one standard deviation, are on
+    all views.
+
+    Args:
+        rows: results of the contenders.
+
+    Returns:
+        The plot as an SVG element.
     """
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
@@ -40,8 +47,8 @@ def time_against_error(rows: Sequence[Row]) -> str:
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     FigureCanvasSVG(figure)
     training, rendering = figure.subplots(1, 2, sharey=True)
-    kept = [(index, row) for index, row in enumerate(rows) if row.runs]
-    for index, row in kept:
+    finished = [(index, row) for index, row in enumerate(rows) if row.runs]
+    for index, row in finished:
         color = color_of(index)
         for run in row.runs:
             if run.curve:
@@ -50,14 +57,14 @@ def time_against_error(rows: Sequence[Row]) -> str:
         for axes, cost in ((training, row.mean("seconds")), (rendering, row.mean("render_seconds"))):
             axes.errorbar([cost], [psnr], [spread or 0], color=color, marker="o", markersize=6, label=row.label)
     for axes, name in ((training, "seconds"), (rendering, "render_seconds")):
-        _front(axes, [(row.mean(name) or 0.0, row.mean("psnr") or 0.0) for _, row in kept])
+        _front(axes, [(row.mean(name) or 0.0, row.mean("psnr") or 0.0) for _, row in finished])
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.grid(True, which="both", linewidth=0.3, alpha=0.6)
     training.set_xlabel("training, s")
-    rendering.set_xlabel("rendering, s an image")
+    rendering.set_xlabel("rendering, s per image")
     training.set_ylabel("PSNR, dB")
     rendering.legend(fontsize="small", loc="best")
     text = io.StringIO()

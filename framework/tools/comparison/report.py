@@ -1,4 +1,4 @@
-"""What a comparison leaves for people and programs: report.html, report.md, results.json, results.csv."""
+"""Reports of a comparison: report.html, report.md, results.json, results.csv."""
 
 from __future__ import annotations
 
@@ -25,16 +25,21 @@ from framework.training.checkpoint import write_atomically
 
 @dataclass(frozen=True)
 class Column:
-    """A column of the table."""
+    """A column of the table of results.
+
+    Args:
+        title: heading.
+        show: formats a value.
+    """
 
     title: str
     figure: str
-    """Of `Measured`."""
+    """Name of the measurement in `Measured`."""
     show: Callable[[float], str]
     best: Callable[[Sequence[float]], float] | None
-    """`max` where more is better, `min` where less is; None where neither."""
+    """`max` if higher is better, `min` if lower is better, or None."""
     same: float = 1e-9
-    """Relative difference below which two figures are both the best."""
+    """Relative difference below which two values are both the best."""
 
 
 COLUMNS = (
@@ -48,22 +53,33 @@ COLUMNS = (
     Column("peak memory, GiB", "peak_memory_bytes", lambda value: f"{value / 2**30:.2f}", min),
     Column("parameters", "parameters", "{:,.0f}".format, min),
 )
+"""The columns of the table of results."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A figure in a table."""
+    """A value in a table.
+
+    Args:
+        text: the formatted value.
+        best: whether it is the best of its column.
+    """
 
     text: str
     best: bool = False
 
 
 def write_report(plan: Plan, rows: Sequence[Row]) -> Path:
-    """Write all four files. Returns: report.html."""
+    """Write all four files, and return the path of report.html.
+
+    Args:
+        plan: the comparison.
+        rows: results of the contenders.
+    """
     runs = [run for row in rows for run in row.runs]
     content = _content(plan, rows, runs)
     template = files("framework.tools.comparison").joinpath("report.html.jinja").read_text(encoding="utf-8")
-    import jinja2  # comes with torch
+    import jinja2  # a dependency of PyTorch
 
     pages = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined)
     _write(plan.folder / "report.html", pages.from_string(template).render(content))
@@ -85,7 +101,7 @@ def _write(path: Path, text: str) -> None:
 
 
 def _content(plan: Plan, rows: Sequence[Row], runs: Sequence[Measured]) -> dict[str, Any]:
-    """What both reports say."""
+    """Return the content shared by the HTML and Markdown reports."""
     folders = [(row.label, Path(row.runs[0].folder) / "views") for row in rows if row.runs]
     figure = plots.time_against_error(rows) if runs and plots.available() else None
     data = Path(plan.conditions.data).name if plan.conditions.data else "the embedded scene"
@@ -113,18 +129,24 @@ def _content(plan: Plan, rows: Sequence[Row], runs: Sequence[Measured]) -> dict[
 
 
 def condition_lines(conditions: Conditions, repeats: int, runs: Sequence[Measured]) -> list[str]:
-    """What was the same for all, in sentences."""
-    views_judged = sorted({run.views for run in runs})
-    judged = " or ".join(map(str, views_judged)) or "all"
+    """Return the conditions shared by all runs as sentences.
+
+    Args:
+        conditions: the conditions.
+        repeats: number of seeds for each contender.
+        runs: measurements of all finished runs.
+    """
+    counts = sorted({run.views for run in runs})
+    evaluated = " or ".join(map(str, counts)) or "all"
     lines = [
-        f"Every method was given {conditions.budget()}, each run in a process of its own.",
-        f"Final figures are means over {judged} held-out views; learning curves over {conditions.curve_images} views "
-        "at most, whose evaluation does not count as training time.",
-        f"{repeats} seed{'s' if repeats > 1 else ''} a method"
+        f"Every method had {conditions.budget()}, each run in its own process.",
+        f"Final results are means over {evaluated} held-out views; learning curves are over at most "
+        f"{conditions.curve_images} views, whose evaluation does not count as training time.",
+        f"{repeats} seed{'s' if repeats > 1 else ''} per method"
         + (
             ": means, ± the standard deviation of a single run."
             if repeats > 1
-            else "; --repeats 3 would tell how much runs differ."
+            else "; --repeats 3 would show how much runs differ."
         ),
     ]
     if used := sorted({str(run.machine.get("kernels")) for run in runs}):
@@ -134,26 +156,34 @@ def condition_lines(conditions: Conditions, repeats: int, runs: Sequence[Measure
 
 
 def table(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """The table's rows: label, colour, whether on a Pareto front, and a cell for each of `COLUMNS`."""
-    there = [row for row in rows if row.runs]
-    front = pareto([(row.mean("seconds") or math.inf, row.mean("psnr") or 0.0) for row in there])
-    on_front = {row.label for row, best in zip(there, front, strict=True) if best}
-    found = []
+    """Return the rows of the table of results: label, colour, whether on the Pareto front, and a cell for each column.
+
+    Args:
+        rows: results of the contenders.
+    """
+    finished = [row for row in rows if row.runs]
+    front = pareto([(row.mean("seconds") or math.inf, row.mean("psnr") or 0.0) for row in finished])
+    on_front = {row.label for row, best in zip(finished, front, strict=True) if best}
+    result = []
     for index, row in enumerate(rows):
-        cells = [_cell(column, row, there) for column in COLUMNS] if row.runs else []
-        found.append(
+        cells = [_cell(column, row, finished) for column in COLUMNS] if row.runs else []
+        result.append(
             {"label": row.label, "color": plots.color_of(index), "front": row.label in on_front, "cells": cells}
         )
-    return found
+    return result
 
 
 def console_table(rows: Sequence[Row]) -> Table:
-    """For a terminal: a line for each figure, for names of methods are long and lines are short."""
-    found = Table("", *(row.label for row in rows))
+    """Return the table of results for a terminal, with a line for each measurement, as labels of methods are long.
+
+    Args:
+        rows: results of the contenders.
+    """
+    result = Table("", *(row.label for row in rows))
     cells = [row["cells"] or [Cell("failed")] * len(COLUMNS) for row in table(rows)]
     for column, figures in zip(COLUMNS, zip(*cells, strict=True), strict=True):
-        found.add_row(column.title, *(cell.text for cell in figures))
-    return found
+        result.add_row(column.title, *(cell.text for cell in figures))
+    return result
 
 
 def _cell(column: Column, row: Row, rows: Sequence[Row]) -> Cell:
@@ -168,30 +198,38 @@ def _cell(column: Column, row: Row, rows: Sequence[Row]) -> Cell:
 
 
 def _best(column: Column, value: float, others: Sequence[float]) -> bool:
-    """Whether a figure is the best; where all are the same, none is."""
+    """Return whether a value is the best of its column; if all are equal, none is."""
     assert column.best is not None
-    alike = [math.isclose(other, column.best(others), rel_tol=column.same) for other in others]
-    return not all(alike) and math.isclose(value, column.best(others), rel_tol=column.same)
+    equal_to_best = [math.isclose(other, column.best(others), rel_tol=column.same) for other in others]
+    return not all(equal_to_best) and math.isclose(value, column.best(others), rel_tol=column.same)
 
 
 def levels(rows: Sequence[Row]) -> list[int]:
-    """The whole dB that some contender reached after its first evaluation, at most the highest sixteen."""
+    """Return the integer PSNRs, dB, that a contender reached after its first evaluation, at most the highest sixteen.
+
+    Args:
+        rows: results of the contenders.
+    """
     reached = {level for row in rows for run in row.runs for level in run.seconds_to}
     return sorted(reached)[-16:]
 
 
 def level_table(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Seconds of training to each of `levels`."""
-    found = []
+    """Return the rows of the table of seconds of training to each of `levels`.
+
+    Args:
+        rows: results of the contenders.
+    """
+    result = []
     for index, row in enumerate(rows):
         times = [row.seconds_to(level) for level in levels(rows)]
         cells = [Cell("–" if time is None else f"{time:.1f}") for time in times]
-        found.append({"label": row.label, "color": plots.color_of(index), "cells": cells})
-    return found
+        result.append({"label": row.label, "color": plots.color_of(index), "cells": cells})
+    return result
 
 
 def machines(runs: Sequence[Measured]) -> list[str]:
-    """The machines of the runs, in a line each."""
+    """Return a line for each machine on which `runs` were made."""
     lines = []
     for run in runs:
         line = ", ".join(f"{name}: {value}" for name, value in run.machine.items() if value is not None)
@@ -201,12 +239,16 @@ def machines(runs: Sequence[Measured]) -> list[str]:
 
 
 def markdown(content: dict[str, Any]) -> str:
-    """The report as Markdown, without pictures."""
+    """Return the report as Markdown, without images.
+
+    Args:
+        content: content of the report.
+    """
     lines = [f"# {content['title']}", "", content["when"], "", *(f"- {line}" for line in content["conditions"]), ""]
     lines += _markdown_table(["method", *content["columns"]], content["rows"])
     lines += [
         "",
-        "Bold: best. *: no other method had a higher PSNR after as little training (times within 1 % are the same).",
+        "Bold: best. *: no other method had a higher PSNR after as little training (times within 1 % count as equal).",
         "",
     ]
     if content["levels"]:
@@ -230,7 +272,9 @@ def _markdown_table(head: list[str], rows: list[dict[str, Any]]) -> list[str]:
 
 
 CSV_FIGURES = ("label", "method", "seed", "psnr", "ssim", "lpips", "views", "steps", "seconds", "rays_per_second")
+"""First columns of results.csv."""
 CSV_MORE = ("render_seconds", "peak_memory_bytes", "parameters", "skipped_steps", "command")
+"""Further columns of results.csv."""
 
 
 def _csv(runs: Sequence[Measured]) -> str:

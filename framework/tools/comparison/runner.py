@@ -1,4 +1,4 @@
-"""Running a comparison's jobs: each in processes of its own, one after the other or one on each device."""
+"""Execution of a comparison's jobs, each in child processes, one after the other or one on each device."""
 
 from __future__ import annotations
 
@@ -22,28 +22,34 @@ from framework.tools.comparison.plan import Conditions, Job, Plan
 from framework.training.signals import NUMBERS, Stopped, handled
 
 LOOK_EVERY = 0.5
-"""Seconds between looks at what a run has printed last."""
+"""Seconds between updates of the displayed last line of a run's output."""
 GRACE = 60.0
 """Seconds that a run has to save before it is killed."""
 
 
 @dataclass(frozen=True)
 class Failure:
-    """A job that did not work."""
+    """A failed job."""
 
     reason: str
-    """The last line that it printed, or the signal that ended it."""
+    """Last line of its output, or the signal that ended it."""
     log: Path
-    """All that it printed."""
+    """File of its output."""
 
 
 def run_jobs(plan: Plan, jobs_at_once: int = 1) -> dict[Job, Failure]:
-    """Train and evaluate every job that is not done yet; a failed one is reported, and the others go on.
+    """Train and evaluate every job that is not finished; a failure is reported, and the others continue.
 
     Args:
-        jobs_at_once: so many run side by side, each on a CUDA device of its own.
-    Returns: the jobs that failed.
-    Raises: ConfigError for more jobs at once than there are CUDA devices; Stopped once the runs under way have saved.
+        plan: the comparison.
+        jobs_at_once: number of jobs that run in parallel, each on its own CUDA device.
+
+    Returns:
+        The failed jobs.
+
+    Raises:
+        ConfigError: if there are fewer CUDA devices than parallel jobs.
+        Stopped: on a signal, after the running jobs have saved.
     """
     devices: Queue[str | None] = Queue()
     for device in _devices(plan.conditions, jobs_at_once):
@@ -56,7 +62,7 @@ def run_jobs(plan: Plan, jobs_at_once: int = 1) -> dict[Job, Failure]:
         if stopped.is_set():
             return
         if is_done(job):
-            say(f"[{number + 1}/{len(jobs)}] {job.title}: done before")
+            say(f"[{number + 1}/{len(jobs)}] {job.title}: already finished")
             return
         device = devices.get()
         try:
@@ -66,55 +72,65 @@ def run_jobs(plan: Plan, jobs_at_once: int = 1) -> dict[Job, Failure]:
             devices.put(device)
         if failure is not None and not stopped.is_set():
             failures[job] = failure
-            say(f"  {job.title} failed: {failure.reason} (all it printed: {failure.log})")
+            say(f"  {job.title} failed: {failure.reason} (full output: {failure.log})")
 
-    with ThreadPoolExecutor(jobs_at_once) as pool, _noted(stopped, signals):
+    with ThreadPoolExecutor(jobs_at_once) as pool, _recorded(stopped, signals):
         for future in [pool.submit(work, number) for number in range(len(jobs))]:
             future.result()
     if signals:
-        raise Stopped(signals[0], "stopped; the same command goes on from here")
+        raise Stopped(signals[0], "stopped; run the same command to continue")
     return failures
 
 
 @contextmanager
-def _noted(stopped: threading.Event, signals: list[int]) -> Iterator[None]:
-    """Ctrl-C and SIGTERM set `stopped`, so that runs are ended in order and not left behind."""
+def _recorded(stopped: threading.Event, signals: list[int]) -> Iterator[None]:
+    """Make Ctrl-C and SIGTERM set `stopped`, so that running jobs are ended properly."""
 
-    def note(number: int, frame: object) -> None:
+    def record(number: int, frame: object) -> None:
         signals.append(number)
         stopped.set()
 
-    with handled(NUMBERS, note):
+    with handled(NUMBERS, record):
         yield
 
 
 def _devices(conditions: Conditions, jobs_at_once: int) -> Sequence[str | None]:
-    """What CUDA_VISIBLE_DEVICES is for each of the jobs that run side by side; None to leave it as it is."""
+    """Return the value of CUDA_VISIBLE_DEVICES for each parallel job; None to leave it unchanged."""
     if jobs_at_once < 1:
         raise ConfigError(f"--jobs is {jobs_at_once}; it must be at least 1")
     if jobs_at_once == 1:
         return [None]
     import torch
 
-    there = torch.cuda.device_count() if conditions.device_type in ("auto", "cuda") else 0
-    if jobs_at_once > there:
+    available = torch.cuda.device_count() if conditions.device_type in ("auto", "cuda") else 0
+    if jobs_at_once > available:
         raise ConfigError(
-            f"--jobs {jobs_at_once} needs as many CUDA devices, and there are {there}: runs that share one would slow "
-            "each other down, and no time would be comparable"
+            f"--jobs {jobs_at_once} needs as many CUDA devices, and there are {available}: runs that share one would "
+            "slow each other down, so that times would not be comparable"
         )
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-    names = visible.split(",") if visible else [str(number) for number in range(there)]
+    names = visible.split(",") if visible else [str(number) for number in range(available)]
     return names[:jobs_at_once]
 
 
 def is_done(job: Job) -> bool:
-    """Whether a job has been trained to its end and evaluated."""
+    """Return whether `job` has been trained to its end and evaluated."""
     summary = read_json(job.folder / "summary.json")
     return isinstance(summary, dict) and summary.get("interrupted") is False and job.evaluation.exists()
 
 
 def run_job(job: Job, conditions: Conditions, device: str | None, stopped: threading.Event) -> Failure | None:
-    """Train and evaluate one job. Returns: why it failed; None where it worked."""
+    """Train and evaluate one job.
+
+    Args:
+        job: the job.
+        conditions: the conditions of the comparison.
+        device: value of CUDA_VISIBLE_DEVICES, or None to leave it unchanged.
+        stopped: set if the job is to end early.
+
+    Returns:
+        The failure, or None if the job succeeded.
+    """
     job.log.parent.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     if device is not None:
@@ -129,13 +145,13 @@ def run_job(job: Job, conditions: Conditions, device: str | None, stopped: threa
 
 
 def _run(command: list[str], job: Job, environment: dict[str, str], stopped: threading.Event) -> int:
-    """Run a command, its output going to the job's log, its last line to the terminal. Returns: its exit status."""
+    """Run a command, with its output in the job's log and its last line on the terminal; return its exit status."""
     with job.log.open("ab") as log:
         log.write(("$ " + " ".join(command) + "\n").encode())
         log.flush()
-        # In a session of its own, so that Ctrl-C reaches it through us, once.
+        # In its own session, so that Ctrl-C reaches it only once, from this process.
         process = subprocess.Popen(command, stdout=log, stderr=log, env=environment, start_new_session=True)
-        # The terminal can show one status; runs side by side go without.
+        # The terminal can show only one status, so parallel runs have none.
         alone = console.is_terminal and "CUDA_VISIBLE_DEVICES" not in environment
         with Status(job.title, console=console) if alone else nullcontext() as status:
             while True:
@@ -149,7 +165,7 @@ def _run(command: list[str], job: Job, environment: dict[str, str], stopped: thr
 
 
 def _end(process: subprocess.Popen[bytes]) -> int:
-    """Let a run save and stop."""
+    """Terminate a run after it has saved."""
     process.terminate()
     try:
         return process.wait(timeout=GRACE)
@@ -159,7 +175,7 @@ def _end(process: subprocess.Popen[bytes]) -> int:
 
 
 def last_line(log: Path) -> str:
-    """The last line of a log that is not empty."""
+    """Return the last line of the file `log` that is not empty."""
     with log.open("rb") as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(size - 4096, 0))

@@ -1,1 +1,1 @@
-"""Nerfloom's methods in other people's programs: one file a program, which none of the framework knows of."""
+"""Adapters to other programs, one module or a few for each; the framework does not depend on them."""

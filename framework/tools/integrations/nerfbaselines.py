@@ -1,8 +1,9 @@
-"""Nerfloom's methods as nerfbaselines runs them: its `Method` protocol around the trainer and the evaluator.
+"""Adapter that runs Nerfloom's methods in nerfbaselines: its `Method` protocol, implemented by trainer and evaluator.
 
-The protocol is structural, so nothing of nerfbaselines is imported. It trains for `max_num_iterations` steps, its
-trainer counting them; overrides have the names of the method's flags, with underscores (`max_num_iterations`,
-`machine.seed`), or of `FrameFlags` after `frame.`. A checkpoint is the trainer's, beside the background of pictures.
+The protocol is structural, so nothing of nerfbaselines is imported. nerfbaselines counts the steps,
+`max_num_iterations` in all. Overrides have the names of the method's flags with underscores (`max_num_iterations`,
+`machine.seed`), or those of `FrameFlags` with the prefix `frame.`. A checkpoint is the trainer's, and a file with the
+background of renders.
 """
 
 from __future__ import annotations
@@ -29,47 +30,52 @@ from framework.evaluation.appearance import appearance_of, fit_appearance, shown
 from framework.evaluation.evaluator import evaluation_background
 from framework.tools.integrations.nerfbaselines_data import (
     CAMERA_MODELS,
+    ArrayImages,
+    DatasetDict,
     Frame,
     FrameFlags,
-    Handed,
-    Photographs,
     background_of,
     cameras_of,
     dataset_of,
 )
-from framework.tools.integrations.nerfbaselines_settings import flattened, over_any, parse_overrides
+from framework.tools.integrations.nerfbaselines_settings import flattened, parse_overrides, with_matching_background
 from framework.training.checkpoint import FOLDER, load_newest
 from framework.training.run import Run, write_json
 from framework.training.trained import restored_model
 from framework.training.trainer import Trainer
 
-PICTURES = "pictures.json"
-"""The file of a checkpoint that says what the trainer's does not: the background of pictures."""
+BACKGROUND_FILE = "pictures.json"
+"""File of a checkpoint with the background of renders, which the trainer's checkpoint lacks."""
 FEATURES = ("color", "points3D_xyz")
-"""What data sets are asked for; the points tell where rays may start, and a set of rendered objects has none."""
+"""Features of data sets that are used; the points determine where rays start, and sets of rendered objects have
+none."""
 OUTPUTS = ("color", "depth", "accumulation")
+"""Names of a render's arrays."""
 
 
 class NerfloomMethod:
-    """One method under nerfbaselines' protocol (`nerfbaselines.Method`). Subclasses name it.
+    """A method under nerfbaselines' protocol (`nerfbaselines.Method`). Subclasses set its name.
 
     Args:
-        checkpoint: a folder that `save` has written.
-        train_dataset: photographs to learn from; needed unless there is a checkpoint that is only to be looked at.
-        config_overrides: settings by name, on top of the method's own or of the checkpoint's; text is read as Python
-            would, words such as `auto` standing for themselves.
-    Raises: ConfigError for unknown settings, or for neither data nor checkpoint; CheckpointError for a checkpoint that
-        is damaged or another method's; DataError for data that cannot be used.
+        checkpoint: a folder written by `save`.
+        train_dataset: training images; not needed to render from a checkpoint.
+        config_overrides: settings by name, on top of the method's or the checkpoint's. Text is parsed as a Python
+            literal, and words such as `auto` are kept.
+
+    Raises:
+        ConfigError: for unknown settings, or if there are neither data nor a checkpoint.
+        CheckpointError: for a checkpoint that is damaged or another method's.
+        DataError: for invalid data.
     """
 
     name: ClassVar[str]
-    """The method's in our registry."""
+    """Name of the method in the registry."""
 
     def __init__(
         self,
         *,
         checkpoint: str | None = None,
-        train_dataset: Handed | None = None,
+        train_dataset: DatasetDict | None = None,
         config_overrides: Mapping[str, Any] | None = None,
     ) -> None:
         saved = None if checkpoint is None else Saved.read(Path(checkpoint), self.name)
@@ -86,14 +92,14 @@ class NerfloomMethod:
             self._frame, background, self._config = saved.frame, saved.background, config
             self._model = restored_model(self.name, config, saved.content, choose_device(config.machine))
         else:
-            raise ConfigError(f"{self.name} needs photographs to learn from, or a checkpoint")
+            raise ConfigError(f"{self.name} needs training images or a checkpoint")
         self._background = background.to(self._model.device)
 
-    # -- what nerfbaselines is told ---------------------------------------------------------------------------
+    # -- information for nerfbaselines --------------------------------------------------------------------------
 
     @classmethod
     def get_method_info(cls) -> dict[str, Any]:
-        """nerfbaselines' `MethodInfo`; it fills in the id that it knows the method by."""
+        """Return nerfbaselines' `MethodInfo`; it fills in its own id of the method."""
         return {
             "method_id": "",
             "required_features": frozenset(FEATURES),
@@ -103,7 +109,7 @@ class NerfloomMethod:
         }
 
     def get_info(self) -> dict[str, Any]:
-        """nerfbaselines' `ModelInfo`: the above, how long to train, the settings, and what was loaded."""
+        """Return nerfbaselines' `ModelInfo`: method, length of training, settings, and loaded checkpoint."""
         return {
             **self.get_method_info(),
             "num_iterations": self._config.max_num_iterations,
@@ -117,42 +123,52 @@ class NerfloomMethod:
     # -- training ---------------------------------------------------------------------------------------------
 
     def train_iteration(self, step: int) -> dict[str, float]:
-        """One step of training, the `step`-th from 0.
+        """Run one training step.
 
-        Returns: the loss and its terms, and the running PSNR of training pixels, dB.
-        Raises: ConfigError without photographs, or out of turn; DivergenceError after ten non-finite steps in a row.
+        Args:
+            step: number of the step, from 0.
+
+        Returns:
+            The loss, its terms, and the running PSNR of training pixels, dB.
+
+        Raises:
+            ConfigError: without training images, or if `step` is not the next step.
+            DivergenceError: after ten consecutive non-finite steps.
         """
         if self._trainer is None:
-            raise ConfigError("there are no photographs to learn from: the method was loaded without")
+            raise ConfigError("the method was loaded without training images")
         if step != self._trainer.state.step:
-            raise ConfigError(f"step {step} is not the next one, which is {self._trainer.state.step}")
+            raise ConfigError(f"step {step} is not the next step, {self._trainer.state.step}")
         report = self._trainer.train_step()
         terms = {f"loss_{name}": value for name, value in report.losses.items()}
         return {"loss": sum(report.losses.values()), "psnr": report.psnr, **terms}
 
     def save(self, path: str) -> None:
-        """Write a checkpoint into the folder `path`.
+        """Write a checkpoint to the folder `path`.
 
-        Raises: CheckpointError or OSError where it cannot be written.
+        Raises:
+            CheckpointError, OSError: if it cannot be written.
         """
         folder = Path(path)
         folder.mkdir(parents=True, exist_ok=True)
         if self._trainer is not None:
             self._trainer.run = replace(self._trainer.run, folder=folder)
             self._trainer.save()
-        elif self._checkpoint is not None:  # the same bytes, of which nerfbaselines keeps a hash
+        elif self._checkpoint is not None:  # the same bytes, as nerfbaselines stores their hash
             shutil.copytree(self._checkpoint / FOLDER, folder / FOLDER, dirs_exist_ok=True)
-        write_json(folder / PICTURES, {"background": self._background.tolist()})
+        write_json(folder / BACKGROUND_FILE, {"background": self._background.tolist()})
 
-    # -- pictures ---------------------------------------------------------------------------------------------
+    # -- rendering --------------------------------------------------------------------------------------------
 
     def render(self, camera: Any, *, options: Mapping[str, Any] | None = None) -> dict[str, np.ndarray]:
-        """What a camera sees.
+        """Render the view of a camera.
 
         Args:
             camera: one of nerfbaselines' cameras, of any size and model.
-            options: `embedding` is the appearance to show, the training photographs' mean if None.
-        Returns: color (H, W, 3) in [0, 1] over the data set's background, depth (H, W) along the ray in the data set's
+            options: `embedding` is the appearance; the mean of the training images' if None.
+
+        Returns:
+            color (H, W, 3) in [0, 1] over the data set's background, depth (H, W) along the ray in the data set's
             units, and accumulation (H, W), float32.
         """
         cameras = self._frame.placed(cameras_of([camera.item()], ["the camera"])).to(self._model.device)
@@ -166,18 +182,22 @@ class NerfloomMethod:
         appearance = appearance_of(self._model)
         return None if appearance is None else appearance.vectors[index].detach().cpu().numpy()
 
-    def optimize_embedding(self, dataset: Handed, *, embedding: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """The appearance of a photograph that was not trained on.
+    def optimize_embedding(self, dataset: DatasetDict, *, embedding: np.ndarray | None = None) -> dict[str, np.ndarray]:
+        """Optimise the appearance of an image that was not trained on.
 
         Args:
-            dataset: one photograph, or what may be seen of it.
-            embedding: (D,) to start from; the training photographs' mean if None.
-        Returns: `embedding` (D,).
-        Raises: NotImplementedError of a method that learns no appearance, which nerfbaselines takes for an answer.
+            dataset: one image, or the visible part of it.
+            embedding: (D,) initial value; the mean of the training images' if None.
+
+        Returns:
+            `embedding` (D,).
+
+        Raises:
+            NotImplementedError: for a method without appearance, as nerfbaselines expects.
         """
         if appearance_of(self._model) is None:
             raise NotImplementedError(f"{self.name} has learnt one appearance for all photographs")
-        data = dataset_of(Photographs.of(dataset), self._frame, "ignored").to(self._model.device)
+        data = dataset_of(ArrayImages.of(dataset), self._frame, "ignored").to(self._model.device)
         pixels = torch.arange(len(data.pixels), device=data.device) if data.kept is None else data.kept.pixels()
         found = fit_appearance(self._model, data, pixels, self._background, self._vector(embedding))
         assert found is not None
@@ -189,51 +209,56 @@ class NerfloomMethod:
 
 
 class InstantNGP(NerfloomMethod):
-    """instant-ngp for nerfbaselines."""
+    """Adapter of instant-ngp."""
 
     name = "instant-ngp"
 
 
 class KPlanes(NerfloomMethod):
-    """kplanes for nerfbaselines."""
+    """Adapter of kplanes."""
 
     name = "kplanes"
 
 
 class Nerfacto(NerfloomMethod):
-    """nerfacto for nerfbaselines."""
+    """Adapter of nerfacto."""
 
     name = "nerfacto"
 
 
 class TensoRF(NerfloomMethod):
-    """tensorf for nerfbaselines."""
+    """Adapter of tensorf."""
 
     name = "tensorf"
 
 
 class VanillaNeRF(NerfloomMethod):
-    """vanilla-nerf for nerfbaselines."""
+    """Adapter of vanilla-nerf."""
 
     name = "vanilla-nerf"
 
 
 @dataclass(frozen=True)
 class Saved:
-    """What `save` has written."""
+    """A checkpoint written by `NerfloomMethod.save`."""
 
     folder: Path
-    """Where."""
+    """Folder of the checkpoint."""
     content: dict[str, Any]
-    """The trainer's checkpoint."""
+    """Content of the trainer's checkpoint."""
     background: Tensor
-    """(3,) behind what is not opaque in a picture."""
+    """(3,) colour behind renders."""
 
     @classmethod
     def read(cls, folder: Path, method: str) -> Saved:
-        """Read it.
+        """Read a checkpoint.
 
-        Raises: CheckpointError where something is missing, damaged, or another method's.
+        Args:
+            folder: folder of the checkpoint.
+            method: name of the method.
+
+        Raises:
+            CheckpointError: if a file is missing or damaged, or the checkpoint is another method's.
         """
         content = load_newest(folder / FOLDER)
         if content is None:
@@ -241,53 +266,53 @@ class Saved:
         if content.get("method") != method:
             raise CheckpointError(f"{folder} is a checkpoint of {content.get('method')}, not of {method}")
         try:
-            background = torch.tensor(json.loads((folder / PICTURES).read_text(encoding="utf-8"))["background"])
+            background = torch.tensor(json.loads((folder / BACKGROUND_FILE).read_text(encoding="utf-8"))["background"])
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise CheckpointError(f"{folder / PICTURES} is missing or damaged: {error}") from error
+            raise CheckpointError(f"{folder / BACKGROUND_FILE} is missing or damaged: {error}") from error
         return cls(folder, content, background)
 
     @property
     def frame(self) -> Frame:
-        """Where the data set lay when it was learnt."""
+        """The frame of the data set in training."""
         return Frame.saved(self.content)
 
 
 @dataclass(frozen=True)
 class ReadByNerfbaselines(DataParser):
-    """Stands where a run names its data format: nerfbaselines has read the data already."""
+    """Placeholder for a run's data format, as nerfbaselines has read the data."""
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
         return False
 
     def parse(self, path: Path | None, split: Split) -> ParsedScene:
-        raise DataError("nerfbaselines reads the data of its runs; there are no files to parse")
+        raise DataError("nerfbaselines has read the data; there are no files to parse")
 
 
 def _begin(
-    method: str, config: TrainConfig, flags: FrameFlags, handed: Handed, saved: Saved | None
+    method: str, config: TrainConfig, flags: FrameFlags, data: DatasetDict, saved: Saved | None
 ) -> tuple[Trainer, Frame, Tensor]:
-    """A trainer at its start, or as it was saved; where its photographs lie; and what is behind them in pictures (3,).
+    """Return a trainer, new or restored from a checkpoint, the frame of its images, and the background of renders (3,).
 
-    What the data decided is said at the start.
+    The decisions based on the data are reported for a new one.
     """
-    photographs = Photographs.of(handed)
-    frame = Frame.of(photographs, flags) if saved is None else saved.frame
-    dataset = dataset_of(photographs, frame, config.masks).to(choose_device(config.machine))
-    background, transparent = background_of(handed), dataset.scene.has_alpha
-    if saved is None and transparent:
-        config = over_any(config, background)
+    images = ArrayImages.of(data)
+    frame = Frame.of(images, flags) if saved is None else saved.frame
+    dataset = dataset_of(images, frame, config.masks).to(choose_device(config.machine))
+    background, has_alpha = background_of(data), dataset.scene.has_alpha
+    if saved is None and has_alpha:
+        config = with_matching_background(config, background)
     trainer = Trainer(Run(method, config, "nerfbaselines", ReadByNerfbaselines(), Path()), dataset, None)
     if saved is not None:
         trainer.restore(saved.content)
         return trainer, frame, saved.background
     for line in trainer.profile().lines():
         say(line)
-    return trainer, frame, background if transparent else evaluation_background(trainer.model)
+    return trainer, frame, background if has_alpha else evaluation_background(trainer.model)
 
 
 def _defaults(method: str, saved: Saved | None) -> TrainConfig:
-    """The settings before any override. nerfbaselines' masks hide what disturbs; they never say that it is empty."""
+    """Return the settings before overrides. nerfbaselines' masks hide unwanted content; they mean no empty space."""
     default = load_method(method).config
     if saved is None:
         return replace(default, masks="ignored")

@@ -1,6 +1,7 @@
-"""Photographs as nerfbaselines hands them over, in memory, and where they lie in a scene of ours.
+"""Conversion of nerfbaselines' data sets, which are in memory, and their placement in a scene.
 
-There, cameras have OpenCV's axes (x right, y down, z ahead); here OpenGL's. Pixels' centres lie at 0.5 in both.
+nerfbaselines' cameras have OpenCV's axes (x right, y down, z forward), those of the framework OpenGL's. Pixel centres
+are at 0.5 in both.
 """
 
 from __future__ import annotations
@@ -22,87 +23,95 @@ from framework.data.dataset import Dataset, Masks, ParsedScene, assemble
 from framework.data.decoding import Decoded, from_arrays
 from framework.data.masks import THRESHOLD
 
-Handed = dict[str, Any]
-"""nerfbaselines' `Dataset`; read are `cameras`, `image_paths`, `images`, `masks`, `points3D_xyz` and `metadata`."""
+DatasetDict = dict[str, Any]
+"""nerfbaselines' `Dataset`, of which `cameras`, `image_paths`, `images`, `masks`, `points3D_xyz` and `metadata` are
+used."""
 CAMERA_MODELS = ("pinhole", "opencv", "opencv_fisheye", "full_opencv")
-"""nerfbaselines' camera models, in the order of their numbers. COLMAP has them all, under the same names."""
+"""nerfbaselines' camera models, in the order of its enumeration. COLMAP has all of them, with the same names."""
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-"""The order of nerfbaselines' distortion parameters, whichever the model; those that are left out are zero."""
+"""Order of nerfbaselines' distortion parameters for all models; missing ones are zero."""
 TO_OPENGL = np.array([1.0, -1.0, -1.0, 1.0])
-"""Signs of a pose's columns."""
+"""Signs of a pose's columns that convert OpenCV's axes to OpenGL's."""
 FAR = 1000.0
-"""Where a scene without a box ends, scene units."""
+"""Distance at which an unbounded scene ends, scene units."""
 BOUND_SHARE = 0.9
-"""Rays start at this share of the least depth that the data set states: of the points it was taken from, a few were
-nearer."""
+"""Near distance as a fraction of the smallest depth stated by the data set: that is a percentile, and a few are
+smaller."""
 
 
 @dataclass(frozen=True)
 class FrameFlags:
-    """Settings of where the scene is; among nerfbaselines' overrides, `frame.` stands before their names."""
+    """Settings of the scene's region; nerfbaselines' overrides name them with the prefix `frame.`."""
 
     half_size: float | None = None
-    """Half the edge of the box of an object that alpha cuts out, the data set's units. If not given: half of what lies
-    between the nearest and the farthest depth that the data set states."""
+    """Half the side of the box of an object cut out by alpha, in the data set's units. If not given: half the range
+    between the smallest and the largest depth stated by the data set."""
 
 
 @dataclass(frozen=True)
-class Photographs:
-    """M photographs in the data set's own frame and units."""
+class ArrayImages:
+    """M images in the data set's own frame and units."""
 
     paths: tuple[Path, ...]
     """M names of files, which need not exist."""
     cameras: Cameras
-    """M cameras; their poses are float64."""
+    """M cameras with float64 poses."""
     decoded: Decoded
-    """Their pixels."""
+    """The images' pixels."""
     bounds: tuple[float, float] | None
-    """Nearest and farthest depth of the scene, where the data set states them."""
+    """Smallest and largest depth of the scene, if the data set states them."""
     points: Tensor | None
-    """(K, 3) float64 sparse points on surfaces, where there are any."""
+    """(K, 3) float64 sparse points, or None."""
 
     @classmethod
-    def of(cls, handed: Handed) -> Photographs:
-        """Read nerfbaselines' dictionary. Images and masks may be padded; what counts is their camera's size.
+    def of(cls, dataset: DatasetDict) -> ArrayImages:
+        """Convert nerfbaselines' dictionary `dataset`. Images and masks may be padded to more than their camera's size.
 
-        Raises: DataError for linear colours, arrays that are no images, and cameras that cannot be.
+        Raises:
+            DataError: for linear colours, invalid arrays, or invalid cameras.
         """
-        space = handed["metadata"].get("color_space") or "srgb"
+        space = dataset["metadata"].get("color_space") or "srgb"
         if space != "srgb":
-            raise DataError(f"the photographs' colours are {space}; only those stored as sRGB can be learnt from")
-        cameras, paths = handed["cameras"], tuple(map(Path, handed["image_paths"]))
+            raise DataError(f"the images' colours are {space}; only sRGB is supported")
+        cameras, paths = dataset["cameras"], tuple(map(Path, dataset["image_paths"]))
         sizes = [(int(width), int(height)) for width, height in cameras.image_sizes]
-        masks = handed.get("masks", handed.get("sampling_masks"))  # as they were called at first
-        images = [_cut(image, *size, path) for image, size, path in zip(handed["images"], sizes, paths, strict=True)]
-        used = None
+        masks = dataset.get("masks", dataset.get("sampling_masks"))  # the name in early versions
+        images = [
+            _unpadded(image, *size, path) for image, size, path in zip(dataset["images"], sizes, paths, strict=True)
+        ]
+        keep = None
         if masks is not None:
-            used = [_used(_cut(mask, *size, path)) for mask, size, path in zip(masks, sizes, paths, strict=True)]
-        bounds, points = cameras.nears_fars, handed.get("points3D_xyz")
+            keep = [
+                _as_bool(_unpadded(mask, *size, path)) for mask, size, path in zip(masks, sizes, paths, strict=True)
+            ]
+        bounds, points = cameras.nears_fars, dataset.get("points3D_xyz")
         return cls(
             paths=paths,
             cameras=cameras_of(cameras, (path.name for path in paths)),
-            decoded=from_arrays(images, used),
+            decoded=from_arrays(images, keep),
             bounds=None if bounds is None else (float(bounds[:, 0].min()), float(bounds[:, 1].max())),
             points=None if points is None else torch.from_numpy(np.array(points, np.float64)),
         )
 
 
-def cameras_of(handed: Any, names: Iterable[str]) -> Cameras:
-    """nerfbaselines' cameras as ours, in the data set's own frame; their poses stay float64.
+def cameras_of(cameras: Any, names: Iterable[str]) -> Cameras:
+    """Convert nerfbaselines' cameras, in the data set's own frame, with float64 poses.
 
     Args:
-        handed: M of them, each with `poses` (3 or 4, 4) camera-to-world, `intrinsics` (4,) fx, fy, cx, cy in pixels,
+        cameras: M cameras, each with `poses` (3 or 4, 4) camera-to-world, `intrinsics` (4,) fx, fy, cx, cy in pixels,
             `camera_models`, `distortion_parameters` (up to 8,) and `image_sizes` (2,) width and height.
-        names: what to call each in messages.
-    Raises: DataError for poses that are not rigid, impossible numbers, or models that one scene cannot mix.
+        names: M names for messages.
+
+    Raises:
+        DataError: for poses that are not rigid, invalid intrinsics, or models that cannot be combined.
     """
-    return join_cameras([_camera(camera, name) for camera, name in zip(handed, names, strict=True)])
+    return join_cameras([_camera(camera, name) for camera, name in zip(cameras, names, strict=True)])
 
 
 def _camera(camera: Any, name: str) -> Cameras:
     model = CAMERA_MODELS[int(camera.camera_models)].upper()
     given = dict(zip(COEFFICIENTS, camera.distortion_parameters, strict=False))
-    coefficients = [given.get(key, 0.0) for key in PARAMETERS[model][1].split()[4:]]  # behind fx fy cx cy
+    coefficients = [given.get(key, 0.0) for key in PARAMETERS[model][1].split()[4:]]  # after fx fy cx cy
     width, height = (int(side) for side in camera.image_sizes)
     numbers = from_colmap(model, [*camera.intrinsics, *coefficients], width, height)
     pose = torch.from_numpy(np.array(camera.poses, np.float64)[:3] * TO_OPENGL)
@@ -120,99 +129,108 @@ def _camera(camera: Any, name: str) -> Cameras:
     )
 
 
-def _cut(image: Any, width: int, height: int, path: Path) -> np.ndarray:
-    """What an array (H, W, ...) holds of an image, without what only makes it as large as others."""
+def _unpadded(image: Any, width: int, height: int, path: Path) -> np.ndarray:
+    """Return the top left part (height, width, ...) of an array, without its padding."""
     image = np.asarray(image)
     if image.shape[0] < height or image.shape[1] < width:
         raise DataError(f"{path} is {image.shape[1]}x{image.shape[0]} pixels, but its camera is for {width}x{height}")
     return image[:height, :width]
 
 
-def _used(mask: np.ndarray) -> np.ndarray:
-    """(H, W) bool of a mask (H, W) or (H, W, 1) that says so in any type: where to learn from."""
+def _as_bool(mask: np.ndarray) -> np.ndarray:
+    """Convert a mask (H, W) or (H, W, 1) of any type to (H, W) bool, true for pixels to train on."""
     mask = mask.reshape(mask.shape[:2])
     return mask if mask.dtype == np.bool_ else mask >= (THRESHOLD if mask.dtype == np.uint8 else 0.5)
 
 
 @dataclass(frozen=True)
 class Frame:
-    """Where a data set lies in the scene, and what of space matters."""
+    """Placement of a data set in the scene, and its region of interest."""
 
     placement: Placement
-    """From the data set's frame to the scene's."""
+    """Transform from the data set's frame to the scene's."""
     box: Tensor
-    """(2, 3) scene coordinates."""
+    """(2, 3) corners of the region of interest, scene coordinates."""
     near: float
-    """Distance from a camera at which the scene may start, scene units."""
+    """Distance from a camera at which the scene starts, scene units."""
     far: float
     """Distance from a camera at which the scene ends, scene units."""
     unbounded: bool
-    """There may be something to see outside `box`."""
+    """Whether there may be visible content outside `box`."""
 
     @classmethod
-    def of(cls, photographs: Photographs, flags: FrameFlags) -> Frame:
-        """Of what alpha cuts out, a box; of all else, a capture without end, as `ns-train` places one.
+    def of(cls, images: ArrayImages, flags: FrameFlags) -> Frame:
+        """Return a box for an object cut out by alpha, and for other data the unbounded frame of `ns-train`.
 
-        Raises: DataError where nothing tells how large the box is.
+        Args:
+            images: the images.
+            flags: the user's settings.
+
+        Raises:
+            DataError: if the size of the box cannot be determined.
         """
-        alpha = photographs.decoded.pixels.shape[1] == 4
-        return _around_an_object(photographs, flags.half_size) if alpha else _without_end(photographs)
+        alpha = images.decoded.pixels.shape[1] == 4
+        return _object_frame(images, flags.half_size) if alpha else _unbounded_frame(images)
 
     @classmethod
     def saved(cls, checkpoint: dict[str, Any]) -> Frame:
-        """The frame that a checkpoint's model has learnt in."""
+        """Return the frame of the model in `checkpoint`."""
         scene, placement = checkpoint["scene"], Placement(checkpoint["transform"], checkpoint["scale"])
         return cls(placement, scene["box"], scene["near"], scene["far"], scene["unbounded"])
 
     def placed(self, cameras: Cameras) -> Cameras:
-        """Cameras of the data set's own frame, in the scene."""
-        poses = _exact(self.placement).poses(cameras.camera_to_worlds.double())
+        """Transform `cameras` from the data set's own frame to the scene's."""
+        poses = _in_float64(self.placement).poses(cameras.camera_to_worlds.double())
         return replace(cameras, camera_to_worlds=poses.float())
 
 
-def _around_an_object(photographs: Photographs, half_size: float | None) -> Frame:
-    """The data set's own frame, and a box around where all cameras look."""
-    poses = photographs.cameras.camera_to_worlds
+def _object_frame(images: ArrayImages, half_size: float | None) -> Frame:
+    """Return the data set's own frame, with a box around the point that all cameras look at."""
+    poses = images.cameras.camera_to_worlds
     centre = nearest_point(poses[:, :, 3], -poses[:, :, 2])
     distances = (poses[:, :, 3] - centre).norm(dim=-1)
-    near, far = photographs.bounds or (float(distances.min()) / 2, float(distances.max()) * 1.5)
+    near, far = images.bounds or (float(distances.min()) / 2, float(distances.max()) * 1.5)
     half = (far - near) / 2 if half_size is None else half_size
     if not half > 0:
-        raise DataError("the cameras do not tell how large the object is; set frame.half_size, in the data set's units")
+        raise DataError("the size of the object cannot be determined; set frame.half_size, in the data set's units")
     box = torch.stack([centre - half, centre + half]).float()
     return Frame(Placement(torch.eye(4)[:3], 1.0), box, near, far, unbounded=False)
 
 
-def _without_end(photographs: Photographs) -> Frame:
-    """The cameras' middle at the origin, their positions within [-1, 1], and rays that start before what is nearest."""
-    placement = place(photographs.cameras.camera_to_worlds)
+def _unbounded_frame(images: ArrayImages) -> Frame:
+    """Return a frame with the cameras' mean at the origin, their positions in [-1, 1], and near before all content."""
+    placement = place(images.cameras.camera_to_worlds)
     cube = torch.tensor([[-1.0], [1.0]]).repeat(1, 3)
     frame = Frame(placement, cube, NEAR, FAR, unbounded=True)
-    if photographs.points is not None:
-        points = _exact(placement).points(photographs.points).float()
-        near = nearest_shown(frame.placed(photographs.cameras), points)
-    elif photographs.bounds is not None:
-        near = BOUND_SHARE * photographs.bounds[0] * placement.scale
+    if images.points is not None:
+        points = _in_float64(placement).points(images.points).float()
+        near = nearest_shown(frame.placed(images.cameras), points)
+    elif images.bounds is not None:
+        near = BOUND_SHARE * images.bounds[0] * placement.scale
     else:
         near = NEAR
     return replace(frame, near=min(near, FAR / 2))
 
 
-def _exact(placement: Placement) -> Placement:
-    """In double precision: positions of a mapped scene may be millions of units from their origin."""
+def _in_float64(placement: Placement) -> Placement:
+    """Return the placement in float64: positions in a mapped scene may be millions of units from their origin."""
     return replace(placement, transform=placement.transform.double())
 
 
-def dataset_of(photographs: Photographs, frame: Frame, masks: Masks) -> Dataset:
-    """The photographs as a data set of the scene.
+def dataset_of(images: ArrayImages, frame: Frame, masks: Masks) -> Dataset:
+    """Construct a data set in the scene's frame.
 
     Args:
-        masks: what they say of pixels that they do not keep.
-    Raises: DataError where a lens has no ray for any pixel.
+        images: the images.
+        frame: their frame.
+        masks: meaning of masked-out pixels.
+
+    Raises:
+        DataError: if no pixel has a ray.
     """
     parsed = ParsedScene(
-        image_paths=photographs.paths,
-        cameras=frame.placed(photographs.cameras),
+        image_paths=images.paths,
+        cameras=frame.placed(images.cameras),
         box=frame.box,
         near=frame.near,
         far=frame.far,
@@ -221,10 +239,10 @@ def dataset_of(photographs: Photographs, frame: Frame, masks: Masks) -> Dataset:
         unbounded=frame.unbounded,
         poses="photographs" if frame.unbounded else "exact",
     )
-    return assemble(parsed, photographs.decoded, "train", masks)
+    return assemble(parsed, images.decoded, "train", masks)
 
 
-def background_of(handed: Handed) -> Tensor:
-    """(3,) what the data set's photographs are judged over; black where it does not say, as in nerfbaselines."""
-    color = handed["metadata"].get("background_color")
+def background_of(dataset: DatasetDict) -> Tensor:
+    """Return the background (3,) of the evaluation of `dataset`; black if it is not stated, as in nerfbaselines."""
+    color = dataset["metadata"].get("background_color")
     return torch.zeros(3) if color is None else torch.tensor(np.asarray(color).tolist()) / 255

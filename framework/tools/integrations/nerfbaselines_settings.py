@@ -1,4 +1,4 @@
-"""Settings as nerfbaselines gives and shows them: flat names with dots, and text where a command line gave them."""
+"""Conversion of settings between nerfbaselines and configs: flat names with dots, and text from a command line."""
 
 from __future__ import annotations
 
@@ -12,22 +12,27 @@ from torch import Tensor
 from framework.base.config import TrainConfig
 
 WORDS = {"true": True, "false": False, "none": None, "null": None}
+"""Words with a special meaning, in any case."""
 
 
 def parse_overrides(overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Overrides as nested plain values: dots nest, and text, which is all that a command line gives, is read."""
+    """Convert overrides to nested plain values.
+
+    Args:
+        overrides: values by name, with dots for nesting; text, as from a command line, is parsed.
+    """
     nested: dict[str, Any] = {}
     for key, value in overrides.items():
         *groups, name = key.split(".")
-        place = nested
-        for group in groups:
-            place = place.setdefault(group, {})
-        place[name] = _read(value) if isinstance(value, str) else value
+        group = nested
+        for group_name in groups:
+            group = group.setdefault(group_name, {})
+        group[name] = _read(value) if isinstance(value, str) else value
     return nested
 
 
 def _read(text: str) -> Any:
-    """A Python literal, true, false, none or null in any case; other text as it is."""
+    """Parse a Python literal, or true, false, none or null in any case; return other text unchanged."""
     if text.lower() in WORDS:
         return WORDS[text.lower()]
     try:
@@ -37,15 +42,28 @@ def _read(text: str) -> Any:
 
 
 def flattened(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings with dots in their names."""
+    """Flatten nested settings.
+
+    Args:
+        settings: nested dictionaries.
+        prefix: beginning of all names.
+
+    Returns:
+        Values by name, with dots for nesting.
+    """
     flat: dict[str, Any] = {}
     for name, value in settings.items():
         flat |= flattened(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
     return flat
 
 
-def over_any(config: TrainConfig, background: Tensor) -> TrainConfig:
-    """The settings, with training over random colours if it would be over one that pictures are not made over."""
+def with_matching_background(config: TrainConfig, background: Tensor) -> TrainConfig:
+    """Return the config with a random background in training, if its fixed one differs from that of renders.
+
+    Args:
+        config: the config.
+        background: (3,) colour behind renders.
+    """
     fixed = {"white": 1.0, "black": 0.0}.get(config.background)
     if fixed is None or bool((background == fixed).all()):
         return config

@@ -1,8 +1,9 @@
-"""What nerfbaselines is told of Nerfloom's methods: plain data, registered with it where it is installed.
+"""Specifications of Nerfloom's methods for nerfbaselines: plain data, registered with it if it is installed.
 
-It finds this file by itself where Nerfloom is installed beside it (entry point group `nerfbaselines.specs`), through
-NERFBASELINES_REGISTER, which names the file, or after `nerfbaselines install --spec` with it. So the file stands alone:
-it imports nothing of Nerfloom, and no torch. Methods run in nerfbaselines' own environment (its `python` backend).
+nerfbaselines finds this file if Nerfloom is installed in the same environment (entry point group
+`nerfbaselines.specs`), by NERFBASELINES_REGISTER with the file's path, or by `nerfbaselines install --spec` with it.
+The file therefore imports neither Nerfloom nor PyTorch. Methods run in nerfbaselines' own environment (its `python`
+backend).
 """
 
 from __future__ import annotations
@@ -15,20 +16,22 @@ COMMON: dict[str, Any] = {
     "supported_camera_models": ["pinhole", "opencv", "opencv_fisheye", "full_opencv"],
     "supported_outputs": ["color", "depth", "accumulation"],
     "presets": {
-        # The box that `ns-train` takes for these scenes: smaller than what lies between nearest and farthest depth.
+        # The box of `ns-train` for these scenes, smaller than the range between smallest and largest depth.
         "blender": {"@apply": [{"dataset": "blender"}], "frame.half_size": 1.5},
     },
 }
-"""What all methods share."""
+"""Entries shared by all methods."""
 LICENSES = [{"name": "Apache-2.0"}]
+"""Licenses of the methods."""
 
 
 def _spec(method: str, method_class: str, **metadata: Any) -> dict[str, Any]:
-    """The spec of a method by its name in our registry.
+    """Return the specification of a method.
 
     Args:
-        method_class: its class in `framework.tools.integrations.nerfbaselines`.
-        metadata: what pages show.
+        method: its name in Nerfloom's registry.
+        method_class: name of its class in `framework.tools.integrations.nerfbaselines`.
+        metadata: entries shown on nerfbaselines' pages.
     """
     return {
         "id": f"nerfloom-{method}",
@@ -44,7 +47,7 @@ SPECS: tuple[dict[str, Any], ...] = (
         "InstantNGP",
         name="Nerfloom Instant-NGP",
         description="Nerfloom's Instant-NGP: a multiresolution hash grid, two small networks and an occupancy grid, "
-        "or proposals in contracted space where there may be something outside the box. It needs no GPU.",
+        "or proposals in contracted space for unbounded scenes. It needs no GPU.",
         paper_title="Instant Neural Graphics Primitives with a Multiresolution Hash Encoding",
         paper_authors=["Thomas Müller", "Alex Evans", "Christoph Schied", "Alexander Keller"],
         paper_link="https://arxiv.org/pdf/2201.05989.pdf",
@@ -68,8 +71,8 @@ SPECS: tuple[dict[str, Any], ...] = (
         "nerfacto",
         "Nerfacto",
         name="Nerfloom Nerfacto",
-        description="Nerfloom's Nerfacto: a hash grid with contraction and proposals, and appearance vectors where "
-        "light differs between the photographs.",
+        description="Nerfloom's Nerfacto: a hash grid with contraction and proposals, and appearance vectors if "
+        "the light differs between images.",
         paper_title="Nerfstudio: A Modular Framework for Neural Radiance Field Development",
         paper_authors=[
             "Matthew Tancik",
@@ -103,7 +106,7 @@ SPECS: tuple[dict[str, Any], ...] = (
         "VanillaNeRF",
         name="Nerfloom NeRF",
         description="Nerfloom's NeRF with the paper's settings: one large network on frequency encodings, sampled "
-        "coarsely and finely, or by proposals in contracted space where there may be something outside the box.",
+        "coarsely and finely, or by proposals in contracted space for unbounded scenes.",
         paper_title="NeRF: Representing Scenes as Neural Radiance Fields for View Synthesis",
         paper_authors=[
             "Ben Mildenhall",
@@ -116,11 +119,12 @@ SPECS: tuple[dict[str, Any], ...] = (
         paper_link="https://arxiv.org/pdf/2003.08934.pdf",
     ),
 )
+"""The specifications."""
 
 try:
     from nerfbaselines import register
-except ImportError:  # not installed, or older than its `register`: the specs are data alone
+except ImportError:  # not installed, or a version without `register`
     pass
 else:
-    for _each in SPECS:
-        register(_each)
+    for _entry in SPECS:
+        register(_entry)

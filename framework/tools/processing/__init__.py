@@ -1,1 +1,1 @@
-"""Photographs, videos and phone captures become data folders: a transforms.json with images beside it."""
+"""Conversion of images, videos and phone captures to data folders: a transforms.json with images beside it."""

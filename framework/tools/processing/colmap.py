@@ -1,4 +1,4 @@
-"""COLMAP through pycolmap 3.10 and later, whose names differ between versions. These functions run in `run_apart`."""
+"""COLMAP by pycolmap 3.10 or later, whose names differ between versions. These functions run in a child process."""
 
 from __future__ import annotations
 
@@ -15,35 +15,48 @@ from framework.tools.processing.settings import ColmapFlags
 from framework.tools.processing.worker import Report
 
 MANY = 10
-"""Photographs of a camera from which its principal point is adjusted too."""
+"""Minimum number of images of a camera whose principal point is refined."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """A reconstruction as COLMAP gives it: world to camera, y down."""
+    """A reconstruction in COLMAP's conventions: world to camera, y down."""
 
     cameras: dict[int, tuple[str, int, int, list[float]]]
-    """Name of the lens model, width, height and parameters of each camera."""
+    """Lens model, width, height and parameters by camera number."""
     images: dict[str, tuple[int, int, np.ndarray]]
-    """Image number, camera number and (3, 4) world-to-camera matrix by the photograph's name."""
+    """Image number, camera number and (3, 4) world-to-camera matrix by the image's name."""
     points: np.ndarray
-    """(K, 3) float64."""
+    """(K, 3) float64 positions of sparse points."""
     colors: np.ndarray
-    """(K, 3) uint8."""
+    """(K, 3) uint8 colours of sparse points."""
     error: float
     """Mean reprojection error, pixels."""
 
 
 def require() -> None:
-    """Raises: DataError that says what to install where pycolmap is absent."""
+    """Check that pycolmap is installed.
+
+    Raises:
+        DataError: if it is not, with the command that installs it.
+    """
     if find_spec("pycolmap") is None:
-        raise DataError("finding camera poses needs COLMAP: pip install pycolmap")
+        raise DataError("estimating camera poses needs COLMAP: pip install pycolmap")
 
 
 def extract(
     report: Report, database: Path, images: Path, groups: list[list[str]], masks: Path | None, flags: ColmapFlags
 ) -> None:
-    """Find features; the photographs of a group, by name, share a camera."""
+    """Extract features.
+
+    Args:
+        report: called with the number of images done; unused, as COLMAP does not report progress.
+        database: COLMAP's database, to be created.
+        images: folder of the images.
+        groups: names of the images that share a camera, for each camera.
+        masks: folder of masks, or None.
+        flags: the user's flags.
+    """
     import pycolmap
 
     sift = _extraction_options(pycolmap)
@@ -55,7 +68,7 @@ def extract(
     if masks is not None:
         reader.mask_path = str(masks)
     usage = pycolmap.extract_features.__doc__ or ""
-    named = "image_names" if "image_names:" in usage else "image_list"  # before 3.12
+    names = "image_names" if "image_names:" in usage else "image_list"  # before 3.12
     options = "extraction_options" if "extraction_options:" in usage else "sift_options"  # before 3.13
     more = {"camera_model": flags.camera_model} if "camera_model:" in usage else {}  # before 4
     for group in groups:
@@ -65,7 +78,7 @@ def extract(
             camera_mode=pycolmap.CameraMode.SINGLE,
             reader_options=reader,
             device=_device(pycolmap, flags),
-            **{named: group, options: sift},
+            **{names: group, options: sift},
             **more,
         )
 
@@ -73,7 +86,16 @@ def extract(
 def match_pairs(
     report: Report, database: Path, pairs: list[tuple[str, str]], list_path: Path, everything: bool, flags: ColmapFlags
 ) -> None:
-    """Compare pairs of photographs, by name; `everything` says that they are all the pairs there are."""
+    """Match the features of pairs of images.
+
+    Args:
+        report: called with the number of pairs done.
+        database: COLMAP's database with features.
+        pairs: pairs of names.
+        list_path: file to which the list of pairs is written.
+        everything: whether these are all possible pairs.
+        flags: the user's flags.
+    """
     import pycolmap
 
     list_path.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")
@@ -98,21 +120,29 @@ def match_pairs(
 
 
 def reconstruct(report: Report, database: Path, images: Path, output: Path, flags: ColmapFlags) -> list[int]:
-    """Place cameras one after the other, and write the models found to output/0, output/1, ... from large to small.
+    """Estimate poses incrementally, and write the resulting models to output/0, output/1, ... from large to small.
 
-    Returns: the number of registered photographs of each model; empty where none was found.
+    Args:
+        report: called with the number of registered images.
+        database: COLMAP's database with matches.
+        images: folder of the images.
+        output: folder of the models.
+        flags: the user's flags.
+
+    Returns:
+        The number of registered images of each model; empty if there is none.
     """
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = flags.num_threads
     options.min_model_size = 3
-    placed = 0
+    registered = 0
 
-    def another(pair: bool = False) -> None:
-        nonlocal placed
-        placed += 2 if pair else 1
-        report(placed)
+    def count_image(pair: bool = False) -> None:
+        nonlocal registered
+        registered += 2 if pair else 1
+        report(registered)
 
     raw = output.with_name(output.name + "_raw")
     raw.mkdir(parents=True)
@@ -121,8 +151,8 @@ def reconstruct(report: Report, database: Path, images: Path, output: Path, flag
         str(images),
         str(raw),
         options=options,
-        initial_image_pair_callback=lambda: another(pair=True),
-        next_image_callback=another,
+        initial_image_pair_callback=lambda: count_image(pair=True),
+        next_image_callback=count_image,
     )
     ordered = sorted(models.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     for index, model in enumerate(ordered):
@@ -135,23 +165,35 @@ def reconstruct(report: Report, database: Path, images: Path, output: Path, flag
 
 
 def undistort(report: Report, model: Path, images: Path, output: Path) -> None:
-    """Write the registered photographs without distortion to output/images, and their model to output/sparse."""
+    """Write the registered images without distortion to output/images, and their model to output/sparse.
+
+    Args:
+        report: unused.
+        model: folder of the model.
+        images: folder of the images.
+        output: folder to write to.
+    """
     import pycolmap
 
     pycolmap.undistort_images(str(output), str(model), str(images), output_type="COLMAP")
 
 
 def read_model(report: Report, folder: Path) -> Model:
-    """Read a model from a folder with cameras.bin, images.bin and points3D.bin.
+    """Read a model.
 
-    Raises: DataError where there is none.
+    Args:
+        report: unused.
+        folder: folder with cameras.bin, images.bin and points3D.bin.
+
+    Raises:
+        DataError: if the folder has no readable model.
     """
     import pycolmap
 
     try:
         model = pycolmap.Reconstruction(str(folder))
     except Exception as error:  # pycolmap raises ValueError, RuntimeError and more
-        raise DataError(f"{folder} holds no COLMAP model that can be read") from error
+        raise DataError(f"{folder} holds no readable COLMAP model") from error
     cameras = {
         number: (_lens(camera), int(camera.width), int(camera.height), [float(p) for p in camera.params])
         for number, camera in model.cameras.items()
@@ -173,9 +215,9 @@ def read_model(report: Report, folder: Path) -> Model:
 
 
 def _refine(pycolmap: Any, model: Any) -> None:
-    """Adjust cameras, points and lenses together, with the principal point free where photographs determine it."""
-    used = [model.images[number].camera_id for number in model.reg_image_ids()]
-    if min(used.count(camera) for camera in set(used)) < MANY:
+    """Run a bundle adjustment with free principal points, if all cameras have enough images to determine theirs."""
+    camera_ids = [model.images[number].camera_id for number in model.reg_image_ids()]
+    if min(camera_ids.count(camera) for camera in set(camera_ids)) < MANY:
         return
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = True
@@ -191,13 +233,13 @@ def _extraction_options(pycolmap: Any) -> Any:
 
 
 def _set(options: Any, name: str, value: Any) -> None:
-    """Set an option, which later versions keep in `options.sift`."""
+    """Set an option, which newer versions keep in `options.sift`."""
     setattr(options if hasattr(options, name) else options.sift, name, value)
 
 
 def _device(pycolmap: Any, flags: ColmapFlags) -> Any:
     if flags.device_type == "cuda" and not pycolmap.has_cuda:
-        raise DataError("--device-type cuda: this pycolmap was built without it; leave the flag out")
+        raise DataError("--device-type cuda: this pycolmap was built without CUDA; leave the flag out")
     return getattr(pycolmap.Device, flags.device_type)
 
 

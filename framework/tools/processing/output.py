@@ -1,4 +1,4 @@
-"""The folder that is written: refused where something would be lost, and unfinished until transforms.json is there."""
+"""The output folder: never overwritten unasked, and incomplete until transforms.json is written."""
 
 from __future__ import annotations
 
@@ -10,39 +10,53 @@ from framework.base.errors import DataError
 from framework.data.data_folder import processed_folder
 
 FINISHED = "transforms.json"
-"""Written last: a folder with it is complete."""
+"""File that is written last; a folder with it is complete."""
 _OURS = re.compile(r"transforms\.json|sparse_pc\.ply|colmap|(images|masks)(_\d+)?")
 
 
 def check_apart(output: Path, data: Path) -> None:
-    """Raises: DataError where the output would be written over the input, or among it."""
+    """Check that input and output do not overlap.
+
+    Args:
+        output: the folder to write.
+        data: the folder or file to read.
+
+    Raises:
+        DataError: if the output would overwrite the input, or lie among it.
+    """
     if output.exists() and output.resolve() == data.resolve():
-        raise DataError(f"--output-dir {output} is the folder that --data names; {_another(output)}")
+        raise DataError(f"--output-dir {output} is the same folder as --data; {_advice(output)}")
     inside = data.resolve()
     if inside.is_relative_to(output.resolve()) and _OURS.fullmatch(inside.relative_to(output.resolve()).parts[0]):
-        raise DataError(f"--data {data} overlaps what is written into --output-dir {output}; {_another(output)}")
+        raise DataError(f"--data {data} overlaps the files written to --output-dir {output}; {_advice(output)}")
 
 
-def _another(output: Path) -> str:
-    return f"name a folder of its own, as in: --output-dir {processed_folder(output)}"
+def _advice(output: Path) -> str:
+    return f"choose another folder, such as: --output-dir {processed_folder(output)}"
 
 
 def claim(output: Path, data: Path, overwrite: bool) -> None:
-    """Make `output` ready to be written into: make it, or with `overwrite` remove what an earlier run wrote.
+    """Create the output folder, or with `overwrite` remove what an earlier run wrote to it.
 
-    Raises: DataError where it holds anything and `overwrite` is not given, or where that would remove `data`.
+    Args:
+        output: the folder to write.
+        data: the folder or file to read.
+        overwrite: whether to replace an earlier run's output; other files are left alone.
+
+    Raises:
+        DataError: if the folder is not empty and `overwrite` is false, or if files to be removed contain `data`.
     """
     if output.exists() and not output.is_dir():
-        raise DataError(f"--output-dir {output} is a file; name a folder")
+        raise DataError(f"--output-dir {output} is a file; choose a folder")
     present = sorted(output.iterdir()) if output.is_dir() else []
     if present and not overwrite:
-        what = "a processed data set" if (output / FINISHED).exists() else f"'{present[0].name}' but no {FINISHED}"
-        raise DataError(f"--output-dir {output} holds {what}; name a new folder, or give --overwrite")
-    doomed = [path for path in present if _OURS.fullmatch(path.name)]
-    for path in doomed:
+        content = "a processed data set" if (output / FINISHED).exists() else f"'{present[0].name}' but no {FINISHED}"
+        raise DataError(f"--output-dir {output} holds {content}; choose a new folder, or use --overwrite")
+    written = [path for path in present if _OURS.fullmatch(path.name)]
+    for path in written:
         if data.resolve().is_relative_to(path.resolve()):
-            raise DataError(f"--overwrite would remove {path}, where --data is; name another --output-dir")
-    for path in sorted(doomed, key=lambda path: path.name != FINISHED):  # first of all it is no longer finished
+            raise DataError(f"--overwrite would remove {path}, which contains --data; choose another --output-dir")
+    for path in sorted(written, key=lambda path: path.name != FINISHED):  # first the mark of completion
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
         else:

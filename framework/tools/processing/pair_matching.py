@@ -1,4 +1,4 @@
-"""Features of given pairs compared in numpy, for versions of pycolmap that only compare all pairs (before 4)."""
+"""Matching of given pairs in numpy, for versions of pycolmap that can only match all pairs (before 4)."""
 
 from __future__ import annotations
 
@@ -13,30 +13,39 @@ import numpy as np
 from framework.tools.processing.retrieval import read_descriptors
 
 MAX_RATIO = 0.8
-"""The nearest feature's angle over the second nearest's, at most (Lowe 2004)."""
+"""Maximum ratio of the nearest feature's angle to the second nearest's (Lowe 2004)."""
 MAX_ANGLE = 0.7
-"""Radians between matching features, at most."""
+"""Maximum angle between matching features, radians."""
 _PAIR_BASE = 2147483647
-"""COLMAP numbers the pair of images i < j as this times i plus j."""
+"""COLMAP's number of the pair of images i < j is this times i, plus j."""
 
 
 def match(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Features of two photographs that are each other's nearest, and clearly nearer than the next.
+    """Return the features of two images that are each other's nearest, by a clear margin.
 
     Args:
-        first, second: (K, D) and (L, D) uint8 descriptors.
-    Returns: (M, 2) uint32 indices into both.
+        first: (K, D) uint8 descriptors.
+        second: (L, D) uint8 descriptors.
+
+    Returns:
+        (M, 2) uint32 indices into both.
     """
     if len(first) < 2 or len(second) < 2:
         return np.zeros((0, 2), np.uint32)
     cosines = _unit(first) @ _unit(second).T
-    there, back = _clearly_nearest(cosines), _clearly_nearest(cosines.T)
-    kept = np.flatnonzero((there >= 0) & (back[there] == np.arange(len(first))))
-    return np.stack([kept, there[kept]], axis=1).astype(np.uint32)
+    forward, backward = _clearly_nearest(cosines), _clearly_nearest(cosines.T)
+    mutual = np.flatnonzero((forward >= 0) & (backward[forward] == np.arange(len(first))))
+    return np.stack([mutual, forward[mutual]], axis=1).astype(np.uint32)
 
 
 def write_matches(report: Callable[[int], None], database: Path, pairs: list[tuple[str, str]]) -> None:
-    """Match pairs of photographs, by name, into COLMAP's database; COLMAP's verification is to follow."""
+    """Match pairs of images and write the matches to COLMAP's database, for verification by COLMAP.
+
+    Args:
+        report: called with the number of pairs done.
+        database: COLMAP's database with features.
+        pairs: pairs of names.
+    """
 
     @lru_cache(maxsize=64)
     def features(name: str) -> np.ndarray:
@@ -56,12 +65,12 @@ def write_matches(report: Callable[[int], None], database: Path, pairs: list[tup
 
 
 def _unit(descriptors: np.ndarray) -> np.ndarray:
-    exact = descriptors.astype(np.float32)
-    return exact / np.maximum(np.linalg.norm(exact, axis=1, keepdims=True), 1e-12)
+    values = descriptors.astype(np.float32)
+    return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12)
 
 
 def _clearly_nearest(cosines: np.ndarray) -> np.ndarray:
-    """(K,) for each row of (K, L) the column with the smallest angle, -1 where it is too large or not clearly so."""
+    """Return the column with the smallest angle for each row of (K, L), or -1 if it is too large or ambiguous."""
     rows = np.arange(len(cosines))
     best = cosines.argmax(axis=1)
     angle = np.arccos(np.clip(cosines[rows, best], -1, 1))

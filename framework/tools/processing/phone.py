@@ -1,4 +1,4 @@
-"""What captures of phones, whose poses are known, have in common: images are prepared, transforms.json is written."""
+"""Conversion of phone captures, whose poses are known: preparation of images, and transforms.json."""
 
 from __future__ import annotations
 
@@ -14,29 +14,37 @@ from framework.base.console import say
 from framework.base.errors import DataError
 from framework.data.image_files import one_line
 from framework.tools.processing.output import FINISHED
-from framework.tools.processing.pipeline import prepared
+from framework.tools.processing.pipeline import prepare_and_report
 from framework.tools.processing.pyramid import write_pyramid
 from framework.tools.processing.transforms import Frame, Lens, content, write
 
 UNUSABLE = (KeyError, TypeError, ValueError, OverflowError)
-"""What goes wrong where a JSON file lacks a number, or has something else in its place."""
+"""Errors raised if a JSON file lacks a number, or has something else instead."""
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Raises: DataError where the file is missing, not JSON, or no object."""
+    """Read the JSON object in the file `path`.
+
+    Raises:
+        DataError: if the file is missing, is not JSON or does not hold an object.
+    """
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        raise DataError(f"there is no {path}") from error
+        raise DataError(f"{path} does not exist") from error
     except (ValueError, OSError, RecursionError) as error:
-        raise DataError(f"{path} is not JSON that can be read: {one_line(error)}") from error
-    if not isinstance(found, dict):
-        raise DataError(f"{path} must hold a JSON object: names and values between braces")
-    return found
+        raise DataError(f"{path} is not readable JSON: {one_line(error)}") from error
+    if not isinstance(content, dict):
+        raise DataError(f"{path} must hold a JSON object: names and values in braces")
+    return content
 
 
 def finite(value: Any) -> float:
-    """A number out of a JSON file. Raises: one of `UNUSABLE` where it is none, or not finite."""
+    """Convert the JSON value `value` to a number.
+
+    Raises:
+        TypeError, ValueError, OverflowError: if it is not a finite number (`UNUSABLE`).
+    """
     number = float(value)
     if not math.isfinite(number):
         raise ValueError(f"{number} is not finite")
@@ -44,9 +52,14 @@ def finite(value: Any) -> float:
 
 
 def undistorted_lens(size: Iterable[Any], intrinsics: Iterable[Any]) -> Lens:
-    """The lens of a JSON file's width and height, and fx, fy, cx, cy, all in pixels.
+    """Return a lens without distortion.
 
-    Raises: one of `UNUSABLE` where they are not such.
+    Args:
+        size: width and height, pixels.
+        intrinsics: fx, fy, cx, cy, pixels.
+
+    Raises:
+        TypeError, ValueError, OverflowError: if a value is invalid (`UNUSABLE`).
     """
     width, height = (int(finite(value)) for value in size)
     fx, fy, cx, cy = (finite(value) for value in intrinsics)
@@ -55,8 +68,8 @@ def undistorted_lens(size: Iterable[Any], intrinsics: Iterable[Any]) -> Lens:
     return Lens("OPENCV", {"w": width, "h": height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy})
 
 
-def evenly(items: list, most: int) -> list:
-    """At most `most` of the items, evenly chosen, the first and the last among them."""
+def evenly_spaced(items: list, most: int) -> list:
+    """Return at most `most` evenly spaced `items`, the first and the last among them."""
     if len(items) <= most:
         return items
     return [items[i] for i in np.linspace(0, len(items) - 1, most).round().astype(int).tolist()]
@@ -70,35 +83,44 @@ def write_folder(
     applied: np.ndarray,
     crop: int = 0,
 ) -> None:
-    """Prepare images and write the data folder `output`, which has been claimed.
+    """Prepare images and write a data folder.
 
     Args:
-        folder: where the images are.
-        posed: (4, 4) camera-to-world pose with OpenGL axes, and lens of the whole image, by the image's path there.
-        applied: (3, 4) from the phone's frame to that of the poses.
+        folder: folder of the images.
+        posed: camera-to-world pose (4, 4) with OpenGL axes, and lens of the uncropped image, by the image's path.
+        output: the output folder, after `output.claim`.
+        num_downscales: number of folders of reduced images.
+        applied: (3, 4) transform from the phone's frame to that of the poses.
         crop: pixels to cut off at each side.
-    Raises: DataError where no image can be read, or one has not its lens's size.
+
+    Raises:
+        DataError: if no image is readable, or one differs in size from its lens.
     """
-    photographs, _ = prepared(folder, list(posed), output / "images", upright=False, crop=crop)
+    prepared, _ = prepare_and_report(folder, list(posed), output / "images", upright=False, crop=crop)
     frames = []
-    for photograph in photographs:
-        pose, whole = posed[Path(photograph.source)]
-        lens = cropped(whole, crop)
-        size = (photograph.width, photograph.height)
+    for image in prepared:
+        pose, uncropped = posed[Path(image.source)]
+        lens = cropped(uncropped, crop)
+        size = (image.width, image.height)
         if size != (lens.values["w"], lens.values["h"]):
-            expected = f"{whole.values['w']}x{whole.values['h']}"
-            found = f"{size[0] + 2 * crop}x{size[1] + 2 * crop}"
-            raise DataError(f"{folder / photograph.source} is {found} pixels, but its camera is for {expected}")
-        frames.append(Frame(photograph.name, pose, lens, source=photograph.source))
-    write_pyramid(output / "images", [photograph.name for photograph in photographs], num_downscales)
-    # The phone knows where down is: the frame is upright already, and need not be guessed from the poses.
+            expected = f"{uncropped.values['w']}x{uncropped.values['h']}"
+            actual = f"{size[0] + 2 * crop}x{size[1] + 2 * crop}"
+            raise DataError(f"{folder / image.source} is {actual} pixels, but its camera is for {expected}")
+        frames.append(Frame(image.name, pose, lens, source=image.source))
+    write_pyramid(output / "images", [image.name for image in prepared], num_downscales)
+    # The phone measures gravity, so the frame is upright and need not be estimated from the poses.
     write(output / FINISHED, content(frames, applied, None, {"orientation_override": "none"}))
     say(f"{len(frames)} images with the phone's poses")
     say(f"data folder: {output}")
 
 
 def cropped(lens: Lens, crop: int) -> Lens:
-    """The lens of images of which `crop` pixels are cut off at each side."""
+    """Return the lens of images with `crop` pixels cut off at each side.
+
+    Args:
+        lens: lens of the uncropped images.
+        crop: pixels.
+    """
     values = dict(lens.values)
     for key, change in (("w", 2 * crop), ("h", 2 * crop), ("cx", crop), ("cy", crop)):
         values[key] -= change

@@ -1,4 +1,4 @@
-"""Reduced copies of images: images_2, images_4, ... beside images."""
+"""Reduced copies of images, in folders images_2, images_4, ... beside the images' folder."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from pathlib import Path
 
 from PIL import Image
 
-from framework.tools.processing.photographs import in_parallel, save
+from framework.tools.processing.images import in_parallel, save
 
 
 def write_pyramid(folder: Path, names: list[str], num_downscales: int, masks: bool = False) -> None:
-    """Halve images again and again, as means over whole blocks of pixels; sizes are rounded down.
+    """Write images reduced by powers of two, averaged over whole blocks of pixels, with sizes rounded down.
 
     Args:
         folder: the images' folder, such as OUT/images; OUT/images_2 and so on are written.
-        names: their paths in it.
-        num_downscales: how many folders.
-        masks: a reduced pixel is white only where all it covers is.
+        names: paths of the images in it.
+        num_downscales: number of folders to write.
+        masks: whether the images are masks, of which a reduced pixel is white only if all pixels in its block are.
     """
     factors = [2 ** (level + 1) for level in range(num_downscales)]
 
@@ -34,7 +34,12 @@ def write_pyramid(folder: Path, names: list[str], num_downscales: int, masks: bo
 
 
 def reduced(image: Image.Image, factor: int) -> Image.Image:
-    """An image reduced by a whole number; colours are weighted by alpha. At least one pixel is left."""
+    """Return an image reduced by an integer factor, with colours weighted by alpha, and at least one pixel large.
+
+    Args:
+        image: the image.
+        factor: side of a block, pixels.
+    """
     width, height = max(image.width // factor, 1), max(image.height // factor, 1)
     if min(image.size) < factor:
         return image.resize((width, height), Image.Resampling.BOX)

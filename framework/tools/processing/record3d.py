@@ -1,4 +1,4 @@
-"""Record3D's export with EXR and RGBD: EXR_RGBD/rgb with numbered images, and metadata.json with the poses."""
+"""Record3D's exports with EXR and RGBD: EXR_RGBD/rgb with numbered images, and metadata.json with the poses."""
 
 from __future__ import annotations
 
@@ -9,53 +9,66 @@ import numpy as np
 
 from framework.base.console import say
 from framework.base.errors import DataError
-from framework.tools.processing.phone import UNUSABLE, evenly, read_json, undistorted_lens, write_folder
-from framework.tools.processing.photographs import find_photographs
+from framework.tools.processing.images import find_images
+from framework.tools.processing.phone import UNUSABLE, evenly_spaced, read_json, undistorted_lens, write_folder
 from framework.tools.processing.transforms import Lens
 
 
-def convert(export: Path, output: Path, num_downscales: int, most: int) -> None:
-    """Write the data folder `output`, which has been claimed.
+def convert(export: Path, output: Path, num_downscales: int, max_images: int) -> None:
+    """Write a data folder from an export.
 
-    An image's number is its pose's place in metadata.json; images may be missing.
+    An image's number is the index of its pose in metadata.json; images may be missing.
 
     Args:
-        export: the folder EXR_RGBD, or the one that holds it.
-        most: images to take at most, evenly chosen.
-    Raises: DataError where the export is not one, or nothing of it can be used.
+        export: the folder EXR_RGBD, or its parent.
+        output: the output folder, after `output.claim`.
+        num_downscales: number of folders of reduced images.
+        max_images: maximum number of images, evenly spaced.
+
+    Raises:
+        DataError: if `export` is not an export, or no image of it is usable.
     """
     root = find_root(export)
     path = root / "metadata.json"
     metadata = read_json(path)
     poses = poses_of(metadata, path)
-    numbered = {int(name.stem): name for name in find_photographs(root / "rgb") if name.stem.isdecimal()}
+    numbered = {int(name.stem): name for name in find_images(root / "rgb") if name.stem.isdecimal()}
     usable = [number for number in sorted(numbered) if number < len(poses)]
     if len(usable) < len(numbered):
         say(f"{len(numbered) - len(usable)} images have a number beyond the {len(poses)} poses and are skipped")
     if not usable:
-        raise DataError(f"{root / 'rgb'} has no image whose number is one of a pose in {path}")
+        raise DataError(f"{root / 'rgb'} has no image whose number is that of a pose in {path}")
     if len(usable) < len(poses):
         say(f"{len(poses) - len(usable)} of {len(poses)} poses have no image")
     lenses = lenses_of(metadata, len(poses), path)
-    posed = {numbered[number]: (poses[number], lenses[number]) for number in evenly(usable, most)}
+    posed = {numbered[number]: (poses[number], lenses[number]) for number in evenly_spaced(usable, max_images)}
     write_folder(root / "rgb", posed, output, num_downscales, np.eye(4)[:3])
 
 
 def find_root(export: Path) -> Path:
-    """The folder with rgb and metadata.json. Raises: DataError where there is none."""
+    """Return the folder with rgb and metadata.json: `export` or one in it.
+
+    Raises:
+        DataError: if there is none.
+    """
     for root in (export / "EXR_RGBD", export):
         if (root / "rgb").is_dir() and (root / "metadata.json").is_file():
             return root
     raise DataError(
-        f"--data {export} is no export of Record3D: it has no EXR_RGBD with rgb and metadata.json; "
+        f"--data {export} is not an export of Record3D: it has no EXR_RGBD with rgb and metadata.json; "
         "export with 'EXR + RGBD'"
     )
 
 
 def poses_of(metadata: dict[str, Any], path: Path) -> np.ndarray:
-    """(N, 4, 4) camera-to-world, OpenGL axes, of the entries [qx, qy, qz, qw, tx, ty, tz].
+    """Return the camera-to-world matrices (N, 4, 4), OpenGL axes, from entries [qx, qy, qz, qw, tx, ty, tz].
 
-    Raises: DataError that names `path` where they are not so.
+    Args:
+        metadata: content of metadata.json.
+        path: the file, for messages.
+
+    Raises:
+        DataError: if the entries are invalid.
     """
     try:
         rows = np.array(metadata["poses"], np.float64).reshape(-1, 7)
@@ -64,7 +77,7 @@ def poses_of(metadata: dict[str, Any], path: Path) -> np.ndarray:
     with np.errstate(over="ignore"):
         lengths = np.linalg.norm(rows[:, :4], axis=1, keepdims=True)
     if not len(rows) or not np.isfinite(rows).all() or not (np.isfinite(lengths) & (lengths > 0)).all():
-        raise DataError(f"{path} has no poses, or some that are not finite or have no rotation")
+        raise DataError(f"{path} has no poses, or poses that are not finite or have no rotation")
     rows[:, :4] /= lengths
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3] = rotations(rows[:, :4])
@@ -73,7 +86,7 @@ def poses_of(metadata: dict[str, Any], path: Path) -> np.ndarray:
 
 
 def rotations(quaternions: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) of unit quaternions (N, 4) with the real part last."""
+    """Return the rotation matrices (N, 3, 3) of unit `quaternions` (N, 4), real part last."""
     x, y, z, w = quaternions.T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -84,9 +97,15 @@ def rotations(quaternions: np.ndarray) -> np.ndarray:
 
 
 def lenses_of(metadata: dict[str, Any], count: int, path: Path) -> list[Lens]:
-    """A lens for each pose: of the whole capture (K, column by column), or each its own where the export has them.
+    """Return the lens of each pose: its own if the export has one for each, else that of the whole capture (K).
 
-    Raises: DataError that names `path` where they are incomplete.
+    Args:
+        metadata: content of metadata.json; K is stored column by column.
+        count: number of poses N.
+        path: the file, for messages.
+
+    Raises:
+        DataError: if the intrinsics are incomplete.
     """
     try:
         size = (metadata["w"], metadata["h"])
@@ -98,4 +117,4 @@ def lenses_of(metadata: dict[str, Any], count: int, path: Path) -> list[Lens]:
             each = [(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])] * count
         return [undistorted_lens(size, intrinsics) for intrinsics in each]
     except UNUSABLE as error:
-        raise DataError(f"{path} has no whole lens (w, h, K of 9 numbers)") from error
+        raise DataError(f"{path} has no complete lens (w, h, K of 9 numbers)") from error

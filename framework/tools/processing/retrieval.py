@@ -1,8 +1,8 @@
-"""Which photographs to compare: those next to each other, and those that look alike.
+"""Selection of pairs of images to match: consecutive images, and similar ones.
 
-Looks are told apart by descriptors aggregated over small vocabularies of the photographs' own (VLAD: Jegou et al.
-2010, "Aggregating local descriptors into a compact image representation"; normalisation: Arandjelovic and Zisserman
-2013, "All about VLAD"), so that no vocabulary need be downloaded.
+Similarity is measured by local descriptors aggregated over a small vocabulary computed from the images themselves
+(VLAD: Jegou et al. 2010, "Aggregating local descriptors into a compact image representation"; normalisation:
+Arandjelovic and Zisserman 2013, "All about VLAD"), so that no vocabulary needs to be downloaded.
 """
 
 from __future__ import annotations
@@ -14,32 +14,39 @@ from pathlib import Path
 import numpy as np
 
 Pair = tuple[int, int]
+"""Indices of two images."""
 
 
 def all_pairs(count: int) -> list[Pair]:
-    """Every pair (i, j), i < j, of `count` photographs."""
+    """Return every pair (i, j), i < j, of `count` images."""
     return [(i, j) for i in range(count) for j in range(i + 1, count)]
 
 
 def sequential_pairs(count: int, overlap: int) -> list[Pair]:
-    """Each photograph with the `overlap` next ones, and with those 2, 4, 8, ... further on (`overlap` of them)."""
+    """Return the pairs of each image with the next ones.
+
+    Args:
+        count: number of images.
+        overlap: number of next images, and also the number of those 1, 2, 4, 8, ... further on.
+    """
     offsets = set(range(1, overlap + 1)) | {2**power for power in range(overlap)}
     return sorted((i, i + offset) for offset in offsets for i in range(count - offset))
 
 
-def similar_pairs(looks: np.ndarray, neighbors: int) -> list[Pair]:
-    """Each photograph with the `neighbors` most similar ones: pairs (i, j), i < j, each once.
+def similar_pairs(descriptors: np.ndarray, neighbors: int) -> list[Pair]:
+    """Return the pairs (i, j), i < j, of each image with the most similar ones, each pair once.
 
     Args:
-        looks: (N, D) unit vectors; a photograph without features is 0, and in no pair.
+        descriptors: (N, D) unit vectors (`global_descriptors`); an image without features is 0, and in no pair.
+        neighbors: number of similar images.
     """
-    count = len(looks)
-    similarity = looks @ looks.T
+    count = len(descriptors)
+    similarity = descriptors @ descriptors.T
     np.fill_diagonal(similarity, -np.inf)
-    empty = ~looks.any(axis=1)
+    empty = ~descriptors.any(axis=1)
     similarity[:, empty] = -np.inf
-    wanted = min(neighbors, count - 1)
-    nearest = np.argsort(-similarity, axis=1, kind="stable")[:, :wanted]
+    limit = min(neighbors, count - 1)
+    nearest = np.argsort(-similarity, axis=1, kind="stable")[:, :limit]
     pairs = set()
     for i in np.flatnonzero(~empty).tolist():
         for j in nearest[i].tolist():
@@ -48,26 +55,36 @@ def similar_pairs(looks: np.ndarray, neighbors: int) -> list[Pair]:
     return sorted(pairs)
 
 
-def looks_of(descriptors: list[np.ndarray], words: int = 32, sample: int = 400, seed: int = 0) -> np.ndarray:
-    """One unit vector for each photograph, whose dot products say how alike photographs are.
+def global_descriptors(descriptors: list[np.ndarray], words: int = 32, sample: int = 400, seed: int = 0) -> np.ndarray:
+    """Return a unit vector for each image; dot products measure the similarity of images.
 
     Args:
-        descriptors: for each photograph (K, D) local descriptors, any number.
+        descriptors: local descriptors (K, D) of each image, for any K.
         words: size of the vocabulary.
-        sample: at most this many descriptors of a photograph are looked at.
-    Returns: (N, words D) float32; 0 for a photograph without descriptors.
+        sample: maximum number of descriptors of an image that are used.
+        seed: seed of random choices.
+
+    Returns:
+        (N, words D) float32; 0 for an image without descriptors.
     """
     random = np.random.default_rng(seed)
-    chosen = [_sampled(each, sample, random) for each in descriptors]
-    everything = np.concatenate(chosen) if chosen else np.zeros((0, 1), np.float32)
+    samples = [_sampled(local, sample, random) for local in descriptors]
+    everything = np.concatenate(samples) if samples else np.zeros((0, 1), np.float32)
     if len(everything) == 0:
         return np.zeros((len(descriptors), 1), np.float32)
     centres = vocabulary(_sampled(everything, 20_000, random), words, random)
-    return np.stack([aggregate(each, centres) for each in chosen])
+    return np.stack([aggregate(local, centres) for local in samples])
 
 
 def vocabulary(descriptors: np.ndarray, words: int, random: np.random.Generator, rounds: int = 10) -> np.ndarray:
-    """(words or fewer, D) cluster centres of (K, D) descriptors, by Lloyd's algorithm."""
+    """Return at most `words` cluster centres (W, D), by Lloyd's algorithm.
+
+    Args:
+        descriptors: (K, D) local descriptors.
+        words: number of clusters.
+        random: source of the initial centres.
+        rounds: number of iterations.
+    """
     centres = descriptors[random.permutation(len(descriptors))[:words]].astype(np.float32)
     for _ in range(rounds):
         nearest = _nearest(descriptors, centres)
@@ -80,7 +97,12 @@ def vocabulary(descriptors: np.ndarray, words: int, random: np.random.Generator,
 
 
 def aggregate(descriptors: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """(W D,) sums of descriptors' (K, D) differences to their nearest centres (W, D); of unit length, each and all."""
+    """Return the sums (W D,) of differences to the nearest centres, normalised to unit length per centre and in all.
+
+    Args:
+        descriptors: (K, D) local descriptors.
+        centres: (W, D) vocabulary.
+    """
     sums = np.zeros_like(centres, dtype=np.float32)
     if len(descriptors):
         nearest = _nearest(descriptors, centres)
@@ -90,18 +112,23 @@ def aggregate(descriptors: np.ndarray, centres: np.ndarray) -> np.ndarray:
 
 
 def read_descriptors(database: Path, names: list[str]) -> list[np.ndarray]:
-    """The local descriptors (K, 128) uint8 of photographs out of COLMAP's database; none for a name it has not."""
+    """Read the local descriptors (K, 128) uint8 of images from COLMAP's database.
+
+    Args:
+        database: COLMAP's database.
+        names: names of the images; an unknown one has no descriptors.
+    """
     with closing(sqlite3.connect(database)) as connection:
         identities = dict(connection.execute("SELECT name, image_id FROM images"))
         query = "SELECT rows, cols, data FROM descriptors WHERE image_id = ?"
-        found = []
+        descriptors = []
         for name in names:
             row = connection.execute(query, (identities.get(name, -1),)).fetchone()
             empty = row is None or not row[0] or row[2] is None
-            found.append(
+            descriptors.append(
                 np.zeros((0, 128), np.uint8) if empty else np.frombuffer(row[2], np.uint8).reshape(row[0], row[1])
             )
-    return found
+    return descriptors
 
 
 def _sampled(descriptors: np.ndarray, count: int, random: np.random.Generator) -> np.ndarray:
@@ -111,5 +138,5 @@ def _sampled(descriptors: np.ndarray, count: int, random: np.random.Generator) -
 
 
 def _nearest(descriptors: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """(K,) index of the centre closest to each descriptor."""
+    """Return the index (K,) of the centre closest to each descriptor."""
     return np.argmin((centres**2).sum(1) - 2 * (descriptors @ centres.T), axis=1)

@@ -1,4 +1,4 @@
-"""What finding camera poses with COLMAP can be told; light, so that the command line starts quickly."""
+"""Flags of the estimation of poses with COLMAP; without heavy imports, so that the command line starts quickly."""
 
 from __future__ import annotations
 
@@ -9,69 +9,75 @@ from typing import Literal
 from framework.base.errors import ConfigError
 
 CameraModel = Literal["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE"]
+"""COLMAP's lens models that transforms.json can express."""
 Matching = Literal["auto", "exhaustive", "sequential", "retrieval"]
+"""Rule by which pairs of images are selected for matching."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class OutputFlags:
-    """What every kind of input can be told."""
+    """Flags for every kind of input."""
 
     data: Path
-    """What to read."""
+    """Folder or file to read."""
     output_dir: Path
-    """The folder to write; new or empty."""
+    """Folder to write; new or empty."""
     overwrite: bool = False
-    """Replace what an earlier run wrote into --output-dir; other files there are left alone."""
+    """Replace the output of an earlier run in --output-dir; other files there are left alone."""
     num_downscales: int = 3
-    """Halved copies of the images: 3 writes images_2, images_4 and images_8."""
+    """Number of reduced copies of the images: 3 writes images_2, images_4 and images_8."""
 
     def check(self) -> None:
-        """Raises: ConfigError for a number out of range."""
+        """Check the values.
+
+        Raises:
+            ConfigError: if a number is out of range.
+        """
         if not 0 <= self.num_downscales <= 8:
             raise ConfigError(f"--num-downscales is {self.num_downscales}; it must be from 0 to 8")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ColmapFlags(OutputFlags):
-    """How poses are found."""
+    """Flags of the estimation of poses."""
 
     camera_model: CameraModel = "OPENCV"
-    """The lens: OPENCV bends by k1, k2, p1, p2; OPENCV_FISHEYE is for more than about 120 degrees."""
+    """Lens model: OPENCV has distortion k1, k2, p1, p2; OPENCV_FISHEYE is for angles of view over about 120 degrees."""
     camera_sharing: Literal["auto", "single", "per-image"] = "auto"
-    """Which photographs share a camera. auto: those of a folder with equal size, device and focal length."""
+    """Which images share a camera. auto: those in a folder with equal size, device and focal length."""
     matching_method: Matching = "auto"
-    """Which photographs are compared. auto: all pairs up to --exhaustive-limit, then retrieval; a video: neighbours."""
+    """Which images are matched. auto: all pairs up to --exhaustive-limit, then retrieval; for videos, neighbours."""
     exhaustive_limit: int = 150
-    """The most photographs of which auto compares all pairs."""
+    """Maximum number of images of which auto matches all pairs."""
     num_neighbors: int = 30
-    """Similar photographs each one is compared with by retrieval."""
+    """Similar images with which retrieval matches each image."""
     sequential_overlap: int = 10
-    """Following photographs each one is compared with by sequential matching; those 16, 32, ... further on, too."""
+    """Following images with which sequential matching matches each image, besides those 16, 32, ... further on."""
     max_image_size: int = 1600
-    """Longest side, in pixels, at which features are looked for."""
+    """Longer side, in pixels, at which features are extracted."""
     max_num_features: int = 8192
-    """The most features of a photograph."""
+    """Maximum number of features of an image."""
     refine_intrinsics: bool = False
-    """Adjust everything once more at the end with the principal point free, for cameras of 10 photographs or more. A
-    turn of the camera looks much like a move of that point: only for captures that determine it well."""
+    """Adjust everything once more at the end with a free principal point, for cameras with 10 images or more. Rotation
+    of the camera and shift of that point are hard to tell apart: only for captures that determine it well."""
     undistort: bool = False
-    """Write images without lens distortion (camera model PINHOLE), of the registered photographs alone."""
+    """Write images without lens distortion (camera model PINHOLE), for registered images only."""
     device_type: Literal["cpu", "cuda"] = "cpu"
-    """Where features are found and matched; cuda needs a pycolmap built with it."""
+    """Device for extraction and matching of features; cuda needs a pycolmap built with it."""
     num_threads: int = -1
-    """Threads to use; -1 for all."""
+    """CPU threads; -1 for all."""
     verbose: bool = False
-    """Show what COLMAP prints; it is kept in OUTPUT_DIR/colmap/log.txt otherwise."""
+    """Show COLMAP's output, which otherwise goes to OUTPUT_DIR/colmap/log.txt."""
 
     def check(self) -> None:
         super().check()
-        at_least = {
+        minimums = {
             "exhaustive_limit": 0, "num_neighbors": 1, "sequential_overlap": 1,
             "max_image_size": 64, "max_num_features": 64,
         }  # fmt: skip
-        for name, least in at_least.items():
-            if getattr(self, name) < least:
+        for name, minimum in minimums.items():
+            if getattr(self, name) < minimum:
                 flag = "--" + name.replace("_", "-")
-                raise ConfigError(f"{flag} is {getattr(self, name)}; it must be at least {least}")
+                raise ConfigError(f"{flag} is {getattr(self, name)}; it must be at least {minimum}")
         if self.num_threads < 1 and self.num_threads != -1:
             raise ConfigError(f"--num-threads is {self.num_threads}; it must be at least 1, or -1 for all")

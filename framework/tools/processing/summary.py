@@ -1,4 +1,4 @@
-"""What a person is told at the end: how much was found, how long it took, and what to do where it is too little."""
+"""The report at the end: how many images were registered, how long it took, and advice if they are too few."""
 
 from __future__ import annotations
 
@@ -6,57 +6,64 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 ENOUGH = 0.8
-"""Share of registered photographs below which advice is given."""
+"""Share of registered images below which advice is given."""
 
 
 @dataclass(frozen=True)
 class Summary:
-    """The figures of a reconstruction."""
+    """Figures of a reconstruction."""
 
-    photographs: int
-    """Readable ones."""
+    images: int
+    """Number of readable images."""
     unreadable: int
+    """Number of unreadable images."""
     registered: int
-    """Photographs of the largest model, which is kept."""
+    """Number of images in the largest model, which is kept."""
     other_models: tuple[int, ...]
-    """Photographs of the other models."""
+    """Number of images in each of the other models."""
     points: int
+    """Number of sparse points."""
     reprojection_error: float
-    """Mean, pixels."""
+    """Mean reprojection error, pixels."""
     matching: str
+    """Rule by which pairs were selected."""
     seconds: dict[str, float]
-    """By stage."""
+    """Seconds by stage."""
 
     def as_json(self) -> dict[str, Any]:
-        """For a file beside the model."""
+        """Return the figures as a dictionary for a JSON file."""
         return asdict(self) | {"seconds": {stage: round(value, 2) for stage, value in self.seconds.items()}}
 
 
 def lines(summary: Summary) -> list[str]:
-    """The figures in words."""
-    share = summary.registered / summary.photographs
+    """Return the figures of `summary` as lines of text."""
+    share = summary.registered / summary.images
     stages = ", ".join(f"{stage} {seconds:.1f} s" for stage, seconds in summary.seconds.items())
-    said = [
-        f"registered: {summary.registered} of {summary.photographs} photographs ({share:.0%}); "
+    messages = [
+        f"registered: {summary.registered} of {summary.images} images ({share:.0%}); "
         f"{summary.points} points; mean reprojection error {summary.reprojection_error:.2f} pixels",
         f"time: {sum(summary.seconds.values()):.1f} s ({stages})",
     ]
     if summary.other_models:
         sizes = ", ".join(map(str, summary.other_models))
-        said.append(f"left out: {len(summary.other_models)} other models that do not connect, of {sizes} photographs")
+        messages.append(f"left out: {len(summary.other_models)} other models that are not connected, of {sizes} images")
     if share < ENOUGH:
-        said.append(f"few photographs were registered. {advice(summary.matching)}")
-    return said
+        messages.append(f"few images were registered. {advice(summary.matching)}")
+    return messages
 
 
 def advice(matching: str) -> str:
-    """What to do where photographs do not connect."""
+    """Return advice for images that cannot be connected.
+
+    Args:
+        matching: the rule by which pairs were selected.
+    """
     steps = [
-        "take photographs with more overlap (two thirds or more with the next one), sharp, in steady light",
-        "give --max-num-features 16384 and --max-image-size 3200",
+        "take images with more overlap (two thirds or more with the next), sharp, in constant light",
+        "set --max-num-features 16384 and --max-image-size 3200",
     ]
     if matching != "exhaustive":
-        steps.append("give --matching-method exhaustive")
+        steps.append("set --matching-method exhaustive")
     if matching == "sequential":
         steps.append("take more frames (--num-frames-target, or a larger --sequential-overlap)")
-    return "To do better: " + "; ".join(steps) + "."
+    return "To improve: " + "; ".join(steps) + "."

@@ -1,4 +1,4 @@
-"""transforms.json as nerfstudio reads it: lenses, camera-to-world poses with OpenGL axes, files."""
+"""The file transforms.json in nerfstudio's format: lenses, camera-to-world poses with OpenGL axes, and file names."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from framework.base.errors import DataError
 
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
-"""(3, 4) from COLMAP's frame, which tends to have y down, to one with z up."""
+"""(3, 4) transform from COLMAP's frame, which tends to have y down, to one with z up."""
 
 _PARAMETERS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -23,47 +23,54 @@ _PARAMETERS = {
     "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
     "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
-"""What COLMAP's parameters are, in their order; f is both focal lengths."""
+"""Names of COLMAP's parameters in their order; f is both focal lengths."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """What a camera's photographs have in common."""
+    """Intrinsics shared by the images of a camera."""
 
     model: str
     """OPENCV, OPENCV_FISHEYE or PINHOLE."""
     values: dict[str, float]
-    """w, h, fl_x, fl_y, cx, cy in pixels (the first pixel's centre is at 0.5) and k1, k2, ... as the model has them."""
+    """w, h, fl_x, fl_y, cx, cy in pixels (the first pixel's centre is at 0.5), and the model's k1, k2, ..."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A photograph with its pose."""
+    """An image with its pose."""
 
     name: str
-    """Path in the images folder, with '/'."""
+    """Path in the images' folder, with '/'."""
     pose: np.ndarray
     """(3 or 4, 4) camera-to-world, OpenGL axes."""
     lens: Lens
+    """Lens of the image."""
     mask: str | None = None
-    """Path in the masks folder."""
+    """Path in the masks' folder."""
     image_id: int | None = None
     """COLMAP's number of the image."""
     source: str | None = None
-    """Path of the photograph in the input folder."""
+    """Path of the original in the input folder."""
 
 
 def lens_of(model: str, width: int, height: int, parameters: Sequence[float]) -> Lens:
-    """A COLMAP camera as a lens; models that are special cases of OPENCV become it.
+    """Convert a COLMAP camera to a lens; models that are special cases of OPENCV become OPENCV.
 
-    Raises: DataError for a model that transforms.json cannot express.
+    Args:
+        model: COLMAP's name of the model.
+        width, height: size of the images, pixels.
+        parameters: parameters in COLMAP's order.
+
+    Raises:
+        DataError: for a model that transforms.json cannot express.
     """
     if model not in _PARAMETERS:
-        raise DataError(f"camera model {model} has no place in transforms.json; it can hold {', '.join(_PARAMETERS)}")
-    named = dict(zip(_PARAMETERS[model], map(float, parameters), strict=True))
-    focal = named.pop("f", None)
+        raise DataError(f"transforms.json cannot express camera model {model}; it supports {', '.join(_PARAMETERS)}")
+    by_name = dict(zip(_PARAMETERS[model], map(float, parameters), strict=True))
+    focal = by_name.pop("f", None)
     if focal is not None:
-        named = {"fl_x": focal, "fl_y": focal, **named}
+        by_name = {"fl_x": focal, "fl_y": focal, **by_name}
     distortion: tuple[str, ...] = ()
     if model.endswith("PINHOLE"):
         kind = "PINHOLE"
@@ -71,12 +78,16 @@ def lens_of(model: str, width: int, height: int, parameters: Sequence[float]) ->
         kind, distortion = model, ("k1", "k2", "k3", "k4")
     else:
         kind, distortion = "OPENCV", ("k1", "k2", "p1", "p2")
-    ordered = {"w": width, "h": height, **{key: named[key] for key in ("fl_x", "fl_y", "cx", "cy")}}
-    return Lens(kind, ordered | {key: named.get(key, 0.0) for key in distortion})
+    ordered = {"w": width, "h": height, **{key: by_name[key] for key in ("fl_x", "fl_y", "cx", "cy")}}
+    return Lens(kind, ordered | {key: by_name.get(key, 0.0) for key in distortion})
 
 
 def opengl_pose(world_to_camera: np.ndarray) -> np.ndarray:
-    """(4, 4) camera-to-world with OpenGL axes (y up, looking along -z) of a (3, 4) world-to-camera with y down."""
+    """Convert a COLMAP pose to a camera-to-world matrix (4, 4) with OpenGL axes (y up, looking along -z).
+
+    Args:
+        world_to_camera: (3, 4) with y down.
+    """
     rotation, translation = world_to_camera[:, :3], world_to_camera[:, 3]
     pose = np.eye(4)
     pose[:3, :3] = rotation.T * [1, -1, -1]
@@ -85,22 +96,30 @@ def opengl_pose(world_to_camera: np.ndarray) -> np.ndarray:
 
 
 def transformed(poses: np.ndarray, transform: np.ndarray) -> np.ndarray:
-    """Camera-to-world poses (..., 4, 4) after a change (3, 4) of the world's frame."""
+    """Return camera-to-world poses after a change of the world's frame.
+
+    Args:
+        poses: (..., 4, 4).
+        transform: (3, 4) from the old frame to the new one.
+    """
     return np.concatenate([transform, [[0.0, 0, 0, 1]]]) @ poses
 
 
 def content(frames: list[Frame], applied: np.ndarray, points: str | None, more: dict[str, Any]) -> dict[str, Any]:
-    """What transforms.json holds.
+    """Return the content of a transforms.json.
 
     Args:
-        frames: at least one; the lens stands at the top where all have the same, else with each frame.
-        applied: (3, 4) from the frame of the poses' origin (COLMAP, phone) to that of `frames`.
-        points: name of the point cloud beside it.
-        more: further entries of the top.
+        frames: at least one; a lens that all share is written at the top, otherwise each frame has its own.
+        applied: (3, 4) transform from the original frame (COLMAP's, the phone's) to that of `frames`.
+        points: name of the point cloud in the same folder, or None.
+        more: further entries at the top.
+
+    Raises:
+        DataError: if the frames have different camera models.
     """
     models = {frame.lens.model for frame in frames}
     if len(models) > 1:
-        raise DataError(f"transforms.json holds one camera model, not {' and '.join(sorted(models))}")
+        raise DataError(f"transforms.json can hold one camera model, not {' and '.join(sorted(models))}")
     shared = frames[0].lens.values if all(frame.lens == frames[0].lens for frame in frames) else None
     top: dict[str, Any] = {"camera_model": frames[0].lens.model, **(shared or {})}
     top |= {"applied_transform": applied.tolist(), **more}
@@ -125,17 +144,23 @@ def content(frames: list[Frame], applied: np.ndarray, points: str | None, more: 
 
 
 def write(path: Path, value: dict[str, Any]) -> None:
-    """Write JSON so that a killed process leaves the whole of it or nothing."""
-    from framework.training.checkpoint import write_atomically  # brings torch
+    """Write JSON so that a killed process leaves a complete file or none.
+
+    Args:
+        path: the file.
+        value: its content.
+    """
+    from framework.training.checkpoint import write_atomically  # imports PyTorch
 
     text = json.dumps(value, indent=2, allow_nan=False)
     write_atomically(path, lambda file: file.write(text.encode()))
 
 
 def write_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
-    """Write a point cloud as a text PLY.
+    """Write a point cloud as an ascii PLY file.
 
     Args:
+        path: the file.
         points: (K, 3) positions.
         colors: (K, 3) uint8.
     """

@@ -1,4 +1,4 @@
-"""A video becomes photographs: the sharpest frame of each of many equal intervals."""
+"""Extraction of images from a video: the sharpest frame of each of many equal intervals."""
 
 from __future__ import annotations
 
@@ -12,14 +12,22 @@ from PIL import Image
 from framework.base.console import say, track
 from framework.base.errors import DataError
 from framework.base.extras import missing
-from framework.tools.processing.photographs import save
+from framework.tools.processing.images import save
 
 
 def write_frames(video: Path, folder: Path, target: int) -> list[Path]:
     """Write about `target` frames of a video as folder/frame_00001.jpg and so on.
 
-    Returns: their paths in the folder.
-    Raises: DataError where the video, or what reads videos, is missing, or it has no frame.
+    Args:
+        video: the video file.
+        folder: folder to create.
+        target: number of frames to write.
+
+    Returns:
+        The paths of the frames in the folder.
+
+    Raises:
+        DataError: if the video or ffmpeg is missing, or the video has no readable frame.
     """
     count, frames = open_video(video)
     folder.mkdir(parents=True)
@@ -33,9 +41,13 @@ def write_frames(video: Path, folder: Path, target: int) -> list[Path]:
 
 
 def open_video(path: Path) -> tuple[int, Iterator[np.ndarray]]:
-    """About how many frames a video has, and the frames (H, W, 3) uint8, turned as they are to be seen.
+    """Return the approximate number of frames of a video, and its frames (H, W, 3) uint8, upright.
 
-    Raises: DataError where it is missing, what reads it is not installed, or it is no video.
+    Args:
+        path: the video file.
+
+    Raises:
+        DataError: if the file or ffmpeg is missing, or the file is not a readable video.
     """
     if not path.is_file():
         raise DataError(f"--data {path}: there is no such file")
@@ -44,31 +56,31 @@ def open_video(path: Path) -> tuple[int, Iterator[np.ndarray]]:
     import imageio.v3 as iio
 
     try:
-        about: dict[str, Any] = iio.immeta(path, plugin="FFMPEG")
-        count = round(float(about["fps"]) * float(about["duration"]))
-    except Exception as error:  # whatever ffmpeg and its wrapper raise
+        metadata: dict[str, Any] = iio.immeta(path, plugin="FFMPEG")
+        count = round(float(metadata["fps"]) * float(metadata["duration"]))
+    except Exception as error:  # any type, from ffmpeg or its wrapper
         first = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise DataError(f"--data {path} is not a readable video: {first}") from error
     return max(count, 1), _frames(path)
 
 
 def sharpest(frames: Iterable[np.ndarray], count: int, target: int) -> Iterator[np.ndarray]:
-    """The sharpest frame of each interval, in their order; one frame is held at a time.
+    """Yield the sharpest frame of each interval in order, holding one frame at a time.
 
     Args:
         frames: (H, W, 3) uint8.
-        count: how many there are, or about so: more are taken as further intervals of the same length.
-        target: number of intervals; every frame where there are not more.
+        count: approximate number of frames; further frames form further intervals of the same length.
+        target: number of intervals; if there are fewer frames, all are yielded.
     """
     length = max(count / target, 1.0)
     best: np.ndarray | None = None
     best_sharpness, interval = -1.0, 0
     for index, frame in enumerate(frames):
-        now = int((index + 1e-9) / length)
-        if now != interval and best is not None:
+        current = int((index + 1e-9) / length)
+        if current != interval and best is not None:
             yield best
             best, best_sharpness = None, -1.0
-        interval = now
+        interval = current
         measured = sharpness(frame)
         if measured > best_sharpness:
             best, best_sharpness = frame, measured
@@ -77,9 +89,12 @@ def sharpest(frames: Iterable[np.ndarray], count: int, target: int) -> Iterator[
 
 
 def sharpness(frame: np.ndarray) -> float:
-    """Variance of the Laplacian of the green channel, of a frame (H, W, 3) reduced to at most 1000 pixels a side.
+    """Return the variance of the Laplacian of a frame's green channel, after reduction to at most 1000 pixels a side.
 
     Pech-Pacheco et al. 2000, "Diatom autofocusing in brightfield microscopy".
+
+    Args:
+        frame: (H, W, 3) uint8.
     """
     factor = max(1, -(-max(frame.shape[:2]) // 1000))
     height, width = (side // factor for side in frame.shape[:2])
@@ -97,6 +112,6 @@ def _frames(path: Path) -> Iterator[np.ndarray]:
 
     try:
         yield from iio.imiter(path, plugin="FFMPEG")
-    except Exception as error:  # a file that was cut short; what came before is used
+    except Exception as error:  # a truncated file; the frames before are used
         first = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        say(f"{path} cannot be decoded to its end; what came before is used: {first}")
+        say(f"{path} cannot be decoded to its end; the frames before are used: {first}")

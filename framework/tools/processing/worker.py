@@ -1,4 +1,4 @@
-"""Work in a process of its own: COLMAP prints to a log, a crash in it is an error in one line, it ends when we do."""
+"""Functions run in a child process, for COLMAP: its output goes to a log, and a crash becomes an error of one line."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from framework.base.console import track
 from framework.base.errors import DataError, NerfloomError
 
 Report = Callable[[int], None]
-"""Told by the work how many units are done."""
+"""Function that the child calls with the number of units done."""
 
 
-def run_apart(
+def run_in_child(
     work: Callable[..., Any],
     arguments: tuple,
     title: str,
@@ -27,15 +27,21 @@ def run_apart(
     log: Path | None,
     count: Callable[[], int] | None = None,
 ) -> Any:
-    """`work(report, *arguments)` in another process, with a progress bar.
+    """Run `work(report, *arguments)` in a child process, with a progress bar.
 
     Args:
-        work: a function of a module, and arguments and result, that can be pickled.
+        work: a module-level function, picklable like its arguments and its result.
+        arguments: arguments after `report`.
+        title: title of the progress bar.
         total: units of the progress bar.
-        log: file that all it prints is added to; None leaves it on the terminal.
-        count: units done, asked now and then, where the work itself cannot tell.
-    Returns: what `work` returns.
-    Raises: DataError where the process dies; whatever error the work raises.
+        log: file to which the child's output is appended; None leaves it on the terminal.
+        count: returns the number of units done, for work that cannot report it.
+
+    Returns:
+        The result of `work`.
+
+    Raises:
+        DataError: if the process dies. Errors of `work` are raised as they are.
     """
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
@@ -53,7 +59,7 @@ def run_apart(
             process.join()
         receiver.close()
     if not outcome:
-        raise DataError(f"COLMAP stopped while {title.lower()} (exit status {process.exitcode}){_last_words(log)}")
+        raise DataError(f"COLMAP stopped while {title.lower()} (exit status {process.exitcode}){_last_line(log)}")
     kind, result = outcome[0]
     if kind == "error":
         raise result
@@ -67,8 +73,8 @@ def _units(
     total: int,
     outcome: list[Any],
 ) -> Iterator[int]:
-    """One item for each unit done, until the process ends; its last message is added to `outcome`."""
-    given, done = 0, 0
+    """Yield once for each unit done, until the process ends; its last message is appended to `outcome`."""
+    yielded, done = 0, 0
     while True:
         try:
             if receiver.poll(0.3):
@@ -83,14 +89,16 @@ def _units(
             return
         if count is not None:
             done = max(done, count())
-        for _ in range(given, min(done, total)):
-            yield given
-            given += 1
+        for _ in range(yielded, min(done, total)):
+            yield yielded
+            yielded += 1
 
 
 def _child(work: Callable[..., Any], arguments: tuple, sender: Connection, log: Path | None) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # C++ would go on for minutes before Python saw a KeyboardInterrupt
-    threading.Thread(target=_end_with_the_parent, daemon=True).start()
+    signal.signal(
+        signal.SIGINT, signal.SIG_DFL
+    )  # Python handles Ctrl-C only after the C++ function returns, minutes later
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
     if log is not None:
         file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
         os.dup2(file, 1)
@@ -112,18 +120,18 @@ def _child(work: Callable[..., Any], arguments: tuple, sender: Connection, log: 
         sender.send(("error", DataError(f"COLMAP: {type(error).__name__}: {first}")))
 
 
-def _end_with_the_parent() -> None:
-    """A parent that is killed can stop nothing. COLMAP lets go of Python's lock while it works."""
+def _exit_with_parent() -> None:
+    """Exit when the parent process ends: a killed parent cannot stop its child. COLMAP releases Python's lock."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
         os._exit(1)
 
 
-def _last_words(log: Path | None) -> str:
-    """The last line of a log, and where it is."""
+def _last_line(log: Path | None) -> str:
+    """Return the last line of a log, and the log's path, as the end of a message."""
     if log is None or not log.is_file():
         return ""
     lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
     last = lines[-1].strip()[:200] if lines else "nothing"
-    return f"; it said: {last} (all of it: {log})"
+    return f"; its last output: {last} (complete: {log})"

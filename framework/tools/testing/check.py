@@ -9,6 +9,7 @@ import torch
 
 from framework.base.config import TrainConfig
 from framework.method import Method
+from framework.ray_model import RayModel
 from framework.tools.testing import declaration, learning, rendering, storage
 from framework.tools.testing.finding import Finding
 from framework.tools.testing.subject import Subject
@@ -25,7 +26,7 @@ class Check:
     needs: tuple[str, ...] = ()
     """Checks without which it would only find again what they have found, as far as they are made."""
     rays_only: bool = False
-    """It is made of methods that cast rays only."""
+    """It is made of a `RayModel` only."""
 
 
 CHECKS = (
@@ -66,7 +67,7 @@ def check_method(method: Method, name: str = "the method", config: TrainConfig |
         wrong all of `CHECKS` are there. What the method raises becomes a finding.
     """
     subject, findings = Subject(method, name, config), dict[str, Finding]()
-    casts_rays = getattr(method.model, "batches", "pixels") == "pixels"
+    casts_rays = isinstance(method.model, type) and issubclass(method.model, RayModel)
     made = [check for check in CHECKS if casts_rays or not check.rays_only]
     names = {check.name for check in made}
     with torch.random.fork_rng(devices=[]), torch.enable_grad():

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from framework.model import Loss
+from framework.ray_model import RayModel
 from framework.tools.testing.finding import Fault
 from framework.tools.testing.rendering import require_rendered
 from framework.tools.testing.subject import STEPS, Learner, Subject
@@ -180,7 +181,7 @@ def check_bfloat16(subject: Subject) -> str:
 
     def look(learner: Learner) -> None:
         batch = learner.batch()
-        if learner.model.batches == "pixels":
+        if isinstance(learner.model, RayModel):
             with torch.autocast("cpu", torch.bfloat16):
                 rendered = learner.rendered(batch.rays, batch.background)
             require_rendered(rendered, len(batch.rays), "under autocast")

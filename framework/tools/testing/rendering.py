@@ -9,6 +9,7 @@ from torch import Tensor
 
 from framework.geometry.rays import Rays
 from framework.model import Model, parts
+from framework.ray_model import RayModel
 from framework.rendering.rendered import Rendered
 from framework.samplers.base import SkipsCells
 from framework.samplers.proposal import ProposalSampler
@@ -124,7 +125,7 @@ def check_few_rays(subject: Subject) -> str:
 def check_background(subject: Subject) -> str:
     """The background shows as far as a ray is not opaque, and where the box is missed altogether."""
     learner = subject.learner()
-    if learner.model.batches == "views":
+    if not isinstance(learner.model, RayModel):
         dark, light = (learner.picture(background=value) for value in (0.0, 1.0))
         _require_change(light.rgb - dark.rgb, light.accumulation[..., None], "a picture")
         return "it shows as far as pixels are not opaque"

@@ -127,8 +127,8 @@ BUGS = (
         "contraction-centre",
         "contraction",
         "framework/kernels/contraction.py",
-        "_Contract.apply(positions.contiguous(), (box[0] + box[1]) / 2, 2 / (box[1] - box[0]))",
-        "_Contract.apply(positions.contiguous(), torch.zeros_like(box[0]), 2 / (box[1] - box[0]))",
+        "centre, scale = (box[0] + box[1]) / 2, 2 / (box[1] - box[0])",
+        "centre, scale = torch.zeros_like(box[0]), 2 / (box[1] - box[0])",
         "of a box that is not around the origin, space is contracted around the wrong place",
     ),
     Bug(
@@ -319,8 +319,8 @@ BUGS = (
         "depth-not-normalised",
         "rendering",
         "framework/rendering/volume.py",
-        "mean = found.moment / torch.where(seen, found.opacity.detach(), torch.ones_like(found.moment))",
-        "mean = found.moment",
+        "mean = sums.moment / torch.where(visible, sums.opacity.detach(), torch.ones_like(sums.moment))",
+        "mean = sums.moment",
         "depth of what is not opaque comes out nearer",
     ),
     Bug(
@@ -334,7 +334,7 @@ BUGS = (
     Bug(
         "pixel-of-one-ray",
         "rendering",
-        "framework/rendering/volume.py",
+        "framework/rendering/rendered.py",
         "rgb=self.rgb.view(*shape, 3).mean(1),",
         "rgb=self.rgb.view(*shape, 3)[:, 0],",
         "four rays a pixel cost four times as much and show one",

@@ -64,8 +64,8 @@ BUGS = (
         "pareto-costly",
         "comparison",
         "framework/tools/comparison/measures.py",
-        "as_cheap = [(c, q) for c, q in points if c <= cost * (1 + SAME_TIME)]",
-        "as_cheap = [(c, q) for c, q in points if c >= cost * (1 - SAME_TIME)]",
+        "no_costlier = [(c, q) for c, q in points if c <= cost * (1 + SAME_TIME)]",
+        "no_costlier = [(c, q) for c, q in points if c >= cost * (1 - SAME_TIME)]",
         "what is beaten by something cheaper and better is starred",
     ),
     Bug(
@@ -144,9 +144,9 @@ BUGS = (
     Bug(
         "held-out-as-first-camera",
         "evaluation",
-        "framework/evaluation/evaluator.py",
-        "model.render(replace(rays, camera_indices=None), background)",
-        "model.render(rays, background)",
+        "framework/ray_model.py",
+        "self.render(replace(rays, camera_indices=None), background)",
+        "self.render(rays, background)",
         "held-out photographs get the appearance and the pose of training photographs of the same number",
     ),
     Bug(
@@ -283,7 +283,7 @@ BUGS = (
         "exported-poses-unrefined",
         "export",
         "framework/cli/export.py",
-        "cameras = believed(trained.model, dataset.cameras)",
+        "cameras = refined_cameras(trained.model, dataset.cameras)",
         "cameras = dataset.cameras",
         "ns-export cameras writes the poses that came in",
     ),
@@ -315,8 +315,8 @@ BUGS = (
         "ply-normals-after-kept",
         "export",
         "framework/export/points.py",
-        "safe_normalize(out.normals.float())[kept].cpu()",
-        "safe_normalize(out.normals.float())[: int(kept.sum())].cpu()",
+        "safe_normalize(out.normals.float())[selected].cpu()",
+        "safe_normalize(out.normals.float())[: int(selected.sum())].cpu()",
         "points have the normals of others",
     ),
     Bug(
@@ -412,7 +412,7 @@ BUGS = (
     Bug(
         "exif-turn-inverted",
         "process-data",
-        "framework/tools/processing/photographs.py",
+        "framework/tools/processing/images.py",
         "6: Image.Transpose.ROTATE_270",
         "6: Image.Transpose.ROTATE_90",
         "upright photographs of phones come out head down",

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from framework.base.errors import DataError
-from framework.tools.processing.photographs import find_photographs, output_names, prepare, prepare_all
+from framework.tools.processing.images import find_images, output_names, prepare, prepare_all
 
 
 def write(path: Path, size: tuple[int, int] = (6, 4), mode: str = "RGB", orientation: int | None = None) -> np.ndarray:
@@ -26,18 +26,18 @@ def test_photographs_are_found_below_and_sorted_as_people_count(tmp_path: Path) 
     for name in ("b/img10.png", "b/img2.png", "a 1.PNG", ".hidden/x.png", "notes.txt"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"") if name.endswith("txt") else write(tmp_path / name)
-    assert [p.as_posix() for p in find_photographs(tmp_path)] == ["a 1.PNG", "b/img2.png", "b/img10.png"]
-    assert [p.as_posix() for p in find_photographs(tmp_path, leave_out=[tmp_path / "b"])] == ["a 1.PNG"]
+    assert [p.as_posix() for p in find_images(tmp_path)] == ["a 1.PNG", "b/img2.png", "b/img10.png"]
+    assert [p.as_posix() for p in find_images(tmp_path, leave_out=[tmp_path / "b"])] == ["a 1.PNG"]
     (tmp_path / "c").mkdir()
     with pytest.raises(DataError, match="has no image"):
-        find_photographs(tmp_path / "c")
+        find_images(tmp_path / "c")
 
 
 def test_digits_that_are_no_numbers_are_letters(tmp_path: Path) -> None:
     """Python takes a superscript for a digit, but makes no number of it."""
     for name in ("12²3.png", "9²3.png"):
         write(tmp_path / name)
-    assert [path.name for path in find_photographs(tmp_path)] == ["9²3.png", "12²3.png"]
+    assert [path.name for path in find_images(tmp_path)] == ["9²3.png", "12²3.png"]
 
 
 def test_names_are_safe_and_different() -> None:
@@ -68,7 +68,7 @@ def test_damaged_photographs_are_left_out_and_named(tmp_path: Path) -> None:
     write(tmp_path / "good.png")
     (tmp_path / "bad.png").write_bytes((tmp_path / "good.png").read_bytes()[:60])
     (tmp_path / "worse.jpg").write_text("no image")
-    sources = find_photographs(tmp_path)
+    sources = find_images(tmp_path)
     photographs, unreadable = prepare_all(tmp_path, sources, tmp_path / "out")
     assert [p.source for p in photographs] == ["good.png"]
     assert len(unreadable) == 2

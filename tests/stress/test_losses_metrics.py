@@ -185,6 +185,7 @@ def variation_by_torch(table: Tensor, layout: PlanesLayout) -> tuple[Tensor, Ten
 def test_regularisers_of_planes_in_space_and_time(backend: str, moving_planes: KPlanes) -> None:
     """Value and gradient, wherever that waits, against float64: planes of 6 x 6, 12 x 12, 6 x 5 and 12 x 5."""
     planes = moving_planes.field.encoding
+    assert planes.layout.resolutions == ((6, 6, 6, 5), (12, 12, 12, 5))
     with torch.no_grad():
         planes.table.copy_(torch.rand(planes.table.shape, generator=torch.Generator().manual_seed(0)) * 2)
     exact = planes.table.detach().double().requires_grad_()

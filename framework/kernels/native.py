@@ -148,13 +148,6 @@ def _last_error() -> str:
     return library.last_error().decode(errors="replace")
 
 
-def usable(*tensors: Tensor | None) -> bool:
-    """Whether compiled kernels exist and every given tensor is float32 on the processor."""
-    if not available():
-        return False
-    return all(t is None or (t.dtype is torch.float32 and t.device.type == "cpu") for t in tensors)
-
-
 def pointer(tensor: Tensor, what: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float32) -> int:
     """The address of a tensor's data, after checking all that a kernel relies on.
 

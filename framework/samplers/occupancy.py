@@ -15,10 +15,9 @@ from torch import Tensor, nn
 from framework.base.errors import ConfigError, shown
 from framework.fields.base import DensityFunction, Field
 from framework.geometry.rays import Rays, Samples
-from framework.kernels import native
 from framework.kernels.given import is_followed
 from framework.kernels.kept import Waves
-from framework.kernels.march import March, Occupancy, ReferenceMarch, refresh_occupancy
+from framework.kernels.march import Occupancy, march, refresh_occupancy
 from framework.kernels.rows import gather_rows
 
 MAX_CELLS = 512
@@ -104,7 +103,7 @@ class OccupancySampler(nn.Module):
     def occupancy(self) -> Occupancy:
         """The grid as marching wants it."""
         if self._packed is None or self._packed.occupied is not self.occupied:
-            self._packed = Occupancy.of(self.occupied, self.box, self.resolution)
+            self._packed = Occupancy(self.occupied, self.box, self.resolution)
         return self._packed
 
     def forget(self) -> None:
@@ -124,20 +123,19 @@ class OccupancySampler(nn.Module):
             raise ValueError("marched samples carry no gradient to rays: detach these, or take a ProposalSampler")
         shift = torch.rand(len(rays), device=rays.origins.device) if jitter else None
         stop = self.train_early_stop if self.training else self.early_stop
-        compiled = native.usable(rays.origins, rays.directions, self.box)
-        march = (March if compiled else ReferenceMarch)(rays, self.occupancy, self.step_size, self.cone, shift, stop)
+        marched = march(rays, self.occupancy, self.step_size, self.cone, shift, stop)
 
         def density(positions: Tensor, owners: Tensor) -> tuple[Tensor, ...]:
             return field.density(positions, None if rays.times is None else rays.times[owners])
 
         evaluated = Waves()
-        while (wave := march.wave(WAVES[min(len(march.waves), len(WAVES) - 1)])) is not None:
-            march.advance(evaluated.evaluate(len(wave.owners), partial(density, wave.positions, wave.owners))[0])
-        order, offsets = march.finish()
-        if not march.waves:  # no ray meets anything: still the field's own, empty, tensors
+        while (wave := marched.wave(WAVES[min(len(marched.waves), len(WAVES) - 1)])) is not None:
+            marched.advance(evaluated.evaluate(len(wave.owners), partial(density, wave.positions, wave.owners))[0])
+        order, offsets = marched.finish()
+        if not marched.waves:  # no ray meets anything: still the field's own, empty, tensors
             empty = rays.nears[:0]
             return Samples(empty, empty, offsets).evaluated(*density(rays.origins[:0], order))
-        waves = march.waves
+        waves = marched.waves
         columns = [[w.t_starts for w in waves], [w.t_ends for w in waves], [w.owners for w in waves]]
         starts, ends, owners = gather_rows(columns, order)
 

@@ -252,7 +252,7 @@ def join_cameras(parts: Sequence[Cameras]) -> Cameras:
     return Cameras(**joined, model=model, lens=torch.cat(lenses))
 
 
-_camera_rays = native.function("camera_rays", "i" + "pqpqpqppppppp" + "ppppi")
+_camera_rays = native.Function("camera_rays", "i" + "pqpqpqppppppp" + "ppppi")
 
 
 def _reference_rays(

@@ -161,4 +161,4 @@ def _compiled(pixels: Tensor, flat: Tensor, behind: Tensor) -> tuple[Tensor, Ten
     return rgb, alpha if channels == 4 else None
 
 
-_gather_colors = native.function("gather_colors", "pqpqipppi")
+_gather_colors = native.Function("gather_colors", "pqpqipppi")

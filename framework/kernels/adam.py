@@ -18,9 +18,9 @@ from torch.optim.adam import adam
 from framework.kernels import native
 from framework.kernels.dispatch import CPP, TORCH, Operation
 
-_sparse = native.function("adam_sparse", "pppppqifddfi", "q")
-_dense = native.function("adam_dense", "ppppppifddfi")
-_finite = native.function("all_finite", "pqi", "i")
+_sparse = native.Function("adam_sparse", "pppppqifddfi", "q")
+_dense = native.Function("adam_dense", "ppppppifddfi")
+_finite = native.Function("all_finite", "pqi", "i")
 
 
 @torch.no_grad()

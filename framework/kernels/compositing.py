@@ -118,8 +118,8 @@ def composite_reference(samples: Samples, sigma: Tensor, rgb: Tensor, background
     return Composited(color, opacity, moment, median, weights)
 
 
-_forward = native.function("composite_forward", "ppppppqqpppppppi")
-_backward = native.function("composite_backward", "pppppqqppppppppi")
+_forward = native.Function("composite_forward", "ppppppqqpppppppi")
+_backward = native.Function("composite_backward", "pppppqqppppppppi")
 
 
 class _Composite(torch.autograd.Function):
@@ -214,7 +214,7 @@ def distortion_reference(weights: Tensor, samples: Samples) -> Tensor:
     return ray_sum(weights * (2 * apart + weights * samples.deltas / 3), samples)
 
 
-_distortion = native.function("distortion", "ppppqqppi")
+_distortion = native.Function("distortion", "ppppqqppi")
 
 
 class _Distortion(torch.autograd.Function):

@@ -39,8 +39,8 @@ def _compiled(positions: Tensor, box: Tensor) -> Tensor:
     return _Contract.apply(positions.contiguous(), box)
 
 
-_forward = native.function("contract_positions", "pppqpi")
-_backward = native.function("contract_positions_backward", "ppppqpi")
+_forward = native.Function("contract_positions", "pppqpi")
+_backward = native.Function("contract_positions_backward", "ppppqpi")
 
 
 class _Contract(torch.autograd.Function):

@@ -13,8 +13,8 @@ from framework.kernels.dispatch import CPP, Operation
 MAX_FREQUENCIES = 32
 """Of which an encoding may be made: from float32 the sines of the last ones are noise long before."""
 
-_forward = native.function("frequency_encoding", "pqiiipi")
-_backward = native.function("frequency_encoding_backward", "ppqiiipi")
+_forward = native.Function("frequency_encoding", "pqiiipi")
+_backward = native.Function("frequency_encoding_backward", "ppqiiipi")
 
 
 def frequency_encoding_reference(x: Tensor, num_frequencies: int, include_input: bool = True) -> Tensor:

@@ -137,10 +137,10 @@ def hash_grid_reference(positions: Tensor, table: Tensor, layout: HashGridLayout
     return torch.cat(features, dim=-1)
 
 
-_forward = native.function("hash_grid_forward", "pqpippipi")
-_backward_table = native.function("hash_grid_backward_table", "pppiippipi")
-_backward_positions = native.function("hash_grid_backward_positions", "pqppippipi")
-_adam = native.function("hash_grid_adam", "pppiippippppfddfi", "q")
+_forward = native.Function("hash_grid_forward", "pqpippipi")
+_backward_table = native.Function("hash_grid_backward_table", "pppiippipi")
+_backward_positions = native.Function("hash_grid_backward_positions", "pqppippipi")
+_adam = native.Function("hash_grid_adam", "pppiippippppfddfi", "q")
 
 
 class TableGradient:

@@ -45,8 +45,8 @@ def _interval_weights(sigma: Tensor, t: Tensor) -> Tensor:
     return _Weights.apply(sigma.contiguous(), t.contiguous())
 
 
-_weights = native.function("interval_weights", "ppqqpi")
-_weights_backward = native.function("interval_weights_backward", "ppppqqpi")
+_weights = native.Function("interval_weights", "ppqqpi")
+_weights_backward = native.Function("interval_weights_backward", "ppppqqpi")
 
 
 class _Weights(torch.autograd.Function):
@@ -119,7 +119,7 @@ def _resample(edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: 
     return out
 
 
-_resample_intervals = native.function("resample_intervals", "pppqqqffpi")
+_resample_intervals = native.Function("resample_intervals", "pppqqqffpi")
 
 
 # -- the loss of a proposal ---------------------------------------------------------------------------------------
@@ -152,7 +152,7 @@ def _proposal_excess(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_
     return _Excess.apply(*(tensor.contiguous() for tensor in (edges, weights, proposed, proposed_weights)))
 
 
-_excess = native.function("proposal_excess", "ppqppqqfppi")
+_excess = native.Function("proposal_excess", "ppqppqqfppi")
 
 
 class _Excess(torch.autograd.Function):

@@ -363,9 +363,9 @@ def ranges(counts: Tensor) -> tuple[Tensor, Tensor]:
     return owners, torch.arange(len(owners), device=counts.device) - firsts[owners]
 
 
-_pack: Callable[..., None] = native.function("pack_occupancy", "pipp")
-_refresh: Callable[..., None] = native.function("refresh_occupancy", "pqfffpi")
-_begin: Callable[..., int] = native.function("march_begin", "pppppqpfppppi", "q")
-_wave: Callable[..., int] = native.function("march_wave", "pppppppqipffppipppppi", "q")
-_advance: Callable[..., int] = native.function("march_advance", "pqpipppfppp", "q")
-_sort: Callable[..., int] = native.function("sort_by_ray", "ppqqpp", "q")
+_pack: Callable[..., None] = native.Function("pack_occupancy", "pipp")
+_refresh: Callable[..., None] = native.Function("refresh_occupancy", "pqfffpi")
+_begin: Callable[..., int] = native.Function("march_begin", "pppppqpfppppi", "q")
+_wave: Callable[..., int] = native.Function("march_wave", "pppppppqipffppipppppi", "q")
+_advance: Callable[..., int] = native.Function("march_advance", "pqpipppfppp", "q")
+_sort: Callable[..., int] = native.Function("sort_by_ray", "ppqqpp", "q")

@@ -40,10 +40,10 @@ def mlp_reference(
     return torch.sigmoid(x) if activation == "sigmoid" else x
 
 
-_forward = native.function("mlp_forward", "ppiqpippipi")
-_backward = native.function("mlp_backward", "ppiqpippippppi")
-_forward_bf16 = native.function("mlp_forward_bf16", "ppiqpippipi")
-_backward_bf16 = native.function("mlp_backward_bf16", "ppiqpippippppi")
+_forward = native.Function("mlp_forward", "ppiqpippipi")
+_backward = native.Function("mlp_backward", "ppiqpippippppi")
+_forward_bf16 = native.Function("mlp_forward_bf16", "ppiqpippipi")
+_backward_bf16 = native.Function("mlp_backward_bf16", "ppiqpippippppi")
 
 
 class _MLP(torch.autograd.Function):

@@ -144,9 +144,9 @@ def planes_reference(positions: Tensor, table: Tensor, layout: PlanesLayout) -> 
 
 
 _TAIL = "iiiippp"
-_forward = native.function("planes_forward", "pqp" + _TAIL + "pi")
-_backward_table = native.function("planes_backward_table", "pqp" + _TAIL + "ppi")
-_backward_positions = native.function("planes_backward_positions", "pqp" + _TAIL + "ppi")
+_forward = native.Function("planes_forward", "pqp" + _TAIL + "pi")
+_backward_table = native.Function("planes_backward_table", "pqp" + _TAIL + "ppi")
+_backward_positions = native.Function("planes_backward_positions", "pqp" + _TAIL + "ppi")
 
 
 class PlanesGradient:

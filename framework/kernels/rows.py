@@ -13,7 +13,7 @@ from framework.kernels import native
 from framework.kernels.dispatch import CPP, INT64, Operation
 from framework.kernels.given import check_indices
 
-_gather = native.function("gather_rows", "ppipipqpi")
+_gather = native.Function("gather_rows", "ppipipqpi")
 
 
 class _TakeRows(torch.autograd.Function):

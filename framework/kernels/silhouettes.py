@@ -15,9 +15,9 @@ from torch.nn import functional
 from framework.kernels import native
 from framework.kernels.dispatch import BOOL, CPP, Operation
 
-_sums = native.function("opaque_sums", "pqqp")
-_hold = native.function("hold_balls", "pqfpffffpqqipi")
-_near = native.function("pixels_near_balls", "pqfpffffpqqpi")
+_sums = native.Function("opaque_sums", "pqqp")
+_hold = native.Function("hold_balls", "pqfpffffpqqipi")
+_near = native.Function("pixels_near_balls", "pqfpffffpqqpi")
 
 
 @dataclass(frozen=True)

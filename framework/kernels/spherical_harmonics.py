@@ -12,7 +12,7 @@ from framework.kernels import kept, native
 from framework.kernels.dispatch import CPP, Operation
 
 MAX_LEVELS = 4
-_harmonics = native.function("spherical_harmonics", "pqipi")
+_harmonics = native.Function("spherical_harmonics", "pqipi")
 
 
 def spherical_harmonics(directions: Tensor, levels: int = 4) -> Tensor:

@@ -127,8 +127,8 @@ BUGS = (
         "contraction-centre",
         "contraction",
         "framework/kernels/contraction.py",
-        "_Contract.apply(positions.contiguous(), (box[0] + box[1]) / 2, 2 / (box[1] - box[0]))",
-        "_Contract.apply(positions.contiguous(), torch.zeros_like(box[0]), 2 / (box[1] - box[0]))",
+        "centre, scale = (box[0] + box[1]) / 2, 2 / (box[1] - box[0])",
+        "centre, scale = torch.zeros_like(box[0]), 2 / (box[1] - box[0])",
         "of a box that is not around the origin, space is contracted around the wrong place",
     ),
     Bug(

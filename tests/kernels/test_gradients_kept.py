@@ -190,7 +190,7 @@ WITHOUT_A_GRADIENT = {
 
 def test_every_kernel_is_asked() -> None:
     sources = "".join(file.read_text() for file in Path(framework.__file__).parent.rglob("*.py"))
-    declared = set(re.findall(r'native\.function\("(\w+)"', sources))
+    declared = set(re.findall(r'native\.Function\("(\w+)"', sources))
     covered = {kernel for operation in OPERATIONS.values() for kernel in operation.kernels}
     assert declared == covered | WITHOUT_A_GRADIENT
 

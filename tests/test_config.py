@@ -181,7 +181,7 @@ def test_class_keywords_keep_type_order_and_help() -> None:
     with pytest.raises(SystemExit), contextlib.redirect_stdout(shown):
         tyro.cli(More, args=["--help"])
     text = " ".join(shown.getvalue().replace("│", " ").split())
-    assert "Adam's learning rate at the start. (default: 0.5)" in text
+    assert "Initial learning rate of Adam. (default: 0.5)" in text
     assert "A setting of its own. (default: 4)" in text
 
 

@@ -99,16 +99,18 @@ METHOD = replace(NGP, paper="none", interface={interface})
 
 def test_methods_of_the_environment_and_their_interface(environment: Callable[..., Path]) -> None:
     modules = {
-        "env_plugin": METHOD_FILE.format(interface=registry.INTERFACE),
-        "newer_plugin": METHOD_FILE.format(interface=registry.INTERFACE + 1),
-        "older_plugin": METHOD_FILE.format(interface=registry.OLDEST_INTERFACE - 1),
+        "env_plugin": METHOD_FILE.format(interface=registry.INTERFACE["methods"]),
+        "newer_plugin": METHOD_FILE.format(interface=registry.INTERFACE["methods"] + 1),
+        "older_plugin": METHOD_FILE.format(interface=registry.INTERFACE["methods"] - 1),
     }
     environment(modules, methods="mine = env_plugin:METHOD ,newer=newer_plugin:METHOD,older=older_plugin:METHOD,")
     assert registry.load_method("mine").paper == "none"
     assert registry.summary(registry.registered("methods")["mine"]) == "A method of the environment."
-    with pytest.raises(ConfigError, match=r"'newer' .* plugin interface 2, and this is 1; upgrade nerfloom"):
+    with pytest.raises(ConfigError, match=r"'newer' .* plugin interface 3, and this is 2; upgrade nerfloom"):
         registry.load_method("newer")
-    with pytest.raises(ConfigError, match=r"'older' .* plugin interface 0, and this is 1; upgrade the plugin"):
+    with pytest.raises(
+        ConfigError, match=r"'older' .* plugin interface 1, and this is 2; docs/plugins\.md, .*says what to change"
+    ):
         registry.load_method("older")
 
 
@@ -164,7 +166,10 @@ def test_methods_that_live_elsewhere(environment: Callable[..., Path]) -> None:
     with pytest.raises(ConfigError, match=r"no method 'splatfacto': .*pip install nerfstudio, ns-train splatfacto"):
         registry.load_method("splatfacto")
     assert not set(ELSEWHERE) & set(registry.registered("methods"))
-    environment({"env_plugin": METHOD_FILE.format(interface=1)}, methods="splatfacto=env_plugin:METHOD")
+    environment(
+        {"env_plugin": METHOD_FILE.format(interface=registry.INTERFACE["methods"])},
+        methods="splatfacto=env_plugin:METHOD",
+    )
     assert registry.load_method("splatfacto").paper == "none"
 
 
@@ -191,8 +196,8 @@ def test_formats_that_fail_do_not_stop_others(
     environment(modules, dataparsers="burning=burning:Format,never=broken_format:X")
     assert find_data(shared_tiny) == (shared_tiny, "blender")
     printed = capsys.readouterr()
-    assert "data format 'burning' failed to look at" in printed.out + printed.err
-    assert "the disk is on fire; it is left out" in (printed.out + printed.err).replace("\n", " ")
+    assert "data format 'burning' failed to examine" in printed.out + printed.err
+    assert "the disk is on fire; it is ignored" in (printed.out + printed.err).replace("\n", " ")
     assert "data format 'never' of NERFLOOM_DATAPARSERS cannot be loaded" in (printed.out + printed.err)
 
 

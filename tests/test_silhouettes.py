@@ -51,7 +51,7 @@ def test_every_pixel_that_could_see_the_hull_is_kept(ball: Dataset) -> None:
     hull = visual_hull(silhouettes, BOX, resolution)
     kept = torch.zeros(len(ball.pixels), dtype=torch.bool)
     kept[pixels_near(silhouettes, hull, BOX, resolution).pixels()] = True
-    grid = Occupancy.of(hull, BOX, resolution)
+    grid = Occupancy(hull, BOX, resolution)
     for image in range(len(ball)):
         rays = ball.cameras.pixel_rays(ball.cameras.image_pixels(image), 0.1, 20)
         _, _, offsets = candidates(rays, grid, 0.01, 0.0, None)

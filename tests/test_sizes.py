@@ -40,7 +40,7 @@ def numbers(config: TrainConfig) -> Iterator[tuple[str, Any]]:
     for name, hint in typing.get_type_hints(type(config)).items():
         if name in shared:
             continue
-        kinds = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+        kinds = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
         for kind in kinds:
             if kind in WRONG:
                 yield from ((name, value) for value in WRONG[kind])

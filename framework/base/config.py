@@ -22,14 +22,21 @@ from framework.base.from_nerfstudio import config_answer
 T = TypeVar("T")
 RaysPerPixel = Literal[1, 4, 9, 16]
 LEFT_TO_DATA = "left to the data"
+"""Marks the types of settings that are."""
 if TYPE_CHECKING:
     Auto = Annotated[T, LEFT_TO_DATA]
 else:
-    Auto = Annotated[T | None, LEFT_TO_DATA]
-"""`Auto[T]`: a setting of type T that may be left to the data, by None, until `Method.decide` fills it in.
 
-Type checkers take it for T: what is built from settings is built after they were decided.
-"""
+    class Auto:
+        """`Auto[T]`: a setting of type T that may be left to the data, by None, until `Method.decide` fills it in.
+
+        Type checkers take it for T: what is built from settings is built after they were decided.
+        """
+
+        def __class_getitem__(cls, kind: Any) -> Any:
+            return Annotated[kind | None, LEFT_TO_DATA]
+
+
 AUTO: Any = None
 """The default of an `Auto` setting."""
 Range = tuple[float, float]

@@ -20,6 +20,7 @@ from framework.geometry.lenses import DISTORTED, Distortion, LensRays, project, 
 from framework.geometry.lenses import LENSES as LENSES
 from framework.geometry.rays import Rays
 from framework.kernels import native
+from framework.kernels.dispatch import CPP, Operation
 from framework.kernels.given import check_indices, is_followed
 
 ROTATION_TOLERANCE = 1e-3
@@ -200,10 +201,7 @@ class Cameras:
             IndexError: if a number exceeds the number of pixels.
         """
         numbers = self.camera_to_worlds, self.fx, self.fy, self.cx, self.cy, subpixels
-        if self.model in COMPILED and native.usable(*numbers) and not is_followed(*numbers, self.lens):
-            return self._pixel_rays_compiled(flat, near, far, times, subpixels)
-        check_indices(flat, int(self.offsets[-1]) if flat.device.type == "cpu" else 0, "pixels")
-        return self.pixel_rays_reference(flat, near, far, times, subpixels)
+        return CAMERA_RAYS(numbers, self, flat, near, far, times, subpixels)
 
     def pixel_rays_reference(
         self, flat: Tensor, near: float, far: float, times: Tensor | None = None, subpixels: Tensor = CENTER
@@ -212,42 +210,13 @@ class Cameras:
 
         `flat`, `near`, `far`, `times` and `subpixels` are as in `pixel_rays`.
         """
+        check_indices(flat, int(self.offsets[-1]) if flat.device.type == "cpu" else 0, "pixels")
         indices = torch.searchsorted(self.offsets, flat, right=True) - 1
         within, widths = flat - self.offsets[indices], self.widths[indices]
         subpixels = subpixels.to(self.fx)
         columns = ((within % widths)[:, None] + subpixels[:, 0]).reshape(-1)
         rows = ((within // widths)[:, None] + subpixels[:, 1]).reshape(-1)
         return self.rays(indices.repeat_interleave(len(subpixels)), columns, rows, near, far, times)
-
-    def _pixel_rays_compiled(
-        self, flat: Tensor, near: float, far: float, times: Tensor | None, subpixels: Tensor
-    ) -> Rays:
-        images, count = len(self), len(flat) * len(subpixels)
-        origins, directions, radii = torch.empty(count, 3), torch.empty(count, 3), torch.empty(count)
-        indices = torch.empty(count, dtype=torch.int64)
-        poses, widths, subpixels = self.camera_to_worlds.contiguous(), self.widths.contiguous(), subpixels.contiguous()
-        numbers = {name: getattr(self, name).contiguous() for name in ("fx", "fy", "cx", "cy")}
-        distortion = None if self.distortion is None else self.distortion.table
-        _camera_rays(
-            COMPILED.index(self.model),
-            native.pointer(flat, "pixel indices", (len(flat),), torch.int64), len(flat),
-            native.pointer(subpixels, "subpixels", (len(subpixels), 2)), len(subpixels),
-            native.pointer(self.offsets, "offsets", (images + 1,), torch.int64), images,
-            native.pointer(widths, "widths", (images,), torch.int64),
-            native.pointer(poses, "poses", (images, 3, 4)),
-            *(native.pointer(values, name, (images,)) for name, values in numbers.items()),
-            None if distortion is None else native.pointer(distortion, "lenses", (images, 11), torch.float64),
-            origins.data_ptr(), directions.data_ptr(), radii.data_ptr(), indices.data_ptr(), native.threads(),
-        )  # fmt: skip
-        return Rays(
-            origins,
-            directions,
-            torch.full((count,), near),
-            torch.full((count,), far),
-            radii,
-            None if times is None else times[indices],
-            indices,
-        )
 
     def image_pixels(self, index: int) -> Tensor:
         """Return the numbers (H * W,) of the pixels of image `index`, row by row, counted through all images."""
@@ -309,7 +278,52 @@ def join_cameras(parts: Sequence[Cameras]) -> Cameras:
     return Cameras(**joined, model=model, lens=torch.cat(lenses))
 
 
-_camera_rays = native.function("camera_rays", "i" + "pqpqpqppppppp" + "ppppi")
+_camera_rays = native.Function("camera_rays", "i" + "pqpqpqppppppp" + "ppppi")
+
+
+def _reference_rays(
+    cameras: Cameras, flat: Tensor, near: float, far: float, times: Tensor | None, places: Tensor
+) -> Rays:
+    return cameras.pixel_rays_reference(flat, near, far, times, places)
+
+
+def _is_compiled(cameras: Cameras, flat: Tensor, near: float, far: float, times: Tensor | None, places: Tensor) -> bool:
+    return cameras.model in COMPILED and not is_followed(cameras.lens)
+
+
+CAMERA_RAYS = Operation("camera_rays", _reference_rays)
+
+
+@CAMERA_RAYS.implementation(CPP, order=0, fits=_is_compiled)
+def _compiled_rays(
+    cameras: Cameras, flat: Tensor, near: float, far: float, times: Tensor | None, places: Tensor
+) -> Rays:
+    images, count = len(cameras), len(flat) * len(places)
+    origins, directions, radii = torch.empty(count, 3), torch.empty(count, 3), torch.empty(count)
+    indices = torch.empty(count, dtype=torch.int64)
+    poses, widths, places = cameras.camera_to_worlds.contiguous(), cameras.widths.contiguous(), places.contiguous()
+    numbers = {name: getattr(cameras, name).contiguous() for name in ("fx", "fy", "cx", "cy")}
+    distortion = None if cameras.distortion is None else cameras.distortion.table
+    _camera_rays(
+        COMPILED.index(cameras.model),
+        native.pointer(flat, "pixel indices", (len(flat),), torch.int64), len(flat),
+        native.pointer(places, "places in a pixel", (len(places), 2)), len(places),
+        native.pointer(cameras.offsets, "offsets", (images + 1,), torch.int64), images,
+        native.pointer(widths, "widths", (images,), torch.int64),
+        native.pointer(poses, "poses", (images, 3, 4)),
+        *(native.pointer(values, name, (images,)) for name, values in numbers.items()),
+        None if distortion is None else native.pointer(distortion, "lenses", (images, 11), torch.float64),
+        origins.data_ptr(), directions.data_ptr(), radii.data_ptr(), indices.data_ptr(), native.threads(),
+    )  # fmt: skip
+    return Rays(
+        origins,
+        directions,
+        torch.full((count,), near),
+        torch.full((count,), far),
+        radii,
+        None if times is None else times[indices],
+        indices,
+    )
 
 
 def check_pose(pose: Tensor, where: str) -> None:

@@ -16,7 +16,8 @@ from framework.data.depths import ray_distances
 from framework.data.error_map import ErrorMap
 from framework.geometry.rays import Rays
 from framework.kernels import native
-from framework.kernels.given import check_indices, is_followed
+from framework.kernels.dispatch import CPP, Operation
+from framework.kernels.given import check_indices
 
 Background = Literal["random", "white", "black"]
 """Kind of background."""
@@ -181,6 +182,7 @@ def _distances(dataset: Dataset, flat: Tensor, rays: Rays) -> Tensor | None:
 
 def gather_colors_reference(pixels: Tensor, flat: Tensor, behind: Tensor) -> tuple[Tensor, Tensor | None]:
     """Compute `gather_colors` of `pixels`, `flat` and `behind` in PyTorch, on any device."""
+    check_indices(flat, len(pixels), "pixels")
     rgba = pixels[flat].float() / 255
     return composite(rgba, behind), rgba[:, 3] if rgba.shape[-1] == 4 else None
 
@@ -199,9 +201,14 @@ def gather_colors(pixels: Tensor, flat: Tensor, behind: Tensor) -> tuple[Tensor,
     Raises:
         IndexError: if a number exceeds the number of pixels.
     """
-    if not native.usable(behind) or is_followed(behind):
-        check_indices(flat, len(pixels), "pixels")
-        return gather_colors_reference(pixels, flat, behind)
+    return GATHER_COLORS((behind,), pixels, flat, behind)
+
+
+GATHER_COLORS = Operation("gather_colors", gather_colors_reference)
+
+
+@GATHER_COLORS.implementation(CPP, order=0)
+def _compiled(pixels: Tensor, flat: Tensor, behind: Tensor) -> tuple[Tensor, Tensor | None]:
     count, channels = len(flat), pixels.shape[1]
     rgb, alpha = torch.empty(count, 3), torch.empty(count)
     _gather_colors(
@@ -212,4 +219,4 @@ def gather_colors(pixels: Tensor, flat: Tensor, behind: Tensor) -> tuple[Tensor,
     return rgb, alpha if channels == 4 else None
 
 
-_gather_colors = native.function("gather_colors", "pqpqipppi")
+_gather_colors = native.Function("gather_colors", "pqpqipppi")

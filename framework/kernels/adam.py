@@ -13,12 +13,14 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from torch.optim.adam import adam
 
 from framework.kernels import native
+from framework.kernels.dispatch import CPP, TORCH, Operation
 
-_sparse = native.function("adam_sparse", "pppppqifddfi", "q")
-_dense = native.function("adam_dense", "ppppppifddfi")
-_finite = native.function("all_finite", "pqi", "i")
+_sparse = native.Function("adam_sparse", "pppppqifddfi", "q")
+_dense = native.Function("adam_dense", "ppppppifddfi")
+_finite = native.Function("all_finite", "pqi", "i")
 
 
 @torch.no_grad()
@@ -56,8 +58,18 @@ def sparse_adam(
         eps: added to the root of the second.
     Returns: how many entries were updated.
     """
-    if not native.usable(values, grad, mean, square, seen):
-        return sparse_adam_reference(values, grad, mean, square, seen, rate, betas, eps)
+    tensors = values, grad, mean, square, seen
+    return SPARSE_ADAM(tensors, *tensors, rate, betas, eps)
+
+
+SPARSE_ADAM = Operation("sparse_adam", sparse_adam_reference)
+
+
+@SPARSE_ADAM.implementation(CPP)
+def _sparse_adam(
+    values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
+    rate: float, betas: tuple[float, float], eps: float,
+) -> int:  # fmt: skip
     shape = (values.shape[0], values.shape[1])
     return _sparse(
         native.pointer(values, "values", shape), native.pointer(mean, "mean", shape),
@@ -68,37 +80,82 @@ def sparse_adam(
 
 @torch.no_grad()
 def dense_adam_reference(
-    values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, step: float,
-    rate: float, betas: tuple[float, float], eps: float,
+    values: Sequence[Tensor], grads: Sequence[Tensor], means: Sequence[Tensor], squares: Sequence[Tensor],
+    steps: Sequence[Tensor], rate: float, betas: tuple[float, float], eps: float,
 ) -> None:  # fmt: skip
-    """As `dense_adam` of one tensor, in torch, on any device and in any float type."""
-    mean.lerp_(grad, 1 - betas[0])
-    square.mul_(betas[1]).addcmul_(grad, grad, value=1 - betas[1])
-    unbias1, unbias2 = (1 - beta**step for beta in betas)
-    values.addcdiv_(mean, square.sqrt() / math.sqrt(unbias2) + eps, value=-rate / unbias1)
+    """As `dense_adam`, in torch, on any device and in any float type."""
+    for value, grad, mean, square, step in zip(values, grads, means, squares, steps, strict=True):
+        step += 1
+        mean.lerp_(grad, 1 - betas[0])
+        square.mul_(betas[1]).addcmul_(grad, grad, value=1 - betas[1])
+        unbias1, unbias2 = (1 - beta ** step.item() for beta in betas)
+        value.addcdiv_(mean, square.sqrt() / math.sqrt(unbias2) + eps, value=-rate / unbias1)
 
 
 def dense_adam(
     values: Sequence[Tensor], grads: Sequence[Tensor], means: Sequence[Tensor], squares: Sequence[Tensor],
-    steps: Sequence[float], rate: float, betas: tuple[float, float], eps: float,
+    steps: Sequence[Tensor], rate: float, betas: tuple[float, float], eps: float,
 ) -> None:  # fmt: skip
-    """Update, in place, every value of several parameters (Kingma and Ba 2015, algorithm 1), compiled.
+    """Update, in place, every value of several parameters (Kingma and Ba 2015, algorithm 1).
 
     Args:
-        values, grads, means, squares: contiguous float32 on the CPU, of the same shapes.
-        steps: updates each parameter has had, this one included.
+        values, grads, means, squares: of each parameter, of one shape.
+        steps: () float32 updates each parameter has had, to which this one is added.
         rate, betas, eps: as for `sparse_adam`.
     """
+    DENSE_ADAM((*values, *grads), values, grads, means, squares, steps, rate, betas, eps)
+
+
+DENSE_ADAM = Operation("dense_adam", dense_adam_reference)
+
+
+def _all_contiguous(
+    values: Sequence[Tensor], grads: Sequence[Tensor], means: Sequence[Tensor], squares: Sequence[Tensor],
+    steps: Sequence[Tensor], rate: float, betas: tuple[float, float], eps: float,
+) -> bool:  # fmt: skip
+    return all(tensor.is_contiguous() for tensor in (*values, *grads))
+
+
+@DENSE_ADAM.implementation(CPP, fits=_all_contiguous)
+def _dense_adam(
+    values: Sequence[Tensor], grads: Sequence[Tensor], means: Sequence[Tensor], squares: Sequence[Tensor],
+    steps: Sequence[Tensor], rate: float, betas: tuple[float, float], eps: float,
+) -> None:  # fmt: skip
     columns = [
         native.pointers([native.pointer(t, name, tuple(v.shape)) for t, v in zip(tensors, values, strict=True)])
         for name, tensors in (("values", values), ("mean", means), ("square", squares), ("grad", grads))
     ]
-    counts = native.integers(tuple(v.numel() for v in values))
-    _dense(*columns, counts, native.doubles(steps), len(values), rate, *betas, eps, native.threads())
+    for step in steps:
+        step += 1
+    counts, times = native.integers(tuple(v.numel() for v in values)), native.doubles([float(s) for s in steps])
+    _dense(*columns, counts, times, len(values), rate, *betas, eps, native.threads())
+
+
+@DENSE_ADAM.implementation(TORCH, types=None)
+def _torch_adam(
+    values: Sequence[Tensor], grads: Sequence[Tensor], means: Sequence[Tensor], squares: Sequence[Tensor],
+    steps: Sequence[Tensor], rate: float, betas: tuple[float, float], eps: float,
+) -> None:  # fmt: skip
+    fused = bool(values) and values[0].device.type in ("cpu", "cuda")
+    adam(
+        [*values], [*grads], [*means], [*squares], [], [*steps], fused=fused, amsgrad=False, beta1=betas[0],
+        beta2=betas[1], lr=rate, weight_decay=0.0, eps=eps, maximize=False,
+    )  # fmt: skip
+
+
+def all_finite_reference(values: Tensor) -> bool:
+    """As `all_finite`, in torch, on any device."""
+    return bool(torch.isfinite(values).all())
 
 
 def all_finite(values: Tensor) -> bool:
     """Whether no value is infinite or NaN, in one pass."""
-    if native.usable(values) and values.is_contiguous():
-        return bool(_finite(values.data_ptr(), values.numel(), native.threads()))
-    return bool(torch.isfinite(values).all())
+    return ALL_FINITE((values,), values)
+
+
+ALL_FINITE = Operation("all_finite", all_finite_reference)
+
+
+@ALL_FINITE.implementation(CPP, fits=lambda values: values.is_contiguous())
+def _all_finite(values: Tensor) -> bool:
+    return bool(_finite(values.data_ptr(), values.numel(), native.threads()))

@@ -20,7 +20,8 @@ from torch.nn import functional
 
 from framework.geometry.rays import Samples
 from framework.kernels import native
-from framework.kernels.given import check_offsets, is_followed
+from framework.kernels.dispatch import CPP, Operation
+from framework.kernels.given import check_offsets
 
 MAX_OPTICAL_DEPTH = 1e3
 """Of one interval. exp(-1000) is 0 even in float64, so nothing is lost, and sums stay finite."""
@@ -117,8 +118,8 @@ def composite_reference(samples: Samples, sigma: Tensor, rgb: Tensor, background
     return Composited(color, opacity, moment, median, weights)
 
 
-_forward = native.function("composite_forward", "ppppppqqpppppppi")
-_backward = native.function("composite_backward", "pppppqqppppppppi")
+_forward = native.Function("composite_forward", "ppppppqqpppppppi")
+_backward = native.Function("composite_backward", "pppppqqppppppppi")
 
 
 class _Composite(torch.autograd.Function):
@@ -179,13 +180,20 @@ def composite(samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor, 
     check_offsets(samples.offsets, len(samples))
     background = background.expand(samples.num_rays, 3)
     tensors = (sigma, rgb, samples.t_starts, samples.t_ends, samples.points, background, fars)
-    if native.usable(*tensors) and not is_followed(*tensors[2:]):
-        inputs = [None if t is None else t.contiguous() for t in tensors]
-        return Composited(*_Composite.apply(*inputs[:5], samples.offsets, *inputs[5:]))
-    return composite_reference(samples, sigma, rgb, background, fars)
+    return COMPOSITE(tensors, samples, sigma, rgb, background, fars)
 
 
-def distortion_reference(weights: Tensor, samples: Samples) -> Tensor:
+COMPOSITE = Operation("composite", composite_reference)
+
+
+@COMPOSITE.implementation(CPP, differentiable=2)
+def _composite(samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor, fars: Tensor) -> Composited:
+    points = None if samples.points is None else samples.points.contiguous()
+    inputs = (tensor.contiguous() for tensor in (sigma, rgb, samples.t_starts, samples.t_ends))
+    return Composited(*_Composite.apply(*inputs, points, samples.offsets, background.contiguous(), fars.contiguous()))
+
+
+def distortion_by_pairs(weights: Tensor, samples: Samples) -> Tensor:
     """As `distortion`, over all pairs of samples of a ray: O(N^2), the truth."""
     middles, losses = (samples.t_starts + samples.t_ends) / 2, []
     for start, end in zip(samples.offsets[:-1].tolist(), samples.offsets[1:].tolist(), strict=True):
@@ -195,7 +203,18 @@ def distortion_reference(weights: Tensor, samples: Samples) -> Tensor:
     return torch.stack(losses) if losses else weights.sum()[None][:0]
 
 
-_distortion = native.function("distortion", "ppppqqppi")
+def distortion_reference(weights: Tensor, samples: Samples) -> Tensor:
+    """As `distortion`, in torch, on any device and in any float type."""
+    # m_i - m_j is the sum of the gaps between neighbouring middles from j to i: each counts for all weight in front.
+    # No term is negative, so nothing cancels, wherever the weights lie and however close together.
+    starts, ends = samples.t_starts, samples.t_ends
+    gaps = ((starts - starts.roll(1)) + (ends - ends.roll(1))).masked_fill(samples.places == 0, 0) / 2
+    steps = gaps * exclusive_sum(weights, samples)
+    apart = exclusive_sum(steps, samples) + steps
+    return ray_sum(weights * (2 * apart + weights * samples.deltas / 3), samples)
+
+
+_distortion = native.Function("distortion", "ppppqqppi")
 
 
 class _Distortion(torch.autograd.Function):
@@ -228,14 +247,13 @@ def distortion(weights: Tensor, samples: Samples) -> Tensor:
     Raises: IndexError where the samples' offsets do not divide them between the rays.
     """
     check_offsets(samples.offsets, len(samples))
-    starts, ends = samples.t_starts, samples.t_ends
-    if native.usable(weights, starts, ends) and not is_followed(starts, ends):
-        starts, ends = starts.contiguous(), ends.contiguous()
-        return _Distortion.apply(weights.contiguous(), starts, ends, samples.offsets)
-    # m_i - m_j is the sum of the gaps between neighbouring middles from j to i: each counts for all weight in front.
-    # No term is negative, so nothing cancels, wherever the weights lie and however close together.
-    w = weights
-    gaps = ((starts - starts.roll(1)) + (ends - ends.roll(1))).masked_fill(samples.places == 0, 0) / 2
-    steps = gaps * exclusive_sum(w, samples)
-    apart = exclusive_sum(steps, samples) + steps
-    return ray_sum(w * (2 * apart + w * samples.deltas / 3), samples)
+    return DISTORTION((weights, samples.t_starts, samples.t_ends), weights, samples)
+
+
+DISTORTION = Operation("distortion", distortion_reference)
+
+
+@DISTORTION.implementation(CPP, differentiable=1)
+def _distortion_compiled(weights: Tensor, samples: Samples) -> Tensor:
+    inputs = (tensor.contiguous() for tensor in (weights, samples.t_starts, samples.t_ends))
+    return _Distortion.apply(*inputs, samples.offsets)

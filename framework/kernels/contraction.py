@@ -9,7 +9,7 @@ from torch import Tensor
 
 from framework.geometry.bounds import contract
 from framework.kernels import kept, native
-from framework.kernels.given import is_followed
+from framework.kernels.dispatch import CPP, Operation
 
 
 def contract_to_unit_reference(positions: Tensor, box: Tensor) -> Tensor:
@@ -28,13 +28,19 @@ def contract_to_unit(positions: Tensor, box: Tensor) -> Tensor:
         box: (2, 3) corners of the part of space that is not contracted, but for its corners.
     Returns: (N, 3).
     """
-    if native.usable(positions, box) and not is_followed(box):
-        return _Contract.apply(positions.contiguous(), box)
-    return contract_to_unit_reference(positions, box)
+    return CONTRACT((positions, box), positions, box)
 
 
-_forward = native.function("contract_positions", "pppqpi")
-_backward = native.function("contract_positions_backward", "ppppqpi")
+CONTRACT = Operation("contract_to_unit", contract_to_unit_reference)
+
+
+@CONTRACT.implementation(CPP, differentiable=1)
+def _compiled(positions: Tensor, box: Tensor) -> Tensor:
+    return _Contract.apply(positions.contiguous(), box)
+
+
+_forward = native.Function("contract_positions", "pppqpi")
+_backward = native.Function("contract_positions_backward", "ppppqpi")
 
 
 class _Contract(torch.autograd.Function):

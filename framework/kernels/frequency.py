@@ -8,12 +8,13 @@ import torch
 from torch import Tensor
 
 from framework.kernels import kept, native
+from framework.kernels.dispatch import CPP, Operation
 
 MAX_FREQUENCIES = 32
 """Of which an encoding may be made: from float32 the sines of the last ones are noise long before."""
 
-_forward = native.function("frequency_encoding", "pqiiipi")
-_backward = native.function("frequency_encoding_backward", "ppqiiipi")
+_forward = native.Function("frequency_encoding", "pqiiipi")
+_backward = native.Function("frequency_encoding_backward", "ppqiiipi")
 
 
 def frequency_encoding_reference(x: Tensor, num_frequencies: int, include_input: bool = True) -> Tensor:
@@ -75,7 +76,13 @@ def frequency_encoding(x: Tensor, num_frequencies: int, include_input: bool = Tr
     if not 0 <= num_frequencies <= MAX_FREQUENCIES:
         raise ValueError(f"a frequency encoding has 0 to {MAX_FREQUENCIES} frequencies, not {num_frequencies}")
     x = _widened(x)
-    if native.usable(x) and x.ndim >= 2:
-        rows = x.flatten(0, -2).contiguous()
-        return _FrequencyEncoding.apply(rows, num_frequencies, include_input).unflatten(0, x.shape[:-1])
-    return frequency_encoding_reference(x, num_frequencies, include_input)
+    return FREQUENCY_ENCODING((x,), x, num_frequencies, include_input)
+
+
+FREQUENCY_ENCODING = Operation("frequency_encoding", frequency_encoding_reference)
+
+
+@FREQUENCY_ENCODING.implementation(CPP, fits=lambda x, *_: x.ndim >= 2)
+def _compiled(x: Tensor, num_frequencies: int, include_input: bool = True) -> Tensor:
+    rows = x.flatten(0, -2).contiguous()
+    return _FrequencyEncoding.apply(rows, num_frequencies, include_input).unflatten(0, x.shape[:-1])

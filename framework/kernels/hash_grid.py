@@ -18,6 +18,7 @@ from framework.base.errors import ConfigError, shown
 from framework.kernels import kept, native
 from framework.kernels.adam import all_finite
 from framework.kernels.deferred import Parts, waiting
+from framework.kernels.dispatch import CPP, Operation
 
 PRIMES = (1, 2654435761, 805459861)
 MAX_LEVELS = 64
@@ -136,10 +137,10 @@ def hash_grid_reference(positions: Tensor, table: Tensor, layout: HashGridLayout
     return torch.cat(features, dim=-1)
 
 
-_forward = native.function("hash_grid_forward", "pqpippipi")
-_backward_table = native.function("hash_grid_backward_table", "pppiippipi")
-_backward_positions = native.function("hash_grid_backward_positions", "pqppippipi")
-_adam = native.function("hash_grid_adam", "pppiippippppfddfi", "q")
+_forward = native.Function("hash_grid_forward", "pqpippipi")
+_backward_table = native.Function("hash_grid_backward_table", "pppiippipi")
+_backward_positions = native.Function("hash_grid_backward_positions", "pqppippipi")
+_adam = native.Function("hash_grid_adam", "pppiippippppfddfi", "q")
 
 
 class TableGradient:
@@ -266,10 +267,20 @@ def hash_grid(
     if table.ndim != 2 or table.shape[0] != layout.num_entries:
         raise ValueError(f"hash_grid: the table has shape {tuple(table.shape)}, not ({layout.num_entries}, F)")
     positions = positions.to(table.dtype)
-    if native.usable(positions, table) and table.shape[1] in (1, 2, 4, 8):
-        positions, table, later = positions.contiguous(), table.contiguous(), None
-        if deferred is not None and table.requires_grad:
-            later = waiting(table, positions, layout.num_levels * table.shape[1], deferred.parts)
-            table = table.detach()
-        return _HashGrid.apply(positions, table, later, layout)
+    return HASH_GRID((positions, table), positions, table, layout, deferred)
+
+
+def _reference(positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> Tensor:
     return hash_grid_reference(positions, table, layout)
+
+
+HASH_GRID = Operation("hash_grid", _reference)
+
+
+@HASH_GRID.implementation(CPP, fits=lambda positions, table, *_: table.shape[1] in (1, 2, 4, 8))
+def _compiled(positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> Tensor:
+    positions, table, later = positions.contiguous(), table.contiguous(), None
+    if deferred is not None and table.requires_grad:
+        later = waiting(table, positions, layout.num_levels * table.shape[1], deferred.parts)
+        table = table.detach()
+    return _HashGrid.apply(positions, table, later, layout)

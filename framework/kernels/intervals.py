@@ -12,6 +12,7 @@ from torch import Tensor
 
 from framework.kernels import native
 from framework.kernels.compositing import exclusive_cumsum, optical_depth
+from framework.kernels.dispatch import CPP, Operation
 
 EPS = 1e-7
 """Keeps the loss of intervals without weight finite."""
@@ -32,13 +33,20 @@ def interval_weights(sigma: Tensor, t: Tensor) -> Tensor:
 
     Without a gradient for `t`.
     """
-    if native.usable(sigma, t):
-        return _Weights.apply(sigma.contiguous(), t.contiguous())
-    return interval_weights_reference(sigma, t.detach())
+    t = t.detach()
+    return INTERVAL_WEIGHTS((sigma, t), sigma, t)
 
 
-_weights = native.function("interval_weights", "ppqqpi")
-_weights_backward = native.function("interval_weights_backward", "ppppqqpi")
+INTERVAL_WEIGHTS = Operation("interval_weights", interval_weights_reference)
+
+
+@INTERVAL_WEIGHTS.implementation(CPP)
+def _interval_weights(sigma: Tensor, t: Tensor) -> Tensor:
+    return _Weights.apply(sigma.contiguous(), t.contiguous())
+
+
+_weights = native.Function("interval_weights", "ppqqpi")
+_weights_backward = native.Function("interval_weights_backward", "ppppqqpi")
 
 
 class _Weights(torch.autograd.Function):
@@ -93,19 +101,25 @@ def resample(edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: f
         power: which the weights are raised to first: less than 1 flattens them (mip-NeRF 360, section 3.1).
         padding: added to each weight, so that no place is never looked at.
     """
-    if not native.usable(edges, weights, shift):
-        return resample_reference(edges, weights, shift, count, power, padding)
+    return RESAMPLE((edges, weights, shift), edges, weights, shift, count, power, padding)
+
+
+RESAMPLE = Operation("resample", resample_reference)
+
+
+@RESAMPLE.implementation(CPP)
+def _resample(edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float, padding: float) -> Tensor:
     rays, bins = weights.shape
     out = edges.new_empty(rays, count + 1)
     edges, weights = edges.contiguous(), weights.contiguous()
-    _resample(
+    _resample_intervals(
         native.pointer(edges, "edges", (rays, bins + 1)), native.pointer(weights, "weights", (rays, bins)),
         native.pointer(shift, "shift", (rays,)), rays, bins, count, power, padding, out.data_ptr(), native.threads(),
     )  # fmt: skip
     return out
 
 
-_resample = native.function("resample_intervals", "pppqqqffpi")
+_resample_intervals = native.Function("resample_intervals", "pppqqqffpi")
 
 
 # -- the loss of a proposal ---------------------------------------------------------------------------------------
@@ -126,13 +140,19 @@ def proposal_excess(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_w
         proposed, proposed_weights: (R, P + 1) and (R, P) what was proposed.
     """
     edges, weights, proposed = edges.detach(), weights.detach(), proposed.detach()
-    if native.usable(edges, weights, proposed, proposed_weights):
-        inputs = (tensor.contiguous() for tensor in (edges, weights, proposed, proposed_weights))
-        return _Excess.apply(*inputs)
-    return proposal_excess_reference(edges, weights, proposed, proposed_weights)
+    tensors = edges, weights, proposed, proposed_weights
+    return PROPOSAL_EXCESS(tensors, *tensors)
 
 
-_excess = native.function("proposal_excess", "ppqppqqfppi")
+PROPOSAL_EXCESS = Operation("proposal_excess", proposal_excess_reference)
+
+
+@PROPOSAL_EXCESS.implementation(CPP)
+def _proposal_excess(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor) -> Tensor:
+    return _Excess.apply(*(tensor.contiguous() for tensor in (edges, weights, proposed, proposed_weights)))
+
+
+_excess = native.Function("proposal_excess", "ppqppqqfppi")
 
 
 class _Excess(torch.autograd.Function):

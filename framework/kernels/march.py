@@ -9,8 +9,10 @@ never evaluated, and none is evaluated twice.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -20,6 +22,7 @@ from framework.geometry.bounds import intersect_box
 from framework.geometry.rays import Rays
 from framework.kernels import native
 from framework.kernels.compositing import optical_depth, segmented_sum
+from framework.kernels.dispatch import CPP, INT64, Operation
 from framework.kernels.given import check_indices
 
 BLOCK = 4
@@ -34,33 +37,39 @@ ROUNDING = 1e-5
 class Occupancy:
     """Which cells of a box are not empty."""
 
+    occupied: Tensor
+    """(n^3,) bool, the cell's index being (x n + y) n + z."""
     box: Tensor
     """(2, 3) smallest and largest corner."""
     resolution: int
     """n, cells along each axis."""
-    occupied: Tensor
-    """(n^3,) bool, the cell's index being (x n + y) n + z."""
-    bits: Tensor | None
-    """(n^3 / 8,) uint8, one bit a cell, for the compiled kernel; None without."""
-    blocks: Tensor | None
-    """(ceil(n / 4)^3,) uint8, how many blocks of 4^3 cells away the nearest with an occupied one is."""
 
-    @classmethod
-    def of(cls, occupied: Tensor, box: Tensor, resolution: int) -> Occupancy:
-        """Packed for the compiled kernel where there is one."""
-        if occupied.device.type != "cpu" or not native.available():
-            return cls(box, resolution, occupied, None, None)
-        bits = torch.empty((resolution**3 + 7) // 8, dtype=torch.uint8)
-        blocks = torch.empty(math.ceil(resolution / BLOCK) ** 3, dtype=torch.uint8)
-        address = native.pointer(occupied, "the occupancy", (resolution**3,), torch.bool)
-        _pack(address, resolution, bits.data_ptr(), blocks.data_ptr())
-        return cls(box, resolution, occupied, bits, blocks)
+    @cached_property
+    def packed(self) -> tuple[Tensor, Tensor]:
+        """What the compiled march reads, made at the first one.
+
+        Returns: (n^3 / 8,) uint8, one bit a cell; (ceil(n / 4)^3,) uint8, how many blocks of 4^3 cells away the nearest
+            with an occupied one is.
+        """
+        bits = torch.empty((self.resolution**3 + 7) // 8, dtype=torch.uint8)
+        blocks = torch.empty(math.ceil(self.resolution / BLOCK) ** 3, dtype=torch.uint8)
+        address = native.pointer(self.occupied, "the occupancy", (self.resolution**3,), torch.bool)
+        _pack(address, self.resolution, bits.data_ptr(), blocks.data_ptr())
+        return bits, blocks
 
     def cells(self, positions: Tensor) -> Tensor:
         """Index (N,) of the cell each position (N, 3) lies in; outside positions go to the nearest cell."""
         scale = self.resolution / (self.box[1] - self.box[0])
         x, y, z = ((positions - self.box[0]) * scale).long().clamp(0, self.resolution - 1).unbind(-1)
         return (x * self.resolution + y) * self.resolution + z
+
+
+def refresh_occupancy_reference(density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float) -> None:
+    """As `refresh_occupancy`, in torch, on any device."""
+    density *= decay
+    alpha = -torch.expm1(-density * step)
+    least = min(threshold, alpha.nanmean().item() * (1 - ROUNDING))  # the threshold where all are NaN
+    occupied.copy_(~(alpha < least))
 
 
 @torch.no_grad()
@@ -73,17 +82,19 @@ def refresh_occupancy(density: Tensor, occupied: Tensor, decay: float, step: flo
         occupied: (n^3,) bool, written.
         step: length of a step, scene units.
     """
-    if native.usable(density):
-        cells = len(density)
-        _refresh(
-            native.pointer(density, "density", (cells,)), cells, decay, step, threshold,
-            native.pointer(occupied, "the occupancy", (cells,), torch.bool), native.threads(),
-        )  # fmt: skip
-        return
-    density *= decay
-    alpha = -torch.expm1(-density * step)
-    least = min(threshold, alpha.nanmean().item() * (1 - ROUNDING))  # the threshold where all are NaN
-    occupied.copy_(~(alpha < least))
+    REFRESH_OCCUPANCY((density,), density, occupied, decay, step, threshold)
+
+
+REFRESH_OCCUPANCY = Operation("refresh_occupancy", refresh_occupancy_reference)
+
+
+@REFRESH_OCCUPANCY.implementation(CPP)
+def _refresh_compiled(density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float) -> None:
+    cells = len(density)
+    _refresh(
+        native.pointer(density, "density", (cells,)), cells, decay, step, threshold,
+        native.pointer(occupied, "the occupancy", (cells,), torch.bool), native.threads(),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -105,24 +116,48 @@ class Wave:
         return (self.t_starts + self.t_ends) / 2
 
 
-class March:
+class March(ABC):
     """Rays on their way through the grid: `wave` and `advance` in turn until `wave` returns None, then `finish`.
 
     Args:
-        rays: R rays, on the processor, float32.
-        occupancy: the packed grid.
-        step: length of a step near the camera, scene units.
-        cone: growth of a step per unit of distance; 0 for even steps.
-        shift: (R,) share of a step by which the first one starts before the box; None for 0.
+        rays: R rays.
         early_stop: transmittance under which a ray ends.
     """
+
+    def __init__(self, rays: Rays, early_stop: float) -> None:
+        self.rays = rays
+        self.budget = -math.log(early_stop) if early_stop > 0 else math.inf
+        self.waves: list[Wave] = []
+        self.reached: list[Tensor] = []
+        """(N,) uint8 of each wave: the samples that light reached."""
+
+    @abstractmethod
+    def wave(self, limit: int) -> Wave | None:
+        """Up to `limit` samples on each ray that is alive; None where no ray is."""
+
+    @abstractmethod
+    def advance(self, sigma: Tensor) -> None:
+        """The density (N,) of the last wave is known: rays whose light is spent, or that left the box, end."""
+
+    def finish(self) -> tuple[Tensor, Tensor]:
+        """Order (M,) that puts the samples of all waves which light reached ray by ray, and offsets (R + 1,)."""
+        if not self.waves:
+            counts = self.rays.nears.new_zeros(len(self.rays) + 1, dtype=torch.int64)
+            return counts[:0], counts
+        owners = torch.cat([wave.owners for wave in self.waves])
+        return sort_by_ray(owners, torch.cat(self.reached), len(self.rays))
+
+
+class CompiledMarch(March):
+    """The march in C++: rays on the CPU, float32. Arguments as for `march`."""
 
     def __init__(
         self, rays: Rays, occupancy: Occupancy, step: float, cone: float, shift: Tensor | None, early_stop: float
     ) -> None:
-        assert occupancy.bits is not None
+        super().__init__(rays, early_stop)
         count = len(rays)
-        self.rays, self.occupancy, self.step, self.cone = rays, occupancy, step, cone
+        self.step, self.cone, self.resolution = step, cone, occupancy.resolution
+        self.bits, self.blocks = occupancy.packed
         self.origins, self.directions = rays.origins.contiguous(), rays.directions.contiguous()
         self.enter, self.leave, self.first = (torch.empty(count) for _ in range(3))
         self.box = occupancy.box.contiguous()
@@ -140,25 +175,18 @@ class March:
         self.alive = alive[:hits]
         self.next = torch.zeros(count, dtype=torch.int32)
         self.spent = torch.zeros(count)
-        self.budget = -math.log(early_stop) if early_stop > 0 else math.inf
-        self.waves: list[Wave] = []
-        self.reached: list[Tensor] = []
 
     def wave(self, limit: int) -> Wave | None:
-        """Up to `limit` samples on each ray that is alive; None where no ray is."""
-        living = len(self.alive)
+        living, room = len(self.alive), len(self.alive) * limit
         if living == 0:
             return None
-        o, room = self.occupancy, living * limit
-        assert o.bits is not None
-        assert o.blocks is not None
         self.counts, self.limit = torch.empty(living, dtype=torch.int32), limit
         starts, ends, positions = torch.empty(room), torch.empty(room), torch.empty(room, 3)
         owners = torch.empty(room, dtype=torch.int64)
         found = _wave(
             self.origins.data_ptr(), self.directions.data_ptr(), self.enter.data_ptr(), self.leave.data_ptr(),
             self.first.data_ptr(), self.next.data_ptr(), self.alive.data_ptr(), living, limit, self.box.data_ptr(),
-            self.step, self.cone, o.bits.data_ptr(), o.blocks.data_ptr(), o.resolution, self.counts.data_ptr(),
+            self.step, self.cone, self.bits.data_ptr(), self.blocks.data_ptr(), self.resolution, self.counts.data_ptr(),
             starts.data_ptr(), ends.data_ptr(), owners.data_ptr(), positions.data_ptr(), native.threads(),
         )  # fmt: skip
         wave = Wave(starts[:found], ends[:found], owners[:found], positions[:found])
@@ -166,7 +194,6 @@ class March:
         return wave
 
     def advance(self, sigma: Tensor) -> None:
-        """The density (N,) of the last wave is known: rays whose light is spent, or that left the box, end."""
         wave, living = self.waves[-1], len(self.alive)
         sigma = sigma.detach().float().contiguous()
         going_on, reached = torch.empty_like(self.alive), torch.empty(len(sigma), dtype=torch.uint8)
@@ -178,16 +205,6 @@ class March:
         self.alive = going_on[:left]
         self.reached.append(reached)
 
-    def finish(self) -> tuple[Tensor, Tensor]:
-        """Order (M,) that puts the samples of all waves which light reached ray by ray, and offsets (R + 1,)."""
-        return sort_by_ray(
-            _cat([wave.owners for wave in self.waves], torch.int64), _cat(self.reached, torch.uint8), len(self.rays)
-        )
-
-
-def _cat(parts: list[Tensor], dtype: torch.dtype) -> Tensor:
-    return torch.cat(parts) if parts else torch.empty(0, dtype=dtype)
-
 
 def sort_by_ray(owners: Tensor, reached: Tensor, num_rays: int) -> tuple[Tensor, Tensor]:
     """Order (M,) of those of N samples that are `reached`, by their ray and otherwise as they stand; offsets (R + 1,).
@@ -197,15 +214,11 @@ def sort_by_ray(owners: Tensor, reached: Tensor, num_rays: int) -> tuple[Tensor,
         reached: (N,) uint8.
     Raises: IndexError where there is no such ray.
     """
-    if native.available() and owners.device.type == "cpu":
-        order, offsets = torch.empty_like(owners), torch.empty(num_rays + 1, dtype=torch.int64)
-        count = len(owners)
-        kept = _sort(
-            native.pointer(owners, "owners", (count,), torch.int64),
-            native.pointer(reached, "reached", (count,), torch.uint8), count, num_rays, order.data_ptr(),
-            offsets.data_ptr(),
-        )  # fmt: skip
-        return order[:kept], offsets
+    return SORT_BY_RAY((owners,), owners, reached, num_rays)
+
+
+def sort_by_ray_reference(owners: Tensor, reached: Tensor, num_rays: int) -> tuple[Tensor, Tensor]:
+    """As `sort_by_ray`, in torch, on any device."""
     check_indices(owners, num_rays, "rays")
     chosen = reached.nonzero().squeeze(-1)
     order = chosen[owners[chosen].argsort(stable=True)]
@@ -213,28 +226,38 @@ def sort_by_ray(owners: Tensor, reached: Tensor, num_rays: int) -> tuple[Tensor,
     return order, functional.pad(counts.cumsum(0), (1, 0))
 
 
-class ReferenceMarch:
-    """The same in torch, on any device: all candidates are found first, and handed out wave by wave.
+SORT_BY_RAY = Operation("sort_by_ray", sort_by_ray_reference)
 
-    Arguments as for `March`; `reach` (n^3,) bool tells cells from which an occupied one lies within half a run of
-    RUN even steps along any axis (`dilated`), so that runs without any are dropped together.
+
+@SORT_BY_RAY.implementation(CPP, types=INT64)
+def _sort_by_ray(owners: Tensor, reached: Tensor, num_rays: int) -> tuple[Tensor, Tensor]:
+    order, offsets = torch.empty_like(owners), torch.empty(num_rays + 1, dtype=torch.int64)
+    count = len(owners)
+    kept = _sort(
+        native.pointer(owners, "owners", (count,), torch.int64),
+        native.pointer(reached, "reached", (count,), torch.uint8), count, num_rays, order.data_ptr(),
+        offsets.data_ptr(),
+    )  # fmt: skip
+    return order[:kept], offsets
+
+
+class ReferenceMarch(March):
+    """The march in torch, on any device: all candidates are found first, and handed out wave by wave.
+
+    Arguments as for `march`.
     """
 
     def __init__(
         self, rays: Rays, occupancy: Occupancy, step: float, cone: float, shift: Tensor | None, early_stop: float
     ) -> None:
-        self.rays = rays
+        super().__init__(rays, early_stop)
         self.t_starts, self.t_ends, self.offsets = candidates(rays, occupancy, step, cone, shift)
         self.counts = self.offsets[1:] - self.offsets[:-1]
         self.spent = rays.origins.new_zeros(len(rays))
-        self.budget = -math.log(early_stop) if early_stop > 0 else math.inf
         self.alive = self.counts.nonzero().squeeze(-1)
         self.handed_out = 0
-        self.waves: list[Wave] = []
-        self.reached: list[Tensor] = []
 
     def wave(self, limit: int) -> Wave | None:
-        """As `March.wave`."""
         if len(self.alive) == 0:
             return None
         ranks, self.places = ranges((self.counts[self.alive] - self.handed_out).clamp(max=limit))
@@ -248,7 +271,6 @@ class ReferenceMarch:
 
     @torch.no_grad()
     def advance(self, sigma: Tensor) -> None:
-        """As `March.advance`."""
         wave = self.waves[-1]
         tau = optical_depth(sigma.detach().to(self.spent.dtype), wave.t_ends - wave.t_starts)
         before = self.spent[wave.owners] + segmented_sum(tau, self.places)
@@ -256,11 +278,24 @@ class ReferenceMarch:
         self.spent.index_add_(0, wave.owners, tau)
         self.alive = self.alive[(self.counts[self.alive] > self.handed_out) & ~(self.spent[self.alive] >= self.budget)]
 
-    def finish(self) -> tuple[Tensor, Tensor]:
-        """As `March.finish`."""
-        device = self.offsets.device
-        owners = _cat([wave.owners for wave in self.waves], torch.int64).to(device)
-        return sort_by_ray(owners, _cat(self.reached, torch.uint8).to(device), len(self.rays))
+
+def march(rays: Rays, occupancy: Occupancy, step: float, cone: float, shift: Tensor | None, early_stop: float) -> March:
+    """March rays through the occupied cells of a grid.
+
+    Args:
+        rays: R rays.
+        occupancy: the grid.
+        step: length of a step near the camera, scene units.
+        cone: growth of a step per unit of distance; 0 for even steps.
+        shift: (R,) share of a step by which the first one starts before the box; None for 0.
+        early_stop: transmittance under which a ray ends.
+    """
+    tensors = rays.origins, rays.directions, rays.nears, rays.fars, occupancy.box
+    return MARCH(tensors, rays, occupancy, step, cone, shift, early_stop)
+
+
+MARCH: Operation[..., March] = Operation("march", ReferenceMarch)
+MARCH.implementation(CPP)(CompiledMarch)
 
 
 def step_start(first: Tensor, k: Tensor, step: float, cone: float) -> Tensor:
@@ -333,9 +368,9 @@ def ranges(counts: Tensor) -> tuple[Tensor, Tensor]:
     return owners, torch.arange(len(owners), device=counts.device) - firsts[owners]
 
 
-_pack: Callable[..., None] = native.function("pack_occupancy", "pipp")
-_refresh: Callable[..., None] = native.function("refresh_occupancy", "pqfffpi")
-_begin: Callable[..., int] = native.function("march_begin", "pppppqpfppppi", "q")
-_wave: Callable[..., int] = native.function("march_wave", "pppppppqipffppipppppi", "q")
-_advance: Callable[..., int] = native.function("march_advance", "pqpipppfppp", "q")
-_sort: Callable[..., int] = native.function("sort_by_ray", "ppqqpp", "q")
+_pack: Callable[..., None] = native.Function("pack_occupancy", "pipp")
+_refresh: Callable[..., None] = native.Function("refresh_occupancy", "pqfffpi")
+_begin: Callable[..., int] = native.Function("march_begin", "pppppqpfppppi", "q")
+_wave: Callable[..., int] = native.Function("march_wave", "pppppppqipffppipppppi", "q")
+_advance: Callable[..., int] = native.Function("march_advance", "pqpipppfppp", "q")
+_sort: Callable[..., int] = native.Function("sort_by_ray", "ppqqpp", "q")

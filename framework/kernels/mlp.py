@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn.functional import linear
 
 from framework.kernels import kept, native
+from framework.kernels.dispatch import CPP, Operation
 
 T = TypeVar("T")
 Activation = Literal["none", "relu", "sigmoid"]
@@ -39,10 +40,10 @@ def mlp_reference(
     return torch.sigmoid(x) if activation == "sigmoid" else x
 
 
-_forward = native.function("mlp_forward", "ppiqpippipi")
-_backward = native.function("mlp_backward", "ppiqpippippppi")
-_forward_bf16 = native.function("mlp_forward_bf16", "ppiqpippipi")
-_backward_bf16 = native.function("mlp_backward_bf16", "ppiqpippippppi")
+_forward = native.Function("mlp_forward", "ppiqpippipi")
+_backward = native.Function("mlp_backward", "ppiqpippippppi")
+_forward_bf16 = native.Function("mlp_forward_bf16", "ppiqpippipi")
+_backward_bf16 = native.Function("mlp_backward_bf16", "ppiqpippippppi")
 
 
 class _MLP(torch.autograd.Function):
@@ -145,9 +146,28 @@ def mlp(
     if [weight.shape[1] for weight in weights] != widths[:-1]:
         shapes = ", ".join(str(tuple(weight.shape)) for weight in weights)
         raise ValueError(f"mlp: weights of shapes {shapes} do not fit inputs of {widths[0]} features")
-    small = max(widths) <= MAX_WIDTH and len(weights) <= MAX_LAYERS
-    if small and native.usable(*inputs, *weights, *(biases or ())):
-        tensors = [x.contiguous() for x in (*inputs, *weights, *(biases or ()))]
-        bf16 = torch.is_autocast_enabled("cpu") and native.has("mlp_forward_bf16")
-        return _MLP.apply(_Plan(len(inputs), len(weights), activation, bf16), *tensors)
-    return mlp_reference(inputs, weights, activation, biases)
+    return NETWORK((*inputs, *weights, *(biases or ())), inputs, weights, activation, biases)
+
+
+NETWORK = Operation("mlp", mlp_reference)
+
+
+def _is_small(
+    inputs: Sequence[Tensor],
+    weights: Sequence[Tensor],
+    activation: Activation = "none",
+    biases: Sequence[Tensor] | None = None,
+) -> bool:
+    return len(weights) <= MAX_LAYERS and all(max(weight.shape) <= MAX_WIDTH for weight in weights)
+
+
+@NETWORK.implementation(CPP, fits=_is_small)
+def _compiled(
+    inputs: Sequence[Tensor],
+    weights: Sequence[Tensor],
+    activation: Activation = "none",
+    biases: Sequence[Tensor] | None = None,
+) -> Tensor:
+    tensors = [x.contiguous() for x in (*inputs, *weights, *(biases or ()))]
+    bf16 = torch.is_autocast_enabled("cpu") and native.has("mlp_forward_bf16")
+    return _MLP.apply(_Plan(len(inputs), len(weights), activation, bf16), *tensors)

@@ -1,6 +1,6 @@
 """The compiled CPU kernels: finding the library that fits this processor, and calling it safely.
 
-Each kernel's Python file declares the C functions it calls with `function`, and hands over tensors through `pointer`,
+Each kernel's Python file declares the C functions it calls as `Function`, and hands over tensors through `pointer`,
 which checks them. What goes wrong in C is a status there and an exception here. The library has threads of its own
 (`csrc/parallel.h`), as many as torch is set to use. ctypes releases Python's lock during a call.
 
@@ -16,7 +16,7 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -107,38 +107,44 @@ _FAILURES: dict[int, type[Exception]] = {1: MemoryError, 2: IndexError, 3: Value
 """Exception for each status; any other status but 0 is a RuntimeError."""
 
 
-def function(name: str, arguments: str, result: str = "") -> Callable[..., Any]:
+class Function:
     """A function of the library, found at its first call.
+
+    A call raises MemoryError, IndexError, ValueError or RuntimeError where the status says so.
 
     Args:
         name: its C name. It returns a status (csrc/status.h).
-        arguments: a letter each: p pointer, q 64-bit integer, i int, f float, d double.
+        arguments: a letter each: p pointer, q 64-bit integer, i int, f float, d double. A test holds them against the
+            C++ sources.
         result: the letter of what it writes through its last argument, which is not in `arguments` and which the
             call returns; empty for nothing.
-
-    The call raises MemoryError, IndexError, ValueError or RuntimeError where the status says so.
     """
-    bound: list[Any] = []
 
-    def call(*values: Any) -> Any:
-        if not bound:
-            library = _load()[1]
-            if library is None:
-                raise RuntimeError(f"{name} was called without compiled kernels")
-            found = getattr(library, name)
-            found.argtypes = [TYPES[letter] for letter in arguments] + [ctypes.c_void_p] * bool(result)
-            found.restype = ctypes.c_int
-            bound.append(found)
+    def __init__(self, name: str, arguments: str, result: str = "") -> None:
+        self.name, self.arguments, self.result = name, arguments, result
+        self._bound: Any = None
+
+    def __call__(self, *values: Any) -> Any:
+        """Call it with numbers, addresses and C arrays."""
+        bound = self._bind() if self._bound is None else self._bound
         start = time.perf_counter() if spent is not None else 0.0
-        out = TYPES[result]() if result else None
-        status = bound[0](*values) if out is None else bound[0](*values, ctypes.byref(out))
+        out = TYPES[self.result]() if self.result else None
+        status = bound(*values) if out is None else bound(*values, ctypes.byref(out))
         if spent is not None:
-            spent[name] = spent.get(name, 0.0) + time.perf_counter() - start
+            spent[self.name] = spent.get(self.name, 0.0) + time.perf_counter() - start
         if status:
-            raise _FAILURES.get(status, RuntimeError)(f"{name}: {_last_error()}")
+            raise _FAILURES.get(status, RuntimeError)(f"{self.name}: {_last_error()}")
         return None if out is None else out.value
 
-    return call
+    def _bind(self) -> Any:
+        library = _load()[1]
+        if library is None:
+            raise RuntimeError(f"{self.name} was called without compiled kernels")
+        found = getattr(library, self.name)
+        found.argtypes = [TYPES[letter] for letter in self.arguments] + [ctypes.c_void_p] * bool(self.result)
+        found.restype = ctypes.c_int
+        self._bound = found  # not before: another thread may be calling
+        return found
 
 
 def _last_error() -> str:
@@ -146,13 +152,6 @@ def _last_error() -> str:
     assert library is not None
     library.last_error.restype = ctypes.c_char_p
     return library.last_error().decode(errors="replace")
-
-
-def usable(*tensors: Tensor | None) -> bool:
-    """Whether compiled kernels exist and every given tensor is float32 on the processor."""
-    if not available():
-        return False
-    return all(t is None or (t.dtype is torch.float32 and t.device.type == "cpu") for t in tensors)
 
 
 def pointer(tensor: Tensor, what: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float32) -> int:

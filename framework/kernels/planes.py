@@ -21,6 +21,7 @@ from framework.base.errors import ConfigError, shown
 from framework.kernels import kept, memory, native
 from framework.kernels.adam import all_finite, sparse_adam
 from framework.kernels.deferred import Parts, waiting
+from framework.kernels.dispatch import CPP, Operation
 
 MAX_GROUPS, MAX_FACTORS = 64, 6
 MAX_VERTICES = 2**20
@@ -143,9 +144,9 @@ def planes_reference(positions: Tensor, table: Tensor, layout: PlanesLayout) -> 
 
 
 _TAIL = "iiiippp"
-_forward = native.function("planes_forward", "pqp" + _TAIL + "pi")
-_backward_table = native.function("planes_backward_table", "pqp" + _TAIL + "ppi")
-_backward_positions = native.function("planes_backward_positions", "pqp" + _TAIL + "ppi")
+_forward = native.Function("planes_forward", "pqp" + _TAIL + "pi")
+_backward_table = native.Function("planes_backward_table", "pqp" + _TAIL + "ppi")
+_backward_positions = native.Function("planes_backward_positions", "pqp" + _TAIL + "ppi")
 
 
 class PlanesGradient:
@@ -252,22 +253,30 @@ def _arguments(positions: Tensor, table: Tensor, layout: PlanesLayout) -> tuple[
 
 
 class _Band(torch.autograd.Function):
-    """Entries [first, first + count) of a table, as they are. Called back only for the table, its one input."""
+    """Rows [first, end) of a table, whose gradient waits. Called back only for the table, its one input."""
 
     @staticmethod
-    def forward(ctx: Any, table: Tensor, first: int, count: int, deferred: PlanesGradient | None) -> Tensor:
-        ctx.first, ctx.shape, ctx.deferred = first, table.shape, deferred
-        return table[first : first + count].clone()
+    def forward(ctx: Any, table: Tensor, first: int, end: int, deferred: PlanesGradient) -> Tensor:
+        ctx.first, ctx.deferred = first, deferred
+        return table[first:end].clone()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, None, None, None]:
-        if ctx.deferred is not None and native.usable(grad):
-            ctx.deferred.bands.append((ctx.first, grad))
-            return None, None, None, None
-        out = grad.new_zeros(ctx.shape)
-        out[ctx.first : ctx.first + len(grad)] = grad
-        return out, None, None, None
+    def backward(ctx: Any, grad: Tensor) -> tuple[None, None, None, None]:
+        ctx.deferred.bands.append((ctx.first, grad))
+        return None, None, None, None
+
+
+def _band_reference(table: Tensor, first: int, end: int, deferred: PlanesGradient | None) -> Tensor:
+    return table[first:end]
+
+
+PLANE_BAND = Operation("plane_band", _band_reference)
+
+
+@PLANE_BAND.implementation(CPP, fits=lambda table, first, end, deferred: deferred is not None)
+def _band_deferred(table: Tensor, first: int, end: int, deferred: PlanesGradient | None) -> Tensor:
+    return _Band.apply(table, first, end, deferred)
 
 
 def plane_band(
@@ -285,7 +294,7 @@ def plane_band(
     """
     _, across = layout.shape(group, index)
     first = layout.offsets[group][index] + first_row * across
-    return _Band.apply(table, first, rows * across, deferred).view(rows, across, -1)
+    return PLANE_BAND((table,), table, first, first + rows * across, deferred).view(rows, across, -1)
 
 
 def planes(
@@ -309,10 +318,20 @@ def planes(
     if table.ndim != 2 or table.shape[0] != layout.num_entries:
         raise ValueError(f"planes: the table has shape {tuple(table.shape)}, not ({layout.num_entries}, F)")
     positions = positions.to(table.dtype)
-    if native.usable(positions, table):
-        positions, table, later = positions.contiguous(), table.contiguous(), None
-        if deferred is not None and table.requires_grad:
-            later = waiting(table, positions, layout.num_groups * table.shape[1], deferred.parts)
-            table = table.detach()
-        return _Planes.apply(positions, table, later, layout)
+    return PLANES((positions, table), positions, table, layout, deferred)
+
+
+def _reference(positions: Tensor, table: Tensor, layout: PlanesLayout, deferred: PlanesGradient | None) -> Tensor:
     return planes_reference(positions, table, layout)
+
+
+PLANES = Operation("planes", _reference)
+
+
+@PLANES.implementation(CPP)
+def _compiled(positions: Tensor, table: Tensor, layout: PlanesLayout, deferred: PlanesGradient | None) -> Tensor:
+    positions, table, later = positions.contiguous(), table.contiguous(), None
+    if deferred is not None and table.requires_grad:
+        later = waiting(table, positions, layout.num_groups * table.shape[1], deferred.parts)
+        table = table.detach()
+    return _Planes.apply(positions, table, later, layout)

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from framework.kernels import native
+from framework.kernels.dispatch import CPP, INT64, Operation
 from framework.kernels.given import check_indices
 
-_gather = native.function("gather_rows", "ppipipqpi")
+_gather = native.Function("gather_rows", "ppipipqpi")
 
 
 class _TakeRows(torch.autograd.Function):
@@ -48,10 +49,21 @@ def gather_rows(columns: Sequence[Sequence[Tensor]], order: Tensor) -> list[Tens
     Returns: (M, ...) of each tensor, without gradient.
     Raises: IndexError where there is no such row.
     """
+    return GATHER_ROWS((order,), columns, order)
+
+
+def gather_rows_reference(columns: Sequence[Sequence[Tensor]], order: Tensor) -> list[Tensor]:
+    """As `gather_rows`, in torch, on any device."""
+    check_indices(order, sum(len(part) for part in columns[0]), "rows")
+    return [torch.cat(list(parts)).index_select(0, order) for parts in columns]
+
+
+GATHER_ROWS = Operation("gather_rows", gather_rows_reference)
+
+
+@GATHER_ROWS.implementation(CPP, types=INT64)
+def _compiled(columns: Sequence[Sequence[Tensor]], order: Tensor) -> list[Tensor]:
     first = columns[0]
-    if order.device.type != "cpu" or not native.available():
-        check_indices(order, sum(len(part) for part in first), "rows")
-        return [torch.cat(list(parts)).index_select(0, order) for parts in columns]
     ends = tuple(accumulate(len(part) for part in first))
     kept = [part.contiguous() for parts in columns for part in parts]
     shapes = [(end - start, *parts[0].shape[1:]) for parts in columns for start, end in zip((0, *ends), ends)]  # noqa: B905

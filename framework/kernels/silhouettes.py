@@ -13,10 +13,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from framework.kernels import native
+from framework.kernels.dispatch import BOOL, CPP, Operation
 
-_sums = native.function("opaque_sums", "pqqp")
-_hold = native.function("hold_balls", "pqfpffffpqqipi")
-_near = native.function("pixels_near_balls", "pqfpffffpqqpi")
+_sums = native.Function("opaque_sums", "pqqp")
+_hold = native.Function("hold_balls", "pqfpffffpqqipi")
+_near = native.Function("pixels_near_balls", "pqfpffffpqqpi")
 
 
 @dataclass(frozen=True)
@@ -44,10 +45,6 @@ class Photograph:
         """Distance (N,) of points (N, 3) along the camera's axis."""
         return (self.pose[:, 3] - points) @ self.pose[:, 2]  # the camera looks down its -z
 
-    def compiled(self, centers: Tensor) -> bool:
-        """Whether the compiled kernels can be used."""
-        return native.usable(self.pose, centers) and self.sums.device.type == "cpu"
-
     def arguments(self, centers: Tensor, radius: float) -> tuple[Any, ...]:
         """The kernels' first arguments. `pose` and `centers` must be contiguous."""
         return (
@@ -66,8 +63,14 @@ def opaque_sums_reference(opaque: Tensor) -> Tensor:
 
 def opaque_sums(opaque: Tensor) -> Tensor:
     """(H + 1, W + 1) int32 from (H, W) bool: how many opaque pixels lie above and left of each pixel's corner."""
-    if not native.available() or opaque.device.type != "cpu":
-        return opaque_sums_reference(opaque)
+    return OPAQUE_SUMS((opaque,), opaque)
+
+
+OPAQUE_SUMS = Operation("opaque_sums", opaque_sums_reference)
+
+
+@OPAQUE_SUMS.implementation(CPP, types=BOOL)
+def _opaque_sums(opaque: Tensor) -> Tensor:
     height, width = opaque.shape
     sums = torch.empty(height + 1, width + 1, dtype=torch.int32)
     opaque = opaque.contiguous()
@@ -120,9 +123,14 @@ def hold_balls(photograph: Photograph, centers: Tensor, radius: float, held: Ten
         held: (N,) bool, what is known from other photographs.
         every: True to keep what all photographs hold, starting from True; False for what any does, from False.
     """
-    if not photograph.compiled(centers):
-        hold_balls_reference(photograph, centers, radius, held, every)
-        return
+    HOLD_BALLS((photograph.pose, centers), photograph, centers, radius, held, every)
+
+
+HOLD_BALLS = Operation("hold_balls", hold_balls_reference)
+
+
+@HOLD_BALLS.implementation(CPP)
+def _hold_balls(photograph: Photograph, centers: Tensor, radius: float, held: Tensor, every: bool) -> None:
     address = native.pointer(held, "held", (len(centers),), torch.bool)
     _hold(*photograph.arguments(centers, radius), int(every), address, native.threads())
 
@@ -142,8 +150,14 @@ def pixels_near_balls(photograph: Photograph, centers: Tensor, radius: float) ->
     Args:
         centers, radius: N balls, (N, 3) and their radius, none of them shown to be empty.
     """
-    if not photograph.compiled(centers):
-        return pixels_near_balls_reference(photograph, centers, radius)
+    return PIXELS_NEAR_BALLS((photograph.pose, centers), photograph, centers, radius)
+
+
+PIXELS_NEAR_BALLS = Operation("pixels_near_balls", pixels_near_balls_reference)
+
+
+@PIXELS_NEAR_BALLS.implementation(CPP)
+def _pixels_near_balls(photograph: Photograph, centers: Tensor, radius: float) -> Tensor:
     near = torch.empty(photograph.height, photograph.width, dtype=torch.bool)
     _near(*photograph.arguments(centers, radius), near.data_ptr(), native.threads())
     return near

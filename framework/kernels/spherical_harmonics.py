@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from framework.kernels import kept, native
-from framework.kernels.given import is_followed
+from framework.kernels.dispatch import CPP, Operation
 
 MAX_LEVELS = 4
-_compiled = native.function("spherical_harmonics", "pqipi")
+_harmonics = native.Function("spherical_harmonics", "pqipi")
 
 
 def spherical_harmonics(directions: Tensor, levels: int = 4) -> Tensor:
@@ -26,17 +26,7 @@ def spherical_harmonics(directions: Tensor, levels: int = 4) -> Tensor:
     """
     if not 1 <= levels <= MAX_LEVELS:
         raise ValueError(f"spherical harmonics have 1 to {MAX_LEVELS} levels, not {levels}")
-    if native.usable(directions) and not is_followed(directions):
-        rows = directions.contiguous()
-
-        def compute() -> Tensor:
-            out = rows.new_empty(len(rows), levels**2)
-            address = native.pointer(rows, "directions", (len(rows), 3))
-            _compiled(address, len(rows), levels, out.data_ptr(), native.threads())
-            return out
-
-        return kept.result(("spherical_harmonics", levels), (rows,), (), compute)
-    return spherical_harmonics_reference(directions, levels)
+    return SPHERICAL_HARMONICS((directions,), directions, levels)
 
 
 def spherical_harmonics_reference(directions: Tensor, levels: int = 4) -> Tensor:
@@ -64,3 +54,19 @@ def spherical_harmonics_reference(directions: Tensor, levels: int = 4) -> Tensor
             -0.5900435899266435 * x * (x * x - 3 * y * y),
         ]
     return torch.stack(bands, dim=-1)
+
+
+SPHERICAL_HARMONICS = Operation("spherical_harmonics", spherical_harmonics_reference)
+
+
+@SPHERICAL_HARMONICS.implementation(CPP, order=0)
+def _compiled(directions: Tensor, levels: int = 4) -> Tensor:
+    rows = directions.contiguous()
+
+    def compute() -> Tensor:
+        out = rows.new_empty(len(rows), levels**2)
+        address = native.pointer(rows, "directions", (len(rows), 3))
+        _harmonics(address, len(rows), levels, out.data_ptr(), native.threads())
+        return out
+
+    return kept.result(("spherical_harmonics", levels), (rows,), (), compute)

@@ -16,11 +16,10 @@ from framework.base.errors import ConfigError, shown
 from framework.fields.base import DensityFunction, Field, HasAlpha
 from framework.geometry.points import Points, interval_points
 from framework.geometry.rays import Rays, Samples
-from framework.kernels import native
 from framework.kernels.alpha import alpha_depth
 from framework.kernels.given import is_followed
 from framework.kernels.kept import Waves
-from framework.kernels.march import March, Occupancy, ReferenceMarch, Wave, refresh_occupancy
+from framework.kernels.march import Occupancy, Wave, march, refresh_occupancy
 from framework.kernels.rows import gather_rows
 from framework.samplers.base import Sampler
 
@@ -107,7 +106,7 @@ class OccupancySampler(Sampler):
     def occupancy(self) -> Occupancy:
         """The grid as marching wants it."""
         if self._packed is None or self._packed.occupied is not self.occupied:
-            self._packed = Occupancy.of(self.occupied, self.box, self.resolution)
+            self._packed = Occupancy(self.occupied, self.box, self.resolution)
         return self._packed
 
     def forget(self) -> None:
@@ -129,8 +128,7 @@ class OccupancySampler(Sampler):
         shift = torch.rand(len(rays), device=rays.origins.device) if jitter else None
         own = self.train_early_stop if self.training else self.early_stop
         stop = own if early_stop is None else early_stop
-        compiled = native.usable(rays.origins, rays.directions, self.box)
-        march = (March if compiled else ReferenceMarch)(rays, self.occupancy, self.step_size, self.cone, shift, stop)
+        marched = march(rays, self.occupancy, self.step_size, self.cone, shift, stop)
 
         def evaluate(wave: Wave) -> tuple[Tensor, Tensor]:
             points = interval_points(rays, wave.owners, wave, wave.positions, field.footprint)
@@ -140,17 +138,17 @@ class OccupancySampler(Sampler):
 
         surface = field if isinstance(field, HasAlpha) else None
         evaluated = Waves()
-        while (wave := march.wave(WAVES[min(len(march.waves), len(WAVES) - 1)])) is not None:
+        while (wave := marched.wave(WAVES[min(len(marched.waves), len(WAVES) - 1)])) is not None:
             stopping = evaluated.evaluate(len(wave.owners), partial(evaluate, wave))[0]
             if surface is not None:  # marched by the density that stops as much light in each interval
                 stopping = alpha_depth(stopping.detach()) / (wave.t_ends - wave.t_starts)
-            march.advance(stopping)
-        order, offsets = march.finish()
-        if not march.waves:  # no ray meets anything: still the field's own, empty, tensors
+            marched.advance(stopping)
+        order, offsets = marched.finish()
+        if not marched.waves:  # no ray meets anything: still the field's own, empty, tensors
             empty = rays.nears[:0]
             samples = Samples(empty, empty, offsets, owners=order, early_stop=stop)
             return _attached(samples, surface, *evaluate(Wave(empty, empty, order, rays.origins[:0])))
-        waves = march.waves
+        waves = marched.waves
         columns = [[w.t_starts for w in waves], [w.t_ends for w in waves], [w.owners for w in waves]]
         starts, ends, owners = gather_rows(columns, order)
 

@@ -8,11 +8,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.optim.adam import adam
 
 from framework.base.config import TrainConfig
 from framework.base.optimised import DefersGradient, ParameterGroup, RowChange
-from framework.kernels import native
 from framework.kernels.adam import all_finite, dense_adam, sparse_adam
 from framework.kernels.hash_grid import TableGradient
 from framework.kernels.memory import require, table
@@ -123,28 +121,8 @@ class Adam(torch.optim.Optimizer):
         grads = [p.grad for p in with_grad]
         states = [self.state[p] for p in with_grad]
         means, squares = [s["exp_avg"] for s in states], [s["exp_avg_sq"] for s in states]
-        if native.usable(*with_grad, *grads) and all(t.is_contiguous() for t in (*with_grad, *grads)):
-            for state in states:
-                state["step"] += 1
-            steps = [float(state["step"]) for state in states]
-            dense_adam(with_grad, grads, means, squares, steps, group["lr"], group["betas"], group["eps"])
-            return
-        adam(
-            with_grad,
-            grads,
-            means,
-            squares,
-            [],
-            [state["step"] for state in states],
-            fused=bool(with_grad) and with_grad[0].device.type in ("cpu", "cuda"),
-            amsgrad=False,
-            beta1=group["betas"][0],
-            beta2=group["betas"][1],
-            lr=group["lr"],
-            weight_decay=0.0,
-            eps=group["eps"],
-            maximize=False,
-        )
+        steps = [s["step"] for s in states]
+        dense_adam(with_grad, grads, means, squares, steps, group["lr"], group["betas"], group["eps"])
 
 
 def make_optimizer(model: Model[Any], config: TrainConfig) -> Adam:

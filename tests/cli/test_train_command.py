@@ -44,7 +44,10 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda d: change(d, lambda c: c["frames"][2]["transform_matrix"][0].__setitem__(0, np.nan)),
         "frame 2: the pose holds a value that is not finite",
     ),
-    "no image": (lambda d: damage_images(d, None), "split 'train' has no image: its data lists 10, of which none"),
+    "no image": (
+        lambda d: damage_images(d, None),
+        "split 'train' has no image: none of the 10 files listed in the data exists",
+    ),
     "no readable image": (lambda d: damage_images(d, b"text"), "r_0.png is not a readable image"),
 }
 

@@ -25,7 +25,7 @@ from framework.kernels.intervals import (
     resample,
     resample_reference,
 )
-from framework.kernels.march import March, Occupancy, ReferenceMarch, refresh_occupancy
+from framework.kernels.march import CompiledMarch, Occupancy, ReferenceMarch, refresh_occupancy
 from framework.kernels.mlp import mlp, mlp_reference
 from framework.kernels.planes import PlanesLayout, planes, planes_reference
 from tests.kernels.compiled import relative_error
@@ -117,13 +117,11 @@ def optimised(form: Callable[..., object], dtype: torch.dtype, **extra: Tensor) 
     """Parameters and moments after three steps of Adam, dense or sparse."""
     torch.manual_seed(1)
     values, mean, square = (torch.rand(COUNT, 2).to(dtype) for _ in range(3))
-    seen = torch.zeros(COUNT, dtype=dtype)
-    for step in range(1, 4):
+    seen, step = torch.zeros(COUNT, dtype=dtype), torch.zeros(())
+    for _ in range(3):
         grad = torch.randn(COUNT, 2).to(dtype) * (torch.rand(COUNT, 1) > 0.5)
-        if form is dense_adam:
-            dense_adam([values], [grad], [mean], [square], [step], 0.01, (0.9, 0.99), 1e-15)
-        elif form is dense_adam_reference:
-            dense_adam_reference(values, grad, mean, square, step, 0.01, (0.9, 0.99), 1e-15)
+        if form in (dense_adam, dense_adam_reference):
+            form([values], [grad], [mean], [square], [step], 0.01, (0.9, 0.99), 1e-15)
         else:
             form(values, grad, mean, square, seen, 0.01, (0.9, 0.99), 1e-15)
     return [values, mean, square]
@@ -136,7 +134,7 @@ def marched(kind: type) -> list[Tensor]:
     origins = 3 * torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
     directions = torch.nn.functional.normalize(torch.rand(count, 3) - 0.5 - origins, dim=-1)
     rays = Rays(origins, directions, torch.zeros(count), torch.full((count,), 10.0))
-    march = kind(rays, Occupancy.of(torch.rand(32**3) < 0.1, BOX, 32), 0.01, 0.0, None, 1e-3)
+    march = kind(rays, Occupancy(torch.rand(32**3) < 0.1, BOX, 32), 0.01, 0.0, None, 1e-3)
     sizes = [8, 8, 16, 1000]
     while (wave := march.wave(sizes.pop(0) if sizes else 1000)) is not None:
         march.advance(torch.full((len(wave.owners),), 20.0))
@@ -163,7 +161,7 @@ def measured() -> dict[str, tuple[float, list[Tensor]]]:
     ):
         steps, truth = optimised(form, torch.float32), optimised(reference, torch.float64)
         found[name] = max(relative_error(a, b) for a, b in zip(steps, truth, strict=True)), steps
-    samples, expected = marched(March), marched(ReferenceMarch)
+    samples, expected = marched(CompiledMarch), marched(ReferenceMarch)
     missing = [len(expected[0]) - len(samples[0]), *(int((a != b).sum()) for a, b in [(samples[1], expected[1])])]
     found["marching"] = float(sum(map(abs, missing))) / len(expected[0]), samples
     density, cells = torch.rand(64**3).log().neg(), torch.empty(64**3, dtype=torch.bool)

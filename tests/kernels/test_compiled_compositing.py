@@ -10,7 +10,7 @@ from framework.kernels.compositing import (
     composite,
     composite_reference,
     distortion,
-    distortion_reference,
+    distortion_by_pairs,
 )
 from tests.kernels.compiled import needs_kernels, relative_error
 from tests.kernels.test_compositing import ragged
@@ -94,7 +94,7 @@ def test_nan_and_infinite_densities() -> None:
 def test_distortion_equals_the_sum_over_pairs(dtype: torch.dtype) -> None:
     samples, (sigma, _, _), _ = inputs()
     weights = (sigma / sigma.sum()).requires_grad_()
-    truth = distortion_reference(weights, samples)
+    truth = distortion_by_pairs(weights, samples)
     direction = torch.linspace(0.5, 2, len(COUNTS), dtype=torch.float64)
     (true_gradient,) = torch.autograd.grad((truth * direction).sum(), weights)
     mine = weights.detach().to(dtype).requires_grad_()

@@ -8,7 +8,7 @@ import torch
 from framework.geometry.rays import Rays
 from framework.kernels import native
 from framework.kernels.march import (
-    March,
+    CompiledMarch,
     Occupancy,
     ReferenceMarch,
     candidates,
@@ -36,7 +36,7 @@ def random_rays(count: int, seed: int = 0) -> Rays:
 
 def occupancy(resolution: int, share: float, seed: int = 0) -> Occupancy:
     generator = torch.Generator().manual_seed(seed)
-    return Occupancy.of(torch.rand(resolution**3, generator=generator) < share, BOX, resolution)
+    return Occupancy(torch.rand(resolution**3, generator=generator) < share, BOX, resolution)
 
 
 def walk(march, limit: int = 16, sigma: float = 0.0):
@@ -60,7 +60,7 @@ def test_compiled_finds_what_the_reference_finds(resolution: int, share: float, 
     rays, grid = random_rays(300), occupancy(resolution, share)
     shift = torch.rand(300, generator=torch.Generator().manual_seed(1))
     found = []
-    for kind in (March, ReferenceMarch):
+    for kind in (CompiledMarch, ReferenceMarch):
         starts, ends, owners, _ = walk(kind(rays, grid, 0.02, cone, shift, 0.0))
         key = zip(owners.tolist(), ((starts + ends) / 2 / 1e-3).round().tolist(), strict=True)
         assert bool((ends > starts).all())
@@ -77,7 +77,9 @@ def test_compiled_finds_what_the_reference_finds(resolution: int, share: float, 
 @pytest.mark.parametrize("sigma", [0.0, 3.0, 1e4, float("nan")])
 def test_light_ends_rays_at_the_same_sample(sigma: float) -> None:
     rays, grid = random_rays(200), occupancy(8, 0.5)
-    compiled, reference = (walk(kind(rays, grid, 0.05, 0.0, None, 1e-3), 8, sigma) for kind in (March, ReferenceMarch))
+    compiled, reference = (
+        walk(kind(rays, grid, 0.05, 0.0, None, 1e-3), 8, sigma) for kind in (CompiledMarch, ReferenceMarch)
+    )
     differing = (compiled[3].diff() - reference[3].diff()).abs()
     assert int((differing > 1).sum()) == 0
     assert int((differing > 0).sum()) <= 4
@@ -89,7 +91,7 @@ def test_light_ends_rays_at_the_same_sample(sigma: float) -> None:
 def test_hidden_samples_are_never_handed_out() -> None:
     """An opaque wall: only the first wave of each ray is evaluated."""
     rays, grid = random_rays(100), occupancy(8, 1.0)
-    march = March(rays, grid, 0.01, 0.0, None, 1e-4)
+    march = CompiledMarch(rays, grid, 0.01, 0.0, None, 1e-4)
     wave = march.wave(8)
     assert wave is not None
     march.advance(torch.full_like(wave.t_starts, 1e6))
@@ -99,9 +101,9 @@ def test_hidden_samples_are_never_handed_out() -> None:
     assert len(order) == int((march.leave > march.enter).sum())
 
 
-@pytest.mark.parametrize("kind", [March, ReferenceMarch])
+@pytest.mark.parametrize("kind", [CompiledMarch, ReferenceMarch])
 def test_a_nan_ray_does_not_show_what_is_hidden_on_others(kind) -> None:
-    if kind is March and not native.available():
+    if kind is CompiledMarch and not native.available():
         pytest.skip("the compiled kernels are not installed")
     march = kind(random_rays(100), occupancy(8, 1.0), 0.01, 0.0, None, 1e-4)
     wave = march.wave(8)
@@ -122,15 +124,15 @@ def test_threads_hand_out_the_same_samples() -> None:
     try:
         for threads in (1, 2, 3):
             torch.set_num_threads(threads)
-            found.append(walk(March(rays, grid, 0.01, 0.0, None, 1e-4), sigma=5.0))
+            found.append(walk(CompiledMarch(rays, grid, 0.01, 0.0, None, 1e-4), sigma=5.0))
     finally:
         torch.set_num_threads(before)
     assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other, strict=True))
 
 
-@pytest.mark.parametrize("kind", [March, ReferenceMarch])
+@pytest.mark.parametrize("kind", [CompiledMarch, ReferenceMarch])
 def test_nothing_to_do(kind) -> None:
-    if kind is March and not native.available():
+    if kind is CompiledMarch and not native.available():
         pytest.skip("the compiled kernels are not installed")
     away = Rays(torch.full((3, 3), 5.0), torch.eye(3), torch.zeros(3), torch.full((3,), 10.0))
     for rays, grid in ((away, occupancy(8, 1.0)), (away[:0], occupancy(8, 1.0)), (random_rays(20), occupancy(8, 0.0))):

@@ -69,7 +69,7 @@ def test_a_missing_library_is_said_once_and_torch_goes_on(tmp_path) -> None:
 def test_a_function_that_is_not_there() -> None:
     assert not native.has("no_such_kernel")
     with pytest.raises(AttributeError):
-        native.function("no_such_kernel", "")()
+        native.Function("no_such_kernel", "")()
 
 
 @needs_kernels

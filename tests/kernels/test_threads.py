@@ -105,16 +105,16 @@ def test_an_error_in_one_chunk_is_raised_and_the_next_call_works(threads: int) -
 
 
 def test_memory_that_is_not_there_is_an_error_and_not_the_end_of_the_process() -> None:
-    refresh = native.function("refresh_occupancy", "pqfffpi")
+    refresh = native.Function("refresh_occupancy", "pqfffpi")
     with pytest.raises(MemoryError, match="refresh_occupancy: there is not enough memory"):
         refresh(None, 2**58, 1.0, 0.1, 0.01, None, 2)  # a sum for each part of as many cells
 
 
 def test_what_no_kernel_can_do_is_refused_by_name() -> None:
-    forward = native.function("hash_grid_forward", "pqpippipi")
+    forward = native.Function("hash_grid_forward", "pqpippipi")
     with pytest.raises(ValueError, match="hash_grid_forward: hash grid: an entry has 1, 2, 4 or 8 features"):
         forward(None, 0, None, 3, None, None, 1, None, 1)
-    network = native.function("mlp_forward", "ppiqpippipi")
+    network = native.Function("mlp_forward", "ppiqpippipi")
     with pytest.raises(ValueError, match="a layer has 1 to 384 features"):
         network(None, None, 1, 0, native.integers((385, 4)), 1, None, None, 0, None, 1)
 

@@ -21,7 +21,7 @@ from framework.geometry.bounds import intersect_box
 from framework.geometry.points import Points
 from framework.geometry.rays import Rays
 from framework.kernels.contraction import contract_to_unit
-from framework.kernels.march import March, Occupancy
+from framework.kernels.march import CompiledMarch, Occupancy
 from framework.kernels.math import safe_normalize
 from framework.samplers.proposal import from_disparity, to_disparity
 from tests.stress.backends import COMPILED, FEW, backends
@@ -153,7 +153,7 @@ def crossings(backend: str, origins: Tensor, directions: Tensor) -> list[tuple[f
     count = len(origins)
     if backend == COMPILED:
         rays = Rays(origins, directions, torch.zeros(count), torch.full((count,), torch.inf))
-        march = March(rays, Occupancy.of(torch.ones(8, dtype=torch.bool), CUBE, 2), 0.1, 0.0, None, 0.0)
+        march = CompiledMarch(rays, Occupancy(torch.ones(8, dtype=torch.bool), CUBE, 2), 0.1, 0.0, None, 0.0)
         enter, leave, hits = march.enter, march.leave, set(march.alive.tolist())
     else:
         enter, leave = intersect_box(origins, directions, CUBE)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from framework.geometry.rays import Samples
-from framework.kernels.compositing import distortion, distortion_reference
+from framework.kernels.compositing import distortion, distortion_by_pairs
 from framework.kernels.frequency import frequency_encoding
 from tests.kernels.compiled import relative_error
 from tests.stress.backends import FEW, backends
@@ -73,7 +73,7 @@ def test_distortion_of_weights_that_do_not_stand_side_by_side(backend: str, rays
     edges = some(rays, bins + 1).cumsum(-1)
     weights = some(rays * bins * stride)[::stride].requires_grad_()
     exact = weights.detach().double().requires_grad_()
-    truth = distortion_reference(exact, Samples.regular(edges[:, :-1].double(), edges[:, 1:].double()))
+    truth = distortion_by_pairs(exact, Samples.regular(edges[:, :-1].double(), edges[:, 1:].double()))
     found = distortion(weights, Samples.regular(edges[:, :-1], edges[:, 1:]))
     (slope,) = torch.autograd.grad(found.sum(), weights)
     (true_slope,) = torch.autograd.grad(truth.sum(), exact)

@@ -18,7 +18,7 @@ from framework.data.scene import Scene
 from framework.encodings.planes import FeaturePlanes
 from framework.evaluation.metrics import MAX_PSNR, load_lpips, psnr, ssim
 from framework.geometry.rays import Histogram, Samples
-from framework.kernels.compositing import distortion, distortion_reference
+from framework.kernels.compositing import distortion, distortion_by_pairs
 from framework.kernels.planes import PlanesLayout, plane_band
 from framework.rendering.losses import depth_error, mean_squared_error
 from framework.samplers.proposal import interlevel_loss
@@ -41,7 +41,7 @@ def test_distortion_of_mass_at_the_far_end(backend: str, width: float) -> None:
     weights = torch.rand(rays, bins, generator=torch.Generator().manual_seed(0)) ** 3
     weights = (weights / weights.sum(-1, keepdim=True)).reshape(-1).requires_grad_()
     exact = weights.detach().double().requires_grad_()
-    truth = distortion_reference(exact, Samples.regular(edges[:, :-1], edges[:, 1:]))
+    truth = distortion_by_pairs(exact, Samples.regular(edges[:, :-1], edges[:, 1:]))
     found = distortion(weights, Samples.regular(edges[:, :-1].float(), edges[:, 1:].float()))
     (slope,) = torch.autograd.grad(found.sum(), weights)
     (true_slope,) = torch.autograd.grad(truth.sum(), exact)

@@ -12,7 +12,7 @@ from framework.fields.base import Field
 from framework.geometry.points import Points
 from framework.geometry.rays import Rays
 from framework.kernels.intervals import resample
-from framework.kernels.march import March, Occupancy, ReferenceMarch
+from framework.kernels.march import CompiledMarch, Occupancy, ReferenceMarch
 from framework.rendering.volume import VolumeRenderer
 from framework.samplers.inverse_cdf import inverse_cdf
 from framework.samplers.proposal import FARTHEST, ProposalSampler, distances, half_edge, interlevel_loss
@@ -160,8 +160,8 @@ def some_rays(count: int, near: float, far: float) -> Rays:
 @pytest.mark.parametrize("cone", [0.0, 1 / 64])
 def test_marching_from_zero_to_infinity(backend: str, cone: float) -> None:
     """The box ends a ray, however far it might go; one that starts inside starts where it is."""
-    kind = March if backend == COMPILED else ReferenceMarch
-    grid = Occupancy.of(torch.ones(512, dtype=torch.bool), BOX, 8)
+    kind = CompiledMarch if backend == COMPILED else ReferenceMarch
+    grid = Occupancy(torch.ones(512, dtype=torch.bool), BOX, 8)
     endless, ended = (walk(kind(some_rays(20, 0.0, far), grid, 0.05, cone, None, 0.0)) for far in (math.inf, 100.0))
     assert endless[3].tolist() == ended[3].tolist()
     for one, other in zip(endless[:3], ended[:3], strict=True):
@@ -245,8 +245,8 @@ def rays_along_faces() -> Rays:
 def test_no_sample_lies_in_an_empty_cell(backend: str, cone: float) -> None:
     """Whichever side of a face rounding puts a sample on: it is at most a thousandth of a cell from an occupied one."""
     occupied = torch.rand(8**3, generator=torch.Generator().manual_seed(0)) < 0.2
-    rays, grid = rays_along_faces(), Occupancy.of(occupied, BOX, 8)
-    kind = March if backend == COMPILED else ReferenceMarch
+    rays, grid = rays_along_faces(), Occupancy(occupied, BOX, 8)
+    kind = CompiledMarch if backend == COMPILED else ReferenceMarch
     starts, ends, owners, _ = walk(kind(rays, grid, 0.05, cone, None, 0.0))
     middles = (starts + ends).double() / 2
     positions = rays.origins[owners].double() + middles[:, None] * rays.directions[owners].double()

@@ -168,7 +168,7 @@ def test_on_somebodys_data(
         (("instant-npg",), "unknown method 'instant-npg'. Did you mean 'instant-ngp'"),
         (("instant-ngp", "--only", "all-whit"), "Did you mean 'all-white'"),
         (("instant-ngp", "--data", "/no/such/folder"), "there is no such folder"),
-        (("instant-ngp 'open",), 'METHOD: "instant-ngp \'open" cannot be read'),
+        (("instant-ngp 'open",), 'METHOD: "instant-ngp \'open" is invalid'),
         (("instant-ngp", "--max-num-iterations", 0), "--max-num-iterations must be at least 1"),
         (("instant-ngp", "--output-path", "table.md"), "--output-path table.md: it must end in .json"),
         (("instant-ngp", "kplanez"), "unknown method 'kplanez'. Did you mean 'kplanes'"),

@@ -64,7 +64,7 @@ def test_cameras_are_rigid_look_at_the_ball_and_see_so_many_degrees(
 def test_every_ray_meets_the_box(field_of_view: float, distance: float | None) -> None:
     for dataset in both(ball_views(field_of_view, distance)):
         pixels = torch.arange(len(dataset.pixels))
-        rays = dataset.cameras.pixel_rays(pixels, 0.0, 100.0, places=subpixels(16))
+        rays = dataset.cameras.pixel_rays(pixels, 0.0, 100.0, subpixels=subpixels(16))
         enter, leave = intersect_box(rays.origins, rays.directions, dataset.scene.box)
         assert bool((leave > enter).all())
 

@@ -12,7 +12,7 @@ import torch
 
 from framework.geometry.rays import Rays
 from framework.kernels import native
-from framework.kernels.march import March, Occupancy, ReferenceMarch
+from framework.kernels.march import CompiledMarch, Occupancy, ReferenceMarch
 
 BOX = np.array([[-1.0, -1.2, -0.9], [1.1, 1.0, 1.3]])
 RESOLUTION, STEP = 48, 0.013
@@ -73,13 +73,13 @@ def middles_by_brute_force(rays: Rays, cells: np.ndarray) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("kind", ["cells", "rod x", "rod y", "rod z", "plate x", "plate y", "plate z"])
-@pytest.mark.parametrize("form", [March, ReferenceMarch])
-def test_nothing_is_passed_over(form: type[March] | type[ReferenceMarch], kind: str) -> None:
-    if form is March and not native.available():
+@pytest.mark.parametrize("form", [CompiledMarch, ReferenceMarch])
+def test_nothing_is_passed_over(form: type[CompiledMarch] | type[ReferenceMarch], kind: str) -> None:
+    if form is CompiledMarch and not native.available():
         pytest.skip("the compiled kernels are not installed")
     cells = occupied(kind)
     rays = rays_towards(cells)
-    grid = Occupancy.of(torch.from_numpy(cells.reshape(-1)), torch.from_numpy(BOX).float(), RESOLUTION)
+    grid = Occupancy(torch.from_numpy(cells.reshape(-1)), torch.from_numpy(BOX).float(), RESOLUTION)
     march = form(rays, grid, STEP, 0.0, None, 0.0)
     while (wave := march.wave(16)) is not None:
         march.advance(torch.zeros_like(wave.t_starts))

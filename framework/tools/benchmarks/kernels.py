@@ -26,7 +26,7 @@ from framework.kernels.adam import sparse_adam, sparse_adam_reference
 from framework.kernels.compositing import composite, composite_reference
 from framework.kernels.frequency import frequency_encoding, frequency_encoding_reference
 from framework.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
-from framework.kernels.march import March, Occupancy, ReferenceMarch
+from framework.kernels.march import CompiledMarch, Occupancy, ReferenceMarch
 from framework.kernels.mlp import Activation, mlp, mlp_reference
 from framework.kernels.planes import PlanesLayout, planes, planes_reference
 from framework.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
@@ -340,14 +340,14 @@ def _marching() -> Kernel:
     """All samples of 8192 rays through a grid of which 3 % are occupied."""
     rays, _ = rays_and_positions(8192 * 16)
     centers = (torch.cartesian_prod(*[torch.arange(128)] * 3) + 0.5) / 128 - 0.5
-    grid = Occupancy.of((centers.norm(dim=-1) - 0.3).abs() < 0.015, BOX, 128)
+    grid = Occupancy((centers.norm(dim=-1) - 0.3).abs() < 0.015, BOX, 128)
 
-    def march(kind: type[March] | type[ReferenceMarch]) -> None:
+    def march(kind: type[CompiledMarch] | type[ReferenceMarch]) -> None:
         marching = kind(rays, grid, 3**0.5 / 512, 0.0, None, 1e-4)
         while (wave := marching.wave(16)) is not None:
             marching.advance(torch.zeros_like(wave.t_starts))
 
-    runs = once(lambda: march(March)), once(lambda: march(ReferenceMarch))
+    runs = once(lambda: march(CompiledMarch)), once(lambda: march(ReferenceMarch))
     return Kernel("marching through a grid of 128^3, 3 % occupied", "ray", len(rays), runs, None)
 
 

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from framework.geometry.points import Points
 from framework.tools.benchmarks.closed_forms import BOX, ClosedForm, scenes
 from nerfloom import Rays
 
@@ -16,10 +17,10 @@ def functions(scene: str | ClosedForm) -> tuple[Callable[..., Tensor], Callable[
     field = scenes()[scene] if isinstance(scene, str) else scene
 
     def rgb_sigma(positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        sigma, rgb = field.density(positions)
+        sigma, rgb = field.density(Points(positions))
         return rgb, sigma
 
-    return lambda positions: field.density(positions)[0], rgb_sigma
+    return lambda positions: field.density(Points(positions))[0], rgb_sigma
 
 
 def steps_through_box(rays: Rays, step: float) -> tuple[Tensor, Tensor]:

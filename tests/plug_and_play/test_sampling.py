@@ -10,7 +10,7 @@ import nerfloom
 from framework.geometry.rays import Samples
 from framework.tools.benchmarks.closed_forms import BOX, Ball, ClosedForm, Medium, Solids, scenes
 from framework.tools.benchmarks.sampling import random_rays
-from tests.interface.scenes import BACKGROUND, functions
+from tests.plug_and_play.scenes import BACKGROUND, functions
 
 
 def error(rays: nerfloom.Rays, samples: Samples, scene: str | ClosedForm) -> float:

@@ -8,7 +8,7 @@ import nerfloom
 from framework.kernels import native
 from framework.tools.benchmarks.closed_forms import BOX, scenes
 from framework.tools.benchmarks.sampling import random_rays
-from tests.interface.scenes import BACKGROUND, dense_quadrature, functions, steps_through_box
+from tests.plug_and_play.scenes import BACKGROUND, dense_quadrature, functions, steps_through_box
 
 STEPS = 256
 SCENES = ("fog", "nested", "blobs", "sparse")

@@ -5,7 +5,7 @@ import re
 import pytest
 import torch
 
-from tests.interface.test_examples import ROOT, differences
+from tests.plug_and_play.test_examples import ROOT, differences
 
 PAGE = (ROOT / "docs" / "plug-and-play.md").read_text()
 

@@ -1,0 +1,275 @@
+"""The table of operations: what is taken when, each implementation against its reference, and room for more."""
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from framework.cameras.cameras import CAMERA_RAYS, Cameras, subpixels
+from framework.data.pixels import GATHER_COLORS
+from framework.geometry.rays import Rays, Samples
+from framework.kernels import dispatch, native
+from framework.kernels.adam import ALL_FINITE, DENSE_ADAM, SPARSE_ADAM
+from framework.kernels.compositing import COMPOSITE, DISTORTION
+from framework.kernels.contraction import CONTRACT
+from framework.kernels.dispatch import Backend, Operation, derivatives
+from framework.kernels.frequency import FREQUENCY_ENCODING
+from framework.kernels.hash_grid import HASH_GRID, HashGridLayout, hash_grid
+from framework.kernels.intervals import INTERVAL_WEIGHTS, PROPOSAL_EXCESS, RESAMPLE
+from framework.kernels.march import MARCH, REFRESH_OCCUPANCY, SORT_BY_RAY, March, Occupancy
+from framework.kernels.mlp import NETWORK
+from framework.kernels.planes import PLANE_BAND, PLANES, PlanesGradient, PlanesLayout
+from framework.kernels.rows import GATHER_ROWS
+from framework.kernels.silhouettes import HOLD_BALLS, OPAQUE_SUMS, PIXELS_NEAR_BALLS, Photograph, opaque_sums
+from framework.kernels.spherical_harmonics import SPHERICAL_HARMONICS
+from tests.kernels.compiled import needs_kernels
+
+GRID = HashGridLayout.build(3, 4, 20, 8)
+LAYOUT = PlanesLayout.build(((5, 6, 7), (8, 9, 10)))
+OFFSETS = torch.tensor([0, 3, 3, 8, 12])
+BOX = torch.tensor([[-1.0, -1.5, -1.0], [1.0, 1.0, 2.0]])
+Arguments = tuple[Any, ...]
+
+
+def rand(*shape: int) -> Tensor:
+    return torch.rand(shape) + 0.1
+
+
+def edges(rays: int, bins: int) -> Tensor:
+    return torch.linspace(0, 1, bins + 1) + 0.01 * torch.rand(rays, bins + 1).cumsum(-1)
+
+
+def samples() -> Samples:
+    ends = rand(12).cumsum(0)
+    return Samples(ends - 0.1, ends, OFFSETS)
+
+
+def unit(count: int) -> Tensor:
+    return torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
+
+
+def rays() -> Rays:
+    origins = 4 * unit(100)
+    directions = torch.nn.functional.normalize(torch.rand(100, 3) * 3 - 1.5 - origins, dim=-1)
+    return Rays(origins, directions, torch.full((100,), 0.1), torch.full((100,), 20.0))
+
+
+def cameras() -> Cameras:
+    poses = torch.eye(3, 4).expand(2, 3, 4) + 0.1 * rand(2, 3, 4)
+    six = torch.full((2,), 6)
+    return Cameras(poses, 5 + rand(2), 5 + rand(2), 3 + rand(2), 3 + rand(2), six, six)
+
+
+def photograph() -> Photograph:
+    pose = torch.cat([torch.eye(3), torch.tensor([[0.0], [0.0], [4.0]])], dim=-1)
+    return Photograph(pose, 60.0, 55.0, 26.0, 19.0, opaque_sums(torch.rand(40, 50) > 0.97))
+
+
+def adam(parameters: int) -> Arguments:
+    """Values, gradients, means, squares."""
+    return tuple([rand(20, 2) for _ in range(parameters)] for _ in range(4))
+
+
+RATES = 0.01, (0.9, 0.99), 1e-15
+CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
+    HASH_GRID: lambda: (torch.rand(50, 3), rand(GRID.num_entries, 2), GRID, None),
+    PLANES: lambda: (torch.rand(50, 3), rand(LAYOUT.num_entries, 4), LAYOUT, None),
+    PLANE_BAND: lambda: (rand(LAYOUT.num_entries, 4), 10, 30, PlanesGradient(LAYOUT)),
+    NETWORK: lambda: ([rand(9, 5), rand(9, 2)], [rand(8, 7), rand(3, 8)], "sigmoid", [rand(8), rand(3)]),
+    FREQUENCY_ENCODING: lambda: (rand(9, 3), 4, True),
+    SPHERICAL_HARMONICS: lambda: (unit(9), 4),
+    CONTRACT: lambda: (5 * torch.randn(40, 3), BOX),
+    COMPOSITE: lambda: (samples(), rand(12), rand(12, 3), rand(4, 3), 5 * rand(4)),
+    DISTORTION: lambda: (rand(12), samples()),
+    INTERVAL_WEIGHTS: lambda: (rand(6, 9), edges(6, 9)),
+    RESAMPLE: lambda: (edges(6, 9), rand(6, 9), torch.rand(6), 5, 0.7, 0.01),
+    PROPOSAL_EXCESS: lambda: (edges(6, 9), rand(6, 9), edges(6, 4), rand(6, 4) / 10),
+    SPARSE_ADAM: lambda: (*(t for (t,) in adam(1)), torch.zeros(20), *RATES),
+    DENSE_ADAM: lambda: (*adam(3), [torch.full((), float(step)) for step in (0, 3, 9)], *RATES),
+    ALL_FINITE: lambda: (torch.tensor([1.0, torch.inf]),),
+    GATHER_ROWS: lambda: ([[rand(4, 3), rand(5, 3)], [torch.arange(4), torch.arange(5)]], torch.tensor([8, 0, 4, 3])),
+    SORT_BY_RAY: lambda: (torch.randint(5, (30,)), torch.randint(2, (30,), dtype=torch.uint8), 5),
+    MARCH: lambda: (rays(), Occupancy(torch.rand(16**3) < 0.1, BOX, 16), 0.05, 0.0, None, 1e-3),
+    REFRESH_OCCUPANCY: lambda: (torch.rand(200) * 0.4, torch.zeros(200, dtype=torch.bool), 0.9, 0.05, 0.01),
+    OPAQUE_SUMS: lambda: (torch.rand(7, 9) > 0.5,),
+    HOLD_BALLS: lambda: (photograph(), torch.rand(200, 3) * 2 - 1, 0.05, torch.rand(200) > 0.5, True),
+    PIXELS_NEAR_BALLS: lambda: (photograph(), torch.rand(20, 3) * 2 - 1, 0.05),
+    GATHER_COLORS: lambda: (torch.randint(256, (60, 4), dtype=torch.uint8), torch.randint(60, (9,)), rand(9, 3)),
+    CAMERA_RAYS: lambda: (cameras(), torch.arange(0, 72, 5), 0.0, 1.0, None, subpixels(4)),
+}
+"""Arguments of every operation that has more than a reference."""
+
+
+def tensors_in(value: Any) -> list[Tensor]:
+    """All tensors in arguments or results, and True or False as one."""
+    if isinstance(value, March):
+        while (wave := value.wave(8)) is not None:
+            value.advance(torch.full_like(wave.t_starts, 3.0))
+        order, offsets = value.finish()
+        starts, owners = (torch.cat([getattr(w, name) for w in value.waves]) for name in ("t_starts", "owners"))
+        return [starts[order], owners[order], offsets]
+    if isinstance(value, Tensor):
+        return [value]
+    if isinstance(value, (bool, int)):
+        return [torch.tensor(value)]
+    if is_dataclass(value):
+        return [tensor for field in fields(value) for tensor in tensors_in(getattr(value, field.name))]
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [tensor for item in value for tensor in tensors_in(item)]
+    return []
+
+
+def test_every_operation_is_compared_with_its_reference() -> None:
+    listed = dispatch.table()
+    assert all(names[-1] == "reference" for names in listed.values())
+    assert {name for name, names in listed.items() if len(names) > 1} == {operation.name for operation in CASES}
+    assert listed["hash_grid"] == ("c++", "reference")
+    assert listed["dense_adam"] == ("c++", "torch", "reference")
+
+
+PAIRS = [(operation, index) for operation in CASES for index in range(len(operation.implementations))]
+
+
+@pytest.mark.parametrize(
+    ("operation", "index"), PAIRS, ids=[f"{o.name}-{o.implementations[i].backend.name}" for o, i in PAIRS]
+)
+def test_an_implementation_computes_what_its_reference_does(operation: Operation[..., Any], index: int) -> None:
+    """Values, and what is written in place. Gradients are compared in test_gradients_kept.py."""
+    implementation = operation.implementations[index]
+    if not implementation.backend.available():
+        pytest.skip(f"{implementation.backend.name} cannot be used on this machine")
+    found = []
+    for run in (implementation.run, operation.reference.run):
+        torch.manual_seed(0)
+        arguments = CASES[operation]()
+        with torch.no_grad():
+            result = run(*arguments)
+        found.append(tensors_in(result) + tensors_in(arguments))
+    assert len(found[0]) == len(found[1]) > 0
+    for value, truth in zip(*found, strict=True):
+        torch.testing.assert_close(value, truth, rtol=1e-4, atol=1e-5)
+
+
+def taken(operation: Operation[..., Any], tensors: Sequence[Tensor | None], *arguments: Any) -> str:
+    return operation.choose(tensors, *arguments).backend.name
+
+
+@needs_kernels
+def test_what_is_taken() -> None:
+    """By device, type, gradients and the shapes that there are kernels for."""
+    positions, table = torch.rand(9, 3), rand(GRID.num_entries, 2)
+
+    def grid(positions: Tensor, table: Tensor) -> str:
+        return taken(HASH_GRID, (positions, table), positions, table, GRID, None)
+
+    assert grid(positions, table) == grid(positions.requires_grad_(), table.requires_grad_()) == "c++"
+    assert grid(positions.double(), table.double()) == "reference"
+    assert grid(positions.to("meta"), table) == grid(positions, table.to("meta")) == "reference"
+    assert grid(positions, rand(GRID.num_entries, 3)) == "reference"
+    line = torch.rand(4)
+    assert taken(FREQUENCY_ENCODING, (line,), line, 3, True) == "reference"
+    for width, layers, expected in ((384, 2, "c++"), (385, 2, "reference"), (8, 8, "c++"), (8, 9, "reference")):
+        weights = [rand(width, width)] * layers
+        inputs = [rand(4, width)]
+        assert taken(NETWORK, (*inputs, *weights), inputs, weights, "none", None) == expected
+    row = rand(4, 6)
+    assert taken(ALL_FINITE, (row,), row) == "c++"
+    assert taken(ALL_FINITE, (row.t(),), row.t()) == "reference"
+    assert taken(PLANE_BAND, (table,), table, 0, 1, None) == "reference"
+    flat = cameras()
+    fan = Cameras(*(getattr(flat, field.name) for field in fields(Cameras)[:7]), model="orthographic")
+    for these, expected in ((flat, "c++"), (fan, "reference")):
+        assert taken(CAMERA_RAYS, (these.fx,), these, torch.arange(3), 0.0, 1.0, None, subpixels(1)) == expected
+
+
+@needs_kernels
+@pytest.mark.parametrize(
+    ("operation", "followed", "expected"),
+    [
+        (SPHERICAL_HARMONICS, 0, "reference"),
+        (CONTRACT, 0, "c++"),
+        (CONTRACT, 1, "reference"),
+        (DISTORTION, 0, "c++"),
+        (DISTORTION, 1, "reference"),
+        (DISTORTION, 2, "reference"),
+        (COMPOSITE, 1, "c++"),
+        (COMPOSITE, 2, "reference"),
+        (COMPOSITE, 6, "reference"),
+    ],
+)
+def test_no_gradient_is_dropped(operation: Operation[..., Any], followed: int, expected: str) -> None:
+    """What an implementation has no gradient for is left to torch, where gradients are asked for."""
+    arguments, here = CASES[operation](), [rand(3) for _ in range(7)]
+    here[followed].requires_grad_()
+    assert taken(operation, here, *arguments) == expected
+    with torch.no_grad():
+        assert taken(operation, here, *arguments) == "c++"
+    assert taken(operation, [None, *(t.detach() for t in here)], *arguments) == "c++"
+
+
+def test_second_derivatives_are_the_references() -> None:
+    positions, table = torch.rand(9, 3, requires_grad=True), rand(GRID.num_entries, 2)
+    with derivatives(2):
+        assert taken(HASH_GRID, (positions, table), positions, table, GRID, None) == "reference"
+        assert taken(SPHERICAL_HARMONICS, (positions,), positions, 4) == "reference"
+        with torch.no_grad():
+            assert taken(HASH_GRID, (table, table), table, table, GRID, None) == (
+                "c++" if native.available() else "reference"
+            )
+        (slope,) = torch.autograd.grad(hash_grid(positions, table, GRID).square().sum(), positions, create_graph=True)
+    (curvature,) = torch.autograd.grad(slope.square().sum(), positions)
+    assert bool(curvature.any())
+    if native.available():
+        (slope,) = torch.autograd.grad(hash_grid(positions, table, GRID).square().sum(), positions, create_graph=True)
+        with pytest.raises(RuntimeError, match="once_differentiable"):
+            slope.square().sum().backward()
+
+
+@needs_kernels
+def test_the_order_of_derivatives_is_a_threads_and_ends_with_its_block() -> None:
+    positions, table, seen = torch.rand(9, 3, requires_grad=True), rand(GRID.num_entries, 2), []
+
+    def look() -> None:
+        seen.append(taken(HASH_GRID, (positions, table), positions, table, GRID, None))
+
+    def look_twice() -> None:
+        with derivatives(2):
+            thread = threading.Thread(target=look)
+            thread.start()
+            thread.join()
+            look()
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        look_twice()
+    look()
+    assert seen == ["c++", "reference", "c++"]
+
+
+@pytest.fixture
+def elsewhere() -> Iterator[list[int]]:
+    """A third backend, of a device that has none, which says how many rows it was asked for."""
+    asked: list[int] = []
+
+    def run(positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: object) -> Tensor:
+        asked.append(len(positions))
+        return positions.new_zeros(len(positions), layout.num_levels * table.shape[1])
+
+    HASH_GRID.implementation(Backend("elsewhere", lambda tensor: tensor.is_meta, lambda: True))(run)
+    yield asked
+    HASH_GRID.implementations.pop()
+
+
+def test_a_third_backend_is_one_more_implementation(elsewhere: list[int]) -> None:
+    """The operation's function, and what calls it, stay as they are."""
+    table = rand(GRID.num_entries, 2)
+    hash_grid(torch.rand(4, 3), table, GRID)
+    assert elsewhere == []
+    out = hash_grid(torch.rand(5, 3, device="meta"), table.to("meta"), GRID)
+    assert elsewhere == [5]
+    assert out.is_meta
+    assert dispatch.table()["hash_grid"] == ("c++", "elsewhere", "reference")

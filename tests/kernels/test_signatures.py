@@ -1,0 +1,124 @@
+"""Each declaration of a C function in Python says what its C++ source says: a wrong one would read foreign memory."""
+
+import importlib
+import pkgutil
+import re
+from pathlib import Path
+
+import pytest
+
+import framework.cameras.cameras
+import framework.data.pixels
+import framework.kernels
+from framework.kernels import native
+
+SOURCES = Path(native.__file__).parent / "csrc"
+LETTERS = {"int64_t": "q", "int": "i", "float": "f", "double": "d"}
+
+
+def without_comments(text: str) -> str:
+    return re.sub(r"/\*.*?\*/|//[^\n]*", "", text, flags=re.DOTALL)
+
+
+def exported(text: str) -> dict[str, tuple[str, ...]]:
+    """The parameters' types of every exported function that returns a status: a letter, or p and what it points to."""
+    found = {}
+    for name, parameters in re.findall(r"\bEXPORT\s+int\s+(\w+)\s*\(([^)]*)\)", without_comments(text)):
+        found[name] = tuple(kind(parameter) for parameter in parameters.split(",") if parameter.strip())
+    return found
+
+
+def kind(parameter: str) -> str:
+    """As `float* out` is p:float, and `int64_t count` is q."""
+    words = re.sub(r"\bconst\b|\w+\s*$", "", parameter).split()  # the last word is the name
+    target, stars = re.fullmatch(r"(\w+)\s*([*\s]*)", " ".join(words)).groups()
+    return f"p:{target}" if stars else LETTERS[target]
+
+
+def declared() -> dict[str, list[native.Function]]:
+    """The declarations of every module that can have any, by the name of their function."""
+    names = [module.name for module in pkgutil.iter_modules(framework.kernels.__path__, "framework.kernels.")]
+    modules = [importlib.import_module(name) for name in names]
+    found: dict[str, list[native.Function]] = {}
+    for module in (*modules, framework.cameras.cameras, framework.data.pixels):
+        for value in vars(module).values():
+            if isinstance(value, native.Function):
+                found.setdefault(value.name, []).append(value)
+    return found
+
+
+def problem(function: native.Function, parameters: tuple[str, ...]) -> str | None:
+    """What a declaration says otherwise than the source; None where nothing."""
+    *read, written = parameters if function.result else (*parameters, "")
+    letters = "".join(parameter[0] for parameter in read)
+    if letters != function.arguments:
+        return f"{function.name} takes {letters}, not {function.arguments}"
+    if function.result and (not written.startswith("p:") or LETTERS.get(written[2:]) != function.result):
+        return f"{function.name} writes {written} through its last argument, not {function.result}"
+    return None
+
+
+EXPORTED = {name: kinds for file in sorted(SOURCES.glob("*.cpp")) for name, kinds in exported(file.read_text()).items()}
+DECLARED = declared()
+
+
+def test_every_exported_function_is_declared_once_and_every_declared_one_exported() -> None:
+    assert set(DECLARED) == set(EXPORTED)
+    assert {name for name, functions in DECLARED.items() if len(functions) > 1} == set()
+    count = sum(
+        len(re.findall(r"^EXPORT int ", file.read_text(), flags=re.MULTILINE)) for file in SOURCES.glob("*.cpp")
+    )
+    assert len(EXPORTED) == count > 30
+
+
+def test_declarations_are_made_at_the_top_of_modules() -> None:
+    """Where the comparison finds them."""
+    root = Path(framework.__file__).parent
+    made = sum(len(re.findall(r"\bnative\.Function\(", file.read_text())) for file in root.rglob("*.py"))
+    assert made == len(DECLARED)
+
+
+@pytest.mark.parametrize("name", sorted(EXPORTED))
+def test_a_declaration_is_its_source(name: str) -> None:
+    assert problem(DECLARED[name][0], EXPORTED[name]) is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "result", "said"),
+    [
+        ("pqfid", "q", None),
+        ("pqfi", "q", "takes pqfid, not pqfi"),  # one too few
+        ("pqfidp", "q", "takes pqfid, not pqfidp"),  # one too many
+        ("pfqid", "q", "takes pqfid, not pfqid"),  # another order
+        ("pqdid", "q", "takes pqfid, not pqdid"),  # a double for a float
+        ("piffd", "q", "takes pqfid, not piffd"),  # an int for 64 bits
+        ("qqfid", "q", "takes pqfid, not qqfid"),  # a number for a pointer
+        ("pqfid", "i", "writes p:int64_t through its last argument, not i"),
+        ("pqfid", "", "takes pqfidp, not pqfid"),  # what it writes is not asked for
+    ],
+)
+def test_a_wrong_declaration_is_found(arguments: str, result: str, said: str | None) -> None:
+    source = """
+    // EXPORT int other(int a);
+    EXPORT int sample(const float* const* parts /* of each, */,
+                      int64_t count, float step, int threads, const double rate, int64_t* found) {
+        return call(1, 2);
+    }
+    """
+    parsed = exported(source)
+    assert parsed == {"sample": ("p:float", "q", "f", "i", "d", "p:int64_t")}
+    found = problem(native.Function("sample", arguments, result), parsed["sample"])
+    assert found == (None if said is None else f"sample {said}")
+
+
+def test_a_type_without_a_letter_is_an_error() -> None:
+    with pytest.raises(KeyError, match="size_t"):
+        exported("EXPORT int sample(size_t count) {")
+
+
+@pytest.mark.parametrize("name", sorted(DECLARED))
+def test_one_letter_more_or_less_is_found_in_every_declaration(name: str) -> None:
+    function = DECLARED[name][0]
+    for arguments in (function.arguments[1:], function.arguments + "i", function.arguments.replace("i", "q", 1)):
+        if arguments != function.arguments:
+            assert problem(native.Function(name, arguments, function.result), EXPORTED[name])

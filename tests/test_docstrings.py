@@ -28,7 +28,6 @@ NOT_YET: tuple[str, ...] = (
     "framework/model.py",
     "framework/rendering",
     "framework/samplers",
-    "framework/tools/__init__.py",
     "framework/tools/benchmarks",
     "framework/tools/stress",
     "framework/tools/testing",

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from framework.base.errors import DataError
-from framework.tools.processing.worker import Report, run_apart
+from framework.tools.processing.worker import Report, run_in_child
 from tests.faults.runs import ROOT
 
 
@@ -29,26 +29,26 @@ def work(report: Report, fate: str) -> int:
 def test_a_process_that_is_killed_at_its_work(tmp_path: Path) -> None:
     log = tmp_path / "log.txt"
     with pytest.raises(DataError) as error:
-        run_apart(work, ("killed",), "Matching", 3, log)
+        run_in_child(work, ("killed",), "Matching", 3, log)
     last = f"it said: half of the pairs (all of it: {log})"
     assert str(error.value) == f"COLMAP stopped while matching (exit status -9); {last}"
 
 
 def test_a_process_that_runs_out_of_memory(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"^COLMAP: MemoryError: no memory$"):
-        run_apart(work, ("out of memory",), "Matching", 3, tmp_path / "log.txt")
-    assert run_apart(work, ("none",), "Matching", 3, tmp_path / "log.txt") == 7
+        run_in_child(work, ("out of memory",), "Matching", 3, tmp_path / "log.txt")
+    assert run_in_child(work, ("none",), "Matching", 3, tmp_path / "log.txt") == 7
 
 
 PARENT = """
 import sys
 from pathlib import Path
 from framework.cli.common import run_command
-from framework.tools.processing.worker import run_apart
+from framework.tools.processing.worker import run_in_child
 from tests.faults.test_worker import endless
 
 if __name__ == "__main__":
-    run_command(lambda _: run_apart(endless, (sys.argv[1],), "Matching", 3, None))
+    run_command(lambda _: run_in_child(endless, (sys.argv[1],), "Matching", 3, None))
 """
 
 

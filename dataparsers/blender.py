@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dataparsers.reading import file_name, read_json, read_pose, read_times, shown
 from framework import Cameras, DataError, DataParser, ParsedScene
-from framework.data.dataset import Split, existing, image_size
+from framework.data.dataset import Split, existing_files, image_size
 
 TRANSFORMS = "transforms_train.json"
 """File by which the format is recognised."""
@@ -54,7 +54,7 @@ class Blender(DataParser):
         labels = [f"{file}: frame {index}" for index in range(len(frames))]
         paths = [_image_path(path, frame, label) for frame, label in zip(frames, labels, strict=True)]
         poses = torch.stack([read_pose(frame, label) for frame, label in zip(frames, labels, strict=True)])
-        keep = existing(paths, split)
+        keep = existing_files(paths, split)
         width, height = image_size([paths[index] for index in keep.tolist()])
         scene = ParsedScene(
             image_paths=tuple(paths),

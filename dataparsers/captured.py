@@ -12,8 +12,8 @@ from torch import Tensor
 
 from framework import Cameras, DataError, DataParser, ParsedScene
 from framework.cameras.cameras import LENSES
-from framework.cameras.poses import Center, Orientation, Placement, held_out, nearest_shown, place
-from framework.data.dataset import Split, existing, image_size
+from framework.cameras.poses import Center, Orientation, Placement, estimate_near, held_out, place
+from framework.data.dataset import Split, existing_files, image_size
 from framework.data.scene import PoseSource
 
 LARGEST_SIDE = 1600
@@ -126,7 +126,7 @@ def captured_scene(flags: Captured, images: PosedImages, split: Split, division:
     """
     _check_flags(flags)
     images, reduction = _choose_files(images, flags.downscale_factor)
-    images = images[existing(images.paths, split)]
+    images = images[existing_files(images.paths, split)]
     names = list(images.names)
     chosen = held_out(names, split, flags.eval_interval) if division is None else division(names)
     if len(chosen) == 0:
@@ -138,7 +138,7 @@ def captured_scene(flags: Captured, images: PosedImages, split: Split, division:
     placement = replace(placement, scale=placement.scale * flags.scale_factor)
     points = None if images.points is None else _placed(images.points, placement)
     cameras = _cameras(images, placement)
-    near = min(nearest_shown(cameras, points), flags.far / 2) if flags.near is None else flags.near
+    near = min(estimate_near(cameras, points), flags.far / 2) if flags.near is None else flags.near
     images = images[chosen]
     _check_masks(images.masks)
     return ParsedScene(
@@ -219,7 +219,7 @@ def _choose_files(images: PosedImages, factor: int | None) -> tuple[PosedImages,
     steps = sorted({*REDUCED, factor or 1})
     available = [step for step in steps if any(_reduced(path, root, step).is_file() for path in paths)]
     if not available:
-        return images, 1  # `existing` reports it
+        return images, 1  # `existing_files` reports it
     if factor is None:
         factor = available[0]
         files = [_reduced(path, root, factor) for path in paths]

@@ -21,14 +21,14 @@ def find_masks(root: Path, names: Sequence[str]) -> tuple[Path | None, ...] | No
     Returns:
         Files in `root`, even if only reduced ones exist; None for an image without mask.
     """
-    existing: set[str] = set()
+    available: set[str] = set()
     for step in REDUCED:
         folder = root if step == 1 else root.with_name(f"{root.name}_{step}")
-        existing |= {file.relative_to(folder).as_posix() for file in folder.rglob("*")}
+        available |= {file.relative_to(folder).as_posix() for file in folder.rglob("*")}
     masks = []
     for name in names:
         candidates = (name, f"{name}.png", PurePath(name).with_suffix(".png").as_posix())
-        masks.append(next((root / candidate for candidate in candidates if candidate in existing), None))
+        masks.append(next((root / candidate for candidate in candidates if candidate in available), None))
     without = [name for name, mask in zip(names, masks, strict=True) if mask is None]
     if len(without) == len(masks):
         return None

@@ -168,8 +168,8 @@ def _sizes(frames: list[dict[str, Any]], content: dict[str, Any], labels: list[s
     """Return width and height (M, 2) int64 that intrinsics refer to: those in the file, else those of the images."""
     stated = [[_side(frame, content, key, label) for key in "wh"] for frame, label in zip(frames, labels, strict=True)]
     if any(None in size for size in stated):
-        found = image_sizes(paths).tolist()
-        stated = [alternative if None in size else size for size, alternative in zip(stated, found, strict=True)]
+        actual = image_sizes(paths).tolist()
+        stated = [alternative if None in size else size for size, alternative in zip(stated, actual, strict=True)]
     return torch.tensor(stated)
 
 
@@ -181,10 +181,10 @@ def _camera_model(file: Path, content: dict[str, Any], frames: list[dict[str, An
     named = {name if isinstance(name, str) else shown(name) for name in given}
     for name in sorted(named - set(CAMERA_MODELS)):
         raise DataError(f"{file}: unknown camera_model '{shown(name)[1:-1]}'. {nearest(name, CAMERA_MODELS)}")
-    found = {CAMERA_MODELS[name] for name in named}
-    if len(found) > 1:
+    models = {CAMERA_MODELS[name] for name in named}
+    if len(models) > 1:
         raise DataError(f"{file} mixes the camera models {' and '.join(sorted(named))}; split it into a file for each")
-    return found.pop()
+    return models.pop()
 
 
 def _intrinsics(
@@ -256,11 +256,11 @@ def _listed(names: list[str], split: Split, lists: dict[str, set[str]]) -> Tenso
     alternative: Split = "test" if split == "val" else "val"
     if split == "train" and split not in lists:
         held = lists.get("val", set()) | lists.get("test", set())
-        wanted = set(names) - held
+        selected = set(names) - held
     else:
-        wanted = lists.get(split, lists.get(alternative, set()))
+        selected = lists.get(split, lists.get(alternative, set()))
     order = _sorted(names)
-    return order[torch.tensor([names[index] in wanted for index in order.tolist()])]
+    return order[torch.tensor([names[index] in selected for index in order.tolist()])]
 
 
 def _fraction(names: list[str], split: Split, fraction: float) -> Tensor:

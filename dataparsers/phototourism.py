@@ -36,28 +36,28 @@ class Phototourism(Captured):
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
-        others = has_transforms(path) or find_models(path)
-        return bool(_tables(path)) and bool(find_models(path, (SPARSE,))) and not others
+        is_other_format = has_transforms(path) or find_models(path)
+        return bool(_tables(path)) and bool(find_models(path, (SPARSE,))) and not is_other_format
 
     def parse(self, path: Path | None, split: Split) -> ParsedScene:
         if path is None:
             raise DataError("the phototourism format needs a folder: --data DIR")
         tables = _tables(path)
         if len(tables) != 1:
-            found = f"there are {', '.join(file.name for file in tables)}" if tables else "there is none"
-            raise DataError(f"{path}: the splits must be listed in one .tsv, but {found}")
+            problem = f"there are {', '.join(file.name for file in tables)}" if tables else "there is none"
+            raise DataError(f"{path}: the splits must be listed in one .tsv, but {problem}")
         splits = read_splits(tables[0])
         model = choose_model(path, self.colmap_path)
         images = read_images(path, model, self.images_path, self.masks_path)
         listed = [index for index, name in enumerate(images.names) if name in splits]
         if not listed:
             raise DataError(f"{tables[0]} lists none of the {len(images.names)} images of {model}")
-        wanted = "train" if split == "train" else "test"
+        group = "train" if split == "train" else "test"
 
         def division(names: list[str]) -> Tensor:
-            chosen = [index for index, name in enumerate(names) if splits[name] == wanted]
+            chosen = [index for index, name in enumerate(names) if splits[name] == group]
             if not chosen:
-                raise DataError(f"{tables[0]}: none of the {len(names)} existing images is of split '{wanted}'")
+                raise DataError(f"{tables[0]}: none of the {len(names)} existing images is of split '{group}'")
             return torch.tensor(chosen)
 
         scene = captured_scene(self, images[torch.tensor(listed)], split, division)

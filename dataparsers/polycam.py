@@ -39,8 +39,8 @@ class Polycam(Captured):
         pairs = [pair for pair in CAMERAS if _is_pair(path, *pair)]
         if not pairs:
             raise DataError(f"{path} has no keyframes/cameras with keyframes/images; export Polycam's raw data")
-        photographs = _posed_images(path / "keyframes", *pairs[0])
-        scene = captured_scene(self, photographs, split)
+        images = _posed_images(path / "keyframes", *pairs[0])
+        scene = captured_scene(self, images, split)
         return replace(from_original(scene, Z_UP), depth_unit=self.depth_unit_scale_factor)
 
 

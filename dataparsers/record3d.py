@@ -12,7 +12,7 @@ from torch import Tensor
 from dataparsers.captured import Captured, PosedImages, captured_scene, has_transforms
 from dataparsers.reading import numbers, read_json, side
 from framework import DataError, ParsedScene
-from framework.data.dataset import Split, existing
+from framework.data.dataset import Split, existing_files
 from framework.data.scene import PoseSource
 from framework.kernels.math import cross_matrix
 
@@ -47,7 +47,7 @@ class Record3D(Captured):
         content = read_json(file)
         poses = _poses(content, file)
         paths = [_image(folder / "rgb", index) for index in range(len(poses))]
-        keep = _evenly_spaced(existing(paths, split), self.max_images)
+        keep = _evenly_spaced(existing_files(paths, split), self.max_images)
         width, height = (side(content.get(key), key, str(file)) for key in "wh")
         images = PosedImages(
             folder=folder,

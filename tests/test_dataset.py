@@ -13,7 +13,7 @@ from PIL import Image
 
 from dataparsers.blender import Blender
 from framework.base.errors import DataError
-from framework.data.dataset import assemble, existing, image_size, load_dataset, read_image
+from framework.data.dataset import assemble, existing_files, image_size, load_dataset, read_image
 from framework.data.decoding import from_arrays
 from framework.data.masks import read_mask
 from framework.data.pixels import background_colors, composite
@@ -162,12 +162,12 @@ def test_missing_files_are_counted_once_and_all_missing_is_an_error(
 ) -> None:
     paths = [tmp_path / f"{index}.png" for index in range(4)]
     paths[1].touch()
-    assert existing(paths, "val").tolist() == [1]
+    assert existing_files(paths, "val").tolist() == [1]
     said = capsys.readouterr().err
     assert said.count("split 'val': 3 of 4 images are missing and skipped") == 1
     assert str(paths[0]) in said
     with pytest.raises(DataError, match="split 'test' has no image: none of the 1 files listed in the data exists"):
-        existing(paths[:1], "test")
+        existing_files(paths[:1], "test")
 
 
 def test_moving_a_set_to_a_device_keeps_everything(shared_tiny: Path) -> None:

@@ -37,7 +37,6 @@ NOT_YET: tuple[str, ...] = (
     "framework/ray_model.py",
     "framework/rendering",
     "framework/samplers",
-    "framework/tools/__init__.py",
     "framework/tools/benchmarks",
     "framework/tools/stress",
     "framework/tools/testing",

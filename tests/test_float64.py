@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from framework.base.device import exact
+from framework.base.device import to_float64
 from framework.kernels import native
 from framework.kernels.adam import sparse_adam_reference
 from tests.training.helpers import TINY, tiny_trainer
@@ -38,7 +38,7 @@ class Watched(TorchDispatchMode):
 def taken_away(values: Tensor) -> Tensor:
     """`exact`, unwatched."""
     with torch.utils._python_dispatch._disable_current_modes():
-        return exact(values)
+        return to_float64(values)
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Torch alone, as on a device that the kernels do not know."""
     monkeypatch.setattr(native, "available", lambda: False)
     for name in ("framework.data.error_map", "framework.evaluation.metrics"):
-        monkeypatch.setattr(importlib.import_module(name), "exact", taken_away)
+        monkeypatch.setattr(importlib.import_module(name), "to_float64", taken_away)
 
 
 def test_the_watch_sees_float64() -> None:
@@ -71,10 +71,10 @@ def test_a_step_of_each_method(kind: str, shared_tiny: Path, tmp_path: Path) -> 
 
 def test_exact_leaves_a_processors_values_where_they_are() -> None:
     values = torch.rand(3)
-    assert exact(values).dtype is torch.float64
-    assert torch.equal(exact(values).float(), values)
+    assert to_float64(values).dtype is torch.float64
+    assert torch.equal(to_float64(values).float(), values)
     moved = Elsewhere()
-    assert exact(moved) is moved  # type: ignore[arg-type, comparison-overlap]
+    assert to_float64(moved) is moved  # type: ignore[arg-type, comparison-overlap]
     assert moved.asked == ["cpu", "double"]
 
 

@@ -217,7 +217,7 @@ def _lines(pose: _Pose, origins: Tensor, directions: Tensor) -> tuple[Tensor, Te
 def _first_hits(poses: list[_Pose], origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
     """Return depth (R,) and index of the part (R,) for origins (3, 1 or R) and directions (3, R)."""
     depth = torch.full_like(directions[0], math.inf)
-    which = torch.full_like(depth, -1, dtype=torch.int64)
+    part_index = torch.full_like(depth, -1, dtype=torch.int64)
     for index, (part, pose) in enumerate(zip(PARTS.values(), poses, strict=True)):
         offset, nearest = _lines(pose, origins, directions)
         near = ((dot(offset, offset) < part.shape.bound**2) & (nearest > -part.shape.bound)).nonzero()[:, 0]
@@ -226,8 +226,8 @@ def _first_hits(poses: list[_Pose], origins: Tensor, directions: Tensor) -> tupl
         entry = part.shape.enter(offset, direction, -nearest) + nearest
         better = entry < depth[near]
         depth[near] = torch.where(better, entry, depth[near])
-        which[near] = torch.where(better, index, which[near])
-    return depth, which
+        part_index[near] = torch.where(better, index, part_index[near])
+    return depth, part_index
 
 
 def _distance(poses: list[_Pose], p: Tensor) -> Tensor:
@@ -267,11 +267,11 @@ def _surroundings(d: Tensor) -> Tensor:
     return light + 2.2 * lamp
 
 
-def _shade(poses: list[_Pose], p: Tensor, normal: Tensor, view: Tensor, which: Tensor) -> Tensor:
+def _shade(poses: list[_Pose], p: Tensor, normal: Tensor, view: Tensor, part_index: Tensor) -> Tensor:
     """Return display colours (3, R) of surface points (3, R) seen along unit `view` directions (3, R)."""
     albedo, gloss = torch.zeros_like(p), torch.zeros_like(p[0])
     for index, (part, pose) in enumerate(zip(PARTS.values(), poses, strict=True)):
-        selected = (which == index).nonzero()[:, 0]
+        selected = (part_index == index).nonzero()[:, 0]
         local = pose.pick(selected)
         albedo[:, selected] = part.texture(local.to_local(p[:, selected] - local.centre))
         gloss[selected] = part.gloss
@@ -308,11 +308,11 @@ def trace_rows(origins: Tensor, directions: Tensor, time: float | Tensor, colour
         As `trace`, but normals and rgb as (3, R).
     """
     poses = _poses(time, directions)
-    depth, which = _first_hits(poses, origins, directions)
+    depth, part_index = _first_hits(poses, origins, directions)
     normals, rgb = torch.zeros_like(directions), torch.zeros_like(directions)
-    rays = (which >= 0).nonzero()[:, 0]
+    rays = (part_index >= 0).nonzero()[:, 0]
     poses = [pose.pick(rays) for pose in poses]
-    view, part = directions[:, rays], which[rays]
+    view, part = directions[:, rays], part_index[rays]
     p = (origins if origins.shape[1] == 1 else origins[:, rays]) + depth[rays] * view
     n = torch.zeros_like(p)
     for index, (solid, pose) in enumerate(zip(PARTS.values(), poses, strict=True)):
@@ -322,7 +322,7 @@ def trace_rows(origins: Tensor, directions: Tensor, time: float | Tensor, colour
     normals[:, rays] = n
     if colour:
         rgb[:, rays] = _shade(poses, p, n, view, part)
-    return Hit(depth, normals, rgb, which >= 0, which)
+    return Hit(depth, normals, rgb, part_index >= 0, part_index)
 
 
 @torch.no_grad()

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 
-def unfolded_size(file: Path | BinaryIO) -> int:
+def uncompressed_size(file: Path | BinaryIO) -> int:
     """Return the uncompressed size in bytes of all entries of a zip file, as its directory states it.
 
     Args:

@@ -29,12 +29,12 @@ def checked(kind: type[T], values: Any) -> T:
         raise ValueError(str(error)) from error
     for name, hint in typing.get_type_hints(kind).items():
         value = getattr(instance, name)
-        if not is_of(value, hint):
+        if not is_instance_of(value, hint):
             raise ValueError(f"{kind.__name__}.{name} is {shown(value)}; it must be {shown(hint)}")
     return instance
 
 
-def is_of(value: Any, hint: Any) -> bool:
+def is_instance_of(value: Any, hint: Any) -> bool:
     """Return whether `value` is of the annotated type `hint`.
 
     Args:
@@ -43,12 +43,12 @@ def is_of(value: Any, hint: Any) -> bool:
     """
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (Union, types.UnionType):
-        return any(is_of(value, argument) for argument in arguments)
+        return any(is_instance_of(value, argument) for argument in arguments)
     if origin is Literal:
         return any(type(value) is type(argument) and value == argument for argument in arguments)
     if origin is tuple:
         inner = arguments[:1] * len(value) if arguments[-1] is Ellipsis and isinstance(value, tuple) else arguments
-        return isinstance(value, tuple) and len(value) == len(inner) and all(map(is_of, value, inner))
+        return isinstance(value, tuple) and len(value) == len(inner) and all(map(is_instance_of, value, inner))
     if hint in (int, float):
         return isinstance(value, (int, float) if hint is float else int) and not isinstance(value, bool)
     return isinstance(value, hint)

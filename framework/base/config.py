@@ -252,12 +252,12 @@ def from_plain(default: T, values: dict[str, Any], where: str) -> T:
         ConfigError: for an unknown key, with the nearest valid one, or a value of the wrong type.
     """
     hints = typing.get_type_hints(type(default))
-    known = {f.name for f in dataclasses.fields(default)}  # type: ignore[arg-type]
+    names = {f.name for f in dataclasses.fields(default)}  # type: ignore[arg-type]
     changes = {}
     for key, value in values.items():
-        if key not in known:
+        if key not in names:
             name = key if isinstance(key, str) else shown(key)
-            raise ConfigError(f"{where}: unknown key {shown(name)}. {nearest(name, known)}")
+            raise ConfigError(f"{where}: unknown key {shown(name)}. {nearest(name, names)}")
         current = getattr(default, key)
         if dataclasses.is_dataclass(current) and isinstance(value, dict):
             changes[key] = from_plain(current, value, f"{where}: {key}")

@@ -43,16 +43,16 @@ def has_bfloat16(device: torch.device) -> bool:
     """Return whether `device` multiplies bfloat16 matrices in hardware."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported()
-    return device.type == "cpu" and bool({"amx_bf16", "avx512_bf16"} & processor_features())
+    return device.type == "cpu" and bool({"amx_bf16", "avx512_bf16"} & cpu_features())
 
 
-def exact(values: Tensor) -> Tensor:
+def to_float64(values: Tensor) -> Tensor:
     """Return `values` in float64: on the CPU if their device is MPS, which lacks float64, else on their own device."""
     return (values.cpu() if values.device.type == "mps" else values).double()
 
 
 @cache
-def processor_features() -> frozenset[str]:
+def cpu_features() -> frozenset[str]:
     """Return the CPU's instruction sets by Linux's names; elsewhere, AVX2 and AVX-512 if PyTorch detects them."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()

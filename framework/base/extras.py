@@ -13,7 +13,7 @@ EXTRAS: dict[str, dict[str, str]] = {
 """Extra of pyproject.toml -> {module that is imported: name of its package for pip}."""
 
 
-def missing(extra: str) -> str | None:
+def install_command(extra: str) -> str | None:
     """Return the command that installs the missing packages of an extra.
 
     Args:
@@ -26,7 +26,7 @@ def missing(extra: str) -> str | None:
     return f"pip install {' '.join(absent)}" if absent else None
 
 
-def reinstall() -> str:
+def reinstall_command() -> str:
     """Return the command that reinstalls this package and builds its kernels."""
     root = Path(__file__).resolve().parents[2]
     return f"pip install -e {root}" if (root / "setup.py").is_file() else "pip install --force-reinstall nerfloom"

@@ -133,7 +133,7 @@ def _principal_axes(points: Tensor, up: Tensor) -> Tensor:
     return axes
 
 
-def nearest_shown(cameras: Cameras, points: Tensor | None) -> float:
+def estimate_near(cameras: Cameras, points: Tensor | None) -> float:
     """Return a distance in scene units before which no image shows anything, estimated from sparse points.
 
     Few images constrain the space right in front of the cameras: for a can in 62 images, the PSNR of held-out images

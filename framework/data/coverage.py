@@ -91,9 +91,9 @@ def _may_lack_rays(cameras: Cameras, index: int) -> bool:
     width, height = cameras.widths[index : index + 1], cameras.heights[index : index + 1]
     columns, rows = torch.stack([0 * width, width - 1]).float(), torch.stack([0 * height, height - 1]).float()
     columns, rows = columns.repeat(2, 1)[:, 0], rows.repeat_interleave(2, 0)[:, 0]
-    x, y, seen = cameras.look(torch.full((4,), index, device=width.device), columns, rows)
+    x, y, rays = cameras.look(torch.full((4,), index, device=width.device), columns, rows)
     if cameras.distortion is None:
-        return not bool(seen.valid.all())
+        return not bool(rays.valid.all())
     return not bool((torch.hypot(x, y) < SURE * cameras.distortion.bounds[index, 0]).all())
 
 

@@ -207,7 +207,7 @@ class Dataset:
         )
 
 
-def existing(paths: Sequence[Path], split: str) -> Tensor:
+def existing_files(paths: Sequence[Path], split: str) -> Tensor:
     """Return the indices of files that exist, and report the number of missing ones and the first.
 
     Args:

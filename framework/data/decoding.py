@@ -199,8 +199,8 @@ def _kept_runs(files: ImageFiles, left: dict[int, _Image], total: int) -> dict[s
     starts, lengths, first = [], [], 0
     for index, image in left.items():
         count = files.sizes[index][0] * files.sizes[index][1]
-        whole = PixelSet.of_runs(torch.tensor([0]), torch.tensor([count]))
-        kept = whole if image.kept is None else image.kept
+        all_pixels = PixelSet.of_runs(torch.tensor([0]), torch.tensor([count]))
+        kept = all_pixels if image.kept is None else image.kept
         starts.append(kept.starts + first)
         lengths.append(kept.before.diff())
         first += count

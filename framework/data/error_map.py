@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.base.device import exact
+from framework.base.device import to_float64
 from framework.data.dataset import Dataset
 
 TILE = 8
@@ -62,7 +62,7 @@ class ErrorMap:
         """
         errors = self.errors[self.squares(candidates)]
         share = EVENLY + (1 - EVENLY) * errors / errors.mean().clamp(min=1e-12)
-        ends = exact(share).cumsum(0) * (count / len(candidates))
+        ends = to_float64(share).cumsum(0) * (count / len(candidates))
         positions = torch.arange(count, device=ends.device) + torch.rand_like(ends[0])
         selected = torch.searchsorted(ends, positions, right=True).clamp(max=len(candidates) - 1).to(share.device)
         return selected, 1 / share[selected]

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from framework.base.archives import unfolded_size
+from framework.base.archives import uncompressed_size
 from framework.base.device import machine_memory
 from framework.base.errors import DataError
 from framework.base.user_cache import cache_folder
@@ -87,7 +87,7 @@ def unpack(path: Path) -> dict[str, np.ndarray] | None:
                 return None
             file.seek(size - length)
             packed = file.read(length)
-        if unfolded_size(io.BytesIO(packed)) > length:  # `pack` does not compress
+        if uncompressed_size(io.BytesIO(packed)) > length:  # `pack` does not compress
             return None
         with np.load(io.BytesIO(packed), allow_pickle=False) as content:
             facts = {name: content[name] for name in content.files}

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from framework.base.device import exact
-from framework.base.extras import missing
+from framework.base.device import to_float64
+from framework.base.extras import install_command
 
 MAX_PSNR = 100.0
 """dB. Identical images would have infinity, which JSON cannot hold."""
@@ -19,7 +19,7 @@ MAX_PSNR = 100.0
 
 def psnr(prediction: Tensor, target: Tensor) -> float:
     """Peak signal-to-noise ratio in dB for a peak of 1; 100 for identical images."""
-    error = (exact(prediction) - exact(target)).square().mean().clamp(min=10 ** (-MAX_PSNR / 10))
+    error = (to_float64(prediction) - to_float64(target)).square().mean().clamp(min=10 ** (-MAX_PSNR / 10))
     return float(-10 * error.log10())
 
 
@@ -32,8 +32,8 @@ def ssim(prediction: Tensor, target: Tensor) -> float:
     """
     if min(prediction.shape[:2]) < 11:
         raise ValueError(f"SSIM needs at least 11x11 pixels, not {prediction.shape[1]}x{prediction.shape[0]}")
-    prediction, target = exact(prediction), exact(target)
-    offsets = exact(torch.arange(-5, 6, device=prediction.device))
+    prediction, target = to_float64(prediction), to_float64(target)
+    offsets = to_float64(torch.arange(-5, 6, device=prediction.device))
     line = torch.exp(-(offsets**2) / (2 * 1.5**2))
     line = line / line.sum()
 
@@ -54,7 +54,7 @@ def load_lpips() -> tuple[Callable[[Tensor, Tensor], float] | None, str]:
 
     Returns: the metric, or None; and a line that says which, and why.
     """
-    if (advice := missing("lpips")) is not None:
+    if (advice := install_command("lpips")) is not None:
         return None, f"absent: {advice}"
     weights = Path(torch.hub.get_dir()) / "checkpoints"
     if not list(weights.glob("alexnet-*.pth")):

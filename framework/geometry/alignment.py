@@ -100,14 +100,14 @@ def pose_errors(estimated: Tensor, given: Tensor) -> PoseErrors:
     Raises:
         DataError: if there are fewer than three cameras, or their centres lie on a line.
     """
-    found, truth = estimated[:, :3].double(), given[:, :3].double()
-    scale, rotation, translation = align(found[:, :, 3], truth[:, :, 3])
-    centres = scale * (found[:, :, 3] @ rotation.T) + translation
-    extent = torch.cdist(truth[:, :, 3], truth[:, :, 3]).max()
-    rotated = (rotation @ found[:, :, :3]).transpose(1, 2) @ truth[:, :, :3]
+    source, target = estimated[:, :3].double(), given[:, :3].double()
+    scale, rotation, translation = align(source[:, :, 3], target[:, :, 3])
+    centres = scale * (source[:, :, 3] @ rotation.T) + translation
+    extent = torch.cdist(target[:, :, 3], target[:, :, 3]).max()
+    rotated = (rotation @ source[:, :, :3]).transpose(1, 2) @ target[:, :, :3]
     # The angle is computed from sine and cosine; small angles cannot be recovered from the rounded cosine alone.
     skew = rotated - rotated.transpose(1, 2)
     sine = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], dim=-1).norm(dim=-1) / 2
     cosine = (rotated.diagonal(dim1=1, dim2=2).sum(-1) - 1) / 2
     angles = torch.rad2deg(torch.atan2(sine, cosine))
-    return PoseErrors(angles, (centres - truth[:, :, 3]).norm(dim=-1) / extent)
+    return PoseErrors(angles, (centres - target[:, :, 3]).norm(dim=-1) / extent)

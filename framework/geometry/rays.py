@@ -163,7 +163,7 @@ class Samples:
         return torch.repeat_interleave(rays, self.counts, output_size=len(self))
 
     @cached_property
-    def places(self) -> Tensor:
+    def ranks(self) -> Tensor:
         """(N,) number of samples in front of each sample on its ray."""
         return torch.arange(len(self), device=self.offsets.device) - self.offsets[:-1][self.ray_indices]
 

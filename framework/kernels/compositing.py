@@ -65,7 +65,7 @@ def exclusive_sum(values: Tensor, samples: Samples) -> Tensor:
     """(N,) sum of `values` (N,) over the samples in front on the same ray."""
     if samples.per_ray is not None:
         return exclusive_cumsum(samples.padded(values)).reshape(-1)
-    return segmented_sum(values, samples.places)
+    return segmented_sum(values, samples.ranks)
 
 
 def ray_sum(values: Tensor, samples: Samples) -> Tensor:
@@ -208,7 +208,7 @@ def distortion_reference(weights: Tensor, samples: Samples) -> Tensor:
     # m_i - m_j is the sum of the gaps between neighbouring middles from j to i: each counts for all weight in front.
     # No term is negative, so nothing cancels, wherever the weights lie and however close together.
     starts, ends = samples.t_starts, samples.t_ends
-    gaps = ((starts - starts.roll(1)) + (ends - ends.roll(1))).masked_fill(samples.places == 0, 0) / 2
+    gaps = ((starts - starts.roll(1)) + (ends - ends.roll(1))).masked_fill(samples.ranks == 0, 0) / 2
     steps = gaps * exclusive_sum(weights, samples)
     apart = exclusive_sum(steps, samples) + steps
     return ray_sum(weights * (2 * apart + weights * samples.deltas / 3), samples)

@@ -25,9 +25,9 @@ import torch
 from torch import Tensor
 
 from framework.base.console import say
-from framework.base.device import processor_features
+from framework.base.device import cpu_features
 from framework.base.errors import ConfigError
-from framework.base.extras import reinstall
+from framework.base.extras import reinstall_command
 
 FOLDER = Path(os.environ.get("NERFLOOM_KERNEL_FOLDER") or Path(__file__).parent / "lib")
 _AVX512 = ("avx512f", "avx512bw", "avx512dq", "avx512vl", "fma")
@@ -69,7 +69,7 @@ def _load() -> tuple[str, ctypes.CDLL | None]:
     if asked == "reference":
         return "reference", None
     if asked == "auto":
-        fitting = [name for name, needs in NEEDS.items() if processor_features().issuperset(needs)]
+        fitting = [name for name, needs in NEEDS.items() if cpu_features().issuperset(needs)]
     elif asked in NEEDS:
         fitting = [asked]
     else:
@@ -86,7 +86,7 @@ def _load() -> tuple[str, ctypes.CDLL | None]:
         raise ConfigError(f"NERFLOOM_KERNELS asks for '{asked}', but {FOLDER / asked}{SUFFIX} does not load: {problem}")
     say(
         f"note: without its compiled kernels ({problem}) nerfloom trains more than ten times slower on this processor; "
-        f"install a C++ compiler ({_compiler_hint()}), then: {reinstall()}"
+        f"install a C++ compiler ({_compiler_hint()}), then: {reinstall_command()}"
     )
     return "reference", None
 

@@ -1,1 +1,1 @@
-"""What is done around training: processing, comparing, measuring, testing."""
+"""Tools around training: processing, comparison, benchmarks, stress, checks, integrations."""

@@ -20,7 +20,7 @@ from typing import Any, BinaryIO
 import torch
 from torch.torch_version import TorchVersion
 
-from framework.base.archives import unfolded_size
+from framework.base.archives import uncompressed_size
 from framework.base.console import say
 from framework.base.errors import CheckpointError
 
@@ -121,7 +121,7 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
         _warn_of(torch.__version__)
     try:
         sealed = _is_sealed(path)
-        if unfolded_size(path) > path.stat().st_size:  # torch compresses nothing, but would unfold what is
+        if uncompressed_size(path) > path.stat().st_size:  # torch compresses nothing, but would unfold what is
             raise CheckpointError(f"{path} is damaged: it would unfold to more than it holds")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torch's doubts about foreign pickles; they are refused below

@@ -13,7 +13,7 @@ from dataparsers.colmap_model import read_model
 from dataparsers.llff import Llff
 from framework.base.errors import DataError
 from framework.cameras.cameras import Cameras
-from framework.cameras.poses import NEAR, nearest_shown
+from framework.cameras.poses import NEAR, estimate_near
 from framework.data.dataset import load_dataset
 from tests.dataparsers.sparse_models import Capture, make_capture, misses, write_colmap, write_images
 
@@ -284,6 +284,6 @@ def test_rays_start_well_before_the_nearest_points() -> None:
     draws = torch.Generator().manual_seed(0)
     wall = torch.cat([2 * torch.rand(999, 2, generator=draws) - 1, torch.full((999, 1), -4.0)], dim=-1)
     points = torch.cat([wall, torch.tensor([[0.0, 0.0, -0.01]])])
-    assert nearest_shown(cameras, points) == pytest.approx(2.0, rel=0.05)
-    assert nearest_shown(cameras, points + torch.tensor([0.0, 0.0, 50.0])) == NEAR  # all of them are behind
-    assert nearest_shown(cameras, None) == nearest_shown(cameras, points[:0]) == NEAR
+    assert estimate_near(cameras, points) == pytest.approx(2.0, rel=0.05)
+    assert estimate_near(cameras, points + torch.tensor([0.0, 0.0, 50.0])) == NEAR  # all of them are behind
+    assert estimate_near(cameras, None) == estimate_near(cameras, points[:0]) == NEAR

@@ -75,7 +75,7 @@ def test_a_function_that_is_not_there() -> None:
 @needs_kernels
 @pytest.mark.parametrize("variant", [name for name, needs in native.NEEDS.items()])
 def test_every_variant_that_fits_this_processor_gives_the_same_answer(variant: str) -> None:
-    if not native.processor_features().issuperset(native.NEEDS[variant]):
+    if not native.cpu_features().issuperset(native.NEEDS[variant]):
         pytest.skip(f"this processor has no {variant}")
     code = (
         "import torch\n"

@@ -12,7 +12,7 @@ from unittest import mock
 
 from setuptools import Extension
 
-from framework.base.device import processor_features
+from framework.base.device import cpu_features
 from framework.kernels.native import NEEDS, SUFFIX
 
 ROOT = Path(__file__).parents[2]
@@ -54,7 +54,7 @@ def build() -> Sanitized:
     Raises: Missing without compiler or runtime; CalledProcessError where it does not compile.
     """
     preloaded = runtime()
-    variant = next(name for name, needs in NEEDS.items() if processor_features().issuperset(needs))
+    variant = next(name for name, needs in NEEDS.items() if cpu_features().issuperset(needs))
     extension = next(e for e in _extensions() if e.name.rsplit(".", 1)[-1] == variant)
     FOLDER.mkdir(parents=True, exist_ok=True)
     objects = {source: FOLDER / f"{Path(source).stem}.o" for source in extension.sources}

@@ -10,7 +10,7 @@ import torch
 
 from dataparsers.nerfstudio import Nerfstudio
 from framework import Cameras, ParsedScene
-from framework.cameras.poses import nearest_shown
+from framework.cameras.poses import estimate_near
 from framework.data.dataset import Dataset, Split, load_dataset
 from framework.data.depths import read_depth
 from framework.geometry.rays import Rays
@@ -144,7 +144,7 @@ def test_points_behind_a_camera_do_not_say_where_its_rays_begin() -> None:
     numbers = torch.full((1,), 50.0)
     camera = Cameras(torch.eye(4)[None, :3], numbers, numbers, numbers / 2, numbers / 2, numbers.long(), numbers.long())
     ahead, behind = torch.tensor([[0.0, 0.0, -4.0]]).repeat(9, 1), torch.tensor([[0.0, 0.0, 0.1]]).repeat(9, 1)
-    assert nearest_shown(camera, torch.cat([ahead, behind])) == pytest.approx(0.5 * 4)
+    assert estimate_near(camera, torch.cat([ahead, behind])) == pytest.approx(0.5 * 4)
 
 
 def test_what_goes_with_a_photograph_goes_with_it_where_others_are_missing(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from torch import Tensor
 from framework.base.errors import DataError
 from framework.cameras.cameras import Cameras, check_pose, join_cameras
 from framework.cameras.colmap import PARAMETERS, from_colmap
-from framework.cameras.poses import NEAR, Placement, nearest_point, nearest_shown, place
+from framework.cameras.poses import NEAR, Placement, estimate_near, nearest_point, place
 from framework.data.dataset import Dataset, Masks, ParsedScene, assemble
 from framework.data.decoding import Decoded, from_arrays
 from framework.data.masks import THRESHOLD
@@ -204,7 +204,7 @@ def _unbounded_frame(images: ArrayImages) -> Frame:
     frame = Frame(placement, cube, NEAR, FAR, unbounded=True)
     if images.points is not None:
         points = _in_float64(placement).points(images.points).float()
-        near = nearest_shown(frame.placed(images.cameras), points)
+        near = estimate_near(frame.placed(images.cameras), points)
     elif images.bounds is not None:
         near = BOUND_SHARE * images.bounds[0] * placement.scale
     else:

@@ -68,16 +68,16 @@ def find_images(folder: Path, leave_out: Iterable[Path] = ()) -> list[Path]:
     if not folder.is_dir():
         raise DataError(f"--data {folder}: there is no such folder")
     ignored = [path.resolve() for path in leave_out if not folder.resolve().is_relative_to(path.resolve())]
-    found = []
+    paths = []
     for path in folder.rglob("*"):
         relative = path.relative_to(folder)
         if path.suffix.lower() not in IMAGE_SUFFIXES or any(part.startswith(".") for part in relative.parts):
             continue
         if path.is_file() and not any(path.resolve().is_relative_to(entry) for entry in ignored):
-            found.append(relative)
-    if not found:
+            paths.append(relative)
+    if not paths:
         raise DataError(f"--data {folder} has no image (looked for {', '.join(IMAGE_SUFFIXES)})")
-    return sorted(found, key=natural_order)
+    return sorted(paths, key=natural_order)
 
 
 def natural_order(path: Path) -> list[tuple[int, int, str]]:
@@ -227,7 +227,7 @@ def write_masks(folder: Path, prepared: list[PreparedImage], masks: Path, crop: 
     Raises:
         DataError: if no mask is found, or one differs in size from its image.
     """
-    found = {}
+    mask_names = {}
     for entry in prepared:
         source = PurePosixPath(entry.source)
         candidates = [source, source.with_suffix(".png"), source.with_suffix(".PNG"), PurePosixPath(f"{source}.png")]
@@ -249,12 +249,12 @@ def write_masks(folder: Path, prepared: list[PreparedImage], masks: Path, crop: 
         target = masks / f"{entry.name}.png"
         target.parent.mkdir(parents=True, exist_ok=True)
         mask.save(target)
-        found[entry.name] = f"{entry.name}.png"
-    if not found:
+        mask_names[entry.name] = f"{entry.name}.png"
+    if not mask_names:
         raise DataError(f"--masks-dir {folder} has no mask; the first expected is {candidates[1] if prepared else ''}")
-    if len(found) < len(prepared):
-        say(f"{len(prepared) - len(found)} of {len(prepared)} images have no mask")
-    return found
+    if len(mask_names) < len(prepared):
+        say(f"{len(prepared) - len(mask_names)} of {len(prepared)} images have no mask")
+    return mask_names
 
 
 def in_parallel(work: Callable[[T], R], items: Iterable[T], title: str, total: int) -> list[R]:

@@ -11,7 +11,7 @@ from PIL import Image
 
 from framework.base.console import say, track
 from framework.base.errors import DataError
-from framework.base.extras import missing
+from framework.base.extras import install_command
 from framework.tools.processing.images import save
 
 
@@ -51,7 +51,7 @@ def open_video(path: Path) -> tuple[int, Iterator[np.ndarray]]:
     """
     if not path.is_file():
         raise DataError(f"--data {path}: there is no such file")
-    if (advice := missing("video")) is not None:
+    if (advice := install_command("video")) is not None:
         raise DataError(f"reading a video needs ffmpeg: {advice}")
     import imageio.v3 as iio
 

@@ -8,8 +8,8 @@ BUGS = (
         "nerfstudio-train-takes-all",
         "splits",
         "dataparsers/nerfstudio.py",
-        "wanted = set(names) - held",
-        "wanted = set(names)",
+        "selected = set(names) - held",
+        "selected = set(names)",
         "of a file that only lists what is held out, those photographs are learnt from too",
     ),
     Bug(
@@ -64,8 +64,8 @@ BUGS = (
         "phototourism-test-as-train",
         "splits",
         "dataparsers/phototourism.py",
-        'wanted = "train" if split == "train" else "test"',
-        'wanted = "train" if split != "test" else "test"',
+        'group = "train" if split == "train" else "test"',
+        'group = "train" if split != "test" else "test"',
         "the validation views of a collection are photographs that are learnt from",
     ),
     Bug(

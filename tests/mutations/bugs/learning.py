@@ -351,7 +351,7 @@ BUGS = (
         "unknown-key-ignored",
         "config",
         "framework/base/config.py",
-        '            raise ConfigError(f"{where}: unknown key {shown(name)}. {nearest(name, known)}")',
+        '            raise ConfigError(f"{where}: unknown key {shown(name)}. {nearest(name, names)}")',
         "            continue",
         "a misspelt key of a recipe is passed over in silence",
     ),

@@ -36,7 +36,8 @@ class _Value(NamedTuple):
 
     @classmethod
     def of(cls, tensor: Tensor) -> _Value:
-        return cls(tensor.detach(), tensor._version)  # shares memory and version, and holds no graph
+        # Shares memory and version, and holds no graph. Most have none: a detach each would be felt in a short step.
+        return cls(tensor.detach() if tensor.requires_grad else tensor, tensor._version)
 
     @property
     def unchanged(self) -> bool:
@@ -79,7 +80,7 @@ class _Tape:
     def result(self, key: Key, rows: Sequence[Tensor], parameters: Sequence[Tensor], compute: Compute) -> Tensor:
         """Compute it, and note it."""
         out = compute()
-        if len(out) == self.count > 0:
+        if out.shape[0] == self.count > 0:
             sources = _sources(rows, [call.result for call in self.calls])
             inputs = tuple(_Value.of(row) for row, source in zip(rows, sources, strict=True) if source is None)
             values = tuple(_Value.of(parameter) for parameter in parameters)
@@ -100,7 +101,7 @@ class _Replay:
 
     def result(self, key: Key, rows: Sequence[Tensor], parameters: Sequence[Tensor], compute: Compute) -> Tensor:
         """The rows of the next call on the tapes that this one repeats; computed where there is none."""
-        if len(rows[0]) == len(self.order) > 0:
+        if rows[0].shape[0] == self.order.shape[0] > 0:
             sources = _sources(rows, self.taken)
             for number in range(self.next, len(self.calls)):
                 waves = self.calls[number]

@@ -64,7 +64,7 @@ GATHER_ROWS = Operation("gather_rows", gather_rows_reference)
 @GATHER_ROWS.implementation(CPP, types=INT64)
 def _compiled(columns: Sequence[Sequence[Tensor]], order: Tensor) -> list[Tensor]:
     first = columns[0]
-    ends = tuple(accumulate(len(part) for part in first))
+    ends = tuple(accumulate(part.shape[0] for part in first))
     kept = [part.contiguous() for parts in columns for part in parts]
     shapes = [(end - start, *parts[0].shape[1:]) for parts in columns for start, end in zip((0, *ends), ends)]  # noqa: B905
     out = [parts[0].new_empty(len(order), *parts[0].shape[1:]) for parts in columns]

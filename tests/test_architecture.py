@@ -137,6 +137,7 @@ LAYERS = (
     ("fields",),
     ("samplers",),
     ("rendering",),
+    ("splats",),
     ("model",),
     ("ray_model",),
     ("method",),

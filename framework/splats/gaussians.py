@@ -1,0 +1,67 @@
+"""Gaussians in space: the parameters of a splatted scene, as they are optimised and as files hold them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+MAX_DEGREE = 3
+"""Highest degree of the spherical harmonics that colours are made of."""
+DC = 0.28209479177387814
+"""The harmonic of degree 0: the colour that a Gaussian has from everywhere is 0.5 + DC * colors."""
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N Gaussians of 3D Gaussian Splatting (Kerbl et al. 2023), before their activations."""
+
+    means: Tensor
+    """(N, 3) centres, scene coordinates."""
+    log_scales: Tensor
+    """(N, 3) logarithm of the standard deviation along each axis."""
+    rotations: Tensor
+    """(N, 4) quaternions w, x, y, z from the axes to the scene, of any length but 0."""
+    logits: Tensor
+    """(N,) opacity before the sigmoid."""
+    colors: Tensor
+    """(N, 3) coefficients of the harmonic of degree 0 for red, green and blue."""
+    harmonics: Tensor
+    """(N, 3, K) coefficients of degrees 1 to D for each channel, in the order of `spherical_harmonics`; K is 0, 3, 8
+    or 15."""
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def degree(self) -> int:
+        """Highest degree of the harmonics, 0 to 3."""
+        return {0: 0, 3: 1, 8: 2, 15: 3}[self.harmonics.shape[2]]
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
+        """Return what a function makes of every tensor.
+
+        Args:
+            function: is applied to each of the six.
+        """
+        return Gaussians(**{field.name: function(getattr(self, field.name)) for field in fields(self)})
+
+    def __getitem__(self, index: Tensor | slice) -> Gaussians:
+        """Return the Gaussians selected by a slice, a mask or an index tensor."""
+        return self.map(lambda values: values[index])
+
+    def finite(self) -> Tensor:
+        """Return (N,) whether all parameters of a Gaussian are finite."""
+        return torch.stack([getattr(self, f.name).flatten(1).isfinite().all(1) if getattr(self, f.name).ndim > 1
+                            else getattr(self, f.name).isfinite() for f in fields(self)]).all(0)  # fmt: skip
+
+
+@runtime_checkable
+class HasGaussians(Protocol):
+    """A model that consists of Gaussians."""
+
+    def gaussians(self) -> Gaussians:
+        """Return them, without gradient."""

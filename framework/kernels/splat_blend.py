@@ -1,0 +1,156 @@
+"""Blending of Gaussians on an image, from front to back (Kerbl et al. 2023, equation 3).
+
+    alpha_i = min(opacity_i exp(-u_i^2 - v_i^2), MAX_ALPHA), or 0 where that is below MIN_ALPHA
+    T_i     = prod_{j < i} (1 - alpha_j)               transmittance in front of it
+    image   = sum_i alpha_i T_i value_i + T background
+
+A pixel is done where its transmittance is below OPAQUE: no value can change by more than that share of its range.
+
+The backward pass goes from front to back too. What is behind a Gaussian is what the whole image shows less what has
+been passed, so T need not be divided by 1 - alpha step by step. Each entry of a tile's list has sums of its own, which
+are added up by Gaussian in a fixed order: no two threads write to one place, and the same bits come out on any number
+of them.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from framework.kernels import native
+from framework.kernels.dispatch import CPP, Operation
+from framework.kernels.splat_project import CUT, DISTANCE, OPACITY, RECORD, RGB
+from framework.kernels.splat_tiles import TILE, TileLists
+
+MAX_ALPHA = 0.999
+"""No Gaussian is more opaque: the gradient divides by 1 - alpha."""
+OPAQUE = 1e-4
+"""Transmittance below which a pixel is done."""
+CHANNELS = {"rgb": 3, "distance": 4, "normals": 7}
+"""What an image has: colours; also the sum of weight times distance; also that of the normals."""
+
+
+class Blended(NamedTuple):
+    """What an image shows."""
+
+    image: Tensor
+    """(H, W, C) colours over the background, then distance and normals, if asked for, times the weights."""
+    transmittance: Tensor
+    """(H, W) share of the light that comes from behind everything."""
+    median: Tensor | None
+    """(H, W) distance at which half of the light is gone, 0 where it never is; None if not asked for."""
+
+
+def blend(
+    records: Tensor, lists: TileLists, width: int, height: int, background: Tensor, channels: int = 3, median: bool = False
+) -> Blended:  # fmt: skip
+    """Blend the Gaussians on an image.
+
+    Args:
+        records: (N, RECORD) Gaussians on the image. Its gradient has, in the columns CUT and REACH_X, what nothing
+            depends on: the sums over pixels of the absolute gradients of x and y (AbsGS, Ye et al. 2024), if compiled.
+        lists: which of them each tile shows.
+        width, height: of the image, pixels.
+        background: (3,) colour behind everything; without gradient.
+        channels: a value of `CHANNELS`; with normals there is no gradient.
+        median: whether to find the median distance.
+    """
+    background = background.detach()
+    return BLEND((records, background), records, lists, width, height, background, channels, median)
+
+
+def blend_reference(
+    records: Tensor, lists: TileLists, width: int, height: int, background: Tensor, channels: int, median: bool
+) -> Blended:
+    """Blend in torch, tile by tile, in any float type. Arguments as for `blend`."""
+    columns, rows = -(-width // TILE), -(-height // TILE)
+    device, dtype = records.device, records.dtype
+    behind = torch.cat([background.to(records), records.new_zeros(channels - 3)])
+    starts = lists.offsets.tolist()
+    within = torch.arange(TILE, device=device)
+    offset_y, offset_x = (part.flatten() for part in torch.meshgrid(within, within, indexing="ij"))
+    tiles, left, middles = [], [], []
+    for tile in range(columns * rows):
+        listed = records[lists.ids[starts[tile] : starts[tile + 1]].long()]
+        x = (tile % columns * TILE + offset_x).to(dtype) + 0.5
+        y = (tile // columns * TILE + offset_y).to(dtype) + 0.5
+        dx, dy = x[:, None] - listed[:, 0], y[:, None] - listed[:, 1]
+        q = (listed[:, 2] * dx + listed[:, 3] * dy) ** 2 + (listed[:, 4] * dy) ** 2
+        alpha = (listed[:, OPACITY] * torch.exp(-q)).clamp(max=MAX_ALPHA)
+        alpha = alpha.masked_fill(q >= listed[:, CUT], 0)
+        through = torch.cat([torch.ones_like(alpha[:, :1]), (1 - alpha).cumprod(1)], 1)
+        done = through[:, :-1] < OPAQUE
+        weights = (alpha * through[:, :-1]).masked_fill(done, 0)
+        rest = 1 - weights.sum(1)
+        tiles.append(weights @ listed[:, RGB : RGB + channels] + rest[:, None] * behind)
+        left.append(rest)
+        crossed = (through[:, :-1] > 0.5) & (through[:, 1:] <= 0.5)
+        middles.append((crossed * listed[:, DISTANCE]).sum(1).detach())
+
+    def joined(parts: list[Tensor]) -> Tensor:
+        grid = torch.stack(parts).view(rows, columns, TILE, TILE, -1).permute(0, 2, 1, 3, 4)
+        return grid.reshape(rows * TILE, columns * TILE, -1)[:height, :width]
+
+    return Blended(joined(tiles), joined(left)[..., 0], joined(middles)[..., 0] if median else None)
+
+
+BLEND = Operation("blend", blend_reference)
+_forward = native.Function("splat_blend", "pqppqiiipppppi")
+_backward = native.Function("splat_blend_backward", "pqpppqiiipppppp" + "i")
+_gather = native.Function("splat_gather", "pqpqppi")
+
+
+class _Blend(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, records: Tensor, lists: TileLists, width: int, height: int, background: Tensor, channels: int,
+        median: bool,
+    ) -> tuple[Tensor, Tensor, Tensor | None]:  # fmt: skip
+        image, through = records.new_empty(height, width, channels), records.new_empty(height, width)
+        middle = records.new_empty(height, width) if median else None
+        used = torch.empty(len(lists.offsets) - 1, dtype=torch.int32)
+        _forward(
+            native.pointer(records, "the records", (len(records), RECORD)), len(records), lists.offsets.data_ptr(),
+            lists.ids.data_ptr(), len(lists.ids), width, height, channels,
+            native.pointer(background, "the background", (3,)), image.data_ptr(), through.data_ptr(),
+            None if middle is None else middle.data_ptr(), used.data_ptr(), native.threads(),
+        )  # fmt: skip
+        ctx.save_for_backward(records, *lists, image, through, used)
+        if middle is not None:
+            ctx.mark_non_differentiable(middle)
+        ctx.set_materialize_grads(False)
+        return image, through, middle
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        records, offsets, ids, slots, firsts, image, through, used = ctx.saved_tensors
+        height, width, channels = image.shape
+        of_image = torch.zeros_like(image) if grads[0] is None else grads[0].contiguous()
+        of_through = None if grads[1] is None else grads[1].contiguous()
+        parts, out = records.new_empty(len(ids), RECORD), torch.empty_like(records)
+        _backward(
+            records.data_ptr(), len(records), offsets.data_ptr(), ids.data_ptr(), slots.data_ptr(), len(ids),
+            width, height, channels, image.data_ptr(), through.data_ptr(), used.data_ptr(),
+            native.pointer(of_image, "the image's gradient", tuple(image.shape)),
+            None if of_through is None else native.pointer(of_through, "the transmittance's", tuple(through.shape)),
+            parts.data_ptr(), native.threads(),
+        )  # fmt: skip
+        _gather(records.data_ptr(), len(records), firsts.data_ptr(), len(ids), parts.data_ptr(), out.data_ptr(),
+                native.threads())  # fmt: skip
+        return out, None, None, None, None, None, None
+
+
+def _gradients_there(
+    records: Tensor, lists: TileLists, width: int, height: int, background: Tensor, channels: int, median: bool
+) -> bool:
+    return channels < CHANNELS["normals"] or not (torch.is_grad_enabled() and records.requires_grad)
+
+
+@BLEND.implementation(CPP, fits=_gradients_there)
+def _compiled(
+    records: Tensor, lists: TileLists, width: int, height: int, background: Tensor, channels: int, median: bool
+) -> Blended:
+    return Blended(*_Blend.apply(records.contiguous(), lists, width, height, background.contiguous(), channels, median))

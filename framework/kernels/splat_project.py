@@ -1,0 +1,231 @@
+"""Projection of Gaussians in space to an image: elliptical weighted averaging (EWA, Zwicker et al. 2001).
+
+As in 3D Gaussian Splatting (Kerbl et al. 2023). With W and t from scene to camera (x right, y down, z forward), a
+Gaussian of mean m, axes R and scales s is on the image
+
+    p = W m + t                         its centre in the camera's frame
+    T = J W R diag(s)                   J: the Jacobian of the image position at p
+    covariance = T T^T + blur I         pixels^2
+
+`blur` makes up for a pixel's size: each Gaussian is at least that wide. Where it should not grow brighter by that,
+its opacity is multiplied by sqrt(det(T T^T) / det(covariance)) (Mip-Splatting, Yu et al. 2024, section 4.2).
+
+A lens bends the image: J is then of the bent position, and the lens's own Jacobian counts as constant in gradients.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from framework.geometry.lenses import Distortion, distort
+from framework.kernels import native
+from framework.kernels.dispatch import CPP, Operation
+from framework.kernels.spherical_harmonics import spherical_harmonics_reference
+
+RECORD = 16
+"""Values of a Gaussian on the image."""
+X, U_X, OPACITY, CUT, REACH_X, RGB, DISTANCE, NORMAL, REACH_Y = 0, 2, 5, 6, 7, 8, 11, 12, 15
+"""Columns of a record: centre (x, y) in pixels; u_x, u_y, v_y, which make alpha at an offset (dx, dy) from the centre
+opacity * exp(-(u_x dx + u_y dy)^2 - (v_y dy)^2); opacity; the exponent from which alpha is below MIN_ALPHA; half the
+width of what is within it; colour; distance from the camera; normal; half the height."""
+MIN_ALPHA = 1 / 255
+"""A Gaussian is not drawn where its alpha is below it."""
+DC = 0.28209479177387814
+"""The harmonic of degree 0."""
+MARGIN = 0.15
+"""Beyond the image's edge by this share of its size, J is taken as at that bound: farther out it grows endlessly."""
+DEGREES = {0: 0, 1: 3, 2: 8, 3: 15}
+"""Degree of the harmonics -> how many there are beyond the first."""
+
+
+@dataclass(frozen=True)
+class SplatCamera:
+    """One pinhole camera, or one with a lens, as splatting sees it."""
+
+    pose: Tensor
+    """(3, 4) from the scene to the camera's frame, x right, y down, z forward; it may require a gradient."""
+    intrinsics: tuple[float, float, float, float]
+    """fx, fy, cx, cy in pixels; the first pixel's centre lies at (0.5, 0.5)."""
+    width: int
+    """Of the image, pixels."""
+    height: int
+    """Of the image, pixels."""
+    near: float = 0.01
+    """What is nearer along the optical axis is not drawn, scene units."""
+    blur: float = 0.3
+    """Added to both variances on the image, pixels^2."""
+    antialiased: bool = False
+    """Whether opacity makes up for the blur."""
+    lens: Distortion | None = None
+    """The lens's distortion; None of a pinhole camera."""
+
+    def plain(self) -> list[float]:
+        """Return all as 33 numbers for a kernel."""
+        pose = self.pose.detach().double().cpu()
+        lens = [0.0] * 12
+        if self.lens is not None:
+            lens = [1.0, *self.lens.table.double().flatten().tolist()]
+        return [
+            *pose[:, :3].flatten().tolist(), *pose[:, 3].tolist(), *self.intrinsics, float(self.width),
+            float(self.height), self.near, self.blur, float(self.antialiased), *lens,
+        ]  # fmt: skip
+
+
+def project_gaussians(
+    means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
+    camera: SplatCamera, degree: int = 3,
+) -> tuple[Tensor, int]:  # fmt: skip
+    """Project N Gaussians to an image.
+
+    Args:
+        means: (N, 3) centres, scene coordinates.
+        log_scales: (N, 3) logarithm of the standard deviations.
+        rotations: (N, 4) quaternions w, x, y, z of any length but 0.
+        logits: (N,) opacity before the sigmoid.
+        colors: (N, 3) coefficients of the harmonic of degree 0; 0 is grey.
+        harmonics: (N, 3, K) coefficients of the degrees from 1, K being 0, 3, 8 or 15.
+        camera: the image.
+        degree: highest degree of the harmonics that counts; those that are not there do not.
+    Returns: records (N, RECORD), all zeros for a Gaussian that the image does not show; and how many are left out as
+        they are not finite. Gradients go to all parameters and to the camera's pose, not to normals.
+    """
+    tensors = (means, log_scales, rotations, logits, colors, harmonics, camera.pose)
+    return PROJECT(tensors, *tensors[:-1], camera, min(DEGREES[degree], harmonics.shape[2]))
+
+
+def rotation_matrices(quaternions: Tensor) -> Tensor:
+    """Return the rotations (N, 3, 3) of quaternions w, x, y, z.
+
+    Args:
+        quaternions: (N, 4), of any length but 0.
+    """
+    w, x, y, z = (quaternions / quaternions.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = (
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def project_reference(
+    means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
+    camera: SplatCamera, basis: int,
+) -> tuple[Tensor, int]:  # fmt: skip
+    """Project in torch, in any float type. Arguments as for `project_gaussians`, `basis` being how many harmonics."""
+    fx, fy, cx, cy = camera.intrinsics
+    pose = camera.pose.to(means)
+    at = means @ pose[:, :3].T + pose[:, 3]
+    everything = torch.cat([at, log_scales.exp(), rotations, logits[:, None], colors, harmonics[..., :basis].flatten(1)], 1)
+    finite = everything.isfinite().all(1) & (rotations.square().sum(1) > 1e-24)
+    shown = finite & (at[:, 2] > camera.near)
+    kept = shown.nonzero()[:, 0]
+    at = at[kept]
+    axes = rotation_matrices(rotations[kept])
+    x, y, over = at[:, 0] / at[:, 2], at[:, 1] / at[:, 2], 1 / at[:, 2]
+    low_x, high_x = (-MARGIN * camera.width - cx) / fx, ((1 + MARGIN) * camera.width - cx) / fx
+    low_y, high_y = (-MARGIN * camera.height - cy) / fy, ((1 + MARGIN) * camera.height - cy) / fy
+    nothing = torch.zeros_like(x)
+    to_plane = torch.stack(
+        [over, nothing, -x.clamp(low_x, high_x) * over, nothing, over, -y.clamp(low_y, high_y) * over], -1
+    ).unflatten(-1, (2, 3))
+    within = torch.ones_like(x, dtype=torch.bool)
+    if camera.lens is not None:
+        within = torch.hypot(x, y) < camera.lens.reach.flatten()[0].to(x)
+        inside_x, inside_y = x.masked_fill(~within, 0), y.masked_fill(~within, 0)
+        coefficients = camera.lens.coefficients.reshape(1, -1).expand(len(x), -1).to(x)
+        x, y, (uu, uv, vv) = distort(inside_x, inside_y, coefficients)
+        to_plane = torch.stack([uu, uv, uv, vv], -1).detach().unflatten(-1, (2, 2)) @ to_plane
+    focal = torch.tensor([fx, fy], dtype=at.dtype, device=at.device)
+    rows = focal[:, None] * to_plane @ pose[:, :3] @ axes * log_scales[kept].exp()[:, None]  # (K, 2, 3)
+    first, second = rows.unbind(1)
+    b = (first * second).sum(-1)
+    spread_x, spread_y = first.square().sum(-1), second.square().sum(-1)
+    blur = camera.blur
+    a, c = spread_x + blur, spread_y + blur
+    det_0 = torch.linalg.cross(first, second).square().sum(-1)
+    det = det_0 + blur * (spread_x + spread_y) + blur * blur
+    opacity = torch.sigmoid(logits[kept])
+    if camera.antialiased:
+        opacity = opacity * (det_0 / det).sqrt()
+    cut = (opacity / MIN_ALPHA).log()
+    reach_x, reach_y = ((2 * cut.clamp(min=0) * variance).sqrt() for variance in (a, c))
+    u_x = (c / (2 * det)).sqrt()
+    center_x, center_y = fx * x + cx, fy * y + cy
+    center = -pose[:, :3].T @ pose[:, 3]
+    directions = torch.nn.functional.normalize(means[kept] - center, dim=-1)
+    rgb = 0.5 + DC * colors[kept]
+    if basis:
+        values = spherical_harmonics_reference(directions, {3: 2, 8: 3, 15: 4}[basis])[:, 1:]
+        rgb = rgb + (harmonics[kept][..., :basis] * values[:, None]).sum(-1)
+    with torch.no_grad():
+        normals = axes[torch.arange(len(kept), device=kept.device), :, log_scales[kept].argmin(-1)]
+        normals = torch.where((normals * directions).sum(-1, keepdim=True) > 0, -normals, normals)
+        visible = within & (cut > 0) & (center_x + reach_x > 0) & (center_x - reach_x < camera.width)
+        visible &= (center_y + reach_y > 0) & (center_y - reach_y < camera.height)
+    columns = [
+        center_x, center_y, u_x, -b / c * u_x, (0.5 / c).sqrt(), opacity, cut.detach(), reach_x.detach(),
+        *rgb.clamp(min=0).unbind(-1), at.norm(dim=-1), *normals.unbind(-1), reach_y.detach(),
+    ]  # fmt: skip
+    records = means.new_zeros(len(means), RECORD)
+    table = torch.stack(columns, -1)
+    sound = visible & table.isfinite().all(1)
+    return records.index_copy(0, kept[sound], table[sound]), int((~finite).sum())
+
+
+PROJECT = Operation("project_gaussians", project_reference)
+_forward = native.Function("splat_project", "ppppppqiippi", "q")
+_backward = native.Function("splat_project_backward", "ppppppqiipppppppppp" + "i")
+
+
+class _Project(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, camera: SplatCamera, basis: int, dropped: list[int], *tensors: Tensor) -> Tensor:
+        *parameters, _ = tensors
+        settings = torch.tensor(camera.plain(), dtype=torch.float64)
+        records = parameters[0].new_empty(len(parameters[0]), RECORD)
+        dropped.append(_forward(*_addresses(parameters), *_sizes(parameters, basis), settings.data_ptr(),
+                                records.data_ptr(), native.threads()))  # fmt: skip
+        ctx.save_for_backward(*parameters, records, settings)
+        ctx.basis = basis
+        return records
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        *parameters, records, settings = ctx.saved_tensors
+        out = [torch.empty_like(parameter) for parameter in parameters]
+        pose = torch.empty(3, 4) if ctx.needs_input_grad[-1] else None
+        _backward(
+            *_addresses(parameters), *_sizes(parameters, ctx.basis), settings.data_ptr(), records.data_ptr(),
+            native.pointer(gradient.contiguous(), "the gradient", (len(records), RECORD)),
+            *(tensor.data_ptr() for tensor in out), None if pose is None else pose.data_ptr(), native.threads(),
+        )  # fmt: skip
+        return None, None, None, *out, pose
+
+
+def _addresses(parameters: list[Tensor]) -> list[int]:
+    """Return where the six parameters are, after checking their shapes."""
+    count, stride = len(parameters[0]), parameters[5].shape[2]
+    shapes = ((count, 3), (count, 3), (count, 4), (count,), (count, 3), (count, 3, stride))
+    names = ("means", "log scales", "rotations", "logits", "colors", "harmonics")
+    return [native.pointer(*each) for each in zip(parameters, names, shapes, strict=True)]
+
+
+def _sizes(parameters: list[Tensor], basis: int) -> tuple[int, int, int]:
+    return len(parameters[0]), basis, parameters[5].shape[2]
+
+
+@PROJECT.implementation(CPP)
+def _compiled(
+    means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
+    camera: SplatCamera, basis: int,
+) -> tuple[Tensor, int]:  # fmt: skip
+    parameters = [t.contiguous() for t in (means, log_scales, rotations, logits, colors, harmonics)]
+    dropped: list[int] = []
+    records = _Project.apply(camera, basis, dropped, *parameters, camera.pose)
+    return records, dropped[0]

@@ -1,0 +1,95 @@
+"""Which Gaussians each tile of an image shows, from front to back.
+
+The Gaussians are sorted by distance once (a radix sort of 32-bit keys), and dealt to the tiles that they touch in that
+order, so that each tile's list is sorted too.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from framework.kernels import native
+from framework.kernels.dispatch import CPP, Operation
+from framework.kernels.splat_project import CUT, DISTANCE, REACH_X, REACH_Y, RECORD
+
+TILE = 16
+"""Pixels along a tile's edge."""
+_CHUNK = 4096
+
+
+class TileLists(NamedTuple):
+    """E entries of T tiles, row by row; each is a Gaussian that a tile may show."""
+
+    offsets: Tensor
+    """(T + 1,) int32, tile t has the entries from offsets[t] to offsets[t + 1], from front to back."""
+    ids: Tensor
+    """(E,) int32, which Gaussian."""
+    slots: Tensor
+    """(E,) int32, where an entry is when all are sorted by Gaussian, and of each by tile."""
+    firsts: Tensor
+    """(N + 1,) int32, Gaussian g has the slots from firsts[g] to firsts[g + 1]."""
+
+
+def tile_lists(records: Tensor, width: int, height: int) -> TileLists:
+    """Return which Gaussians each tile of an image shows. Without gradient.
+
+    Args:
+        records: (N, RECORD) Gaussians on the image (`project_gaussians`).
+        width, height: of the image, pixels.
+    """
+    records = records.detach()
+    return TILES((records,), records, width, height)
+
+
+def tile_lists_reference(records: Tensor, width: int, height: int) -> TileLists:
+    """Return lists as of `tile_lists`, in torch: tiles that only the box around a Gaussian touches are in them too."""
+    columns, rows = -(-width // TILE), -(-height // TILE)
+    device = records.device
+    order = records[:, DISTANCE].sort(stable=True).indices
+    order = order[records[order, CUT] > 0]
+    x, y, wide, high = records[order][:, [0, 1, REACH_X, REACH_Y]].unbind(-1)
+    edges_x, edges_y = (torch.arange(count, device=device) * TILE for count in (columns, rows))
+
+    def met(center: Tensor, reach: Tensor, edges: Tensor) -> Tensor:
+        after = (center + reach)[:, None] >= edges + 0.5
+        return after & ((center - reach)[:, None] <= edges + TILE - 0.5)
+
+    touched = met(y, high, edges_y)[:, :, None] & met(x, wide, edges_x)[:, None]
+    place, tile = touched.flatten(1).nonzero().unbind(-1)  # by Gaussian in order of distance, then by tile
+    by_tile = tile.sort(stable=True).indices
+    ids = order[place[by_tile]]
+    counts = torch.bincount(tile, minlength=columns * rows)
+    slots = torch.empty_like(ids)
+    slots[ids.sort(stable=True).indices] = torch.arange(len(ids), device=device)
+    firsts = torch.bincount(ids, minlength=len(records))
+    starts = [torch.nn.functional.pad(each.cumsum(0), (1, 0)).int() for each in (counts, firsts)]
+    return TileLists(starts[0], ids.int(), slots.int(), starts[1])
+
+
+TILES = Operation("tile_lists", tile_lists_reference)
+_sort = native.Function("splat_sort", "pqp", "q")
+_count = native.Function("splat_count", "pqpqiippi", "q")
+_bin = native.Function("splat_bin", "pqpqiippqppppi")
+
+
+@TILES.implementation(CPP)
+def _compiled(records: Tensor, width: int, height: int) -> TileLists:
+    count, threads = len(records), native.threads()
+    tiles = -(-width // TILE) * -(-height // TILE)
+    address = native.pointer(records.contiguous(), "the records", (count, RECORD))
+
+    def room(size: int) -> Tensor:
+        return torch.empty(size, dtype=torch.int32)
+
+    order = room(count)
+    visible = _sort(address, count, order.data_ptr())
+    touched, counts = room(count), room(-(-visible // _CHUNK) * tiles)
+    sizes = address, count, order.data_ptr(), visible, width, height
+    entries = _count(*sizes, touched.data_ptr(), counts.data_ptr(), threads)
+    lists = TileLists(room(tiles + 1), room(entries), room(entries), room(count + 1))
+    offsets, ids, slots, firsts = (each.data_ptr() for each in lists)
+    _bin(*sizes, touched.data_ptr(), counts.data_ptr(), entries, firsts, offsets, ids, slots, threads)
+    return lists

@@ -17,7 +17,6 @@ from framework.kernels.splat_project import CUT, DISTANCE, REACH_X, REACH_Y, REC
 
 TILE = 16
 """Pixels along a tile's edge."""
-_CHUNK = 4096
 
 
 class TileLists(NamedTuple):
@@ -71,8 +70,8 @@ def tile_lists_reference(records: Tensor, width: int, height: int) -> TileLists:
 
 TILES = Operation("tile_lists", tile_lists_reference)
 _sort = native.Function("splat_sort", "pqp", "q")
-_count = native.Function("splat_count", "pqpqiippi", "q")
-_bin = native.Function("splat_bin", "pqpqiippqppppi")
+_bound = native.Function("splat_bound", "pqiii", "q")
+_bin = native.Function("splat_bin", "pqpqiiqppppi", "q")
 
 
 @TILES.implementation(CPP)
@@ -86,10 +85,10 @@ def _compiled(records: Tensor, width: int, height: int) -> TileLists:
 
     order = room(count)
     visible = _sort(address, count, order.data_ptr())
-    touched, counts = room(count), room(-(-visible // _CHUNK) * tiles)
-    sizes = address, count, order.data_ptr(), visible, width, height
-    entries = _count(*sizes, touched.data_ptr(), counts.data_ptr(), threads)
-    lists = TileLists(room(tiles + 1), room(entries), room(entries), room(count + 1))
-    offsets, ids, slots, firsts = (each.data_ptr() for each in lists)
-    _bin(*sizes, touched.data_ptr(), counts.data_ptr(), entries, firsts, offsets, ids, slots, threads)
-    return lists
+    bound = _bound(address, count, width, height, threads)
+    offsets, ids, slots, firsts = room(tiles + 1), room(bound), room(bound), room(count + 1)
+    entries = _bin(
+        address, count, order.data_ptr(), visible, width, height, bound, firsts.data_ptr(), offsets.data_ptr(),
+        ids.data_ptr(), slots.data_ptr(), threads,
+    )  # fmt: skip
+    return TileLists(offsets, ids[:entries], slots[:entries], firsts)

@@ -6,7 +6,7 @@
 
 namespace {
 
-constexpr int64_t GRAIN = 4096;  // Gaussians in a chunk
+constexpr int64_t GRAIN = 2048;  // Gaussians in a chunk
 
 struct Grid {
     int columns, rows;
@@ -31,9 +31,8 @@ struct Span {
     }
 };
 
-// Whether an ellipse comes within CUT on a tile: the least of a quadratic form over a rectangle. Not inlined: it has to
-// round alike wherever it is asked, or tiles would be counted that are not there.
-__attribute__((noinline)) bool touches(const float* g, int column, int row) {
+// Whether an ellipse comes within CUT on a tile: the least of a quadratic form over a rectangle.
+bool touches(const float* g, int column, int row) {
     const float x0 = column * TILE + 0.5f - g[X], x1 = x0 + (TILE - 1), y0 = row * TILE + 0.5f - g[Y], y1 = y0 + (TILE - 1);
     const float near_x = x0 > 0 ? x0 : (x1 < 0 ? x1 : 0), near_y = y0 > 0 ? y0 : (y1 < 0 ? y1 : 0);
     if (near_x == 0 && near_y == 0) return true;
@@ -93,66 +92,79 @@ EXPORT int splat_sort(const float* records, int64_t count, int32_t* order, int64
     });
 }
 
-// How many entries the tiles' lists have in all: one for each tile that a Gaussian of `order` touches. Fills in
-// `touched` (count) for each Gaussian, and `counts` (chunks, tiles), chunks of 4096 Gaussians in order.
-EXPORT int splat_count(const float* records, int64_t count, const int32_t* order, int64_t visible, int width, int height,
-                       int32_t* touched, int32_t* counts, int threads, int64_t* entries) {
+// The most entries that the tiles' lists can have: one for each tile that the box around a Gaussian touches.
+EXPORT int splat_bound(const float* records, int64_t count, int width, int height, int threads, int64_t* bound) {
     return guarded([&] {
         const Grid grid(width, height);
-        const int64_t tiles = int64_t(grid.columns) * grid.rows, chunks = (visible + GRAIN - 1) / GRAIN;
-        std::memset(touched, 0, size_t(count) * sizeof *touched);
-        std::vector<int64_t> sums(size_t(chunks), 0);
-        for_chunks(threads, chunks, [&](int64_t chunk, int) {
-            int32_t* own = counts + chunk * tiles;
-            std::memset(own, 0, size_t(tiles) * sizeof *own);
-            for (int64_t i = chunk * GRAIN; i < std::min(visible, (chunk + 1) * GRAIN); i++) {
-                const int64_t id = order[i];
-                check_index(id, count, "Gaussians");
-                int32_t some = 0;
-                for_tiles(records + id * RECORD, grid, [&](int tile) { own[tile]++, some++; });
-                touched[id] = some, sums[size_t(chunk)] += some;
-            }
+        std::vector<int64_t> sums(size_t((count + GRAIN - 1) / GRAIN), 0);
+        for_chunks(threads, int64_t(sums.size()), [&](int64_t chunk, int) {
+            for (int64_t g = chunk * GRAIN; g < std::min(count, (chunk + 1) * GRAIN); g++)
+                if (records[g * RECORD + CUT] > 0) {
+                    const Span span(records + g * RECORD, grid);
+                    sums[size_t(chunk)] += int64_t(std::max(span.right - span.left, 0)) * std::max(span.bottom - span.top, 0);
+                }
         });
-        *entries = 0;
-        for (const int64_t some : sums) *entries += some;
-        if (*entries > INT32_MAX) throw std::invalid_argument("more than 2^31 Gaussians on the image's tiles");
+        *bound = 0;
+        for (const int64_t some : sums) *bound += some;
+        if (*bound > INT32_MAX) throw std::invalid_argument("more than 2^31 Gaussians on the image's tiles");
     });
 }
 
-// The lists themselves: tile t's are [offsets[t], offsets[t + 1]), from front to back. Each entry says which Gaussian,
-// and its slot: the place of the entry where they are sorted by Gaussian; Gaussian g's are from firsts[g].
+// The lists: tile t's entries are [offsets[t], offsets[t + 1]), from front to back. Each says which Gaussian, and its
+// slot: the place of the entry where they are sorted by Gaussian; Gaussian g's are from firsts[g]. There is room for
+// `bound` entries. Returns how many there are.
 EXPORT int splat_bin(const float* records, int64_t count, const int32_t* order, int64_t visible, int width, int height,
-                     const int32_t* touched, int32_t* counts, int64_t entries, int32_t* firsts, int32_t* offsets,
-                     int32_t* ids, int32_t* slots, int threads) {
+                     int64_t bound, int32_t* firsts, int32_t* offsets, int32_t* ids, int32_t* slots, int threads,
+                     int64_t* entries) {
     return guarded([&] {
         const Grid grid(width, height);
-        const int64_t tiles = int64_t(grid.columns) * grid.rows, chunks = (visible + GRAIN - 1) / GRAIN;
+        const int64_t tiles = int64_t(grid.columns) * grid.rows;
+        // The tiles of each Gaussian, in the order in which they lie in memory.
+        std::vector<std::vector<int32_t>> found(size_t((count + GRAIN - 1) / GRAIN));
+        firsts[0] = 0;
+        for_chunks(threads, int64_t(found.size()), [&](int64_t chunk, int) {
+            std::vector<int32_t>& own = found[size_t(chunk)];
+            own.reserve(size_t(4 * GRAIN));
+            for (int64_t g = chunk * GRAIN; g < std::min(count, (chunk + 1) * GRAIN); g++) {
+                const size_t before = own.size();
+                if (records[g * RECORD + CUT] > 0) for_tiles(records + g * RECORD, grid, [&](int tile) { own.push_back(tile); });
+                firsts[g + 1] = int32_t(own.size() - before);
+            }
+        });
+        for (int64_t g = 0; g < count; g++) firsts[g + 1] += firsts[g];
+        *entries = firsts[count];
+        if (*entries > bound) throw std::invalid_argument("more entries than there is room for");
+        std::vector<int32_t> tile_of;
+        tile_of.reserve(size_t(*entries));
+        for (const auto& own : found) tile_of.insert(tile_of.end(), own.begin(), own.end());
+        // Dealt in the order of distance: how many of each tile a chunk has, where they go, and there.
+        const int64_t chunks = (visible + GRAIN - 1) / GRAIN;
+        std::vector<int32_t> counts(size_t(chunks * tiles), 0);
+        for_chunks(threads, chunks, [&](int64_t chunk, int) {
+            int32_t* own = counts.data() + chunk * tiles;
+            for (int64_t i = chunk * GRAIN; i < std::min(visible, (chunk + 1) * GRAIN); i++) {
+                check_index(order[i], count, "Gaussians");
+                for (int32_t slot = firsts[order[i]]; slot < firsts[order[i] + 1]; slot++) own[tile_of[size_t(slot)]]++;
+            }
+        });
         int32_t sum = 0;
-        for (int64_t g = 0; g < count; g++) firsts[g] = sum, sum += touched[g];
-        firsts[count] = sum;
-        sum = 0;
         for (int64_t tile = 0; tile < tiles; tile++) {
             offsets[tile] = sum;
             for (int64_t chunk = 0; chunk < chunks; chunk++) {
-                int32_t& start = counts[chunk * tiles + tile];
+                int32_t& start = counts[size_t(chunk * tiles + tile)];
                 const int32_t inside = start;
                 start = sum, sum += inside;
             }
         }
         offsets[tiles] = sum;
-        if (sum != entries) throw std::invalid_argument("the counts are not of these Gaussians");
+        if (sum != *entries) throw std::invalid_argument("the order is not of these Gaussians");
         for_chunks(threads, chunks, [&](int64_t chunk, int) {
-            int32_t* next = counts + chunk * tiles;
-            for (int64_t i = chunk * GRAIN; i < std::min(visible, (chunk + 1) * GRAIN); i++) {
-                const int64_t id = order[i];
-                check_index(id, count, "Gaussians");
-                int32_t slot = firsts[id];
-                for_tiles(records + id * RECORD, grid, [&](int tile) {
-                    const int32_t at = next[tile]++;
-                    check_index(at, entries, "entries");
-                    ids[at] = int32_t(id), slots[at] = slot++;
-                });
-            }
+            int32_t* next = counts.data() + chunk * tiles;
+            for (int64_t i = chunk * GRAIN; i < std::min(visible, (chunk + 1) * GRAIN); i++)
+                for (int32_t slot = firsts[order[i]]; slot < firsts[order[i] + 1]; slot++) {
+                    const int32_t at = next[tile_of[size_t(slot)]]++;
+                    ids[at] = order[i], slots[at] = slot;
+                }
         });
     });
 }

@@ -15,6 +15,7 @@ from framework.base.device import has_bfloat16
 from framework.base.optimised import ParameterGroup, RowChange, parameter_groups
 from framework.cameras.cameras import Cameras
 from framework.cameras.view import View
+from framework.data.dataset import Dataset
 from framework.data.scene import Scene
 from framework.fields.appearance import Appearance
 from framework.geometry.points import Points
@@ -132,6 +133,18 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
 
 class LearnsMotion:
     """A model that uses the images' times."""
+
+
+@runtime_checkable
+class StartsFromImages(Protocol):
+    """A model whose parameters are first set by the images, before the first step."""
+
+    def start(self, dataset: Dataset) -> None:
+        """Set the parameters of a fresh model.
+
+        Args:
+            dataset: images to learn from, on the model's device.
+        """
 
 
 @runtime_checkable

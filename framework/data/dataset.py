@@ -140,6 +140,8 @@ class Dataset:
     none."""
     mapped: MappedPixels | None = None
     """The file of `pixels`, if they exceed the memory limit; they then stay on the CPU."""
+    points: Tensor | None = None
+    """(K, 3) sparse points on surfaces, scene coordinates; None if there are none."""
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -308,6 +310,7 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         light=light,
         depths=depths,
         mapped=decoded.mapped,
+        points=parsed.points,
     )
 
 

@@ -27,6 +27,7 @@ from framework.evaluation.panels import composed, view_panels
 from framework.kernels.native import torch_on_one_thread
 from framework.scene.profile import SceneProfile
 from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest, save_checkpoint
+from framework.model import StartsFromImages
 from framework.training.curve import Entry, FewImages, Point, in_order, rows
 from framework.training.optim import first_non_finite, make_optimizer
 from framework.training.preparation import profile_of, skip_by_silhouettes
@@ -225,7 +226,7 @@ class Trainer:
         return profile_of(self.run.method, self.config, self.model, self.train_set, self.decisions)
 
     def prepare(self) -> None:
-        """Skip what the images' silhouettes show to be empty, once, before the first step.
+        """Skip what the images' silhouettes show to be empty, and start from the images, once, before the first step.
 
         It counts as training time, and is said.
         """
@@ -235,6 +236,8 @@ class Trainer:
         start, fresh = time.perf_counter(), self.state.step == 0
         self.train_set = skip_by_silhouettes(self.config, self.model, self.train_set, fresh)
         self.source = self.source.drawing_from(self.train_set)
+        if fresh and isinstance(self.model, StartsFromImages):
+            self.model.start(self.train_set)
         seconds = time.perf_counter() - start
         if fresh:
             self.state.seconds += seconds

@@ -1,0 +1,109 @@
+"""Pictures of Gaussians: from a camera of the framework to an image and what is seen in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from framework.base.errors import ConfigError
+from framework.cameras.cameras import Cameras
+from framework.cameras.view import View, every
+from framework.geometry.lenses import Distortion
+from framework.kernels.splat_blend import CHANNELS, blend
+from framework.kernels.splat_project import SplatCamera, project_gaussians
+from framework.kernels.splat_tiles import tile_lists
+from framework.rendering.rendered import Picture
+from framework.splats.gaussians import Gaussians
+
+DRAWN = ("pinhole", "opencv")
+"""Camera models that Gaussians can be drawn for."""
+FLIPPED = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
+"""From a camera's axes (x right, y up, looking along -z) to those of splatting (x right, y down, z forward)."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """An image of Gaussians, with what training looks at."""
+
+    rgb: Tensor
+    """(H, W, 3) colours over the background."""
+    transmittance: Tensor
+    """(H, W) share of the background that is seen."""
+    records: Tensor
+    """(N, RECORD) the Gaussians on the image; after a backward pass, its gradient."""
+    dropped: int
+    """Gaussians left out as they are not finite."""
+
+
+def splat_camera(
+    camera: Cameras, near: float, antialiased: bool = False, pose: Tensor | None = None, reduced: int = 1
+) -> SplatCamera:
+    """Return a camera as splatting sees it.
+
+    Args:
+        camera: one camera.
+        near: what is nearer to it along its axis is not drawn, scene units.
+        antialiased: make up for the blur of small Gaussians by their opacity.
+        pose: (3, 4) camera-to-scene pose to use instead of its own; it may require a gradient.
+        reduced: factor by which the image is smaller than the camera's.
+    Raises: ConfigError for a camera model that is not among `DRAWN`.
+    """
+    if camera.model not in DRAWN:
+        raise ConfigError(
+            f"Gaussians cannot be drawn for {camera.model} cameras, only for {' and '.join(DRAWN)}; "
+            "undistort the images first, or take a method that casts rays, such as nerfacto"
+        )
+    pose = camera.camera_to_worlds[0] if pose is None else pose
+    rotation = pose.new_tensor(FLIPPED) @ pose[:, :3].T
+    to_camera = torch.cat([rotation, -(rotation @ pose[:, 3])[:, None]], 1)
+    fx, fy, cx, cy = (float(value[0]) / reduced for value in (camera.fx, camera.fy, camera.cx, camera.cy))
+    lens = None if camera.lens is None else Distortion.of(camera.model, camera.lens)
+    width, height = int(camera.widths[0]) // reduced, int(camera.heights[0]) // reduced
+    return SplatCamera(to_camera, (fx, fy, cx, cy), width, height, near, antialiased=antialiased, lens=lens)
+
+
+def draw(gaussians: Gaussians, camera: SplatCamera, background: Tensor, degree: int = 3) -> Drawn:
+    """Draw Gaussians with a gradient.
+
+    Args:
+        gaussians: what is drawn.
+        camera: the image.
+        background: (3,) colour behind everything.
+        degree: highest degree of the harmonics that counts.
+    """
+    records, dropped = project_gaussians(*vars(gaussians).values(), camera=camera, degree=degree)
+    if records.requires_grad:
+        records.retain_grad()
+    lists = tile_lists(records, camera.width, camera.height)
+    image, transmittance, _ = blend(records, lists, camera.width, camera.height, background)
+    return Drawn(image, transmittance, records, dropped)
+
+
+@torch.no_grad()
+def draw_view(gaussians: Gaussians, view: View, background: Tensor, near: float, far: float, antialiased: bool) -> Picture:
+    """Draw what a view shows.
+
+    Args:
+        gaussians: what is drawn.
+        view: the camera.
+        background: (3,) colour behind everything.
+        near: what is nearer is not drawn, scene units.
+        far: depth where nothing is seen, scene units.
+        antialiased: make up for the blur of small Gaussians by their opacity.
+    Raises: ConfigError for a camera model that is not among `DRAWN`.
+    """
+    camera = splat_camera(view.camera, near, antialiased)
+    records, _ = project_gaussians(*vars(gaussians).values(), camera=camera)
+    lists = tile_lists(records, camera.width, camera.height)
+    image, through, median = blend(
+        records, lists, camera.width, camera.height, background, CHANNELS["normals"], median=True
+    )
+    assert median is not None
+    opacity = 1 - through
+    depth = torch.where(opacity > 1e-6, image[..., 3] / opacity.clamp(min=1e-6), far)
+    normals = torch.nn.functional.normalize(image[..., 4:7], dim=-1)
+    parts = (image[..., :3], depth, torch.where(median > 0, median, far), opacity, normals)
+    rgb, depth, median, opacity, normals = (every(part, view.stride) for part in parts)
+    return Picture(rgb, depth, median, opacity, normals)

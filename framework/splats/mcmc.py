@@ -1,0 +1,92 @@
+"""Where Gaussians go: Markov chain Monte Carlo (Kheradmand et al. 2024, "3D Gaussian Splatting as MCMC").
+
+Gaussians that have become transparent are moved to opaque ones, and new ones are added there, so that what is drawn
+stays as it was; noise moves those that are nearly transparent, and so looks for places where they are needed.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from framework.kernels.splat_project import rotation_matrices
+from framework.splats.gaussians import Gaussians
+
+DEAD = 0.005
+"""Opacity from which on a Gaussian is of no use."""
+MOST_COPIES = 51
+"""Gaussians that one may become at a time."""
+NOISE_SHARPNESS, NOISE_FROM = 100.0, 0.005
+"""How steeply noise ends with opacity, and at which opacity half of it is left."""
+
+
+def moved(gaussians: Gaussians, added: int) -> tuple[Tensor, Gaussians] | None:
+    """Move dead Gaussians to live ones, and add more.
+
+    Args:
+        gaussians: all of them.
+        added: how many more there are to be.
+    Returns: which Gaussians (K,) stay as they are, and those that are added behind them: each that was chosen, as many
+        times as it is to be there. None where nothing is to be done.
+    """
+    opacity = torch.sigmoid(gaussians.logits)
+    alive = (opacity > DEAD) & gaussians.finite()
+    wanted = int((~alive).sum()) + added
+    if wanted == 0 or not bool(alive.any()):
+        return None
+    weight = torch.where(alive, opacity, 0).double().cumsum(0)
+    draws = (torch.arange(wanted, device=weight.device) + torch.rand(wanted, device=weight.device)) / wanted
+    sources = torch.searchsorted(weight, draws.to(weight) * weight[-1]).clamp(max=len(weight) - 1)
+    copies = torch.bincount(sources, minlength=len(gaussians)).clamp(max=MOST_COPIES - 1)
+    chosen = copies.nonzero()[:, 0]
+    count = copies[chosen] + 1
+    logits, log_scales = shared(gaussians.logits[chosen], gaussians.log_scales[chosen], count)
+    index = torch.repeat_interleave(torch.arange(len(chosen), device=count.device), count)
+    fresh = gaussians[chosen[index]]
+    fresh = Gaussians(fresh.means, log_scales[index], fresh.rotations, logits[index], fresh.colors, fresh.harmonics)
+    return (alive & (copies == 0)).nonzero()[:, 0], fresh
+
+
+def shared(logits: Tensor, log_scales: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
+    """Return what each of several Gaussians at one place must be, so that together they look like the one.
+
+    Equation 9 of the paper: alpha' = 1 - (1 - alpha)^(1/n), and scales times
+    alpha / sum_{i=1}^{n} sum_{k=0}^{i-1} binom(i-1, k) (-1)^k alpha'^{k+1} / sqrt(k+1).
+
+    Args:
+        logits: (K,) opacity before the sigmoid.
+        log_scales: (K, 3).
+        counts: (K,) int64 n, how many it becomes; at most MOST_COPIES.
+    Returns: (K,) and (K, 3).
+    """
+    alpha = torch.sigmoid(logits.double()).clamp(1e-6, 1 - 1e-6)
+    each = -torch.expm1(torch.log1p(-alpha) / counts)
+    most = int(counts.max()) if len(counts) else 1
+    # sum_{i=1}^{n} binom(i-1, k) = binom(n, k+1)
+    k = torch.arange(most, device=alpha.device, dtype=torch.float64)
+    n = counts.double()[:, None]
+    log_binomial = torch.lgamma(n + 1) - math.lgamma(1) - torch.lgamma(k + 2) - torch.lgamma((n - k).clamp(min=1))
+    terms = torch.exp(log_binomial + (k + 1) * each.log()[:, None]) / (k + 1).sqrt() * (1 - 2 * (k % 2))
+    total = terms.masked_fill(k[None] >= n, 0).sum(1)
+    factor = alpha / total.clamp(min=1e-12)
+    return torch.logit(each.clamp(DEAD, 1 - 1e-6)).to(logits), log_scales + factor.log()[:, None].to(log_scales)
+
+
+@torch.no_grad()
+def shaken(gaussians: Gaussians, size: float) -> tuple[Tensor, Tensor]:
+    """Return noise for the centres of those that are nearly transparent (the paper's equation 7).
+
+    Args:
+        gaussians: all of them.
+        size: the noise of a transparent Gaussian, in its standard deviations squared per scene unit.
+    Returns: which (K,), and by how much (K, 3), scene units.
+    """
+    opacity = torch.sigmoid(gaussians.logits)
+    chosen = (opacity < NOISE_FROM + 6 / NOISE_SHARPNESS).nonzero()[:, 0]
+    some = gaussians[chosen]
+    gate = torch.sigmoid(-NOISE_SHARPNESS * (opacity[chosen] - NOISE_FROM))
+    axes = rotation_matrices(some.rotations) * some.log_scales.exp()[:, None]
+    noise = torch.randn(len(chosen), 3, device=opacity.device) * (size * gate)[:, None]
+    return chosen, (axes @ (axes.transpose(1, 2) @ noise[:, :, None]))[:, :, 0]

@@ -1,0 +1,128 @@
+"""Where Gaussians start: at sparse points of a reconstruction, at random, or on surfaces that a field has found."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from framework.data.dataset import Dataset
+from framework.splats.gaussians import DC, Gaussians
+
+OPACITY = 0.1
+"""Of every Gaussian at the start."""
+NEIGHBOURS = 3
+"""Whose mean distance is a Gaussian's first size."""
+
+
+def from_points(points: Tensor, colors: Tensor, degree: int, opacity: float = OPACITY, size: float = 1.0) -> Gaussians:
+    """Return round Gaussians at points.
+
+    Args:
+        points: (N, 3) scene coordinates.
+        colors: (N, 3) in [0, 1].
+        degree: highest degree of the harmonics.
+        opacity: of each.
+        size: standard deviation, in mean distances to the nearest neighbours.
+    """
+    count = len(points)
+    distance = (size * neighbour_distance(points)).clamp(min=1e-7)
+    turn = points.new_zeros(count, 4)
+    turn[:, 0] = 1
+    logits = points.new_full((count,), opacity).logit()
+    harmonics = points.new_zeros(count, 3, (degree + 1) ** 2 - 1)
+    return Gaussians(points, distance.log()[:, None].expand(-1, 3).clone(), turn, logits, (colors - 0.5) / DC, harmonics)
+
+
+def neighbour_distance(points: Tensor) -> Tensor:
+    """Return the mean distance (N,) of each point to its three nearest neighbours, or nearly so.
+
+    Neighbours are looked for among the points next to it on four curves that fill space (Morton order, shifted by four
+    offsets), which finds most of them.
+
+    Args:
+        points: (N, 3).
+    """
+    count = len(points)
+    if count < 2:
+        return points.new_ones(count)
+    low, high = points.min(0).values, points.max(0).values
+    unit = (points - low) / (high - low).max().clamp(min=1e-12)
+    best = points.new_full((count, NEIGHBOURS), torch.inf)
+    for shift in (0.0, 0.137, 0.291, 0.433):
+        order = morton(((unit + shift) / 1.5 * (2**20 - 1)).long().clamp(0, 2**20 - 1)).argsort()
+        along = points[order]
+        steps = range(1, min(2 * NEIGHBOURS, count - 1) + 1)
+        found = [best[order]]
+        for step in steps:
+            gap = (along[step:] - along[:-step]).norm(dim=-1)
+            infinite = gap.new_full((step,), torch.inf)
+            found += [torch.cat([gap, infinite])[:, None], torch.cat([infinite, gap])[:, None]]
+        # The same neighbour may be met on several curves: distances that are equal count once.
+        near = torch.cat(found, 1).sort(1).values
+        near[:, 1:][near[:, 1:] == near[:, :-1]] = torch.inf
+        best[order] = near.sort(1).values[:, :NEIGHBOURS]
+    known = best.isfinite()
+    return best.masked_fill(~known, 0).sum(1) / known.sum(1).clamp(min=1)
+
+
+def morton(cells: Tensor) -> Tensor:
+    """Return the place (N,) int64 of cells along a curve that fills space.
+
+    Args:
+        cells: (N, 3) int64, from 0 below 2^20.
+    """
+    code = torch.zeros_like(cells[:, 0])
+    for axis in range(3):
+        x = cells[:, axis]
+        for shift, mask in ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
+                            (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249)):  # fmt: skip
+            x = (x | (x << shift)) & mask
+        code |= x << axis
+    return code
+
+
+def seen_colors(points: Tensor, dataset: Dataset, views: int = 2) -> Tensor:
+    """Return the mean colour (N, 3) in [0, 1] that the nearest cameras see of each point, grey where none does.
+
+    Args:
+        points: (N, 3) scene coordinates.
+        dataset: images; of one with alpha, only pixels that are not transparent count.
+        views: how many images count.
+    """
+    cameras = dataset.cameras
+    total, count = points.new_zeros(len(points), 3), points.new_zeros(len(points))
+    centers = cameras.camera_to_worlds[:, :, 3]
+    distance = torch.cdist(points, centers)
+    for index in distance.mean(0).argsort().tolist():
+        columns, rows, shown = cameras.project(points, index)
+        height, width = int(cameras.heights[index]), int(cameras.widths[index])
+        column, row = columns.round().long(), rows.round().long()
+        shown &= (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        ranked = (distance < distance[:, index : index + 1]).sum(1) < 4 * views
+        shown &= ranked & (count < views)
+        if not bool(shown.any()):
+            continue
+        pixels = dataset.image(index)[row[shown], column[shown]].float() / 255
+        weight = pixels[:, 3] if pixels.shape[1] == 4 else torch.ones_like(pixels[:, 0])
+        weight = (weight > 0.5).to(points)
+        total[shown] += weight[:, None] * pixels[:, :3]
+        count[shown] += weight
+    return torch.where(count[:, None] > 0, total / count[:, None].clamp(min=1), 0.5)
+
+
+def hull_points(hull: Tensor, box: Tensor, resolution: int, count: int) -> Tensor:
+    """Return random points (count, 3) in the cells along the surface of a visual hull.
+
+    Args:
+        hull: (n^3,) bool, cells that may hold something, at least one.
+        box: (2, 3) corners of all cells, scene coordinates.
+        resolution: n.
+        count: number of points.
+    """
+    grid = hull.view(1, 1, resolution, resolution, resolution).float()
+    inner = -torch.nn.functional.max_pool3d(-torch.nn.functional.pad(grid, [1] * 6), 3, stride=1)
+    cells = ((grid > 0) & (inner == 0)).view(-1).nonzero()[:, 0]
+    chosen = cells[torch.randint(len(cells), (count,), device=cells.device)]
+    corner = torch.stack([chosen // resolution**2, chosen // resolution % resolution, chosen % resolution], -1)
+    at = (corner + torch.rand(count, 3, device=cells.device)) / resolution
+    return box[0] + at * (box[1] - box[0])

@@ -132,6 +132,10 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
     def runs_on_kernels(self) -> bool:
         return True
 
+    @property
+    def uses_bfloat16(self) -> bool:
+        return False  # there is no network
+
     def parameters_of_gaussians(self) -> list[nn.Parameter]:
         """Return the six tables."""
         tables = (self.means, self.log_scales, self.rotations, self.logits, self.colors, self.harmonics)

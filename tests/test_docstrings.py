@@ -20,15 +20,8 @@ ROOT = Path(__file__).parents[1]
 FOLDERS = ("framework", "methods", "dataparsers", "nerfloom")
 FILES = sorted(file.relative_to(ROOT).as_posix() for folder in FOLDERS for file in (ROOT / folder).rglob("*.py"))
 NOT_YET: tuple[str, ...] = (
-    "framework/base/decisions.py",
-    "framework/base/optimised.py",
-    "framework/cameras/view.py",
     "framework/cli",
-    "framework/data/sources.py",
     "framework/evaluation",
-    "framework/export/points.py",
-    "framework/geometry/points.py",
-    "framework/geometry/rays.py",
     "framework/kernels",
     "framework/tools/benchmarks",
     "framework/tools/stress",

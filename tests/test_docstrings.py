@@ -22,7 +22,6 @@ FILES = sorted(file.relative_to(ROOT).as_posix() for folder in FOLDERS for file 
 NOT_YET: tuple[str, ...] = (
     "framework/cli",
     "framework/evaluation",
-    "framework/kernels",
     "framework/tools/benchmarks",
     "framework/tools/stress",
     "framework/tools/testing",

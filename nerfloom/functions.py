@@ -44,7 +44,7 @@ class DensityOnly(Field):
         return sigma, sigma[:, None]
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
-        raise NotImplementedError("samplers ask for density alone")
+        raise NotImplementedError("a density function has no colours")
 
 
 def as_density(sigma_fn: SigmaFunction) -> DensityFunction:

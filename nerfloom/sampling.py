@@ -118,4 +118,4 @@ def sample_proposals(
 def _check_ends(rays: Rays) -> None:
     """Check that no far end is infinite, which is the default of `Rays`."""
     if bool(rays.fars.isinf().any()):
-        raise ValueError("a ray ends nowhere: give Rays its fars, or nerfloom.clip_to_box(rays, box)")
+        raise ValueError("a ray has an infinite far end: give Rays its fars, or nerfloom.clip_to_box(rays, box)")

@@ -80,7 +80,7 @@ def interval_points(
     if footprint == "none":
         return Points(positions, times)
     if rays.pixel_radii is None:
-        raise ValueError("this field wants to know the size of its points: the rays need pixel_radii")
+        raise ValueError("this field uses the size of its points: the rays need pixel_radii")
     radii = rays.pixel_radii.index_select(0, owners)
     if footprint == "radius":
         return Points(positions, times, intervals.t * radii)

@@ -45,6 +45,6 @@ def check_offsets(offsets: Tensor, count: int) -> None:
     if offsets.device.type != "cpu":
         return
     if offsets.ndim != 1 or len(offsets) == 0 or int(offsets[0]) != 0 or int(offsets[-1]) != count:
-        raise IndexError(f"the rays' offsets must lead from 0 to {count}, the number of samples")
+        raise IndexError(f"the rays' offsets must start at 0 and end at {count}, the number of samples")
     if bool((offsets[1:] < offsets[:-1]).any()):
-        raise IndexError("the rays' offsets must not fall: each ray's samples stand behind those of the one before")
+        raise IndexError("the rays' offsets must not decrease: the samples of each ray follow those of the ray before")

@@ -47,12 +47,12 @@ class HashGridLayout:
     def __post_init__(self) -> None:
         _check("levels", len(self.resolutions), MAX_LEVELS)
         if len(self.offsets) != len(self.resolutions) + 1 or self.offsets[0] != 0:
-            raise ConfigError(f"a hash grid of {len(self.resolutions)} levels has one offset more, the first being 0")
+            raise ConfigError(f"a hash grid of {len(self.resolutions)} levels needs one more offset, the first being 0")
         for resolution, (first, end) in zip(self.resolutions, pairwise(self.offsets), strict=True):
             _check("cells along an axis", resolution, MAX_RESOLUTION)
             _check("entries of a level", end - first, 2**MAX_LOG2_TABLE_SIZE)
             if (resolution + 1) ** 3 > end - first and (end - first) & (end - first - 1):
-                raise ConfigError(f"a hash grid's level of {end - first} entries is hashed: it needs a power of two")
+                raise ConfigError(f"a hashed level of a hash grid needs a power of two of entries, not {end - first}")
 
     @classmethod
     def build(cls, num_levels: int, base_resolution: int, max_resolution: int, log2_table_size: int) -> HashGridLayout:

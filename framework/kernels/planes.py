@@ -53,7 +53,7 @@ class PlanesLayout:
             for along, first in zip(group, firsts, strict=True):
                 last = first + math.prod(sizes[axis] for axis in along)
                 if not 0 <= first < last <= self.num_entries:
-                    raise ConfigError(f"planes of {self.num_entries} entries have none from {first} to {last}")
+                    raise ConfigError(f"planes of {self.num_entries} entries have no factor from {first} to {last}")
 
     @classmethod
     def build(
@@ -123,14 +123,14 @@ def _check_factors(resolutions: tuple[tuple[int, ...], ...], axes: tuple[tuple[t
     """Check vertices and axes, on which the kernels rely; a ConfigError says what is wrong."""
     dims = {len(scale) for scale in resolutions}
     if len(dims) != 1 or not dims <= {2, 3, 4} or len(resolutions) > MAX_GROUPS:
-        raise ConfigError(f"planes need the same 2 to 4 axes at every scale, of 1 to {MAX_GROUPS}, not {sorted(dims)}")
+        raise ConfigError(f"planes need 1 to {MAX_GROUPS} groups of the same 2 to 4 axes, not {sorted(dims)} axes")
     for size in (size for scale in resolutions for size in scale):
         if not isinstance(size, int) or not 2 <= size <= MAX_VERTICES:
             raise ConfigError(f"planes need 2 to {MAX_VERTICES} vertices along each axis, not {shown(size)}")
     (count,) = dims
     numbers = {len(group) for group in axes}
     if len(axes) != len(resolutions) or len(numbers) != 1 or not numbers <= set(range(1, MAX_FACTORS + 1)):
-        raise ConfigError(f"planes need as many factors in every group, 1 to {MAX_FACTORS}, not {shown(axes)}")
+        raise ConfigError(f"planes need 1 to {MAX_FACTORS} factors, as many in every group, not {shown(axes)}")
     for along in (along for group in axes for along in group):
         if len(along) not in (1, 2) or len(set(along)) != len(along) or not set(along) <= set(range(count)):
             raise ConfigError(f"planes need one or two of the axes 0 to {count - 1} for each factor, not {along}")

@@ -103,7 +103,7 @@ def footprint(photograph: Photograph, centers: Tensor, radius: float) -> tuple[T
     local = (centers - pose[:, 3]) @ pose[:, :2]
     column = photograph.cx + photograph.fx * local[:, 0] / depth
     row = photograph.cy - photograph.fy * local[:, 1] / depth
-    # Off the optical axis a ball is projected to an ellipse, whose length exceeds its width by at most 1 / cos^2.
+    # Off the optical axis a ball is projected to an ellipse, longer than wide by a factor of at most 1 / cos^2.
     slant = 1 + (local / safe[:, None]).square().sum(-1)
     reach = radius / safe * max(photograph.fx, photograph.fy) * slant + 1  # edges are accurate to a pixel
     edges = torch.stack(

@@ -53,7 +53,7 @@ class PlanesLayout:
             for along, first in zip(group, firsts, strict=True):
                 last = first + math.prod(sizes[axis] for axis in along)
                 if not 0 <= first < last <= self.num_entries:
-                    raise ConfigError(f"planes of {self.num_entries} entries have no factor from {first} to {last}")
+                    raise ConfigError(f"planes of {self.num_entries} entries have no entries {first} to {last}")
 
     @classmethod
     def build(
@@ -123,7 +123,8 @@ def _check_factors(resolutions: tuple[tuple[int, ...], ...], axes: tuple[tuple[t
     """Check vertices and axes, on which the kernels rely; a ConfigError says what is wrong."""
     dims = {len(scale) for scale in resolutions}
     if len(dims) != 1 or not dims <= {2, 3, 4} or len(resolutions) > MAX_GROUPS:
-        raise ConfigError(f"planes need 1 to {MAX_GROUPS} groups of the same 2 to 4 axes, not {sorted(dims)} axes")
+        groups = f"{len(resolutions)} groups of {sorted(dims)} axes"
+        raise ConfigError(f"planes need 1 to {MAX_GROUPS} groups of the same 2 to 4 axes, not {groups}")
     for size in (size for scale in resolutions for size in scale):
         if not isinstance(size, int) or not 2 <= size <= MAX_VERTICES:
             raise ConfigError(f"planes need 2 to {MAX_VERTICES} vertices along each axis, not {shown(size)}")

@@ -93,7 +93,7 @@ def sampler_choice(config: SamplingConfig, unbounded: bool) -> Choice:
         unbounded: whether the scene may extend beyond the box.
     """
     bounded = "hierarchical" if isinstance(config, HierarchicalConfig) else "occupancy"
-    reason = "the scene may extend beyond its box" if unbounded else "the scene ends at its box"
+    reason = "there may be something outside the box" if unbounded else "the scene ends at its box"
     return Choice("sampler", "proposal" if unbounded else bounded, reason)
 
 

@@ -1,4 +1,4 @@
-"""A method as its file declares it: a model's parts, settings, and what is decided by the data."""
+"""Declaration of a method: the parts of its model, its settings, and the settings that depend on the data."""
 
 from __future__ import annotations
 
@@ -19,57 +19,60 @@ from framework.samplers.base import Sampler
 
 
 def nothing_to_decide(config: Any, scene: Scene) -> tuple[Any, list[Decision]]:
-    """Return the settings as they are.
+    """Return the settings unchanged, and no decisions: `Method.decide` of a method that leaves no setting open.
 
     Args:
-        config: a method's settings.
-        scene: facts about the data.
+        config: the method's settings.
+        scene: properties of the scene.
     """
     return config, []
 
 
 def volume_renderer(config: Any, scene: Scene) -> Renderer:
-    """Return the renderer of most methods.
+    """Return a `VolumeRenderer`, the renderer of most methods.
 
     Args:
-        config: a method's settings.
-        scene: facts about the data.
+        config: the method's settings; not used.
+        scene: properties of the scene; not used.
     """
     return VolumeRenderer()
 
 
 @dataclass(frozen=True)
 class Method:
-    """A method as its file declares it; its name is the entry point's, its summary the file's first line.
+    """Declaration of a method. Its name is that of the entry point, its summary the first line of its file.
 
-    One that casts rays names its field, sampler and renderer, each a function of settings and scene; a plugin exchanges
-    one of them by `dataclasses.replace(METHOD, renderer=...)`. One that draws whole images names its model alone.
+    A method that casts rays declares a field, a sampler and a renderer, each as a function of settings and scene; a
+    plugin replaces one of them by `dataclasses.replace(METHOD, renderer=...)`. A method that draws whole images
+    declares a model only.
     """
 
     config: TrainConfig
     """Default settings."""
     paper: str
-    """Where it was published."""
+    """Publication that describes the method."""
     field: Callable[[Any, Scene], Field] | None = None
-    """Makes the field that is sampled; None of a method that casts no rays."""
+    """Creates the field, from settings and scene; None for a method that casts no rays."""
     sampler: Callable[[Any, Scene], Sampler] | None = None
-    """Makes what says where the field is asked."""
+    """Creates the sampler, which chooses where the field is evaluated."""
     renderer: Callable[[Any, Scene], Renderer] = volume_renderer
-    """Makes what turns samples into colours and depths."""
+    """Creates the renderer, which turns samples into colours and depths."""
     model: type[Model[Any]] = RayModel
-    """Built as `model(config, scene, field, sampler, renderer)`, or, without a field, as `model(config, scene)`."""
+    """Class of the model: called with (config, scene, field, sampler, renderer), or (config, scene) without a field."""
     decide: Callable[[Any, Scene], tuple[Any, list[Decision]]] = nothing_to_decide
-    """Fills in the settings that were left to the data, and says why (`framework.base.decisions.fill`)."""
+    """Fills in the settings that depend on the data, and gives the reasons (`framework.base.decisions.fill`)."""
     interface: int = 2
-    """The version of the plugin interface it was written for (`registry.INTERFACE`)."""
+    """Version of the plugin interface that the method was written for (`registry.INTERFACE`)."""
 
     def build(self, config: TrainConfig, scene: Scene) -> Model[Any]:
-        """Return the model with fresh parameters.
+        """Return the model, with newly initialised parameters.
 
         Args:
-            config: settings, decided or not.
-            scene: facts about the data.
-        Raises: ConfigError where settings do not fit the scene or each other.
+            config: the settings; those that are still open are decided first.
+            scene: properties of the scene.
+
+        Raises:
+            ConfigError: if the settings do not fit the scene or each other.
         """
         config, _ = self.decide(config, scene)
         if self.field is None:

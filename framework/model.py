@@ -1,4 +1,4 @@
-"""What the trainer, the evaluator and the commands know of a method."""
+"""The interface of models, which the trainer, the evaluator and the commands use."""
 
 from __future__ import annotations
 
@@ -27,31 +27,33 @@ PartT = TypeVar("PartT")
 
 @dataclass(frozen=True)
 class Loss:
-    """What a model makes of a batch."""
+    """The loss of a model on a batch."""
 
     terms: dict[str, Tensor]
     """Named scalars; their sum is minimised."""
     rgb: Tensor
-    """The colours that it showed, shaped like the batch's; for the running error and the choice of pixels."""
+    """Rendered colours, with the shape of the batch's; for the running error and the choice of pixels."""
     num_samples: int = 0
-    """Evaluations of the field; 0 of a method that has none."""
+    """Number of evaluations of the field; 0 for a model without a field."""
 
     @property
     def total(self) -> Tensor:
-        """What is minimised."""
+        """Sum () of the terms, which is minimised."""
         return torch.stack(list(self.terms.values())).sum()
 
 
 class Model(nn.Module, ABC, Generic[ConfigT]):
-    """What is trained and rendered. `self.training` tells random sampling (True) from fixed (False).
+    """Base class of models, which are trained and rendered.
+
+    Samples are at random positions if `self.training` is True, and at fixed positions if it is False.
 
     Args:
         config: the method's settings, decided.
-        scene: facts about the data.
+        scene: properties of the scene.
     """
 
     batches: ClassVar[Literal["pixels", "views"]]
-    """What it learns from: pixels of all images (`PixelBatch`), or one whole image (`ViewBatch`)."""
+    """Kind of the training batches: pixels of all images (`PixelBatch`), or one whole image (`ViewBatch`)."""
 
     def __init__(self, config: ConfigT, scene: Scene) -> None:
         super().__init__()
@@ -60,66 +62,66 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
 
     @abstractmethod
     def loss(self, batch: Any, step: int) -> Loss:
-        """Return what is to be minimised on a batch.
+        """Return the loss on a batch.
 
         Args:
-            batch: a `PixelBatch` or a `ViewBatch`, as `batches` says.
-            step: training steps done.
+            batch: a `PixelBatch` or a `ViewBatch`, according to `batches`.
+            step: number of training steps done.
         """
 
     @abstractmethod
     def render_view(self, view: View, background: Tensor) -> Picture:
-        """Return what a camera sees, in evaluation mode and without gradient.
+        """Render an image in evaluation mode, without gradient.
 
         Args:
             view: the camera, on the model's device.
-            background: (3,) colour behind what is not opaque.
+            background: (3,) colour in [0, 1] of the background.
         """
 
     def before_step(self, step: int, progress: float) -> None:
-        """Follow schedules and refresh samplers, before a training step.
+        """Apply schedules and update samplers; called before each training step.
 
         Args:
-            step: training steps done.
-            progress: share of the budget spent.
+            step: number of training steps done.
+            progress: fraction of the training budget that is spent.
         """
 
     def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
-        """Return rows of parameters to add, drop or reorder, after a training step; gradients are still there.
+        """Return rows of parameters to add, drop or reorder; called after each training step, with gradients in place.
 
         Args:
-            step: training steps done before it.
-            progress: share of the budget spent.
+            step: number of training steps done before this one.
+            progress: fraction of the training budget that is spent.
         """
         return ()
 
     def groups(self) -> list[ParameterGroup]:
-        """Return the parameters, grouped as the modules that hold them say (`Optimised`)."""
+        """Return the parameters, grouped by the `Optimised` settings of the modules that hold them."""
         return parameter_groups(self)
 
     @property
     def samples_per_step(self) -> int | None:
-        """Samples a training step should evaluate, the number of pixels following; None for a fixed number."""
+        """Number of samples per training step, to which the number of pixels is adapted; None for a fixed one."""
         return None
 
     @property
     def rays_per_pixel(self) -> int:
-        """Rays of which a pixel of a picture is the mean, where the view does not say."""
+        """Number of rays that are averaged for each pixel of an image, if the view does not set it."""
         return 1
 
     @property
     def runs_on_kernels(self) -> bool:
-        """Whether compiled kernels do the heavy work: then torch's own operations keep to one CPU thread."""
+        """True if compiled kernels do most of the work; torch's own operations then use one CPU thread."""
         return False
 
     @property
     def device(self) -> torch.device:
-        """Where the parameters are."""
+        """The device of the parameters."""
         return next(self.parameters()).device
 
     @property
     def uses_bfloat16(self) -> bool:
-        """Whether networks run in bfloat16: as configured, else as the device allows."""
+        """True if networks run in bfloat16: as configured, or else if the device supports it."""
         chosen = self.config.mixed_precision
         return has_bfloat16(self.device) if chosen is None else chosen
 
@@ -128,11 +130,11 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
         return sum(parameter.numel() for parameter in self.parameters())
 
 
-# -- what some models can do --------------------------------------------------------------------------------------
+# -- optional capabilities ----------------------------------------------------------------------------------------
 
 
 class LearnsMotion:
-    """A model that uses the images' times."""
+    """A model of a moving scene, which uses the times of the images."""
 
 
 @runtime_checkable
@@ -149,41 +151,37 @@ class StartsFromImages(Protocol):
 
 @runtime_checkable
 class HasAppearance(Protocol):
-    """A model that can give each image an appearance of its own."""
+    """A model that can learn an appearance vector for each image."""
 
     appearance: Appearance | None
-    """The images' vectors; None where the settings or the scene leave them out."""
+    """The vectors; None if the settings or the scene do not use them."""
 
 
 @runtime_checkable
 class RefinesPoses(Protocol):
-    """A model that can refine the training cameras' poses."""
+    """A model that can refine the poses of the training cameras."""
 
     def refined_cameras(self, cameras: Cameras) -> Cameras:
-        """Return the training cameras where they are believed to be after training.
+        """Return the training cameras with their refined poses.
 
         Args:
-            cameras: M training cameras as they are given.
+            cameras: M training cameras with their given poses.
         """
 
 
 @runtime_checkable
 class HasDensity(Protocol):
-    """A model that knows density anywhere."""
+    """A model whose density can be evaluated at any position."""
 
     def density(self, points: Points) -> Tensor:
-        """Return density (N,), 1/length.
-
-        Args:
-            points: N points, scene coordinates.
-        """
+        """Return the density (N,) at `points`, in 1/length."""
 
 
 def parts(model: nn.Module, kind: Callable[..., PartT]) -> list[PartT]:
-    """Return the modules of a model that have a capability.
+    """Return the modules of a model that are of a kind, including the model itself.
 
     Args:
-        model: whose modules are looked at.
-        kind: a protocol or class, as in `parts(model, SkipsCells)`.
+        model: the model to search.
+        kind: a class or a runtime-checkable protocol, as in `parts(model, SkipsCells)`.
     """
     return [module for module in model.modules() if isinstance(module, cast("type[PartT]", kind))]

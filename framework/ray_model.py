@@ -1,4 +1,4 @@
-"""A model put together from a field, a sampler and a renderer, which casts rays."""
+"""The model of methods that cast rays: a field, a sampler and a renderer."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ RayConfigT = TypeVar("RayConfigT", bound=RayConfig)
 
 
 class RayModel(Model[RayConfigT], Generic[RayConfigT]):
-    """A field, asked where a sampler chooses, and shown by a renderer.
+    """A model that evaluates a field at the positions of a sampler and composites the values with a renderer.
 
     Args:
         config: the method's settings, decided.
-        scene: facts about the data.
+        scene: properties of the scene.
         field: density and colour.
-        sampler: where the field is asked.
-        renderer: from samples to what rays show.
+        sampler: chooses the positions along each ray.
+        renderer: turns samples into colours and depths.
     """
 
     batches: ClassVar[Literal["pixels", "views"]] = "pixels"
@@ -45,21 +45,21 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
         self.field, self.sampler, self.renderer = field, sampler, renderer
 
     def render(self, rays: Rays, background: Tensor) -> Rendered:
-        """Return what R rays show.
+        """Render R rays.
 
         Args:
             rays: the rays; R may be 0.
-            background: (R, 3) or (3,) colour that shows as far as a ray is not opaque.
+            background: (R, 3) or (3,) colour in [0, 1] of the background.
         """
         samples = self.sampler.sample(rays, self.field, self.training)
         return self.renderer.render(rays, samples, self.field, background)
 
     def loss(self, batch: PixelBatch, step: int) -> Loss:
-        """Return the squared error of the pixels' colours, what the sampler learns by, and `regularizers`.
+        """Return the mean squared error of the pixels' colours, the losses of the sampler, and `regularizers`.
 
         Args:
-            batch: pixels with what they should show.
-            step: training steps done.
+            batch: pixels with their true colours.
+            step: number of training steps done.
         """
         per_pixel = batch.rays_per_pixel
         rendered = self.render(batch.rays, batch.background.repeat_interleave(per_pixel, 0))
@@ -74,17 +74,18 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
         return Loss(terms, pixels.rgb.detach(), rendered.num_samples)
 
     def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
-        """Return further named scalars to be minimised, of rays or of parameters; none by default.
+        """Return further terms of the loss by name, each a scalar; none by default.
 
         Args:
-            rendered: what the batch's rays showed, before any are averaged to pixels.
+            rendered: the rendered rays of the batch, before they are averaged to pixels.
             batch: the pixels.
-            step: training steps done.
+            step: number of training steps done.
         """
         return {}
 
     @torch.no_grad()
     def render_view(self, view: View, background: Tensor) -> Picture:
+        """Render `view` over `background` (3,) in chunks of `eval_num_rays_per_chunk` rays, in evaluation mode."""
         was_training, per_pixel = self.training, view.rays_per_pixel or self.rays_per_pixel
         offsets, grid, times = subpixels(per_pixel), view.pixels(), view.times()
         chunk = max(self.config.eval_num_rays_per_chunk // per_pixel, 1)
@@ -97,10 +98,10 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
         ):
             for pixels in grid.reshape(-1).split(chunk):
                 rays = view.camera.pixel_rays(pixels, self.scene.near, self.scene.far, times, offsets)
-                # The camera is no training camera, whose number it must not be taken for.
-                shown = self.render(replace(rays, camera_indices=None), background).to_pixels(per_pixel)
-                columns.append((shown.rgb, shown.depth, shown.median_depth, shown.accumulation))
-                normals += [] if shown.normals is None else [safe_normalize(shown.normals.float())]
+                # Index 0 of the view's one camera must not be taken for the index of a training camera.
+                rendered = self.render(replace(rays, camera_indices=None), background).to_pixels(per_pixel)
+                columns.append((rendered.rgb, rendered.depth, rendered.median_depth, rendered.accumulation))
+                normals += [] if rendered.normals is None else [safe_normalize(rendered.normals.float())]
         self.train(was_training)
         rgb, depth, median, accumulation = (torch.cat(column).float() for column in zip(*columns, strict=True))
         return Picture(
@@ -113,24 +114,24 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
         )
 
     def before_step(self, step: int, progress: float) -> None:
+        """Update the sampler for `step`; `progress` is not used."""
         self.sampler.update(step, self.field.density)
 
     def density(self, points: Points) -> Tensor:
-        """Return density (N,), 1/length.
-
-        Args:
-            points: N points, scene coordinates.
-        """
+        """Return the density (N,) at `points`, in 1/length."""
         return self.field.density(points)[0]
 
     @property
     def runs_on_kernels(self) -> bool:
+        """True if the field runs on compiled kernels; torch's own operations then use one CPU thread."""
         return self.field.runs_on_kernels
 
     @property
     def samples_per_step(self) -> int | None:
+        """Number of samples per training step, as the sampler sets it; None for a fixed number of pixels."""
         return self.sampler.samples_per_step
 
     @property
     def rays_per_pixel(self) -> int:
+        """Number of rays that are averaged for each pixel of an image, as configured."""
         return self.config.rays_per_pixel

@@ -1,8 +1,8 @@
-"""Nerfloom in a notebook or a script: `import nerfloom` and a few lines.
+"""The Python interface of Nerfloom, for notebooks and scripts.
 
-`load` a run, render its views, evaluate it, `train` another (docs/notebooks). For a radiance field and a training loop
-of your own (docs/plug-and-play.md): a grid of what is occupied, samples where light gets, and what they add up to.
-Names are imported when they are used, so that `import nerfloom` costs nothing.
+`load` loads a run, to render its views and evaluate it, and `train` trains another (docs/notebooks). For your own
+radiance field and training loop (docs/plug-and-play.md) there are an occupancy grid, sampling and compositing. Names
+are imported when they are used, so that `import nerfloom` is fast.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ _HOMES = {
     "sample_uniform": "nerfloom.sampling",
     "train": "nerfloom.runs",
 }
-"""Name -> the module that it is imported from."""
+"""Module from which each name is imported."""
 
 __all__ = sorted(_HOMES)
 

@@ -1,7 +1,7 @@
-"""Calls a user's functions of positions, and checks the rays that are given and the tensors that are returned.
+"""Calls of user-defined functions of positions, with checks of the rays and of the tensors that they return.
 
-A function is called with the positions alone where the rays have no times, and with the times behind them where they
-have. Whatever else it needs (camera indices, lengths of intervals) it can take from the samples around it.
+A function is called with the positions, followed by the times if the rays have times. Other inputs (camera indices,
+lengths of intervals) it can take from the samples in its enclosing scope.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from framework.geometry.points import Points
 from framework.geometry.rays import Rays, Samples
 
 SigmaFunction = Callable[..., Tensor]
-"""(positions (N, 3)[, times (N,)]) -> sigma (N,), density, at least 0, 1/length."""
+"""Function (positions (N, 3)[, times (N,)]) -> sigma (N,), the density in 1/length, at least 0."""
 RgbFunction = Callable[..., tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Mapping[str, Tensor]]]
-"""(positions (N, 3), unit directions (N, 3)[, times (N,)]) -> rgb (N, 3), sigma or alpha (N,)[, further properties by
-name, each (N, ...)]."""
+"""Function (positions (N, 3), unit directions (N, 3)[, times (N,)]) -> rgb (N, 3), sigma or alpha (N,)[, further
+properties by name, each (N, ...)]."""
 UNIT = 1e-3
-"""By how much the length of a direction may differ from 1."""
+"""Maximum difference of the length of a direction from 1."""
 
 
 class DensityOnly(Field):
-    """Makes a function of positions a field without colour, for samplers, which ask for nothing but density.
+    """A field of density without colour, from a user-defined function, for samplers, which evaluate density only.
 
     Args:
-        sigma_fn: see `SigmaFunction`; None for a field that is empty everywhere.
+        sigma_fn: a `SigmaFunction`; None for a field that is empty everywhere.
     """
 
     def __init__(self, sigma_fn: SigmaFunction | None) -> None:
@@ -44,15 +44,17 @@ class DensityOnly(Field):
         return sigma, sigma[:, None]
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
-        raise NotImplementedError("samplers ask for density alone")
+        raise NotImplementedError("a density function has no colours")
 
 
 def as_density(sigma_fn: SigmaFunction) -> DensityFunction:
-    """Wrap a user's function as samplers call it: with times or None, and with (empty) features beside the density.
+    """Wrap a user-defined function in the form in which samplers call it, with empty features beside the density.
 
     Args:
-        sigma_fn: see `SigmaFunction`.
-    Returns: a function whose density is float32, or float64 where it is that already. It raises ValueError where
+        sigma_fn: a `SigmaFunction`.
+
+    Returns:
+        a function whose density is float64 if that of `sigma_fn` is, and float32 otherwise. It raises ValueError if
         `sigma_fn` returns another shape than (N,).
     """
 
@@ -68,15 +70,19 @@ def as_density(sigma_fn: SigmaFunction) -> DensityFunction:
 def evaluate(
     function: RgbFunction, what: str, rays: Rays, samples: Samples
 ) -> tuple[Tensor, Tensor, Mapping[str, Tensor]]:
-    """Evaluate a user's function at N samples, gradients included.
+    """Evaluate a user-defined function at samples, gradients included.
 
     Args:
-        function: see `RgbFunction`.
-        what: the name of what it returns beside colours, for errors: "sigma" or "alpha".
-        rays: whose samples these are. The positions have a gradient to them, with t held fixed.
-        samples: where to evaluate.
-    Returns: colours (N, 3), density or alpha (N,), and further properties (N, ...) by name.
-    Raises: ValueError where a result is of another shape.
+        function: an `RgbFunction`.
+        what: name of the second value that it returns, for errors: "sigma" or "alpha".
+        rays: R rays. Gradients of the positions reach the rays, with t held fixed.
+        samples: N samples along the rays.
+
+    Returns:
+        colours (N, 3), density or alpha (N,), and further properties (N, ...) by name.
+
+    Raises:
+        ValueError: if a returned value has another shape.
     """
     times = samples.times(rays)
     arguments = samples.positions(rays), rays.directions.index_select(0, samples.ray_indices)
@@ -91,14 +97,17 @@ def evaluate(
 
 
 def check_shape(values: Any, shape: tuple[int, ...], what: str) -> None:
-    """Check that a function has returned a tensor of the shape that it must have.
+    """Check that a function has returned a tensor of the required shape.
+
+    A density of shape (N, 1) instead of (N,) would otherwise be broadcast to one value for each pair of samples.
 
     Args:
-        values: what was returned.
-        shape: which it must have.
-        what: which function returned what, for the error.
-    Raises: ValueError that names `what`, both shapes, and what to do. A density of shape (N, 1) instead of (N,) would
-        otherwise become one for each pair of samples, silently.
+        values: the returned value.
+        shape: the required shape.
+        what: name of the function and the value, for the error, such as "sigma_fn returned density".
+
+    Raises:
+        ValueError: if the value is no tensor, or has another shape.
     """
     actual = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
     if actual != shape:
@@ -107,13 +116,12 @@ def check_shape(values: Any, shape: tuple[int, ...], what: str) -> None:
 
 
 def check_rays(rays: Rays) -> None:
-    """Check that rays are (R, 3) and their directions of length 1, so that t is a distance.
+    """Check that the origins and directions of `rays` are (R, 3), and the directions of length 1.
 
-    Lengths are checked on a CPU only: elsewhere that would wait for the device.
+    Lengths are checked on the CPU only, because on other devices the check would wait for the device.
 
-    Args:
-        rays: R rays.
-    Raises: ValueError that names the first property that is wrong, or the ray whose direction is worst.
+    Raises:
+        ValueError: if a shape is wrong, or the length of a direction is not 1.
     """
     for name in ("origins", "directions"):
         shape = tuple(getattr(rays, name).shape)
@@ -132,5 +140,5 @@ def check_rays(rays: Rays) -> None:
 
 
 def at_least_float32(values: Tensor) -> Tensor:
-    """Convert values (N, ...) of lower precision to float32."""
+    """Convert `values` (N, ...) of types other than float64 to float32."""
     return values if values.dtype == torch.float64 else values.float()

@@ -1,4 +1,4 @@
-"""Composites a user's colours and densities, or alphas, over a background."""
+"""Compositing of user-defined colours and densities, or alphas, over a background."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from nerfloom.functions import RgbFunction, at_least_float32, check_rays, evalua
 
 @dataclass(frozen=True)
 class Rendering:
-    """Holds what N samples along R rays add up to."""
+    """Rendered values of R rays with N samples."""
 
     rgb: Tensor
     """(R, 3) colour over the background."""
     depth: Tensor
-    """(R,) expected distance: the mean of t under the weights; the ray's far end where it met nothing."""
+    """(R,) expected distance, the weighted mean of t; the far end of the ray if it is transparent."""
     median_depth: Tensor
-    """(R,) distance at which half of the light is gone; the ray's far end where it never is."""
+    """(R,) distance at which the transmittance falls to 0.5; the far end of the ray if it does not."""
     accumulation: Tensor
     """(R,) opacity, the sum of the weights."""
     weights: Tensor
-    """(N,) of the samples."""
+    """(N,) weight of each sample."""
     extras: dict[str, Tensor]
-    """(R, ...) the further properties by name: sums under the weights, with nothing behind them."""
+    """(R, ...) weighted sum of each further property by name, without a background."""
 
 
 def render(
@@ -41,21 +41,23 @@ def render(
     *,
     rgb_alpha_fn: RgbFunction | None = None,
 ) -> Rendering:
-    """Evaluate a field at samples and composite what it returns (NeRF, Mildenhall et al. 2020, equation 3).
+    """Evaluate a field at samples and composite its values: NeRF (Mildenhall et al. 2020), equation 3.
 
-    Gradients reach whatever the function is made of, and the rays through positions and directions, t held fixed.
+    Gradients reach the parameters of the function, and the rays through positions and directions, with t held fixed.
 
     Args:
         rays: R rays.
-        samples: N samples on them.
-        rgb_sigma_fn: (positions (N, 3), directions (N, 3)) -> rgb (N, 3), sigma (N,), and where rays have times
-            (positions, directions, times (N,)). A third result, a dictionary from names to tensors (N, ...), holds
-            further properties (specularity, features, semantics), which are summed under the same weights. N may be 0.
-        background: (3,), (R, 3) or one number, what shows where a ray is not opaque.
-        rgb_alpha_fn: the same with alpha (N,) in [0, 1], the share of light that a sample stops, in place of sigma
-            (NeuS, Wang et al. 2021): an alternative to `rgb_sigma_fn`.
-    Raises: ValueError where neither or both functions are given, where the samples are of other rays, or where the
-        function returns other shapes.
+        samples: N samples along the rays; N may be 0.
+        rgb_sigma_fn: function (positions (N, 3), directions (N, 3)) -> rgb (N, 3), sigma (N,); if the rays have times,
+            it is called as (positions, directions, times (N,)). It may return a third value, a dictionary of further
+            properties (N, ...) by name (specularity, features, semantics), which are summed with the same weights.
+        background: (3,), (R, 3) or one number: colour of the background.
+        rgb_alpha_fn: alternative to `rgb_sigma_fn` that returns the opacity alpha (N,) in [0, 1] of each sample instead
+            of sigma (NeuS, Wang et al. 2021).
+
+    Raises:
+        ValueError: if neither or both functions are given, if the samples are of another number of rays, or if the
+            function returns other shapes.
     """
     check_rays(rays)
     if samples.num_rays != len(rays):
@@ -75,13 +77,15 @@ def render(
 
 
 def accumulate(samples: Samples, weights: Tensor, values: Tensor) -> Tensor:
-    """Sum a property of samples along each ray under their weights.
+    """Return the weighted sum of a property of samples along each ray.
 
     Args:
         samples: N samples of R rays.
-        weights: (N,), such as `Rendering.weights`; detached, the sum teaches the property alone.
-        values: (N, ...).
-    Returns: (R, ...); 0 for a ray without samples.
+        weights: (N,) weights, such as `Rendering.weights`; detach them to train the property only.
+        values: (N, ...) values of the property.
+
+    Returns:
+        (R, ...) sums; 0 for a ray without samples.
     """
     values = at_least_float32(values)
     return ray_sum(weights.view(-1, *[1] * (values.ndim - 1)) * values, samples)

@@ -1,4 +1,4 @@
-"""Train a method, load what was trained, look at it and judge it."""
+"""Training of methods, and rendering and evaluation of trained runs."""
 
 from __future__ import annotations
 
@@ -22,52 +22,53 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 Device = Literal["auto", "cpu", "cuda", "mps"]
+"""Type of a device; auto is cuda if it is available, and cpu otherwise."""
 
 
 class TrainedRun:
-    """A trained run, ready to be rendered and judged.
+    """A trained run, for rendering and evaluation.
 
     Args:
-        trained: the run's model, settings and folder.
+        trained: model, settings and folder of the run.
     """
 
     def __init__(self, trained: Trained) -> None:
         self.model = trained.model
-        """What was learnt, in evaluation mode (`framework.Model`)."""
+        """The trained model (`framework.Model`), in evaluation mode."""
         self.run = trained.run
-        """The method, its settings, the data format and the folder."""
+        """Method, settings, data format and folder of the run."""
         self._datasets: dict[Split, Dataset] = {}
 
     def __repr__(self) -> str:
         return f"TrainedRun({self.run.method!r}, {str(self.run.folder)!r}, {self.model.size():,} parameters)"
 
     def dataset(self, split: Split = "test") -> Dataset:
-        """Return the images of a split, with their cameras; read once.
+        """Return the images of a split, with their cameras. They are read once.
 
         Args:
             split: train, val or test.
-        Raises: DataError where the data is not there any more.
+
+        Raises:
+            DataError: if the data cannot be read any more.
         """
         if split not in self._datasets:
             self._datasets[split] = load_split(self.run, split).to(self.model.device)
         return self._datasets[split]
 
     def views(self, split: Split = "test") -> list[View]:
-        """Return the cameras of a split's images, one each.
-
-        Args:
-            split: train, val or test.
-        """
+        """Return a view for each image of `split`: train, val or test."""
         dataset = self.dataset(split)
         return [dataset.view(index) for index in range(len(dataset))]
 
     def render(self, camera: View | Cameras, time: float | None = None) -> Picture:
-        """Return what a camera sees: `rgb`, `depth`, `accumulation` and more.
+        """Render an image, with colour, depth and opacity.
 
         Args:
             camera: a view, or one camera.
-            time: in [0, 1], of a scene that moves; that of the view if None.
-        Raises: ValueError for several cameras.
+            time: time in [0, 1] of a moving scene; that of the view if None.
+
+        Raises:
+            ValueError: if there are several cameras.
         """
         if isinstance(camera, Cameras):
             if len(camera) != 1:
@@ -78,17 +79,17 @@ class TrainedRun:
         return self.model.render_view(camera, evaluation_background(self.model))
 
     def evaluate(self, split: Split = "test", max_images: int | None = None) -> dict[str, Any]:
-        """Return PSNR in dB, SSIM, LPIPS and speed, by the names that eval.json has.
+        """Return PSNR in dB, SSIM, LPIPS and rendering speed, by their names in eval.json.
 
         Args:
-            split: which images to judge by.
-            max_images: at most this many, evenly spread; all if None.
+            split: the images to compare with: train, val or test.
+            max_images: maximum number of images, evenly spread over the split; None for all.
         """
         return evaluate(self.model, self.dataset(split), max_images=max_images).results
 
 
 def methods() -> dict[str, str]:
-    """Return the methods that can be trained: name and summary."""
+    """Return the summary of each method that can be trained, by name."""
     return {name: summary(entry) for name, entry in registered("methods").items()}
 
 
@@ -96,24 +97,30 @@ def load(run: str | Path, data: str | Path | None = None, device: Device = "auto
     """Load a trained run.
 
     Args:
-        run: its folder, or its config.yml.
-        data: where its data is now, if that has moved.
-        device: where to render.
-    Raises: ConfigError or CheckpointError where something is missing or does not fit.
+        run: folder of the run, or its config.yml.
+        data: new location of the data, if it has been moved.
+        device: device of the model.
+
+    Raises:
+        ConfigError: if config.yml is missing or invalid.
+        CheckpointError: if the checkpoint is missing or does not fit the settings.
     """
-    moved = None if data is None else Path(data)
-    return TrainedRun(load_trained(config_file(Path(run)), device_type=device, data=moved))
+    data_folder = None if data is None else Path(data)
+    return TrainedRun(load_trained(config_file(Path(run)), device_type=device, data=data_folder))
 
 
 def train(method: str, data: str | Path | None = None, format: str | None = None, **settings: Any) -> TrainedRun:
     """Train a method as `ns-train` does, and load the result.
 
     Args:
-        method: its name; `methods()` lists them.
+        method: name of the method; `methods()` lists all.
         data: folder of the data set; the embedded scene if None.
-        format: name of the data format; recognised if None.
-        settings: the method's flags by their names, with underscores, as in `max_seconds=60`.
-    Raises: ConfigError for an unknown method or setting; DataError for data that cannot be used.
+        format: name of the data format; detected if None.
+        settings: settings of the method by name, with underscores, as in `max_seconds=60`.
+
+    Raises:
+        ConfigError: if the method or a setting is unknown.
+        DataError: if the data cannot be used.
     """
     from framework.cli.session import start
 
@@ -129,13 +136,15 @@ def _text(path: Path | None) -> str | None:
 
 
 def image(picture: Picture, what: Literal["rgb", "depth", "accumulation", "normals"] = "rgb") -> Image:
-    """Return a part of a picture as an image that notebooks show by themselves.
+    """Return a component of a rendered image as a PIL image, which notebooks display.
 
     Args:
-        picture: from `TrainedRun.render`.
-        what: colours; or depth, from dark (near) to light (far) over the depths of what is opaque; or opacity; or
-            normals, red, green and blue being x, y and z from -1 to 1.
-    Raises: ValueError for normals that the method does not have.
+        picture: the rendered image, from `TrainedRun.render`.
+        what: rgb for colour; depth for median depth, from dark (near) to light (far) over the depths of opaque pixels;
+            accumulation for opacity; normals for x, y and z from -1 to 1 as red, green and blue.
+
+    Raises:
+        ValueError: if normals are requested and the method has none.
     """
     from PIL import Image as images
 

@@ -1,4 +1,4 @@
-"""Chooses samples without a grid: evenly, by the inverse CDF of weights, or by proposals."""
+"""Sampling without a grid: uniform, by the inverse CDF of weights, or with proposals."""
 
 from __future__ import annotations
 
@@ -17,11 +17,14 @@ from nerfloom.functions import DensityOnly, SigmaFunction, as_density, check_ray
 
 
 def clip_to_box(rays: Rays, box: Tensor | Sequence[Sequence[float]]) -> Rays:
-    """Clip rays to where they enter and leave a box; a ray that misses it gets length 0.
+    """Clip rays to a box. A ray that misses the box gets equal near and far ends.
 
     Args:
-        rays: R rays, near and far ends being kept where they are inside.
-        box: (2, 3) smallest and largest corner.
+        rays: R rays; near and far ends inside the box are kept.
+        box: (2, 3) minimum and maximum corner.
+
+    Raises:
+        ValueError: if a shape is wrong, or the length of a direction is not 1.
     """
     check_rays(rays)
     corners = torch.as_tensor(box, dtype=rays.origins.dtype, device=rays.origins.device)
@@ -31,13 +34,15 @@ def clip_to_box(rays: Rays, box: Tensor | Sequence[Sequence[float]]) -> Rays:
 
 
 def sample_uniform(rays: Rays, count: int, *, jitter: bool = False) -> Samples:
-    """Sample rays in bins of equal length between near and far: NeRF (Mildenhall et al. 2020), equation 2.
+    """Return samples in bins of equal length between near and far: NeRF (Mildenhall et al. 2020), equation 2.
 
     Args:
         rays: R rays with near and far ends.
-        count: bins a ray.
-        jitter: at a random distance in each bin (training), or in its middle.
-    Raises: ValueError where a far end is infinite.
+        count: number of bins per ray, with one sample each.
+        jitter: True for a random distance in each bin (training), False for its middle.
+
+    Raises:
+        ValueError: if a far end is infinite.
     """
     check_rays(rays)
     _check_ends(rays)
@@ -45,17 +50,22 @@ def sample_uniform(rays: Rays, count: int, *, jitter: bool = False) -> Samples:
 
 
 def sample_inverse_cdf(rays: Rays, samples: Samples, weights: Tensor, count: int, *, jitter: bool = False) -> Samples:
-    """Add `count` samples to each ray where the weights are: NeRF, section 5.2.
+    """Return samples with further ones that are drawn from their weights: NeRF, section 5.2.
 
-    Each stands for what is nearer to it than to the others, so that they share the ray from near to far between them.
+    The intervals of the result end halfway between neighbouring samples, and cover the ray from near to far.
 
     Args:
         rays: R rays with near and far ends.
-        samples: S samples on each ray whose intervals follow one another, as from `sample_uniform`.
-        weights: (R * S,) of their intervals, such as `Rendering.weights`; without a gradient.
-        count: samples to draw on each ray.
-        jitter: drawn at random (training), or at even quantiles.
-    Raises: ValueError where rays have different numbers of samples, or a far end is infinite.
+        samples: S samples on each ray with adjacent intervals, as from `sample_uniform`.
+        weights: (R * S,) weights of these samples, such as `Rendering.weights`; without a gradient.
+        count: number of samples to draw on each ray.
+        jitter: True for random samples (training), False for evenly spaced quantiles.
+
+    Returns:
+        S + count samples on each ray.
+
+    Raises:
+        ValueError: if rays have different numbers of samples, or a far end is infinite.
     """
     check_rays(rays)
     _check_ends(rays)
@@ -77,22 +87,23 @@ def sample_proposals(
     scale: float | None = None,
     power: float = 1.0,
 ) -> Samples:
-    """Sample rays where small density fields propose it: mip-NeRF 360 (Barron et al. 2022), section 3.
+    """Return samples that are drawn from the weights of proposals: mip-NeRF 360 (Barron et al. 2022), section 3.
 
-    With gradients enabled the proposals' own are attached to the result: add `interlevel_loss(samples, weights)`, of
-    the weights that were rendered, to the loss, and they learn to bound these from above.
+    If gradients are enabled, the proposals' weights are attached to the result. To train the proposals, add
+    `interlevel_loss(samples, weights)` to the loss, with the weights of the rendered samples.
 
     Args:
-        rays: R rays with near and far ends; far may be infinite with a `scale`. Samples have no gradient to rays.
-        sigma_fns: of each level but the last, (positions (N, 3)) -> sigma (N,), and where rays have times
-            (positions, times (N,)).
-        counts: intervals a ray of each level, then samples: one more than there are functions.
-        jitter: random positions (training), or fixed ones.
-        scale: of an unbounded scene, the distance up to which normalised distance is even, being in disparity beyond;
-            None for even ones throughout.
-        power: which weights are raised to before they are drawn by: from 0 to 1 over the first steps, proposals come
-            to be believed.
-    Raises: ValueError where counts do not fit the functions, or a far end is infinite without a `scale`.
+        rays: R rays with near and far ends; with a `scale`, far may be infinite. Samples have no gradient for rays.
+        sigma_fns: density of each level but the last: (positions (N, 3)) -> sigma (N,); if the rays have times, it is
+            called as (positions, times (N,)).
+        counts: intervals per ray of each level, followed by the number of samples per ray: one more than functions.
+        jitter: True for random positions (training), False for fixed ones.
+        scale: distance up to which samples are drawn linearly in distance, and beyond which linearly in disparity, for
+            an unbounded scene; None for linearly throughout.
+        power: exponent of the weights that are drawn from; increase it from 0 to 1 in the first training steps.
+
+    Raises:
+        ValueError: if the number of counts does not fit the functions, or a far end is infinite without a `scale`.
     """
     check_rays(rays)
     if len(counts) != len(sigma_fns) + 1:
@@ -105,6 +116,6 @@ def sample_proposals(
 
 
 def _check_ends(rays: Rays) -> None:
-    """Check that no ray's far end is infinite, which it is if it was not given."""
+    """Check that no far end is infinite, which is the default of `Rays`."""
     if bool(rays.fars.isinf().any()):
-        raise ValueError("a ray ends nowhere: give Rays its fars, or nerfloom.clip_to_box(rays, box)")
+        raise ValueError("a ray has an infinite far end: give Rays its fars, or nerfloom.clip_to_box(rays, box)")

@@ -1,4 +1,4 @@
-"""Skips empty space by an occupancy grid, and what is hidden by marching with an early stop."""
+"""Sampling with an occupancy grid, which skips empty space, and an early stop, which skips hidden space."""
 
 from __future__ import annotations
 
@@ -13,25 +13,30 @@ from framework.samplers.occupancy import OccupancySampler
 from nerfloom.functions import DensityOnly, SigmaFunction, as_density, check_rays
 
 FILL_STEPS = 1025
-"""Training steps whose updates fill a grid: those that visit all cells, and three times as many beside what is full."""
+"""Number of steps that `OccupancyGrid.fill` makes: those that visit all cells, and three times as many in which cells
+near occupied ones are evaluated."""
 
 
 class OccupancyGrid(nn.Module):
-    """Records which cells of a box are not empty: Instant-NGP's grid (Mueller et al. 2022, appendix E.2).
+    """The occupied cells of a box: Instant-NGP (Mueller et al. 2022), appendix E.2.
 
-    It has buffers and no parameters: as a part of a model it is saved with it and moves to its device. As long as
-    nothing is known of a cell, it is taken for occupied.
+    The state is in buffers, without parameters: as a part of a model it is saved with the model and moves to its
+    device. A cell is occupied until its density has been evaluated.
 
     Args:
-        box: (2, 3) smallest and largest corner, a tensor or two lists; the grid is on its device.
-        resolution: cells along each axis, 512 at most.
-        num_steps: steps along the box's diagonal, which says how far apart samples are: see `step_size`.
-        alpha_threshold: a cell is occupied where one step through it has at least this opacity, or the grid's mean if
-            that is less.
-        cone: growth of a step per unit of distance, beyond the distance where it exceeds the even step; 0 for even
+        box: (2, 3) minimum and maximum corner, a tensor or two lists; the grid is on the device of the tensor.
+        resolution: cells along each axis, at most 512.
+        num_steps: steps along the diagonal of the box, which determine `step_size`.
+        alpha_threshold: a cell is occupied if the opacity of one step through it is at least this, or at least the mean
+            over the grid if that is less.
+        cone: growth of the step per unit of distance, beyond the distance where it exceeds the even step; 0 for even
             steps throughout.
-        moving: the scene changes with time, and its functions take times: a cell is occupied if it is at any time.
-    Raises: ConfigError where there are too many cells, or no step; ValueError where the box is none.
+        moving: whether the scene changes with time, so that its functions take times. A cell is then occupied if it is
+            at any time.
+
+    Raises:
+        ConfigError: if there are too many cells, or no steps.
+        ValueError: if the box has another shape, or an edge that is not positive.
     """
 
     def __init__(
@@ -54,53 +59,57 @@ class OccupancyGrid(nn.Module):
 
     @property
     def box(self) -> Tensor:
-        """(2, 3) smallest and largest corner."""
+        """(2, 3) minimum and maximum corner."""
         return self.marcher.box
 
     @property
     def step_size(self) -> float:
-        """Length of a step near the camera, scene units."""
+        """Length of a step near the camera, in the unit of the box."""
         return self.marcher.step_size
 
     @property
     def moving(self) -> bool:
-        """Whether functions take times."""
+        """True if the scene changes with time, so that functions take times."""
         return self.marcher.moving
 
     @property
     def occupied(self) -> Tensor:
-        """(n, n, n) bool along x, y, z: the cells that are not skipped."""
+        """(n, n, n) bool along x, y, z, True for cells that are sampled."""
         return self.marcher.occupied.view(3 * (self.marcher.resolution,))
 
     def update(self, step: int, sigma_fn: SigmaFunction) -> None:
-        """Evaluate the density in some cells and mark anew which are occupied: every 8 steps at first, every 16 later.
+        """Evaluate the density in some cells and update `occupied`, every 8 steps at first and every 16 later.
 
-        To be called before each training step. By step 256 all cells have been visited, those that are not empty four
-        times.
+        It should be called before each training step. By step 256 every cell has been evaluated, and occupied cells
+        four times.
 
         Args:
             step: number of the training step, from 0.
-            sigma_fn: (positions (N, 3)) -> sigma (N,), and of a moving scene (positions, times (N,)); without a
-                gradient.
-        Raises: ValueError where `sigma_fn` returns another shape.
+            sigma_fn: density (positions (N, 3)) -> sigma (N,), or (positions, times (N,)) -> sigma (N,) if `moving`;
+                called without gradient.
+
+        Raises:
+            ValueError: if `sigma_fn` returns another shape.
         """
         self.marcher.update(step, as_density(sigma_fn))
 
     def fill(self, sigma_fn: SigmaFunction) -> None:
-        """Evaluate the density in all cells, for a field that has been trained already.
+        """Evaluate the density in all cells, for a field that has already been trained.
 
         Args:
-            sigma_fn: as for `update`.
-        Raises: ValueError where `sigma_fn` returns another shape.
+            sigma_fn: density, as in `update`.
+
+        Raises:
+            ValueError: if `sigma_fn` returns another shape.
         """
         for step in range(FILL_STEPS):
             self.update(step, sigma_fn)
 
     def carve(self, kept: Tensor) -> None:
-        """Mark cells as empty for good, whatever updates say of them.
+        """Mark cells as empty permanently; later updates do not change them.
 
         Args:
-            kept: (n, n, n) bool along x, y, z; False where a cell is empty.
+            kept: (n, n, n) bool along x, y, z, False for cells to mark as empty.
         """
         self.marcher.carve(kept.reshape(-1).to(self.marcher.occupied.device))
 
@@ -113,23 +122,27 @@ def sample(
     early_stop: float = 1e-4,
     jitter: bool = False,
 ) -> Samples:
-    """Sample rays in occupied cells, as far as light gets.
+    """Return samples of rays in occupied cells, up to an early stop.
 
-    Rays are marched in waves, from near to far; a ray whose transmittance has fallen below `early_stop` is not followed
-    any further. What is behind could have changed a colour channel in [0, 1] by at most `early_stop`. For what the
-    grid skips no bound is stated: a cell is judged by a few positions in it.
+    Rays are marched in waves, from near to far, until their transmittance is below `early_stop`. The samples behind
+    could have changed a colour channel in [0, 1] by at most `early_stop`. There is no such bound for the error of cells
+    that the grid skips, because a cell is classified by the density at a few positions.
 
     Args:
-        rays: R rays; where near and far ends are not given, those of the grid's box. Samples have no gradient to rays.
-        sigma_fn: (positions (N, 3)) -> sigma (N,), and of a moving scene (positions, times (N,)); asked without a
-            gradient, and for nothing but where to stop. None skips empty cells alone.
-        grid: what is occupied.
-        early_stop: transmittance below which the rest of a ray is dropped; 0 for never. While training, 1e-2 is as good
-            a teacher as 1e-4, and faster.
-        jitter: each ray's steps begin at a random share of one (training); else at 0 (evaluation).
-    Returns: packed samples of R rays, ray by ray and from near to far.
-    Raises: ValueError where rays are of another shape or length, rays or the grid alone know of times, or `sigma_fn`
-        returns another shape.
+        rays: R rays; without near and far ends, those of the grid's box are used. Samples have no gradient for rays.
+        sigma_fn: density (positions (N, 3)) -> sigma (N,), or (positions, times (N,)) -> sigma (N,) for a moving scene;
+            called without gradient, and only to find where a ray ends. None for no early stop.
+        grid: the occupied cells.
+        early_stop: transmittance below which the rest of a ray is dropped; 0 for never. In training, 1e-2 gives results
+            as good as 1e-4, and is faster.
+        jitter: True to start each ray at a random fraction of a step (training), False to start at 0 (evaluation).
+
+    Returns:
+        packed samples, ray by ray, and from near to far on each ray.
+
+    Raises:
+        ValueError: if the rays have a wrong shape or length of directions, if only the rays or only the grid has times,
+            or if `sigma_fn` returns another shape.
     """
     check_rays(rays)
     if rays.times is None and grid.moving:

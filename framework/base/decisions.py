@@ -1,4 +1,4 @@
-"""Settings that are left to the data, and what became of each."""
+"""Decisions on settings whose values depend on the data."""
 
 from __future__ import annotations
 
@@ -14,34 +14,34 @@ ConfigT = TypeVar("ConfigT", bound="TrainConfig")
 
 @dataclass(frozen=True)
 class Decision:
-    """What became of an option that was left to the data."""
+    """A record of a setting that was chosen by the data, for the user."""
 
     option: str
-    """What people call it."""
+    """Name of the setting in words."""
     choice: str
-    """What was chosen."""
+    """The chosen value in words."""
     reason: str
-    """Why, as the rest of a sentence after "as"."""
+    """Reason, as a clause that follows "as"."""
 
     def line(self) -> str:
-        """Return one line for people."""
+        """Return the decision as a line of text."""
         return f"  {self.option}: {self.choice}, as {self.reason}"
 
 
 @dataclass(frozen=True)
 class Choice:
-    """A value for a setting that was not given."""
+    """A value for a setting that the user has left open."""
 
     setting: str
     """Name of the config's field."""
     value: Any
-    """What it becomes."""
+    """The chosen value."""
     reason: str
-    """Why, as the rest of a sentence after "as"."""
+    """Reason, as a clause that follows "as"."""
     option: str | None = None
-    """What people call the setting; its name with spaces if None."""
+    """Name of the setting in words; the name of the field with spaces if None."""
     shown: str | None = None
-    """The value for people; its own text if None."""
+    """The value in words; the value's own text if None."""
 
     def decision(self) -> Decision:
         """Return the record of this choice."""
@@ -52,18 +52,20 @@ class Choice:
 
 
 def is_open(value: Any) -> bool:
-    """Return whether a setting's value leaves it to the data."""
+    """Return whether `value` leaves a setting open: None or "auto"."""
     return value is None or value == "auto"
 
 
 def fill(config: ConfigT, *choices: Choice) -> tuple[ConfigT, list[Decision]]:
-    """Fill in the settings that are still open; those that were given stay, and are not reported.
+    """Fill in the settings that are still open. The others stay unchanged, and are not reported.
 
     Args:
-        config: a method's settings.
+        config: the method's settings.
         choices: a value for each setting that may be open.
-    Returns: the settings, and what was decided.
+
+    Returns:
+        the settings, and the decisions that were made.
     """
-    made = [choice for choice in choices if is_open(getattr(config, choice.setting))]
-    values = {choice.setting: choice.value for choice in made}
-    return dataclasses.replace(config, **values), [choice.decision() for choice in made]
+    applied = [choice for choice in choices if is_open(getattr(config, choice.setting))]
+    values = {choice.setting: choice.value for choice in applied}
+    return dataclasses.replace(config, **values), [choice.decision() for choice in applied]

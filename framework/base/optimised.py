@@ -1,4 +1,4 @@
-"""How the parameters of a module are to be optimised, said by the module itself."""
+"""Optimiser settings that modules declare for their parameters."""
 
 from __future__ import annotations
 
@@ -14,80 +14,77 @@ Schedule = Literal["constant", "exponential", "cosine", "hold-exponential"]
 
 @dataclass(frozen=True)
 class Optimised:
-    """How a module's parameters are optimised. What is None is as for the module that holds it, or as the run says.
+    """Optimiser settings of a module's parameters. A value of None is that of the containing module, or of the run.
 
-    A module has it as its attribute `optimised`; it counts for the parameters of all modules within that have none.
+    A module declares them in its attribute `optimised`. They apply to the parameters of the module and of all modules
+    in it that declare none.
     """
 
     name: str | None = None
-    """What the learning rate's curve is called."""
+    """Name of the group, under which its learning rate is logged."""
     learning_rate: float | None = None
-    """Adam's learning rate at the start."""
+    """Initial learning rate of Adam."""
     betas: tuple[float, float] | None = None
-    """Adam's decay of the mean and of the squared gradient."""
+    """Decay rates of Adam's first and second moments."""
     eps: float | None = None
-    """Adam's epsilon."""
+    """Epsilon of Adam."""
     schedule: Schedule | None = None
-    """Learning rate over the budget."""
+    """Schedule of the learning rate over the training budget."""
     sparse: bool | None = None
-    """The parameters are tables (E, F), of which a step updates only the entries that it used."""
+    """True if the parameters are tables (E, F), of which a step updates only the entries that it has used."""
 
     def within(self, outer: Optimised) -> Optimised:
-        """Return these settings with what is open as in `outer`."""
+        """Return these settings, with values of None replaced by those of `outer`."""
         own = {name: value for name, value in vars(self).items() if value is not None}
         return dataclasses.replace(outer, **own)
 
 
 @dataclass(frozen=True)
 class ParameterGroup:
-    """Parameters that are optimised alike."""
+    """Parameters with the same optimiser settings."""
 
     parameters: tuple[nn.Parameter, ...]
-    """The parameters, each of which is in one group."""
+    """The parameters. Each parameter of a model is in exactly one group."""
     settings: Optimised
-    """How they are optimised."""
+    """Their optimiser settings."""
 
 
 @dataclass(frozen=True)
 class RowChange:
-    """New rows for a parameter: some of the old ones in another order, and fresh ones behind them.
+    """A change of a parameter's rows: some are kept, in any order, and new ones are appended.
 
-    The optimiser's state of a row goes with it; that of a fresh row begins anew.
+    A row that is kept keeps its optimiser state; that of a new row is reset.
     """
 
     parameter: nn.Parameter
     """(E, ...) a parameter of the model."""
     kept: Tensor
-    """(K,) int64, which rows stay, in their new order."""
+    """(K,) int64 indices of the rows that are kept, in their new order."""
     fresh: Tensor | None = None
-    """(A, ...) further rows; None for none."""
+    """(A, ...) values of the new rows; None if there are none."""
 
 
 @runtime_checkable
 class DefersGradient(Protocol):
-    """A table whose gradient waits for the optimiser instead of being added up by autograd."""
+    """A module with a table whose gradient is accumulated by the optimiser instead of autograd."""
 
     table: nn.Parameter
-    """(E, F)."""
+    """(E, F) the table."""
     deferred: Any
-    """The waiting gradient (`framework.kernels`); None where autograd adds it up after all."""
+    """The deferred gradient (`TableGradient` or `PlanesGradient`); None if autograd accumulates it after all."""
 
 
 def parameter_groups(model: nn.Module) -> list[ParameterGroup]:
-    """Return the parameters of a model, grouped by how its modules say that they are optimised.
-
-    Args:
-        model: a module, whose own `optimised` counts for all.
-    """
+    """Return the parameters of `model`, grouped by the `Optimised` settings that its modules declare."""
     groups: dict[Optimised, list[nn.Parameter]] = {}
-    taken: set[int] = set()
+    grouped: set[int] = set()
 
     def visit(module: nn.Module, outer: Optimised) -> None:
         own = getattr(module, "optimised", None)
         settings = outer if own is None else own.within(outer)
         for parameter in module.parameters(recurse=False):
-            if id(parameter) not in taken:
-                taken.add(id(parameter))
+            if id(parameter) not in grouped:
+                grouped.add(id(parameter))
                 groups.setdefault(settings, []).append(parameter)
         for child in module.children():
             visit(child, settings)

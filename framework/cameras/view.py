@@ -1,4 +1,4 @@
-"""One camera of which a picture is made."""
+"""A view to be rendered: a camera, a time, and the pixels."""
 
 from __future__ import annotations
 
@@ -13,55 +13,50 @@ from framework.cameras.cameras import Cameras
 
 @dataclass(frozen=True)
 class View:
-    """What a picture shows: a camera, a time, and how it is sampled."""
+    """A camera, a time, and the pixels and rays that are rendered."""
 
     camera: Cameras
     """One camera: size, pose, lens."""
     time: float | None = None
-    """In [0, 1], of a scene that moves."""
+    """Time in [0, 1]; None for a static scene."""
     rays_per_pixel: Literal[1, 4, 9, 16] | None = None
-    """Rays of which a pixel is the mean; as the method's settings say if None."""
+    """Number of rays that are averaged for each pixel; that of the method's settings if None."""
     stride: int = 1
-    """Only every so many-th row and column of the pixels is rendered, the first at half of the stride."""
+    """Distance in pixels between the rows and columns that are rendered, the first of which is at `stride // 2`."""
 
     @classmethod
     def of(cls, cameras: Cameras, index: int, times: Tensor | None = None, stride: int = 1) -> View:
-        """Return what camera `index` shows.
+        """Return the view of one of several cameras.
 
         Args:
             cameras: M cameras.
-            index: which of them.
-            times: (M,) time of each camera; None for a scene that stands still.
-            stride: only every so many-th row and column.
+            index: number of the camera.
+            times: (M,) time of each camera in [0, 1]; None for a static scene.
+            stride: distance in pixels between the rows and columns that are rendered.
         """
         chosen = cameras[torch.tensor([index], device=cameras.fx.device)]
         return cls(chosen, None if times is None else float(times[index]), stride=stride)
 
     @property
     def height(self) -> int:
-        """Height of the picture, pixels."""
+        """Height of the rendered image in pixels."""
         return len(range(self.stride // 2, int(self.camera.heights[0]), self.stride))
 
     @property
     def width(self) -> int:
-        """Width of the picture, pixels."""
+        """Width of the rendered image in pixels."""
         return len(range(self.stride // 2, int(self.camera.widths[0]), self.stride))
 
     def pixels(self) -> Tensor:
-        """Return (height, width) int64, which of the camera's pixels are rendered."""
+        """Return the numbers (height, width) int64 of the camera's pixels that are rendered."""
         grid = self.camera.image_pixels(0).view(int(self.camera.heights[0]), -1)
         return every(grid, self.stride)
 
     def times(self) -> Tensor | None:
-        """Return (1,) the camera's time; None for a scene that stands still."""
+        """Return the time of the camera as a tensor (1,); None for a static scene."""
         return None if self.time is None else torch.tensor([self.time], device=self.camera.fx.device)
 
 
 def every(image: Tensor, stride: int) -> Tensor:
-    """Return every `stride`-th row and column of an image (H, W, ...), the first being at half of the stride.
-
-    Args:
-        image: (H, W, ...).
-        stride: 1 for all.
-    """
+    """Return every `stride`-th row and column of `image` (H, W, ...), starting from row and column `stride // 2`."""
     return image[stride // 2 :: stride, stride // 2 :: stride]

@@ -1,4 +1,4 @@
-"""Where batches come from: pixels in memory, pixels in a file, or whole images."""
+"""Sources of training batches: pixels in memory, pixels in a file, or whole images."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ from framework.data.pixels import (
 
 @dataclass(frozen=True)
 class Request:
-    """What a training step asks for."""
+    """A training step's request for a batch."""
 
     step: int
-    """Training steps done."""
+    """Number of training steps done."""
     num_pixels: int
-    """Pixels to draw; of no meaning where batches are whole images."""
+    """Number of pixels to draw; not used if batches are whole images."""
     rays_per_pixel: int = 1
-    """Rays through each pixel: 1 for its centre, else a square number."""
+    """Number of rays through each pixel: 1, through its centre, or another square number."""
 
 
 class BatchSource(ABC):
-    """Draws what a training step learns from.
+    """Base class of sources, which draw the training batches.
 
-    A batch is a function of torch's generator, which is seeded by (seed, step) before each step, and of what the source
-    has learnt; so a run that goes on in another process draws the same.
+    A batch depends only on torch's generator, which is seeded by (seed, step) before each step, and on what the source
+    has learnt, so that a run that is resumed in another process draws the same batches.
     """
 
     dataset: Dataset
@@ -52,48 +52,44 @@ class BatchSource(ABC):
 
     @abstractmethod
     def draw(self, request: Request) -> Any:
-        """Return a `PixelBatch` or a `ViewBatch`.
-
-        Args:
-            request: what the step asks for.
-        """
+        """Return a `PixelBatch` or a `ViewBatch` for `request`."""
 
     @abstractmethod
     def drawing_from(self, dataset: Dataset) -> BatchSource:
-        """Return a source of the same kind, and with what this one has learnt, of a changed data set.
+        """Return a source of the same kind for a changed data set, with what this one has learnt.
 
         Args:
-            dataset: the same images, of which other pixels may be worth drawing.
+            dataset: the same images, with a different selection of pixels to draw.
         """
 
     def learn(self, batch: Any, squared_errors: Tensor) -> None:  # noqa: B027, most have nothing to learn
-        """Take note of how wrong a batch was shown.
+        """Record the errors of a rendered batch.
 
         Args:
-            batch: what was drawn.
-            squared_errors: the mean over channels of each pixel's squared error, shaped as the batch's pixels.
+            batch: the batch, from `draw`.
+            squared_errors: squared error of each pixel, averaged over channels, with the shape of the batch's pixels.
         """
 
     def state(self) -> Tensor | None:
-        """Return what has been learnt, for a checkpoint; None for nothing."""
+        """Return what has been learnt, for a checkpoint; None if the source learns nothing."""
         return None
 
     def restore(self, state: Tensor | None) -> None:  # noqa: B027, likewise
-        """Go on with what a checkpoint holds.
+        """Restore what has been learnt from a checkpoint.
 
         Args:
-            state: from `state`; None where the checkpoint has none.
+            state: the result of `BatchSource.state`; None if the checkpoint has none.
         """
 
 
 class PixelSource(BatchSource):
-    """Pixels of all images, drawn evenly or by where the error was large.
+    """A source of pixels of all images, drawn uniformly or by their errors.
 
     Args:
-        dataset: the images; where they lie in a file, pixels are read ahead of the steps that draw them.
-        background: behind transparent pixels.
-        seed: the run's.
-        by_error: draw half of the pixels where the error was large lately.
+        dataset: the images. If they are in a file, pixels are read ahead of the steps that draw them.
+        background: background of transparent pixels.
+        seed: seed of the run.
+        by_error: whether half of the pixels are drawn with a probability proportional to their recent error.
     """
 
     def __init__(self, dataset: Dataset, background: Background, seed: int, by_error: bool = False) -> None:
@@ -107,7 +103,7 @@ class PixelSource(BatchSource):
         return draw_batch(self.dataset, request.num_pixels, self.background, self.errors, offsets, look_up)
 
     def _look_up(self, step: int) -> LookUp | None:
-        """Return what finds a step's colours, if they lie in a file."""
+        """Return the function that looks up the colours of a step's pixels in a file; None if they are in memory."""
         if self.dataset.mapped is None:
             return None
         self.stream = self.stream or PixelStream(self.dataset, self.seed)
@@ -131,11 +127,11 @@ class PixelSource(BatchSource):
 
 
 class ViewSource(BatchSource):
-    """Whole images, one a step, each as likely as the others.
+    """A source of whole images, one per step, drawn uniformly.
 
     Args:
         dataset: the images.
-        background: behind transparent pixels: of "random", one colour for the whole image.
+        background: background of transparent pixels; if "random", one colour for the whole image.
     """
 
     def __init__(self, dataset: Dataset, background: Background) -> None:
@@ -155,12 +151,12 @@ class ViewSource(BatchSource):
 
 
 def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource:
-    """Return the source that a model learns from.
+    """Return the source of a model's training batches.
 
     Args:
-        kind: the model's `batches`.
-        dataset: images to learn from, on the device.
-        config: the run's settings.
+        kind: kind of the batches: `Model.batches`.
+        dataset: the training images, on the device.
+        config: the settings of the run.
     """
     background = training_background(config.background, dataset.scene.has_alpha)
     if kind == "views":

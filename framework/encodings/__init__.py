@@ -1,1 +1,1 @@
-"""Encodings that hold parameters."""
+"""Encodings with learnt parameters."""

@@ -1,4 +1,4 @@
-"""The multiresolution hash grid, with its table."""
+"""The multiresolution hash grid as a module with its table of features."""
 
 from __future__ import annotations
 
@@ -10,15 +10,19 @@ from framework.kernels.memory import table
 
 
 class HashGrid(nn.Module):
-    """Multiresolution hash grid over [0, 1]^3 (Instant-NGP, section 3).
+    """A multiresolution hash grid over [0, 1]^3: Instant-NGP (Mueller et al. 2022), section 3.
 
     Args:
-        num_levels: L.
-        features_per_level: F.
-        base_resolution, max_resolution: cells along an axis at the first and last level.
-        log2_table_size: largest table of one level, as a power of two.
-        sparse: updates touch only the entries that a step used. Compiled, the table's gradient then waits in
-            `deferred` for the optimiser, and `table.grad` stays None.
+        num_levels: number L of levels.
+        features_per_level: number F of features of an entry.
+        base_resolution: cells along an axis at the first level.
+        max_resolution: cells along an axis at the last level.
+        log2_table_size: maximum number of entries of one level, as a power of two.
+        sparse: whether the optimiser updates only the entries that a step has used. The compiled kernels then keep the
+            gradient of the table in `deferred` for the optimiser, and `table.grad` stays None.
+
+    Raises:
+        ConfigError: if a number is out of range, or the table needs more memory than the machine has.
     """
 
     dims = 3
@@ -34,12 +38,12 @@ class HashGrid(nn.Module):
     ) -> None:
         super().__init__()
         self.layout = HashGridLayout.build(num_levels, base_resolution, max_resolution, log2_table_size)
-        # Small random values, as in the paper's section 4: features start near zero but not alike.
+        # Small random values, as in section 4 of the paper: features start near zero, but not equal.
         self.table = nn.Parameter(table(self.layout.num_entries, features_per_level).uniform_(-1e-4, 1e-4))
         self.optimised = Optimised("tables", sparse=True) if sparse else None
         self.deferred = TableGradient(self.layout) if sparse else None
         self.num_features = num_levels * features_per_level
 
     def forward(self, positions: Tensor) -> Tensor:
-        """Positions (N, 3) in [0, 1] to features (N, L * F)."""
+        """Return the features (N, L * F) at `positions` (N, 3) in [0, 1]."""
         return hash_grid(positions, self.table, self.layout, self.deferred)

@@ -1,4 +1,4 @@
-"""Feature planes and lines, with their table."""
+"""Feature planes and lines as a module with their table of features."""
 
 from __future__ import annotations
 
@@ -12,17 +12,21 @@ from framework.kernels.memory import table
 from framework.kernels.planes import PlanesGradient, PlanesLayout, plane_band, planes
 
 BANDS = 16
+"""Number of bands into which `random_band` divides the rows of a factor."""
 
 
 class FeaturePlanes(nn.Module):
-    """Factorised features over [0, 1]^D (K-Planes, section 3; TensoRF, section 4); a fourth axis is time.
+    """Factorised features over [0, 1]^D: K-Planes, section 3, and TensoRF, section 4. A fourth axis is time.
 
     Args:
-        resolutions: vertices along each axis, per group of factors.
-        features_per_group: F.
-        axes: each factor's axis or two axes, per group; a plane for every pair of axes if None.
-        sparse: updates touch only the entries that a step used, as for `HashGrid`.
-        resizable: `resample` will be called; a checkpoint may hold other resolutions.
+        resolutions: vertices along each of the D axes, for each of G groups of factors.
+        features_per_group: number F of features of a group.
+        axes: the axis or two axes of each factor, per group; a plane for every pair of axes if None.
+        sparse: whether the optimiser updates only the entries that a step has used, as for `HashGrid`.
+        resizable: whether `resample` may be called, so that a checkpoint may have other resolutions.
+
+    Raises:
+        ConfigError: if a number is out of range, or the table needs more memory than the machine has.
     """
 
     resolutions: Tensor
@@ -40,7 +44,7 @@ class FeaturePlanes(nn.Module):
         self.layout = PlanesLayout.build(resolutions, axes)
         self.dims, self.num_features = self.layout.dims, self.layout.num_groups * features_per_group
         self.register_buffer("resolutions", torch.tensor(resolutions))
-        # As in K-Planes' section 4.1: products start neither at zero nor at one; time changes nothing at first.
+        # As in section 4.1 of K-Planes: products start neither at 0 nor at 1, and factors of time at 1.
         self.table = nn.Parameter(table(self.layout.num_entries, features_per_group).uniform_(0.1, 0.5))
         with torch.no_grad():
             for group, factors in enumerate(self.layout.axes):
@@ -51,14 +55,21 @@ class FeaturePlanes(nn.Module):
         self.deferred = PlanesGradient(self.layout) if sparse else None
 
     def forward(self, positions: Tensor) -> Tensor:
-        """Positions (N, D) in [0, 1] to features (N, G * F)."""
+        """Return the features (N, G * F) at `positions` (N, D) in [0, 1]."""
         return planes(positions, self.table, self.layout, self.deferred)
 
     def random_band(self, group: int, index: int) -> Tensor:
-        """Some neighbouring rows (at most vertices / 16, along the first axis, F) of a factor, for regularisers.
+        """Return a random band of consecutive rows of a factor, for regularisers.
 
-        A look at all of a large table would be dear. The band may stick out of the factor, where it is cut off, so that
-        every row is as likely as any other.
+        Reading all of a large table in every step would be slow. The band may extend beyond the factor, where it is
+        cut off, so that all rows are equally likely.
+
+        Args:
+            group: number of the group.
+            index: number of the factor in the group.
+
+        Returns:
+            (B, vertices along the first axis, F) values, where B is at most 1/16 of the rows, or 2.
         """
         height, _ = self.layout.shape(group, index)
         rows = max(height // BANDS, 2)
@@ -68,10 +79,15 @@ class FeaturePlanes(nn.Module):
 
     @torch.no_grad()
     def resample(self, resolutions: tuple[tuple[int, ...], ...], lower: Tensor, upper: Tensor) -> None:
-        """Other resolutions, over the part of space from `lower` to `upper` (D,), in units of the present one.
+        """Change the resolutions and the covered part of space.
 
-        Factors are interpolated linearly, so that what is looked up stays as it was at the new vertices. The table
-        becomes larger or smaller; the optimiser begins anew where its size changes.
+        Factors are interpolated linearly, so that the features at the new vertices stay the same. The optimiser's state
+        is reset if the size of the table changes.
+
+        Args:
+            resolutions: vertices along each axis, per group, of the new factors.
+            lower: (D,) lower corner of the part of space to cover, in units of the present one.
+            upper: (D,) upper corner of the part of space to cover, in units of the present one.
         """
         before, old = self.layout, self.table.data
         self._relayout(torch.tensor(resolutions))
@@ -99,9 +115,9 @@ class FeaturePlanes(nn.Module):
 
 
 def _interpolated(values: Tensor, dim: int, first: float, last: float, count: int) -> Tensor:
-    """`values` along `dim` at `count` places evenly from `first` to `last`, 0 being its start and 1 its end."""
+    """Interpolate along `dim`, which spans [0, 1], at `count` evenly spaced positions from `first` to `last`."""
     size = values.shape[dim]
-    places = torch.linspace(first, last, count, device=values.device).clamp(0, 1) * (size - 1)
-    left = places.long().clamp(max=size - 2)
+    scaled = torch.linspace(first, last, count, device=values.device).clamp(0, 1) * (size - 1)
+    left = scaled.long().clamp(max=size - 2)
     shape = [-1 if d == dim else 1 for d in range(values.ndim)]
-    return torch.lerp(values.index_select(dim, left), values.index_select(dim, left + 1), (places - left).view(shape))
+    return torch.lerp(values.index_select(dim, left), values.index_select(dim, left + 1), (scaled - left).view(shape))

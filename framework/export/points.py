@@ -33,7 +33,9 @@ class SurfacePoints:
 
 @torch.no_grad()
 def surface_points(model: RayModel[Any], dataset: Dataset, count: int, reach: float | None) -> Iterator[SurfacePoints]:
-    """Points that random training pixels show, chunk by chunk; fewer than `count` where rays end in nothing.
+    """Return surface points at the median depth of random training pixels, chunk by chunk.
+
+    There are fewer than `count` points if some rays do not end on a surface.
 
     Args:
         model: the model in evaluation mode.
@@ -60,13 +62,9 @@ def surface_points(model: RayModel[Any], dataset: Dataset, count: int, reach: fl
 
 
 def joined(parts: Iterator[SurfacePoints]) -> SurfacePoints:
-    """Return the points of several parts in one.
-
-    Args:
-        parts: at least one.
-    """
-    found = list(parts)
-    whole = SurfacePoints(torch.cat([p.positions for p in found]), torch.cat([p.colors for p in found]), None)
-    if any(part.normals is None for part in found):
+    """Concatenate `parts`, of which there must be at least one; without normals if any part has none."""
+    chunks = list(parts)
+    whole = SurfacePoints(torch.cat([p.positions for p in chunks]), torch.cat([p.colors for p in chunks]), None)
+    if any(chunk.normals is None for chunk in chunks):
         return whole
-    return replace(whole, normals=torch.cat([p.normals for p in found if p.normals is not None]))
+    return replace(whole, normals=torch.cat([p.normals for p in chunks if p.normals is not None]))

@@ -1,1 +1,1 @@
-"""Fields: what the scene is at a point. One file a family."""
+"""Fields, which compute density and colour at positions. Each file has one kind."""

@@ -1,4 +1,4 @@
-"""What differs between photographs of one scene: light, exposure, camera. NeRF-W (Martin-Brualla et al. 2021)."""
+"""Appearance vectors, for images of a scene that differ in light, exposure or camera: NeRF-W."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from torch.nn import functional
 
 
 class Appearance(nn.Module):
-    """A learnt vector for each photograph, fed to the colour network: NeRF-W, section 4.1.
+    """A learnt vector for each image, an input of the colour network: NeRF-W (Martin-Brualla et al. 2021), section 4.1.
 
     Args:
-        size: D.
-        count: photographs.
+        size: number D of features of a vector.
+        count: number of images.
     """
 
     def __init__(self, size: int, count: int) -> None:
@@ -24,17 +24,26 @@ class Appearance(nn.Module):
         self._shown: Tensor | None = None
 
     def forward(self, camera_indices: Tensor | None, count: int) -> Tensor:
-        """(N, D) of the photographs `camera_indices` (N,); of None, what is `shown` or else the mean, N times."""
+        """Return the vector of the image of each sample.
+
+        Args:
+            camera_indices: (N,) image of each sample; None for evaluation, where all samples get the vector that
+                `shown` has set, or else the mean vector.
+            count: number N of samples.
+
+        Returns:
+            (N, D) vectors.
+        """
         if camera_indices is not None:
-            # Not `vectors[camera_indices]`, whose gradient is added up in whatever order threads come.
+            # Not `vectors[camera_indices]`, whose gradient depends on the order in which threads add it up.
             return functional.embedding(camera_indices, self.vectors)
         return (self.vectors.mean(0) if self._shown is None else self._shown).expand(count, -1)
 
     @contextmanager
     def shown(self, vector: Tensor) -> Iterator[None]:
-        """Photographs that were not trained on look like `vector` (D,) for a while."""
-        self._shown, before = vector, self._shown
+        """Use `vector` (D,) as the appearance in evaluation, within a `with` block."""
+        self._shown, previous = vector, self._shown
         try:
             yield
         finally:
-            self._shown = before
+            self._shown = previous

@@ -1,4 +1,4 @@
-"""What every field offers, and the small network most are made of."""
+"""The interface of fields, and the small network that most of them use."""
 
 from __future__ import annotations
 
@@ -16,74 +16,79 @@ from framework.kernels.memory import require
 from framework.kernels.mlp import Activation, mlp
 
 DensityFunction = Callable[[Points], tuple[Tensor, Tensor]]
-"""Points (N) to density (N,) and features (N, F): what samplers are given."""
+"""Function from N points to density (N,), 1/length, and features (N, F); samplers are called with it."""
 
 
 class Field(nn.Module, ABC):
-    """Density and colour at a point. Two functions, so that a sampler can ask for density alone."""
+    """Base class of fields. Density and colour are two methods, so that a sampler can compute the density only."""
 
     footprint: ClassVar[Footprint] = "none"
-    """What `density` wants to know of the points' size."""
+    """Kind of the points' size that `density` needs."""
     optimised: Optimised | None = None
-    """How its parameters are optimised; as the model's if None."""
+    """Optimiser settings of its parameters; those of the model if None."""
     runs_on_kernels: bool = False
-    """Whether compiled kernels do its heavy work: then torch's own operations keep to one CPU thread."""
+    """True if compiled kernels do most of its work; torch's own operations then use one CPU thread."""
 
     @abstractmethod
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
-        """Return density at points.
+        """Return the density at points.
 
         Args:
-            points: N points, with the `footprint` that the field asks for; N may be 0.
-        Returns: sigma (N,) float32, at least 0, 1/length; features (N, F) for `color`.
+            points: N points, with the size that `footprint` names; N may be 0.
+
+        Returns:
+            density (N,), float32, at least 0, in 1/length, and features (N, F) for `color`.
         """
 
     @abstractmethod
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
-        """Colour (N, 3) in [0, 1] of `features` (N, F) seen along unit `directions` (N, 3).
+        """Return the colour (N, 3) in [0, 1] at points.
 
-        `camera_indices` (N,) tells a field with per-image appearance which image is meant; None asks for the
-        appearance used in evaluation.
+        Args:
+            features: (N, F) features of the points, from `density`.
+            directions: (N, 3) unit viewing directions.
+            camera_indices: (N,) training image of each point, for fields with an appearance per image; None for the
+                appearance in evaluation.
         """
 
 
 @runtime_checkable
 class HasAlpha(Protocol):
-    """A field of surfaces, which knows how opaque an interval is: NeuS (Wang et al. 2021), equation 13."""
+    """A field of surfaces, which computes the opacity of intervals: NeuS (Wang et al. 2021), equation 13."""
 
     def alpha(self, points: Points, directions: Tensor, deltas: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the opacity of intervals around points, and features for `color`.
+        """Return the opacity of intervals around points.
 
         Args:
             points: N points, in the middle of their intervals.
             directions: (N, 3) unit directions of their rays.
             deltas: (N,) lengths of the intervals, scene units.
-        Returns: alpha (N,) in [0, 1], features (N, F).
+
+        Returns:
+            opacity (N,) in [0, 1], and features (N, F) for `color`.
         """
 
 
 @runtime_checkable
 class HasSignedDistance(Protocol):
-    """A field that knows how far the nearest surface is."""
+    """A field that is defined by the distance to the nearest surface."""
 
     def signed_distance(self, points: Points) -> Tensor:
-        """Return distances (N,) to the nearest surface, scene units, negative inside.
-
-        Args:
-            points: N points.
-        """
+        """Return the distances (N,) from `points` to the nearest surface, scene units, negative inside."""
 
 
 class MLP(nn.Sequential):
-    """Linear layers with ReLU between them.
+    """A fully connected network: linear layers with ReLU between them.
 
-    Up to 384 features wide it runs as one compiled kernel.
+    With up to 8 layers of up to 384 features it runs as one compiled kernel on the CPU.
 
     Args:
-        widths: features of the input, of each hidden layer, and of the output.
-        bias: whether the layers have one.
-        activation: of the output.
-    Raises: ConfigError where a width is less than 1, or the machine has less memory than the weights take.
+        widths: number of features of the input, of each hidden layer, and of the output.
+        bias: whether the layers have biases.
+        activation: activation function of the output.
+
+    Raises:
+        ConfigError: if a width is less than 1, or the weights need more memory than the machine has.
     """
 
     def __init__(self, *widths: int, bias: bool = True, activation: Activation = "none") -> None:
@@ -96,7 +101,7 @@ class MLP(nn.Sequential):
                 layers.append(nn.ReLU(inplace=True))
             layers.append(nn.Linear(inputs, outputs, bias=bias))
         super().__init__(*layers)
-        if not bias:  # He et al. 2015: with torch's smaller default the small networks wake up slowly
+        if not bias:  # He et al. 2015: with torch's default weights, which are smaller, training starts slowly
             for layer in layers:
                 if isinstance(layer, nn.Linear):
                     nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
@@ -104,7 +109,7 @@ class MLP(nn.Sequential):
         self.activation = activation
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """(N, D_i) parts, which stand side by side, to (N, outputs)."""
+        """Return the output (N, D_out) for `inputs`, parts (N, D_i) that are concatenated along their features."""
         layers = [layer for layer in self if isinstance(layer, nn.Linear)]
         biases = [layer.bias for layer in layers] if self.bias else None
         return mlp(inputs, [layer.weight for layer in layers], self.activation, biases)

@@ -1,4 +1,4 @@
-"""A field that moves: D-NeRF (Pumarola et al. 2021), section 3."""
+"""A field of a moving scene: D-NeRF (Pumarola et al. 2021), section 3."""
 
 from __future__ import annotations
 
@@ -15,14 +15,16 @@ from framework.kernels.frequency import frequency_encoding
 
 
 class DeformedField(Field):
-    """A canonical field, seen through a displacement that a network learns for every place and time.
+    """A canonical field with a learnt displacement of every position and time.
 
     Args:
-        canonical: the scene as it is at time 0, where the displacement is zero (equation 2).
-        width, depth: features of a hidden layer, and hidden layers (256 and 8 in the paper).
-        position_frequencies, time_frequencies: L of the two encodings (10 and 4 in the paper).
-        contracted: (2, 3) the box around which all of space is contracted into [-1, 1]^3, so that frequencies fit;
-            None to take positions as they are.
+        canonical: the field at time 0, where the displacement is zero (equation 2).
+        width: features of a hidden layer of the displacement network (256 in the paper).
+        depth: hidden layers of the displacement network (8 in the paper).
+        position_frequencies: number L of frequencies of the encoded positions (10 in the paper).
+        time_frequencies: number L of frequencies of the encoded times (4 in the paper).
+        contracted: (2, 3) box around which all of space is contracted into [-1, 1]^3, the range that the frequencies
+            are made for; None to encode scene coordinates.
     """
 
     contracted: Tensor | None
@@ -51,16 +53,24 @@ class DeformedField(Field):
         nn.init.zeros_(last.bias)
 
     def displacement(self, positions: Tensor, times: Tensor | None) -> Tensor:
-        """(N, 3) from where something is at its time to where it is at time 0, scene units."""
+        """Return the displacement (N, 3) from positions at their times to positions at time 0, scene units.
+
+        Args:
+            positions: (N, 3) scene coordinates.
+            times: (N,) in [0, 1].
+
+        Raises:
+            ValueError: if `times` is None.
+        """
         if self.contracted is not None:
             positions = 2 * contract_to_unit(positions, self.contracted) - 1
         encoded = (
             frequency_encoding(positions, self.position_frequencies),
             encoded_times(times, self.time_frequencies),
         )
-        found = self.after_skip(self.before_skip(*encoded), *encoded).float()
+        moved_by = self.after_skip(self.before_skip(*encoded), *encoded).float()
         assert times is not None
-        return torch.where(times[:, None] == 0, torch.zeros_like(found), found)
+        return torch.where(times[:, None] == 0, torch.zeros_like(moved_by), moved_by)
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
         moved = points.positions + self.displacement(points.positions, points.times)

@@ -1,4 +1,4 @@
-"""An encoding that holds features in space, and two small networks: Instant-NGP (Mueller et al. 2022), section 5.4."""
+"""Fields of an encoding with learnt features and small networks: Instant-NGP (Mueller et al. 2022), section 5.4."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from framework.kernels.math import split_density, truncated_exp
 from framework.kernels.spherical_harmonics import spherical_harmonics
 
 NUM_FEATURES = 16
-"""Features handed from density to colour in the paper, the first being log-density."""
+"""Number of features that the density network passes to the colour network; the first is the log-density."""
 
 
 class BoxField(Field):
-    """A field whose features stand in a box, or in all of space contracted around it.
+    """A field whose encoding covers a box, or all of space contracted around the box.
 
     Args:
-        box: (2, 3) the part of space that is encoded.
-        encoding: of positions in [0, 1]^3, or of those and time.
-        unbounded: encode all of space, contracted (see `contract_to_unit`).
+        box: (2, 3) corners of the box, scene units.
+        encoding: encoding of positions in [0, 1]^3, or of positions and times in [0, 1]^4.
+        unbounded: whether the encoding covers all of space, contracted by `contract_to_unit`.
     """
 
     box: Tensor
@@ -42,15 +42,20 @@ class BoxField(Field):
         self.encoding = encoding
 
     def unit(self, positions: Tensor) -> Tensor:
-        """Positions (N, 3) in the encoding's [0, 1]^3."""
+        """Map `positions` (N, 3), scene coordinates, to the [0, 1]^3 of the encoding."""
         if self.unbounded:
             return contract_to_unit(positions, self.box)
         return torch.addcmul(self.shift, positions, self.scale)
 
     def encode(self, positions: Tensor, times: Tensor | None) -> Tensor:
-        """Features (N, E) at positions (N, 3).
+        """Return the features (N, E) of the encoding.
 
-        Raises: ValueError where the encoding wants times and there are none.
+        Args:
+            positions: (N, 3) scene coordinates.
+            times: (N,) in [0, 1]; not used if the encoding has no time axis.
+
+        Raises:
+            ValueError: if the encoding has a time axis and `times` is None.
         """
         unit = self.unit(positions)
         if self.encoding.dims == 4:
@@ -61,11 +66,13 @@ class BoxField(Field):
 
 
 class DensityField(BoxField):
-    """Density alone, from the encoding's features: what proposals are made of (mip-NeRF 360, section 3).
+    """A field of density without colour, for proposals: mip-NeRF 360 (Barron et al. 2022), section 3.
 
     Args:
-        box, encoding, unbounded: as for `BoxField`.
+        box: (2, 3) corners of the box, scene units.
+        encoding: encoding of positions in [0, 1]^3, or of positions and times in [0, 1]^4.
         width: features of the hidden layer.
+        unbounded: whether the encoding covers all of space, contracted by `contract_to_unit`.
     """
 
     def __init__(
@@ -83,17 +90,19 @@ class DensityField(BoxField):
 
 
 class EncodedField(BoxField):
-    """Density from the encoding's features, colour from 16 features and the view's spherical harmonics.
+    """A field with a density network on an encoding, and a colour network on its output and the viewing direction.
 
     Args:
-        box: (2, 3) the part of space that is encoded.
-        encoding: of positions in [0, 1]^3, or of those and time.
+        box: (2, 3) corners of the box, scene units.
+        encoding: encoding of positions in [0, 1]^3, or of positions and times in [0, 1]^4.
         width: features of a hidden layer (64 in the paper).
-        num_features: features handed from density to colour (16 in the paper, the first being log-density).
-        direction_levels: bands of spherical harmonics (4 in the paper); 0 for colours that look alike from all sides.
-        unbounded: encode all of space, contracted (see `contract_to_unit`).
-        appearance: features in which each photograph may differ from the others, and how many photographs there are
-            (NeRF-W, Martin-Brualla et al. 2021, section 4.1); None for a scene that looks alike in all of them.
+        num_features: features that the density network passes to the colour network, the first being the log-density
+            (16 in the paper).
+        direction_levels: bands of the spherical harmonics of the viewing direction (4 in the paper); 0 for colours that
+            do not depend on it.
+        unbounded: whether the encoding covers all of space, contracted by `contract_to_unit`.
+        appearance: size of an image's appearance vector, and number of images (NeRF-W, Martin-Brualla et al. 2021,
+            section 4.1); None for no appearance vectors.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The field of NeRF (Mildenhall et al. 2020), appendix A, figure 7: one large network."""
+"""The field of NeRF (Mildenhall et al. 2020), appendix A, figure 7."""
 
 from __future__ import annotations
 
@@ -11,17 +11,21 @@ from framework.kernels.frequency import frequency_encoding
 
 
 class NeRFField(Field):
-    """8 layers of 256 with the position fed in again at the fifth; colour from 256 features and the direction.
+    """A field of one large network, of positions and viewing directions in a frequency encoding.
+
+    The defaults are those of the paper: 8 hidden layers of 256 features with a skip connection, and one of 128 for the
+    colour.
 
     Args:
-        width: features of a hidden layer; the colour layer has half of it.
-        depth: hidden layers before density.
-        skip: the layer that is fed the encoded position again.
-        position_frequencies, direction_frequencies: L of the two encodings (10 and 4 in the paper).
-        time_frequencies: L of the time's encoding, which stands beside the position's: T-NeRF (Pumarola et al. 2021,
-            section 4); None for a field that does not change with time.
-        contracted: (2, 3) the box around which all of space is contracted into [-1, 1]^3, so that frequencies fit;
-            None to take positions as they are.
+        width: features of a hidden layer; the colour layer has half as many.
+        depth: hidden layers before density and features.
+        skip: number of hidden layers after which the encoded position is an input again.
+        position_frequencies: number L of frequencies of the encoded positions (10 in the paper).
+        direction_frequencies: number L of frequencies of the encoded directions (4 in the paper).
+        time_frequencies: number L of frequencies of the encoded times, which are a further input: T-NeRF (Pumarola et
+            al. 2021, section 4); None for a field that does not change with time.
+        contracted: (2, 3) box around which all of space is contracted into [-1, 1]^3, the range that the frequencies
+            are made for; None to encode scene coordinates.
     """
 
     contracted: Tensor | None
@@ -51,10 +55,10 @@ class NeRFField(Field):
         self._initialise()
 
     def _initialise(self) -> None:
-        """Glorot weights and zero biases, as the authors' code has them.
+        """Set Glorot weights and zero biases, as in the authors' code.
 
-        The density starts slightly positive: a ReLU that is negative everywhere never gets a gradient and
-        leaves the image empty for good (a failure every reimplementation has met).
+        The bias of the density is positive instead: a ReLU whose input is negative everywhere has no gradient, and the
+        image would stay empty.
         """
         for layer in self.modules():
             if isinstance(layer, nn.Linear):
@@ -79,9 +83,14 @@ class NeRFField(Field):
 
 
 def encoded_times(times: Tensor | None, num_frequencies: int) -> Tensor:
-    """Times (N,) to (N, 1 + 2 L).
+    """Return the frequency encoding (N, 1 + 2 L) of times.
 
-    Raises: ValueError where there are none.
+    Args:
+        times: (N,) in [0, 1].
+        num_frequencies: number L of frequencies.
+
+    Raises:
+        ValueError: if `times` is None.
     """
     if times is None:
         raise ValueError("this field changes with time: it needs the times of its positions")

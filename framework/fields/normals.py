@@ -1,4 +1,4 @@
-"""Normals: what the density says of surfaces, and a head that learns to say it smoothly."""
+"""Surface normals: from the gradient of the density, and from a network that predicts smoother ones."""
 
 from __future__ import annotations
 
@@ -15,25 +15,26 @@ from framework.kernels.frequency import frequency_encoding
 from framework.kernels.math import safe_normalize
 
 FREQUENCIES = 2
+"""Number of frequencies of the positions' encoding."""
 
 
 def density_normals(field: Field, points: Points) -> Tensor:
-    """Return unit directions (N, 3) in which density falls fastest; 0 where it does not change. Without a gradient.
+    """Return the unit directions (N, 3) of steepest descent of the density; 0 where its gradient is 0.
 
-    One more evaluation of the field, whose parameters get no gradient from it.
+    The field is evaluated once more. The result has no gradient.
 
     Args:
-        field: whose density is looked at.
+        field: the field.
         points: N points.
     """
     parameters = [p for p in field.parameters() if p.requires_grad]
     try:
-        for parameter in parameters:  # else the kernels would also take the parameters' gradients
+        for parameter in parameters:  # otherwise the kernels would also compute the parameters' gradients
             parameter.requires_grad_(False)
         with torch.enable_grad():
-            followed = points.positions.detach().requires_grad_()
-            sigma, _ = field.density(replace(points, positions=followed))
-            (gradient,) = torch.autograd.grad(sigma.sum(), followed)
+            positions = points.positions.detach().requires_grad_()
+            sigma, _ = field.density(replace(points, positions=positions))
+            (gradient,) = torch.autograd.grad(sigma.sum(), positions)
     finally:
         for parameter in parameters:
             parameter.requires_grad_(True)
@@ -41,11 +42,11 @@ def density_normals(field: Field, points: Points) -> Tensor:
 
 
 class NormalHead(nn.Module):
-    """Normals from a field's features and the place: Ref-NeRF (Verbin et al. 2022), section 4.
+    """A network that predicts normals from a field's features and positions: Ref-NeRF (Verbin et al. 2022), section 4.
 
     Args:
-        num_features: of the field.
-        width: features of the hidden layers.
+        num_features: number F of features of the field.
+        width: features of a hidden layer.
     """
 
     def __init__(self, num_features: int, width: int = 64) -> None:
@@ -53,7 +54,12 @@ class NormalHead(nn.Module):
         self.network = MLP(num_features + 3 + 6 * FREQUENCIES, width, width, 3)
 
     def forward(self, features: Tensor, positions: Tensor) -> Tensor:
-        """Unit normals (N, 3); `positions` (N, 3) are contracted ones or those of a box, of magnitude 1."""
+        """Return the unit normals (N, 3).
+
+        Args:
+            features: (N, F) features of the field.
+            positions: (N, 3) positions, contracted or in units of the box, so that they are of magnitude 1.
+        """
         encoded = frequency_encoding(positions, FREQUENCIES)
         return safe_normalize(self.network(features, encoded.to(features.dtype)).float())
 
@@ -61,18 +67,23 @@ class NormalHead(nn.Module):
 def normal_penalties(
     predicted: Tensor, normals: Tensor, directions: Tensor, weights: Tensor, samples: Samples
 ) -> dict[str, Tensor]:
-    """What is wrong with predicted normals, per ray: Ref-NeRF, equations 10 and 11.
+    """Return the penalties of predicted normals per ray: Ref-NeRF, equations 10 and 11.
 
-    Unlike there the density learns nothing from it: the kernels have first derivatives only.
+    Unlike in the paper the density gets no gradient from them, because the kernels have first derivatives only.
 
     Args:
-        predicted, normals: (N, 3) of the head and of the density.
-        directions: (N, 3) of the samples' rays.
-        weights: (N,) of the samples.
-    Returns: "normals" (R,), how far the two are apart; "orientation" (R,), how much predicted ones face away.
+        predicted: (N, 3) predicted unit normals.
+        normals: (N, 3) unit normals of the density, or 0.
+        directions: (N, 3) unit directions of the samples' rays.
+        weights: (N,) weights of the samples; without a gradient.
+        samples: N samples of R rays.
+
+    Returns:
+        "normals" (R,), the weighted difference from the normals of the density, and "orientation" (R,), the weighted
+        squared cosine of predicted normals that face away from the camera.
     """
     weights = weights.detach()
-    known = normals.square().sum(-1)  # 0 where the density does not change
-    apart = weights * known * (1 - (predicted * normals).sum(-1))
+    is_defined = normals.square().sum(-1)  # 0 where the density's gradient is 0, else 1
+    apart = weights * is_defined * (1 - (predicted * normals).sum(-1))
     away = weights * (predicted * directions).sum(-1).clamp(min=0).square()
     return {"normals": ray_sum(apart, samples), "orientation": ray_sum(away, samples)}

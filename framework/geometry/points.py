@@ -1,4 +1,4 @@
-"""Points at which a field is asked, and how large they are."""
+"""Points at which a field is evaluated, with their size."""
 
 from __future__ import annotations
 
@@ -11,50 +11,52 @@ from torch import Tensor
 from framework.geometry.rays import Rays, Samples
 
 Footprint = Literal["none", "radius", "gaussian"]
-"""What a field wants to know of a point's size: nothing, the cone's radius there, or the cone's mean and covariance."""
+"""Kind of a point's size that a field needs: none, radius of the pixel's cone, or mean and covariance of the cone."""
 
 
 @dataclass(frozen=True)
 class Points:
-    """N points in space, at which density is asked for."""
+    """N points at which a field is evaluated."""
 
     positions: Tensor
     """(N, 3) scene coordinates."""
     times: Tensor | None = None
-    """(N,) in [0, 1] of a moving scene; None for a scene that stands still."""
+    """(N,) times in [0, 1]; None for a static scene."""
     radii: Tensor | None = None
-    """(N,) radius of the pixel's cone at each point, scene units; None where unknown."""
+    """(N,) radius of the pixel's cone at each point, scene units; None if not computed."""
     covariances: Tensor | None = None
-    """(N, 3) diagonal of the covariance of the cone's interval, squared scene units; None where unknown."""
+    """(N, 3) diagonal of the covariance of the cone's interval, squared scene units; None if not computed."""
 
     def __len__(self) -> int:
         return self.positions.shape[0]
 
 
 class Intervals(Protocol):
-    """Intervals along rays, as `Samples` are, and as a march hands them out."""
+    """N intervals along rays, such as `Samples` or the `Wave` of a march."""
 
     @property
     def t_starts(self) -> Tensor:
-        """(N,) where they start."""
+        """(N,) distance at the start of each interval."""
 
     @property
     def t_ends(self) -> Tensor:
-        """(N,) where they end."""
+        """(N,) distance at the end of each interval."""
 
     @property
     def t(self) -> Tensor:
-        """(N,) where the field is asked."""
+        """(N,) distance at which the field is evaluated."""
 
 
 def sample_points(rays: Rays, samples: Samples, footprint: Footprint = "none") -> Points:
-    """Return the points at which a field is asked for N samples of R rays.
+    """Return the points at which a field is evaluated for samples.
 
     Args:
-        rays: the rays; a footprint needs their `pixel_radii`.
-        samples: intervals along them.
-        footprint: how much of the points' size is computed.
-    Raises: ValueError where a footprint is wanted and the rays have no radius.
+        rays: R rays; with `pixel_radii` if a footprint is computed.
+        samples: N samples along the rays.
+        footprint: kind of the points' size to compute.
+
+    Raises:
+        ValueError: if a footprint is to be computed and the rays have no `pixel_radii`.
     """
     return interval_points(rays, samples.ray_indices, samples, samples.positions(rays), footprint)
 
@@ -62,21 +64,23 @@ def sample_points(rays: Rays, samples: Samples, footprint: Footprint = "none") -
 def interval_points(
     rays: Rays, owners: Tensor, intervals: Intervals, positions: Tensor, footprint: Footprint
 ) -> Points:
-    """Return the points at which a field is asked for N intervals of R rays.
+    """Return the points at which a field is evaluated for intervals.
 
     Args:
-        rays: the rays; a footprint needs their `pixel_radii`.
-        owners: (N,) int64, the ray of each interval.
-        intervals: N intervals.
-        positions: (N, 3) where the field is asked, but for Gaussians, which have a mean of their own.
-        footprint: how much of the points' size is computed.
-    Raises: ValueError where a footprint is wanted and the rays have no radius.
+        rays: R rays; with `pixel_radii` if a footprint is computed.
+        owners: (N,) int64 index of the ray of each interval.
+        intervals: N intervals along the rays.
+        positions: (N, 3) positions of the points; not used for Gaussians, whose positions are their means.
+        footprint: kind of the points' size to compute.
+
+    Raises:
+        ValueError: if a footprint is to be computed and the rays have no `pixel_radii`.
     """
     times = None if rays.times is None else rays.times[owners]
     if footprint == "none":
         return Points(positions, times)
     if rays.pixel_radii is None:
-        raise ValueError("this field wants to know the size of its points: the rays need pixel_radii")
+        raise ValueError("this field uses the size of its points: the rays need pixel_radii")
     radii = rays.pixel_radii.index_select(0, owners)
     if footprint == "radius":
         return Points(positions, times, intervals.t * radii)
@@ -90,14 +94,17 @@ def conical_frustums(t_starts: Tensor, t_ends: Tensor, radii: Tensor) -> tuple[T
     """Return the Gaussians of conical frustums: Mip-NeRF (Barron et al. 2021), equation 7, in its stable form.
 
     Args:
-        t_starts, t_ends: (N,) distances between which each frustum lies.
+        t_starts: (N,) distance at which each frustum starts.
+        t_ends: (N,) distance at which each frustum ends.
         radii: (N,) radius of the cone at distance 1.
-    Returns: (N,) mean distance, variance along the ray, and variance across it.
+
+    Returns:
+        (N,) mean distance, (N,) variance along the ray, and (N,) variance perpendicular to the ray.
     """
     middle, half = (t_starts + t_ends) / 2, (t_ends - t_starts) / 2
-    # In the share that half is of the middle, which is at most 1: half^4 overflows where an interval has no end.
-    there = middle > 0
-    squared = torch.where(there, half / torch.where(there, middle, torch.ones_like(middle)), 0.0).square()
+    # Written in half / middle, which is at most 1: half^4 overflows for the last interval, which is very long.
+    positive = middle > 0
+    squared = torch.where(positive, half / torch.where(positive, middle, torch.ones_like(middle)), 0.0).square()
     total = 3 + squared
     mean_t = middle * (1 + 2 * squared / total)
     along = half.square() * (1 / 3 - (4 / 15) * squared * (12 - squared) / total.square())

@@ -81,7 +81,7 @@ class Histogram:
 
 @dataclass(frozen=True)
 class CoarseLevel:
-    """An earlier level that says where to look, and is supervised too."""
+    """The coarse level of hierarchical sampling, which is rendered and supervised too."""
 
     field: Any
     """The field that was sampled (`framework.Field`)."""
@@ -119,9 +119,9 @@ class Samples:
     alpha: Tensor | None = None
     """(N,) opacity of each interval, of a field that has it instead of density."""
     early_stop: float = 0.0
-    """Transmittance under which rays were ended: the most that a colour channel can be off by. 0 for none."""
+    """Transmittance below which rays were ended: the maximum error of a colour channel. 0 if none were."""
     coarse: CoarseLevel | None = None
-    """What the samples were drawn by, where it is rendered too."""
+    """The coarse level from whose weights the samples were drawn, if it is rendered too."""
     edges: Tensor | None = None
     """(R, S + 1) ends of the intervals in normalised distance, from samplers that use it."""
     proposals: tuple[Histogram, ...] = ()
@@ -205,5 +205,10 @@ class Samples:
         return replace(self, sigma=sigma, features=features)
 
     def with_alpha(self, alpha: Tensor, features: Tensor) -> Samples:
-        """The same samples with the opacity of their intervals (N,) and features (N, F) attached."""
+        """Return the samples with opacity and features attached.
+
+        Args:
+            alpha: (N,) opacity of each interval.
+            features: (N, F) the field's features.
+        """
         return replace(self, alpha=alpha, features=features)

@@ -1,1 +1,1 @@
-"""The hot loops, one file an operation: the readable torch reference, the fast path, and what chooses between them."""
+"""Operations with compiled implementations. Each file has the PyTorch reference and the compiled form of a few."""

@@ -1,9 +1,9 @@
-"""Adam (Kingma and Ba 2015), dense, and on a table of which a step touches few entries.
+"""Adam (Kingma and Ba 2015), dense, and sparse for tables of which a step uses few entries.
 
-Each entry sees Adam on the sequence of its own gradients that are not zero: its moments decay, and their bias is
-corrected, by the number of updates it has had, not by the number of steps. So an entry that is met for the first time
-after a thousand steps, or not for a thousand steps, moves as far as it should (Instant-NGP's optimiser skips entries
-the same way; Mueller et al. 2022, section 4).
+Sparse Adam updates an entry only if its gradient is not zero. The moments of the entry decay, and their bias is
+corrected, by the number of its updates rather than the number of steps. An entry that is used for the first time after
+a thousand steps therefore moves as far as in a first step (Instant-NGP's optimiser skips entries in the same way;
+Mueller et al. 2022, section 4).
 """
 
 from __future__ import annotations
@@ -28,11 +28,14 @@ def sparse_adam_reference(
     values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
     rate: float, betas: tuple[float, float], eps: float,
 ) -> int:  # fmt: skip
-    """As `sparse_adam`, in torch, on any device and in any float type."""
+    """Compute `sparse_adam` in PyTorch, on any device and for any float type.
+
+    `values`, `grad`, `mean`, `square`, `seen`, `rate`, `betas` and `eps` are as in `sparse_adam`.
+    """
     rows = (grad != 0).any(-1).nonzero().squeeze(-1)
     g = grad[rows]
     seen[rows] += 1
-    # In the values' own type, which all devices have: 1 - beta^count by powers would lose digits.
+    # expm1 rather than 1 - beta^count, which would lose digits in the type of the values, the one all devices have.
     count, logs = seen[rows], [math.log(beta) if beta else -math.inf for beta in betas]
     mean[rows] = betas[0] * mean[rows] + (1 - betas[0]) * g
     square[rows] = betas[1] * square[rows] + (1 - betas[1]) * g * g
@@ -46,17 +49,20 @@ def sparse_adam(
     values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
     rate: float, betas: tuple[float, float], eps: float,
 ) -> int:  # fmt: skip
-    """Update, in place, the entries that have a gradient, and set their gradient to zero.
+    """Update, in place, the entries whose gradient is not zero, and set their gradient to zero.
 
     Args:
         values: (E, F) parameters.
-        grad: (E, F) gradient; an entry of zeros is left alone.
-        mean, square: (E, F) moments.
-        seen: (E,) updates each entry has had, counted at least until the corrections are 1 in float32.
+        grad: (E, F) gradient; an entry of zeros is not updated.
+        mean: (E, F) first moments.
+        square: (E, F) second moments.
+        seen: (E,) number of updates of each entry, counted at least until the bias corrections are 1 in float32.
         rate: learning rate.
-        betas: decay of the two moments.
-        eps: added to the root of the second.
-    Returns: how many entries were updated.
+        betas: decay rates of the two moments.
+        eps: added to the square root of the second moment.
+
+    Returns:
+        the number of entries that were updated.
     """
     tensors = values, grad, mean, square, seen
     return SPARSE_ADAM(tensors, *tensors, rate, betas, eps)
@@ -83,7 +89,10 @@ def dense_adam_reference(
     values: Sequence[Tensor], grads: Sequence[Tensor], means: Sequence[Tensor], squares: Sequence[Tensor],
     steps: Sequence[Tensor], rate: float, betas: tuple[float, float], eps: float,
 ) -> None:  # fmt: skip
-    """As `dense_adam`, in torch, on any device and in any float type."""
+    """Compute `dense_adam` in PyTorch, on any device and for any float type.
+
+    `values`, `grads`, `means`, `squares`, `steps`, `rate`, `betas` and `eps` are as in `dense_adam`.
+    """
     for value, grad, mean, square, step in zip(values, grads, means, squares, steps, strict=True):
         step += 1
         mean.lerp_(grad, 1 - betas[0])
@@ -96,12 +105,17 @@ def dense_adam(
     values: Sequence[Tensor], grads: Sequence[Tensor], means: Sequence[Tensor], squares: Sequence[Tensor],
     steps: Sequence[Tensor], rate: float, betas: tuple[float, float], eps: float,
 ) -> None:  # fmt: skip
-    """Update, in place, every value of several parameters (Kingma and Ba 2015, algorithm 1).
+    """Update, in place, all values of several parameters: Kingma and Ba 2015, algorithm 1.
 
     Args:
-        values, grads, means, squares: of each parameter, of one shape.
-        steps: () float32 updates each parameter has had, to which this one is added.
-        rate, betas, eps: as for `sparse_adam`.
+        values: the parameters, each of any shape.
+        grads: gradient of each parameter, of the same shape.
+        means: first moments of each parameter, of the same shape.
+        squares: second moments of each parameter, of the same shape.
+        steps: () float32 number of updates of each parameter, which is increased by 1.
+        rate: learning rate.
+        betas: decay rates of the two moments.
+        eps: added to the square root of the second moment.
     """
     DENSE_ADAM((*values, *grads), values, grads, means, squares, steps, rate, betas, eps)
 
@@ -144,12 +158,12 @@ def _torch_adam(
 
 
 def all_finite_reference(values: Tensor) -> bool:
-    """As `all_finite`, in torch, on any device."""
+    """Compute `all_finite` of `values` in PyTorch, on any device."""
     return bool(torch.isfinite(values).all())
 
 
 def all_finite(values: Tensor) -> bool:
-    """Whether no value is infinite or NaN, in one pass."""
+    """Return whether none of `values` is infinite or NaN, in one pass."""
     return ALL_FINITE((values,), values)
 
 

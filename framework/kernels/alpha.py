@@ -1,9 +1,10 @@
-"""Composites alphas, the share of light that each sample stops, as of a surface (NeuS, Wang et al. 2021, eq. 10).
+"""Compositing of alphas, the opacities of samples of a surface (NeuS, Wang et al. 2021, equation 10).
 
     T_i = prod_{j < i} (1 - alpha_j)            transmittance in front of a sample
     w_i = T_i alpha_i                           weight
 
-An alpha is the optical depth tau = -log(1 - alpha) of an interval of length 1, so densities' compositing does it.
+An alpha is equivalent to the optical depth tau = -log(1 - alpha) of an interval of length 1, so that alphas are
+composited as densities.
 """
 
 from __future__ import annotations
@@ -18,14 +19,16 @@ from framework.kernels.compositing import Composited, composite
 
 
 def alpha_depth(alpha: Tensor) -> Tensor:
-    """Compute the optical depth (N,) -log(1 - alpha), which is finite at 1, as is its gradient; NaN stays NaN.
+    """Return the optical depth (N,) -log(1 - alpha). It is finite at 1, as is its gradient; NaN stays NaN.
 
-    An alpha within sqrt(eps) of 1 (3.5e-4 in float32) is taken for 1 - sqrt(eps), with the gradient of the identity.
-    Nearer to 1 the gradient of the sums, whose rounding 1 / (1 - alpha) multiplies, would lose its digits.
+    An alpha within sqrt(eps) of 1 (3.5e-4 in float32) is replaced by 1 - sqrt(eps), with the gradient of the identity.
+    Closer to 1 the factor 1 / (1 - alpha) would amplify the rounding errors of the composited sums in the gradient.
 
     Args:
         alpha: (N,) in [0, 1].
-    Returns: float32, or float64 where alpha is that.
+
+    Returns:
+        optical depth (N,), float64 if `alpha` is float64, and float32 otherwise.
     """
     alpha = alpha if alpha.dtype == torch.float64 else alpha.float()
     most = 1 - torch.finfo(alpha.dtype).eps ** 0.5
@@ -33,12 +36,14 @@ def alpha_depth(alpha: Tensor) -> Tensor:
 
 
 def unit_intervals(samples: Samples, alpha: Tensor) -> tuple[Samples, Tensor]:
-    """Turn alphas into densities over intervals of length 1, which stop the same share of light.
+    """Convert alphas to densities of intervals of length 1, which have the same opacity.
 
     Args:
         samples: N samples.
-        alpha: (N,) in [0, 1].
-    Returns: the samples with such intervals and with t as it was, and their density (N,).
+        alpha: (N,) opacity of each sample in [0, 1].
+
+    Returns:
+        the samples with such intervals and their previous t, and the density (N,).
     """
     depth = alpha_depth(alpha)
     t = samples.t
@@ -46,16 +51,21 @@ def unit_intervals(samples: Samples, alpha: Tensor) -> tuple[Samples, Tensor]:
 
 
 def composite_alpha(samples: Samples, alpha: Tensor, rgb: Tensor, background: Tensor, fars: Tensor) -> Composited:
-    """Composite N packed samples with alphas to colour, opacity and depth of R rays.
+    """Composite packed samples with alphas.
 
-    Weights are within sqrt(eps) of their alpha's dtype (3.5e-4 in float32) of the products above.
+    Weights differ from the products T_i alpha_i by at most sqrt(eps) of the type of `alpha` (3.5e-4 in float32).
 
     Args:
-        samples: N samples; only their order and t matter.
-        alpha: (N,) in [0, 1].
-        rgb: (N, 3) colour.
-        background: (R, 3) or (3,) what shows where a ray is not opaque.
-        fars: (R,) the rays' far ends.
-    Raises: IndexError where the samples' offsets do not divide them between the rays.
+        samples: N samples of R rays; only their order and t are used.
+        alpha: (N,) opacity of each sample in [0, 1].
+        rgb: (N, 3) colour in [0, 1].
+        background: (R, 3) or (3,) colour in [0, 1] of the background.
+        fars: (R,) distance of the far end of each ray.
+
+    Returns:
+        colour, opacity and depth of R rays, and the weights.
+
+    Raises:
+        IndexError: if the offsets of the samples do not divide them between the rays.
     """
     return composite(*unit_intervals(samples, alpha), rgb, background, fars)

@@ -1,4 +1,4 @@
-"""Compositing: from densities to the weight of each sample.
+"""Compositing: weights of samples from densities, and sums over rays.
 
 Max 1995, and NeRF (Mildenhall et al. 2020) equation 3, for intervals of constant density:
 
@@ -6,8 +6,8 @@ Max 1995, and NeRF (Mildenhall et al. 2020) equation 3, for intervals of constan
     T_i   = exp(-sum_{j < i} tau_j)             transmittance in front of it
     w_i   = T_i * (1 - exp(-tau_i))             weight
 
-Optical depth is summed and exponentiated, and alpha is -expm1(-tau): products of (1 - alpha) lose every
-optical depth below 6e-8, so that a thousand thin samples would vanish.
+Optical depths are summed and exponentiated, and alpha is computed as -expm1(-tau). Products of (1 - alpha) would lose
+optical depths below 6e-8, so that many thin samples would have no effect.
 """
 
 from __future__ import annotations
@@ -24,34 +24,44 @@ from framework.kernels.dispatch import CPP, Operation
 from framework.kernels.given import check_offsets
 
 MAX_OPTICAL_DEPTH = 1e3
-"""Of one interval. exp(-1000) is 0 even in float64, so nothing is lost, and sums stay finite."""
+"""Maximum optical depth of an interval, so that sums stay finite. exp(-1000) is 0 even in float64."""
 
 
 def optical_depth(sigma: Tensor, deltas: Tensor) -> Tensor:
-    """tau (N,) = sigma * delta, in [0, MAX_OPTICAL_DEPTH]; none where density or length is 0, whatever the other.
+    """Return the optical depth (N,) of intervals: sigma * delta, at most `MAX_OPTICAL_DEPTH`.
 
-    NaN densities stay NaN: a broken field must be seen. The density of an interval without end learns nothing: there
-    tau leaps from 0 to its bound as soon as there is any.
+    It is 0 if the density or the length is 0, even if the other is infinite. NaN densities stay NaN, so that a broken
+    field is noticed. The density of an infinite interval has no gradient, because its optical depth is either 0 or the
+    maximum.
+
+    Args:
+        sigma: (N,) density in 1/length, at least 0.
+        deltas: (N,) length of each interval.
     """
-    # Infinity times 0 would be NaN, in tau and in its gradient, so the largest number stands for it.
+    # Infinity times 0 would be NaN, in tau and in its gradient, so infinity is replaced by the largest finite number.
     lengths = deltas.clamp(max=torch.finfo(deltas.dtype).max)
     sigma = torch.where(deltas == torch.inf, sigma.detach(), sigma).clamp(max=torch.finfo(sigma.dtype).max)
     return (sigma * lengths).clamp(max=MAX_OPTICAL_DEPTH)
 
 
 def exclusive_cumsum(values: Tensor) -> Tensor:
-    """(..., S) sum of `values` (..., S) over those in front in the last dimension.
+    """Return the exclusive cumulative sum (..., S) of `values` (..., S) along the last dimension.
 
-    Sums are moved on by one. Taking each value out of its own sum again would leave, of a large one, its rounding.
+    The inclusive sums are shifted by one. Subtracting each value from its inclusive sum would leave rounding errors of
+    large values.
     """
     return functional.pad(values, (1, 0)).cumsum(-1)[..., :-1]
 
 
 def segmented_sum(values: Tensor, places: Tensor) -> Tensor:
-    """(N,) sum of `values` (N,) over the `places` (N,) samples right in front of each, which are those of its ray.
+    """Return the exclusive cumulative sum (N,) of `values` (N,) within each ray.
 
-    Values of two rays never meet, so NaN and rounding stay where they are. In log2 S passes, each of which doubles
-    how many are added up (Hillis and Steele 1986); unlike rows of S for each ray, one long ray costs no memory.
+    Values of different rays are never added, so that NaN and rounding errors stay in their ray. The sums take log2 S
+    passes (Hillis and Steele 1986), and no padding to the longest ray.
+
+    Args:
+        values: (N,) one value per sample.
+        places: (N,) int64 number of samples in front of each sample on its ray.
     """
     most = int(places.max()) if len(places) else 0
     total, reach = values.roll(1).masked_fill(places < 1, 0), 1
@@ -62,14 +72,14 @@ def segmented_sum(values: Tensor, places: Tensor) -> Tensor:
 
 
 def exclusive_sum(values: Tensor, samples: Samples) -> Tensor:
-    """(N,) sum of `values` (N,) over the samples in front on the same ray."""
+    """Return the sum (N,) of `values` (N,) over the samples in front of each of `samples` on its ray."""
     if samples.per_ray is not None:
         return exclusive_cumsum(samples.padded(values)).reshape(-1)
     return segmented_sum(values, samples.ranks)
 
 
 def ray_sum(values: Tensor, samples: Samples) -> Tensor:
-    """(R, ...) sum of `values` (N, ...) over each ray's samples; 0 for a ray without samples."""
+    """Return the sum (R, ...) of `values` (N, ...) over the `samples` of each ray; 0 for a ray without samples."""
     if samples.per_ray is not None:
         return samples.padded(values).sum(1)
     total = values.new_zeros(samples.num_rays, *values.shape[1:])
@@ -77,11 +87,11 @@ def ray_sum(values: Tensor, samples: Samples) -> Tensor:
 
 
 def weights_and_transmittance(sigma: Tensor, samples: Samples) -> tuple[Tensor, Tensor]:
-    """Weights (N,) and the transmittance (N,) in front of each sample.
+    """Return the weight (N,) of each sample and the transmittance (N,) in front of it.
 
     Args:
-        sigma: (N,) density, 1/length, at least 0.
-        samples: the intervals.
+        sigma: (N,) density in 1/length, at least 0.
+        samples: N samples.
     """
     tau = optical_depth(sigma, samples.deltas)
     transmittance = torch.exp(-exclusive_sum(tau, samples))
@@ -89,32 +99,35 @@ def weights_and_transmittance(sigma: Tensor, samples: Samples) -> tuple[Tensor, 
 
 
 class Composited(NamedTuple):
-    """What light along R rays adds up to."""
+    """Composited values of R rays with N samples."""
 
     color: Tensor
-    """(R, 3) over the background."""
+    """(R, 3) colour over the background."""
     opacity: Tensor
-    """(R,) the sum of the weights."""
+    """(R,) sum of the weights."""
     moment: Tensor
-    """(R,) the sum of weight * t; without gradient."""
+    """(R,) sum of weight * t, without gradient."""
     median: Tensor
-    """(R,) the t behind which at most half of the light is left, or the ray's far end; without gradient."""
+    """(R,) t of the first sample behind which the transmittance is at most 0.5, or the far end; without gradient."""
     weights: Tensor
-    """(N,)"""
+    """(N,) weight of each sample."""
 
 
 def composite_reference(samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor, fars: Tensor) -> Composited:
-    """The sums in torch: the truth, in any float type. Arguments as for `composite`."""
+    """Compute `composite` in PyTorch, on any device and for any float type.
+
+    `samples`, `sigma`, `rgb`, `background` and `fars` are as in `composite`.
+    """
     weights, transmittance = weights_and_transmittance(sigma, samples)
     opacity = ray_sum(weights, samples)
     left = (1 - opacity).clamp(min=0)
     color = ray_sum(weights[:, None] * rgb, samples) + left[:, None] * background
     with torch.no_grad():
-        # An endless interval has an infinite t: where it stops no light, it has no part in the mean.
+        # t is infinite in the middle of an infinite interval; with weight 0 it must not make the mean NaN.
         moment = ray_sum((weights * samples.t).masked_fill(weights == 0, 0), samples)
         far = fars[samples.ray_indices]
-        seen = torch.where(transmittance - weights <= 0.5, torch.minimum(samples.t, far), far)
-        median = fars.to(seen.dtype).scatter_reduce(0, samples.ray_indices, seen, "amin")
+        crossing = torch.where(transmittance - weights <= 0.5, torch.minimum(samples.t, far), far)
+        median = fars.to(crossing.dtype).scatter_reduce(0, samples.ray_indices, crossing, "amin")
     return Composited(color, opacity, moment, median, weights)
 
 
@@ -123,7 +136,7 @@ _backward = native.Function("composite_backward", "pppppqqppppppppi")
 
 
 class _Composite(torch.autograd.Function):
-    """The compiled sums: one pass over a ray forward, two backward."""
+    """The compiled form of `composite`: one pass over each ray forward, two backward."""
 
     @staticmethod
     def forward(
@@ -152,30 +165,35 @@ class _Composite(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         sigma, rgb, starts, ends, offsets, background, weights, opacity = ctx.saved_tensors
         count, rays = len(sigma), len(offsets) - 1
-        of_color = torch.zeros_like(background) if grads[0] is None else grads[0].contiguous()
-        of_opacity, of_weights = (None if g is None else g.contiguous() for g in (grads[1], grads[4]))
-        of_sigma, of_rgb = torch.empty_like(sigma), torch.empty_like(rgb)
+        grad_color = torch.zeros_like(background) if grads[0] is None else grads[0].contiguous()
+        grad_opacity, grad_weights = (None if g is None else g.contiguous() for g in (grads[1], grads[4]))
+        grad_sigma, grad_rgb = torch.empty_like(sigma), torch.empty_like(rgb)
         _backward(
             sigma.data_ptr(), rgb.data_ptr(), starts.data_ptr(), ends.data_ptr(), offsets.data_ptr(), rays, count,
             background.data_ptr(), weights.data_ptr(), opacity.data_ptr(),
-            native.pointer(of_color, "the colour's gradient", (rays, 3)),
-            None if of_opacity is None else native.pointer(of_opacity, "the opacity's gradient", (rays,)),
-            None if of_weights is None else native.pointer(of_weights, "the weights' gradient", (count,)),
-            of_sigma.data_ptr(), of_rgb.data_ptr(), native.threads(),
+            native.pointer(grad_color, "the colour's gradient", (rays, 3)),
+            None if grad_opacity is None else native.pointer(grad_opacity, "the opacity's gradient", (rays,)),
+            None if grad_weights is None else native.pointer(grad_weights, "the weights' gradient", (count,)),
+            grad_sigma.data_ptr(), grad_rgb.data_ptr(), native.threads(),
         )  # fmt: skip
-        return of_sigma, of_rgb, None, None, None, None, None, None
+        return grad_sigma, grad_rgb, None, None, None, None, None, None
 
 
 def composite(samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor, fars: Tensor) -> Composited:
-    """Colour, opacity and depth of R rays from N packed samples.
+    """Composite packed samples: NeRF (Mildenhall et al. 2020), equation 3.
 
     Args:
-        samples: the intervals.
-        sigma: (N,) density.
-        rgb: (N, 3) colour.
-        background: (R, 3) or (3,) what shows where a ray is not opaque.
-        fars: (R,) the rays' far ends.
-    Raises: IndexError where the samples' offsets do not divide them between the rays.
+        samples: N samples of R rays.
+        sigma: (N,) density in 1/length, at least 0.
+        rgb: (N, 3) colour in [0, 1].
+        background: (R, 3) or (3,) colour in [0, 1] of the background.
+        fars: (R,) distance of the far end of each ray.
+
+    Returns:
+        colour, opacity and depth of R rays, and the weights.
+
+    Raises:
+        IndexError: if the offsets of the samples do not divide them between the rays.
     """
     check_offsets(samples.offsets, len(samples))
     background = background.expand(samples.num_rays, 3)
@@ -194,7 +212,7 @@ def _composite(samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor,
 
 
 def distortion_by_pairs(weights: Tensor, samples: Samples) -> Tensor:
-    """As `distortion`, over all pairs of samples of a ray: O(N^2), the truth."""
+    """Compute `distortion` of `weights` and `samples` over all pairs of samples of a ray, as its definition says."""
     middles, losses = (samples.t_starts + samples.t_ends) / 2, []
     for start, end in zip(samples.offsets[:-1].tolist(), samples.offsets[1:].tolist(), strict=True):
         w, m, delta = weights[start:end], middles[start:end], samples.deltas[start:end]
@@ -204,9 +222,9 @@ def distortion_by_pairs(weights: Tensor, samples: Samples) -> Tensor:
 
 
 def distortion_reference(weights: Tensor, samples: Samples) -> Tensor:
-    """As `distortion`, in torch, on any device and in any float type."""
-    # m_i - m_j is the sum of the gaps between neighbouring middles from j to i: each counts for all weight in front.
-    # No term is negative, so nothing cancels, wherever the weights lie and however close together.
+    """Compute `distortion` of `weights` and `samples` in PyTorch, on any device and for any float type."""
+    # m_i - m_j is the sum of the gaps between neighbouring middles from j to i, so each gap is multiplied by the sum of
+    # the weights in front of it. No term is negative, so that there is no cancellation.
     starts, ends = samples.t_starts, samples.t_ends
     gaps = ((starts - starts.roll(1)) + (ends - ends.roll(1))).masked_fill(samples.ranks == 0, 0) / 2
     steps = gaps * exclusive_sum(weights, samples)
@@ -221,30 +239,37 @@ class _Distortion(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
         count, rays = len(weights), len(offsets) - 1
-        loss, of_weights = weights.new_empty(rays), torch.empty_like(weights)
+        loss, grad_weights = weights.new_empty(rays), torch.empty_like(weights)
         _distortion(
             native.pointer(weights, "weights", (count,)), native.pointer(starts, "t_starts", (count,)),
             native.pointer(ends, "t_ends", (count,)), native.pointer(offsets, "offsets", (rays + 1,), torch.int64),
-            rays, count, loss.data_ptr(), of_weights.data_ptr(), native.threads(),
+            rays, count, loss.data_ptr(), grad_weights.data_ptr(), native.threads(),
         )  # fmt: skip
-        ctx.save_for_backward(of_weights, offsets)
+        ctx.save_for_backward(grad_weights, offsets)
         return loss
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
-        of_weights, offsets = ctx.saved_tensors
-        return of_weights * grad.repeat_interleave(offsets[1:] - offsets[:-1]), None, None, None
+        grad_weights, offsets = ctx.saved_tensors
+        return grad_weights * grad.repeat_interleave(offsets[1:] - offsets[:-1]), None, None, None
 
 
 def distortion(weights: Tensor, samples: Samples) -> Tensor:
-    """How far a ray's light is spread along it (mip-NeRF 360, Barron et al. 2022, equation 15), not by pairs.
+    """Return the distortion of rays, the spread of their weights: mip-NeRF 360 (Barron et al. 2022), equation 15.
+
+    It is computed in time proportional to the number of samples, without their pairs.
 
     Args:
-        weights: (N,).
-        samples: their intervals.
-    Returns: (R,) sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 delta_i / 3, in the unit of t.
-    Raises: IndexError where the samples' offsets do not divide them between the rays.
+        weights: (N,) weight of each sample.
+        samples: N samples of R rays.
+
+    Returns:
+        (R,) sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 delta_i / 3, in the unit of t, where m_i is the middle of
+        interval i.
+
+    Raises:
+        IndexError: if the offsets of the samples do not divide them between the rays.
     """
     check_offsets(samples.offsets, len(samples))
     return DISTORTION((weights, samples.t_starts, samples.t_ends), weights, samples)

@@ -1,4 +1,4 @@
-"""Contraction of unbounded space into the unit cube, where encodings stand."""
+"""Contraction of unbounded space into the unit cube, the domain of encodings."""
 
 from __future__ import annotations
 
@@ -13,20 +13,23 @@ from framework.kernels.dispatch import CPP, Operation
 
 
 def contract_to_unit_reference(positions: Tensor, box: Tensor) -> Tensor:
-    """As `contract_to_unit`, in torch, in any float type."""
+    """Compute `contract_to_unit` of `positions` and `box` in PyTorch, on any device and for any float type."""
     centre, half = (box[0] + box[1]) / 2, (box[1] - box[0]) / 2
     return contract((positions - centre) / half) / 4 + 0.5
 
 
 def contract_to_unit(positions: Tensor, box: Tensor) -> Tensor:
-    """All of space into [0, 1]^3, the ball inside `box` keeping half of its width.
+    """Contract all of space into [0, 1]^3, where the ellipsoid inside `box` takes half of the width.
 
-    mip-NeRF 360 (Barron et al. 2022), equation 10 (`framework.geometry.bounds.contract`); the ball of radius 2 fits.
+    mip-NeRF 360 (Barron et al. 2022), equation 10 (`framework.geometry.bounds.contract`), scaled so that its ball of
+    radius 2 fits into the cube.
 
     Args:
         positions: (N, 3) scene coordinates.
-        box: (2, 3) corners of the part of space that is not contracted, but for its corners.
-    Returns: (N, 3).
+        box: (2, 3) corners of a box; space is contracted outside the ellipsoid that it encloses.
+
+    Returns:
+        (N, 3) positions in [0, 1].
     """
     return CONTRACT((positions, box), positions, box)
 

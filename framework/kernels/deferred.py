@@ -1,4 +1,4 @@
-"""Gradients of tables that wait for the optimiser instead of being added up by autograd."""
+"""Gradients of tables that are kept for the optimiser instead of being accumulated by autograd."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 Parts = list[tuple[Tensor, Tensor]]
-"""Positions (N, D) and incoming gradient (N, width) of each look-up."""
+"""Positions (N, D) of each look-up, and gradient (N, width) of its result."""
 
 
 class _Waiting(torch.autograd.Function):
-    """A node between a look-up and its table, whose gradient is the look-up's own incoming gradient.
+    """A node between a look-up and its table, which receives the gradient of the look-up's result.
 
-    Autograd calls a node's backward only in a pass that asks for something behind it. The look-up stands before its
-    positions too, and would be called for those alone.
+    Autograd calls the backward of a node only in a pass that needs the gradient of one of its inputs. The look-up
+    itself has the positions as a further input, so that its backward may be called for those only.
     """
 
     @staticmethod
@@ -31,15 +31,18 @@ class _Waiting(torch.autograd.Function):
 
 
 def waiting(table: Tensor, positions: Tensor, width: int, parts: Parts) -> Tensor:
-    """A stand-in for a look-up's table, so that its incoming gradient is left in `parts`.
+    """Return a placeholder for the table of a look-up, whose backward appends the look-up's gradient to `parts`.
 
-    Only by a backward pass that asks for the table's gradient: `backward()`, or one whose `inputs` name the table.
-    `autograd.grad` of the table finds no gradient to return; a look-up without `deferred` gives one.
+    It does so only in a backward pass that computes the gradient of the table: `backward()`, or one whose `inputs`
+    contain the table. `autograd.grad` of the table gets no gradient; use a look-up without `deferred` for that.
 
     Args:
         table: (E, F) parameters.
-        positions: (N, D) where they are looked up.
-        width: features of the result.
-    Returns: (N, width) no values. Its gradient, which the look-up gives, is that of its result.
+        positions: (N, D) positions of the look-up.
+        width: number of features of the result.
+        parts: positions and gradients of look-ups, to which this one's are appended.
+
+    Returns:
+        (N, width) zeros. The look-up must return the gradient of its result as the gradient of this tensor.
     """
     return _Waiting.apply(table, positions.detach(), width, parts)

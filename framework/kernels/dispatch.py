@@ -1,8 +1,7 @@
-"""Which implementation of an operation runs: one table, asked once a call.
+"""Choice of the implementation of an operation, at each call, from one table.
 
-An operation has a reference, which is torch on any device, in any type and of any derivative, and implementations by
-backends for some of that. A new backend adds an implementation to each operation it has; what calls the operation stays
-as it is.
+An operation has a reference in PyTorch, for any device, type and order of derivative, and implementations by backends
+for some of these. A new backend adds its implementations to the operations, whose callers do not change.
 """
 
 from __future__ import annotations
@@ -25,39 +24,42 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class Backend:
-    """Where implementations run."""
+    """A way to run operations, such as compiled C++ code."""
 
     name: str
+    """Name under which it is listed."""
     reads: Callable[[Tensor], bool]
-    """Whether it can read a tensor's memory. Not by the device's name, which torch takes a microsecond to tell."""
+    """Returns whether it can read a tensor's memory. `tensor.device`, which takes a microsecond, should be avoided."""
     available: Callable[[], bool]
-    """Whether it can be used on this machine."""
+    """Returns whether it can be used on this machine."""
 
 
 REFERENCE = Backend("reference", lambda tensor: True, lambda: True)
 TORCH = Backend("torch", lambda tensor: True, lambda: True)
-"""torch's own fast implementation, where it has one that is not the readable reference."""
+"""Fast implementations by PyTorch itself, if they differ from the reference."""
 CPP = Backend("c++", attrgetter("is_cpu"), lambda: native.available())
 FLOAT32, INT64, BOOL = (frozenset({kind}) for kind in (torch.float32, torch.int64, torch.bool))
 
 
 @dataclass(frozen=True)
 class Implementation(Generic[P, R]):
-    """One way to compute an operation, and when it may be taken."""
+    """An implementation of an operation, with the conditions under which it can be used."""
 
     backend: Backend
+    """The backend that runs it."""
     run: Callable[P, R]
+    """Computes the operation."""
     types: frozenset[torch.dtype] | None = None
-    """Of the tensors that are looked at; None for all."""
+    """Supported types of the tensors that decide; None for all types."""
     order: float = torch.inf
-    """Of the highest derivative that it has: 0 for none."""
+    """Order of the highest derivative that it supports: 0 for none."""
     differentiable: int | None = None
-    """How many of the tensors, the first ones, it has derivatives for; None for all."""
+    """Number of tensors, from the first, for which it supports derivatives; None for all."""
     fits: Callable[P, bool] | None = None
-    """A further condition on the arguments."""
+    """Further condition on the arguments; None if there is none."""
 
     def suits(self, tensors: Sequence[Tensor | None], *args: P.args, **kwargs: P.kwargs) -> bool:
-        """Whether it may be taken for these tensors and arguments."""
+        """Return whether it can be used for `tensors`, `args` and `kwargs`, which are as in `Operation`."""
         reads, types = self.backend.reads, self.types
         for tensor in tensors:
             if tensor is not None and not (reads(tensor) and (types is None or tensor.dtype in types)):
@@ -71,18 +73,18 @@ class Implementation(Generic[P, R]):
 
 
 class Operation(Generic[P, R]):
-    """A row of the table: an operation's reference and its other implementations.
+    """An operation: its reference and its other implementations.
 
     Args:
-        name: under which it is listed.
-        reference: the readable form in torch, which is taken where nothing else is.
+        name: name under which it is listed.
+        reference: the readable form in PyTorch, which is used if no other implementation can be.
     """
 
     def __init__(self, name: str, reference: Callable[P, R]) -> None:
         self.name = name
         self.reference = Implementation(REFERENCE, reference)
         self.implementations: list[Implementation[P, R]] = []
-        """Beside the reference, the preferred ones first."""
+        """Implementations other than the reference, in order of preference."""
         _operations[name] = self
 
     def implementation(
@@ -93,14 +95,14 @@ class Operation(Generic[P, R]):
         differentiable: int | None = None,
         fits: Callable[P, bool] | None = None,
     ) -> Callable[[Callable[P, R]], Callable[P, R]]:
-        """A decorator that adds a function as the implementation by a backend.
+        """Return a decorator that adds a function as an implementation.
 
         Args:
-            backend: where it runs.
-            types: of the tensors that are looked at; None for all.
-            order: of the highest derivative that it has: 0 for none.
-            differentiable: how many of the tensors, the first ones, it has derivatives for; None for all.
-            fits: a further condition on the arguments.
+            backend: the backend that runs it.
+            types: supported types of the tensors that decide; None for all types.
+            order: order of the highest derivative that it supports: 0 for none.
+            differentiable: number of tensors, from the first, for which it supports derivatives; None for all.
+            fits: further condition on the arguments; None if there is none.
         """
 
         def add(run: Callable[P, R]) -> Callable[P, R]:
@@ -110,7 +112,7 @@ class Operation(Generic[P, R]):
         return add
 
     def choose(self, tensors: Sequence[Tensor | None], *args: P.args, **kwargs: P.kwargs) -> Implementation[P, R]:
-        """The first implementation that may be taken, or the reference. Arguments as for a call."""
+        """Return the first implementation that can be used for `tensors`, `args` and `kwargs`, or the reference."""
         for implementation in self.implementations:
             if implementation.suits(tensors, *args, **kwargs):
                 return implementation
@@ -120,8 +122,9 @@ class Operation(Generic[P, R]):
         """Run the operation.
 
         Args:
-            tensors: those whose device, type and gradients decide which implementation runs; None is passed over.
-            args, kwargs: the arguments, the same for all implementations.
+            tensors: those whose device, type and gradients decide which implementation runs; None is ignored.
+            args: positional arguments of the operation.
+            kwargs: keyword arguments of the operation.
         """
         return self.choose(tensors, *args, **kwargs).run(*args, **kwargs)
 
@@ -130,9 +133,9 @@ _operations: dict[str, Operation[..., Any]] = {}
 
 
 def table() -> dict[str, tuple[str, ...]]:
-    """The backends of every operation in the modules that are imported, the reference last."""
+    """Return the names of the backends of every operation in the imported modules, the reference last."""
     return {
-        name: tuple(one.backend.name for one in (*operation.implementations, operation.reference))
+        name: tuple(item.backend.name for item in (*operation.implementations, operation.reference))
         for name, operation in sorted(_operations.items())
     }
 
@@ -146,15 +149,15 @@ _thread = _Thread()
 
 @contextmanager
 def derivatives(order: int) -> Iterator[None]:
-    """Within it, only implementations that have derivatives of this order are taken where gradients are asked for.
+    """Use only implementations with derivatives of a given order, within a `with` block, if gradients are needed.
 
-    Outside it is 1. A loss on a field's gradient (an eikonal term, say) needs 2.
+    The default is 1. A loss on the gradient of a field, such as an eikonal term, needs 2.
 
     Args:
-        order: of the highest derivative that will be asked for.
+        order: order of the highest derivative that will be computed.
     """
-    before, _thread.order = _thread.order, order
+    previous, _thread.order = _thread.order, order
     try:
         yield
     finally:
-        _thread.order = before
+        _thread.order = previous

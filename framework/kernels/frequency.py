@@ -11,14 +11,17 @@ from framework.kernels import kept, native
 from framework.kernels.dispatch import CPP, Operation
 
 MAX_FREQUENCIES = 32
-"""Of which an encoding may be made: from float32 the sines of the last ones are noise long before."""
+"""Maximum number of frequencies. In float32 the sines of the highest ones are noise already with fewer."""
 
 _forward = native.Function("frequency_encoding", "pqiiipi")
 _backward = native.Function("frequency_encoding_backward", "ppqiiipi")
 
 
 def frequency_encoding_reference(x: Tensor, num_frequencies: int, include_input: bool = True) -> Tensor:
-    """The encoding in torch: the truth, in float32 and float64. Arguments as for `frequency_encoding`."""
+    """Compute `frequency_encoding` in PyTorch, on any device.
+
+    `x`, `num_frequencies` and `include_input` are as in `frequency_encoding`.
+    """
     x = _widened(x)
     scales = 2.0 ** torch.arange(num_frequencies, device=x.device, dtype=x.dtype)
     angles = x[..., None, :] * scales[:, None]
@@ -27,12 +30,12 @@ def frequency_encoding_reference(x: Tensor, num_frequencies: int, include_input:
 
 
 def _widened(x: Tensor) -> Tensor:
-    """As float32, where it is not float64: in half precision 2^9 x overflows from x = 128 on."""
+    """Convert types other than float64 to float32: in half precision 2^9 x overflows from x = 128 on."""
     return x if x.dtype == torch.float64 else x.float()
 
 
 class _FrequencyEncoding(torch.autograd.Function):
-    """The compiled encoding."""
+    """The compiled form of `frequency_encoding`."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, num_frequencies: int, include_input: bool) -> Tensor:
@@ -60,18 +63,22 @@ class _FrequencyEncoding(torch.autograd.Function):
 
 
 def frequency_encoding(x: Tensor, num_frequencies: int, include_input: bool = True) -> Tensor:
-    """sin and cos of x times 1, 2, 4, ..., 2^(L - 1).
+    """Return the sines and cosines of x times 1, 2, 4, ..., 2^(L - 1).
 
-    The factor pi of equation 4 is left out, as in the authors' own code. float32 resolves the highest
-    frequency only while |x| * 2^(L - 1) stays well below 10^5: scenes are scaled to about 1.
+    The factor pi of equation 4 is omitted, as in the authors' code. float32 resolves the highest frequency only if
+    |x| * 2^(L - 1) is well below 10^5, so x should be of magnitude 1. The compiled form has first derivatives only.
 
     Args:
-        x: (..., D) input, of any type.
-        num_frequencies: L, 0 to 32.
-        include_input: put x itself in front.
-    Returns: (..., D * (2 L + include_input)): [x, sin(x), cos(x), sin(2 x), cos(2 x), ...], in float64 where x is, and
-        in float32 otherwise. First derivatives only where compiled.
-    Raises: ValueError for another number of frequencies.
+        x: (..., D) input, of any float type.
+        num_frequencies: number L of frequencies, 0 to 32.
+        include_input: whether the result starts with x itself.
+
+    Returns:
+        (..., D * (2 L + include_input)) values x, sin(x), cos(x), sin(2 x), cos(2 x), ...; float64 if `x` is float64,
+        and float32 otherwise.
+
+    Raises:
+        ValueError: if the number of frequencies is out of range.
     """
     if not 0 <= num_frequencies <= MAX_FREQUENCIES:
         raise ValueError(f"a frequency encoding has 0 to {MAX_FREQUENCIES} frequencies, not {num_frequencies}")

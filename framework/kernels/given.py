@@ -1,4 +1,4 @@
-"""Checks of tensors that came from outside. Compiled kernels check indices themselves, as they use them."""
+"""Checks of tensors that are passed by callers. Compiled kernels check indices themselves when they use them."""
 
 from __future__ import annotations
 
@@ -7,16 +7,23 @@ from torch import Tensor
 
 
 def is_followed(*tensors: Tensor | None) -> bool:
-    """Whether autograd follows any of the tensors: what a kernel has no gradient for is left to torch then."""
+    """Return whether autograd records any of `tensors`, so that an operation on it must have a gradient."""
     return torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors)
 
 
 def check_indices(indices: Tensor, count: int, what: str) -> None:
-    """Check indices into `count` things.
+    """Check that indices are in range.
 
-    On the processor only: elsewhere a look at them would wait for the device, which reports what is too large itself.
+    Indices on other devices than the CPU are not checked: reading them would wait for the device, which reports indices
+    out of range itself.
 
-    Raises: IndexError that names `what`, the first end that is out of range, and the range.
+    Args:
+        indices: integers of any shape.
+        count: number of items that are indexed.
+        what: name of the items, for the error.
+
+    Raises:
+        IndexError: if an index is less than 0, or not less than `count`.
     """
     if indices.device.type != "cpu" or indices.numel() == 0:
         return
@@ -26,13 +33,18 @@ def check_indices(indices: Tensor, count: int, what: str) -> None:
 
 
 def check_offsets(offsets: Tensor, count: int) -> None:
-    """Check that offsets (R + 1,) divide `count` samples between R rays. On the processor only, as above.
+    """Check that offsets divide samples between rays; on the CPU only, as in `check_indices`.
 
-    Raises: IndexError.
+    Args:
+        offsets: (R + 1,) int64 index of each ray's first sample; the last entry is the number of samples.
+        count: number N of samples.
+
+    Raises:
+        IndexError: if the offsets do not rise from 0 to `count`.
     """
     if offsets.device.type != "cpu":
         return
     if offsets.ndim != 1 or len(offsets) == 0 or int(offsets[0]) != 0 or int(offsets[-1]) != count:
-        raise IndexError(f"the rays' offsets must lead from 0 to {count}, the number of samples")
+        raise IndexError(f"the rays' offsets must start at 0 and end at {count}, the number of samples")
     if bool((offsets[1:] < offsets[:-1]).any()):
-        raise IndexError("the rays' offsets must not fall: each ray's samples stand behind those of the one before")
+        raise IndexError("the rays' offsets must not decrease: the samples of each ray follow those of the ray before")

@@ -1,7 +1,8 @@
 """Multiresolution hash encoding: Instant-NGP (Mueller et al. 2022), section 3.
 
-Level l is a grid of resolution r_l = floor(r_0 * b^l). A level whose vertices fit into its table is stored
-densely; a finer one is hashed (equation 4). A position's feature is the trilinear blend of its cell's 8 corners.
+Level l is a grid of resolution r_l = floor(r_0 * b^l). A level whose vertices fit into its table is stored densely; a
+finer one is hashed (equation 4). The features at a position are interpolated trilinearly between the 8 corners of its
+cell.
 """
 
 from __future__ import annotations
@@ -21,40 +22,50 @@ from framework.kernels.deferred import Parts, waiting
 from framework.kernels.dispatch import CPP, Operation
 
 PRIMES = (1, 2654435761, 805459861)
+"""Factors of the hash (equation 4)."""
 MAX_LEVELS = 64
+"""Maximum number of levels."""
 MAX_RESOLUTION = 2**20
-"""Cells along an axis: float32 has 4 bits left for where in such a cell a position lies."""
+"""Maximum number of cells along an axis; float32 then has 4 bits left for the position in a cell."""
 MAX_LOG2_TABLE_SIZE = 28
-"""Entries of a level, as a power of two: 32 bits tell them apart."""
+"""Maximum number of entries of a level, as a power of two, so that 32 bits can index them."""
 
 
 @dataclass(frozen=True)
 class HashGridLayout:
-    """Where each level's entries stand in the one table (E, F) that all levels share.
+    """Resolution and entries of each of L levels, in one table (E, F) that all levels share.
 
-    Raises: ConfigError where levels or their entries are none that a grid can have: the kernels rely on it.
+    Raises:
+        ConfigError: if the numbers are inconsistent or out of range; the kernels rely on them.
     """
 
     resolutions: tuple[int, ...]
-    """Cells along each axis, per level."""
+    """Number of cells along each axis, for each level."""
     offsets: tuple[int, ...]
-    """First entry of each level; one more than there are levels, the last being E."""
+    """Index of the first entry of each level, followed by the number E of all entries: L + 1 values."""
 
     def __post_init__(self) -> None:
         _check("levels", len(self.resolutions), MAX_LEVELS)
         if len(self.offsets) != len(self.resolutions) + 1 or self.offsets[0] != 0:
-            raise ConfigError(f"a hash grid of {len(self.resolutions)} levels has one offset more, the first being 0")
+            raise ConfigError(f"a hash grid of {len(self.resolutions)} levels needs one more offset, the first being 0")
         for resolution, (first, end) in zip(self.resolutions, pairwise(self.offsets), strict=True):
             _check("cells along an axis", resolution, MAX_RESOLUTION)
             _check("entries of a level", end - first, 2**MAX_LOG2_TABLE_SIZE)
             if (resolution + 1) ** 3 > end - first and (end - first) & (end - first - 1):
-                raise ConfigError(f"a hash grid's level of {end - first} entries is hashed: it needs a power of two")
+                raise ConfigError(f"a hashed level of a hash grid needs a power of two of entries, not {end - first}")
 
     @classmethod
     def build(cls, num_levels: int, base_resolution: int, max_resolution: int, log2_table_size: int) -> HashGridLayout:
-        """Resolutions grow geometrically from base to max (equations 2 and 3).
+        """Return a layout whose resolutions grow geometrically: equations 2 and 3.
 
-        Raises: ConfigError where a size is beyond MAX_LEVELS, MAX_RESOLUTION or MAX_LOG2_TABLE_SIZE, or less than 1.
+        Args:
+            num_levels: number L of levels.
+            base_resolution: cells along an axis at the first level.
+            max_resolution: cells along an axis at the last level.
+            log2_table_size: maximum number of entries of one level, as a power of two.
+
+        Raises:
+            ConfigError: if a number is less than 1 or exceeds MAX_LEVELS, MAX_RESOLUTION or MAX_LOG2_TABLE_SIZE.
         """
         _check("levels", num_levels, MAX_LEVELS)
         _check("cells along an axis", base_resolution, MAX_RESOLUTION)
@@ -70,10 +81,12 @@ class HashGridLayout:
 
     @property
     def num_entries(self) -> int:
+        """Number E of entries of all levels."""
         return self.offsets[-1]
 
     @property
     def num_levels(self) -> int:
+        """Number L of levels."""
         return len(self.resolutions)
 
     @cached_property
@@ -82,23 +95,27 @@ class HashGridLayout:
         return native.integers(self.resolutions), native.integers(self.offsets)
 
     def is_dense(self, level: int) -> bool:
-        """Whether each vertex of a level has an entry of its own."""
+        """Return whether each vertex of `level` has an entry of its own."""
         return (self.resolutions[level] + 1) ** 3 <= self.offsets[level + 1] - self.offsets[level]
 
 
 def _check(what: str, count: int, most: int) -> None:
-    """Refuse a count that is no whole number from 1 to `most`."""
+    """Check that a count is an integer from 1 to `most`."""
     if not isinstance(count, int) or not 1 <= count <= most:
         raise ConfigError(f"a hash grid has 1 to {most} {what}, not {shown(count)}")
 
 
 def corners(positions: Tensor, layout: HashGridLayout, level: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The 8 corners of the cell that each position lies in, at one level.
+    """Return the 8 corners of the cell of each position at one level.
 
     Args:
-        positions: (N, 3); what lies outside [0, 1] is moved to the face. NaN is in cell 0, with NaN for weights.
-    Returns: entries (8, N) int32 counted from the level's first one, trilinear weights (8, N), and the
-        fractions (3, N) they are made of. Corner c is at (c >> 2 & 1, c >> 1 & 1, c & 1) along x, y, z.
+        positions: (N, 3); coordinates are clamped to [0, 1]. NaN is in cell 0, with weights of NaN.
+        layout: resolutions and offsets of the levels.
+        level: number of the level.
+
+    Returns:
+        entries (8, N) int32, counted from the first entry of the level; trilinear weights (8, N); and positions in the
+        cell (3, N) in [0, 1]. Corner c is at (c >> 2 & 1, c >> 1 & 1, c & 1) along x, y, z.
     """
     resolution = layout.resolutions[level]
     scaled = positions.t().clamp(0, 1) * resolution
@@ -108,7 +125,7 @@ def corners(positions: Tensor, layout: HashGridLayout, level: int) -> tuple[Tens
         x, y, z = _both_ends(cell.int(), ((resolution + 1) ** 2, resolution + 1, 1))
         entries = x + y + z
     else:
-        x, y, z = _both_ends(cell.int(), PRIMES)  # products wrap around in int32, as the hash wants
+        x, y, z = _both_ends(cell.int(), PRIMES)  # the products wrap around in int32, as the hash requires
         entries = (x ^ y ^ z) & (layout.offsets[level + 1] - layout.offsets[level] - 1)
     wx, wy, wz = (torch.stack([1 - f, f]) for f in fractions)
     weights = wx[:, None, None] * wy[:, None] * wz
@@ -116,19 +133,22 @@ def corners(positions: Tensor, layout: HashGridLayout, level: int) -> tuple[Tens
 
 
 def _both_ends(cell: Tensor, strides: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
-    """The cell's two ends along x, y, z times the axis's stride, shaped to broadcast to (2, 2, 2, N)."""
+    """Return the cell's two ends along x, y, z times the stride of the axis, which broadcast to (2, 2, 2, N)."""
     signed = [(stride + 2**31) % 2**32 - 2**31 for stride in strides]
     x, y, z = (torch.stack([row * s, row * s + s]) for row, s in zip(cell, signed, strict=True))
     return x[:, None, None], y[:, None], z
 
 
 def hash_grid_reference(positions: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
-    """The encoding as the paper writes it: the truth, in any float type, differentiable to any order.
+    """Compute `hash_grid` in PyTorch, for any device and float type, with derivatives of any order.
 
     Args:
-        positions: (N, 3) in [0, 1].
+        positions: (N, 3); coordinates are clamped to [0, 1].
         table: (E, F) entries of all levels.
-    Returns: (N, L * F), level by level.
+        layout: resolutions and offsets of the levels.
+
+    Returns:
+        (N, L * F) features, level by level.
     """
     features = []
     for level, offset in enumerate(layout.offsets[:-1]):
@@ -144,28 +164,31 @@ _adam = native.Function("hash_grid_adam", "pppiippippppfddfi", "q")
 
 
 class TableGradient:
-    """A table's gradient that is not added up yet: what the backward passes of several encodings left.
+    """The deferred gradient of a table: gradients of encodings, collected in backward passes and not yet accumulated.
 
-    A step touches few entries. Adding them up level by level, with Adam at once on each, makes one pass over the
-    table where autograd's dense gradient makes many.
+    A step uses few entries. Accumulating the gradient level by level, each followed by Adam, takes one pass over the
+    table, while autograd's dense gradient takes many.
+
+    Args:
+        layout: resolutions and offsets of the levels.
     """
 
     def __init__(self, layout: HashGridLayout) -> None:
         self.layout = layout
         self.parts: Parts = []
-        """Positions (N, 3) and incoming gradient (N, L * F) of each encoding."""
+        """Positions (N, 3) of each encoding, and gradient (N, L * F) of its result."""
 
     @property
     def pending(self) -> bool:
-        """Whether there is any."""
+        """True if there is a gradient."""
         return bool(self.parts)
 
     def clear(self) -> None:
-        """Forget it."""
+        """Discard the gradient."""
         self.parts.clear()
 
     def finite(self) -> bool:
-        """Whether no incoming gradient is infinite or NaN."""
+        """Return whether no value of the collected gradients is infinite or NaN."""
         return all(all_finite(grad) for _, grad in self.parts)
 
     def _arguments(self, features: int) -> tuple[Any, ...]:
@@ -177,7 +200,7 @@ class TableGradient:
         return native.pointers(positions), native.pointers(grads), native.integers(ends), len(ends), features, *layout
 
     def add_to(self, grad: Tensor) -> None:
-        """Add it all to `grad` (E, F), and forget it."""
+        """Add the gradient to `grad` (E, F), and discard it."""
         shape = (self.layout.num_entries, grad.shape[1])
         into = native.pointer(grad, "the table's gradient", shape)
         _backward_table(*self._arguments(shape[1]), into, native.threads())
@@ -187,7 +210,10 @@ class TableGradient:
         self, table: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
         rate: float, betas: tuple[float, float], eps: float,
     ) -> int:  # fmt: skip
-        """One step of `framework.kernels.adam.sparse_adam` with this gradient, which is forgotten then."""
+        """Update `table` (E, F) by `framework.kernels.adam.sparse_adam` with this gradient, and discard the gradient.
+
+        `mean`, `square`, `seen`, `rate`, `betas`, `eps` and the result are as in `sparse_adam`.
+        """
         shape = (self.layout.num_entries, table.shape[1])
         updated = _adam(
             *self._arguments(shape[1]), native.pointer(table, "the table", shape), native.pointer(mean, "mean", shape),
@@ -199,14 +225,14 @@ class TableGradient:
 
 
 class _HashGrid(torch.autograd.Function):
-    """The compiled encoding."""
+    """The compiled form of `hash_grid`."""
 
     @staticmethod
     def forward(
         ctx: Any,
         positions: Tensor,
         table: Tensor,
-        later: Tensor | None,
+        placeholder: Tensor | None,
         layout: HashGridLayout,
     ) -> Tensor:
         count, features = len(positions), table.shape[1]
@@ -234,9 +260,9 @@ class _HashGrid(torch.autograd.Function):
         grad_positions = grad_table = None
         if ctx.needs_input_grad[1]:
             grad_table = torch.zeros_like(table)
-            alone = TableGradient(layout)
-            alone.parts.append((positions, grad))
-            alone.add_to(grad_table)
+            gradient = TableGradient(layout)
+            gradient.parts.append((positions, grad))
+            gradient.add_to(grad_table)
         if ctx.needs_input_grad[0]:
             grad_positions = torch.empty_like(positions)
             _backward_positions(
@@ -252,15 +278,21 @@ def hash_grid(
     layout: HashGridLayout,
     deferred: TableGradient | None = None,
 ) -> Tensor:
-    """Multiresolution hash encoding.
+    """Return the multiresolution hash encoding of positions: Instant-NGP, section 3.
+
+    The compiled form has first derivatives only.
 
     Args:
-        positions: (N, 3) in [0, 1]; what lies outside is moved to the face.
+        positions: (N, 3); coordinates are clamped to [0, 1].
         table: (E, F) entries of all levels, E = layout.num_entries.
-        layout: resolutions and offsets.
-        deferred: where a compiled backward pass that asks for the table's gradient leaves it, autograd getting none.
-    Returns: (N, L * F) features in the table's type. First derivatives only; see `hash_grid_reference`.
-    Raises: ValueError where a shape does not fit the layout.
+        layout: resolutions and offsets of the levels.
+        deferred: collects the gradient of the table in the compiled form, instead of autograd; None for autograd.
+
+    Returns:
+        (N, L * F) features of the type of `table`, level by level.
+
+    Raises:
+        ValueError: if a shape does not fit the layout.
     """
     if positions.ndim != 2 or positions.shape[1] != 3:
         raise ValueError(f"hash_grid: positions have shape {tuple(positions.shape)}, not (N, 3)")
@@ -279,8 +311,8 @@ HASH_GRID = Operation("hash_grid", _reference)
 
 @HASH_GRID.implementation(CPP, fits=lambda positions, table, *_: table.shape[1] in (1, 2, 4, 8))
 def _compiled(positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> Tensor:
-    positions, table, later = positions.contiguous(), table.contiguous(), None
+    positions, table, placeholder = positions.contiguous(), table.contiguous(), None
     if deferred is not None and table.requires_grad:
-        later = waiting(table, positions, layout.num_levels * table.shape[1], deferred.parts)
+        placeholder = waiting(table, positions, layout.num_levels * table.shape[1], deferred.parts)
         table = table.detach()
-    return _HashGrid.apply(positions, table, later, layout)
+    return _HashGrid.apply(positions, table, placeholder, layout)

@@ -1,6 +1,6 @@
-"""Histograms along rays: weights of intervals, new intervals where the weight is, and the loss of a proposal.
+"""Histograms along rays: weights of intervals, resampling by weight, and the loss of proposals.
 
-Letters: R rays, B bins of a histogram, which has B + 1 edges on every ray, sorted.
+Letters: R rays, B bins of a histogram, which has B + 1 sorted edges on every ray.
 """
 
 from __future__ import annotations
@@ -15,23 +15,25 @@ from framework.kernels.compositing import exclusive_cumsum, optical_depth
 from framework.kernels.dispatch import CPP, Operation
 
 EPS = 1e-7
-"""Keeps the loss of intervals without weight finite."""
+"""Added to weights in a denominator, so that the loss of intervals with weight 0 is finite."""
 
 
 # -- weights ------------------------------------------------------------------------------------------------------
 
 
 def interval_weights_reference(sigma: Tensor, t: Tensor) -> Tensor:
-    """As `interval_weights`, in torch, in any float type."""
+    """Compute `interval_weights` of `sigma` and `t` in PyTorch, on any device and for any float type."""
     tau = optical_depth(sigma, t.diff(dim=-1))
     in_front = torch.exp(-exclusive_cumsum(tau))
     return in_front * -torch.expm1(-tau)
 
 
 def interval_weights(sigma: Tensor, t: Tensor) -> Tensor:
-    """Weight (R, B) of intervals between distances t (R, B + 1) with densities sigma (R, B): NeRF, equation 3.
+    """Return the weights (R, B) of intervals: NeRF, equation 3.
 
-    Without a gradient for `t`.
+    Args:
+        sigma: (R, B) density of each interval, 1/length.
+        t: (R, B + 1) sorted distances between which the intervals lie; without a gradient.
     """
     t = t.detach()
     return INTERVAL_WEIGHTS((sigma, t), sigma, t)
@@ -79,7 +81,10 @@ class _Weights(torch.autograd.Function):
 def resample_reference(
     edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float, padding: float
 ) -> Tensor:
-    """As `resample`, in torch, in any float type."""
+    """Compute `resample` in PyTorch, on any device and for any float type.
+
+    `edges`, `weights`, `shift`, `count`, `power` and `padding` are as in `resample`.
+    """
     heavy = weights.to(torch.promote_types(weights.dtype, edges.dtype)) ** power + padding
     cdf = torch.cat([torch.zeros_like(heavy[:, :1]), heavy.cumsum(-1)], dim=-1)
     steps = torch.arange(count + 1, device=edges.device)
@@ -93,13 +98,15 @@ def resample_reference(
 
 @torch.no_grad()
 def resample(edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float, padding: float) -> Tensor:
-    """Edges (R, count + 1) of new intervals, each of which holds an equal share of a histogram's weight.
+    """Return the edges (R, count + 1) of new intervals with equal shares of the weight of a histogram.
 
     Args:
-        edges, weights: (R, B + 1) and (R, B), the histogram.
-        shift: (R,) in [0, 1): the new edges are the quantiles (j + shift) / (count + 1).
-        power: which the weights are raised to first: less than 1 flattens them (mip-NeRF 360, section 3.1).
-        padding: added to each weight, so that no place is never looked at.
+        edges: (R, B + 1) sorted edges of the histogram.
+        weights: (R, B) weights of its bins.
+        shift: (R,) in [0, 1): the new edges are the quantiles (j + shift) / (count + 1), for j from 0 to count.
+        count: number of new intervals.
+        power: exponent of the weights; less than 1 flattens them (mip-NeRF 360, section 3.1).
+        padding: added to each weight after the exponentiation, so that every bin can be drawn.
     """
     return RESAMPLE((edges, weights, shift), edges, weights, shift, count, power, padding)
 
@@ -126,18 +133,23 @@ _resample_intervals = native.Function("resample_intervals", "pppqqqffpi")
 
 
 def proposal_excess_reference(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor) -> Tensor:
-    """As `proposal_excess`, by comparing all pairs of intervals: the truth, in any float type."""
+    """Compute `proposal_excess` in PyTorch from all pairs of intervals, for any float type.
+
+    `edges`, `weights`, `proposed` and `proposed_weights` are as in `proposal_excess`.
+    """
     touches = (proposed[:, None, :-1] <= edges[:, 1:, None]) & (proposed[:, None, 1:] >= edges[:, :-1, None])
     bound = (touches * proposed_weights[:, None, :]).sum(-1)
     return ((weights - bound).clamp(min=0).square() / (weights + EPS)).sum(-1)
 
 
 def proposal_excess(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor) -> Tensor:
-    """Loss (R,) of a proposed histogram that should bound another from above: mip-NeRF 360, equation 13.
+    """Return the loss (R,) of proposed histograms that should bound others from above: mip-NeRF 360, equation 13.
 
     Args:
-        edges, weights: (R, B + 1) and (R, B) what was found; without a gradient.
-        proposed, proposed_weights: (R, P + 1) and (R, P) what was proposed.
+        edges: (R, B + 1) sorted edges of the histogram to be bounded; without a gradient.
+        weights: (R, B) weights of its bins; without a gradient.
+        proposed: (R, P + 1) sorted edges of the proposed histogram; without a gradient.
+        proposed_weights: (R, P) weights of its bins.
     """
     edges, weights, proposed = edges.detach(), weights.detach(), proposed.detach()
     tensors = edges, weights, proposed, proposed_weights
@@ -172,5 +184,5 @@ class _Excess(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[None, None, None, Tensor]:
-        (of_weights,) = ctx.saved_tensors
-        return None, None, None, of_weights * grad[:, None]
+        (grad_weights,) = ctx.saved_tensors
+        return None, None, None, grad_weights * grad[:, None]

@@ -1,13 +1,13 @@
-"""Results of operations that are kept from a pass without gradient for the one that needs it.
+"""Cache of operations' results between a pass without gradient and a later one with gradient.
 
 A sampler that marches in waves needs densities before it knows which samples it keeps. `Waves` evaluates a function
-wave by wave, noting on a tape what each operation of ours returned, and once more, with gradient, for the samples that
-were chosen: there every operation takes its rows from the tapes, so that only the backward pass is left to compute.
-The function is written as if nothing of this existed.
+wave by wave and records the results of the compiled operations on a tape. It then evaluates the function again, with
+gradient, for the samples that are kept. There the operations take their rows from the tapes, so that only the backward
+pass is computed. The function itself needs no changes.
 
-A result is taken only where the same operation was called with the same parameters on the same rows, which is checked
-value by value; everything else is computed again. So a function may do anything, such as evaluate in chunks or sort its
-positions: one that is unusual loses the saving and nothing else.
+A result is reused only if the same operation was called with the same parameters on the same rows, which is checked by
+value; everything else is computed again. A function that evaluates in chunks or sorts its positions is therefore
+computed correctly, but without the saving.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from torch import Tensor
 from framework.kernels.rows import gather_rows, take_rows
 
 CLOSE, ALMOST_ZERO = 1e-4, 1e-6
-"""Relative and absolute difference of equal inputs: torch rounds differently in batches of different sizes."""
+"""Relative and absolute tolerance of equal inputs, since torch's rounding depends on the batch size."""
 Compute = Callable[[], Tensor]
 Key = tuple[Any, ...]
 
 
 class _Value(NamedTuple):
-    """A tensor as it was when it was noted."""
+    """A tensor and its version when it was recorded."""
 
     tensor: Tensor
     version: int
@@ -41,27 +41,27 @@ class _Value(NamedTuple):
 
     @property
     def unchanged(self) -> bool:
-        """Whether nobody has written to it since."""
+        """Whether the tensor has not been modified since."""
         return self.tensor._version == self.version
 
     def is_(self, other: Tensor) -> bool:
-        """Whether `other` is the same memory, unchanged. While held here, it cannot have become another tensor's."""
-        mine = self.tensor
-        return mine.data_ptr() == other.data_ptr() and mine.shape == other.shape and self.version == other._version
+        """Return whether `other` is the same memory, unmodified; memory that is held here cannot be reused."""
+        tensor = self.tensor
+        return tensor.data_ptr() == other.data_ptr() and tensor.shape == other.shape and self.version == other._version
 
 
 class _Call(NamedTuple):
     """A call of an operation on one wave."""
 
     key: Key
-    """Its name, its settings, its inputs' shapes, and which of them are results of earlier calls."""
+    """Name and settings of the operation, shapes of its inputs, and the earlier calls of which they are results."""
     parameters: tuple[_Value, ...]
     inputs: tuple[_Value, ...]
-    """Those that are no results of earlier calls."""
+    """The inputs that are not results of earlier calls."""
     result: _Value
 
     def stands_for(self, key: Key, parameters: Sequence[Tensor]) -> bool:
-        """Whether another call is of the same operation, parameters and sources, so that only inputs may differ."""
+        """Return whether a call has the same operation, parameters and sources, so that only inputs may differ."""
         return (
             self.key == key
             and len(self.parameters) == len(parameters)
@@ -71,14 +71,14 @@ class _Call(NamedTuple):
 
 
 class _Tape:
-    """The calls on one wave of `count` samples that returned a row for each of them."""
+    """The recorded calls on one wave of `count` samples; those that return one row per sample are recorded."""
 
     def __init__(self, count: int) -> None:
         self.count = count
         self.calls: list[_Call] = []
 
     def result(self, key: Key, rows: Sequence[Tensor], parameters: Sequence[Tensor], compute: Compute) -> Tensor:
-        """Compute it, and note it."""
+        """Compute the result and record it."""
         out = compute()
         if out.shape[0] == self.count > 0:
             sources = _sources(rows, [call.result for call in self.calls])
@@ -89,54 +89,54 @@ class _Tape:
 
 
 class _Replay:
-    """The chosen rows, in `order`, of the results on the tapes, handed out call by call."""
+    """Rows of the results on the tapes, in `order`, which are returned call by call."""
 
     def __init__(self, tapes: Sequence[_Tape], order: Tensor) -> None:
-        noted = [tape.calls for tape in tapes if tape.count]
-        alike = len({len(calls) for calls in noted}) == 1
-        self.calls = list(zip(*noted, strict=True)) if alike else []
+        recorded = [tape.calls for tape in tapes if tape.count]
+        alike = len({len(calls) for calls in recorded}) == 1
+        self.calls = list(zip(*recorded, strict=True)) if alike else []
         self.order = order
         self.next = 0
-        self.taken: list[_Value | None] = [None] * len(self.calls)
+        self.results: list[_Value | None] = [None] * len(self.calls)
 
     def result(self, key: Key, rows: Sequence[Tensor], parameters: Sequence[Tensor], compute: Compute) -> Tensor:
-        """The rows of the next call on the tapes that this one repeats; computed where there is none."""
+        """Return the rows of the next recorded call that this one repeats; compute them if there is none."""
         if rows[0].shape[0] == self.order.shape[0] > 0:
-            sources = _sources(rows, self.taken)
+            sources = _sources(rows, self.results)
             for number in range(self.next, len(self.calls)):
                 waves = self.calls[number]
                 if all(call.stands_for((key, sources), parameters) for call in waves):
                     self.next = number + 1
-                    found = self._take(number, [r for r, s in zip(rows, sources, strict=True) if s is None])
-                    return compute() if found is None else found
+                    gathered = self._take(number, [r for r, s in zip(rows, sources, strict=True) if s is None])
+                    return compute() if gathered is None else gathered
         return compute()
 
     def _take(self, number: int, inputs: Sequence[Tensor]) -> Tensor | None:
-        """A call's rows; None where its inputs were not these."""
+        """Return the rows of a recorded call's result, or None if its inputs were different."""
         waves = self.calls[number]
         columns = [[call.inputs[index].tensor for call in waves] for index in range(len(inputs))]
-        out, *before = gather_rows([[call.result.tensor for call in waves], *columns], self.order)
-        if not all(_equal(one, other) for one, other in zip(inputs, before, strict=True)):
+        out, *recorded = gather_rows([[call.result.tensor for call in waves], *columns], self.order)
+        if not all(_equal(tensor, other) for tensor, other in zip(inputs, recorded, strict=True)):
             return None
-        self.taken[number] = _Value.of(out)
+        self.results[number] = _Value.of(out)
         return out
 
 
 def _sources(rows: Sequence[Tensor], results: Sequence[_Value | None]) -> tuple[int | None, ...]:
-    """Of each input the number of the call whose result it is; None where it is no such result."""
+    """Return, for each input, the number of the call whose result it is, or None."""
     return tuple(
         next((number for number, value in enumerate(results) if value is not None and value.is_(row)), None)
         for row in rows
     )
 
 
-def _equal(one: Tensor, other: Tensor) -> bool:
-    """Whether two tensors of the same shape are equal but for rounding; NaN equals NaN."""
-    return torch.equal(one, other) or torch.allclose(one, other, CLOSE, ALMOST_ZERO, equal_nan=True)
+def _equal(tensor: Tensor, other: Tensor) -> bool:
+    """Return whether two tensors of the same shape are equal up to rounding errors; NaN equals NaN."""
+    return torch.equal(tensor, other) or torch.allclose(tensor, other, CLOSE, ALMOST_ZERO, equal_nan=True)
 
 
 class _Thread(threading.local):
-    """What this thread's operations note their results on, or take them from."""
+    """The tape on which operations of this thread record results, or from which they take them."""
 
     tape: _Tape | _Replay | None = None
 
@@ -146,24 +146,27 @@ _thread = _Thread()
 
 @contextmanager
 def _used(tape: _Tape | _Replay) -> Iterator[None]:
-    before, _thread.tape = _thread.tape, tape
+    previous, _thread.tape = _thread.tape, tape
     try:
         yield
     finally:
-        _thread.tape = before
+        _thread.tape = previous
 
 
 def result(key: Key, rows: Sequence[Tensor], parameters: Sequence[Tensor], compute: Compute) -> Tensor:
-    """What a compiled operation returns: computed, or taken from what was computed before.
+    """Return the result of a compiled operation, computed or taken from a recorded call.
 
-    To be called within an operation's `torch.autograd.Function.forward`, whose backward pass must not depend on which
-    of the two it was.
+    It must be called in `forward` of the operation's `torch.autograd.Function`, whose backward pass must not depend on
+    which of the two it is.
 
     Args:
-        key: the operation's name, and all settings that its result depends on.
-        rows: its inputs (N, ...) that have a row for each sample.
-        parameters: its other inputs.
-        compute: computes the result (N, ...), row i from row i of the inputs alone.
+        key: name of the operation, and all settings that its result depends on.
+        rows: inputs (N, ...) of the operation with one row per sample.
+        parameters: other inputs of the operation.
+        compute: computes the result (N, ...), whose row i must depend only on row i of the inputs.
+
+    Returns:
+        (N, ...) result.
     """
     tape = _thread.tape
     if tape is None:
@@ -173,10 +176,10 @@ def result(key: Key, rows: Sequence[Tensor], parameters: Sequence[Tensor], compu
 
 
 class Waves:
-    """A differentiable function of samples that come in waves, of which some are chosen in the end.
+    """Evaluation of a differentiable function of samples in waves, of which some samples are kept in the end.
 
-    Where nobody asks for gradients, or where the function calls no operation of ours that has parameters and is
-    compiled, each wave is evaluated as usual, and the chosen rows of its values are returned.
+    If gradients are disabled, or if the function calls no compiled operation with parameters, each wave is evaluated as
+    usual, and the rows of its values that are kept are returned.
     """
 
     def __init__(self) -> None:
@@ -188,15 +191,17 @@ class Waves:
         """Evaluate the next wave.
 
         Args:
-            count: N, its samples.
-            function: computes its values, each of N rows.
-        Returns: the values, whose gradients are not to be used.
+            count: number N of samples of the wave.
+            function: computes the values of the wave, each with N rows.
+
+        Returns:
+            the values; their gradients must not be used.
         """
         if self._values or not self._follows:
             self._values.append(function())
             return self._values[-1]
         tape = _Tape(count)
-        with _used(tape), torch.set_grad_enabled(not self._tapes):  # the first wave tells which of the two ways it is
+        with _used(tape), torch.set_grad_enabled(not self._tapes):  # the first wave shows if there are parameters
             values = function()
         if self._tapes or any(call.parameters for call in tape.calls):
             self._tapes.append(tape)
@@ -205,13 +210,15 @@ class Waves:
         return values
 
     def choose(self, order: Tensor, function: Callable[[], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
-        """The values of some samples, with gradient.
+        """Return the values of some samples, with gradient.
 
         Args:
-            order: (M,) int64 which of the samples of all waves, each at most once.
-            function: computes their values from the inputs of `evaluate`, in this order. It is called where results
-                were kept.
-        Returns: the values, each of M rows.
+            order: (M,) int64 indices of the samples, counted through all waves, each at most once.
+            function: computes the values of these samples, in this order, from the same inputs as in `evaluate`. It is
+                called only if results were recorded.
+
+        Returns:
+            the values, each with M rows.
         """
         if not self._tapes:
             return tuple(take_rows(torch.cat(column), order) for column in zip(*self._values, strict=True))

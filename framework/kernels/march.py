@@ -1,9 +1,9 @@
-"""Marching rays through an occupancy grid, in waves.
+"""Marching of rays through an occupancy grid, in waves.
 
-A ray's candidates are the steps first + k * step, growing with distance beyond step / cone (Instant-NGP, Mueller et
-al. 2022, appendix E.1); those whose middle lies in an occupied cell are samples. A wave hands out the next few samples
-of every ray on which light is left; when their density is known, `advance` decides who goes on. So hidden samples are
-never evaluated, and none is evaluated twice.
+The candidates of a ray are the steps first + k * step, which grow with distance beyond step / cone (Instant-NGP,
+Mueller et al. 2022, appendix E.1). Candidates whose middle lies in an occupied cell are samples. A wave consists of the
+next few samples of every ray that has not ended. When their density is known, `advance` ends rays whose transmittance
+is low, so that hidden samples are never evaluated, and no sample is evaluated twice.
 """
 
 from __future__ import annotations
@@ -26,30 +26,30 @@ from framework.kernels.dispatch import CPP, INT64, Operation
 from framework.kernels.given import check_indices
 
 BLOCK = 4
-"""Cells along an edge of a block of the coarser level."""
+"""Cells along an edge of a block, which is a cell of the coarser level."""
 RUN = 8
-"""Steps that the reference tests together."""
+"""Number of steps that the reference tests together."""
 ROUNDING = 1e-5
-"""By how much, relatively, a mean of equal opacities may exceed them: cells that are all alike are not empty."""
+"""Relative tolerance of the mean opacity, so that rounding errors do not empty a grid whose cells are all equal."""
 
 
 @dataclass(frozen=True)
 class Occupancy:
-    """Which cells of a box are not empty."""
+    """The occupied cells of a grid over a box."""
 
     occupied: Tensor
-    """(n^3,) bool, the cell's index being (x n + y) n + z."""
+    """(n^3,) bool; the index of cell (x, y, z) is (x n + y) n + z."""
     box: Tensor
-    """(2, 3) smallest and largest corner."""
+    """(2, 3) minimum and maximum corner, scene units."""
     resolution: int
-    """n, cells along each axis."""
+    """Number n of cells along each axis."""
 
     @cached_property
     def packed(self) -> tuple[Tensor, Tensor]:
-        """What the compiled march reads, made at the first one.
+        """(ceil(n^3 / 8),) uint8 with one bit per cell, and (ceil(n / 4)^3,) uint8, for the compiled march.
 
-        Returns: (n^3 / 8,) uint8, one bit a cell; (ceil(n / 4)^3,) uint8, how many blocks of 4^3 cells away the nearest
-            with an occupied one is.
+        The second tensor has, for each block of 4^3 cells, the distance in blocks to the nearest block with an occupied
+        cell.
         """
         bits = torch.empty((self.resolution**3 + 7) // 8, dtype=torch.uint8)
         blocks = torch.empty(math.ceil(self.resolution / BLOCK) ** 3, dtype=torch.uint8)
@@ -58,29 +58,31 @@ class Occupancy:
         return bits, blocks
 
     def cells(self, positions: Tensor) -> Tensor:
-        """Index (N,) of the cell each position (N, 3) lies in; outside positions go to the nearest cell."""
+        """Return the index (N,) of the cell of each of `positions` (N, 3), or of the nearest cell if it is outside."""
         scale = self.resolution / (self.box[1] - self.box[0])
         x, y, z = ((positions - self.box[0]) * scale).long().clamp(0, self.resolution - 1).unbind(-1)
         return (x * self.resolution + y) * self.resolution + z
 
 
 def refresh_occupancy_reference(density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float) -> None:
-    """As `refresh_occupancy`, in torch, on any device."""
+    """Compute `refresh_occupancy` of `density`, `occupied`, `decay`, `step` and `threshold` in PyTorch."""
     density *= decay
     alpha = -torch.expm1(-density * step)
-    least = min(threshold, alpha.nanmean().item() * (1 - ROUNDING))  # the threshold where all are NaN
+    least = min(threshold, alpha.nanmean().item() * (1 - ROUNDING))  # the threshold if all are NaN
     occupied.copy_(~(alpha < least))
 
 
 @torch.no_grad()
 def refresh_occupancy(density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float) -> None:
-    """Mark, in place, the cells whose opacity over one step is at least `threshold`, or the mean if that is less.
+    """Mark, in place, the cells whose opacity over one step is at least a threshold.
 
     Args:
-        density: (n^3,) what is known of each cell, multiplied by `decay` first; infinite where nothing is. A cell of
-            NaN is marked, so that a broken field is seen, and left out of the mean.
-        occupied: (n^3,) bool, written.
+        density: (n^3,) density of each cell, 1/length, which is multiplied by `decay` in place; infinite if unknown.
+            Cells of NaN are marked, so that a broken field is noticed, and left out of the mean.
+        occupied: (n^3,) bool, to be written.
+        decay: factor of the densities.
         step: length of a step, scene units.
+        threshold: minimum opacity, or the mean opacity over all cells if that is less.
     """
     REFRESH_OCCUPANCY((density,), density, occupied, decay, step, threshold)
 
@@ -99,29 +101,29 @@ def _refresh_compiled(density: Tensor, occupied: Tensor, decay: float, step: flo
 
 @dataclass(frozen=True)
 class Wave:
-    """Samples that are evaluated together."""
+    """N samples that are evaluated together."""
 
     t_starts: Tensor
-    """(N,)"""
+    """(N,) distance at the start of each interval."""
     t_ends: Tensor
-    """(N,)"""
+    """(N,) distance at the end of each interval."""
     owners: Tensor
-    """(N,) int64, the ray of each."""
+    """(N,) int64 index of the ray of each sample."""
     positions: Tensor
-    """(N, 3) the middles."""
+    """(N, 3) middle of each interval, scene coordinates."""
 
     @property
     def t(self) -> Tensor:
-        """(N,) distances of the middles."""
+        """(N,) distance at the middle of each interval."""
         return (self.t_starts + self.t_ends) / 2
 
 
 class March(ABC):
-    """Rays on their way through the grid: `wave` and `advance` in turn until `wave` returns None, then `finish`.
+    """The state of a march: call `wave` and `advance` in turn until `wave` returns None, then `finish`.
 
     Args:
         rays: R rays.
-        early_stop: transmittance under which a ray ends.
+        early_stop: transmittance below which a ray ends; 0 for never.
     """
 
     def __init__(self, rays: Rays, early_stop: float) -> None:
@@ -129,18 +131,18 @@ class March(ABC):
         self.budget = -math.log(early_stop) if early_stop > 0 else math.inf
         self.waves: list[Wave] = []
         self.reached: list[Tensor] = []
-        """(N,) uint8 of each wave: the samples that light reached."""
+        """(N,) uint8 for each wave: 1 for samples in front of which the transmittance is not below `early_stop`."""
 
     @abstractmethod
     def wave(self, limit: int) -> Wave | None:
-        """Up to `limit` samples on each ray that is alive; None where no ray is."""
+        """Return up to `limit` samples on each ray that has not ended; None if all have."""
 
     @abstractmethod
     def advance(self, sigma: Tensor) -> None:
-        """The density (N,) of the last wave is known: rays whose light is spent, or that left the box, end."""
+        """End rays whose transmittance is low or that have left the box, by the density `sigma` (N,) of the wave."""
 
     def finish(self) -> tuple[Tensor, Tensor]:
-        """Order (M,) that puts the samples of all waves which light reached ray by ray, and offsets (R + 1,)."""
+        """Return the order (M,) that sorts the reached samples of all waves by ray, and the rays' offsets (R + 1,)."""
         if not self.waves:
             counts = self.rays.nears.new_zeros(len(self.rays) + 1, dtype=torch.int64)
             return counts[:0], counts
@@ -149,7 +151,10 @@ class March(ABC):
 
 
 class CompiledMarch(March):
-    """The march in C++: rays on the CPU, float32. Arguments as for `march`."""
+    """The compiled march, for float32 on the CPU.
+
+    `rays`, `occupancy`, `step`, `cone`, `shift` and `early_stop` are as in `march`.
+    """
 
     def __init__(
         self, rays: Rays, occupancy: Occupancy, step: float, cone: float, shift: Tensor | None, early_stop: float
@@ -183,13 +188,13 @@ class CompiledMarch(March):
         self.counts, self.limit = torch.empty(living, dtype=torch.int32), limit
         starts, ends, positions = torch.empty(room), torch.empty(room), torch.empty(room, 3)
         owners = torch.empty(room, dtype=torch.int64)
-        found = _wave(
+        count = _wave(
             self.origins.data_ptr(), self.directions.data_ptr(), self.enter.data_ptr(), self.leave.data_ptr(),
             self.first.data_ptr(), self.next.data_ptr(), self.alive.data_ptr(), living, limit, self.box.data_ptr(),
             self.step, self.cone, self.bits.data_ptr(), self.blocks.data_ptr(), self.resolution, self.counts.data_ptr(),
             starts.data_ptr(), ends.data_ptr(), owners.data_ptr(), positions.data_ptr(), native.threads(),
         )  # fmt: skip
-        wave = Wave(starts[:found], ends[:found], owners[:found], positions[:found])
+        wave = Wave(starts[:count], ends[:count], owners[:count], positions[:count])
         self.waves.append(wave)
         return wave
 
@@ -207,18 +212,21 @@ class CompiledMarch(March):
 
 
 def sort_by_ray(owners: Tensor, reached: Tensor, num_rays: int) -> tuple[Tensor, Tensor]:
-    """Order (M,) of those of N samples that are `reached`, by their ray and otherwise as they stand; offsets (R + 1,).
+    """Return the order (M,) that sorts the reached samples by ray, stably, and the offsets (R + 1,) of the rays.
 
     Args:
-        owners: (N,) int64.
-        reached: (N,) uint8.
-    Raises: IndexError where there is no such ray.
+        owners: (N,) int64 index of the ray of each sample.
+        reached: (N,) uint8, not 0 for samples that are kept.
+        num_rays: number R of rays.
+
+    Raises:
+        IndexError: if an index of a ray is out of range.
     """
     return SORT_BY_RAY((owners,), owners, reached, num_rays)
 
 
 def sort_by_ray_reference(owners: Tensor, reached: Tensor, num_rays: int) -> tuple[Tensor, Tensor]:
-    """As `sort_by_ray`, in torch, on any device."""
+    """Compute `sort_by_ray` of `owners`, `reached` and `num_rays` in PyTorch, on any device."""
     check_indices(owners, num_rays, "rays")
     chosen = reached.nonzero().squeeze(-1)
     order = chosen[owners[chosen].argsort(stable=True)]
@@ -242,9 +250,9 @@ def _sort_by_ray(owners: Tensor, reached: Tensor, num_rays: int) -> tuple[Tensor
 
 
 class ReferenceMarch(March):
-    """The march in torch, on any device: all candidates are found first, and handed out wave by wave.
+    """The march in PyTorch, for any device: it finds all candidates first, and returns them wave by wave.
 
-    Arguments as for `march`.
+    `rays`, `occupancy`, `step`, `cone`, `shift` and `early_stop` are as in `march`.
     """
 
     def __init__(
@@ -255,16 +263,16 @@ class ReferenceMarch(March):
         self.counts = self.offsets[1:] - self.offsets[:-1]
         self.spent = rays.origins.new_zeros(len(rays))
         self.alive = self.counts.nonzero().squeeze(-1)
-        self.handed_out = 0
+        self.num_returned = 0
 
     def wave(self, limit: int) -> Wave | None:
         if len(self.alive) == 0:
             return None
-        ranks, self.places = ranges((self.counts[self.alive] - self.handed_out).clamp(max=limit))
-        owners = self.alive[ranks]
-        chosen = self.offsets[:-1][owners] + self.handed_out + self.places
+        ray_numbers, self.ranks = ranges((self.counts[self.alive] - self.num_returned).clamp(max=limit))
+        owners = self.alive[ray_numbers]
+        chosen = self.offsets[:-1][owners] + self.num_returned + self.ranks
         starts, ends = self.t_starts[chosen], self.t_ends[chosen]
-        self.handed_out += limit
+        self.num_returned += limit
         wave = Wave(starts, ends, owners, self.rays.points(owners, (starts + ends) / 2))
         self.waves.append(wave)
         return wave
@@ -273,22 +281,23 @@ class ReferenceMarch(March):
     def advance(self, sigma: Tensor) -> None:
         wave = self.waves[-1]
         tau = optical_depth(sigma.detach().to(self.spent.dtype), wave.t_ends - wave.t_starts)
-        before = self.spent[wave.owners] + segmented_sum(tau, self.places)
+        before = self.spent[wave.owners] + segmented_sum(tau, self.ranks)
         self.reached.append((~(before >= self.budget)).to(torch.uint8))
         self.spent.index_add_(0, wave.owners, tau)
-        self.alive = self.alive[(self.counts[self.alive] > self.handed_out) & ~(self.spent[self.alive] >= self.budget)]
+        remaining = self.counts[self.alive] > self.num_returned
+        self.alive = self.alive[remaining & ~(self.spent[self.alive] >= self.budget)]
 
 
 def march(rays: Rays, occupancy: Occupancy, step: float, cone: float, shift: Tensor | None, early_stop: float) -> March:
-    """March rays through the occupied cells of a grid.
+    """Start a march of rays through the occupied cells of a grid.
 
     Args:
         rays: R rays.
         occupancy: the grid.
         step: length of a step near the camera, scene units.
         cone: growth of a step per unit of distance; 0 for even steps.
-        shift: (R,) share of a step by which the first one starts before the box; None for 0.
-        early_stop: transmittance under which a ray ends.
+        shift: (R,) fraction of a step by which the first step starts in front of the box; None for 0.
+        early_stop: transmittance below which a ray ends; 0 for never.
     """
     tensors = rays.origins, rays.directions, rays.nears, rays.fars, occupancy.box
     return MARCH(tensors, rays, occupancy, step, cone, shift, early_stop)
@@ -299,7 +308,10 @@ MARCH.implementation(CPP)(CompiledMarch)
 
 
 def step_start(first: Tensor, k: Tensor, step: float, cone: float) -> Tensor:
-    """Where step k (N,) of rays that begin at `first` (N,) starts: even while step > cone * t, then geometric."""
+    """Return the distances (N,) at which steps `k` (N,) start on rays whose step 0 starts at `first` (N,).
+
+    Steps have the length `step` while it exceeds `cone` * t, and then grow by the factor 1 + `cone`.
+    """
     k = k.to(first.dtype)
     even = first + k * step
     if cone == 0:
@@ -312,7 +324,10 @@ def step_start(first: Tensor, k: Tensor, step: float, cone: float) -> Tensor:
 def candidates(
     rays: Rays, occupancy: Occupancy, step: float, cone: float, shift: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """All steps of R rays whose middle lies in an occupied cell: starts (N,), ends (N,), offsets (R + 1,)."""
+    """Return the starts (N,), ends (N,) and offsets (R + 1,) of all steps whose middle is in an occupied cell.
+
+    `rays`, `occupancy`, `step`, `cone` and `shift` are as in `march`.
+    """
     enter, leave = intersect_box(rays.origins, rays.directions, occupancy.box)
     enter, leave = torch.maximum(enter, rays.nears), torch.minimum(leave, rays.fars)
     first = enter if shift is None else enter - shift * step
@@ -337,7 +352,7 @@ def candidates(
 def _near_occupied(
     rays: Rays, occupancy: Occupancy, step: float, first: Tensor, counts: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Owners and numbers of the steps in those runs of RUN that come near an occupied cell."""
+    """Return the rays and numbers of the steps in those runs of RUN steps that are near an occupied cell."""
     cell = ((occupancy.box[1] - occupancy.box[0]) / occupancy.resolution).min().item()
     reach = dilated(occupancy, math.ceil((RUN - 1) / 2 * step / cell))
     owners, run = ranges((counts + RUN - 1) // RUN)
@@ -349,7 +364,7 @@ def _near_occupied(
 
 
 def dilated(occupancy: Occupancy, radius: int) -> Tensor:
-    """(n^3,) bool: cells with an occupied one within `radius` along every axis."""
+    """Return the cells (n^3,) bool of `occupancy` that have an occupied cell within `radius` cells along every axis."""
     n = occupancy.resolution
     grid = occupancy.occupied.view(n, n, n)
     for axis in range(3):
@@ -362,7 +377,7 @@ def dilated(occupancy: Occupancy, radius: int) -> Tensor:
 
 
 def ranges(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Owner (N,) and rank (N,) of each item when owner i has counts[i] of them: 0 .. counts[i] - 1."""
+    """Return the owner (N,) and rank (N,) of each item, where owner i has `counts[i]` items, ranked from 0."""
     owners = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
     firsts = counts.cumsum(0) - counts
     return owners, torch.arange(len(owners), device=counts.device) - firsts[owners]

@@ -1,4 +1,4 @@
-"""Small functions whose plain form overflows, cancels or has a NaN gradient somewhere."""
+"""Small functions in a form that avoids overflow, cancellation and NaN gradients."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 MAX_LOG_DENSITY = 15.0
+"""Maximum log-density; larger ones are clipped."""
 
 
 class _TruncatedExp(torch.autograd.Function):
@@ -24,9 +25,10 @@ class _TruncatedExp(torch.autograd.Function):
 
 
 def truncated_exp(x: Tensor) -> Tensor:
-    """exp(min(x, 15)), with the gradient of the clipped value: a density that is too high can still come down.
+    """Return exp(min(x, 15)), whose gradient is the result itself, so that a density that is too high can decrease.
 
-    float32 whatever the input's type, for exp overflows half precision at 11 (Instant-NGP's `trunc_exp`).
+    This is Instant-NGP's `trunc_exp`. In half precision exp would overflow for `x` above 11, so that types other than
+    float64 are converted to float32.
     """
     return _TruncatedExp.apply(x.float() if x.dtype != torch.float64 else x)
 
@@ -51,9 +53,9 @@ class _SplitDensity(torch.autograd.Function):
 
 
 def split_density(features: Tensor) -> tuple[Tensor, Tensor]:
-    """Density (N,), the `truncated_exp` of the first of F features, and the features (N, F) for the colour.
+    """Return the density (N,), which is the `truncated_exp` of the first feature, and the `features` (N, F) themselves.
 
-    The same as slicing, but the two gradients meet in one pass.
+    It equals slicing, but computes the sum of the two gradients in one pass.
     """
     return _SplitDensity.apply(features if features.dtype == torch.float64 else features.float())
 
@@ -71,14 +73,18 @@ class _ScaledGradient(torch.autograd.Function):
 
 
 def scale_gradient(values: Tensor, factors: Tensor) -> Tensor:
-    """`values` (N, ...) as they are, their gradient multiplied by `factors` (N,)."""
+    """Return `values` (N, ...) unchanged, with their gradient multiplied by `factors` (N,)."""
     return _ScaledGradient.apply(values, factors)
 
 
 def safe_normalize(v: Tensor, eps: float = 1e-12) -> Tensor:
-    """v / |v| over the last dimension; 0, with a zero gradient, where |v| < eps; NaN where v is not finite.
+    """Return v / |v| along the last dimension; NaN if v is not finite.
 
-    v is divided by its largest component first: in float32 the square of what is longer than 1.8e19 is infinite.
+    v is divided by its largest component first, because in float32 the squares of components above 1.8e19 are infinite.
+
+    Args:
+        v: (..., D) vectors.
+        eps: length below which the result and its gradient are 0.
     """
     least = max(eps, torch.finfo(v.dtype).tiny)  # 1e-12 would be 0 in float16
     scaled = v / v.detach().abs().amax(-1, keepdim=True).clamp(min=least)  # shorter than 1 where |v| < least
@@ -87,7 +93,7 @@ def safe_normalize(v: Tensor, eps: float = 1e-12) -> Tensor:
 
 
 def cross_matrix(v: Tensor) -> Tensor:
-    """(..., 3, 3) the matrices that take x to the cross product v x x, for vectors v (..., 3)."""
+    """Return the matrices (..., 3, 3) whose product with a vector w is the cross product `v` x w, for `v` (..., 3)."""
     x, y, z = v.unbind(-1)
     zero = torch.zeros_like(x)
     rows = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1)

@@ -1,4 +1,4 @@
-"""Memory for tables that are read all over."""
+"""Memory of large tables that are read at random."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from framework.base.device import machine_memory
 from framework.base.errors import ConfigError
 
 HUGE_PAGE = 2**21
+"""Size of a huge page in bytes."""
 _MADV_HUGEPAGE = 14
 
 
@@ -24,26 +25,33 @@ def _madvise() -> Any:
 
 
 def require(size: float, what: str) -> None:
-    """Refuse what this machine cannot hold, before the system stops the process for it.
+    """Check that the machine has enough memory, before the system would end the process.
 
     Args:
-        size: bytes.
-        what: takes them, as in "a table".
-    Raises: ConfigError that names both sizes.
+        size: number of bytes that are needed.
+        what: name of what needs them, such as "a table", for the error.
+
+    Raises:
+        ConfigError: if the machine has less memory.
     """
-    there = machine_memory()
-    if size > there:
+    available = machine_memory()
+    if size > available:
         raise ConfigError(
-            f"these settings take {size / 2**30:,.1f} GiB for {what}; this machine has {there / 2**30:,.1f} GiB"
+            f"these settings take {size / 2**30:,.1f} GiB for {what}; this machine has {available / 2**30:,.1f} GiB"
         )
 
 
 def table(*shape: int, like: Tensor | None = None) -> Tensor:
-    """Zeros of a shape, on `like`'s device and of its type, on pages of 2 MB where the system has them.
+    """Return zeros, in pages of 2 MB if the system supports them.
 
-    Random reads from a table of many small pages miss the processor's page cache each time.
+    Random reads from a table of many small pages miss the CPU's translation cache almost every time.
 
-    Raises: ConfigError where the machine has less memory than they take.
+    Args:
+        shape: shape of the result.
+        like: tensor whose device and type the result has; None for the defaults.
+
+    Raises:
+        ConfigError: if the machine has less memory.
     """
     require(4.0 * math.prod(shape), "a table")
     if like is None:

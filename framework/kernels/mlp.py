@@ -1,8 +1,8 @@
-"""Small fully connected networks: linear layers, ReLU between them (tiny-cuda-nn's FullyFusedMLP, Mueller et al. 2021,
-"Real-time neural radiance caching", section 3).
+"""Small fully connected networks: linear layers with ReLU between them.
 
-Layers of a few hundred features are too small for a matrix library: most of its time goes into moving activations
-through memory. The compiled kernel takes a block of samples through all layers while it stays in cache.
+They follow tiny-cuda-nn's FullyFusedMLP (Mueller et al. 2021, "Real-time neural radiance caching", section 3). For
+layers of a few hundred features, a matrix library spends most of its time on moving activations through memory. The
+compiled kernel computes all layers for a block of samples while it is in the cache.
 """
 
 from __future__ import annotations
@@ -20,9 +20,13 @@ from framework.kernels.dispatch import CPP, Operation
 
 T = TypeVar("T")
 Activation = Literal["none", "relu", "sigmoid"]
+"""Activation function of the output."""
 CODES: dict[Activation, int] = {"none": 0, "relu": 1, "sigmoid": 2}
+"""Number of each activation function in the compiled kernels."""
 MAX_WIDTH = 384
+"""Maximum number of features of a layer in the compiled kernels."""
 MAX_LAYERS = 8
+"""Maximum number of layers in the compiled kernels."""
 
 
 def mlp_reference(
@@ -31,7 +35,10 @@ def mlp_reference(
     activation: Activation = "none",
     biases: Sequence[Tensor] | None = None,
 ) -> Tensor:
-    """The network as torch writes it: the truth, in any float type. Arguments as for `mlp`."""
+    """Compute `mlp` in PyTorch, on any device and for any float type, with derivatives of any order.
+
+    `inputs`, `weights`, `activation` and `biases` are as in `mlp`.
+    """
     x = torch.cat([part.to(weights[0].dtype) for part in inputs], dim=-1)
     for layer, weight in enumerate(weights):
         x = linear(torch.relu(x) if layer else x, weight, None if biases is None else biases[layer])
@@ -47,7 +54,7 @@ _backward_bf16 = native.Function("mlp_backward_bf16", "ppiqpippippppi")
 
 
 class _MLP(torch.autograd.Function):
-    """The compiled network. Its backward pass computes hidden layers again, and skips samples without a gradient."""
+    """The compiled form of `mlp`; backward computes hidden layers again, and skips samples whose gradient is 0."""
 
     @staticmethod
     def forward(ctx: Any, plan: _Plan, *tensors: Tensor) -> Tensor:
@@ -74,19 +81,19 @@ class _MLP(torch.autograd.Function):
             for index, (tensor, wanted) in enumerate(zip(tensors, ctx.needs_input_grad[1:], strict=True))
         ]
         addresses = [None if g is None else g.data_ptr() for g in grads]
-        of_inputs, of_weights, of_biases = plan.split(addresses)
+        grad_inputs, grad_weights, grad_biases = plan.split(addresses)
         run = _backward_bf16 if plan.bf16 else _backward
         run(
             *call.arguments, CODES[plan.activation], native.pointer(grad, "the gradient", (call.count, call.outputs)),
-            native.pointers(of_inputs), native.pointers(of_weights),
-            native.pointers(of_biases or [None] * plan.layers), native.threads(),
+            native.pointers(grad_inputs), native.pointers(grad_weights),
+            native.pointers(grad_biases or [None] * plan.layers), native.threads(),
         )  # fmt: skip
         return None, *grads
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """What a row of tensors means: inputs, then weights, then biases if there are any."""
+    """The layout of a sequence of tensors: inputs, then weights, then biases if there are any."""
 
     inputs: int
     layers: int
@@ -94,13 +101,13 @@ class _Plan:
     bf16: bool
 
     def split(self, values: Sequence[T]) -> tuple[Sequence[T], Sequence[T], Sequence[T]]:
-        """Inputs, weights, biases (none or one a layer)."""
+        """Return the inputs, the weights, and the biases, of which there is none or one per layer."""
         last = self.inputs + self.layers
         return values[: self.inputs], values[self.inputs : last], values[last:]
 
 
 class _Call:
-    """The arguments that forward and backward share, checked. Holds the C arrays alive."""
+    """The checked arguments that forward and backward share; it keeps the C arrays alive."""
 
     def __init__(self, plan: _Plan, tensors: Sequence[Tensor]) -> None:
         inputs, weights, biases = plan.split(tensors)
@@ -128,19 +135,22 @@ def mlp(
     activation: Activation = "none",
     biases: Sequence[Tensor] | None = None,
 ) -> Tensor:
-    """A small network.
+    """Return the output of a fully connected network with ReLU between its layers.
+
+    The compiled form has first derivatives only. Under autocast it multiplies in bfloat16 and sums in float32 if the
+    CPU has instructions for that, and computes in float32 otherwise.
 
     Args:
-        inputs: parts (N, D_i) that stand side by side: as if concatenated, without the copy.
-        weights: (out, in) of each layer, as torch's Linear stores them.
-        activation: of the output; ReLU stands between layers.
-        biases: (out,) of each layer, or None for none.
+        inputs: parts (N, D_i) of the input, as if concatenated along the features, but without a copy.
+        weights: (D_out, D_in) weights of each layer, as in `torch.nn.Linear`.
+        activation: activation function of the output.
+        biases: (D_out,) biases of each layer; None for no biases.
 
-    Under autocast the compiled products are of bfloat16, summed in float32, where the processor has instructions for
-    that, and of float32 elsewhere.
+    Returns:
+        (N, D_out) output of the last layer, float32.
 
-    Returns: (N, out of the last layer), float32. First derivatives only where compiled; see `mlp_reference`.
-    Raises: ValueError where the widths do not fit together.
+    Raises:
+        ValueError: if the widths of inputs and layers do not fit.
     """
     widths = [sum(part.shape[1] for part in inputs), *(weight.shape[0] for weight in weights)]
     if [weight.shape[1] for weight in weights] != widths[:-1]:

@@ -1,11 +1,12 @@
-"""The compiled CPU kernels: finding the library that fits this processor, and calling it safely.
+"""The library of compiled CPU kernels: choice of the variant for this CPU, and checked calls.
 
-Each kernel's Python file declares the C functions it calls as `Function`, and hands over tensors through `pointer`,
-which checks them. What goes wrong in C is a status there and an exception here. The library has threads of its own
+Each kernel's Python file declares its C functions as `Function`, and passes tensors through `pointer`, which checks
+them. A C function returns a status, which is raised as an exception here. The library has its own threads
 (`csrc/parallel.h`), as many as torch is set to use. ctypes releases Python's lock during a call.
 
-`NERFLOOM_KERNELS` overrides the choice: a variant's name (baseline, avx2, avx512, avx512_bf16), or "reference" for
-torch alone. `NERFLOOM_KERNEL_FOLDER` names another folder of libraries than the installed one (`make sanitize`).
+The environment variable `NERFLOOM_KERNELS` overrides the choice: a variant's name (baseline, avx2, avx512,
+avx512_bf16), or "reference" for PyTorch only. `NERFLOOM_KERNEL_FOLDER` is a folder of libraries to use instead of the
+installed one (`make sanitize`).
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "avx2": ("avx2", "fma"),
     "baseline": (),
 }
-"""Variant -> processor features it uses, the fastest first."""
+"""CPU features that each variant needs, by its name, the fastest variant first."""
 SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 TYPES: dict[str, Any] = {
     "p": ctypes.c_void_p,
@@ -47,19 +48,20 @@ TYPES: dict[str, Any] = {
     "d": ctypes.c_double,
 }
 spent: dict[str, float] | None = None
-"""Seconds in each kernel, kept while this is a dictionary (`ns-bench profile-step`)."""
+"""Seconds spent in each kernel by name, recorded if this is a dictionary (`ns-bench profile-step`)."""
 
 
 def variant() -> str:
-    """Which library is used: a name in `NEEDS`, or "reference" where there is none.
+    """Return the name of the variant in use: one of `NEEDS`, or "reference" if there are no compiled kernels.
 
-    Raises: ConfigError where NERFLOOM_KERNELS asks for what is not there.
+    Raises:
+        ConfigError: if NERFLOOM_KERNELS selects a variant that is unknown or cannot be loaded.
     """
     return _load()[0]
 
 
 def available() -> bool:
-    """Whether compiled kernels are used."""
+    """Return whether compiled kernels are used."""
     return _load()[1] is not None
 
 
@@ -98,26 +100,27 @@ def _compiler_hint() -> str:
 
 @functools.cache
 def has(name: str) -> bool:
-    """Whether the library in use has a function: some are built for processors with certain instructions only."""
+    """Return whether the library in use has a function of this `name`; some variants lack some functions."""
     library = _load()[1]
     return library is not None and hasattr(library, name)
 
 
 _FAILURES: dict[int, type[Exception]] = {1: MemoryError, 2: IndexError, 3: ValueError}
-"""Exception for each status; any other status but 0 is a RuntimeError."""
+"""Exception for each status; other statuses than 0 raise a RuntimeError."""
 
 
 class Function:
-    """A function of the library, found at its first call.
+    """A C function of the library, which is looked up at its first call.
 
-    A call raises MemoryError, IndexError, ValueError or RuntimeError where the status says so.
+    A call raises MemoryError, IndexError, ValueError or RuntimeError according to the status that the C function
+    returns (csrc/status.h).
 
     Args:
-        name: its C name. It returns a status (csrc/status.h).
-        arguments: a letter each: p pointer, q 64-bit integer, i int, f float, d double. A test holds them against the
-            C++ sources.
-        result: the letter of what it writes through its last argument, which is not in `arguments` and which the
-            call returns; empty for nothing.
+        name: name of the C function.
+        arguments: types of its arguments, one letter each: p pointer, q 64-bit integer, i int, f float, d double. A
+            test compares them with the C++ sources.
+        result: type of the value that it writes through a last argument, which is not in `arguments`; a call returns
+            this value. Empty if there is none.
     """
 
     def __init__(self, name: str, arguments: str, result: str = "") -> None:
@@ -125,7 +128,7 @@ class Function:
         self._bound: Any = None
 
     def __call__(self, *values: Any) -> Any:
-        """Call it with numbers, addresses and C arrays."""
+        """Call the function with `values`: numbers, addresses and C arrays."""
         bound = self._bind() if self._bound is None else self._bound
         start = time.perf_counter() if spent is not None else 0.0
         out = TYPES[self.result]() if self.result else None
@@ -140,11 +143,11 @@ class Function:
         library = _load()[1]
         if library is None:
             raise RuntimeError(f"{self.name} was called without compiled kernels")
-        found = getattr(library, self.name)
-        found.argtypes = [TYPES[letter] for letter in self.arguments] + [ctypes.c_void_p] * bool(self.result)
-        found.restype = ctypes.c_int
-        self._bound = found  # not before: another thread may be calling
-        return found
+        function = getattr(library, self.name)
+        function.argtypes = [TYPES[letter] for letter in self.arguments] + [ctypes.c_void_p] * bool(self.result)
+        function.restype = ctypes.c_int
+        self._bound = function  # only when it is complete: another thread may be calling
+        return function
 
 
 def _last_error() -> str:
@@ -155,9 +158,16 @@ def _last_error() -> str:
 
 
 def pointer(tensor: Tensor, what: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float32) -> int:
-    """The address of a tensor's data, after checking all that a kernel relies on.
+    """Return the address of a tensor's data, after checking the properties that kernels rely on.
 
-    Raises: ValueError that names `what` and what is wrong with it.
+    Args:
+        tensor: a contiguous tensor on the CPU.
+        what: name of the tensor, for the error.
+        shape: the shape that it must have.
+        dtype: the type that it must have.
+
+    Raises:
+        ValueError: if the tensor is not contiguous, not on the CPU, or of another shape or type.
     """
     if tensor.device.type != "cpu":
         raise ValueError(f"{what} is on {tensor.device}, not on the processor")
@@ -171,17 +181,17 @@ def pointer(tensor: Tensor, what: str, shape: tuple[int, ...], dtype: torch.dtyp
 
 
 def pointers(addresses: Sequence[int | None]) -> Any:
-    """A C array of pointers; None is the null pointer. It must be kept alive during the call."""
+    """Return a C array of `addresses`, where None is the null pointer; keep it alive during the call."""
     return (ctypes.c_void_p * len(addresses))(*addresses)
 
 
 def integers(values: tuple[int, ...]) -> Any:
-    """A C array of 64-bit integers."""
+    """Return a C array of 64-bit integers with these `values`."""
     return (ctypes.c_int64 * len(values))(*values)
 
 
 def doubles(values: Sequence[float]) -> Any:
-    """A C array of 64-bit floating point numbers."""
+    """Return a C array of 64-bit floating-point numbers with these `values`."""
     return (ctypes.c_double * len(values))(*values)
 
 
@@ -189,19 +199,19 @@ _threads: int | None = None
 
 
 def threads() -> int:
-    """Threads a kernel may use: as many as torch was set to."""
+    """Return the number of threads that a kernel may use: the number that torch was set to."""
     return torch.get_num_threads() if _threads is None else _threads
 
 
 @contextmanager
 def torch_on_one_thread(wanted: bool = True) -> Iterator[None]:
-    """Within it torch's own operations run on one thread, and the compiled kernels on as many as before.
+    """Run torch's own operations on one thread, within a `with` block, and compiled kernels on as many as before.
 
-    Two sets of threads that look out for work in turn get into each other's way. Where kernels do the heavy work, what
-    torch's small operations gain from threads is less than what that costs.
+    Two pools of threads that wait for work in turn slow each other down. If kernels do most of the work, this costs
+    more than torch's small operations gain from threads.
 
     Args:
-        wanted: whether to; without compiled kernels nothing changes either way.
+        wanted: False to change nothing. Without compiled kernels nothing changes either way.
     """
     global _threads
     if not wanted or _threads is not None or not available():

@@ -1,9 +1,10 @@
 """Factorised features: K-Planes (Fridovich-Keil et al. 2023), section 3; TensoRF (Chen et al. 2022), section 4.
 
-A group of factors, each a plane over two axes or a line along one, is looked up where a position falls on each, by
-bilinear or linear interpolation, and the features found are multiplied. Groups stand side by side. K-Planes' groups
-are its scales, with a plane for every pair of axes (equation 2). TensoRF's VM decomposition has three groups of a plane
-and the line across it, its CP decomposition one group of three lines (equations 4 and 3).
+A factor is a plane of features over two axes, or a line of features along one axis. Each factor of a group is
+interpolated at the projection of a position, bilinearly or linearly, and the results are multiplied. The products of
+all groups are concatenated. The groups of K-Planes are its scales, with a plane for every pair of axes (equation 2).
+The VM decomposition of TensoRF has three groups of a plane and the line perpendicular to it, its CP decomposition one
+group of three lines (equations 4 and 3).
 """
 
 from __future__ import annotations
@@ -24,24 +25,27 @@ from framework.kernels.deferred import Parts, waiting
 from framework.kernels.dispatch import CPP, Operation
 
 MAX_GROUPS, MAX_FACTORS = 64, 6
+"""Maximum number of groups, and of factors of a group."""
 MAX_VERTICES = 2**20
-"""Along an axis: float32 has 4 bits left for where between such vertices a position lies."""
+"""Maximum number of vertices along an axis; float32 then has 4 bits left for the position between two vertices."""
 
 
 @dataclass(frozen=True)
 class PlanesLayout:
-    """Where each plane's entries stand in the one table (E, F) that all share.
+    """Axes, resolution and entries of each factor, in one table (E, F) that all factors share.
 
-    Raises: ConfigError where axes, vertices or entries are none that factors can have: the kernels rely on it.
+    Raises:
+        ConfigError: if the numbers are inconsistent or out of range; the kernels rely on them.
     """
 
     resolutions: tuple[tuple[int, ...], ...]
-    """Vertices along each of D axes, per group."""
+    """Vertices along each of the D axes, for each of the G groups."""
     axes: tuple[tuple[tuple[int, ...], ...], ...]
-    """The axis or the two axes of each factor, per group. The first one's index runs fastest."""
+    """The axis or two axes of each factor, per group. The index along the first axis varies fastest."""
     offsets: tuple[tuple[int, ...], ...]
-    """First entry of each factor, per group."""
+    """Index of the first entry of each factor, per group."""
     num_entries: int
+    """Number E of entries of all factors."""
 
     def __post_init__(self) -> None:
         _check_factors(self.resolutions, self.axes)
@@ -49,16 +53,21 @@ class PlanesLayout:
             for along, first in zip(group, firsts, strict=True):
                 last = first + math.prod(sizes[axis] for axis in along)
                 if not 0 <= first < last <= self.num_entries:
-                    raise ConfigError(f"planes of {self.num_entries} entries have none from {first} to {last}")
+                    raise ConfigError(f"planes of {self.num_entries} entries have no entries {first} to {last}")
 
     @classmethod
     def build(
         cls, resolutions: tuple[tuple[int, ...], ...], axes: tuple[tuple[tuple[int, ...], ...], ...] | None = None
     ) -> PlanesLayout:
-        """Factors along the given axes; a plane for every pair of axes in every group if not given.
+        """Return the layout of factors, one after the other in the table.
 
-        Raises: ConfigError where an axis has fewer than 2 or more than MAX_VERTICES vertices, or the groups differ in
-            how many axes or factors they have.
+        Args:
+            resolutions: vertices along each of the D axes, for each of the G groups.
+            axes: the axis or two axes of each factor, per group; a plane for every pair of axes if None.
+
+        Raises:
+            ConfigError: if an axis has less than 2 or more than MAX_VERTICES vertices, or the groups differ in their
+                number of axes or factors.
         """
         axes = axes or tuple(tuple(combinations(range(len(scale)), 2)) for scale in resolutions)
         _check_factors(resolutions, axes)
@@ -73,20 +82,30 @@ class PlanesLayout:
 
     @property
     def dims(self) -> int:
-        """D, the number of axes."""
+        """Number D of axes."""
         return len(self.resolutions[0])
 
     @property
     def num_groups(self) -> int:
+        """Number G of groups."""
         return len(self.resolutions)
 
     def shape(self, group: int, index: int) -> tuple[int, int]:
-        """Vertices of a factor along its second axis (1 for a line), and along its first."""
+        """Return the vertices along the second axis, 1 for a line, and the first axis of factor `index` of `group`."""
         sizes = [self.resolutions[group][axis] for axis in self.axes[group][index]]
         return (sizes[1] if len(sizes) == 2 else 1), sizes[0]
 
     def factor(self, table: Tensor, group: int, index: int) -> Tensor:
-        """A factor of a table (E, F) as a view (vertices along the second axis or 1, along the first, F)."""
+        """Return a view of a factor's entries.
+
+        Args:
+            table: (E, F) entries of all factors.
+            group: number of the group.
+            index: number of the factor in the group.
+
+        Returns:
+            (vertices along the second axis, or 1, vertices along the first axis, F) entries.
+        """
         up, across = self.shape(group, index)
         first = self.offsets[group][index]
         return table[first : first + across * up].view(up, across, -1)
@@ -101,24 +120,34 @@ class PlanesLayout:
 
 
 def _check_factors(resolutions: tuple[tuple[int, ...], ...], axes: tuple[tuple[tuple[int, ...], ...], ...]) -> None:
-    """Refuse vertices and axes that the kernels cannot bear. Raises: ConfigError."""
+    """Check vertices and axes, on which the kernels rely; a ConfigError says what is wrong."""
     dims = {len(scale) for scale in resolutions}
     if len(dims) != 1 or not dims <= {2, 3, 4} or len(resolutions) > MAX_GROUPS:
-        raise ConfigError(f"planes need the same 2 to 4 axes at every scale, of 1 to {MAX_GROUPS}, not {sorted(dims)}")
+        groups = f"{len(resolutions)} groups of {sorted(dims)} axes"
+        raise ConfigError(f"planes need 1 to {MAX_GROUPS} groups of the same 2 to 4 axes, not {groups}")
     for size in (size for scale in resolutions for size in scale):
         if not isinstance(size, int) or not 2 <= size <= MAX_VERTICES:
             raise ConfigError(f"planes need 2 to {MAX_VERTICES} vertices along each axis, not {shown(size)}")
     (count,) = dims
     numbers = {len(group) for group in axes}
     if len(axes) != len(resolutions) or len(numbers) != 1 or not numbers <= set(range(1, MAX_FACTORS + 1)):
-        raise ConfigError(f"planes need as many factors in every group, 1 to {MAX_FACTORS}, not {shown(axes)}")
+        raise ConfigError(f"planes need 1 to {MAX_FACTORS} factors, as many in every group, not {shown(axes)}")
     for along in (along for group in axes for along in group):
         if len(along) not in (1, 2) or len(set(along)) != len(along) or not set(along) <= set(range(count)):
             raise ConfigError(f"planes need one or two of the axes 0 to {count - 1} for each factor, not {along}")
 
 
 def planes_reference(positions: Tensor, table: Tensor, layout: PlanesLayout) -> Tensor:
-    """The look-up as the paper writes it: the truth, in any float type, differentiable to any order."""
+    """Compute `planes` in PyTorch, on any device and for any float type, with derivatives of any order.
+
+    Args:
+        positions: (N, D); coordinates are clamped to [0, 1].
+        table: (E, F) entries of all factors.
+        layout: axes, resolutions and offsets of the factors.
+
+    Returns:
+        (N, G * F) features, group by group.
+    """
     clamped, features = positions.clamp(0, 1), []
     for group, resolution in enumerate(layout.resolutions):
         vertices = torch.tensor(resolution, device=positions.device)
@@ -150,35 +179,39 @@ _backward_positions = native.Function("planes_backward_positions", "pqp" + _TAIL
 
 
 class PlanesGradient:
-    """A table's gradient that is not added up yet: what the backward passes of several look-ups left.
+    """The deferred gradient of a table: gradients of look-ups, collected in backward passes and not yet accumulated.
 
-    A step touches few entries. They are added up in a table that is kept, and that Adam clears where it was used.
+    A step uses few entries. The gradient is accumulated in a table that is kept between steps, in which Adam sets the
+    entries that were used to zero.
+
+    Args:
+        layout: axes, resolutions and offsets of the factors.
     """
 
     def __init__(self, layout: PlanesLayout) -> None:
         self.layout = layout
         self.parts: Parts = []
-        """Positions (N, D) and incoming gradient (N, G * F) of each look-up."""
+        """Positions (N, D) of each look-up, and gradient (N, G * F) of its result."""
         self.bands: list[tuple[int, Tensor]] = []
-        """First entry and gradient (B, F) of each band of entries that was read as it is."""
+        """Index of the first entry, and gradient (B, F), of each band of entries that `plane_band` has read."""
         self._sum: Tensor | None = None
 
     def finite(self) -> bool:
-        """Whether no incoming gradient is infinite or NaN."""
+        """Return whether no value of the collected gradients is infinite or NaN."""
         return all(all_finite(grad) for _, grad in (*self.parts, *self.bands))
 
     @property
     def pending(self) -> bool:
-        """Whether there is any."""
+        """True if there is a gradient."""
         return bool(self.parts or self.bands)
 
     def clear(self) -> None:
-        """Forget it."""
+        """Discard the gradient."""
         self.parts.clear()
         self.bands.clear()
 
     def relayout(self, layout: PlanesLayout) -> None:
-        """The entries are others from now on, and what waits is void."""
+        """Change the layout of the table to `layout`, and discard the gradient."""
         self.clear()
         self.layout, self._sum = layout, None
 
@@ -186,7 +219,10 @@ class PlanesGradient:
         self, table: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
         rate: float, betas: tuple[float, float], eps: float,
     ) -> int:  # fmt: skip
-        """One step of `framework.kernels.adam.sparse_adam` with this gradient, which is forgotten then."""
+        """Update `table` (E, F) by `framework.kernels.adam.sparse_adam` with this gradient, and discard the gradient.
+
+        `mean`, `square`, `seen`, `rate`, `betas`, `eps` and the result are as in `sparse_adam`.
+        """
         if self._sum is None:
             self._sum = memory.table(*table.shape)
         for positions, grad in self.parts:
@@ -198,14 +234,14 @@ class PlanesGradient:
 
 
 class _Planes(torch.autograd.Function):
-    """The compiled look-up."""
+    """The compiled form of `planes`."""
 
     @staticmethod
     def forward(
         ctx: Any,
         positions: Tensor,
         table: Tensor,
-        later: Tensor | None,
+        placeholder: Tensor | None,
         layout: PlanesLayout,
     ) -> Tensor:
         def compute() -> Tensor:
@@ -222,16 +258,16 @@ class _Planes(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         positions, table = ctx.saved_tensors
         grad = grad.contiguous()
-        of_positions = of_table = None
+        grad_positions = grad_table = None
         if ctx.needs_input_grad[0]:
-            of_positions = torch.empty_like(positions)
+            grad_positions = torch.empty_like(positions)
             incoming = _incoming(grad, positions, table, ctx.layout)
             arguments = _arguments(positions, table, ctx.layout)
-            _backward_positions(*arguments, incoming, of_positions.data_ptr(), native.threads())
+            _backward_positions(*arguments, incoming, grad_positions.data_ptr(), native.threads())
         if ctx.needs_input_grad[1]:
-            of_table = torch.zeros_like(table)
-            _add_to(of_table, positions, table, grad, ctx.layout)
-        return of_positions, of_table, grad if ctx.needs_input_grad[2] else None, None
+            grad_table = torch.zeros_like(table)
+            _add_to(grad_table, positions, table, grad, ctx.layout)
+        return grad_positions, grad_table, grad if ctx.needs_input_grad[2] else None, None
 
 
 def _add_to(total: Tensor, positions: Tensor, table: Tensor, grad: Tensor, layout: PlanesLayout) -> None:
@@ -253,7 +289,7 @@ def _arguments(positions: Tensor, table: Tensor, layout: PlanesLayout) -> tuple[
 
 
 class _Band(torch.autograd.Function):
-    """Rows [first, end) of a table, whose gradient waits. Called back only for the table, its one input."""
+    """Rows [first, end) of a table, whose gradient is deferred; the table is the only input with a gradient."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, first: int, end: int, deferred: PlanesGradient) -> Tensor:
@@ -283,14 +319,19 @@ def plane_band(
     table: Tensor, layout: PlanesLayout, group: int, index: int, first_row: int, rows: int,
     deferred: PlanesGradient | None = None,
 ) -> Tensor:  # fmt: skip
-    """Some rows of a plane, for regularisers that look at neighbours: a look at all of a large table is dear.
+    """Return consecutive rows of a factor, for regularisers, for which reading all of a large table is slow.
 
     Args:
-        table: (E, F).
-        group, index: which plane.
-        first_row, rows: along the plane's second axis.
-        deferred: where the gradient is left on the processor, as for `planes`.
-    Returns: (rows, vertices along the first axis, F).
+        table: (E, F) entries of all factors.
+        layout: axes, resolutions and offsets of the factors.
+        group: number of the group.
+        index: number of the factor in the group.
+        first_row: index of the first row, along the factor's second axis.
+        rows: number of rows.
+        deferred: collects the gradient of the table on the CPU, instead of autograd, as in `planes`; None for autograd.
+
+    Returns:
+        (rows, vertices along the first axis, F) entries.
     """
     _, across = layout.shape(group, index)
     first = layout.offsets[group][index] + first_row * across
@@ -303,15 +344,21 @@ def planes(
     layout: PlanesLayout,
     deferred: PlanesGradient | None = None,
 ) -> Tensor:
-    """Factorised features.
+    """Return the factorised features at positions: K-Planes, section 3, and TensoRF, section 4.
+
+    The compiled form has first derivatives only.
 
     Args:
-        positions: (N, D) in [0, 1]; what lies outside is moved to the edge.
-        table: (E, F) entries of all planes, E = layout.num_entries.
-        layout: resolutions and offsets.
-        deferred: where a compiled backward pass that asks for the table's gradient leaves it, autograd getting none.
-    Returns: (N, G * F), group by group. First derivatives only where compiled; see `planes_reference`.
-    Raises: ValueError where a shape does not fit the layout.
+        positions: (N, D); coordinates are clamped to [0, 1].
+        table: (E, F) entries of all factors, E = layout.num_entries.
+        layout: axes, resolutions and offsets of the factors.
+        deferred: collects the gradient of the table in the compiled form, instead of autograd; None for autograd.
+
+    Returns:
+        (N, G * F) features, group by group.
+
+    Raises:
+        ValueError: if a shape does not fit the layout.
     """
     if positions.ndim != 2 or positions.shape[1] != layout.dims:
         raise ValueError(f"planes: positions have shape {tuple(positions.shape)}, not (N, {layout.dims})")
@@ -330,8 +377,8 @@ PLANES = Operation("planes", _reference)
 
 @PLANES.implementation(CPP)
 def _compiled(positions: Tensor, table: Tensor, layout: PlanesLayout, deferred: PlanesGradient | None) -> Tensor:
-    positions, table, later = positions.contiguous(), table.contiguous(), None
+    positions, table, placeholder = positions.contiguous(), table.contiguous(), None
     if deferred is not None and table.requires_grad:
-        later = waiting(table, positions, layout.num_groups * table.shape[1], deferred.parts)
+        placeholder = waiting(table, positions, layout.num_groups * table.shape[1], deferred.parts)
         table = table.detach()
-    return _Planes.apply(positions, table, later, layout)
+    return _Planes.apply(positions, table, placeholder, layout)

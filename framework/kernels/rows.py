@@ -1,4 +1,4 @@
-"""Choosing rows of tensors, each at most once."""
+"""Selection of rows of tensors, each at most once."""
 
 from __future__ import annotations
 
@@ -30,30 +30,34 @@ class _TakeRows(torch.autograd.Function):
 
 
 def take_rows(values: Tensor, rows: Tensor) -> Tensor:
-    """`values[rows]` where no row is chosen twice: the gradient is a copy, where `index_select` has to add.
+    """Return `values[rows]`, where no row is selected twice, so that the gradient is a copy instead of a sum.
 
     Args:
-        values: (N, ...).
-        rows: (M,) int64, all different.
+        values: (N, ...) values.
+        rows: (M,) int64 indices of rows, all different.
     """
     return _TakeRows.apply(values, rows)
 
 
 @torch.no_grad()
 def gather_rows(columns: Sequence[Sequence[Tensor]], order: Tensor) -> list[Tensor]:
-    """Rows of several tensors that come in parts, in one pass and without putting the parts together first.
+    """Return rows of several tensors that are given in parts, without concatenating the parts first.
 
     Args:
-        columns: for each of the tensors its parts (N_p, ...); all have the same P parts of the same lengths.
-        order: (M,) int64 indices into the N_1 + ... + N_P rows.
-    Returns: (M, ...) of each tensor, without gradient.
-    Raises: IndexError where there is no such row.
+        columns: the P parts (N_p, ...) of each tensor; the lengths N_p are the same for all tensors.
+        order: (M,) int64 indices of rows, counted through all parts.
+
+    Returns:
+        (M, ...) rows of each tensor, without gradient.
+
+    Raises:
+        IndexError: if an index is out of range.
     """
     return GATHER_ROWS((order,), columns, order)
 
 
 def gather_rows_reference(columns: Sequence[Sequence[Tensor]], order: Tensor) -> list[Tensor]:
-    """As `gather_rows`, in torch, on any device."""
+    """Compute `gather_rows` of `columns` and `order` in PyTorch, on any device."""
     check_indices(order, sum(len(part) for part in columns[0]), "rows")
     return [torch.cat(list(parts)).index_select(0, order) for parts in columns]
 

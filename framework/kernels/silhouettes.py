@@ -1,6 +1,7 @@
-"""Balls in space that a photograph with alpha shows to be empty, and its pixels that may see the others.
+"""Projections of balls into an image with alpha, for the visual hull (Laurentini 1994).
 
-Used for the visual hull (Laurentini 1994): see `framework.scene.silhouettes`.
+They determine which balls the image shows to be empty, and which pixels may show the others: see
+`framework.scene.silhouettes`.
 """
 
 from __future__ import annotations
@@ -22,31 +23,37 @@ _near = native.Function("pixels_near_balls", "pqfpffffpqqpi")
 
 @dataclass(frozen=True)
 class Photograph:
-    """A photograph taken through a pinhole camera."""
+    """An image with alpha, taken by a pinhole camera."""
 
     pose: Tensor
-    """(3, 4) camera to world."""
+    """(3, 4) camera-to-world matrix."""
     fx: float
+    """Focal length along x, pixels."""
     fy: float
+    """Focal length along y, pixels."""
     cx: float
+    """Principal point along x, pixels."""
     cy: float
+    """Principal point along y, pixels."""
     sums: Tensor
-    """(H + 1, W + 1) int32 of its pixels that are not fully transparent (`opaque_sums`)."""
+    """(H + 1, W + 1) int32 sums of the pixels that are not fully transparent (`opaque_sums`)."""
 
     @property
     def height(self) -> int:
+        """Height H in pixels."""
         return self.sums.shape[0] - 1
 
     @property
     def width(self) -> int:
+        """Width W in pixels."""
         return self.sums.shape[1] - 1
 
     def depth(self, points: Tensor) -> Tensor:
-        """Distance (N,) of points (N, 3) along the camera's axis."""
-        return (self.pose[:, 3] - points) @ self.pose[:, 2]  # the camera looks down its -z
+        """Return the depth (N,) of `points` (N, 3) along the optical axis, scene units."""
+        return (self.pose[:, 3] - points) @ self.pose[:, 2]  # the camera looks along its -z axis
 
     def arguments(self, centers: Tensor, radius: float) -> tuple[Any, ...]:
-        """The kernels' first arguments. `pose` and `centers` must be contiguous."""
+        """Return the first arguments of the kernels, for balls of `radius` around `centers` (N, 3), contiguous."""
         return (
             native.pointer(centers, "the centres", (len(centers), 3)), len(centers), radius,
             native.pointer(self.pose, "the pose", (3, 4)), self.fx, self.fy, self.cx, self.cy,
@@ -56,13 +63,13 @@ class Photograph:
 
 
 def opaque_sums_reference(opaque: Tensor) -> Tensor:
-    """As `opaque_sums`, in torch, on any device."""
+    """Compute `opaque_sums` of `opaque` in PyTorch, on any device."""
     sums = opaque.to(torch.int32).cumsum(0, dtype=torch.int32).cumsum(1, dtype=torch.int32)
     return functional.pad(sums, (1, 0, 1, 0))
 
 
 def opaque_sums(opaque: Tensor) -> Tensor:
-    """(H + 1, W + 1) int32 from (H, W) bool: how many opaque pixels lie above and left of each pixel's corner."""
+    """Return the number (H + 1, W + 1) int32 of pixels of `opaque` (H, W) bool above and left of each pixel corner."""
     return OPAQUE_SUMS((opaque,), opaque)
 
 
@@ -79,10 +86,16 @@ def _opaque_sums(opaque: Tensor) -> Tensor:
 
 
 def footprint(photograph: Photograph, centers: Tensor, radius: float) -> tuple[Tensor, Tensor]:
-    """Where a photograph shows balls of `radius` around centers (N, 3), to a pixel more on each side.
+    """Return the bounding rectangles of projected balls, one pixel larger on each side.
 
-    Returns: left, right, top, bottom (4, N) in pixels' corners, clamped to the photograph; and (N,) bool whether
-        the ball lies in it whole, in front of the camera.
+    Args:
+        photograph: the image.
+        centers: (N, 3) centres of the balls, scene coordinates.
+        radius: radius of the balls, scene units.
+
+    Returns:
+        left, right, top and bottom (4, N) int64 as numbers of pixel corners, clamped to the image; and (N,) bool, True
+        for balls in front of the camera whose rectangle is entirely inside the image.
     """
     pose, depth = photograph.pose, photograph.depth(centers)
     nearest = depth - radius
@@ -90,9 +103,9 @@ def footprint(photograph: Photograph, centers: Tensor, radius: float) -> tuple[T
     local = (centers - pose[:, 3]) @ pose[:, :2]
     column = photograph.cx + photograph.fx * local[:, 0] / depth
     row = photograph.cy - photograph.fy * local[:, 1] / depth
-    # A ball at an angle to the axis is seen as an ellipse, at most 1 / cos^2 as long as its height is wide.
+    # Off the optical axis a ball is projected to an ellipse, longer than wide by a factor of at most 1 / cos^2.
     slant = 1 + (local / safe[:, None]).square().sum(-1)
-    reach = radius / safe * max(photograph.fx, photograph.fy) * slant + 1  # an edge is known to a pixel
+    reach = radius / safe * max(photograph.fx, photograph.fy) * slant + 1  # edges are accurate to a pixel
     edges = torch.stack(
         [(column - reach).floor(), (column + reach).ceil(), (row - reach).floor(), (row + reach).ceil()]
     )
@@ -110,18 +123,26 @@ def _may_hold(photograph: Photograph, centers: Tensor, radius: float) -> Tensor:
 
 
 def hold_balls_reference(photograph: Photograph, centers: Tensor, radius: float, held: Tensor, every: bool) -> None:
-    """As `hold_balls`, in torch, on any device."""
+    """Compute `hold_balls` in PyTorch, on any device.
+
+    `photograph`, `centers`, `radius`, `held` and `every` are as in `hold_balls`.
+    """
     rest = (held if every else ~held).nonzero().squeeze(-1)
     held[rest] = _may_hold(photograph, centers[rest], radius)
 
 
 def hold_balls(photograph: Photograph, centers: Tensor, radius: float, held: Tensor, every: bool) -> None:
-    """Note, in place, which balls a photograph does not show to be empty: not whole, or with an opaque pixel in it.
+    """Update, in place, which balls may hold matter, by one image.
+
+    An image shows a ball to be empty if the ball's `footprint` is entirely inside the image and has no opaque pixel.
 
     Args:
-        centers, radius: N balls, (N, 3) and their radius.
-        held: (N,) bool, what is known from other photographs.
-        every: True to keep what all photographs hold, starting from True; False for what any does, from False.
+        photograph: the image.
+        centers: (N, 3) centres of the balls, scene coordinates.
+        radius: radius of the balls, scene units.
+        held: (N,) bool, the result of the images before.
+        every: True for balls that no image shows to be empty, where `held` starts as True; False for balls that at
+            least one image does not show to be empty, where `held` starts as False.
     """
     HOLD_BALLS((photograph.pose, centers), photograph, centers, radius, held, every)
 
@@ -136,19 +157,21 @@ def _hold_balls(photograph: Photograph, centers: Tensor, radius: float, held: Te
 
 
 def pixels_near_balls_reference(photograph: Photograph, centers: Tensor, radius: float) -> Tensor:
-    """As `pixels_near_balls`, in torch, on any device."""
+    """Compute `pixels_near_balls` of `photograph`, `centers` and `radius` in PyTorch, on any device."""
     return _near_opaque(photograph, centers, radius) | _under_cut_balls(photograph, centers, radius)
 
 
 def pixels_near_balls(photograph: Photograph, centers: Tensor, radius: float) -> Tensor:
-    """Which pixels may see a ball that the photograph does not show to be empty: (H, W) bool, some more included.
+    """Return the pixels (H, W) bool whose rays may meet one of the balls, and some more pixels.
 
-    A ball that a photograph shows whole has an opaque pixel within the reach of its image, and a ray that meets the
-    ball lies within that reach too: so twice the largest reach around opaque pixels is enough. Of balls that stick out
-    of the photograph, every pixel that may see them is taken.
+    The projection of a ball that is entirely inside the image contains an opaque pixel, and the pixels of rays that
+    meet the ball. All pixels within twice the largest radius of a projection around opaque pixels are therefore
+    sufficient. For balls that are partly outside the image, all pixels of their rectangles are included.
 
     Args:
-        centers, radius: N balls, (N, 3) and their radius, none of them shown to be empty.
+        photograph: the image.
+        centers: (N, 3) centres of balls that no image shows to be empty, scene coordinates.
+        radius: radius of the balls, scene units.
     """
     return PIXELS_NEAR_BALLS((photograph.pose, centers), photograph, centers, radius)
 
@@ -181,7 +204,7 @@ def _under_cut_balls(photograph: Photograph, centers: Tensor, radius: float) -> 
     depth = photograph.depth(centers)
     cut = ~whole & (x1 > x0) & (y1 > y0) & (depth > -radius)
     height, width = photograph.height, photograph.width
-    if bool((cut & (depth <= radius)).any()):  # the camera stands within the ball
+    if bool((cut & (depth <= radius)).any()):  # the camera may be inside the ball
         return torch.ones(height, width, dtype=torch.bool, device=centers.device)
     marks = torch.zeros((height + 1) * (width + 1), dtype=torch.int32, device=centers.device)
     ones = torch.ones(int(cut.sum()), dtype=torch.int32, device=centers.device)

@@ -1,6 +1,6 @@
-"""Real spherical harmonics up to degree 4, the view encoding of Instant-NGP (Mueller et al. 2022, section 5.4).
+"""Real spherical harmonics of up to 4 bands: Instant-NGP (Mueller et al. 2022), section 5.4.
 
-Constants as in Sloan 2008, "Stupid spherical harmonics tricks", appendix A2, with the Condon-Shortley phase.
+The constants are those of Sloan 2008, "Stupid spherical harmonics tricks", appendix A2, with the Condon-Shortley phase.
 """
 
 from __future__ import annotations
@@ -12,17 +12,24 @@ from framework.kernels import kept, native
 from framework.kernels.dispatch import CPP, Operation
 
 MAX_LEVELS = 4
+"""Maximum number of bands."""
 _harmonics = native.Function("spherical_harmonics", "pqipi")
 
 
 def spherical_harmonics(directions: Tensor, levels: int = 4) -> Tensor:
-    """The first levels^2 real spherical harmonics Y_l^m, ordered l = 0, 1, ..., m = -l ... l.
+    """Return the first real spherical harmonics Y_l^m of directions, ordered by l = 0, 1, ... and m = -l ... l.
+
+    The compiled form has no derivatives.
 
     Args:
         directions: (N, 3) unit vectors.
-        levels: number of bands, 1 to 4 (what papers call degree).
-    Returns: (N, levels^2), orthonormal over the sphere.
-    Raises: ValueError for another number of levels.
+        levels: number of bands, 1 to 4, which papers call the degree.
+
+    Returns:
+        (N, levels^2) values of functions that are orthonormal over the sphere.
+
+    Raises:
+        ValueError: if the number of levels is out of range.
     """
     if not 1 <= levels <= MAX_LEVELS:
         raise ValueError(f"spherical harmonics have 1 to {MAX_LEVELS} levels, not {levels}")
@@ -30,7 +37,7 @@ def spherical_harmonics(directions: Tensor, levels: int = 4) -> Tensor:
 
 
 def spherical_harmonics_reference(directions: Tensor, levels: int = 4) -> Tensor:
-    """The same in torch: the truth, in any float type, differentiable."""
+    """Compute `spherical_harmonics` of `directions` and `levels` in PyTorch, for any float type, with derivatives."""
     x, y, z = directions.unbind(-1)
     bands = [torch.full_like(x, 0.28209479177387814)]
     if levels > 1:

@@ -1,1 +1,1 @@
-"""From samples to what is seen: volume rendering, and losses."""
+"""Volume rendering and losses: from samples to colours, depths and opacities of rays and pixels."""

@@ -10,11 +10,12 @@ from framework.kernels.compositing import ray_sum
 
 
 def mean_squared_error(prediction: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Mean of (prediction - target)^2 over all elements. 0 for empty input, so that an empty batch is harmless.
+    """Return the mean () of weight * (prediction - target)^2 over all elements; 0 for empty input.
 
     Args:
-        prediction, target: (R, C).
-        weights: (R,) what each row's part is multiplied by; None for 1.
+        prediction: (R, C) predicted values.
+        target: (R, C) true values.
+        weights: (R,) factor of each row; None for 1.
     """
     if prediction.numel() == 0:
         return prediction.sum()
@@ -23,19 +24,19 @@ def mean_squared_error(prediction: Tensor, target: Tensor, weights: Tensor | Non
 
 
 def depth_error(weights: Tensor, samples: Samples, known: Tensor) -> Tensor:
-    """How far light comes from, relative to how far it is known to: mean of sum_i w_i |t_i - d| / d.
+    """Return the relative error () of the depth of rays: the mean over rays of sum_i w_i min(|t_i - d| / d, 1).
 
-    Unlike the error of the mean distance, it is only small where all of the light comes from there.
+    Unlike the error of the expected depth, it is small only if all weight is at the known depth.
 
     Args:
-        weights: (N,) of the samples of R rays.
-        samples: their intervals.
-        known: (R,) distances d; 0 where unknown, and the ray does not count.
+        weights: (N,) weights of the samples of R rays.
+        samples: N samples.
+        known: (R,) known distances d along the rays, scene units; 0 if unknown, in which case the ray is left out.
     """
-    there = known > 0
-    if not bool(there.any()):
+    has_depth = known > 0
+    if not bool(has_depth.any()):
         return weights.sum() * 0
-    wanted = torch.where(there, known, torch.ones_like(known))[samples.ray_indices]
-    # Light from beyond twice the distance counts as from there: disparity's tail would drown all else.
-    apart = ((samples.t - wanted).abs() / wanted).clamp(max=1)
-    return ray_sum(weights * apart, samples)[there].mean()
+    depths = torch.where(has_depth, known, torch.ones_like(known))[samples.ray_indices]
+    # Without the bound, far samples, which are sparse where distances are in disparity, would dominate the mean.
+    apart = ((samples.t - depths).abs() / depths).clamp(max=1)
+    return ray_sum(weights * apart, samples)[has_depth].mean()

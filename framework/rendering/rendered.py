@@ -1,4 +1,4 @@
-"""What is seen: along rays, in pixels, and in a whole picture."""
+"""Results of rendering: of rays, of pixels, and of a whole image."""
 
 from __future__ import annotations
 
@@ -12,64 +12,66 @@ from framework.geometry.rays import Samples
 
 @dataclass(frozen=True)
 class Pixels:
-    """What P pixels show."""
+    """Rendered values of P pixels."""
 
     rgb: Tensor
-    """(P, 3) colour over the background."""
+    """(P, 3) colour in [0, 1] over the background."""
     depth: Tensor
-    """(P,) expected distance along the ray, scene units; the ray's far end where it met nothing."""
+    """(P,) expected distance along the ray, scene units; the far end of the ray if it is transparent."""
     median_depth: Tensor
-    """(P,) distance at which half of the light is gone; the ray's far end where it never is."""
+    """(P,) distance at which the transmittance falls to 0.5, scene units; the far end of the ray if it does not."""
     accumulation: Tensor
     """(P,) opacity."""
     normals: Tensor | None = None
-    """(P, 3) mean of the normals seen, of a method that has them; not of unit length."""
+    """(P, 3) mean normal, not of unit length; None if the method has no normals."""
 
 
 @dataclass(frozen=True)
 class Rendered:
-    """What R rays show, and the samples that it was made of."""
+    """Rendered values of R rays, and the N samples that they were computed from."""
 
     rgb: Tensor
-    """(R, 3) colour over the background."""
+    """(R, 3) colour in [0, 1] over the background."""
     depth: Tensor
-    """(R,) expected distance: the mean of t under the weights; the ray's far end where it met nothing."""
+    """(R,) expected distance, the weighted mean of t, scene units; the far end of the ray if it is transparent."""
     median_depth: Tensor
-    """(R,) distance at which half of the light is gone; the ray's far end where it never is."""
+    """(R,) distance at which the transmittance falls to 0.5, scene units; the far end of the ray if it does not."""
     accumulation: Tensor
     """(R,) opacity, the sum of the weights."""
     num_samples: int
-    """Evaluations of the field on these rays; a proposal's are not counted."""
+    """Number of evaluations of the field on these rays, without those of proposals."""
     weights: Tensor | None = None
     """(N,) weight of each sample."""
     samples: Samples | None = None
-    """The samples themselves."""
+    """The samples."""
     coarse: Rendered | None = None
-    """What a coarser level showed, where it is supervised too."""
+    """Rendered values of the coarse level, if it is supervised too."""
     normals: Tensor | None = None
-    """(R, 3) mean of the samples' normals under the weights, of a method that has them."""
+    """(R, 3) weighted sum of the samples' normals; None if the method has no normals."""
     penalties: dict[str, Tensor] = field(default_factory=dict)
-    """Named (R,) terms of the loss that only the samples' own values tell."""
+    """Terms (R,) of the loss by name that depend on values of single samples."""
     error_bound: float = 0.0
-    """The most that a colour channel can be off by, as rays were ended early."""
+    """Maximum error of a colour channel that the early stop of rays causes."""
 
     def over(self, coarse: Rendered) -> Rendered:
-        """Return this with the coarser level that it was refined from; the evaluations of both count.
+        """Return these values with those of the coarse level attached, and the evaluations of both levels added up.
 
         Args:
-            coarse: what that level showed of the same rays.
+            coarse: the coarse level, rendered on the same rays.
         """
         return replace(self, coarse=coarse, num_samples=self.num_samples + coarse.num_samples)
 
     def to_pixels(self, rays_per_pixel: int = 1) -> Pixels:
         """Average the rays of each pixel.
 
-        Colour and opacity are means, and so is the depth, over the rays as far as they are opaque; the median depth is
-        one ray's.
+        Colour, opacity and normal are means over the rays. The depth is a mean weighted by the opacity of the rays,
+        and the median depth is the median of the rays' own.
 
         Args:
-            rays_per_pixel: how many successive rays make a pixel.
-        Returns: R / rays_per_pixel pixels.
+            rays_per_pixel: number of consecutive rays that form a pixel.
+
+        Returns:
+            R / rays_per_pixel pixels.
         """
         if rays_per_pixel == 1:
             return Pixels(self.rgb, self.depth, self.median_depth, self.accumulation, self.normals)
@@ -88,22 +90,22 @@ class Rendered:
 
 @dataclass(frozen=True)
 class Picture:
-    """What a camera sees, row by row."""
+    """A rendered image."""
 
     rgb: Tensor
-    """(H, W, 3) colour over the background."""
+    """(H, W, 3) colour in [0, 1] over the background."""
     depth: Tensor
     """(H, W) expected distance along the ray, scene units."""
     median_depth: Tensor
-    """(H, W) distance along the ray at which half of the light is gone, scene units."""
+    """(H, W) distance along the ray at which the transmittance falls to 0.5, scene units."""
     accumulation: Tensor
     """(H, W) opacity."""
     normals: Tensor | None = None
-    """(H, W, 3) unit directions away from surfaces, scene coordinates, of a method that has them."""
+    """(H, W, 3) unit normals, scene coordinates, pointing away from surfaces; None if the method has no normals."""
     num_rays: int = 0
-    """Rays that it was made of; 0 of a method that casts none."""
+    """Number of rays that were cast for the image; 0 if the method casts none."""
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height and width, pixels."""
+        """Height and width in pixels."""
         return self.rgb.shape[0], self.rgb.shape[1]

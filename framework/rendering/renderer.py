@@ -1,4 +1,4 @@
-"""What every renderer offers: from what was sampled to what is seen."""
+"""The interface of renderers, which turn samples into colours and depths of rays."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from framework.rendering.rendered import Rendered
 
 
 class Renderer(nn.Module, ABC):
-    """From samples along rays to what the rays show.
+    """Base class of renderers.
 
-    A renderer that learns (normals, a sky) holds its parameters; `self.training` tells training from evaluation.
+    A renderer with learnt components (normals, a sky) holds their parameters; `self.training` is True in training.
     """
 
     optimised: Optimised | None = None
-    """How its parameters are optimised; as the model's if None."""
+    """Optimiser settings of its parameters; those of the model if None."""
 
     @abstractmethod
     def render(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
-        """Return what R rays show.
+        """Render R rays from their samples.
 
         Args:
             rays: the rays; R may be 0.
-            samples: samples along them, with density and features where the sampler has evaluated these already
-                (`Samples.sigma`, `.features`): they are not evaluated again.
-            field: what was sampled.
-            background: (R, 3) or (3,) colour that shows as far as a ray is not opaque.
+            samples: samples along the rays. If the sampler has attached density and features (`Samples.sigma`,
+                `Samples.features`), these are used and not evaluated again.
+            field: the field that was sampled.
+            background: (R, 3) or (3,) colour in [0, 1] of the background.
         """

@@ -1,4 +1,4 @@
-"""Volume rendering: from samples with density and colour to what rays show."""
+"""Volume rendering: NeRF (Mildenhall et al. 2020), equation 3."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from framework.rendering.renderer import Renderer
 
 
 class VolumeRenderer(Renderer):
-    """Composite density, or alpha where the field has it (`HasAlpha`), over a background: NeRF, equation 3.
+    """A renderer that composites densities, or alphas if the field has them (`HasAlpha`): NeRF, equation 3.
 
-    Subclasses may change one step: `shade` (colours and weights of samples), or `render` around it.
+    Subclasses can override `shade`, which computes colours and weights of samples, or `render`, which calls it.
     """
 
     def render(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
@@ -29,23 +29,27 @@ class VolumeRenderer(Renderer):
         return rendered.over(self.shade(rays, coarse.samples, coarse.field, background))
 
     def shade(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
-        """Colour and composite samples whose density and features are there.
+        """Compute the colours of samples and composite them.
 
         Args:
-            rays, field, background: as for `render`.
-            samples: with `sigma` and `features`.
-        Raises: ValueError where they are missing.
+            rays: R rays.
+            samples: N samples along the rays, with density or alpha, and features, attached.
+            field: the field that was sampled.
+            background: (R, 3) or (3,) colour in [0, 1] of the background.
+
+        Raises:
+            ValueError: if the samples have no density or no features.
         """
         return shade(rays, samples, field, background)
 
 
 def evaluated(rays: Rays, samples: Samples, field: Field) -> Samples:
-    """Return samples with density, or alpha, and features; those that the sampler evaluated are not evaluated again.
+    """Return samples with density or alpha, and features; those that have them are returned as they are.
 
     Args:
-        rays: the samples' rays.
-        samples: N samples.
-        field: what is sampled.
+        rays: R rays.
+        samples: N samples along the rays.
+        field: the field to evaluate.
     """
     if samples.features is not None and (samples.sigma is not None or samples.alpha is not None):
         return samples
@@ -60,15 +64,17 @@ def evaluated(rays: Rays, samples: Samples, field: Field) -> Samples:
 def shade(
     rays: Rays, samples: Samples, field: Field, background: Tensor, gradient_factors: Tensor | None = None
 ) -> Rendered:
-    """Colour and composite samples whose density, or alpha, and features are there.
+    """Compute the colours of samples and composite them.
 
     Args:
-        rays: the samples' rays.
-        samples: N samples, evaluated.
-        field: gives their colour.
-        background: (R, 3) or (3,) what shows where a ray is not opaque.
-        gradient_factors: (N,) multiply the gradients of density and colour; None for 1.
-    Raises: ValueError where the samples have no density or features.
+        rays: R rays.
+        samples: N samples along the rays, with density or alpha, and features, attached.
+        field: the field, which computes colours from features and directions.
+        background: (R, 3) or (3,) colour in [0, 1] of the background.
+        gradient_factors: (N,) factors of the gradients of density (or alpha) and colour; None for 1.
+
+    Raises:
+        ValueError: if the samples have no density or no features.
     """
     stopping = samples.sigma if samples.alpha is None else samples.alpha
     if stopping is None or samples.features is None:
@@ -84,15 +90,15 @@ def shade(
 def volume_render(
     rays: Rays, samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor, is_alpha: bool = False
 ) -> Rendered:
-    """Composite packed samples (NeRF, equation 3).
+    """Composite densities or alphas, and colours, of packed samples: NeRF, equation 3.
 
     Args:
-        rays: R rays, for their far end.
-        samples: N intervals.
-        sigma: (N,) density, or the opacity of each interval.
-        rgb: (N, 3) colour.
-        background: (R, 3) or (3,) what shows where the ray is not opaque.
-        is_alpha: whether `sigma` is an opacity, as of surfaces (NeuS, Wang et al. 2021, equation 13).
+        rays: R rays, whose far ends are the depth of transparent rays.
+        samples: N samples along the rays.
+        sigma: (N,) density in 1/length, or the opacity of each interval.
+        rgb: (N, 3) colour in [0, 1].
+        background: (R, 3) or (3,) colour in [0, 1] of the background.
+        is_alpha: whether `sigma` is an opacity, as in NeuS (Wang et al. 2021, equation 13).
     """
     sigma, rgb = _at_least_float32(sigma), _at_least_float32(rgb)
     over = composite_alpha if is_alpha else composite

@@ -1,1 +1,1 @@
-"""Samplers: where on its ray a field is evaluated. One file a way of choosing."""
+"""Samplers, which choose where on each ray a field is evaluated. Each file has one sampler."""

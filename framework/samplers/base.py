@@ -1,4 +1,4 @@
-"""What every sampler offers."""
+"""The interface of samplers."""
 
 from __future__ import annotations
 
@@ -13,67 +13,70 @@ from framework.geometry.rays import Rays, Samples
 
 
 class Sampler(nn.Module, ABC):
-    """Chooses where along rays a field is evaluated. What it learns or remembers are parameters and buffers."""
+    """Base class of samplers, which choose where along rays a field is evaluated.
+
+    A sampler's learnt values are parameters, and its other state is in buffers.
+    """
 
     optimised: Optimised | None = None
-    """How its parameters are optimised; as the model's if None."""
+    """Optimiser settings of its parameters; those of the model if None."""
     samples_per_step: int | None = None
-    """Samples that a training step should evaluate, the number of rays following; None for a fixed number of rays."""
+    """Number of samples per training step, to which the number of rays is adapted; None for a fixed number of rays."""
 
     @abstractmethod
     def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
         """Return samples for R rays.
 
         Args:
-            rays: where to sample.
-            field: what is sampled, for samplers that look before they choose. What they evaluate they attach to the
-                result (`Samples.sigma`, `Samples.features`), gradients included.
-            jitter: random positions (training) or fixed ones (evaluation).
+            rays: the rays to sample.
+            field: the field, for samplers that evaluate it in order to sample. They attach the values to the result
+                (`Samples.sigma`, `Samples.features`), gradients included.
+            jitter: True for random positions (training), False for fixed ones (evaluation).
         """
 
     def update(self, step: int, density: DensityFunction) -> None:
-        """Refresh what the sampler knows; called before each training step. A function of `step` alone.
+        """Update the state of the sampler; called before each training step. Schedules depend on `step` only.
 
         Args:
-            step: training steps done.
-            density: the field's.
+            step: number of training steps done.
+            density: density of the field.
         """
 
     def losses(self, samples: Samples, weights: Tensor) -> dict[str, Tensor]:
-        """Return named scalars by which the sampler itself learns.
+        """Return the losses that train the sampler itself, by name, each a scalar.
 
         Args:
-            samples: what it returned for a batch.
-            weights: (N,) what the samples turned out to weigh.
+            samples: N samples that the sampler returned for a batch.
+            weights: (N,) weights of these samples when rendered.
         """
         return {}
 
 
 @runtime_checkable
 class StopsEarly(Protocol):
-    """A sampler that ends rays where little light is left."""
+    """A sampler that ends a ray where its transmittance is low."""
 
     early_stop: float
-    """Transmittance below which the rest of a ray is dropped: the most that a colour channel can be off by."""
+    """Transmittance below which the rest of a ray is dropped: the maximum error of a colour channel in [0, 1]."""
 
 
 @runtime_checkable
 class SkipsCells(Protocol):
-    """A sampler that passes over empty cells of a grid over a box."""
+    """A sampler that skips the empty cells of a grid over a box."""
 
     box: Tensor
-    """(2, 3) corners of the grid."""
+    """(2, 3) corners of the grid, scene units."""
     resolution: int
-    """n, cells along each axis."""
+    """Number n of cells along each axis."""
     occupied: Tensor
-    """(n^3,) bool, cells that are sampled; the cell's index is (x n + y) n + z."""
+    """(n^3,) bool, True for cells that are sampled; the index of cell (x, y, z) is (x n + y) n + z."""
     carved: Tensor
-    """(n^3,) bool, cells that are empty for good."""
+    """(n^3,) bool, True for cells that stay empty."""
     early_stop: float
-    """As for `StopsEarly`."""
+    """Transmittance below which the rest of a ray is dropped, as in `StopsEarly`."""
 
     def carve(self, hull: Tensor) -> None:
-        """Empty all cells outside `hull` (n^3,) bool for good."""
+        """Mark all cells outside `hull` (n^3,) bool as empty, permanently."""
 
     def forget(self) -> None:
-        """Read `occupied` anew, which has changed."""
+        """Discard what was computed from `occupied`; to be called after `occupied` has changed."""

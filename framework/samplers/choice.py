@@ -1,4 +1,4 @@
-"""Which sampler a method uses: a grid of what is occupied for a scene in a box, proposals for one without end."""
+"""Choice of a method's sampler: an occupancy grid for a scene in a box, proposals for an unbounded scene."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ from framework.samplers.occupancy import MAX_CELLS, OccupancySampler
 from framework.samplers.proposal import ProposalSampler
 
 COARSEST_PROPOSAL = 128
-"""Cells along an axis at the finest level of the first proposal; each further one has twice as many."""
+"""Cells along an axis at the finest level of the first proposal; each further proposal has twice as many."""
 MOST_PROPOSALS = 8
+"""Maximum number of proposals."""
 
 
 @dataclass(frozen=True)
 class SamplingConfig(RayConfig):
-    """Settings of a method that can be sampled through an occupancy grid or by proposals."""
+    """Settings of a method that can be sampled with an occupancy grid or with proposals."""
 
     RANGES: ClassVar[dict[str, Range]] = {
         "grid_resolution": (1, MAX_CELLS),
@@ -35,26 +36,26 @@ class SamplingConfig(RayConfig):
         "num_proposal_samples": (1, 2**14),
         "num_nerf_samples": (1, 2**14),
     }
-    """What these numbers may be."""
+    """Minimum and maximum of these settings."""
     sampler: Literal["auto", "occupancy", "proposal"] = "auto"
-    """occupancy: march through the box where it is not empty. proposal: small density fields say where to look, in all
-    of space, contracted. auto: proposal where there may be something outside the box."""
+    """occupancy: march through the occupied cells of the box. proposal: small density fields choose the samples, in all
+    of space, contracted. auto: proposal if the scene may extend beyond the box, otherwise occupancy."""
     silhouette_cells: bool = True
-    """Where images are transparent, cells of the occupancy grid that one of them shows empty are never sampled."""
+    """Never sample cells of the occupancy grid that an image with an alpha channel shows to be empty (occupancy)."""
     silhouette_pixels: bool = True
-    """Pixels whose ray meets only such cells are never drawn."""
+    """Never draw pixels whose ray passes only through such empty cells (occupancy)."""
     grid_resolution: int = 128
-    """Cells along an axis of the occupancy grid (occupancy)."""
+    """Cells along each axis of the occupancy grid (occupancy)."""
     num_steps: Auto[int] = 512
-    """Steps along the box's diagonal (occupancy)."""
+    """Steps along the diagonal of the box (occupancy)."""
     early_stop: float = 1e-4
-    """Transmittance below which the rest of a ray is dropped: the largest error of a colour channel (occupancy)."""
+    """Transmittance below which the rest of a ray is dropped: the maximum error of a colour channel (occupancy)."""
     train_early_stop: float = 1e-2
-    """The same while training, where less exact colours teach as well (occupancy)."""
+    """The same threshold during training, where less exact colours are sufficient (occupancy)."""
     num_proposal_samples: tuple[int, ...] = (128, 64)
-    """Intervals a ray of each proposal (proposal)."""
+    """Intervals per ray of each proposal (proposal)."""
     num_nerf_samples: int = 32
-    """Samples a ray where the proposals say (proposal)."""
+    """Samples per ray, placed by the last proposal (proposal)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -64,32 +65,32 @@ class SamplingConfig(RayConfig):
 
 @dataclass(frozen=True)
 class HierarchicalConfig(SamplingConfig):
-    """Settings of a method that can also be sampled as NeRF is, by a coarse field for a fine one."""
+    """Settings of a method that can also be sampled hierarchically, with a coarse and a fine field, as NeRF is."""
 
     RANGES: ClassVar[dict[str, Range]] = {
         "num_coarse_samples": (LEAST_COARSE, 2**14),
         "num_fine_samples": (1, 2**14),
     }
-    """What these numbers may be."""
+    """Minimum and maximum of these settings."""
     sampler: Literal["auto", "hierarchical", "occupancy", "proposal"] = "auto"  # type: ignore[assignment]
     """hierarchical: a coarse and a fine field. occupancy: one field and an occupancy grid. proposal: one field, and
-    small density fields that say where to look, in all of space, contracted. auto: hierarchical, or proposal where
-    there may be something outside the box."""
+    small density fields that choose the samples, in all of space, contracted. auto: proposal if the scene may extend
+    beyond the box, otherwise hierarchical."""
     num_coarse_samples: int = 64
-    """Stratified samples a ray for the coarse field (hierarchical)."""
+    """Stratified samples per ray for the coarse field (hierarchical)."""
     num_fine_samples: int = 128
-    """Further samples a ray for the fine field, drawn where the coarse one found something (hierarchical)."""
+    """Further samples per ray for the fine field, drawn from the weights of the coarse field (hierarchical)."""
 
 
 SamplingConfigT = TypeVar("SamplingConfigT", bound=SamplingConfig)
 
 
 def sampler_choice(config: SamplingConfig, unbounded: bool) -> Choice:
-    """Return what `--sampler auto` becomes.
+    """Return the sampler that `--sampler auto` selects.
 
     Args:
         config: the method's settings.
-        unbounded: there may be something outside the box.
+        unbounded: whether the scene may extend beyond the box.
     """
     bounded = "hierarchical" if isinstance(config, HierarchicalConfig) else "occupancy"
     reason = "there may be something outside the box" if unbounded else "the scene ends at its box"
@@ -97,33 +98,38 @@ def sampler_choice(config: SamplingConfig, unbounded: bool) -> Choice:
 
 
 def decide_sampler(config: SamplingConfigT, scene: Scene) -> tuple[SamplingConfigT, list[Decision]]:
-    """Decide `--sampler auto` by the scene: `Method.decide` of a method that leaves nothing else open.
+    """Decide `--sampler auto` by the scene: `Method.decide` of a method that leaves no other setting open.
 
     Args:
         config: the method's settings.
-        scene: facts about the data.
+        scene: properties of the scene.
+
+    Returns:
+        the settings, and the decisions that were made.
     """
     return fill(config, sampler_choice(config, scene.unbounded))
 
 
 def contracted_box(config: SamplingConfig, scene: Scene) -> Tensor | None:
-    """Return the box around which a method's field contracts all of space; None where it ends at its box.
+    """Return the box (2, 3) around which a method's field contracts all of space; None if the field ends at the box.
 
     Args:
         config: the settings, decided.
-        scene: facts about the data.
+        scene: properties of the scene.
     """
     return scene.box if scene.unbounded and config.sampler == "proposal" else None
 
 
 def make_sampler(config: SamplingConfig, scene: Scene, make_coarse: Callable[[], Field] | None = None) -> Sampler:
-    """Return the sampler that the settings ask for.
+    """Return the sampler that the settings select.
 
     Args:
         config: the settings, decided.
-        scene: facts about the data.
-        make_coarse: makes the coarse field of `--sampler hierarchical`.
-    Raises: ConfigError where that is asked for and the method has no such field.
+        scene: properties of the scene.
+        make_coarse: creates the coarse field of `--sampler hierarchical`; None if the method has none.
+
+    Raises:
+        ConfigError: if the hierarchical sampler is selected and the method has no coarse field.
     """
     sampler = _sampler(config, scene, make_coarse)
     sampler.samples_per_step = config.samples_per_batch

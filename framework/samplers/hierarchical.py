@@ -1,4 +1,4 @@
-"""Coarse-to-fine sampling: NeRF (Mildenhall et al. 2020), section 5.2."""
+"""Hierarchical (coarse-to-fine) sampling: NeRF (Mildenhall et al. 2020), section 5.2."""
 
 from __future__ import annotations
 
@@ -13,19 +13,21 @@ from framework.samplers.inverse_cdf import inverse_cdf, uniform_variates
 from framework.samplers.uniform import samples_from_points, stratified_points
 
 LEAST_COARSE = 3
-"""Stratified samples on a ray, of which those between the first and the last say where to look."""
+"""Minimum number of stratified samples per ray; fine samples are drawn from the weights between first and last."""
 
 
 class HierarchicalSampler(Sampler):
-    """Stratified samples, and more where a coarse field of the sampler's own finds something with them.
+    """Stratified samples, and further ones drawn from the weights that a coarse field has at the stratified ones.
 
-    The coarse field is rendered and supervised too (`Samples.coarse`).
+    The coarse field belongs to the sampler, and is rendered and supervised too (`Samples.coarse`).
 
     Args:
-        coarse: the field that says where to look.
-        num_coarse: stratified samples on a ray.
-        num_fine: samples drawn between them; the field is asked at all of both.
-    Raises: ValueError for fewer than 3 stratified samples, which have none in the middle to say where to look.
+        coarse: the coarse field.
+        num_coarse: stratified samples per ray.
+        num_fine: samples per ray drawn from the weights; the fine field is evaluated at both kinds.
+
+    Raises:
+        ValueError: if there are fewer than 3 stratified samples, which leave no weights between first and last.
     """
 
     def __init__(self, coarse: Field, num_coarse: int = 64, num_fine: int = 128) -> None:

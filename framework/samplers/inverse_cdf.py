@@ -7,17 +7,20 @@ from torch import Tensor
 
 
 def inverse_cdf(edges: Tensor, weights: Tensor, u: Tensor, padding: float = 1e-5) -> Tensor:
-    """Points whose density is proportional to `weights` over the bins between `edges`.
+    """Return points drawn from histograms, by inverting the cumulative distribution.
 
     Args:
-        edges: (R, B + 1) sorted bin edges.
-        weights: (R, B) at least 0. `padding` is added to each, so that a ray without weight is sampled evenly.
-        u: (R, S) in [0, 1]: random or evenly spaced, in any order.
-    Returns: (R, S) points within [edges[:, 0], edges[:, -1]], in the order of u.
+        edges: (R, B + 1) sorted edges of the bins.
+        weights: (R, B) weights of the bins, at least 0, not necessarily normalised.
+        u: (R, S) values of the cumulative distribution in [0, 1], random or evenly spaced, in any order.
+        padding: added to each weight, so that all bins of a ray whose weights are 0 are drawn equally often.
+
+    Returns:
+        (R, S) points in [edges[:, 0], edges[:, -1]], in the order of `u`.
     """
     weights = weights.to(torch.promote_types(weights.dtype, edges.dtype)) + padding
     cdf = torch.cumsum(weights / weights.sum(-1, keepdim=True), dim=-1)
-    # Rounding leaves the end off 1 by some 1e-7: it is set, not hoped for.
+    # Rounding errors leave the last value about 1e-7 from 1, so it is set to exactly 1.
     cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf[:, :-1].clamp(max=1), torch.ones_like(cdf[:, :1])], dim=-1)
     above = torch.searchsorted(cdf, u.contiguous(), right=True).clamp(1, weights.shape[-1])
     low, high = cdf.gather(-1, above - 1), cdf.gather(-1, above)
@@ -28,7 +31,14 @@ def inverse_cdf(edges: Tensor, weights: Tensor, u: Tensor, padding: float = 1e-5
 
 
 def uniform_variates(num_rays: int, count: int, jitter: bool, device: torch.device) -> Tensor:
-    """u (R, count) for `inverse_cdf`: independent uniform numbers, or `count` evenly spaced ones (evaluation)."""
+    """Return values u (R, count) in [0, 1] for `inverse_cdf`.
+
+    Args:
+        num_rays: R.
+        count: number of values per ray.
+        jitter: True for independent, uniform random values (training), False for evenly spaced ones (evaluation).
+        device: device of the result.
+    """
     if jitter:
         return torch.rand(num_rays, count, device=device)
     return ((torch.arange(count, device=device) + 0.5) / count).expand(num_rays, count)

@@ -1,7 +1,7 @@
-"""Skip empty space with an occupancy grid, and what is hidden by marching in waves.
+"""Sampling with an occupancy grid, which skips empty space, in waves, which skip hidden space.
 
-The grid is Instant-NGP's (Mueller et al. 2022, appendix E.2): a moving maximum of the density in each cell, a cell
-being skipped while a step through it would be nearly transparent.
+The grid is that of Instant-NGP (Mueller et al. 2022, appendix E.2): it holds a decaying maximum of the density in each
+cell, and a cell is skipped while a step through it is nearly transparent.
 """
 
 from __future__ import annotations
@@ -24,36 +24,41 @@ from framework.kernels.rows import gather_rows
 from framework.samplers.base import Sampler
 
 MAX_CELLS = 512
-"""Along an axis of the grid: of 512^3 cells what is known takes 0.8 GB."""
+"""Maximum number of cells along an axis; the state of 512^3 cells takes 0.8 GB."""
 CHUNK = 2**15
-"""Cells evaluated at once."""
+"""Number of cells that are evaluated at once."""
 WARM_UP_STEPS = 256
-"""Steps during which the grid is visited in a fixed shuffle."""
+"""Number of training steps in which the cells are updated in the order of a fixed shuffle."""
 WARM_UP_DECAY, DECAY = 0.7, 0.8
-"""Of a cell's density at each visit, in the beginning and afterwards."""
+"""Factors of a cell's density at each update, during warm-up and afterwards."""
 TIMES_PER_VISIT, MOVING_DECAY = 4, 0.95
-"""Of a scene that moves: times at which a cell is looked at, and its decay, for it may be full for a short while."""
+"""Number of times at which a cell of a moving scene is evaluated at each update, and the factor of its density, which
+is larger because a cell may be occupied for a short time only."""
 SHUFFLE_STRIDE = 2654435761
-"""A prime, so that its multiples visit every cell once a pass, far from one another."""
+"""A prime number, whose multiples modulo the number of cells visit every cell once per pass, in scattered order."""
 WAVES = (8, 8, 16, 32, 64, 128)
-"""Samples a ray in each wave; the last size repeats."""
+"""Samples per ray in each wave; the last size repeats."""
 
 
 class OccupancySampler(Sampler):
-    """March through the occupied cells of a box.
+    """Samples at steps through the occupied cells of a box.
 
     Args:
-        box: (2, 3) corners of the space that is marched.
+        box: (2, 3) corners of the box, scene units.
         resolution: cells along each axis.
-        num_steps: steps along the box's diagonal.
-        early_stop: transmittance below which the rest of a ray is dropped: the most that any colour channel can be
-            off by. 0 keeps everything.
-        train_early_stop: the same while training, where less exact colours teach as well; `early_stop` if None.
-        alpha_threshold: a cell is occupied where one step through it has at least this opacity, or the grid's mean
-            if that is less.
-        cone: growth of a step per unit of distance, beyond the distance where it exceeds the even step; 0 for even
+        num_steps: steps along the diagonal of the box.
+        early_stop: transmittance below which the rest of a ray is dropped: the maximum error of a colour channel. 0
+            drops nothing.
+        train_early_stop: the same threshold during training, where less exact colours are sufficient; `early_stop` if
+            None.
+        alpha_threshold: a cell is occupied if the opacity of one step through it is at least this, or at least the mean
+            over the grid if that is less.
+        cone: growth of the step per unit of distance, beyond the distance where it exceeds the even step; 0 for even
             steps throughout.
-        moving: the scene changes with time: a cell is occupied if it is at any time.
+        moving: whether the scene changes with time; a cell is then occupied if it is at any time.
+
+    Raises:
+        ConfigError: if the number of cells or steps is out of range.
     """
 
     box: Tensor
@@ -94,34 +99,41 @@ class OccupancySampler(Sampler):
 
     @property
     def occupied_share(self) -> float:
-        """Share of cells that are not skipped."""
+        """Fraction of the cells that are occupied."""
         return self.occupied.float().mean().item()
 
     @property
     def any_carved(self) -> bool:
-        """Whether silhouettes have emptied cells for good."""
+        """True if silhouettes have marked cells as empty permanently."""
         return bool(self.carved.any())
 
     @property
     def occupancy(self) -> Occupancy:
-        """The grid as marching wants it."""
+        """The grid in the form that `march` needs."""
         if self._packed is None or self._packed.occupied is not self.occupied:
             self._packed = Occupancy(self.occupied, self.box, self.resolution)
         return self._packed
 
     def forget(self) -> None:
-        """`occupied` has changed: pack it anew when it is asked for."""
+        """Discard `occupancy`, which is computed again on demand; to be called after `occupied` has changed."""
         self._packed = None
 
     # -- sampling ---------------------------------------------------------------------------------------------
 
     def sample(self, rays: Rays, field: Field, jitter: bool, early_stop: float | None = None) -> Samples:
-        """Samples in occupied cells, as far as light gets; densities and features attached.
+        """Return samples in occupied cells, up to the early stop, with densities and features attached.
 
-        What is dropped could have changed a colour channel by at most `early_stop`: what is given here, or the
-        sampler's own, `train_early_stop` while training.
+        The samples that are dropped could have changed a colour channel by at most the threshold of the early stop.
 
-        Raises: ValueError where the rays ask for a gradient, which marched samples do not carry.
+        Args:
+            rays: R rays; they must not require a gradient.
+            field: the field, which is evaluated at the samples.
+            jitter: True to start each ray at a random fraction of a step, False to start at 0.
+            early_stop: transmittance below which the rest of a ray is dropped; if None, the sampler's own:
+                `train_early_stop` in training mode, and else `early_stop`.
+
+        Raises:
+            ValueError: if the rays require a gradient, which marched samples do not have.
         """
         if is_followed(rays.origins, rays.directions):
             raise ValueError("marched samples carry no gradient to rays: detach these, or take a ProposalSampler")
@@ -140,11 +152,11 @@ class OccupancySampler(Sampler):
         evaluated = Waves()
         while (wave := marched.wave(WAVES[min(len(marched.waves), len(WAVES) - 1)])) is not None:
             stopping = evaluated.evaluate(len(wave.owners), partial(evaluate, wave))[0]
-            if surface is not None:  # marched by the density that stops as much light in each interval
+            if surface is not None:  # the march needs the density with the same opacity in each interval
                 stopping = alpha_depth(stopping.detach()) / (wave.t_ends - wave.t_starts)
             marched.advance(stopping)
         order, offsets = marched.finish()
-        if not marched.waves:  # no ray meets anything: still the field's own, empty, tensors
+        if not marched.waves:  # no occupied cell on any ray: empty tensors with the field's shapes and types
             empty = rays.nears[:0]
             samples = Samples(empty, empty, offsets, owners=order, early_stop=stop)
             return _attached(samples, surface, *evaluate(Wave(empty, empty, order, rays.origins[:0])))
@@ -159,10 +171,10 @@ class OccupancySampler(Sampler):
         samples = Samples(starts, ends, offsets, owners=owners, early_stop=stop)
         return _attached(samples, surface, *evaluated.choose(order, chosen))
 
-    # -- keeping the grid up ----------------------------------------------------------------------------------
+    # -- updating the grid ------------------------------------------------------------------------------------
 
     def carve(self, hull: Tensor) -> None:
-        """Cells outside `hull` (n^3,) are known to be empty (`framework.scene.silhouettes`), and stay so for good."""
+        """Mark all cells outside `hull` (n^3,) bool (`framework.scene.silhouettes`) as empty, permanently."""
         self.carved.copy_(~hull)
         self.density_grid.masked_fill_(self.carved, 0)
         self.occupied.logical_and_(hull)
@@ -170,10 +182,15 @@ class OccupancySampler(Sampler):
 
     @torch.no_grad()
     def update(self, step: int, density: DensityFunction) -> None:
-        """Evaluate some cells and mark anew which are occupied: every 8 steps at first, every 16 later.
+        """Evaluate the density in some cells and update `occupied`, every 8 steps during warm-up and every 16 later.
 
-        At first the cells come in the order of a fixed shuffle, so that each is seen soon; afterwards they are drawn
-        among all cells, so that an emptied one can fill again, among the occupied ones, and among those beside them.
+        During warm-up the cells are taken in the order of a fixed shuffle, so that all are evaluated soon. Afterwards
+        one third is drawn from all cells, so that an empty cell can become occupied again, one third from the occupied
+        cells, and one third from the neighbours of occupied cells.
+
+        Args:
+            step: number of training steps done.
+            density: density of the field.
         """
         warming_up = step < WARM_UP_STEPS
         if step == 0 or step % (8 if warming_up else 16):
@@ -186,31 +203,31 @@ class OccupancySampler(Sampler):
         sigma = _in_chunks(density, positions, None) if not self.moving else _over_time(density, positions)
         before = self.density_grid.index_select(0, cells)
         before *= WARM_UP_DECAY if warming_up else MOVING_DECAY if self.moving else DECAY
-        seen = torch.isfinite(before)
-        self.density_grid.index_copy_(0, cells, torch.where(seen, torch.maximum(before, sigma), sigma))
+        evaluated = torch.isfinite(before)
+        self.density_grid.index_copy_(0, cells, torch.where(evaluated, torch.maximum(before, sigma), sigma))
         refresh_occupancy(self.density_grid, self.occupied, 1.0, self.step_size, self.alpha_threshold)
         if self.any_carved:
             self.occupied.logical_and_(~self.carved)
         self.forget()
 
     def _shuffled(self, turn: int) -> Tensor:
-        """The cells of one of the first updates: four passes over the grid by step WARM_UP_STEPS.
+        """Return the cells of update number `turn` during warm-up, which makes four passes over the grid.
 
-        Of cells already found empty, which stay so unless the field changes its mind, one in eight is looked at.
+        Only one in eight of the empty cells is returned, because few of them become occupied again.
         """
         num_cells = self.resolution**3
-        share = math.ceil(4 * num_cells * 8 / WARM_UP_STEPS)
-        places = torch.arange(turn * share, (turn + 1) * share, device=self.occupied.device)
-        cells = places * SHUFFLE_STRIDE % num_cells
-        looked_at = self.occupied.index_select(0, cells) | (torch.rand(share, device=cells.device) < 1 / 8)
-        return cells[looked_at & ~self.carved.index_select(0, cells)]
+        count = math.ceil(4 * num_cells * 8 / WARM_UP_STEPS)
+        ranks = torch.arange(turn * count, (turn + 1) * count, device=self.occupied.device)
+        cells = ranks * SHUFFLE_STRIDE % num_cells
+        selected = self.occupied.index_select(0, cells) | (torch.rand(count, device=cells.device) < 1 / 8)
+        return cells[selected & ~self.carved.index_select(0, cells)]
 
     def _drawn(self) -> Tensor:
-        """A third anywhere, a third among occupied cells, a third beside those.
+        """Return random cells: a third of all cells, a third of the occupied ones, a third of their neighbours.
 
-        Cells beside are those that matter reaches into a little, and that one look may take for empty: of a thin shell
-        the error is 30 times less with them than without (`ns-bench quadrature`). A cell drawn twice is evaluated
-        twice, harmlessly.
+        Matter that reaches only a little into a neighbour may be missed by one evaluation: for a thin shell the error
+        is 30 times smaller with the neighbours than without (`ns-bench quadrature`). A cell that is drawn twice is
+        evaluated twice, which does no harm.
         """
         num_cells = self.resolution**3
         third = max(num_cells // 64, 1)
@@ -220,12 +237,12 @@ class OccupancySampler(Sampler):
         anywhere = anywhere[~self.carved[anywhere]]
         if len(occupied) == 0:
             return anywhere
-        known, within = (occupied[torch.randint(len(occupied), (third,), device=device)] for _ in range(2))
-        beside = self._beside(within)
-        return torch.cat([anywhere, known, beside[~self.carved[beside]]])
+        drawn, centers = (occupied[torch.randint(len(occupied), (third,), device=device)] for _ in range(2))
+        neighbours = self._beside(centers)
+        return torch.cat([anywhere, drawn, neighbours[~self.carved[neighbours]]])
 
     def _beside(self, cells: Tensor) -> Tensor:
-        """A random neighbour of each cell: where matter may reach, or, where something moves, may have come to."""
+        """Return a random neighbour of each of `cells`, or the cell itself."""
         n = self.resolution
         corner = torch.stack([cells // n**2, cells // n % n, cells % n], dim=-1)
         corner = (corner + torch.randint(-1, 2, corner.shape, device=cells.device)).clamp(0, n - 1)
@@ -233,21 +250,21 @@ class OccupancySampler(Sampler):
 
 
 def _attached(samples: Samples, surface: HasAlpha | None, stopping: Tensor, features: Tensor) -> Samples:
-    """Return samples with their density, or with the opacity of a surface's intervals, and features."""
+    """Return samples with features, and with their density or, for a surface, their opacity."""
     return samples.evaluated(stopping, features) if surface is None else samples.with_alpha(stopping, features)
 
 
 def _over_time(density: DensityFunction, positions: Tensor) -> Tensor:
-    """The largest density (N,) at a few random times, one in each equal part: something may pass a cell quickly."""
-    found = []
+    """Return the maximum density (N,) over random times, one in each of `TIMES_PER_VISIT` equal parts of [0, 1]."""
+    densities = []
     for part in range(TIMES_PER_VISIT):
         times = (part + torch.rand(len(positions), device=positions.device)) / TIMES_PER_VISIT
-        found.append(_in_chunks(density, positions, times))
-    return torch.stack(found).amax(0)
+        densities.append(_in_chunks(density, positions, times))
+    return torch.stack(densities).amax(0)
 
 
 def _in_chunks(density: DensityFunction, positions: Tensor, times: Tensor | None) -> Tensor:
-    """Density (N,) at positions (N, 3), a chunk at a time: fresh memory of many megabytes costs more than the work."""
+    """Return the density (N,) at positions (N, 3), in chunks: allocating large results costs more than the work."""
     parts = positions.split(CHUNK)
-    when = [None] * len(parts) if times is None else times.split(CHUNK)
-    return torch.cat([density(Points(part, t))[0] for part, t in zip(parts, when, strict=True)])
+    part_times = [None] * len(parts) if times is None else times.split(CHUNK)
+    return torch.cat([density(Points(part, t))[0] for part, t in zip(parts, part_times, strict=True)])

@@ -1,9 +1,11 @@
-"""Samples where small density fields propose them: mip-NeRF 360 (Barron et al. 2022), section 3.
+"""Sampling with proposals, which are small density fields: mip-NeRF 360 (Barron et al. 2022), section 3.
 
-A proposal looks at many intervals of a ray cheaply, and the next level's intervals are drawn by the light that it
-believes them to stop. What the last level finds teaches the proposals to bound it from above (`interlevel_loss`).
-Distance is normalised: s in [0, 1] from a ray's near to its far end, evenly up to half of the box's edge and in
-disparity beyond for an unbounded scene, evenly throughout for a bounded one.
+A proposal is evaluated cheaply in many intervals of a ray, and the intervals of the next level are drawn from its
+weights. The proposals are trained so that their weights bound those of the last level from above (`interlevel_loss`).
+
+Intervals are drawn in normalised distance s in [0, 1], from the near to the far end of a ray. In a bounded scene s is
+linear in the distance; in an unbounded scene it is linear up to half the edge of the box, and linear in disparity
+beyond.
 """
 
 from __future__ import annotations
@@ -27,26 +29,31 @@ from framework.kernels.intervals import interval_weights, proposal_excess, resam
 from framework.samplers.base import Sampler
 
 ANNEALING_SLOPE = 10.0
-"""b of the annealing of weights: u^(b x / ((b - 1) x + 1)) with x the share of `anneal_steps` done."""
+"""Parameter b of the annealing of weights w^(b x / ((b - 1) x + 1)), where x is the fraction of `anneal_steps` done."""
 PADDING = 0.01
-"""Added to all weights of a ray together, so that no place is never looked at."""
+"""Sum of what is added to the weights of a ray, so that every interval can be drawn."""
 ALWAYS_LEARN_UNTIL, LEARN_EVERY = 256, 4
-"""Steps after which proposals, which change little by then, learn only in one of so many."""
+"""Step until which the proposals learn in every step, and the interval of steps at which they learn afterwards."""
 FARTHEST = 1e10
-"""Where an endless ray's last interval ends."""
+"""Far end of the last interval of an endless ray, scene units."""
 
 
 class ProposalSampler(Sampler):
-    """Two or more levels of proposals, the last of which places the samples.
+    """Samples that are drawn from the weights of one or more proposals in sequence.
 
     Args:
-        box: (2, 3) the scene.
-        counts: intervals of each proposal, then samples.
+        box: (2, 3) corners of the box that holds the scene, scene units.
+        counts: intervals per ray of each proposal, followed by the number of samples per ray.
         resolutions: cells along an axis at the finest level of each proposal's hash grid.
-        unbounded: the scene goes on outside the box.
-        endless: the last interval has no end, so that a ray always ends in matter: for photographs without alpha.
-        log2_table_size, num_levels: of the proposals' hash grids.
-        anneal_steps: over which the proposals come to be believed.
+        unbounded: whether the scene extends beyond the box.
+        endless: whether the last interval ends at `FARTHEST`, so that any density there makes the ray opaque: for
+            images without an alpha channel.
+        log2_table_size: maximum number of entries per level of the proposals' hash grids, as a power of two.
+        num_levels: levels of the proposals' hash grids.
+        anneal_steps: training steps over which the weights are annealed.
+
+    Raises:
+        ValueError: if there is not one count more than there are resolutions.
     """
 
     box: Tensor
@@ -77,11 +84,11 @@ class ProposalSampler(Sampler):
 
     @property
     def proposals(self) -> list[Field]:
-        """The density fields, in the order in which they are asked."""
+        """The density fields, in the order in which they are evaluated."""
         return [field for field in self.fields if isinstance(field, Field)]
 
     def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
-        """The last level's samples; with a gradient for the proposals in the steps in which they learn."""
+        """Return the samples of the last level, with the proposals' gradients attached in steps in which they learn."""
         learning = self.learning and self.training and torch.is_grad_enabled()
         nears, fars = self._ends(rays)
         return propose(
@@ -96,7 +103,7 @@ class ProposalSampler(Sampler):
         )
 
     def update(self, step: int, density: DensityFunction) -> None:
-        """How far the proposals are believed in this step, and whether they learn."""
+        """Set the exponent of the annealing, and whether the proposals learn in this step."""
         x = min(step / max(self.anneal_steps, 1), 1.0)
         self.power = ANNEALING_SLOPE * x / ((ANNEALING_SLOPE - 1) * x + 1)
         self.learning = step < ALWAYS_LEARN_UNTIL or step % LEARN_EVERY == 0
@@ -105,7 +112,7 @@ class ProposalSampler(Sampler):
         return {"interlevel": interlevel_loss(samples, weights)} if samples.proposals else {}
 
     def _ends(self, rays: Rays) -> tuple[Tensor, Tensor]:
-        """Where sampling starts and ends on each ray."""
+        """Return the distances (R,) at which sampling starts and ends; in a bounded scene those inside the box."""
         if self.unbounded:
             return rays.nears, rays.fars
         enter, leave = intersect_box(rays.origins.detach(), rays.directions.detach(), self.box)
@@ -124,17 +131,17 @@ def propose(
     learning: bool,
     endless: bool,
 ) -> Samples:
-    """Draw samples in levels, each by the densities of the one before, and return those of the last.
+    """Return samples that are drawn in levels, each from the weights of the level before.
 
     Args:
-        rays: R rays, sampled from near to far.
-        densities: of each level but the last.
-        counts: intervals of each level, then samples: one more than there are densities.
-        scale: see `distances`.
-        jitter: random positions, or fixed ones.
-        power: which weights are raised to before they are drawn by: less than 1 flattens them.
-        learning: keep what the densities found, gradients attached, in `Samples.proposals`.
-        endless: the last interval has no end.
+        rays: R rays, sampled from the near to the far end.
+        densities: density of each level but the last.
+        counts: intervals per ray of each level, followed by the number of samples per ray: one more than densities.
+        scale: the distance up to which normalised distance is linear, as in `distances`.
+        jitter: True for random positions, False for fixed ones.
+        power: exponent of the weights that are drawn from; less than 1 flattens them.
+        learning: whether to keep the proposals' weights, gradients attached, in `Samples.proposals`.
+        endless: whether the last interval ends at `FARTHEST`.
     """
     nears, fars = rays.nears, rays.fars
     count, device = len(rays), nears.device
@@ -143,17 +150,17 @@ def propose(
         moved = edges + (torch.rand(count, 1, device=device) - 0.5) / counts[0]
         edges = torch.cat([edges[:, :1], moved[:, 1:-1], edges[:, -1:]], dim=-1)
     proposals: list[Histogram] = []
-    for (here, following), density in zip(pairwise(counts), densities, strict=True):
+    for (num_intervals, num_next), density in zip(pairwise(counts), densities, strict=True):
         t = distances(edges, nears, fars, scale)
         middles = (t[:, 1:] + t[:, :-1]) / 2
         with torch.set_grad_enabled(learning):
             positions = _positions(rays, middles)
-            when = None if rays.times is None else rays.times.repeat_interleave(here)
-            sigma, _ = density(Points(positions, when))
+            times = None if rays.times is None else rays.times.repeat_interleave(num_intervals)
+            sigma, _ = density(Points(positions, times))
             weights = interval_weights(sigma.view(middles.shape), t)
         proposals.append(Histogram(edges, weights))
         shift = torch.rand(count, device=device) if jitter else torch.full((count,), 0.5, device=device)
-        edges = resample(edges, weights.detach(), shift, following, power, PADDING / here)
+        edges = resample(edges, weights.detach(), shift, num_next, power, PADDING / num_intervals)
     t = distances(edges, nears, fars, scale)
     ends = t[:, 1:]
     if endless:
@@ -167,12 +174,13 @@ def propose(
 
 
 def distances(edges: Tensor, nears: Tensor, fars: Tensor, scale: float | None) -> Tensor:
-    """Convert normalised distances (R, B) to distances along rays (R, B).
+    """Return distances (R, B) along rays, scene units, for normalised distances.
 
     Args:
-        edges: (R, B) in [0, 1].
-        nears, fars: (R,) the rays' ends, where edges of 0 and 1 lie.
-        scale: the distance up to which they are even, being in disparity beyond; None for even ones throughout.
+        edges: (R, B) normalised distances in [0, 1].
+        nears, fars: (R,) distances of the rays' ends, which correspond to 0 and 1.
+        scale: the distance up to which normalised distance is linear; beyond, it is linear in disparity. None if it is
+            linear throughout.
     """
     if scale is None:
         return torch.lerp(nears[:, None], fars[:, None], edges)
@@ -181,34 +189,38 @@ def distances(edges: Tensor, nears: Tensor, fars: Tensor, scale: float | None) -
 
 
 def half_edge(box: Tensor) -> float:
-    """Half of the edge of the cube that is as large as `box` (2, 3): the unit of an unbounded scene's distances."""
+    """Return half the edge of the cube with the volume of `box` (2, 3): the `scale` of an unbounded scene."""
     return math.prod((box[1] - box[0]).tolist()) ** (1 / 3) / 2
 
 
 def to_disparity(t: Tensor) -> Tensor:
-    """Distances from 0 to infinity to [0, 1): t / 2 up to t = 1, then 1 - 1 / (2 t)."""
+    """Map distances `t` in [0, inf) to [0, 1): t / 2 up to t = 1, and 1 - 1 / (2 t) beyond."""
     return torch.where(t < 1, t / 2, 1 - 1 / (2 * t.clamp(min=1)))
 
 
 def from_disparity(s: Tensor) -> Tensor:
-    """The inverse of `to_disparity`; finite at 1."""
+    """Map `s` in [0, 1] to distances: the inverse of `to_disparity`, with a large, finite result at s = 1."""
     tiny = torch.finfo(s.dtype).eps
     return torch.where(s < 0.5, 2 * s, 1 / (2 - 2 * s).clamp(min=tiny))
 
 
 def interlevel_loss(samples: Samples, weights: Tensor) -> Tensor:
-    """How much the proposals fell short of the weights (N,) found by the last level, a mean over rays.
+    """Return the loss () of the proposals, whose weights should bound those of the last level from above.
 
-    mip-NeRF 360, equation 13. 0 where no proposal is learning.
+    mip-NeRF 360, equation 13: the mean over rays, summed over proposals. It is 0 if no proposal is learning.
+
+    Args:
+        samples: N samples of a `ProposalSampler`.
+        weights: (N,) their weights when rendered; without a gradient.
     """
     if samples.edges is None or not samples.proposals or samples.num_rays == 0:
         return weights.new_zeros(())
-    found = samples.padded(weights.detach())
-    losses = [proposal_excess(samples.edges, found, p.edges, p.weights).mean() for p in samples.proposals]
+    rendered = samples.padded(weights.detach())
+    losses = [proposal_excess(samples.edges, rendered, p.edges, p.weights).mean() for p in samples.proposals]
     return torch.stack(losses).sum()
 
 
 def _positions(rays: Rays, t: Tensor) -> Tensor:
-    """(R * B, 3) at distances t (R, B); without a gradient for the rays."""
+    """Return positions (R * B, 3) at distances `t` (R, B), without a gradient for the rays."""
     origins, directions = rays.origins.detach(), rays.directions.detach()
     return torch.addcmul(origins[:, None], directions[:, None], t[..., None]).view(-1, 3)

@@ -10,11 +10,17 @@ from framework.geometry.rays import Rays, Samples
 from framework.samplers.base import Sampler
 
 LAST_INTERVAL = 1e10
-"""The authors' code lets the last sample stand for everything behind it."""
+"""Length of the last interval, scene units, as in the authors' code: the last sample stands for all behind it."""
 
 
 def stratified_points(rays: Rays, count: int, jitter: bool) -> Tensor:
-    """(R, count) distances, one in each of `count` equal bins: random in its bin, or its middle."""
+    """Return distances (R, count) along rays, one in each of `count` bins of equal length.
+
+    Args:
+        rays: R rays with near and far ends.
+        count: number of bins per ray.
+        jitter: True for a random distance in each bin, False for its middle.
+    """
     within = rays.nears.new_full((len(rays), count), 0.5)
     within = torch.rand_like(within) if jitter else within
     fraction = (torch.arange(count, device=rays.nears.device) + within) / count
@@ -22,16 +28,19 @@ def stratified_points(rays: Rays, count: int, jitter: bool) -> Tensor:
 
 
 def samples_from_points(points: Tensor) -> Samples:
-    """Point samples (R, S), sorted, as NeRF's quadrature takes them: the interval of point i ends at point i + 1."""
+    """Return samples at `points` (R, S), sorted distances, where the interval of point i ends at point i + 1.
+
+    This is the quadrature of NeRF, equation 3. The last interval of a ray has the length `LAST_INTERVAL`.
+    """
     ends = torch.cat([points[:, 1:], points[:, -1:] + LAST_INTERVAL], dim=-1)
     return Samples.regular(points, ends, points)
 
 
 class UniformSampler(Sampler):
-    """Samples between near and far on every ray, one in each of so many equal bins.
+    """One sample in each of `count` bins of equal length between the near and far end of every ray.
 
     Args:
-        count: samples on a ray.
+        count: samples per ray.
     """
 
     def __init__(self, count: int) -> None:

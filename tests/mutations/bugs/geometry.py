@@ -311,8 +311,8 @@ BUGS = (
         "median-of-first",
         "rendering",
         "framework/kernels/compositing.py",
-        "seen = torch.where(transmittance - weights <= 0.5",
-        "seen = torch.where(transmittance <= 0.5",
+        "crossing = torch.where(transmittance - weights <= 0.5",
+        "crossing = torch.where(transmittance <= 0.5",
         "without compiled kernels, depth is a sample too far",
     ),
     Bug(

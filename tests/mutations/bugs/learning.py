@@ -175,7 +175,7 @@ BUGS = (
         "depth-loss-unknown",
         "losses",
         "framework/rendering/losses.py",
-        "return ray_sum(weights * apart, samples)[there].mean()",
+        "return ray_sum(weights * apart, samples)[has_depth].mean()",
         "return ray_sum(weights * apart, samples).mean()",
         "pixels without a depth are pulled to distance 1",
     ),

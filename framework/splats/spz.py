@@ -12,12 +12,13 @@ The format is described in https://github.com/nianticlabs/spz (README.md and src
     harmonics    3K x 8 bits    128 (f + 1) of degrees 1 and higher; red, green, blue of each coefficient in a row
 
 **Axes.** The README says that SPZ is RUB (x right, y up, z back) and PLY is RDF (x right, y down, z front). Neither is
-true of a captured scene, whose axes are anyone's; but all programs that convert between the two turn y and z around,
-half a turn about x. So does this one: `read_spz` gives what a PLY file of the same scene gives. With y and z also
-change sign: y and z of quaternions, and the harmonics that are odd in y and z together (`SIGNS`).
+true of a captured scene, whose axes are anyone's; what counts is that y and z change sign between the two, half a turn
+about x. So `read_spz` gives what a PLY file of the same scene gives, and what Niantic's library gives when asked for
+RDF, number for number. (Converters that leave axes alone exist.) With y and z also change sign: y and z of quaternions,
+and the harmonics that are odd in y and z together (`SIGNS`).
 
 **Versions.** Version 2 is written, since some programs read no other, and 2 and 3 are read. With 8 bits of x, y and z,
-w has no bits to speak of where it is near 0, and such a rotation may be off by ten degrees. But a Gaussian has 24
+w has no bits to speak of where it is near 0, and such a rotation may be off by twelve degrees. But a Gaussian has 24
 descriptions, as its axes can be exchanged and turned around, and in one of them w is at least 0.85. That is written,
 and its rotation is off by a degree at most.
 """
@@ -268,7 +269,7 @@ def _unpacked(file: Path) -> tuple[int, int, int, int, np.ndarray]:
                 if surplus > SURPLUS:
                     raise DataError(f"{file} has too much behind its {count:,} Gaussians; export it again")
     except (gzip.BadGzipFile, zlib.error) as error:
-        raise DataError(f"{file} is damaged, or not an SPZ file: {error}; copy or export it again") from error
+        raise DataError(f"{file} is damaged, or not an SPZ file: copy or export it again") from error
     except EOFError as error:
         raise DataError(f"{file} is truncated: copy or export it again") from error
     except OSError as error:

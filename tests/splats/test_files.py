@@ -359,7 +359,7 @@ def test_damaged_spz_is_refused(tmp_path: Path) -> None:
     assert "holds no Gaussians" in refused_in_a_line(file, packed(2, 0, 0, b""))
     assert "too much behind its 1 Gaussians" in refused_in_a_line(file, packed(2, 1, 0, one + bytes(20_000_000)))
     whole = packed(2, 1, 0, one)
-    assert "CRC" in refused_in_a_line(file, whole[:-8] + bytes(4) + whole[-4:])
+    assert "is damaged" in refused_in_a_line(file, whole[:-8] + bytes(4) + whole[-4:])
     refused_in_a_line(file, whole + b"something else")
 
 
@@ -441,7 +441,7 @@ def test_max_megabytes_holds_and_no_more_is_given_up_than_needed(tmp_path: Path,
     whole = file.stat().st_size
     assert write_gaussians(file, gaussians, whole / 1e6) == []  # it just fits
     counts, degrees = [], []
-    for limit in np.linspace(whole - 1, whole / 200, 30).tolist():
+    for limit in np.linspace(whole - 1, whole / 200, 16).tolist():
         said = write_gaussians(file, gaussians, limit / 1e6)
         assert limit * 0.5 < file.stat().st_size <= limit
         read = read_gaussians(file)

@@ -83,7 +83,6 @@ KINDS = {
     "poisson": _MESH,
     "tsdf": _MESH,
     "marching-cubes": _MESH,
-    "gaussian-splat": "no method here has Gaussians; 'pointcloud' writes points",
     "metashape": _OTHER_POSES,
     "realitycapture": _OTHER_POSES,
     "odm": _OTHER_POSES,

@@ -48,6 +48,11 @@ class Placement:
         """Rotate unit `directions` (K, 3) from the scene's frame to the input's."""
         return directions @ self.transform[:, :3]
 
+    def original_similarity(self) -> tuple[Tensor, float, Tensor]:
+        """Return rotation (3, 3), scale and shift (3,) of `original_points`: x -> scale * rotation @ x + shift."""
+        rotation = self.transform[:, :3].T
+        return rotation, 1 / self.scale, -rotation @ self.transform[:, 3]
+
     def original_poses(self, poses: Tensor) -> Tensor:
         """Transform `poses` (M, 3, 4) from the scene's frame to the input's: the inverse of `Placement.poses`."""
         rotations = self.transform[:, :3].T @ poses[:, :, :3]

@@ -1,7 +1,10 @@
-"""Points in PLY files (Turk 1994), ascii or binary, with any other properties."""
+"""Vertices in PLY files (Turk 1994), ascii or binary: points, and whatever other numbers they have."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
@@ -25,10 +28,27 @@ LONGEST_LINE = 1000
 """Maximum number of bytes of a line of the header."""
 
 
+@dataclass(frozen=True)
+class PlyHeader:
+    """The header of a PLY file, as far as it describes the vertices, which come first in the file."""
+
+    order: str
+    """Key of `ORDERS`."""
+    count: int
+    """Number of vertices that it claims."""
+    columns: list[tuple[str, str]]
+    """Name and numpy type of each of their properties, in the file's order; x, y and z are among them."""
+    start: int
+    """Position of the first vertex in the file, bytes."""
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the properties."""
+        return [name for name, _ in self.columns]
+
+
 def read_points(file: Path) -> Tensor:
     """Read the positions of the vertices (K, 3), float64; those that are not finite are left out.
-
-    The memory allocated is bounded by the size of the file, whatever count its header claims.
 
     Args:
         file: path of the PLY file.
@@ -36,10 +56,62 @@ def read_points(file: Path) -> Tensor:
     Raises:
         DataError: if the file cannot be read, is not a PLY file, lacks positions or is truncated.
     """
+    columns = read_columns(file, read_header(file), "xyz")
+    points = torch.from_numpy(np.stack([column.astype(np.float64) for column in columns], axis=-1))
+    return points[points.isfinite().all(-1)]
+
+
+def read_header(file: Path) -> PlyHeader:
+    """Read the header of a PLY file.
+
+    Args:
+        file: path of the PLY file.
+
+    Raises:
+        DataError: if the file cannot be read, is not a PLY file, or its vertices lack positions.
+    """
+    with _opened(file) as stream:
+        order, count, columns = _header(stream, file)
+        return PlyHeader(order, count, columns, stream.tell())
+
+
+def read_columns(file: Path, header: PlyHeader, names: Sequence[str]) -> list[np.ndarray]:
+    """Read properties of the vertices, (count,) each: in the file's type from a binary file, float64 from an ascii one.
+
+    The memory allocated is bounded by the size of the file, whatever count its header claims.
+
+    Args:
+        file: path of the PLY file.
+        header: its header.
+        names: properties that the header has.
+
+    Raises:
+        DataError: if the file cannot be read or is truncated.
+    """
+    with _opened(file) as stream:
+        remaining = file.stat().st_size - header.start
+        row = np.dtype([(name, ORDERS[header.order] + kind) for name, kind in header.columns])
+        ascii_ = header.order == "ascii"
+        # In ascii at least a digit and a separator, of which the last may be missing.
+        needed = 2 * len(header.columns) * header.count - 1 if ascii_ else row.itemsize * header.count
+        if needed > remaining:
+            raise DataError(
+                f"{file} is truncated: its header states {header.count} points, and {remaining} bytes follow"
+            )
+        if ascii_:
+            stream.seek(header.start)
+            return _ascii_columns(stream, file, header, names)
+        table = np.fromfile(stream, row, header.count, offset=header.start)
+        if len(table) < header.count:
+            raise DataError(f"{file} is truncated: {len(table)} of {header.count} points could be read")
+        return [table[name] for name in names]
+
+
+@contextmanager
+def _opened(file: Path) -> Iterator[BinaryIO]:
     try:
         with file.open("rb") as stream:
-            order, count, columns = _header(stream, file)
-            return _positions(stream, file, order, count, columns)
+            yield stream
     except OSError as error:
         raise DataError(f"cannot read {file}: {error.strerror}") from error
 
@@ -80,35 +152,18 @@ def _header(stream: BinaryIO, file: Path) -> tuple[str, int, list[tuple[str, str
     return order, count, columns
 
 
-def _positions(stream: BinaryIO, file: Path, order: str, count: int, columns: list[tuple[str, str]]) -> Tensor:
-    start = stream.tell()
-    remaining = file.stat().st_size - start
-    row = np.dtype([(name, ORDERS[order] + kind) for name, kind in columns])
-    smallest = 2 * len(columns) if order == "ascii" else row.itemsize  # a digit and a separator
-    if count * smallest > remaining + 1:
-        raise DataError(f"{file} is truncated: its header states {count} points, and {remaining} bytes follow")
-    if order == "ascii":
-        axes = _ascii_axes(stream, file, count, [name for name, _ in columns])
-    else:
-        table = np.fromfile(file, row, count, offset=start)
-        axes = [table[axis].astype(np.float64) for axis in "xyz"]
-    points = torch.from_numpy(np.stack(axes, axis=-1))
-    return points[points.isfinite().all(-1)]
-
-
-def _ascii_axes(stream: BinaryIO, file: Path, count: int, names: list[str]) -> list[np.ndarray]:
-    """Return the coordinates x, y and z, (count,) each."""
-    columns = [names.index(axis) for axis in "xyz"]
-    points = np.empty((3, count))
-    for index in range(count):
+def _ascii_columns(stream: BinaryIO, file: Path, header: PlyHeader, names: Sequence[str]) -> list[np.ndarray]:
+    places = [header.names.index(name) for name in names]
+    values = np.empty((len(names), header.count))
+    for index in range(header.count):
         words = stream.readline().split()
-        if len(words) < len(names):
-            raise DataError(f"{file}: point {index} has {len(words)} values instead of {len(names)}")
+        if len(words) < len(header.columns):
+            raise DataError(f"{file}: point {index} has {len(words)} values instead of {len(header.columns)}")
         try:
-            points[:, index] = [float(words[column]) for column in columns]
+            values[:, index] = [float(words[place]) for place in places]
         except ValueError as error:
             raise DataError(f"{file}: a value of point {index} is not a number") from error
-    return list(points)
+    return list(values)
 
 
 def write_points(file: Path, positions: Tensor, colors: Tensor, normals: Tensor | None = None) -> None:
@@ -123,17 +178,41 @@ def write_points(file: Path, positions: Tensor, colors: Tensor, normals: Tensor 
     Raises:
         OSError: if the file cannot be written.
     """
-    columns: list[tuple[str, str, str, np.ndarray]] = []
+    columns: list[tuple[str, np.ndarray]] = []
     for names, values in (("xyz", positions), (("nx", "ny", "nz"), normals)):
         if values is not None:
-            columns += [(n, "float", "<f4", v) for n, v in zip(names, values.numpy().T, strict=True)]
+            columns += zip(names, values.float().numpy().T, strict=True)
     stored = (colors.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-    columns += [(n, "uchar", "u1", v) for n, v in zip(("red", "green", "blue"), stored.T, strict=True)]
-    table = np.empty(len(positions), [(name, kind) for name, _, kind, _ in columns])
-    for name, _, _, column in columns:
-        table[name] = column
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
-    header += [f"property {called} {name}" for name, called, _, _ in columns]
+    columns += zip(("red", "green", "blue"), stored.T, strict=True)
+    write_columns(file, columns)
+
+
+def write_columns(file: Path, columns: Sequence[tuple[str, np.ndarray]]) -> None:
+    """Write vertices to a binary PLY file, little endian.
+
+    Args:
+        file: path of the PLY file.
+        columns: names and values (K,) of the properties, uint8 or floating point, which is written as float32.
+
+    Raises:
+        OSError: if the file cannot be written.
+    """
+    kinds = [(name, "uchar" if values.dtype == np.uint8 else "float") for name, values in columns]
+    table = np.empty(len(columns[0][1]), [(name, {"uchar": "u1", "float": "<f4"}[kind]) for name, kind in kinds])
+    for name, values in columns:
+        table[name] = values
     with file.open("wb") as stream:
-        stream.write(("\n".join([*header, "end_header"]) + "\n").encode())
-        stream.write(table.tobytes())
+        stream.write(header_text(len(table), kinds))
+        stream.write(table.data)
+
+
+def header_text(count: int, kinds: Sequence[tuple[str, str]]) -> bytes:
+    """Return the header of a binary file, little endian.
+
+    Args:
+        count: number of vertices.
+        kinds: names of their properties, and PLY's names of their types.
+    """
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines += [f"property {kind} {name}" for name, kind in kinds]
+    return ("\n".join([*lines, "end_header"]) + "\n").encode()

@@ -28,6 +28,8 @@ from framework.data.dataset import load_dataset
 from framework.data.mapped_pixels import MappedPixels
 from framework.data.pixel_cache import PixelMemory, pack, unpack
 from framework.data.ply import read_points
+from framework.splats.files import SUFFIXES, read_gaussians, write_gaussians
+from framework.splats.gaussians import Gaussians
 from framework.tools.processing import polycam, record3d
 from framework.tools.processing.images import find_images, prepare_all
 from framework.training.checkpoint import FOLDER, load_newest
@@ -137,6 +139,23 @@ def read_ply(folder: Path, scratch: Path) -> None:
     for file in sorted(folder.glob("*.ply")):
         points = read_points(file)
         require(points.shape[1:] == (3,) and bool(points.isfinite().all()), "points that are nowhere")
+
+
+def write_splats(folder: Path) -> None:
+    random = torch.Generator().manual_seed(0)
+    shapes = ((6, 3), (6, 3), (6, 4), (6,), (6, 3), (6, 3, 8))
+    gaussians = Gaussians(*(torch.randn(shape, generator=random) for shape in shapes))
+    for suffix in SUFFIXES:
+        write_gaussians(folder / f"splat{suffix}", gaussians)
+
+
+def read_splats(folder: Path, scratch: Path) -> None:
+    for file in sorted(folder.glob("splat*")):
+        gaussians = read_gaussians(file)
+        require(len(gaussians), "no Gaussians")
+        require(bool(gaussians.finite().all()), "Gaussians that are nowhere")
+        require(bool(gaussians.log_scales.exp().isfinite().all()), "Gaussians without end")
+        require(bool((gaussians.rotations.norm(dim=-1) > 0).all()), "Gaussians without axes")
 
 
 # -- images -------------------------------------------------------------------------------------------------------
@@ -296,6 +315,7 @@ READERS: dict[str, Reader] = {
     "polycam": Reader(write_polycam, partial(parse, Polycam()), ("keyframes/cameras/*.json",), ("fx", "cx", "width")),
     "phototourism": Reader(write_phototourism, partial(parse, Phototourism()), ("gate.tsv",)),
     "ply": Reader(write_ply, read_ply, ("*.ply",)),
+    "splats": Reader(write_splats, read_splats, ("splat.*",)),
     "images": Reader(write_blender, partial(load, Blender(), MEMORY), ("train/*.png",)),
     "images-to-a-file": Reader(write_blender, partial(load, Blender(), 0.0), ("train/*.png",)),
     "masks": Reader(write_masked, partial(load, Nerfstudio(), MEMORY), ("masks/*.png",)),

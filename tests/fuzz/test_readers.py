@@ -19,7 +19,7 @@ FEW, MANY = 10, 200
 """Inputs for each reader."""
 READERS = (
     "blender", "dnerf", "nerfstudio", "colmap-binary", "colmap-text", "llff", "llff-ndc", "record3d", "polycam",
-    "phototourism", "ply", "images", "images-to-a-file", "masks", "depths", "photographs", "polycam-raw",
+    "phototourism", "ply", "splats", "images", "images-to-a-file", "masks", "depths", "photographs", "polycam-raw",
     "record3d-raw", "config", "comparison", "checkpoint", "run", "pixel-cache",
 )  # fmt: skip
 """Their names here too, so that tests are collected without reading anything."""

@@ -1,0 +1,147 @@
+"""Gaussians in a file of limited size: what is given up, in an order that costs least.
+
+Harmonics go first: their degree and, in SPZ files, the bits to which they are rounded. Of the choices that fit, that
+with the least error is taken. Gaussians are dropped only where degree 0 is too much, the least visible first.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from framework.base.errors import ConfigError
+from framework.splats.gaussians import Gaussians
+from framework.splats.ply import ply_size
+from framework.splats.spz import BITS, encoded, rounded_harmonics
+
+COARSER_BITS = (4, 3)
+"""Bits of harmonics in SPZ files where `BITS` are too many."""
+SAMPLE = 1 << 16
+"""Maximum number of Gaussians by which sizes and errors are estimated."""
+DOUBT = 1.05
+"""Ratio of an estimated size to the limit beyond which a choice is not tried."""
+
+
+def fitted_ply(gaussians: Gaussians, most_bytes: float) -> tuple[Gaussians, str]:
+    """Return Gaussians whose PLY file is not larger than a limit, and what was left out, in words.
+
+    Args:
+        gaussians: N Gaussians.
+        most_bytes: maximum size of the file.
+
+    Raises:
+        ConfigError: if not even one Gaussian fits.
+    """
+    for degree in range(gaussians.degree, -1, -1):
+        if ply_size(len(gaussians), _terms(degree)) <= most_bytes:
+            return with_degree(gaussians, degree), _changes(gaussians, degree, BITS, len(gaussians))
+    # Not less than what fits: the header is longest for N.
+    header = ply_size(len(gaussians), 0) - len(gaussians) * (row := ply_size(1, 0) - ply_size(0, 0))
+    count = math.floor((most_bytes - header) / row)
+    if count < 1:
+        raise _too_small(most_bytes)
+    return most_visible(with_degree(gaussians, 0), count), _changes(gaussians, 0, BITS, count)
+
+
+def fitted_spz(gaussians: Gaussians, most_bytes: float) -> tuple[bytes, str]:
+    """Return the content of an SPZ file that is not larger than a limit, and what was left out, in words.
+
+    Args:
+        gaussians: N Gaussians on the CPU.
+        most_bytes: maximum size of the file.
+
+    Raises:
+        ConfigError: if not even one Gaussian fits, or the format cannot hold them.
+    """
+    sample = gaussians[:: -(-len(gaussians) // SAMPLE) or 1]
+    choices = [(degree, bits) for degree in range(1, gaussians.degree + 1) for bits in (BITS, COARSER_BITS)]
+    choices = [(0, BITS), *choices]
+    for degree, bits in sorted(choices, key=lambda choice: colour_error(sample, *choice)):
+        size = len(encoded(with_degree(sample, degree), bits)) * len(gaussians) / max(len(sample), 1)
+        if size > DOUBT * most_bytes:
+            continue
+        content = encoded(with_degree(gaussians, degree), bits)
+        if len(content) <= most_bytes:
+            return content, _changes(gaussians, degree, bits, len(gaussians))
+    fewer, count = with_degree(gaussians, 0), len(gaussians)
+    while count > 0:
+        content = encoded(most_visible(fewer, count))
+        if len(content) <= most_bytes:
+            return content, _changes(gaussians, 0, BITS, count)
+        count = math.floor(count * min(0.99, 0.995 * most_bytes / len(content)))
+    raise _too_small(most_bytes)
+
+
+def colour_error(gaussians: Gaussians, degree: int, bits: tuple[int, int]) -> float:
+    """Return the mean squared error of colours over all directions, weighted by visibility, in an SPZ file.
+
+    Harmonics are orthonormal, so that it is the sum of squared errors of their coefficients, but for a factor.
+
+    Args:
+        gaussians: N Gaussians.
+        degree: highest degree that is kept.
+        bits: as in `encoded`.
+    """
+    kept = torch.zeros_like(gaussians.harmonics)
+    terms = _terms(degree)
+    kept[:, :, :terms] = rounded_harmonics(gaussians.harmonics[:, :, :terms], bits)
+    squares = (kept - gaussians.harmonics).double().square().sum((1, 2))
+    weights = visibility(gaussians).double()
+    return float((weights * squares).sum() / weights.sum().clamp(min=1e-30))
+
+
+def visibility(gaussians: Gaussians) -> Tensor:
+    """Return (N,) opacity times the product of the two largest standard deviations, relative to the largest such value.
+
+    The product is the area of the largest silhouette, up to a factor. A flat Gaussian has no volume and is seen.
+
+    Args:
+        gaussians: N Gaussians.
+    """
+    areas = gaussians.log_scales.sum(-1) - gaussians.log_scales.amin(-1)
+    logarithms = torch.nn.functional.logsigmoid(gaussians.logits) + areas
+    return (logarithms - logarithms.max()).exp() if len(gaussians) else logarithms
+
+
+def most_visible(gaussians: Gaussians, count: int) -> Gaussians:
+    """Return the most visible Gaussians, in their order.
+
+    Args:
+        gaussians: N Gaussians.
+        count: how many are kept, at most N.
+    """
+    if count >= len(gaussians):
+        return gaussians
+    return gaussians[visibility(gaussians).argsort(descending=True, stable=True)[:count].sort().values]
+
+
+def with_degree(gaussians: Gaussians, degree: int) -> Gaussians:
+    """Return Gaussians with harmonics up to a degree.
+
+    Args:
+        gaussians: N Gaussians.
+        degree: highest degree that is kept.
+    """
+    return replace(gaussians, harmonics=gaussians.harmonics[:, :, : _terms(degree)])
+
+
+def _terms(degree: int) -> int:
+    return (degree + 1) ** 2 - 1
+
+
+def _changes(gaussians: Gaussians, degree: int, bits: tuple[int, int], count: int) -> str:
+    parts = []
+    if degree < gaussians.degree:
+        parts.append(f"harmonics up to degree {degree} of {gaussians.degree}")
+    if degree and bits != BITS:
+        parts.append(f"{' and '.join(map(str, bits))} bits of harmonics instead of {' and '.join(map(str, BITS))}")
+    if count < len(gaussians):
+        parts.append(f"the {count:,} most visible of {len(gaussians):,} Gaussians")
+    return ", ".join(parts)
+
+
+def _too_small(most_bytes: float) -> ConfigError:
+    return ConfigError(f"no Gaussian fits into {most_bytes:,.0f} bytes; --max-megabytes counts millions of bytes")

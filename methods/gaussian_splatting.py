@@ -7,8 +7,9 @@ where they are needed as in Kheradmand et al., "3D Gaussian Splatting as Markov 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, Literal, cast
 
 import torch
 from torch import Tensor, nn
@@ -27,6 +28,8 @@ from framework.splats.start import from_points, hull_points, seen_colors
 
 HULL_CELLS = 128
 """Cells of the visual hull along an axis."""
+FIELD_OPACITY, FIELD_SIZE = 0.5, 0.7
+"""Of Gaussians on a field's surfaces at the start: opacity, and standard deviation in distances to neighbours."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +55,11 @@ class GaussianSplattingConfig(
     """The most Gaussians; by the time there is if not given."""
     start_gaussians: int | None = None
     """Gaussians at the start, where they do not start at the points of a reconstruction."""
-    start: Literal["auto", "points", "silhouettes", "random"] = "auto"
-    """Where they start: at the points of a reconstruction, along the silhouettes' hull, or anywhere in the box."""
+    start: Literal["auto", "points", "field", "silhouettes", "random"] = "auto"
+    """Where they start: at the points of a reconstruction, on surfaces that a short run of instant-ngp finds, along the
+    silhouettes' hull, or anywhere in the box."""
+    field_seconds: float | None = None
+    """Seconds for which instant-ngp is trained first, where Gaussians start on its surfaces."""
     degree: int = 3
     """Highest degree of the spherical harmonics that colours are made of."""
     ssim_weight: float = 0.2
@@ -88,6 +94,7 @@ def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplat
     return fill(
         config,
         Choice("num_gaussians", count, "that suits the time", "Gaussians", f"up to {count:,}"),
+        Choice("field_seconds", 5.0 if seconds is None else min(max(0.1 * seconds, 3.0), 15.0), "a tenth of the time"),
         Choice("start_gaussians", count // 4, "a quarter of them", "Gaussians at the start", f"{count // 4:,}"),
     )
 
@@ -158,8 +165,14 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         Args:
             dataset: images to learn from.
         """
-        points, how = self._first_points(dataset)
-        self._set(from_points(points, seen_colors(points, dataset), self.config.degree))
+        if self.config.start == "field":
+            with torch.enable_grad():
+                points, colors = _surfaces(self.config, dataset)
+            self._set(from_points(points, colors, self.config.degree, FIELD_OPACITY, FIELD_SIZE))
+            how = "on a field's surfaces"
+        else:
+            points, how = self._first_points(dataset)
+            self._set(from_points(points, seen_colors(points, dataset), self.config.degree))
         say(f"  {len(points):,} Gaussians start {how}")
 
     def _first_points(self, dataset: Dataset) -> tuple[Tensor, str]:
@@ -240,6 +253,29 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
     @property
     def _near(self) -> float:
         return max(0.2 * self.scene.near, 1e-3)
+
+
+def _surfaces(config: GaussianSplattingConfig, dataset: Dataset) -> tuple[Tensor, Tensor]:
+    """Return points (N, 3) on the surfaces that a short run of instant-ngp finds, and their colours (N, 3)."""
+    from framework.base.registry import load_method
+    from framework.export.points import joined, surface_points
+    from framework.training.run import Run
+    from framework.training.trainer import Trainer
+
+    seconds, count = config.field_seconds, config.start_gaussians
+    assert seconds is not None and count is not None
+    field = replace(
+        load_method("instant-ngp").config, max_seconds=seconds, vis="none", machine=config.machine, background=config.background
+    )
+    trainer = Trainer(Run("instant-ngp", field, "", cast("Any", None), Path()), dataset, None)
+    while trainer.state.seconds < seconds:
+        trainer.train_step()
+    model = trainer.model.eval()
+    points, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
+    while (left := count - sum(map(len, points))) > 0 and len(points) < 16:
+        found = joined(surface_points(cast("Any", model), dataset, 2 * left, None))
+        points.append(found.positions[:left]), colors.append(found.colors[:left])
+    return torch.cat(points).to(dataset.device), torch.cat(colors).to(dataset.device)
 
 
 def _extent(scene: Scene) -> float:

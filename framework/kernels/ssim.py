@@ -1,0 +1,122 @@
+"""Structural similarity (SSIM) of an image and its target, as a loss on whole images.
+
+Definition: Wang, Bovik, Sheikh and Simoncelli 2004, "Image quality assessment: from error visibility to structural
+similarity". Each window p has 11 x 11 pixels, weighted by a Gaussian g of sigma 1.5. With the means m, variances s and
+the covariance s_xy in it of an image x and its target y:
+
+    S(p) = (2 m_x m_y + C1) (2 s_xy + C2) / ((m_x^2 + m_y^2 + C1) (s_xx + s_yy + C2))
+
+The compiled form works on the sum u = x + y - 1 and the difference v = x - y, in which the same reads:
+
+    S(p) = (1 - m_v^2 / (m_x^2 + m_y^2 + C1)) (1 - s_vv / ((s_uu + s_vv) / 2 + C2))
+
+Only u, v, u^2 and v^2 have to be blurred, and 1 - S is small without cancellation where the images are alike. The
+derivative by a pixel q, with E for the blurred squares, is a sum over the windows that the pixel lies in:
+
+    sum_p g(q - p) (dS/dm(p) + 2 u(q) dS/dE[u^2](p) + 2 v(q) dS/dE[v^2](p))
+
+The loss is a number, so its incoming gradient is one too: the derivative is computed together with the value, while
+rows are in the processor's cache, and the backward pass only multiplies it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from framework.kernels import native
+from framework.kernels.dispatch import CPP, Operation
+
+WINDOW = 11
+"""Pixels along each side of the window."""
+SIGMA = 1.5
+"""Standard deviation of the window's Gaussian, in pixels."""
+C1, C2 = 0.01**2, 0.03**2
+"""Constants that bound the quotients of dark and of flat windows, for values in [0, 1]."""
+
+
+def ssim(image: Tensor, target: Tensor) -> Tensor:
+    """Return the mean structural similarity of an image and its target: 1 where they are equal.
+
+    The definition is that of `framework.evaluation.metrics.ssim`, which is for measuring: in float64, without gradient.
+    Values that are NaN make the result NaN.
+
+    Args:
+        image: (H, W, C) values whose range is taken to be [0, 1]. Compiled with its first derivative.
+        target: (H, W, C) values to compare with. A gradient to it takes the slow reference.
+
+    Returns:
+        The mean over channels and over all windows that lie inside the image, a tensor without dimensions.
+
+    Raises:
+        ValueError: The shapes differ or are not those of images, or a side is shorter than the window.
+    """
+    if image.ndim != 3 or image.shape != target.shape or image.shape[2] < 1:
+        raise ValueError(f"SSIM needs two images (H, W, C), not {tuple(image.shape)} and {tuple(target.shape)}")
+    if min(image.shape[:2]) < WINDOW:
+        raise ValueError(f"SSIM needs at least {WINDOW}x{WINDOW} pixels, not {image.shape[1]}x{image.shape[0]}")
+    return SSIM((image, target), image, target)
+
+
+def ssim_reference(image: Tensor, target: Tensor) -> Tensor:
+    """Compute `ssim` in torch, on any device, in any float type, with derivatives of any order by both images.
+
+    Args:
+        image: (H, W, C) values.
+        target: (H, W, C) values to compare with.
+
+    Returns:
+        The mean over channels and windows, a tensor without dimensions.
+    """
+    mean_x, mean_y = _blurred(image), _blurred(target)
+    variance_x, variance_y = _blurred(image * image) - mean_x**2, _blurred(target * target) - mean_y**2
+    covariance = _blurred(image * target) - mean_x * mean_y
+    similarity = (2 * mean_x * mean_y + C1) * (2 * covariance + C2)
+    return (similarity / ((mean_x**2 + mean_y**2 + C1) * (variance_x + variance_y + C2))).mean()
+
+
+def _blurred(values: Tensor) -> Tensor:
+    """Return the weighted sums of values (H, W, C) over each window that lies inside, (H - 10, W - 10, C)."""
+    offsets = torch.arange(WINDOW, device=values.device, dtype=values.dtype) - WINDOW // 2
+    line = torch.exp(-(offsets**2) / (2 * SIGMA**2))
+    line = line / line.sum()
+    for dim in (0, 1):
+        size = values.shape[dim] - WINDOW + 1
+        total = line[0] * values.narrow(dim, 0, size)
+        for k in range(1, WINDOW):
+            total = total + line[k] * values.narrow(dim, k, size)
+        values = total
+    return values
+
+
+SSIM = Operation("ssim", ssim_reference)
+_ssim = native.Function("ssim", "ppqqqpi", "d")
+
+
+class _SSIM(torch.autograd.Function):
+    """The compiled sweep over an image, which computes the value and the derivative."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, target: Tensor, learned: bool) -> Tensor:
+        derivative = torch.empty_like(image) if learned else None
+        value = _ssim(
+            native.pointer(image, "the image", image.shape), native.pointer(target, "the target", image.shape),
+            *image.shape, None if derivative is None else derivative.data_ptr(), native.threads(),
+        )  # fmt: skip
+        if derivative is not None:
+            ctx.save_for_backward(derivative)
+        return image.new_tensor(value)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        (derivative,) = ctx.saved_tensors
+        return derivative * grad, None, None
+
+
+@SSIM.implementation(CPP, differentiable=1)
+def _compiled(image: Tensor, target: Tensor) -> Tensor:
+    learned = image.requires_grad and torch.is_grad_enabled()
+    return _SSIM.apply(image.contiguous(), target.contiguous(), learned)

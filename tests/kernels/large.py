@@ -28,6 +28,7 @@ from framework.kernels.intervals import (
 from framework.kernels.march import CompiledMarch, Occupancy, ReferenceMarch, refresh_occupancy
 from framework.kernels.mlp import mlp, mlp_reference
 from framework.kernels.planes import PlanesLayout, planes, planes_reference
+from framework.kernels.ssim import ssim, ssim_reference
 from tests.kernels.compiled import relative_error
 
 COUNT = 20_000
@@ -61,6 +62,7 @@ def differentiable() -> dict[str, tuple[Callable[..., Tensor], Callable[..., Ten
         return run
 
     edges = torch.linspace(0, 3, 33).expand(COUNT // 10, 33)
+    target = torch.rand(150, 140, 3)
     return {
         "hash grid": (
             lambda x, table: hash_grid(x, table, GRID),
@@ -109,6 +111,12 @@ def differentiable() -> dict[str, tuple[Callable[..., Tensor], Callable[..., Ten
             lambda sigma: interval_weights_reference(sigma, edges.double()),
             [torch.rand(COUNT // 10, 32)],
             32,
+        ),
+        "similarity": (
+            lambda x: ssim(x, target)[None, None],
+            lambda x: ssim_reference(x, target.double())[None, None],
+            [torch.rand(150, 140, 3)],
+            1,
         ),
     }
 

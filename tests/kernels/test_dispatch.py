@@ -26,6 +26,7 @@ from framework.kernels.planes import PLANE_BAND, PLANES, PlanesGradient, PlanesL
 from framework.kernels.rows import GATHER_ROWS
 from framework.kernels.silhouettes import HOLD_BALLS, OPAQUE_SUMS, PIXELS_NEAR_BALLS, Photograph, opaque_sums
 from framework.kernels.spherical_harmonics import SPHERICAL_HARMONICS
+from framework.kernels.ssim import SSIM
 from tests.kernels.compiled import needs_kernels
 
 GRID = HashGridLayout.build(3, 4, 20, 8)
@@ -98,6 +99,7 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     OPAQUE_SUMS: lambda: (torch.rand(7, 9) > 0.5,),
     HOLD_BALLS: lambda: (photograph(), torch.rand(200, 3) * 2 - 1, 0.05, torch.rand(200) > 0.5, True),
     PIXELS_NEAR_BALLS: lambda: (photograph(), torch.rand(20, 3) * 2 - 1, 0.05),
+    SSIM: lambda: (rand(13, 15, 3), rand(13, 15, 3)),
     GATHER_COLORS: lambda: (torch.randint(256, (60, 4), dtype=torch.uint8), torch.randint(60, (9,)), rand(9, 3)),
     CAMERA_RAYS: lambda: (cameras(), torch.arange(0, 72, 5), 0.0, 1.0, None, subpixels(4)),
 }
@@ -196,6 +198,8 @@ def test_what_is_taken() -> None:
         (DISTORTION, 0, "c++"),
         (DISTORTION, 1, "reference"),
         (DISTORTION, 2, "reference"),
+        (SSIM, 0, "c++"),
+        (SSIM, 1, "reference"),
         (COMPOSITE, 1, "c++"),
         (COMPOSITE, 2, "reference"),
         (COMPOSITE, 6, "reference"),

@@ -28,6 +28,7 @@ from framework.kernels.intervals import (
 from framework.kernels.mlp import mlp, mlp_reference
 from framework.kernels.planes import PlanesLayout, planes, planes_reference
 from framework.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
+from framework.kernels.ssim import ssim, ssim_reference
 from framework.samplers.occupancy import OccupancySampler
 from tests.kernels.compiled import needs_kernels, relative_error
 
@@ -162,6 +163,9 @@ OPERATIONS = {
         },
         ("proposal_excess",),
         frozenset({"edges", "weights", "proposed"}),
+    ),
+    "similarity": Operation(
+        ssim, ssim_reference, lambda: {"image": rand(13, 15, 3), "target": rand(13, 15, 3)}, ("ssim",)
     ),
     "camera rays": Operation(
         rays_of("pixel_rays"),

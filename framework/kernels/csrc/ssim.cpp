@@ -99,7 +99,7 @@ class Band {
     void run(float scale, double* dissimilarity, float* gradient) {
         for (int64_t row = 0; row < REACH; row++) read(row);
         for (int64_t row = 0; row < rows; row += ROWS) {
-            for (int64_t next = row + REACH; next < row + KEPT; next++) read(next);
+            for (int64_t next = row + REACH; next < std::min<int64_t>(row + KEPT, rows + REACH); next++) read(next);
             compare(row, dissimilarity);
             if (gradient && row + ROWS > REACH) differentiate(row, scale, gradient);
         }
@@ -136,7 +136,7 @@ class Band {
             for (int m = 0; m < 4; m++) blur_down(from[m], i, moment[m]);
             const Floats counts = load(inside + i);
             for (int r = 0; r < ROWS; r++) {
-                // S = (1 - darker) (1 - flatter). Without its offset the mean of the sum is `full`.
+                // S = (1 - darker) (1 - flatter), by means and by variances. `full` is the sum without its offset.
                 const Floats sum = moment[0][r], full = sum + 1.0f, difference = moment[1][r];
                 const Floats square = difference * difference;
                 const Floats of_sum = positive(moment[2][r] - sum * sum);
@@ -202,8 +202,8 @@ class Band {
     const Images& images;
     const int64_t top, rows, step, row_floats, reach, windows, margin;
     Rows moments[4];            // sum, difference and their squares, blurred along
-    Rows slopes[3];             // of the windows' similarity by pixels: a constant, times their sum, times difference
-    Rows blurred[3];            // the slopes, blurred down; like these, with `margin` zeros in front
+    Rows slopes[3];             // by the mean, and twice those by the means of both squares, after `margin` zeros
+    Rows blurred[3];            // the slopes, blurred down
     float *sums, *differences;  // of a row of both images
     float* inside;              // 1 where a row has a window, 0 behind
 };

@@ -32,7 +32,7 @@ def draw(rows: Sequence[Row], path: Path) -> bool:
     axes.plot(bounds, heights, "|", color="#d55e00", markersize=11, label="forward at the ceiling")
     for place, row, value in zip(places, rows, theirs, strict=True):
         axes.text(value * 1.1, place, f"{row.speed_up:.1f} x", va="center", fontsize=8)
-    axes.set(xscale="log", xlabel=f"ns a sample, ray or entry, forward and backward, {rows[0].threads} threads")
+    axes.set(xscale="log", xlabel=f"ns a sample, ray, entry or pixel, forward and backward, {rows[0].threads} threads")
     axes.set_yticks(list(places), [row.kernel for row in rows], fontsize=8)
     axes.margins(x=0.1)
     axes.legend(fontsize=8)

@@ -14,7 +14,7 @@ TABLES = (1, 8, 64)
 
 @dataclass(frozen=True)
 class Work:
-    """What a kernel has to do for each sample, ray or entry, whatever else it does."""
+    """What a kernel has to do for each sample, ray, entry or pixel, whatever else it does."""
 
     bytes: float = 0.0
     """Read or written in order."""

@@ -30,6 +30,7 @@ from framework.kernels.march import CompiledMarch, Occupancy, ReferenceMarch
 from framework.kernels.mlp import Activation, mlp, mlp_reference
 from framework.kernels.planes import PlanesLayout, planes, planes_reference
 from framework.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
+from framework.kernels.ssim import ssim, ssim_reference
 from framework.tools.benchmarks.ceilings import Ceilings, Work
 from framework.tools.benchmarks.plane_lookups import grid_samples, layouts, planes_of
 from framework.tools.benchmarks.timing import Run, alternating, differentiated, once
@@ -62,7 +63,7 @@ class Kernel:
 
     name: str
     unit: str
-    """What it works on: sample, ray or entry."""
+    """What it works on: sample, ray, entry or pixel."""
     count: int
     """How many at once."""
     runs: tuple[Run, Run]
@@ -149,7 +150,7 @@ def measured(kernel: Kernel, ceilings: Ceilings, repeats: int, all_threads: int)
 
 def table(rows: Sequence[Row]) -> Table:
     """For people: what fits a line of a terminal."""
-    found = Table(title="ns a sample, ray or entry", title_justify="left", box=SIMPLE, padding=(0, 1, 0, 0))
+    found = Table(title="ns a sample, ray, entry or pixel", title_justify="left", box=SIMPLE, padding=(0, 1, 0, 0))
     for heading in ("kernel", "forward", "backward", "torch", "speed-up", "error"):
         found.add_column(heading, justify="left" if heading == "kernel" else "right", no_wrap=heading != "kernel")
     for row in rows:
@@ -199,6 +200,7 @@ def kernels(count: int) -> Iterator[Kernel]:
         yield _plane_lookup(name, layout, features, count)
     yield _marching()
     yield _updating()
+    yield _similarity()
     for model, lens in LENSES:
         yield _ray_generation(model, lens)
 
@@ -369,6 +371,25 @@ def _updating() -> Kernel:
     work = Work(bytes=4 * (2 * 4 + 1) * 2)  # value, gradient and both moments of 2, and its uses: read and written
     runs = steps(sparse_adam), steps(sparse_adam_reference)
     return Kernel("sparse Adam, half of 2^19 x 2", "entry", updated, runs, work)
+
+
+def _similarity() -> Kernel:
+    """SSIM of an image of 400 x 400 and its noisy target. The forward pass leaves a factor to the backward pass."""
+    target = torch.nn.functional.avg_pool2d(torch.rand(3, 406, 406), 7, 1).permute(1, 2, 0).contiguous()
+    image = (target + 0.05 * torch.randn_like(target)).clamp(0, 1)
+
+    def against(form: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
+        return lambda x: form(x, target.to(x))
+
+    ours, exact = against(ssim), against(ssim_reference)
+    return Kernel(
+        "SSIM of 400 x 400 x 3",
+        "pixel",
+        400 * 400,
+        (differentiated(ours, [image], None), differentiated(exact, [image], None)),
+        Work(bytes=4 * 3 * 3),  # both images read, a gradient written
+        lambda: (errors(ours, exact, [image], True), errors(exact, exact, [image], True)),
+    )
 
 
 def _ray_generation(model: str, lens: list[float]) -> Kernel:

@@ -1,0 +1,235 @@
+"""Structural similarity: the compiled sweep against its reference in float64, and against other implementations."""
+
+from collections.abc import Callable, Iterator
+
+import pytest
+import torch
+from skimage.metrics import structural_similarity
+from torch import Tensor
+
+from framework.evaluation import metrics
+from framework.kernels import native
+from framework.kernels.dispatch import derivatives
+from framework.kernels.ssim import WINDOW, ssim, ssim_reference
+from tests.kernels.compiled import needs_kernels, relative_error
+
+SIZES = [(11, 11, 1), (11, 11, 3), (11, 64, 3), (90, 11, 4), (12, 27, 1), (23, 16, 3), (70, 53, 3), (41, 37, 4)]
+TALL = (131, 45, 3)
+"""Several bands on two threads, the last of which is short."""
+
+
+def smooth(height: int, width: int, channels: int) -> Tensor:
+    """Return an image of waves in [0, 1], which has edges, slopes and nearly flat parts."""
+    y, x = torch.meshgrid(torch.linspace(0, 6, height), torch.linspace(0, 4, width), indexing="ij")
+    phases = torch.arange(channels) * 0.7
+    return ((y[..., None] + phases).sin() * (x * y)[..., None].cos() * 0.5 + 0.5).float()
+
+
+def noisy(image: Tensor, amount: float) -> Tensor:
+    return (image + amount * torch.randn_like(image)).clamp(0, 1)
+
+
+def value_and_gradient(
+    form: Callable[[Tensor, Tensor], Tensor], image: Tensor, target: Tensor
+) -> tuple[Tensor, Tensor]:
+    leaf = image.clone().requires_grad_()
+    value = form(leaf, target)
+    (gradient,) = torch.autograd.grad(value, leaf)
+    return value.detach(), gradient
+
+
+def compared(image: Tensor, target: Tensor) -> tuple[float, float]:
+    """Return the error of the value, and that of the gradient over its largest, of `ssim` against float64."""
+    value, gradient = value_and_gradient(ssim, image, target)
+    truth, true_gradient = value_and_gradient(ssim_reference, image.double(), target.double())
+    assert value.dtype == gradient.dtype == torch.float32
+    assert value.shape == ()
+    return abs(value.item() - truth.item()), relative_error(gradient, true_gradient)
+
+
+@pytest.fixture
+def threads() -> Iterator[Callable[[int], None]]:
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@needs_kernels
+@pytest.mark.parametrize("size", SIZES, ids=str)
+def test_value_and_gradient_of_noise(size: tuple[int, int, int]) -> None:
+    torch.manual_seed(0)
+    error, of_gradient = compared(torch.rand(size), torch.rand(size))
+    assert error < 5e-7
+    assert of_gradient < 2e-6
+
+
+@needs_kernels
+def test_value_and_gradient_of_random_sizes(threads: Callable[[int], None]) -> None:
+    torch.manual_seed(1)
+    for _ in range(40):
+        height, width, channels, count = (
+            int(torch.randint(*ends, ())) for ends in ((11, 120), (11, 90), (1, 6), (1, 5))
+        )
+        threads(count)
+        target = smooth(height, width, channels)
+        error, of_gradient = compared(noisy(target, 0.1), target)
+        assert error < 1e-6, (height, width, channels, count)
+        assert of_gradient < 1e-4, (height, width, channels, count)
+
+
+@needs_kernels
+@pytest.mark.parametrize("amount", [0.3, 0.03, 3e-3, 3e-4])
+@pytest.mark.parametrize("flat", [None, 0.0, 0.5, 1.0])
+def test_little_is_lost_near_flat_parts_and_near_the_target(amount: float, flat: float | None) -> None:
+    """Variances are differences, of which little would be left there."""
+    torch.manual_seed(0)
+    target = smooth(80, 75, 3) if flat is None else torch.full((80, 75, 3), flat)
+    error, of_gradient = compared(noisy(target, amount), target)
+    assert error < 1e-6
+    assert of_gradient < 2e-4
+
+
+@needs_kernels
+def test_an_image_is_similar_to_itself() -> None:
+    torch.manual_seed(0)
+    for image in (torch.rand(TALL), smooth(*TALL), torch.zeros(TALL), torch.ones(TALL)):
+        value, gradient = value_and_gradient(ssim, image, image)
+        assert value.item() == 1
+        assert not gradient.any()
+
+
+@pytest.mark.parametrize("size", SIZES, ids=str)
+@pytest.mark.parametrize("amount", [0.0, 0.02, 0.5])
+def test_the_value_is_the_metrics(size: tuple[int, int, int], amount: float) -> None:
+    torch.manual_seed(0)
+    target = smooth(*size)
+    image = noisy(target, amount)
+    assert ssim_reference(image.double(), target.double()).item() == pytest.approx(
+        metrics.ssim(image, target), abs=1e-12
+    )
+    assert ssim(image, target).item() == pytest.approx(metrics.ssim(image, target), abs=1e-6)
+
+
+def test_the_value_is_scikit_images() -> None:
+    torch.manual_seed(0)
+    target = smooth(61, 47, 3)
+    image = noisy(target, 0.1)
+    expected = structural_similarity(
+        target.double().numpy(), image.double().numpy(), channel_axis=-1, data_range=1.0,
+        gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
+    )  # fmt: skip
+    assert ssim_reference(image.double(), target.double()).item() == pytest.approx(expected, abs=1e-9)
+    assert ssim(image, target).item() == pytest.approx(expected, abs=1e-6)
+
+
+@needs_kernels
+@pytest.mark.parametrize("size", [TALL, (97, 19, 1), (260, 21, 4), (11, 30, 3)], ids=str)
+def test_the_same_bits_on_any_number_of_threads(size: tuple[int, int, int], threads: Callable[[int], None]) -> None:
+    torch.manual_seed(0)
+    image, target = torch.rand(size), torch.rand(size)
+    threads(1)
+    value, gradient = value_and_gradient(ssim, image, target)
+    for count in (2, 3, 7):
+        threads(count)
+        found, found_gradient = value_and_gradient(ssim, image, target)
+        assert torch.equal(found, value)
+        assert torch.equal(found_gradient, gradient)
+
+
+@needs_kernels
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("place", [(0, 0, 0), (60, 20, 1), (130, 44, 2), (66, 0, 2)])
+def test_nan_and_infinity_stay_visible_and_stay_where_they_are(bad: float, place: tuple[int, int, int]) -> None:
+    torch.manual_seed(0)
+    image, target = torch.rand(TALL), torch.rand(TALL)
+    image[place] = bad
+    value, gradient = value_and_gradient(ssim, image, target)
+    assert value.isnan()
+    y, x, channel = place
+    near = torch.zeros(TALL, dtype=torch.bool)  # in a window with it
+    near[max(y - WINDOW + 1, 0) : y + WINDOW, max(x - WINDOW + 1, 0) : x + WINDOW, channel] = True
+    assert torch.equal(gradient.isnan(), near)
+    assert bool(gradient[~near].isfinite().all())
+
+
+@needs_kernels
+@pytest.mark.parametrize(("image", "target"), [(0.01, 1.0), (1.0, 0.01), (0.01, 0.01), (1.0, 1.0), (0.0, 1.0)])
+@pytest.mark.parametrize("flat", [False, True])
+def test_images_far_apart_dark_or_bright(image: float, target: float, flat: bool) -> None:
+    torch.manual_seed(0)
+    ones = torch.ones(80, 75, 3)
+    error, of_gradient = compared(image * torch.rand_like(ones), target * (ones if flat else smooth(80, 75, 3)))
+    assert error < 1e-6
+    assert of_gradient < 3e-4
+
+
+@needs_kernels
+@pytest.mark.parametrize("scale", [10.0, 1e4, 1e8, 1e12])
+def test_values_far_outside_the_range_are_dissimilar(scale: float) -> None:
+    torch.manual_seed(0)
+    value, gradient = value_and_gradient(ssim, scale * torch.rand(30, 40, 3), torch.rand(30, 40, 3))
+    assert value.item() == pytest.approx(0, abs=2e-3)
+    assert bool(gradient.isfinite().all())
+
+
+@needs_kernels
+def test_memory_in_another_order_and_incoming_gradients() -> None:
+    torch.manual_seed(0)
+    image, target = torch.rand(3, 40, 30).permute(1, 2, 0).requires_grad_(), torch.rand(30, 40, 3).transpose(0, 1)
+    loss = 0.2 * (1 - ssim(image, target))
+    (gradient,) = torch.autograd.grad(loss, image, retain_graph=True)
+    _, expected = value_and_gradient(ssim, image.detach().contiguous(), target.contiguous())
+    torch.testing.assert_close(gradient, -0.2 * expected)
+    (again,) = torch.autograd.grad(loss, image)
+    assert torch.equal(again, gradient)
+
+
+@needs_kernels
+def test_without_gradients_the_value_is_the_same() -> None:
+    torch.manual_seed(0)
+    image, target = torch.rand(TALL), torch.rand(TALL)
+    value = ssim(image, target)
+    assert not value.requires_grad
+    assert torch.equal(value, value_and_gradient(ssim, image, target)[0])
+    with torch.no_grad():
+        assert torch.equal(ssim(image.requires_grad_(), target), value)
+
+
+def test_derivatives_of_the_reference() -> None:
+    torch.manual_seed(0)
+    image, target = (torch.rand(12, 11, 1, dtype=torch.float64, requires_grad=True) for _ in range(2))
+    assert torch.autograd.gradcheck(ssim_reference, (image, target))
+    assert torch.autograd.gradgradcheck(ssim_reference, (image, target))
+
+
+def test_second_derivatives_are_the_references() -> None:
+    torch.manual_seed(0)
+    image, target = torch.rand(12, 13, 2, requires_grad=True), torch.rand(12, 13, 2)
+    with derivatives(2):
+        (slope,) = torch.autograd.grad(ssim(image, target), image, create_graph=True)
+    (curvature,) = torch.autograd.grad(slope.square().sum(), image)
+    assert bool(curvature.any())
+
+
+@pytest.mark.parametrize(
+    ("image", "target", "said"),
+    [
+        ((10, 30, 3), (10, 30, 3), "11x11 pixels, not 30x10"),
+        ((30, 10, 3), (30, 10, 3), "11x11 pixels, not 10x30"),
+        ((30, 30, 3), (30, 31, 3), "two images"),
+        ((30, 30, 3), (30, 30), "two images"),
+        ((30, 30), (30, 30), "two images"),
+        ((30, 30, 0), (30, 30, 0), "two images"),
+    ],
+)
+def test_what_is_refused(image: tuple[int, ...], target: tuple[int, ...], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        ssim(torch.zeros(image), torch.zeros(target))
+
+
+@needs_kernels
+@pytest.mark.parametrize("size", [(10, 11, 3), (11, 10, 3), (11, 11, 0)])
+def test_the_kernel_refuses_too_small_images_itself(size: tuple[int, int, int]) -> None:
+    kernel = native.Function("ssim", "ppqqqpi", "d")
+    with pytest.raises(ValueError, match="SSIM needs 11x11 pixels"):
+        kernel(None, None, *size, None, 1)

@@ -26,7 +26,6 @@ NOT_YET: tuple[str, ...] = (
     "framework/cli",
     "framework/data/sources.py",
     "framework/encodings",
-    "framework/evaluation",
     "framework/export/points.py",
     "framework/fields",
     "framework/geometry/points.py",

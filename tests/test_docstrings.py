@@ -23,7 +23,6 @@ NOT_YET: tuple[str, ...] = (
     "framework/base/decisions.py",
     "framework/base/optimised.py",
     "framework/cameras/view.py",
-    "framework/cli",
     "framework/data/sources.py",
     "framework/encodings",
     "framework/export/points.py",

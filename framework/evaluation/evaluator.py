@@ -147,8 +147,7 @@ def evaluate(
         model: the trained model.
         dataset: views with images, on the model's device.
         max_images: maximum number of views, evenly spaced; all if None.
-        pictures: folder for renders, true images, `view_panels`, and normals (x, y, z from -1 to 1 as RGB) if there are
-            any; no files if None.
+        pictures: folder for renders, true images, `view_panels` and normals (x, y, z as RGB); no files if None.
         max_pictures: maximum number of views of which files are written; all if None.
         round_to_uint8: whether colours are rounded to 8 bits before they are measured.
         title: text of the progress bar.

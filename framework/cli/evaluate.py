@@ -73,25 +73,25 @@ def _command(arguments: list[str]) -> None:
     dataset = load_split(trained.run, flags.split).to(trained.model.device)
     bound = None if flags.max_error is None else parse_error(flags.max_error)
     with nullcontext() if bound is None else limited_error(trained.model, bound):
-        found = evaluate(
+        evaluation = evaluate(
             trained.model,
             dataset,
             max_images=flags.max_images,
             pictures=flags.render_output_path,
             round_to_uint8=flags.round_to_uint8,
         )
-    say(f"{flags.split}: {found.line()}")
+    say(f"{flags.split}: {evaluation.line()}")
     if bound is not None:
         worst, faster = measured_error(trained.model, dataset, bound)
         say(f"--max-error {bound:.2g}: colours off by at most {worst:.2g} (measured), {faster:.2f} x as fast as exact")
-    if flags.eval_appearance == "half" and found.eval_appearance is None:
+    if flags.eval_appearance == "half" and evaluation.eval_appearance is None:
         say("--eval-appearance half: this run has no appearance vectors; whole images were evaluated")
-    say(f"LPIPS {found.lpips_note}")
+    say(f"LPIPS {evaluation.lpips_note}")
     output = flags.output_path or trained.run.folder / "eval.json"
-    write_evaluation(output, trained.run, trained.checkpoint, found, trained.model.device)
+    write_evaluation(output, trained.run, trained.checkpoint, evaluation, trained.model.device)
     say(f"written to {output}")
-    if found.pictures_note is not None:
-        raise ConfigError(found.pictures_note)
+    if evaluation.pictures_note is not None:
+        raise ConfigError(evaluation.pictures_note)
 
 
 if __name__ == "__main__":

@@ -101,10 +101,10 @@ def _divide(rules: dict[type, StructConstructorSpec], settings: Any, groups: lis
 def _flag(field: StructFieldSpec) -> StructFieldSpec:
     """Return a field whose flag has no prefix, and whose default is not shown as None if it depends on the data."""
     is_open = field.default is None and LEFT_TO_DATA in getattr(field.type, "__metadata__", ())
-    shown: Any = Annotated[
+    annotated: Any = Annotated[
         field.type, tyro.conf.arg(prefix_name=False, help_behavior_hint=DECIDED if is_open else None)
     ]
-    return dataclasses.replace(field, type=shown, helptext=partial(_unwrapped, field.helptext))
+    return dataclasses.replace(field, type=annotated, helptext=partial(_unwrapped, field.helptext))
 
 
 def _unwrapped(text: str | Callable[[], str | None] | None) -> str | None:

@@ -101,19 +101,19 @@ def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:
     test_set = first_split(run, ("test", "val"))
     if test_set is None or run.config.max_eval_images == 0:
         return
-    found = evaluate(
+    evaluation = evaluate(
         trainer.model,
         test_set.to(trainer.device),
         max_images=run.config.max_eval_images,
         pictures=run.folder / "pictures",
         max_pictures=PICTURES,
     )
-    say(f"test: {found.line()}")  # before files are written, which may fail on a full disk
-    if found.pictures_note is None:
+    say(f"test: {evaluation.line()}")  # before files are written, which may fail on a full disk
+    if evaluation.pictures_note is None:
         say(f"pictures (photograph, render, error, depth, opacity): {run.folder / 'pictures'}")
     else:
-        say(f"warning: {found.pictures_note}")
-    write_evaluation(run.folder / "eval.json", run, outcome.checkpoint, found, trainer.device)
+        say(f"warning: {evaluation.pictures_note}")
+    write_evaluation(run.folder / "eval.json", run, outcome.checkpoint, evaluation, trainer.device)
     say(f"evaluate again with: ns-eval --load-config {run.config_path}")
 
 

@@ -357,13 +357,13 @@ class Trainer:
         due = every is not None and self.state.seconds - self._last_eval >= every
         if due or step % config.steps_per_eval_all_images == 0:
             self._last_eval, start = self.state.seconds, time.perf_counter()
-            found = evaluate(self.model, self.eval_set, max_images=config.max_eval_images, title="Evaluating")
-            psnr, ssim, images = (found.results[name] for name in ("psnr", "ssim", "num_images"))
+            evaluation = evaluate(self.model, self.eval_set, max_images=config.max_eval_images, title="Evaluating")
+            psnr, ssim, images = (evaluation.results[name] for name in ("psnr", "ssim", "num_images"))
             cost = time.perf_counter() - start
             point = Point(self.state.seconds, step, psnr, ssim, images, evaluation_seconds=cost)
             self.state.curve += (point.entry(),)
             board.scalars({"eval/psnr": psnr} | ({} if ssim is None else {"eval/ssim": ssim}), step)
-            say(f"{self.state.seconds:5.0f} s  step {step:,}  {found.line()}")
+            say(f"{self.state.seconds:5.0f} s  step {step:,}  {evaluation.line()}")
             self._write_curve()
 
     def _look_if_due(self, report: StepReport, board: TensorBoard, last: bool) -> None:

@@ -26,15 +26,15 @@ RISE = 0.25
 
 def ball_in_a_box() -> Dataset:
     """Return images of a ball at the origin, transparent around it."""
-    colors, shown = _ball(_rays(), torch.zeros(3))
-    return _dataset(torch.cat([colors, shown[:, None]], dim=-1))
+    colors, hits = _ball(_rays(), torch.zeros(3))
+    return _dataset(torch.cat([colors, hits[:, None]], dim=-1))
 
 
 def ball_under_a_sky() -> Dataset:
     """Return images of a ball at the origin before a sky at infinity: without alpha, in an unbounded scene."""
     rays = _rays()
-    colors, shown = _ball(rays, torch.zeros(3))
-    return _dataset(torch.where(shown[:, None] > 0, colors, 0.5 + 0.4 * rays.directions), unbounded=True)
+    colors, hits = _ball(rays, torch.zeros(3))
+    return _dataset(torch.where(hits[:, None] > 0, colors, 0.5 + 0.4 * rays.directions), unbounded=True)
 
 
 def moving_ball() -> Dataset:
@@ -42,8 +42,8 @@ def moving_ball() -> Dataset:
     rays, times = _rays(), torch.linspace(0, 1, COUNT)
     assert rays.camera_indices is not None
     heights = RISE * (2 * times[rays.camera_indices] - 1)
-    colors, shown = _ball(rays, heights[:, None] * torch.tensor([0.0, 0.0, 1.0]))
-    return _dataset(torch.cat([colors, shown[:, None]], dim=-1), times)
+    colors, hits = _ball(rays, heights[:, None] * torch.tensor([0.0, 0.0, 1.0]))
+    return _dataset(torch.cat([colors, hits[:, None]], dim=-1), times)
 
 
 def _cameras() -> Cameras:

@@ -23,7 +23,7 @@ from framework.samplers.choice import HierarchicalConfig, contracted_box, make_s
 from methods.vanilla_nerf import A_RAY, OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH
 
 HASH_SAMPLES_PER_BATCH = 2**14
-"""With a hash grid the networks are small, and a step can hold more samples."""
+"""Samples of a training step with a hash grid, whose networks are small, and an occupancy grid."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class DNeRFConfig(
     adam_eps=1e-7,
     num_steps=192,
 ):
-    """Settings of dnerf; networks, samples and learning rate are the paper's.
+    """Settings of dnerf; the defaults of networks, samples and learning rate are the paper's.
 
-    Unlike there, photographs with alpha are composited over random colours in training: over white, a scene with much
-    white in white in it is learnt as empty space, and stays so.
+    Unlike in the paper, images with alpha are composited over random colours in training. Over white, white objects
+    are learnt as empty space and stay empty.
     """
 
     RANGES: ClassVar[dict[str, Range]] = {
@@ -54,47 +54,50 @@ class DNeRFConfig(
         "max_resolution": (1, MAX_RESOLUTION),
         "log2_table_size": (1, MAX_LOG2_TABLE_SIZE),
     }
-    """What these numbers may be."""
+    """Allowed range of each numeric setting."""
     variant: Literal["d-nerf", "t-nerf"] = "d-nerf"
-    """d-nerf: a canonical field, deformed. t-nerf: one network of place and time."""
+    """d-nerf: a canonical field and a deformation network. t-nerf: one network of position and time."""
     canonical: Literal["network", "hash-grid"] = "network"
-    """What d-nerf deforms: the paper's network, or a hash grid with small networks."""
+    """Canonical field of d-nerf: the paper's network, or a hash grid with small networks."""
     num_layers: int = 8
-    """Layers of the canonical network before density."""
+    """Layers of the canonical network before its density output."""
     hidden_width: int = 256
-    """Features of a layer of the canonical network."""
+    """Features per layer of the canonical network."""
     deformation_layers: Auto[int] = AUTO
     """Hidden layers of the deformation network. If not given: 8, or 4 with a hash grid."""
     deformation_width: Auto[int] = AUTO
-    """Features of a layer of the deformation network. If not given: 256, or 64 with a hash grid."""
+    """Features per layer of the deformation network. If not given: 256, or 64 with a hash grid."""
     position_frequencies: int = 10
-    """L of the position's encoding."""
+    """Number of frequencies in the encoding of positions."""
     direction_frequencies: int = 4
-    """L of the direction's encoding."""
+    """Number of frequencies in the encoding of directions."""
     time_frequencies: int = 4
-    """L of the time's encoding."""
+    """Number of frequencies in the encoding of times."""
     grid_learning_rate: float = 1e-2
-    """Of the hash grid and the two networks that read it."""
+    """Initial learning rate of the hash grid and of the two networks that read it."""
     max_resolution: int = 512
-    """Cells along an axis at the hash grid's finest level."""
+    """Cells per axis at the finest level of the hash grid."""
     log2_table_size: int = 16
-    """Entries of a level's table at most, as a power of two."""
+    """Maximum number of table entries per level of the hash grid, log2."""
     sparse_updates: bool = True
-    """Adam updates only the entries of the hash grid that a step used."""
+    """Whether Adam updates only the entries of the hash grid that a step used."""
     grid_resolution: int = 64
-    """Cells along an axis of the occupancy grid. A cell is occupied if it is at any time."""
+    """Cells per axis of the occupancy grid. A cell counts as occupied if it is occupied at any time."""
 
 
 class DNeRF(RayModel[DNeRFConfig], LearnsMotion):
-    """A deformed field, or one of position and time. Without times, the canonical field alone."""
+    """A model of a scene that moves; of a scene without times, the canonical field alone."""
 
 
 def decide(config: DNeRFConfig, scene: Scene) -> tuple[DNeRFConfig, list[Decision]]:
-    """Return the settings with what the scene decides, and why.
+    """Fill in the settings that depend on the scene.
 
     Args:
-        config: settings, some of which may be open.
-        scene: facts about the data.
+        config: the method's settings; those left open are filled in.
+        scene: properties of the data.
+
+    Returns:
+        Settings without open ones, and a record of each that was filled in.
     """
     grid = config.canonical == "hash-grid"
     network = f"the canonical field is a {'hash grid' if grid else 'network'}"
@@ -110,17 +113,17 @@ def decide(config: DNeRFConfig, scene: Scene) -> tuple[DNeRFConfig, list[Decisio
         config, more = fill(config, Choice("samples_per_batch", samples, A_RAY, "samples a step"))
         made += more
     if not scene.moving:
-        made = [one for one in made if not one.option.startswith("deformation")]
+        made = [decision for decision in made if not decision.option.startswith("deformation")]
         made.append(Decision("deformation", "left out", "the images have no times"))
     return config, made
 
 
 def make_field(config: DNeRFConfig, scene: Scene) -> Field:
-    """Return the deformed field, one network of position and time, or, of a still scene, the canonical field.
+    """Return a deformed field, one network of position and time, or, if the scene has no times, the canonical field.
 
     Args:
-        config: the settings, decided.
-        scene: facts about the data.
+        config: the method's settings, none left open.
+        scene: properties of the data.
     """
     faster = OCCUPANCY_RATE if config.sampler == "occupancy" else 1.0
     networks = Optimised("networks", learning_rate=config.learning_rate * faster)
@@ -154,11 +157,11 @@ def make_field(config: DNeRFConfig, scene: Scene) -> Field:
 
 
 def sampler(config: DNeRFConfig, scene: Scene) -> Sampler:
-    """Return the sampler that is asked for; the coarse field of the paper's is one like the fine one.
+    """Return the configured sampler; the coarse field of hierarchical sampling is built like the fine one.
 
     Args:
-        config: the settings, decided.
-        scene: facts about the data.
+        config: the method's settings, none left open.
+        scene: properties of the data.
     """
     return make_sampler(config, scene, partial(make_field, config, scene))
 

@@ -22,12 +22,14 @@ PLANS = (
     (150.0, 17, 512, 2**15, 2),
     (math.inf, 18, 1024, 2**16, 2),
 )
-"""What suits how much time: seconds of training at most, log2 of the table size, steps along the diagonal, samples a
-step, finest cells a pixel. Small tables and batches learn fastest; large ones get further."""
+"""Settings by time budget: maximum seconds of training, log2 of the table size, marching steps along the box's
+diagonal, samples per training step, cells of the finest level per pixel. Small tables and batches learn fastest; large
+ones reach a higher PSNR."""
 
 SPARSE_FROM = 17
-"""log2 of the table size from which sparse updates pay. On Lego after 45 s, with 2^16 entries, dense ones were 0.06,
-0.23 and 0.25 dB better, as seldom used entries move further; after 300 s, with 2^18, sparse ones were 0.21 dB."""
+"""log2 of the table size from which updates are sparse. On Lego, three runs of 45 s with 2^16 entries were 0.06, 0.23
+and 0.25 dB better with dense updates, which move rarely used entries further; after 300 s with 2^18 entries, sparse
+updates were 0.21 dB better."""
 
 
 @dataclass(frozen=True)
@@ -55,33 +57,36 @@ class InstantNGPConfig(
         "detail": (1, 64),
         "hidden_width": (1, 2**14),
     }
-    """What these numbers may be."""
+    """Allowed range of each numeric setting."""
     num_levels: int = 16
-    """Resolutions of the hash grid."""
+    """Number of levels of the hash grid."""
     features_per_level: int = 2
-    """Features stored at a grid vertex."""
+    """Features per grid vertex."""
     base_resolution: int = 16
-    """Cells along an axis at the coarsest level."""
+    """Cells per axis at the coarsest level."""
     max_resolution: Auto[int] = AUTO
-    """Cells along an axis at the finest level. If not given: a power of two, `detail` cells a pixel or more."""
+    """Cells per axis at the finest level. If not given: a power of two, at least `detail` cells per pixel."""
     detail: Auto[int] = AUTO
-    """Finest cells along the images' longer side for each of its pixels. If not given: what suits the time."""
+    """Cells of the finest level per pixel of the longer side of the images. If not given: depends on --max-seconds."""
     log2_table_size: Auto[int] = AUTO
-    """Entries of a level's table at most, as a power of two. If not given: what suits the time."""
+    """Maximum number of table entries per level, log2. If not given: depends on --max-seconds."""
     sparse_updates: Auto[bool] = AUTO
-    """Adam updates only the table entries that a step used. If not given: where there are 2^17 or more a level."""
+    """Whether Adam updates only the table entries that a step used. If not given: from 2^17 entries per level on."""
     hidden_width: int = 64
-    """Features of a layer of the two networks."""
+    """Features per hidden layer of the two networks."""
     view_dependence: bool = True
-    """Colours depend on where they are seen from. False saves a few per cent of the time, and most scenes need it."""
+    """Whether colour depends on the viewing direction. Most scenes need it; False saves a few per cent of the time."""
 
 
 def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, list[Decision]]:
-    """Return the settings with what suits the time and the scene, and why.
+    """Fill in the settings that depend on the time budget and the scene.
 
     Args:
-        config: settings, some of which may be open.
-        scene: facts about the data.
+        config: the method's settings; those left open are filled in.
+        scene: properties of the data.
+
+    Returns:
+        Settings without open ones, and a record of each that was filled in.
     """
     seconds = math.inf if config.max_seconds is None else config.max_seconds
     limit, log2_table_size, num_steps, samples, detail = next(plan for plan in PLANS if seconds <= plan[0])
@@ -93,7 +98,7 @@ def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, li
         Choice("num_steps", num_steps, suits, "steps along the box's diagonal"),
         Choice("samples_per_batch", samples, suits, "samples a step"),
     )
-    config, _ = fill(config, Choice("detail", detail, suits))  # told with the resolution that follows from it
+    config, _ = fill(config, Choice("detail", detail, suits))  # reported with the resolution that follows from it
     finest = 2 ** (config.detail * scene.image_size - 1).bit_length()
     pays = config.log2_table_size >= SPARSE_FROM
     config, more = fill(
@@ -110,11 +115,11 @@ def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, li
 
 
 def make_field(config: InstantNGPConfig, scene: Scene) -> EncodedField:
-    """Return one hash field.
+    """Return a field of one hash grid and two small networks.
 
     Args:
-        config: the settings, decided.
-        scene: facts about the data.
+        config: the method's settings, none left open.
+        scene: properties of the data.
     """
     grid = HashGrid(
         config.num_levels,

@@ -23,6 +23,7 @@ from framework.kernels.spherical_harmonics import spherical_harmonics
 from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_choice
 
 MAX_SCALES = 4
+"""Maximum number of scales if the setting is left open; the paper's number."""
 
 
 @dataclass(frozen=True)
@@ -48,37 +49,39 @@ class KPlanesConfig(
         "time_smoothness": AT_LEAST_0,
         "time_sparsity": AT_LEAST_0,
     }
-    """What these numbers may be."""
+    """Allowed range of each numeric setting."""
     decoder: Literal["hybrid", "explicit"] = "hybrid"
-    """hybrid: two small networks. explicit: linear density, and a learned basis of colours."""
+    """hybrid: two small networks. explicit: density linear in the features, and a learned colour basis."""
     base_resolution: int = 64
-    """Vertices along an axis of space at the coarsest scale; each scale doubles it."""
+    """Vertices per axis of space at the coarsest scale; each further scale has twice as many."""
     num_scales: Auto[int] = AUTO
-    """Scales. If not given: as many as the images' pixels can show, 4 at most."""
+    """Number of scales. If not given: until the finest has a vertex per pixel of the images, but at most 4."""
     time_resolution: int = 25
-    """Vertices along time, at every scale; a second difference needs 3."""
+    """Vertices along the time axis at every scale; second differences need 3."""
     features_per_scale: int = 32
-    """Features of a plane's vertex."""
+    """Features per vertex of a plane."""
     hidden_width: int = 64
-    """Features of a layer of the networks."""
+    """Features per hidden layer of the networks."""
     space_tv: float = 1e-4
-    """Weight of the planes' total variation in space."""
+    """Weight of the total variation of the planes in space."""
     time_smoothness: float = 0.1
-    """Weight of the planes' second difference in time."""
+    """Weight of the squared second differences of the planes along time."""
     time_sparsity: float = 1e-4
-    """Weight of what keeps the planes of time at one, where nothing moves."""
+    """Weight of the mean distance of the time planes from one, their value where nothing moves."""
     sparse_updates: bool = True
-    """Adam updates only the entries that a step used."""
+    """Whether Adam updates only the table entries that a step used."""
 
 
 class ExplicitField(BoxField):
-    """Linear density, and colour as features times a basis that a small network of the direction learns (section 3.4).
+    """A field whose density is linear in the features, as is colour with a learned basis (section 3.4).
+
+    The basis is a small network of the direction.
 
     Args:
-        box: (2, 3) the part of space that is encoded.
-        planes: the encoding.
-        width: features of the basis network's hidden layers.
-        unbounded: encode all of space, contracted.
+        box: (2, 3) minimum and maximum corner of the encoded region, scene units.
+        planes: encoding of positions, and of times if the scene moves.
+        width: features per hidden layer of the basis network.
+        unbounded: whether all of space is encoded, contracted around the box.
     """
 
     def __init__(self, box: Tensor, planes: FeaturePlanes, width: int, unbounded: bool = False) -> None:
@@ -96,7 +99,7 @@ class ExplicitField(BoxField):
 
 
 class KPlanes(RayModel[KPlanesConfig], LearnsMotion):
-    """Planes of features in space and, for a scene that moves, in time, with the paper's regularisers."""
+    """A model of feature planes in space and, if the scene moves, in time, with the paper's regularisers."""
 
     def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
         variation, roughness, activity = self._regularisers(rendered.rgb.new_zeros(()))
@@ -107,9 +110,9 @@ class KPlanes(RayModel[KPlanesConfig], LearnsMotion):
         return losses
 
     def _regularisers(self, zero: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Total variation in space, roughness in time, distance of time's planes from one: means over planes.
+        """Return total variation in space, roughness in time and distance of time planes from one (equations 4 to 6).
 
-        Equations 4 to 6, on a random band of rows of each plane of space, and on time's small planes whole.
+        Each is a mean over planes: space planes by a random band of rows, the small time planes whole.
         """
         assert isinstance(self.field, BoxField)
         planes = self.field.encoding
@@ -131,18 +134,21 @@ class KPlanes(RayModel[KPlanesConfig], LearnsMotion):
 
 
 def _squared_steps(plane: Tensor, dim: int) -> Tensor:
-    """Mean squared difference of neighbours; 0 where there are none."""
+    """Return the mean squared difference of neighbours along `dim`; 0 if there is only one entry."""
     return plane.diff(dim=dim).square().mean() if plane.shape[dim] > 1 else plane.new_zeros(())
 
 
 def decide(config: KPlanesConfig, scene: Scene) -> tuple[KPlanesConfig, list[Decision]]:
-    """Return the settings with what the scene decides, and why.
+    """Fill in the settings that depend on the scene.
 
     Args:
-        config: settings, some of which may be open.
-        scene: facts about the data.
+        config: the method's settings; those left open are filled in.
+        scene: properties of the data.
+
+    Returns:
+        Settings without open ones, and a record of each that was filled in.
     """
-    scales = 1  # until a plane has a vertex a pixel or more, but no more than the paper's 4
+    scales = 1  # until a plane has at least a vertex per pixel
     while scales < MAX_SCALES and config.base_resolution << (scales - 1) < scene.image_size:
         scales += 1
     config, made = fill(
@@ -156,11 +162,11 @@ def decide(config: KPlanesConfig, scene: Scene) -> tuple[KPlanesConfig, list[Dec
 
 
 def make_field(config: KPlanesConfig, scene: Scene) -> BoxField:
-    """Return a field that reads feature planes.
+    """Return a field on feature planes, with the configured decoder.
 
     Args:
-        config: the settings, decided.
-        scene: facts about the data.
+        config: the method's settings, none left open.
+        scene: properties of the data.
     """
     time = (config.time_resolution,) if scene.moving else ()
     resolutions = tuple((config.base_resolution << scale,) * 3 + time for scale in range(config.num_scales))

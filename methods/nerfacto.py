@@ -1,6 +1,6 @@
-"""Nerfacto: what works on real captures, put together: hash grid, contraction, proposals, and what a scene asks for.
+"""Nerfacto: hash grid, contraction and proposal sampling for real captures; further parts depend on the data.
 
-Tancik et al., "Nerfstudio: A Modular Framework for Neural Radiance Field Development", SIGGRAPH 2023, section 4. The
+Tancik et al., "Nerfstudio: A Modular Framework for Neural Radiance Field Development", SIGGRAPH 2023, section 4. Its
 parts: hash grid (Mueller et al. 2022); contraction, proposals and distortion loss (Barron et al. 2022); appearance
 vectors (Martin-Brualla et al. 2021); gradients scaled near cameras (Philip and Deschaintre 2023).
 """
@@ -44,8 +44,11 @@ from framework.samplers.choice import SamplingConfig, make_sampler, sampler_choi
 from framework.samplers.proposal import half_edge
 
 APPEARANCE_SIZE = 16
+"""Default length of appearance vectors where the appearance varies."""
 DISTORTION = 2e-3
+"""Default weight of the distortion loss in unbounded scenes."""
 DEPTH = 0.1
+"""Default weight of the depth loss if there are depth images."""
 DEPTH_REASONS = {True: "there are depth images", False: "there are no depth images"}
 POSE_REASONS = {
     "exact": "the poses are exact",
@@ -68,7 +71,7 @@ class NerfactoConfig(
     eval_num_rays_per_chunk=4_096,
     sampler="proposal",
 ):
-    """Settings of nerfacto. What is not given is decided by the scene."""
+    """Settings of nerfacto; those not given depend on the scene."""
 
     RANGES: ClassVar[dict[str, Range]] = {
         "distortion_loss_mult": AT_LEAST_0,
@@ -83,49 +86,49 @@ class NerfactoConfig(
         "log2_table_size": (1, MAX_LOG2_TABLE_SIZE),
         "hidden_width": (1, 2**14),
     }
-    """What these numbers may be."""
+    """Allowed range of each numeric setting."""
     contraction: Auto[bool] = AUTO
-    """Contract all of space around the box. If not given: where there may be something outside it."""
+    """Whether space outside the box is contracted. If not given: in unbounded scenes."""
     distortion_loss_mult: Auto[float] = AUTO
-    """Weight of the distortion loss. If not given: 0.002 for unbounded scenes, else none."""
+    """Weight of the distortion loss. If not given: 0.002 in unbounded scenes, else 0."""
     appearance_embedding_dim: Auto[int] = AUTO
-    """Features in which each photograph may differ. If not given: 16 where light differs between them, else none."""
+    """Length of each image's appearance vector. If not given: 16 if light or exposure differ between images, else 0."""
     camera_optimizer: Literal["auto", "off", "SO3xR3", "SE3"] = "auto"
-    """Refine the training cameras' poses; auto: SO3xR3 where a device tracked them."""
+    """Refinement of the training cameras' poses; auto: SO3xR3 if a device tracked them, else off."""
     camera_learning_rate: float = 1e-3
-    """Of the poses."""
+    """Initial learning rate of the poses."""
     depth_loss_mult: Auto[float] = AUTO
-    """Weight of how far light comes from, against depth images. If not given: 0.1 where there are any, else none."""
+    """Weight of the depth loss. If not given: 0.1 if there are depth images, else 0."""
     predict_normals: bool = False
-    """Learn normals too, as the density's gradient has them but smoother."""
+    """Whether to predict normals, which are smoother than those of the density's gradient."""
     orientation_loss_mult: float = 0.1
-    """Weight of predicted normals that face away from where they are seen, relative to their distance from the
-    density's."""
+    """Weight of the penalty on predicted normals that face away from the camera, relative to that on their difference
+    from the density's normals."""
     gradient_scaling: Auto[bool] = AUTO
-    """Gradients grow with squared distance up to half of the box's edge, against floaters at cameras. If not given: for
-    unbounded scenes."""
+    """Whether gradients near cameras are scaled down, by squared distance up to half of the box's edge, against
+    floaters. If not given: in unbounded scenes."""
     num_levels: int = 16
-    """Resolutions of the hash grid."""
+    """Number of levels of the hash grid."""
     features_per_level: int = 2
-    """Features stored at a grid vertex."""
+    """Features per grid vertex."""
     base_resolution: int = 16
-    """Cells along an axis at the coarsest level."""
+    """Cells per axis at the coarsest level."""
     max_resolution: int = 2_048
-    """Cells along an axis at the finest level."""
+    """Cells per axis at the finest level."""
     log2_table_size: int = 18
-    """Entries of a level's table at most, as a power of two."""
+    """Maximum number of table entries per level, log2."""
     sparse_updates: bool = True
-    """Adam updates only the table entries that a step used."""
+    """Whether Adam updates only the table entries that a step used."""
     hidden_width: int = 64
-    """Features of a layer of the two networks."""
+    """Features per hidden layer of the two networks."""
 
 
 class NerfactoRenderer(VolumeRenderer):
-    """Volume rendering whose gradients fade near cameras, and with normals where they are predicted.
+    """Volume rendering with optional gradient scaling near cameras and optional predicted normals.
 
     Args:
-        unit_length: distance from a camera up to which gradients are scaled; None for no scaling.
-        normals: predicts normals; None for none.
+        unit_length: distance from the camera up to which gradients are scaled, scene units; None for no scaling.
+        normals: the network that predicts normals; None for no normals.
     """
 
     def __init__(self, unit_length: float | None, normals: NormalHead | None) -> None:
@@ -142,7 +145,7 @@ class NerfactoRenderer(VolumeRenderer):
     def _with_normals(
         self, head: NormalHead, field: Field, rays: Rays, samples: Samples, rendered: Rendered
     ) -> Rendered:
-        """Return the same with normals, and in training with what is wrong with them."""
+        """Return `rendered` with normals, and in training with their penalties."""
         assert isinstance(field, EncodedField)
         assert samples.features is not None
         assert rendered.weights is not None
@@ -158,7 +161,18 @@ class NerfactoRenderer(VolumeRenderer):
 
 
 class Nerfacto(RayModel[NerfactoConfig]):
-    """One hash field, sampled where proposals say, with what a capture asks for."""
+    """A model whose training poses can be refined, with appearance vectors, distortion and depth losses.
+
+    Args:
+        config: the method's settings, none left open.
+        scene: properties of the data.
+        field: density and colour.
+        sampler: chooses the samples along rays.
+        renderer: turns samples into colours and depths.
+
+    Raises:
+        ConfigError: if poses are to be refined in normalised device coordinates or with another sampler than proposals.
+    """
 
     def __init__(
         self, config: NerfactoConfig, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer
@@ -177,14 +191,14 @@ class Nerfacto(RayModel[NerfactoConfig]):
 
     @property
     def appearance(self) -> Appearance | None:
-        """The images' appearance vectors."""
+        """Appearance vectors of the training images; None if there are none."""
         return self.field.appearance if isinstance(self.field, EncodedField) else None
 
     def refined_cameras(self, cameras: Cameras) -> Cameras:
-        """Return the training cameras where they are believed to be.
+        """Return the training cameras with refined poses.
 
         Args:
-            cameras: M training cameras as they are given.
+            cameras: M training cameras with the poses of the data.
         """
         return cameras if self.poses is None else self.poses.refined(cameras)
 
@@ -208,11 +222,14 @@ class Nerfacto(RayModel[NerfactoConfig]):
 
 
 def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[Decision]]:
-    """Return the settings with what the scene asks for, and why.
+    """Fill in the settings that depend on the scene.
 
     Args:
-        config: settings, some of which may be open.
-        scene: facts about the data.
+        config: the method's settings; those left open are filled in.
+        scene: properties of the data.
+
+    Returns:
+        Settings without open ones, and a record of each that was filled in.
     """
     unbounded = scene.unbounded if config.contraction is None else config.contraction
     config, made = fill(config, sampler_choice(config, unbounded))
@@ -236,11 +253,11 @@ def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[D
 
 
 def make_field(config: NerfactoConfig, scene: Scene) -> EncodedField:
-    """Return one hash field, with appearance vectors where light differs.
+    """Return a field of one hash grid and two small networks, with appearance vectors if their length is not 0.
 
     Args:
-        config: the settings, decided.
-        scene: facts about the data.
+        config: the method's settings, none left open.
+        scene: properties of the data.
     """
     grid = HashGrid(
         config.num_levels,
@@ -261,21 +278,21 @@ def make_field(config: NerfactoConfig, scene: Scene) -> EncodedField:
 
 
 def sampler(config: NerfactoConfig, scene: Scene) -> Sampler:
-    """Return the sampler that is asked for, of all of space where it is contracted.
+    """Return the configured sampler, over all of space if it is contracted.
 
     Args:
-        config: the settings, decided.
-        scene: facts about the data.
+        config: the method's settings, none left open.
+        scene: properties of the data.
     """
     return make_sampler(config, replace(scene, unbounded=config.contraction))
 
 
 def renderer(config: NerfactoConfig, scene: Scene) -> Renderer:
-    """Return the renderer, with a head for normals where they are asked for.
+    """Return the renderer, with gradient scaling and predicted normals as configured.
 
     Args:
-        config: the settings, decided.
-        scene: facts about the data.
+        config: the method's settings, none left open.
+        scene: properties of the data.
     """
     normals = NormalHead(NUM_FEATURES, config.hidden_width) if config.predict_normals else None
     return NerfactoRenderer(half_edge(scene.box) if config.gradient_scaling else None, normals)

@@ -44,15 +44,15 @@ VM = (((0, 1), (2,)), ((0, 2), (1,)), ((1, 2), (0,)))
 CP = (((0,), (1,), (2,)),)
 """One group: a line along each axis (equation 3)."""
 DENSITY_SHIFT, DENSITY_SCALE = -10.0, 25.0
-"""Density is DENSITY_SCALE * softplus(sum of components + DENSITY_SHIFT): empty at first (section 4.4 and its code)."""
+"""Density is DENSITY_SCALE * softplus(sum of components + DENSITY_SHIFT), near 0 at first (section 4.4 and code)."""
 BLIND_STEPS = 128
-"""The field is empty at first: until it has learnt something, it does not say what cells to skip."""
+"""Steps before the occupancy grid is updated: the field starts empty, and would mark every cell as empty."""
 FIRST_SIDE, LAST_SIDE = 128, {"vm": 300, "cp": 500}
-"""Of the first grid and the last one, as cubes (section 5)."""
+"""Vertices per axis of the first and the last grid, if cubes (section 5)."""
 VERTICES_PER_PIXEL = 2
-"""Along an axis, of the photographs' longer side: more tell nothing apart, and each of them has to be learnt."""
+"""Maximum number of vertices per axis, per pixel of the images' longer side: the images cannot resolve more."""
 MARGIN = 1
-"""Cells of the occupancy grid kept around what is occupied when the box shrinks."""
+"""Cells of the occupancy grid kept around the occupied ones when the box shrinks."""
 
 
 @dataclass(frozen=True)
@@ -78,40 +78,43 @@ class TensoRFConfig(
         "total_variation": AT_LEAST_0,
         "hidden_width": (1, 2**14),
     }
-    """What these numbers may be."""
+    """Allowed range of each numeric setting."""
     network_learning_rate: float = 1e-3
-    """Of the basis and the colour network."""
+    """Initial learning rate of the basis and the colour network."""
     decomposition: Literal["vm", "cp"] = "vm"
-    """vm: planes and lines. cp: lines alone, which is slower to learn and under 4 MB."""
+    """vm: planes and lines. cp: lines alone, which take less than 4 MB and learn more slowly."""
     density_components: Auto[int] = AUTO
-    """Of each group. If not given: 16 (vm) or 96 (cp)."""
+    """Components of density per group. If not given: 16 (vm) or 96 (cp)."""
     appearance_components: Auto[int] = AUTO
-    """Of each group. If not given: 48 (vm) or 288 (cp)."""
+    """Components of appearance per group. If not given: 48 (vm) or 288 (cp)."""
     first_voxels: Auto[int] = AUTO
-    """Voxels that the vertices of the first grid make. If not given: 128^3, or what the photographs tell apart."""
+    """Vertices of the first grid. If not given: 128^3, or fewer if the images cannot resolve as many."""
     last_voxels: Auto[int] = AUTO
-    """The same for the last grid. If not given: 300^3 (vm) or 500^3 (cp), or what the photographs tell apart."""
+    """Vertices of the last grid. If not given: 300^3 (vm) or 500^3 (cp), or fewer as for --first-voxels."""
     upsample_at: tuple[float, ...] = (0.07, 0.1, 0.13, 0.18, 0.23)
-    """Shares of the budget after which the grid grows, in equal ratios; the box shrinks to what is occupied before."""
+    """Fractions of the budget at which the grid grows, by equal ratios, and the box shrinks to occupied space."""
     sparsity: float = 8e-5
-    """Weight of the mean absolute values of density's factors; half of it once the grid has grown."""
+    """Weight of the mean absolute values of the density factors; halved once the grid has grown."""
     total_variation: float = 0.0
-    """Weight of the factors' total variation, of appearance a tenth; for photographs of real scenes, 0.01 and more."""
+    """Weight of the total variation of the density factors; a tenth of it for appearance. Real scenes need 0.01 or
+    more."""
     hidden_width: int = 128
-    """Features of a layer of the colour network."""
+    """Features per hidden layer of the colour network."""
     sparse_updates: bool = True
-    """Adam updates only the entries that a step used."""
+    """Whether Adam updates only the table entries that a step used."""
 
 
 class TensorField(Field):
-    """Density as a sum of components; colour from components of its own by a basis and a small network (section 4.3).
+    """A field whose density is a sum of components (section 4.3).
+
+    Colour has components of its own, which a linear basis and a small network turn into RGB.
 
     Args:
-        box: (2, 3) the part of space that is encoded.
-        density, appearance: the factors.
-        width: features of the colour network's hidden layers.
-        num_features: of which the basis makes the appearance (27 in the paper).
-        unbounded: the factors stand in all of space, contracted.
+        box: (2, 3) minimum and maximum corner of the encoded region, scene units.
+        density, appearance: factors of the components.
+        width: features per hidden layer of the colour network.
+        num_features: outputs of the basis (27 in the paper).
+        unbounded: whether the factors cover all of space, contracted around the box.
     """
 
     box: Tensor
@@ -139,7 +142,7 @@ class TensorField(Field):
 
     @staticmethod
     def _sigma(components: Tensor, unit: Tensor) -> Tensor:
-        """Density of summed components, and none outside the box, which may have shrunk."""
+        """Return density, the activated sum of `components` (N, K); 0 outside the box, which may have shrunk."""
         inside = ((unit >= 0) & (unit <= 1)).all(-1)
         return softplus(components.float().sum(-1) + DENSITY_SHIFT) * DENSITY_SCALE * inside
 
@@ -152,10 +155,18 @@ class TensorField(Field):
 
 
 class TensoRF(RayModel[TensoRFConfig]):
-    """Factors that grow from coarse to fine, while their box shrinks to what an occupancy grid, if used, has found."""
+    """A model whose factors grow from coarse to fine; with an occupancy grid, their box shrinks to occupied space.
+
+    Args:
+        config: the method's settings, none left open.
+        scene: properties of the data.
+        field: the `TensorField`.
+        sampler: chooses the samples along rays.
+        renderer: turns samples into colours and depths.
+    """
 
     growths: Tensor
-    """Times the grid has grown."""
+    """Number of times that the grid has grown."""
 
     def __init__(self, config: TensoRFConfig, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer) -> None:
         super().__init__(config, scene, field, sampler, renderer)
@@ -163,7 +174,7 @@ class TensoRF(RayModel[TensoRFConfig]):
 
     @property
     def factors(self) -> TensorField:
-        """The field, whose factors grow."""
+        """The field, whose factors are resampled."""
         assert isinstance(self.field, TensorField)
         return self.field
 
@@ -177,7 +188,7 @@ class TensoRF(RayModel[TensoRFConfig]):
 
     @torch.no_grad()
     def _grow(self, share: float) -> None:
-        """More voxels, over what of the box is occupied. Their number grows evenly in its logarithm."""
+        """Resample the factors over the occupied box, with first^(1 - share) * last^share vertices."""
         voxels = self.config.first_voxels ** (1 - share) * self.config.last_voxels**share
         box, field = self._occupied_box(), self.factors
         vertices = vertices_of(voxels, box)
@@ -190,7 +201,7 @@ class TensoRF(RayModel[TensoRFConfig]):
         field.box.copy_(box)
 
     def _occupied_box(self) -> Tensor:
-        """(2, 3) corners of what holds all occupied cells and a margin; the field's box where none is."""
+        """Return corners (2, 3) around all occupied cells and a margin; the field's box if no cell is occupied."""
         sampler, box = self.sampler, self.factors.box
         if not isinstance(sampler, SkipsCells):
             return box.clone()
@@ -200,8 +211,8 @@ class TensoRF(RayModel[TensoRFConfig]):
             return box.clone()
         corners = torch.stack([cells // n**2, cells // n % n, cells % n], dim=-1)
         ends = torch.stack([corners.min(0).values - MARGIN, corners.max(0).values + 1 + MARGIN]) / n
-        found = torch.lerp(sampler.box[0], sampler.box[1], ends)
-        return torch.stack([found[0].maximum(box[0]), found[1].minimum(box[1])])
+        occupied = torch.lerp(sampler.box[0], sampler.box[1], ends)
+        return torch.stack([occupied[0].maximum(box[0]), occupied[1].minimum(box[1])])
 
     def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
         losses, field = dict[str, Tensor](), self.factors
@@ -216,31 +227,34 @@ class TensoRF(RayModel[TensoRFConfig]):
 
 
 def _sum_over_bands(factors: FeaturePlanes, measure: Callable[[Tensor], Tensor]) -> Tensor:
-    """What is measured on a random band of rows of each factor."""
+    """Return the sum of `measure` over a random band of rows of each factor."""
     axes = factors.layout.axes
     bands = (factors.random_band(group, index) for group in range(len(axes)) for index in range(len(axes[group])))
     return torch.stack([measure(band) for band in bands]).sum()
 
 
 def _variation(band: Tensor) -> Tensor:
-    """Sum over both axes of the mean squared difference of neighbours, where there are any."""
-    found = band.new_zeros(())
+    """Return the mean squared difference of neighbours, summed over the axes that have any."""
+    variation = band.new_zeros(())
     for dim in (0, 1):
         if band.shape[dim] > 1:
-            found = found + band.diff(dim=dim).square().mean()
-    return found
+            variation = variation + band.diff(dim=dim).square().mean()
+    return variation
 
 
 def decide(config: TensoRFConfig, scene: Scene) -> tuple[TensoRFConfig, list[Decision]]:
-    """Return the settings with what the images tell apart, and why.
+    """Fill in the settings that depend on the scene and on the resolution of the images.
 
     Args:
-        config: settings, some of which may be open.
-        scene: facts about the data.
+        config: the method's settings; those left open are filled in.
+        scene: properties of the data.
+
+    Returns:
+        Settings without open ones, and a record of each that was filled in.
     """
     density, appearance = (16, 48) if config.decomposition == "vm" else (96, 288)
-    told_apart = VERTICES_PER_PIXEL * scene.image_size
-    first, last = (min(side, told_apart) for side in (FIRST_SIDE, LAST_SIDE[config.decomposition]))
+    resolved = VERTICES_PER_PIXEL * scene.image_size
+    first, last = (min(side, resolved) for side in (FIRST_SIDE, LAST_SIDE[config.decomposition]))
     decomposed = f"the decomposition is {config.decomposition}"
     pixels = f"the images have {scene.image_size} pixels along a side"
     return fill(
@@ -254,11 +268,11 @@ def decide(config: TensoRFConfig, scene: Scene) -> tuple[TensoRFConfig, list[Dec
 
 
 def vertices_of(voxels: float, box: Tensor) -> tuple[int, ...]:
-    """Return the vertices along each axis of a grid of about so many cubes over a box.
+    """Return the number of vertices along each axis of a grid of cubic voxels over a box, at least 2.
 
     Args:
-        voxels: how many cubes.
-        box: (2, 3) corners.
+        voxels: approximate number of voxels.
+        box: (2, 3) minimum and maximum corner, scene units.
     """
     size = (box[1] - box[0]).tolist()
     edge = (math.prod(size) / voxels) ** (1 / 3)
@@ -266,16 +280,18 @@ def vertices_of(voxels: float, box: Tensor) -> tuple[int, ...]:
 
 
 def make_field(config: TensoRFConfig, scene: Scene) -> TensorField:
-    """Return the factors and the network that reads them.
+    """Return the field with its first, coarsest factors.
 
     Args:
-        config: the settings, decided.
-        scene: facts about the data.
-    Raises: ConfigError where the machine has less memory than the last grid takes.
+        config: the method's settings, none left open.
+        scene: properties of the data.
+
+    Raises:
+        ConfigError: if the last grid needs more memory than the machine has.
     """
     axes = VM if config.decomposition == "vm" else CP
     counts = config.density_components, config.appearance_components
-    for voxels in (config.first_voxels, config.last_voxels):  # before the training that the last would end
+    for voxels in (config.first_voxels, config.last_voxels):  # check both now: the last is made late in training
         layout = PlanesLayout.build((vertices_of(voxels, scene.box),) * len(axes), axes)
         require(4.0 * layout.num_entries * sum(counts), "a grid")
     vertices = (vertices_of(config.first_voxels, scene.box),) * len(axes)
@@ -287,7 +303,7 @@ def make_field(config: TensoRFConfig, scene: Scene) -> TensorField:
     field.optimised = Optimised("networks", learning_rate=config.network_learning_rate)
     for factors in (density, appearance):
         factors.optimised = Optimised("tables", config.learning_rate, sparse=config.sparse_updates)
-        with torch.no_grad():  # of CP's triple products the factors are larger, as in the authors' code
+        with torch.no_grad():  # CP multiplies three factors, which are larger, as in the authors' code
             factors.table.normal_(0, 0.1 if config.decomposition == "vm" else 0.2)
     return field
 

@@ -1,8 +1,8 @@
-"""NeRF as published in 2020: one large network on frequency encodings, coarse and fine sampling.
+"""NeRF: large networks on frequency encodings, with coarse and fine sampling.
 
 Mildenhall et al., "NeRF: Representing Scenes as Neural Radiance Fields for View Synthesis", ECCV 2020. With
-`--sampler occupancy` one network of the same shape is sampled through an occupancy grid instead: empty and hidden
-space is skipped (as in NerfAcc, Li et al. 2023).
+`--sampler occupancy`, one network of the same shape is sampled with an occupancy grid instead, which skips empty and
+hidden space (as in NerfAcc, Li et al. 2023).
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ from framework.kernels.frequency import MAX_FREQUENCIES
 from framework.samplers.choice import HierarchicalConfig, contracted_box, make_sampler, sampler_choice
 
 OCCUPANCY_SAMPLES_PER_BATCH = 2**12
-"""With the occupancy grid the number of samples a ray varies a hundredfold, so the number of rays follows it."""
+"""Samples of a training step with the occupancy grid, where the number of samples per ray varies a hundredfold."""
 A_RAY = "the number of samples on a ray varies a hundredfold"
+"""Reason for a fixed number of samples, rather than of rays, per training step."""
 OCCUPANCY_RATE = 2.0
-"""Times the learning rate with the occupancy grid. Smaller batches and longer steps (`num_steps`) at twice the rate
-reached 22.5 dB on Lego after 90 s on two cores, where 2^13 samples, 512 steps and the paper's rate were at 17."""
+"""Factor of the learning rate with the occupancy grid. On Lego after 90 s on two cores, smaller batches and longer
+marching steps (`num_steps`) at twice the rate reached 22.5 dB; 2^13 samples, 512 steps and the paper's rate, 17 dB."""
 
 
 @dataclass(frozen=True)
@@ -46,23 +47,26 @@ class VanillaNeRFConfig(
         "position_frequencies": (0, MAX_FREQUENCIES),
         "direction_frequencies": (0, MAX_FREQUENCIES),
     }
-    """What these numbers may be."""
+    """Allowed range of each numeric setting."""
     num_layers: int = 8
-    """Layers before density."""
+    """Layers before the density output."""
     hidden_width: int = 256
-    """Features of a layer."""
+    """Features per layer."""
     position_frequencies: int = 10
-    """L of the position's encoding."""
+    """Number of frequencies in the encoding of positions."""
     direction_frequencies: int = 4
-    """L of the direction's encoding."""
+    """Number of frequencies in the encoding of directions."""
 
 
 def decide(config: VanillaNeRFConfig, scene: Scene) -> tuple[VanillaNeRFConfig, list[Decision]]:
-    """Return the settings with what the scene decides, and why.
+    """Fill in the settings that depend on the scene.
 
     Args:
-        config: settings, some of which may be open.
-        scene: facts about the data.
+        config: the method's settings; those left open are filled in.
+        scene: properties of the data.
+
+    Returns:
+        Settings without open ones, and a record of each that was filled in.
     """
     config, made = fill(config, sampler_choice(config, scene.unbounded))
     if config.sampler != "occupancy":
@@ -72,11 +76,11 @@ def decide(config: VanillaNeRFConfig, scene: Scene) -> tuple[VanillaNeRFConfig, 
 
 
 def make_field(config: VanillaNeRFConfig, scene: Scene) -> NeRFField:
-    """Return one network; the coarse one is of the same shape.
+    """Return the network of the fine field; the coarse one has the same shape.
 
     Args:
-        config: the settings, decided.
-        scene: facts about the data.
+        config: the method's settings, none left open.
+        scene: properties of the data.
     """
     field = NeRFField(
         config.hidden_width,
@@ -92,11 +96,11 @@ def make_field(config: VanillaNeRFConfig, scene: Scene) -> NeRFField:
 
 
 def sampler(config: VanillaNeRFConfig, scene: Scene) -> Sampler:
-    """Return the sampler that is asked for; the coarse field of the paper's is a network like the fine one.
+    """Return the configured sampler; the coarse field of hierarchical sampling is built like the fine one.
 
     Args:
-        config: the settings, decided.
-        scene: facts about the data.
+        config: the method's settings, none left open.
+        scene: properties of the data.
     """
     return make_sampler(config, scene, partial(make_field, config, scene))
 

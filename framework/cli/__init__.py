@@ -1,1 +1,1 @@
-"""The commands."""
+"""The commands of nerfloom: ns-train, ns-eval and others."""

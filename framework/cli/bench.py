@@ -1,4 +1,4 @@
-"""ns-bench: measurements that anybody can repeat, of kernels, samplers, methods and all that stands around them."""
+"""The command `ns-bench`: repeatable measurements of kernels, samplers, methods, caching and camera poses."""
 
 from __future__ import annotations
 
@@ -17,121 +17,122 @@ from framework.cli.common import chosen_kind, make_room, run_command
 USAGE = """\
 usage: ns-bench WHAT [flags]
 
-  kernels          time and error of every compiled kernel against torch, beside what the machine can do at all
-  quadrature       error against field evaluations of every sampler, on scenes whose integral is known
+  kernels          time and error of every compiled kernel against torch, and the machine's measured limits
+  quadrature       error of every sampler against field evaluations per ray, on scenes with a known integral
   methods          time to each PSNR of every built-in method, on the embedded scene or on --data
-  ablation         what each part of instant-ngp is worth: trained with one part switched off, or on, in turn
-  profile-step     where the time of a training step goes: to each compiled kernel, and to Python and torch
+  ablation         effect of each part of instant-ngp: training with one part switched off, or on, in turn
+  profile-step     time of a training step: of each compiled kernel, and of Python and torch
   contention       speed of training and rendering beside other programs
-  cache            memory and speed of a large image set under --cache-limit, beside a small set in memory
-  poses            poses found by ns-process-data beside those of a COLMAP model of the same images
-  pose-refinement  what refining camera poses mends, on the embedded scene with its training poses disturbed
+  cache            memory and speed with a large image set under --cache-limit, and with a small one in memory
+  poses            differences between poses from ns-process-data and from a COLMAP model of the same images
+  pose-refinement  effect of refining camera poses, on the embedded scene with disturbed training poses
 
-ns-bench WHAT --help shows its flags. Results are JSON, in docs/results of the working folder unless --output-dir or
---output says otherwise; poses prints them.
+ns-bench WHAT --help shows its flags. Results are written as JSON to docs/results in the working folder, or to
+--output-dir or --output; poses prints them.
 """
 RESULTS = Path("docs/results")
+"""Default folder of the results."""
 
 
 @dataclass(frozen=True)
 class KernelFlags:
-    """Time per sample and error of each compiled kernel against its torch reference, in alternating runs."""
+    """Measure time per sample and error of each compiled kernel against its torch reference, in alternating runs."""
 
     samples: int = 2**15
-    """Samples in a batch."""
+    """Number of samples in a batch."""
     repeats: int = 9
-    """Runs of which medians are taken."""
+    """Number of runs, of which medians are reported."""
     variants: tuple[str, ...] = ()
-    """Instruction sets, each measured in a process of its own, as in avx2 avx512; the fastest if not given."""
+    """Instruction sets, each measured in its own process, such as avx2 avx512; the fastest if not given."""
     output_dir: Path = RESULTS
-    """Where kernels-VARIANT.json goes."""
+    """Folder of kernels-VARIANT.json."""
     plot_dir: Path | None = None
-    """Where a picture of the times goes; none if not given."""
+    """Folder of a plot of the times; no plot if not given."""
 
 
 @dataclass(frozen=True)
 class QuadratureFlags:
-    """Error of the rendered colour against field evaluations a ray, for every sampler, where the truth is known."""
+    """Measure the error of colours against field evaluations per ray, for every sampler, with known true colours."""
 
     quick: bool = False
-    """Fewer rays and counts: a minute instead of ten."""
+    """Use fewer rays and sample counts: one minute instead of ten."""
     seed: int = 0
-    """Of rays, jitter and proposals."""
+    """Random seed of rays, jitter and proposals."""
     output_dir: Path = RESULTS
-    """Where quadrature.json goes."""
+    """Folder of quadrature.json."""
     plot_dir: Path | None = None
-    """Where pictures of the curves go; none if not given."""
+    """Folder of plots of the curves; no plots if not given."""
 
 
 @dataclass(frozen=True)
 class MethodFlags:
-    """Train every built-in method on one data set for the same time; a comparison as by ns-compare."""
+    """Train every built-in method on one data set for the same time and compare them, as ns-compare does."""
 
     data: Path | None = None
-    """Folder of the data set. The embedded scene if not given."""
+    """Folder of the data set; the embedded scene if not given."""
     max_seconds: float = 120.0
     """Seconds of training of each method."""
     repeats: int = 1
-    """Seeds."""
+    """Number of runs of each method, with different seeds."""
     run_dir: Path | None = None
-    """Where runs and report go; outputs/bench-DATA if not given."""
+    """Folder of runs and report; outputs/bench-DATA if not given."""
     output_dir: Path = RESULTS
-    """Where methods-DATA.json goes."""
+    """Folder of methods-DATA.json."""
     plot_dir: Path | None = None
-    """Where a picture of time against error goes; none if not given."""
+    """Folder of a plot of PSNR over time; no plot if not given."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AblationFlags:
-    """Train instant-ngp with one of its parts switched off, or on, in turn: time to a PSNR, and PSNR at the end."""
+    """Train instant-ngp with one part switched off, or on, in turn; report the time to a PSNR and the final PSNR."""
 
     data: Path
     """Folder of the data set."""
     seconds: float = 45.0
     """Seconds of training of each run."""
     seeds: int = 2
-    """Runs of each variant."""
+    """Number of runs of each variant."""
     target: float = 30.0
-    """PSNR on validation views, dB, the time to which is reported."""
+    """PSNR of the validation views, dB, to which the time is reported."""
     output_dir: Path = RESULTS
-    """Where ablation-DATA.json goes."""
+    """Folder of ablation-DATA.json."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProfileFlags:
-    """Train for a while, then measure 200 steps: the time in each compiled kernel, and the rest."""
+    """Train for some steps, then measure 200: the time in each compiled kernel, and the rest."""
 
     data: Path
     """Folder of the data set."""
     method: str = "instant-ngp"
     """Name of the method."""
     steps: int = 900
-    """Steps before the measurement."""
+    """Training steps before the measurement."""
     max_seconds: float = 45.0
-    """Seconds of training for which the method chooses its settings; it is not stopped by them."""
+    """Time budget, seconds, for which the method chooses its settings; training does not stop after it."""
     output_dir: Path = RESULTS
-    """Where profile-METHOD.json goes."""
+    """Folder of profile-METHOD.json."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ContentionFlags:
-    """Run instant-ngp alone, beside busy loops and beside itself: what share of its speed is left, and what is fair."""
+    """Run instant-ngp alone, beside busy loops and beside itself; report the remaining fraction of its speed."""
 
     data: Path
     """Folder of the data set."""
     seconds: float = 20.0
     """Seconds of each measurement."""
     rows: tuple[str, ...] = ()
-    """Names of conditions, or parts of names; all if not given. Running alone is always measured."""
+    """Names of conditions, or parts of names; all if not given. The run alone is always measured."""
     work: Literal["training", "rendering"] | None = None
-    """What is measured; both if not given."""
+    """Work to measure; both if not given."""
     output: Path = RESULTS / "contention.json"
-    """The JSON file."""
+    """JSON file to write."""
 
 
 @dataclass(frozen=True)
 class CacheFlags:
-    """Train on large images with their pixels in a file, and on small ones in memory: memory, speed, waiting."""
+    """Train on large images with pixels in a file and on small ones in memory; report memory, speed and waiting."""
 
     images: int = 250
     """Number of images."""
@@ -142,16 +143,16 @@ class CacheFlags:
     seconds: float = 60.0
     """Seconds of training on each set."""
     limit: float = 500.0
-    """MB of decoded pixels that may be in memory."""
+    """Maximum memory of decoded pixels, MB."""
     folder: Path | None = None
-    """Where images and cache go while it runs; the system's temporary folder if not given."""
+    """Folder of images and cache during the run; the system's temporary folder if not given."""
     output: Path = RESULTS / "cache.json"
-    """The JSON file."""
+    """JSON file to write."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PosesFlags:
-    """Compare the poses that ns-process-data found with those of a COLMAP model of the same images, by name."""
+    """Compare poses from ns-process-data with those of a COLMAP model of the same images, by name."""
 
     processed: Path
     """Folder with transforms.json."""
@@ -161,22 +162,22 @@ class PosesFlags:
 
 @dataclass(frozen=True)
 class PoseRefinementFlags:
-    """Train on the embedded scene with exact, disturbed and refined poses: errors of the poses, and PSNR."""
+    """Train on the embedded scene with exact, disturbed and refined poses; report pose errors and PSNR."""
 
     seconds: float = 120.0
     """Seconds of training of each run."""
     degrees: float = 1.0
-    """Angle by which each training camera is turned."""
+    """Angle by which each training camera is rotated, degrees."""
     percent: float = 1.0
-    """Distance by which each is moved, in percent of its distance from the middle of the scene."""
+    """Distance by which each training camera is moved, per cent of its distance from the centre of the scene."""
     method: str = "nerfacto"
     """Name of the method."""
     output_dir: Path = RESULTS
-    """Where pose-refinement.json goes."""
+    """Folder of pose-refinement.json."""
 
 
 def main() -> None:
-    """The ns-bench command."""
+    """Run ns-bench on the arguments of the process."""
     run_command(_command)
 
 

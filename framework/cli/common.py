@@ -1,4 +1,4 @@
-"""What the commands share: one-line errors, and how flags become settings."""
+"""Functions that all commands share: errors on one line, exit statuses, and arguments before the flags."""
 
 from __future__ import annotations
 
@@ -22,13 +22,19 @@ K = TypeVar("K")
 def chosen_kind(
     arguments: list[str], kinds: Mapping[str, K], usage: str, unknown: str
 ) -> tuple[str, K, list[str]] | None:
-    """What the first argument names, and the arguments behind it; None where help was asked for, which is printed.
+    """Return what the first argument names, or print the help if it asks for it.
 
     Args:
-        kinds: what may be named.
-        usage: the help.
-        unknown: how to call a name that is not among them, as in "unknown path".
-    Raises: ConfigError for such a name, with the nearest.
+        arguments: arguments of the command.
+        kinds: what may be named, by name.
+        usage: text of the help.
+        unknown: start of the message for another name, such as "unknown path".
+
+    Returns:
+        The name, its entry of `kinds` and the remaining arguments; None if the help was printed.
+
+    Raises:
+        ConfigError: if `kinds` has no such name; the message suggests the nearest.
     """
     if not arguments or arguments[0] in ("-h", "--help"):
         print(usage)
@@ -42,43 +48,50 @@ def chosen_kind(
 
 
 def with_run(arguments: list[str]) -> list[str]:
-    """The arguments of a command that takes a run, where it may stand without --load-config, as in ns-eval RUN_FOLDER.
+    """Return the arguments of a command that takes a run, with --load-config before a run without it.
 
-    Every flag has one value, or holds it after a =.
+    So `ns-eval RUN_FOLDER` is `ns-eval --load-config RUN_FOLDER`.
+
+    Args:
+        arguments: arguments of the command; each flag has one value, as the next argument or after a "=".
     """
     if any(word.partition("=")[0] == "--load-config" for word in arguments):
         return arguments
-    place = 0
-    while place < len(arguments):
-        word = arguments[place]
+    index = 0
+    while index < len(arguments):
+        word = arguments[index]
         if not word.startswith("-"):
-            return [*arguments[:place], "--load-config", *arguments[place:]]
-        place += 1 if "=" in word or word in ("-h", "--help") else 2
+            return [*arguments[:index], "--load-config", *arguments[index:]]
+        index += 1 if "=" in word or word in ("-h", "--help") else 2
     return arguments
 
 
 def make_room(path: Path) -> None:
-    """Make the folder of a file that is to be written, and see that it can be, before anything is spent on it.
+    """Create the folder of the file `path`, and check that the file can be written, before any work is done for it.
 
-    Raises: ConfigError where it cannot.
+    Raises:
+        ConfigError: if it cannot be written.
     """
-    there = os.path.lexists(path)
+    existed = os.path.lexists(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.open("ab").close()
-        if not there:
+        if not existed:
             path.unlink()
     except OSError as error:
-        # A file where a folder must be: `mkdir` only says that it exists.
+        # If the folder is a file, the error of `mkdir` only says that it exists.
         reason = os.strerror(errno.ENOTDIR) if isinstance(error, FileExistsError) else error.strerror
         raise ConfigError(f"cannot write {path}: {reason}; name another place") from error
 
 
 def run_command(command: Callable[[list[str]], None]) -> None:
-    """Run a command on the process's arguments.
+    """Run a command on the arguments of the process, and exit with its status.
 
-    Errors a user can act on become one line and exit status 1; `--debug` anywhere shows the traceback instead. A
-    command that a signal ends says so, and exits with 128 and the signal's number.
+    Errors that a user can act on are printed on one line, and the exit status is 1; with `--debug` among the arguments,
+    the traceback is shown. After a signal the status is 128 plus the signal's number.
+
+    Args:
+        command: function of the list of arguments, without `--debug`.
     """
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     debug = len(arguments) < len(sys.argv) - 1
@@ -106,13 +119,13 @@ def run_command(command: Callable[[list[str]], None]) -> None:
 
 
 def version() -> str:
-    """The line that --version prints: the package's version, where it lies, and the Python that runs it."""
-    place = Path(framework.__file__).parent
-    return f"nerfloom {framework.__version__} from {place} (Python {platform.python_version()})"
+    """Return the line that --version prints: the package's version, its folder, and the version of Python."""
+    folder = Path(framework.__file__).parent
+    return f"nerfloom {framework.__version__} from {folder} (Python {platform.python_version()})"
 
 
 def in_our_words(error: Exception) -> str:
-    """An error's line; of the system's errors the file comes first, and its number is left out."""
+    """Return the line of text for an `error`; an OSError becomes its file and its reason, without its number."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename is not None else error.strerror
     return str(error)

@@ -1,4 +1,4 @@
-"""ns-compare: several methods on one data set, under the same conditions, and a report."""
+"""The command `ns-compare`: several methods on one data set, under the same conditions, and a report."""
 
 from __future__ import annotations
 
@@ -17,40 +17,40 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CompareFlags:
-    """Compare methods on one data set: each is trained and judged under the same conditions, in a process of its own.
+    """Compare methods on one data set: each is trained and evaluated under the same conditions, in its own process.
 
-    Writes report.html, report.md, results.json and results.csv. Run again, it goes on where it was stopped."""
+    Writes report.html, report.md, results.json and results.csv. If run again, it continues where it was stopped."""
 
     methods: tuple[str, ...] = ()
-    """Methods, each with flags of its own if need be, in quotes: instant-ngp "vanilla-nerf --sampler occupancy"."""
+    """Methods, in quotes if with flags of their own: instant-ngp "vanilla-nerf --sampler occupancy"."""
     data: Path | None = None
-    """Folder of the data set. The embedded scene if not given."""
+    """Folder of the data set; the embedded scene if not given."""
     data_flags: str = ""
     """Flags of the data format, for all methods, in quotes: "--downscale-factor 2"."""
     max_seconds: float | None = None
-    """Seconds of training of each method; evaluation and saving do not count."""
+    """Seconds of training of each method, without evaluation and saving."""
     max_num_iterations: int | None = None
-    """Steps of each method."""
+    """Training steps of each method."""
     target_psnr: float | None = None
-    """Stop a method once it reaches this PSNR on the validation views, dB."""
+    """PSNR of the validation views, dB, at which training of a method stops."""
     repeats: int = 1
-    """Runs of each method, with different seeds."""
+    """Number of runs of each method, with different seeds."""
     output_dir: Path | None = None
-    """Where everything goes; outputs/compare-DATA if not given."""
+    """Folder of runs and report; outputs/compare-DATA if not given."""
     max_eval_images: int | None = None
-    """Judge the final models on at most this many held-out views, evenly spread; all if not given."""
+    """Maximum number of held-out views of the final evaluation, evenly spaced; all if not given."""
     curve_images: int = 4
-    """Views on which a method is judged while it learns."""
+    """Number of views of the evaluations during training."""
     num_threads: int | None = None
-    """Processor threads of each run; all cores if not given."""
+    """CPU threads of each run; all cores if not given."""
     device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """Device to train on."""
     jobs: int = 1
-    """Runs side by side, each on a CUDA device of its own."""
+    """Number of simultaneous runs, each on its own CUDA device."""
 
 
 def main() -> None:
-    """The ns-compare command."""
+    """Run ns-compare on the arguments of the process."""
     run_command(_command)
 
 
@@ -74,19 +74,20 @@ def _command(arguments: list[str]) -> None:
 
 
 def _recipe(arguments: list[str]) -> tuple[Path | None, list[str]]:
-    """The file that --load-config names, and the other arguments."""
+    """Return the file after --load-config, if given, and the other arguments."""
     if "--load-config" not in arguments:
         return None, arguments
-    at = arguments.index("--load-config")
-    if at + 1 == len(arguments):
+    index = arguments.index("--load-config")
+    if index + 1 == len(arguments):
         raise ConfigError("--load-config needs a file, such as configs/compare-lego.yml")
-    return Path(arguments[at + 1]), arguments[:at] + arguments[at + 2 :]
+    return Path(arguments[index + 1]), arguments[:index] + arguments[index + 2 :]
 
 
 def plan_of(flags: CompareFlags) -> Plan:
-    """What the flags ask for.
+    """Return the plan of the comparison that `flags` describe.
 
-    Raises: ConfigError for what makes no sense.
+    Raises:
+        ConfigError: if a flag's value is invalid, or flags contradict each other.
     """
     from framework.data.data_folder import find_data
     from framework.tools.comparison.plan import Conditions, Contender, Plan, split_words
@@ -110,7 +111,15 @@ def plan_of(flags: CompareFlags) -> Plan:
 
 
 def compare(plan: Plan, jobs_at_once: int = 1) -> list[Row]:
-    """Run what is missing of a comparison and write its report; print its table."""
+    """Run the missing runs of a comparison, write its report and print its table.
+
+    Args:
+        plan: the methods, conditions and folder.
+        jobs_at_once: number of simultaneous runs.
+
+    Returns:
+        A row of the table for each method.
+    """
     from framework.base.console import console, say
     from framework.tools.comparison import plots
     from framework.tools.comparison.measures import measure, rows_of

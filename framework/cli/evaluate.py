@@ -1,4 +1,4 @@
-"""ns-eval: measure a trained run on held-out views."""
+"""The command `ns-eval`: metrics of a trained run on held-out views."""
 
 from __future__ import annotations
 
@@ -13,37 +13,37 @@ from framework.cli.common import run_command, with_run
 
 @dataclass(frozen=True)
 class EvalFlags:
-    """Measure a trained run on held-out views."""
+    """Compute PSNR, SSIM and LPIPS of a trained run on held-out views."""
 
     load_config: Path
-    """The run's folder, or its config.yml; the flag's name may be left out."""
+    """Folder of the run, or its config.yml; the flag's name may be omitted."""
     output_path: Path | None = None
-    """Where the JSON goes; eval.json beside config.yml if not given."""
+    """JSON file to write; eval.json beside config.yml if not given."""
     render_output_path: Path | None = None
-    """Folder for every view's render, photograph, and comparison (photograph, render, error, depth, opacity)."""
+    """Folder for each view's render, true image, and comparison (image, render, error, depth, opacity)."""
     load_checkpoint: Path | None = None
-    """A checkpoint other than the run's newest."""
+    """Checkpoint to load; the newest if not given."""
     data: Path | None = None
-    """The data's folder, where it has moved since training."""
+    """Folder of the data, if it has moved since training."""
     split: Literal["test", "val", "train"] = "test"
-    """Which images."""
+    """Split to evaluate."""
     max_images: int | None = None
-    """Evaluate at most this many images, evenly spread; all if not given."""
+    """Maximum number of evaluated images, evenly spaced; all if not given."""
     rays_per_pixel: RaysPerPixel | None = None
-    """Rays of which a pixel is the mean: more are closer to a photograph. As the run says if not given."""
+    """Rays per pixel, of which its colour is the mean; the run's setting if not given."""
     eval_appearance: Literal["mean", "half"] | None = None
-    """Appearance of held-out photographs: the mean, or optimised on the left half, the right half being judged
-    (NeRF-W's protocol). As the run says if not given."""
+    """Appearance of held-out images. mean: the mean of the training images'. half: fitted to the left half of each,
+    with metrics of the right half (NeRF-W's protocol). The run's setting if not given."""
     max_error: str | None = None
-    """Rays end where the rest cannot change a colour by more than this, such as 1/255; 1e-4 if not given."""
+    """Maximum error of a colour, such as 1/255: rays end where the rest cannot change it by more; 1e-4 if not given."""
     round_to_uint8: bool = False
-    """Measure pictures as they would be stored, rounded to 8 bits."""
+    """Round colours to 8 bits before they are measured."""
     device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """Device to render on."""
 
 
 def main() -> None:
-    """The ns-eval command."""
+    """Run ns-eval on the arguments of the process."""
     run_command(_command)
 
 
@@ -73,25 +73,25 @@ def _command(arguments: list[str]) -> None:
     dataset = load_split(trained.run, flags.split).to(trained.model.device)
     bound = None if flags.max_error is None else parse_error(flags.max_error)
     with nullcontext() if bound is None else limited_error(trained.model, bound):
-        found = evaluate(
+        evaluation = evaluate(
             trained.model,
             dataset,
             max_images=flags.max_images,
             pictures=flags.render_output_path,
             round_to_uint8=flags.round_to_uint8,
         )
-    say(f"{flags.split}: {found.line()}")
+    say(f"{flags.split}: {evaluation.line()}")
     if bound is not None:
         worst, faster = measured_error(trained.model, dataset, bound)
         say(f"--max-error {bound:.2g}: colours off by at most {worst:.2g} (measured), {faster:.2f} x as fast as exact")
-    if flags.eval_appearance == "half" and found.eval_appearance is None:
-        say("--eval-appearance half: this run has no appearance vectors; whole photographs were judged")
-    say(f"LPIPS {found.lpips_note}")
+    if flags.eval_appearance == "half" and evaluation.eval_appearance is None:
+        say("--eval-appearance half: this run has no appearance vectors; whole images were evaluated")
+    say(f"LPIPS {evaluation.lpips_note}")
     output = flags.output_path or trained.run.folder / "eval.json"
-    write_evaluation(output, trained.run, trained.checkpoint, found, trained.model.device)
+    write_evaluation(output, trained.run, trained.checkpoint, evaluation, trained.model.device)
     say(f"written to {output}")
-    if found.pictures_note is not None:
-        raise ConfigError(found.pictures_note)
+    if evaluation.pictures_note is not None:
+        raise ConfigError(evaluation.pictures_note)
 
 
 if __name__ == "__main__":

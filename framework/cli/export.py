@@ -1,4 +1,4 @@
-"""ns-export: what a trained run has found, for other programs, in the frame and units of its input."""
+"""The command `ns-export`: point clouds and cameras of a trained run, in the frame and units of its input."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 USAGE = """\
 usage: ns-export WHAT RUN_FOLDER --output-dir DIR [flags]
 
-  pointcloud      point_cloud.ply: points on surfaces, with colours, and normals where the method has them
+  pointcloud      point_cloud.ply: points on surfaces, with colours, and normals if the method has them
   gaussian-splat  splat.ply or splat.spz: the Gaussians of a method that has them, for viewers
-  cameras         transforms_train.json: the training cameras, refined where the run has refined them
+  cameras         transforms_train.json: the training cameras, with refined poses if the run has refined them
 
 ns-export WHAT --help shows its flags. Everything is written in the frame and units of the run's input.
 """
@@ -26,33 +26,33 @@ ns-export WHAT --help shows its flags. Everything is written in the frame and un
 
 @dataclass(frozen=True)
 class ExportFlags:
-    """What every export can be told."""
+    """Flags of every export."""
 
     load_config: Path
-    """The run's folder, or its config.yml; the flag's name may be left out."""
+    """Folder of the run, or its config.yml; the flag's name may be omitted."""
     output_dir: Path
-    """Where files go."""
+    """Folder to write to."""
     load_checkpoint: Path | None = None
-    """A checkpoint other than the run's newest."""
+    """Checkpoint to load; the newest if not given."""
     data: Path | None = None
-    """The data's folder, where it has moved since training."""
+    """Folder of the data, if it has moved since training."""
     device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """Device to render on."""
 
 
 @dataclass(frozen=True)
 class PointFlags(ExportFlags):
-    """Write point_cloud.ply: where half of the light of random training rays is gone."""
+    """Write point_cloud.ply: points at the median depth of random training rays."""
 
     num_points: int = 1_000_000
-    """Rays; those that end in nothing or too far away give no point."""
+    """Number of rays; rays that end on no surface, or too far away, give no point."""
     reach: float = 2.0
-    """Leave out points farther from the middle of the scene's box than this many of its half edges; 0 for none."""
+    """Maximum distance of a point from the box's centre along each axis, in half edges of the box; 0 keeps all."""
 
 
 @dataclass(frozen=True)
 class CameraFlags(ExportFlags):
-    """Write transforms_train.json: names and camera-to-world matrices of the training photographs."""
+    """Write transforms_train.json: names and camera-to-world matrices of the training images."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class SplatFlags(ExportFlags):
 
 
 def main() -> None:
-    """The ns-export command."""
+    """Run ns-export on the arguments of the process."""
     run_command(_command)
 
 
@@ -83,12 +83,12 @@ def _command(arguments: list[str]) -> None:
     make_room(path)
     trained = load_trained(flags.load_config, flags.load_checkpoint, flags.device_type, flags.data)
     if trained.model.scene.warped:
-        raise ConfigError("this run lives in normalised device coordinates (--ndc), which have no scale to export")
+        raise ConfigError("this run is in normalised device coordinates (--ndc), which have no scale to export")
     run(flags, trained, _placement(trained), path)
 
 
 def _placement(trained: Trained) -> Placement:
-    """Of the input in the run's scene."""
+    """Return the placement of the input in the run's scene."""
     from framework.cameras.poses import Placement
 
     return Placement(trained.content["transform"].double().cpu(), float(trained.content["scale"]))
@@ -126,7 +126,7 @@ def _cameras(flags: CameraFlags, trained: Trained, placement: Placement, path: P
     from framework.training.datasets import load_split
     from framework.training.run import write_json
 
-    # With its images: one that could not be read has no camera in the model.
+    # Load the images too: cameras of unreadable images are not in the model.
     dataset = load_split(trained.run, "train").to(trained.model.device)
     cameras = refined_cameras(trained.model, dataset.cameras)
     write_json(path, camera_list(cameras, dataset.names, placement))

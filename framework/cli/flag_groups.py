@@ -1,7 +1,7 @@
-"""Groups of flags in the help of `ns-train METHOD`: the everyday ones first, then by the class that declares a setting.
+"""Groups of flags in the help of `ns-train METHOD`: the most used first, then by the class that declares a setting.
 
-A flag's name does not depend on its group. What a plugin declares is its method's own group; what it inherits stands
-where it stands for every method.
+A flag's name does not depend on its group. Settings that a plugin declares are in the method's own group; settings that
+it inherits are in the same group as for every method.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from framework.data.dataset import DataParser
 from framework.samplers.choice import HierarchicalConfig, SamplingConfig
 
 OWN = "METHOD"
-"""Stands for the method's name; its group holds what no other does."""
+"""Placeholder of the method's name, whose group has all settings that no other group has."""
 GROUPS: dict[str, tuple[str | type, ...]] = {
     "everyday": (
         "data", "max_seconds", "max_num_iterations", "output_dir", "experiment_name", "rays_per_pixel", "background",
@@ -49,11 +49,11 @@ DECIDED = "(default: decided by the data)"
 
 
 def grouped_flags(method: str, config: TrainConfig, data_format: str, parser: DataParser) -> ConstructorRegistry:
-    """Return rules by which tyro shows the flags of a method and of a data format in groups.
+    """Return rules with which tyro shows the flags of a method and of a data format in groups.
 
     Args:
         method: the method's name.
-        config: its settings.
+        config: the method's settings.
         data_format: the data format's name.
         parser: the data format with its settings.
     """
@@ -67,7 +67,7 @@ def grouped_flags(method: str, config: TrainConfig, data_format: str, parser: Da
 
 
 def _grouped(kind: type[TrainConfig]) -> Iterator[tuple[str, list[str]]]:
-    """The titles and settings of each group. A setting is of the first class that has it, whoever changes it later."""
+    """Yield the title and the settings of each group; a setting belongs to the first class that declares it."""
     declared = {
         field.name: next(base for base in reversed(kind.__mro__) if field.name in inspect.get_annotations(base))
         for field in dataclasses.fields(kind)
@@ -82,7 +82,7 @@ def _grouped(kind: type[TrainConfig]) -> Iterator[tuple[str, list[str]]]:
 
 
 def _divide(rules: dict[type, StructConstructorSpec], settings: Any, groups: list[tuple[str, list[str]]]) -> None:
-    """Add rules by which tyro takes a dataclass for a struct of groups, each a struct of some of its fields."""
+    """Add rules with which tyro treats a dataclass as a struct of groups, each a struct of some of its fields."""
     whole: Any = ConstructorRegistry.get_struct_spec(StructTypeInfo.make(type(settings), settings, False))
     flags = {field.name: _flag(field) for field in whole.fields}
     boxes = []
@@ -99,15 +99,15 @@ def _divide(rules: dict[type, StructConstructorSpec], settings: Any, groups: lis
 
 
 def _flag(field: StructFieldSpec) -> StructFieldSpec:
-    """A field whose flag is its bare name, and whose default, where the data decide it, is not shown as None."""
+    """Return a field whose flag has no prefix, and whose default is not shown as None if it depends on the data."""
     is_open = field.default is None and LEFT_TO_DATA in getattr(field.type, "__metadata__", ())
-    shown: Any = Annotated[
+    annotated: Any = Annotated[
         field.type, tyro.conf.arg(prefix_name=False, help_behavior_hint=DECIDED if is_open else None)
     ]
-    return dataclasses.replace(field, type=shown, helptext=partial(_unwrapped, field.helptext))
+    return dataclasses.replace(field, type=annotated, helptext=partial(_unwrapped, field.helptext))
 
 
 def _unwrapped(text: str | Callable[[], str | None] | None) -> str | None:
-    """A help text, read from the source only when it is shown, without the line breaks of the source."""
+    """Return a help text without the line breaks of the source, which is read only when the text is shown."""
     text = text() if callable(text) else text
     return text and re.sub(r"(?<!\n)\n(?=\w)", " ", text)

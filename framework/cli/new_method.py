@@ -1,4 +1,4 @@
-"""ns-new-method: a package with a method in it, to be made into your own."""
+"""The command `ns-new-method`: a new package with a small, working method, to be changed."""
 
 from __future__ import annotations
 
@@ -15,24 +15,25 @@ from framework.cli.common import run_command
 
 TEMPLATES = Path(__file__).parents[1] / "templates" / "method"
 SUFFIX = ".template"
+"""Extension of the templates."""
 USAGE = """\
 usage: ns-new-method NAME [--dir DIR]
 
-Writes a package with a small, working method into the folder NAME, or DIR: one file to make your own, its tests, and
-what pip needs to know. NAME, such as my-method, is what ns-train will call it.
+Writes a package with a small, working method into the folder NAME, or DIR: one file with the method, which you change,
+its tests, and the package's description for pip. NAME, such as my-method, is the method's name for ns-train.
 """
 
 
 @dataclass(frozen=True)
 class NewMethodFlags:
-    """Write a package with a small, working method, to be made into your own."""
+    """Write a package with a small, working method, to be changed."""
 
     dir: Path | None = None
-    """Folder to write into, new or empty; the method's name if not given."""
+    """Folder to write, new or empty; the method's name if not given."""
 
 
 def main() -> None:
-    """The ns-new-method command."""
+    """Run ns-new-method on the arguments of the process."""
     run_command(_command)
 
 
@@ -58,9 +59,10 @@ def _command(arguments: list[str]) -> None:
 
 
 def check_name(name: str) -> None:
-    """Refuse a name that a method cannot have, or that is taken.
+    """Check that `name` is valid for a new method and not taken.
 
-    Raises: ConfigError that says why.
+    Raises:
+        ConfigError: if it is invalid or taken.
     """
     if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", name):
         raise ConfigError(f"'{name}' is no method's name: lowercase letters, digits and single dashes, as my-method")
@@ -72,35 +74,40 @@ def check_name(name: str) -> None:
 
 
 def module_of(name: str) -> str:
-    """The Python module of a method: my_method for my-method."""
+    """Return the name of a method's Python module; of `name` my-method, my_method."""
     return name.replace("-", "_")
 
 
 def package_of(name: str) -> dict[str, str]:
-    """The files of a new method's package: their places in its folder, and what they hold."""
+    """Return the files of the package of a new method `name`: their text by path, relative to its folder."""
     words = {
         "name": name,
         "module": module_of(name),
         "Class": "".join(part.capitalize() for part in name.split("-")),
     }
-    found = {}
+    files = {}
     for path in sorted(TEMPLATES.rglob(f"*{SUFFIX}")):
-        place = path.relative_to(TEMPLATES).as_posix().removesuffix(SUFFIX)
+        relative = path.relative_to(TEMPLATES).as_posix().removesuffix(SUFFIX)
         content = path.read_text(encoding="utf-8")
-        found[Template(place).substitute(words)] = Template(content).substitute(words)
-    return found
+        files[Template(relative).substitute(words)] = Template(content).substitute(words)
+    return files
 
 
 def write_package(name: str, folder: Path) -> None:
-    """Write a new method's package.
+    """Write the package of a new method.
 
-    Raises: ConfigError where something is there already, or the folder cannot be written.
+    Args:
+        name: the method's name.
+        folder: folder to write, new or empty.
+
+    Raises:
+        ConfigError: if the folder is not empty or cannot be written.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConfigError(f"{folder} is there already, and nothing is overwritten; choose another --dir")
     try:
-        for place, content in package_of(name).items():
-            path = folder / place
+        for relative, content in package_of(name).items():
+            path = folder / relative
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(content, encoding="utf-8", newline="\n")
     except OSError as error:

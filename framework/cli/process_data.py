@@ -1,4 +1,4 @@
-"""ns-process-data: photographs, a video or a phone's capture become a data folder."""
+"""The command `ns-process-data`: conversion of images, a video or a phone's capture to a data folder."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ USAGE = """\
 usage: ns-process-data KIND --data IN --output-dir OUT [flags]
 
 kinds:
-  images          a folder of photographs; COLMAP finds their poses
-  video           a video; its sharpest frames become photographs
+  images          a folder of images; COLMAP estimates their poses
+  video           a video; COLMAP estimates the poses of its sharpest frames
   polycam         Polycam's raw export, with the phone's poses
   record3d        Record3D's export with EXR and RGBD, with the phone's poses
 
@@ -30,10 +30,10 @@ ns-process-data KIND --help shows its flags.
 
 @dataclass(frozen=True, kw_only=True)
 class ImagesFlags(ColmapFlags):
-    """Find the poses of the photographs in a folder and those below it."""
+    """Estimate the poses of the images in a folder and its subfolders."""
 
     masks_dir: Path | None = None
-    """Masks under the photographs' names: black is neither used for poses nor learnt from."""
+    """Folder of masks with the images' names; black pixels are used neither for poses nor for training."""
 
     def check(self) -> None:
         super().check()
@@ -45,10 +45,10 @@ class ImagesFlags(ColmapFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class VideoFlags(ColmapFlags):
-    """Find the poses of the sharpest frames of a video."""
+    """Estimate the poses of the sharpest frames of a video."""
 
     num_frames_target: int = 300
-    """Frames to take: the sharpest of each of so many equal intervals."""
+    """Number of frames to take, the sharpest of each of as many equal intervals."""
 
     def check(self) -> None:
         super().check()
@@ -58,10 +58,10 @@ class VideoFlags(ColmapFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class PhoneFlags(OutputFlags):
-    """What captures with poses can be told."""
+    """Flags of captures with poses."""
 
     max_dataset_size: int = 300
-    """The most images to take, evenly chosen; -1 for all."""
+    """Maximum number of images to take, evenly spaced; -1 for all."""
 
     def check(self) -> None:
         super().check()
@@ -70,7 +70,7 @@ class PhoneFlags(OutputFlags):
 
     @property
     def most(self) -> int:
-        """The most images to take."""
+        """Maximum number of images to take."""
         return sys.maxsize if self.max_dataset_size == -1 else self.max_dataset_size
 
 
@@ -79,9 +79,9 @@ class PolycamFlags(PhoneFlags):
     """Convert Polycam's raw export."""
 
     min_blur_score: float = 25.0
-    """Leave out images that Polycam gives a lower score."""
+    """Minimum score of sharpness, from Polycam; images with a lower score are omitted."""
     crop_border_pixels: int = 15
-    """Pixels to cut off at each side, where Polycam's images may have a black border."""
+    """Pixels to cut off at each side, as Polycam's images may have a black border."""
 
     def check(self) -> None:
         super().check()
@@ -103,7 +103,7 @@ KINDS: dict[str, type[OutputFlags]] = {
 
 
 def main() -> None:
-    """The ns-process-data command."""
+    """Run ns-process-data on the arguments of the process."""
     run_command(_command)
 
 
@@ -124,7 +124,7 @@ def _command(arguments: list[str]) -> None:
 
 
 def _spelt_out(arguments: list[str], kind: type[OutputFlags]) -> list[str]:
-    """`--overwrite` alone means `--overwrite True`."""
+    """Return the arguments with `--overwrite` alone spelt out as `--overwrite True`."""
     hints = get_type_hints(kind)
     switches = {f.name for f in dataclasses.fields(kind) if hints[f.name] is bool}
     words = []
@@ -159,7 +159,7 @@ def _find_poses(flags: ColmapFlags) -> None:
     seconds: dict[str, float] = {}
     masks = flags.masks_dir if isinstance(flags, ImagesFlags) else None
     if isinstance(flags, VideoFlags):
-        open_video(flags.data)  # nothing is removed for a video that cannot be read
+        open_video(flags.data)  # before anything is removed, check that the video can be read
         claim(flags.output_dir, flags.data, flags.overwrite)
         start = time.perf_counter()
         folder = flags.output_dir / "colmap" / "unfinished" / "frames"

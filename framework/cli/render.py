@@ -1,4 +1,4 @@
-"""ns-render: pictures and animations of a trained run."""
+"""The command `ns-render`: images and animations of a trained run."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ USAGE = """\
 usage: ns-render PATH RUN_FOLDER --output-path FILE.gif [flags]
 
 paths:
-  orbit           a horizontal circle around the scene, as high and far as the training cameras
-  interpolate     a smooth walk past the training cameras, in the order of their photographs' names
+  orbit           a horizontal circle around the scene, with the mean height and distance of the training cameras
+  interpolate     a smooth path past the training cameras, in the order of their images' names
   time            one of the cameras, while time runs from 0 to 1
 
 ns-render PATH --help shows its flags.
@@ -31,60 +31,60 @@ ns-render PATH --help shows its flags.
 
 @dataclass(frozen=True)
 class RenderFlags:
-    """What every path can be told."""
+    """Flags of every path."""
 
     load_config: Path
-    """The run's folder, or its config.yml; the flag's name may be left out."""
+    """Folder of the run, or its config.yml; the flag's name may be omitted."""
     fps: float = 16.0
-    """Pictures per second."""
+    """Frames per second."""
     downscale_factor: int = 1
-    """Reduce the pictures by this whole number."""
+    """Integer factor by which width and height are reduced."""
     rays_per_pixel: RaysPerPixel | None = None
-    """Rays of which a pixel is the mean: more are closer to a photograph. As the run says if not given."""
+    """Rays per pixel, of which its colour is the mean; the run's setting if not given."""
     max_error: str | None = None
-    """Rays end where the rest cannot change a colour by more than this, such as 1/255; 1e-4 if not given."""
+    """Maximum error of a colour, such as 1/255: rays end where the rest cannot change it by more; 1e-4 if not given."""
     load_checkpoint: Path | None = None
-    """A checkpoint other than the run's newest."""
+    """Checkpoint to load; the newest if not given."""
     data: Path | None = None
-    """The data's folder, where it has moved since training."""
+    """Folder of the data, if it has moved since training."""
     device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """Device to render on."""
 
 
 @dataclass(frozen=True)
 class OrbitFlags(RenderFlags):
-    """Render a horizontal circle around the scene, as high and far as the training cameras."""
+    """Render a horizontal circle around the scene, with the mean height and distance of the training cameras."""
 
     output_path: Path = Path("orbit.gif")
-    """The animation; its ending (.gif, .webp, .png) chooses the format."""
+    """Animation to write; its extension (.gif, .webp, .png) is the format."""
     num_frames: int = 48
-    """Pictures in the circle."""
+    """Number of frames."""
     time: float | None = None
-    """Time of all pictures of a scene that moves, 0 to 1. If not given, it runs from 0 to 1 on the way."""
+    """Time of all frames of a scene that moves, 0 to 1. If not given, it runs from 0 to 1."""
 
 
 @dataclass(frozen=True)
 class TimeFlags(RenderFlags):
-    """Render what one camera sees while time runs from 0 to 1."""
+    """Render the view of one camera while time runs from 0 to 1."""
 
     output_path: Path = Path("time.gif")
-    """An animation (.gif, .webp), or the pictures side by side (.png)."""
+    """File to write: an animation (.gif, .webp), or the frames side by side (.png)."""
     num_frames: int = 32
-    """Pictures from time 0 to 1."""
+    """Number of frames."""
     split: Literal["train", "val", "test"] = "test"
-    """The images whose cameras are counted."""
+    """Split of which --camera-index counts the cameras."""
     camera_index: int = 0
-    """Which camera, from 0."""
+    """Index of the camera, from 0."""
 
 
 @dataclass(frozen=True)
 class InterpolateFlags(RenderFlags):
-    """Render a smooth walk past the training cameras, in the order of their photographs' names."""
+    """Render a smooth path past the training cameras, in the order of their images' names."""
 
     output_path: Path = Path("interpolate.gif")
-    """The animation; its ending (.gif, .webp, .png) chooses the format."""
+    """Animation to write; its extension (.gif, .webp, .png) is the format."""
     num_frames: int = 96
-    """Pictures on the way."""
+    """Number of frames."""
 
 
 Flags = OrbitFlags | InterpolateFlags | TimeFlags
@@ -92,7 +92,7 @@ PATHS: dict[str, type[Flags]] = {"orbit": OrbitFlags, "interpolate": Interpolate
 
 
 def main() -> None:
-    """The ns-render command."""
+    """Run ns-render on the arguments of the process."""
     run_command(_command)
 
 
@@ -109,7 +109,7 @@ def _render(flags: Flags) -> None:
     if flags.num_frames < 1 or not flags.fps > 0 or flags.downscale_factor < 1:
         raise ConfigError("--num-frames and --downscale-factor must be at least 1, --fps more than 0")
     if flags.output_path.suffix.lower() not in (".gif", ".webp", ".png"):
-        raise ConfigError(f"--output-path {flags.output_path}: the ending must be .gif, .webp or .png")
+        raise ConfigError(f"--output-path {flags.output_path}: the extension must be .gif, .webp or .png")
     make_room(flags.output_path)
     from contextlib import nullcontext
 
@@ -138,14 +138,14 @@ def _render(flags: Flags) -> None:
             frames.append(model.render_view(View.of(cameras, index, times), background).rgb)
     if isinstance(flags, TimeFlags) and flags.output_path.suffix.lower() == ".png":
         write_image(flags.output_path, torch.cat(frames, dim=1))
-        say(f"pictures, side by side: {flags.output_path}")
+        say(f"frames, side by side: {flags.output_path}")
     else:
         write_animation(flags.output_path, frames, flags.fps)
         say(f"animation: {flags.output_path}")
 
 
 def _path(flags: Flags, trained: Trained, parsed: ParsedScene) -> tuple[Cameras, Tensor | None]:
-    """The cameras and, of a scene that moves, their times."""
+    """Return the cameras of a path and, if the scene moves, their times."""
     import torch
 
     from framework.evaluation.paths import interpolate

@@ -1,4 +1,4 @@
-"""A training session from start to end: data, training, final evaluation, and what is printed."""
+"""Training from start to end: data, training, final evaluation, and the printed lines."""
 
 from __future__ import annotations
 
@@ -19,17 +19,19 @@ from framework.training.skipping import as_plain, lines, skip_report
 from framework.training.trainer import Outcome, Trainer
 
 PICTURES = 4
+"""Maximum number of held-out views of which images are written at the end."""
 FEW_PIXELS = 16
-"""Pixels of an image's longer side below which something went wrong with the images."""
+"""Longer side of the images, pixels, below which a warning is printed."""
 
 
 def start(run: Run) -> None:
-    """Train a new run.
+    """Train and evaluate a new `run`.
 
-    Raises: Stopped where somebody ends it; what was saved is said.
+    Raises:
+        Stopped: if a signal ends it; the message says what was saved.
     """
     trainer = _prepare(run)
-    run = trainer.run  # with what was decided
+    run = trainer.run  # with open settings filled in
     trainer.restore_as_configured()
     with sole_user(run.folder):
         create_folder(run)
@@ -37,7 +39,11 @@ def start(run: Run) -> None:
 
 
 def resume(run: Run) -> None:
-    """Go on with a run from its newest checkpoint; from the beginning where it has none. Raises as `start`."""
+    """Continue a `run` from its newest checkpoint, or from the start if it has none.
+
+    Raises:
+        Stopped: if a signal ends it; the message says what was saved.
+    """
     with sole_user(run.folder):
         trainer = _prepare(run)
         checkpoint = load_newest(run.folder / FOLDER, trainer.device)
@@ -66,11 +72,11 @@ def _prepare(run: Run) -> Trainer:
 
 
 def _finish(run: Run, trainer: Trainer) -> None:
-    # Also of a run that goes on: it may have been killed before it came to this.
+    # Also when a run is resumed, as it may have been killed before.
     write_transforms(run, trainer.train_set)
-    if trainer.first_step == 0:  # later there is nothing left to decide
+    if trainer.first_step == 0:  # a resumed run has no open settings left
         write_report(run.folder / "scene_profile.json", trainer.profile().as_plain())
-    with _saying_of_a_stop(lambda: _what_is_saved(trainer)):
+    with _noted_stop(lambda: _saved_note(trainer)):
         outcome = trainer.train()
     state = trainer.state
     say(
@@ -87,7 +93,7 @@ def _finish(run: Run, trainer: Trainer) -> None:
     say(f"checkpoint: {outcome.checkpoint}")
     if outcome.stopped_by is not None:
         raise Stopped(outcome.stopped_by, f"continue with: ns-train --resume {run.folder}")
-    with _saying_of_a_stop(lambda: f"stopped while evaluating; the trained run is saved: ns-eval {run.folder}"):
+    with _noted_stop(lambda: f"stopped while evaluating; the trained run is saved: ns-eval {run.folder}"):
         _evaluate(run, trainer, outcome)
 
 
@@ -95,33 +101,33 @@ def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:
     test_set = first_split(run, ("test", "val"))
     if test_set is None or run.config.max_eval_images == 0:
         return
-    found = evaluate(
+    evaluation = evaluate(
         trainer.model,
         test_set.to(trainer.device),
         max_images=run.config.max_eval_images,
         pictures=run.folder / "pictures",
         max_pictures=PICTURES,
     )
-    say(f"test: {found.line()}")  # first of all, for what follows needs room on the disk
-    if found.pictures_note is None:
+    say(f"test: {evaluation.line()}")  # before files are written, which may fail on a full disk
+    if evaluation.pictures_note is None:
         say(f"pictures (photograph, render, error, depth, opacity): {run.folder / 'pictures'}")
     else:
-        say(f"warning: {found.pictures_note}")
-    write_evaluation(run.folder / "eval.json", run, outcome.checkpoint, found, trainer.device)
+        say(f"warning: {evaluation.pictures_note}")
+    write_evaluation(run.folder / "eval.json", run, outcome.checkpoint, evaluation, trainer.device)
     say(f"evaluate again with: ns-eval --load-config {run.config_path}")
 
 
 @contextmanager
-def _saying_of_a_stop(note: Callable[[], str]) -> Iterator[None]:
-    """Where a signal ends what is done meanwhile, say what came of it."""
+def _noted_stop(note: Callable[[], str]) -> Iterator[None]:
+    """If a signal ends the `with` block, raise Stopped with a note."""
     try:
         yield
     except KeyboardInterrupt as stop:
         raise Stopped(signal_of(stop), note()) from None
 
 
-def _what_is_saved(trainer: Trainer) -> str:
-    """Say what is saved of a run that is ended at once."""
+def _saved_note(trainer: Trainer) -> str:
+    """Return a line that says which checkpoint an interrupted run has saved."""
     saved = list_checkpoints(trainer.checkpoint_folder)
     if not saved:
         return "stopped at once: nothing was saved"

@@ -1,4 +1,4 @@
-"""ns-stress: methods in hard scenes and under hard conditions."""
+"""The command `ns-stress`: methods on hard scenes and under hard conditions."""
 
 from __future__ import annotations
 
@@ -22,42 +22,42 @@ USAGE = """\
 usage: ns-stress METHOD [METHOD ...] [--data DIR] [flags]
        ns-stress all [--data DIR] [flags]
 
-METHOD is a registered method, with flags of its own in quotes if need be: "vanilla-nerf --sampler occupancy"; all
-stands for each of them. Each is trained for a short while, on a ball made in memory or on a few photographs of
---data DIR, plainly and then under
+METHOD is a registered method, in quotes if with flags of its own: "vanilla-nerf --sampler occupancy"; all is every
+registered method. Each is trained for a short time, on a ball rendered in memory or on a few images of --data DIR,
+first without a condition (plain) and then under each of
 
-  what the photographs show   all-white all-black all-transparent one-image one-pixel-images duplicate-cameras
-  how it is looked at         field-of-view-4 field-of-view-170 inside
-  where the scene is          scale-1e-6 scale-1e6 shift-1e4, and as captures arrive: placed scale-1e-6-placed
+  images                      all-white all-black all-transparent one-image one-pixel-images duplicate-cameras
+  cameras                     field-of-view-4 field-of-view-170 inside
+  units and origin            scale-1e-6 scale-1e6 shift-1e4, and as for captures: placed scale-1e-6-placed
                               scale-1e6-placed shift-1e4-placed
-  how it is trained           another-seed learning-rate-x10 float32 bfloat16 float16 1-ray 8192-rays
-  what should be refused      nan-pixels inf-pixels nan-pose
+  training                    another-seed learning-rate-x10 float32 bfloat16 float16 1-ray 8192-rays
+  invalid data                nan-pixels inf-pixels nan-pose
 
-and each is a pass, degraded (more PSNR lost against the plain run than the condition allows), refused (with a clear
-error, where that is right) or a fail. The exit status is 1 where one fails. ns-stress METHOD --help shows the flags.
+The outcome of each is pass, degraded (the PSNR is lower than that without a condition by more than is allowed), refused
+(with a clear error, as it should) or fail. The exit status is 1 if one fails. ns-stress METHOD --help shows the flags.
 """
 
 
 @dataclass(frozen=True)
 class StressFlags:
-    """Run methods through hard scenes and conditions: which do they pass, which degrade them, where do they fail?"""
+    """Train methods on hard scenes and under hard conditions; report where they pass, degrade or fail."""
 
     data: Path | None = None
-    """Folder of a data set, of which a few photographs are used, reduced. A ball made in memory if not given."""
+    """Folder of a data set, of which a few images are used, reduced; a ball rendered in memory if not given."""
     data_flags: str = ""
     """Flags of the data format, in quotes: "--downscale-factor 2"."""
     only: tuple[str, ...] = ()
-    """Conditions besides the plain run, as ns-stress --help lists them; all if not given."""
+    """Conditions, as listed by ns-stress --help; all if not given. The plain run is always made."""
     max_num_iterations: int = 300
-    """Steps of training under each condition."""
+    """Training steps under each condition."""
     max_seconds: float | None = 30.0
-    """Seconds of training under each condition, if its steps take longer; None for no limit."""
+    """Maximum seconds of training under each condition; None for no limit."""
     output_path: Path | None = None
-    """The JSON; outputs/stress-DATA/METHOD.json, or methods.json of several, if not given. A .md goes beside it."""
+    """JSON file to write, with a .md beside it; if not given, outputs/stress-DATA/METHOD.json, or methods.json."""
 
 
 def main() -> None:
-    """The ns-stress command."""
+    """Run ns-stress on the arguments of the process."""
     run_command(_command)
 
 
@@ -80,11 +80,20 @@ def _command(arguments: list[str]) -> None:
 
 
 def stress(methods: Sequence[str], flags: StressFlags) -> list[Result]:
-    """Run methods, with flags of their own if there are any, through the conditions; print and write what came of it.
+    """Train methods under each condition; print and write the outcomes.
 
-    The JSON is written after each condition: should the process itself be ended, what came before stands.
+    The JSON file is written after each condition, so that earlier outcomes survive the end of the process.
 
-    Raises: ConfigError or DataError for what cannot be begun.
+    Args:
+        methods: names of the methods, each followed by flags of its own, if any.
+        flags: the flags of the command.
+
+    Returns:
+        The outcomes of each method.
+
+    Raises:
+        ConfigError: if a flag is invalid.
+        DataError: if the data is missing or cannot be read.
     """
     from framework.base.console import say
     from framework.base.device import choose_device
@@ -113,32 +122,32 @@ def stress(methods: Sequence[str], flags: StressFlags) -> list[Result]:
 
 
 def _run(method: str, flags: StressFlags) -> Run:
-    """The method and its settings, as `ns-train` would take them."""
+    """Return the run that `ns-train` would start with the method and its flags."""
     from framework.cli.train import run_of
     from framework.tools.comparison.plan import split_words
 
-    words, of_data = split_words(method, "METHOD"), split_words(flags.data_flags, "--data-flags")
+    words, data_flags = split_words(method, "METHOD"), split_words(flags.data_flags, "--data-flags")
     if not words:
         raise ConfigError("the method is missing, as in 'ns-stress instant-ngp'")
     data = [] if flags.data is None else ["--data", str(flags.data)]
-    run = run_of(words[0], [*words[1:], *data, *of_data])
+    run = run_of(words[0], [*words[1:], *data, *data_flags])
     if run.config.data != flags.data:
         raise ConfigError(f"{method}: --data stands behind the methods, for all of them get the same photographs")
     return run
 
 
 def _conditions(flags: StressFlags) -> list[Condition]:
-    """The conditions asked for, less those that cannot be made of somebody's data."""
+    """Return the selected conditions, without those that cannot be applied to --data."""
     from framework.base.console import say
     from framework.tools.stress.conditions import select
 
-    asked = select(flags.only)
+    selected = select(flags.only)
     if flags.data is None:
-        return asked
-    left_out = [condition.name for condition in asked if condition.ball_only]
+        return selected
+    left_out = [condition.name for condition in selected if condition.ball_only]
     if left_out:
         say(f"left out, for they need pictures that only the ball has: {', '.join(left_out)}")
-    return [condition for condition in asked if not condition.ball_only]
+    return [condition for condition in selected if not condition.ball_only]
 
 
 def _budget(flags: StressFlags) -> Budget:
@@ -150,7 +159,7 @@ def _budget(flags: StressFlags) -> Budget:
 
 
 def _path(runs: Sequence[Run], flags: StressFlags) -> Path:
-    """The JSON file."""
+    """Return the path of the JSON file."""
     path = flags.output_path
     if path is None:
         name = runs[0].method if len(runs) == 1 else "methods"
@@ -165,7 +174,7 @@ def _data_name(flags: StressFlags) -> str:
 
 
 def _write(path: Path, flags: StressFlags, conditions: Sequence[Condition], results: Sequence[Result]) -> None:
-    """What was asked for, and what came of it so far."""
+    """Write the flags, the conditions and the outcomes so far."""
     from framework.training.run import write_json
 
     content = {
@@ -188,12 +197,12 @@ def _print(results: Sequence[Result]) -> None:
     from framework.tools.stress.report import notes, table
 
     head, *rows = table(results)
-    shown = Table()
+    grid = Table()
     for name in head:
-        shown.add_column(Text(name))  # as text: brackets in it would be taken for markup
+        grid.add_column(Text(name))  # as text, as brackets in a string would be taken for markup
     for row in rows:
-        shown.add_row(*map(Text, row))
-    console.print(shown)
+        grid.add_row(*map(Text, row))
+    console.print(grid)
     for note in notes(results):
         say(note)
 

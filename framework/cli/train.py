@@ -1,4 +1,4 @@
-"""ns-train: train a method on a data set."""
+"""The command `ns-train`: training of a method on a data set."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
 USAGE = """\
 usage: ns-train METHOD [--data DIR] [flags] [FORMAT [format flags]]
-       ns-train --load-config FILE [flags]     train as a recipe or an earlier run says
-       ns-train --resume RUN_FOLDER [flags]    go on with a run that was stopped
+       ns-train --load-config FILE [flags]     train with the settings of a recipe or an earlier run
+       ns-train --resume RUN_FOLDER [flags]    continue a run that was stopped
 """
 
 
 def main() -> None:
-    """The ns-train command."""
+    """Run ns-train on the arguments of the process."""
     run_command(_command)
 
 
@@ -54,7 +54,7 @@ def _command(arguments: list[str]) -> None:
 
 
 def _take(arguments: list[str], flag: str) -> tuple[str | None, list[str]]:
-    """The value of `flag`, wherever it stands, and the other arguments."""
+    """Return the value of `flag`, None if it is not given, and the other arguments."""
     for index, argument in enumerate(arguments):
         if argument == flag:
             if index + 1 == len(arguments):
@@ -68,19 +68,19 @@ def _take(arguments: list[str], flag: str) -> tuple[str | None, list[str]]:
 def _overview() -> str:
     lines = [USAGE, "methods:"]
     lines += [f"  {name:<16}{summary(entry)}" for name, entry in registered("methods").items()]
-    lines += ["", "data formats (recognised by themselves, or named after the flags):"]
+    lines += ["", "data formats (recognised automatically, or named after the flags):"]
     lines += [f"  {name:<16}{summary(entry)}" for name, entry in registered("dataparsers").items()]
     lines += ["", "ns-train METHOD --help shows the method's flags."]
     return "\n".join(lines)
 
 
 def _default_run(method: str) -> Run:
-    """A method with its default settings, its data not known yet."""
+    """Return a run of a method with its default settings, without data."""
     if os.path.exists(method) and method not in registered("methods"):
         raise ConfigError(f"the method comes first, as in: ns-train nerfacto --data {shlex.quote(method)}")
     if method.startswith("-"):
         raise ConfigError(f"the method comes first, before {method}; ns-train --help lists them")
-    entry_of("methods", method)  # a name that is unknown is told before anything heavy is imported
+    entry_of("methods", method)  # report an unknown name before slow imports
     from framework.base.registry import load_dataparser, load_method
     from framework.training.run import Run
 
@@ -88,7 +88,11 @@ def _default_run(method: str) -> Run:
 
 
 def run_of(method: str, flags: list[str]) -> Run:
-    """The run that `ns-train METHOD` with these flags would start."""
+    """Return the run that `ns-train` with this `method` and these `flags` would start.
+
+    Raises:
+        ConfigError: if the method or a flag is unknown or invalid.
+    """
     return _parse_flags(_default_run(method), flags, fresh=True)
 
 
@@ -99,9 +103,9 @@ def _read_run(path: Path) -> Run:
 
 
 def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
-    """`run` with its settings and its data format's changed by command-line flags, in any order.
+    """Return `run` with the settings of the method and the data format changed by flags, in any order.
 
-    A first look finds --data and the format's name; the second knows all flags.
+    Flags are parsed twice: first for --data and the format's name, then with the flags of both.
     """
     import tyro
 
@@ -113,7 +117,7 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
     if (answer := vis_answer(_take(flags, "--vis")[0] or "")) is not None:
         raise ConfigError(answer)
     options = (tyro.conf.FlagConversionOff, tyro.conf.ConsolidateSubcommandArgs)
-    looked, unknown = tyro.cli(
+    initial, unknown = tyro.cli(
         type(run.config),
         prog=f"ns-train {run.method}",
         args=[flag for flag in flags if flag not in ("-h", "--help")],
@@ -123,14 +127,14 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
     )
     if (word := _stray_word(unknown)) is not None:
         _check_format(word, run.method)
-        (data, named), flags = find_data(looked.data, word), _without(flags, word)
-    elif not run.dataparser or looked.data != run.config.data:
-        data, named = find_data(looked.data)
+        (data, named), flags = find_data(initial.data, word), _without(flags, word)
+    elif not run.dataparser or initial.data != run.config.data:
+        data, named = find_data(initial.data)
     else:
-        data, named = looked.data, run.dataparser
+        data, named = initial.data, run.dataparser
     parser = run.parser if named == run.dataparser else load_dataparser(named)()
 
-    # One flat set of flags: the method's and the data format's, so that their order does not matter.
+    # One flat set of the flags of both, so that their order does not matter.
     fields = [
         (name, Annotated[type(value), tyro.conf.arg(name="")])
         for name, value in (("method", run.config), ("format", parser))
@@ -152,24 +156,24 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
 
 
 def _check_format(word: str, method: str) -> None:
-    """Raises: ConfigError for a word that is no data format, with what was meant."""
+    """Raise ConfigError if `word` is no data format."""
     if word not in registered("dataparsers") and os.path.exists(word):
         raise ConfigError(f"'{word}' is no data format; the data is named by a flag: ns-train {method} --data {word}")
     entry_of("dataparsers", word)
 
 
 def _check_for_nerfstudio(flags: list[str], method: str, settings: list[Any]) -> None:
-    """Raises: ConfigError for a flag of nerfstudio's, with ours."""
-    known = {name for value in settings for name in _flag_names(value)}
+    """Raise ConfigError for a flag that only nerfstudio has, naming the equivalent one."""
+    names = {name for value in settings for name in _flag_names(value)}
     for flag in flags:
-        if flag.startswith("--") and (answer := flag_answer(flag, method, known)) is not None:
+        if flag.startswith("--") and (answer := flag_answer(flag, method, names)) is not None:
             raise ConfigError(answer)
 
 
-def _flag_names(settings: Any, before: str = "--") -> Iterator[str]:
-    """The flags that set the fields of a dataclass."""
+def _flag_names(settings: Any, prefix: str = "--") -> Iterator[str]:
+    """Yield the flags that set the fields of a dataclass."""
     for field in dataclasses.fields(settings):
-        value, name = getattr(settings, field.name), before + field.name.replace("_", "-")
+        value, name = getattr(settings, field.name), prefix + field.name.replace("_", "-")
         if dataclasses.is_dataclass(value):
             yield from _flag_names(value, f"{name}.")
         else:
@@ -177,7 +181,7 @@ def _flag_names(settings: Any, before: str = "--") -> Iterator[str]:
 
 
 def _stray_word(unknown: list[str]) -> str | None:
-    """The first word that is neither a flag nor a flag's value: the name of a data format."""
+    """Return the first word that is neither a flag nor a flag's value, which names a data format."""
     for index, word in enumerate(unknown):
         if word.startswith("-"):
             continue
@@ -188,10 +192,10 @@ def _stray_word(unknown: list[str]) -> str | None:
 
 
 def _without(flags: list[str], name: str) -> list[str]:
-    """`flags` less the format's name: its first place that is not the value of a flag, else its last."""
-    places = [index for index, flag in enumerate(flags) if flag == name]
-    free = [index for index in places if index == 0 or not flags[index - 1].startswith("--") or "=" in flags[index - 1]]
-    drop = (free or places[-1:])[0]
+    """Return `flags` without the format's name, preferably an occurrence that is not the value of a flag."""
+    same = [index for index, flag in enumerate(flags) if flag == name]
+    free = [index for index in same if index == 0 or not flags[index - 1].startswith("--") or "=" in flags[index - 1]]
+    drop = (free or same[-1:])[0]
     return flags[:drop] + flags[drop + 1 :]
 
 

@@ -1,1 +1,1 @@
-"""Evaluation: one evaluator for every method."""
+"""Evaluation of any method by one evaluator, and images and camera paths for people."""

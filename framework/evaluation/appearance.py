@@ -1,7 +1,7 @@
-"""The appearance of a held-out photograph, found on its left half: NeRF-W's protocol.
+"""Appearance of held-out images, fitted to their left halves by NeRF-W's protocol.
 
-Martin-Brualla et al., "NeRF in the Wild", CVPR 2021, section 5: a photograph that was not trained on has no appearance
-vector; one is optimised on its left half, all else being fixed, and the picture is judged on its right half.
+Martin-Brualla et al., "NeRF in the Wild", CVPR 2021, section 5. A held-out image has no appearance vector. One is
+optimised on its left half with all other parameters fixed, and metrics are computed on its right half.
 """
 
 from __future__ import annotations
@@ -22,36 +22,36 @@ from framework.ray_model import RayModel
 from framework.rendering.losses import mean_squared_error
 
 STEPS, PIXELS, RATE = 60, 1024, 0.05
-"""Of Adam: steps, pixels in each, learning rate."""
+"""Steps of Adam, pixels per step, and learning rate, with which an appearance vector is fitted."""
 
 
 def appearance_of(model: Model[Any]) -> Appearance | None:
-    """Return the images' appearance vectors; None of a model that has none.
+    """Return the appearance vectors of the training images; None if the model has none.
 
     Args:
-        model: any method's.
+        model: a model of any method.
     """
     return model.appearance if isinstance(model, HasAppearance) else None
 
 
 def right_half(image: Tensor) -> Tensor:
-    """Return (H, W - W // 2, ...), what is judged of an image.
+    """Return the right half (H, W - W // 2, ...) of an image, on which metrics are computed.
 
     Args:
-        image: (H, W, ...).
+        image: (H, W, ...) image.
     """
     return image[:, image.shape[1] // 2 :]
 
 
 @contextmanager
 def fitted_appearance(model: Model[Any], dataset: Dataset, index: int, background: Tensor) -> Iterator[None]:
-    """Show image `index` in the appearance found on its left half.
+    """Render with the appearance fitted to the left half of an image, within a `with` block.
 
     Args:
-        model: with appearance vectors.
-        dataset: held-out images.
-        index: which of them.
-        background: (3,) colour behind what is not opaque.
+        model: a model with appearance vectors.
+        dataset: the held-out images.
+        index: index of the image.
+        background: (3,) colour behind transparent pixels.
     """
     with shown_appearance(model, fit_appearance(model, dataset, _left_pixels(dataset, index), background)):
         yield
@@ -59,11 +59,11 @@ def fitted_appearance(model: Model[Any], dataset: Dataset, index: int, backgroun
 
 @contextmanager
 def shown_appearance(model: Model[Any], vector: Tensor | None) -> Iterator[None]:
-    """Show what is no training image in an appearance.
+    """Render views that are no training images with an appearance vector, within a `with` block.
 
     Args:
-        model: whose pictures are meant.
-        vector: (D,) the appearance; None of a model without.
+        model: the model.
+        vector: (D,) appearance vector; None to change nothing.
     """
     appearance = appearance_of(model)
     with nullcontext() if appearance is None or vector is None else appearance.shown(vector):
@@ -73,15 +73,17 @@ def shown_appearance(model: Model[Any], vector: Tensor | None) -> Iterator[None]
 def fit_appearance(
     model: Model[Any], dataset: Dataset, pixels: Tensor, background: Tensor, start: Tensor | None = None
 ) -> Tensor | None:
-    """Find the appearance in which the model's picture comes nearest to an image, all else being fixed.
+    """Fit the appearance vector with which the model's colours come closest to given pixels.
 
     Args:
-        model: what is shown.
+        model: the model, whose parameters are not changed.
         dataset: the images.
-        pixels: (P,) which to look at, counted through all images; P may be 0.
-        background: (3,) colour behind what is not opaque.
-        start: (D,) the vector to start from; the mean of the training images' if None.
-    Returns: (D,) the vector; None of a model without appearance.
+        pixels: (P,) indices of the pixels, counted through all images; P may be 0.
+        background: (3,) colour behind transparent pixels.
+        start: (D,) initial vector; the mean of the training images' vectors if None.
+
+    Returns:
+        (D,) vector; None if the model has no appearance vectors.
     """
     appearance = appearance_of(model)
     if appearance is None:
@@ -94,7 +96,7 @@ def fit_appearance(
 
 
 def _left_pixels(dataset: Dataset, index: int) -> Tensor:
-    """(P,) those of the photograph's left half that no mask ignores, counted through all images."""
+    """Return the unmasked pixels (P,) of an image's left half, counted through all images."""
     width = int(dataset.cameras.widths[index])
     pixels = dataset.cameras.image_pixels(index).view(-1, width)[:, : width // 2]
     kept = dataset.kept_of(index)
@@ -105,10 +107,10 @@ def _fit(model: RayModel[Any], dataset: Dataset, pixels: Tensor, vector: Tensor,
     was_training = model.training
     model.eval()
     optimizer = torch.optim.Adam([vector], lr=RATE)
-    draws = torch.Generator().manual_seed(0)
+    generator = torch.Generator().manual_seed(0)
     with torch.enable_grad(), torch.autocast(model.device.type, torch.bfloat16, enabled=False):
         for _ in range(STEPS):
-            chosen = pixels[torch.randint(len(pixels), (PIXELS,), generator=draws).to(pixels.device)]
+            chosen = pixels[torch.randint(len(pixels), (PIXELS,), generator=generator).to(pixels.device)]
             batch = gather_batch(dataset, chosen, background.repeat(len(chosen), 1))
             rendered = model.render(replace(batch.rays, camera_indices=None), batch.background)
             (vector.grad,) = torch.autograd.grad(mean_squared_error(rendered.rgb, batch.rgb), [vector])

@@ -1,4 +1,4 @@
-"""Rendering faster within a stated error: rays end where the rest cannot change a colour by more than that."""
+"""Faster rendering within an error bound: rays end where the rest cannot change a colour by more than the bound."""
 
 from __future__ import annotations
 
@@ -13,12 +13,14 @@ from framework.model import Model, parts
 from framework.samplers.base import StopsEarly
 
 MEASURED_VIEWS = 4
+"""Maximum number of views on which the error is measured."""
 
 
 def parse_error(text: str) -> float:
-    """A bound such as 0.004 or 1/255.
+    """Return the error bound that `text`, such as 0.004 or 1/255, stands for.
 
-    Raises: ConfigError where it is not a number from 0 to below 1.
+    Raises:
+        ConfigError: if it is not a number in [0, 1).
     """
     try:
         numerator, _, denominator = text.partition("/")
@@ -32,9 +34,14 @@ def parse_error(text: str) -> float:
 
 @contextmanager
 def limited_error(model: Model[Any], bound: float) -> Iterator[None]:
-    """Render with rays that end at transmittance `bound`: what is cut off could add at most bound * (1 - 0).
+    """End rays at a given transmittance, within a `with` block; the rest of a ray changes a colour by at most as much.
 
-    Raises: ConfigError for a method whose rays do not end early.
+    Args:
+        model: the model.
+        bound: transmittance in [0, 1).
+
+    Raises:
+        ConfigError: if the model's sampler cannot end rays early.
     """
     samplers = parts(model, StopsEarly)
     if not samplers:
@@ -50,14 +57,23 @@ def limited_error(model: Model[Any], bound: float) -> Iterator[None]:
 
 
 def measured_error(model: Model[Any], dataset: Dataset, bound: float) -> tuple[float, float]:
-    """Largest difference of a colour channel to rendering without early stop, over a few views, and the speed-up."""
+    """Measure the error and the speed-up of rendering with an error bound, on a few views.
+
+    Args:
+        model: the model.
+        dataset: views, on the model's device.
+        bound: transmittance at which rays end.
+
+    Returns:
+        The maximum difference of a colour channel to rendering without early stop, and the ratio of the two times.
+    """
     background, worst, times = evaluation_background(model), 0.0, [0.0, 0.0]
     for index in spread(len(dataset), MEASURED_VIEWS):
         views = []
-        for place, stop in enumerate((0.0, bound)):
+        for number, stop in enumerate((0.0, bound)):
             with limited_error(model, stop):
                 picture, seconds = timed_view(model, dataset.view(index), background)
             views.append(picture)
-            times[place] += seconds
+            times[number] += seconds
         worst = max(worst, float((views[0].rgb - views[1].rgb).abs().max()))
     return worst, times[0] / times[1]

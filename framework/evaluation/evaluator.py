@@ -1,4 +1,4 @@
-"""One evaluator for every method: the same numbers at the end of training and from `ns-eval`."""
+"""The evaluator of every method, used at the end of training and by `ns-eval`."""
 
 from __future__ import annotations
 
@@ -28,11 +28,14 @@ from framework.model import Model
 from framework.rendering.rendered import Picture
 
 LONGEST_STEM = 150
-"""Bytes of a photograph's name that its pictures are called by."""
+"""Maximum number of bytes of an image's name in the names of the files written for it."""
 
 
 def evaluation_background(model: Model) -> Tensor:
-    """(3,) what training is over; white where that is random, but black where no photograph has alpha."""
+    """Return the background colour (3,) of an evaluation of `model`.
+
+    It is that of training; if that is random or automatic, white, or black if no image has alpha.
+    """
     asked = model.config.background
     black = asked == "black" or (asked != "white" and not model.scene.has_alpha)
     return torch.full((3,), 0.0 if black else 1.0, device=model.device)
@@ -40,27 +43,35 @@ def evaluation_background(model: Model) -> Tensor:
 
 @dataclass(frozen=True)
 class Measured:
-    """How near a picture comes to its photograph."""
+    """Metrics of a rendered image."""
 
     psnr: float
-    """dB."""
+    """Peak signal-to-noise ratio, dB."""
     ssim: float | None
-    """None for a picture that is smaller than SSIM's window."""
+    """Structural similarity; None if the image is smaller than SSIM's window."""
 
 
 def measure(rgb: Tensor, target: Tensor, kept: Tensor | None) -> Measured:
-    """PSNR of the kept pixels; SSIM of the whole, in which the rest should agree.
+    """Compute the PSNR of the kept pixels and the SSIM of the whole image, in which other pixels should be equal.
 
     Args:
-        rgb, target: (H, W, 3) picture and photograph.
-        kept: (H, W) bool which pixels count; all if None.
+        rgb, target: (H, W, 3) rendered and true image in [0, 1].
+        kept: (H, W) bool, pixels that count; all if None.
     """
     judged = (rgb, target) if kept is None else (rgb[kept], target[kept])
     return Measured(psnr(*judged), ssim(rgb, target) if min(rgb.shape[:2]) >= 11 else None)
 
 
 def measure_view(model: Model, dataset: Dataset, index: int, background: Tensor, stride: int = 1) -> Measured:
-    """How near the picture of view `index` comes to its photograph, of every `stride`-th row and column of both."""
+    """Render a view and compute its metrics.
+
+    Args:
+        model: the trained model.
+        dataset: views with images, on the model's device.
+        index: index of the view.
+        background: (3,) colour behind transparent pixels.
+        stride: distance between rendered rows and columns, pixels.
+    """
     target = composite(every(dataset.image(index), stride).float() / 255, background)
     kept = dataset.kept_of(index)
     rgb = model.render_view(dataset.view(index, stride), background).rgb.clamp(0, 1)
@@ -69,21 +80,22 @@ def measure_view(model: Model, dataset: Dataset, index: int, background: Tensor,
 
 
 def views_to_judge(dataset: Dataset, half: bool = False) -> list[int]:
-    """The views of which masks leave something to judge.
+    """Return the indices of the images of which masks keep some pixels.
 
     Args:
+        dataset: the images.
         half: whether only the right half counts.
     """
-    return [index for index in range(len(dataset)) if _shows_something(dataset, index, half)]
+    return [index for index in range(len(dataset)) if _has_kept_pixels(dataset, index, half)]
 
 
 def timed_view(model: Model, view: View, background: Tensor) -> tuple[Picture, float]:
-    """Render a view; return the picture, and the seconds that it took.
+    """Render a view; return the rendered image and the seconds that it took.
 
     Args:
         model: the trained model.
-        view: the camera, on the model's device.
-        background: (3,) colour behind what is not opaque.
+        view: the view, on the model's device.
+        background: (3,) colour behind transparent pixels.
     """
     start = time.perf_counter()
     picture = model.render_view(view, background)
@@ -93,21 +105,21 @@ def timed_view(model: Model, view: View, background: Tensor) -> tuple[Picture, f
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What an evaluation found."""
+    """Metrics of a set of images."""
 
     per_image: list[dict[str, Any]]
-    """name, psnr, ssim and lpips of each image."""
+    """Name, psnr, ssim, lpips and rendering seconds of each image."""
     results: dict[str, Any]
-    """Means, standard deviations and speed, under nerfstudio's keys."""
+    """Means, standard deviations and rendering speed, with nerfstudio's keys."""
     lpips_note: str
-    """Which LPIPS was used, or why none."""
+    """Network of LPIPS, or the reason why it is absent."""
     eval_appearance: Literal["mean", "half"] | None = None
-    """How held-out photographs were given an appearance; None for a method without."""
+    """Source of the held-out images' appearance; None if the method has none."""
     pictures_note: str | None = None
-    """Why pictures are missing, where they could not be written."""
+    """Reason why rendered images could not be written; None if there is none."""
 
     def line(self) -> str:
-        """The results in a line."""
+        """Return the results as a line of text."""
         r = self.results
         ssim, lpips = ("absent" if r[name] is None else f"{r[name]:.4f}" for name in ("ssim", "lpips"))
         return (
@@ -126,26 +138,27 @@ def evaluate(
     round_to_uint8: bool = False,
     title: str = "Evaluating",
 ) -> Evaluation:
-    """Render views and compare them with their photographs.
+    """Render views and compute their metrics.
 
-    What masks ignore does not count: PSNR is that of the other pixels, and for SSIM and LPIPS, which look at
-    surroundings, the picture takes the photograph's own colours there. A photograph of which nothing is left is passed
-    over. Where a method has appearance vectors and `eval_appearance` says so, only the right half counts.
+    Masked-out pixels do not count: PSNR omits them; for SSIM and LPIPS they are copied from the true image. Images
+    without other pixels are skipped. If appearance is fitted to left halves (`eval_appearance`), right halves count.
 
     Args:
         model: the trained model.
-        dataset: views with photographs, on the model's device.
-        max_images: at most this many views, evenly spread; all if None.
-        pictures: folder for renders, their photographs, comparisons (photograph, render, error, depth, opacity), and
-            normals where there are any, red, green and blue being x, y and z from -1 to 1; none if None.
-        max_pictures: write only the first so many.
-        round_to_uint8: measure the picture as it would be stored.
-    Raises: DataError where there is nothing to evaluate.
+        dataset: views with images, on the model's device.
+        max_images: maximum number of views, evenly spaced; all if None.
+        pictures: folder for renders, true images, `view_panels` and normals (x, y, z as RGB); no files if None.
+        max_pictures: maximum number of views of which files are written; all if None.
+        round_to_uint8: whether colours are rounded to 8 bits before they are measured.
+        title: text of the progress bar.
+
+    Raises:
+        DataError: if there is no image to evaluate.
     """
     has_appearance = appearance_of(model) is not None
     half = has_appearance and isinstance(model.config, AppearanceConfig) and model.config.eval_appearance == "half"
-    shown = views_to_judge(dataset, half)
-    chosen = [shown[place] for place in spread(len(shown), max_images)]
+    views = views_to_judge(dataset, half)
+    chosen = [views[rank] for rank in spread(len(views), max_images)]
     if not chosen:
         raise DataError(f"there is no image to evaluate: masks leave nothing of the {len(dataset)} that there are")
     lpips, lpips_note = load_lpips()
@@ -159,14 +172,14 @@ def evaluate(
         rgb = picture.rgb.clamp(0, 1)
         if round_to_uint8:
             rgb = (rgb * 255).round() / 255
-        found, kept = _judged(rgb, target, dataset.kept_of(index), half)
-        measured = measure(*found, kept)
+        pair, kept = _judged(rgb, target, dataset.kept_of(index), half)
+        measured = measure(*pair, kept)
         rows.append(
             {
                 "name": dataset.names[index],
                 "psnr": measured.psnr,
                 "ssim": measured.ssim,
-                "lpips": None if lpips is None else lpips(*found),
+                "lpips": None if lpips is None else lpips(*pair),
                 "seconds": spent,
             }
         )
@@ -175,7 +188,7 @@ def evaluate(
         if pictures is not None and (max_pictures is None or len(rows) <= max_pictures):
             try:
                 _write_pictures(pictures, f"{index:04d}_{_short_stem(dataset.names[index])}", rgb, target, picture)
-            except OSError as error:  # the figures are worth more
+            except OSError as error:  # metrics do not need the files
                 pictures, pictures_note = None, f"cannot write pictures to {pictures}: {error.strerror or error}"
     results = {**_statistics(rows), "num_rays_per_sec": rays / seconds, "fps": len(rows) / seconds}
     protocol: Literal["mean", "half"] | None = ("half" if half else "mean") if has_appearance else None
@@ -183,7 +196,7 @@ def evaluate(
 
 
 def _write_pictures(folder: Path, stem: str, rgb: Tensor, target: Tensor, picture: Picture) -> None:
-    """A view's picture, its photograph, both compared, and its normals. Raises: OSError as it comes."""
+    """Write a view's rendered image, true image, comparison and normals."""
     write_image(folder / f"{stem}.png", rgb)
     write_image(folder / f"{stem}_photograph.png", target)
     panels = view_panels(rgb, target, picture.median_depth, picture.accumulation)
@@ -193,38 +206,38 @@ def _write_pictures(folder: Path, stem: str, rgb: Tensor, target: Tensor, pictur
 
 
 def _short_stem(name: str) -> str:
-    """A photograph's name without its ending, so short that something may stand before and behind it."""
+    """Return an image's name without its extension, cut to LONGEST_STEM bytes."""
     return os.fsencode(Path(name).stem)[:LONGEST_STEM].decode("utf-8", "ignore")
 
 
 def _judged(
     rgb: Tensor, target: Tensor, kept: Tensor | None, half: bool
 ) -> tuple[tuple[Tensor, Tensor], Tensor | None]:
-    """Picture and photograph as metrics see them, and which of their pixels count (None for all)."""
+    """Return the rendered and the true image as metrics compare them, and which pixels count (None for all)."""
     if half:
         rgb, target = right_half(rgb), right_half(target)
         kept = None if kept is None else right_half(kept)
     return (rgb if kept is None else torch.where(kept[..., None], rgb, target), target), kept
 
 
-def _shows_something(dataset: Dataset, index: int, half: bool) -> bool:
-    """Whether masks leave any of what is judged of an image."""
+def _has_kept_pixels(dataset: Dataset, index: int, half: bool) -> bool:
+    """Return whether masks keep any pixel of an image, or of its right half."""
     kept = dataset.kept_of(index)
     return kept is None or bool((right_half(kept) if half else kept).any())
 
 
 def spread(total: int, limit: int | None) -> list[int]:
-    """At most `limit` of the numbers 0 .. total - 1, evenly spread."""
+    """Return at most `limit` of the numbers 0 to `total` - 1, evenly spaced; all if `limit` is None."""
     if limit is None or limit >= total:
         return list(range(total))
     return [index * total // limit for index in range(limit)]
 
 
 def _statistics(rows: list[dict[str, Any]]) -> dict[str, float | None]:
-    """Mean and standard deviation of each metric; None where it is absent."""
-    out: dict[str, float | None] = {}
+    """Return the mean and the standard deviation of each metric; None if it is absent."""
+    statistics: dict[str, float | None] = {}
     for name in ("psnr", "ssim", "lpips"):
         values = [row[name] for row in rows if row[name] is not None]
-        out[name] = fmean(values) if values else None
-        out[f"{name}_std"] = (stdev(values) if len(values) > 1 else 0.0) if values else None
-    return out
+        statistics[name] = fmean(values) if values else None
+        statistics[f"{name}_std"] = (stdev(values) if len(values) > 1 else 0.0) if values else None
+    return statistics

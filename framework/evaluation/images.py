@@ -1,4 +1,4 @@
-"""Pictures: renders, comparisons and animations."""
+"""Conversion and writing of images and animations, and error maps."""
 
 from __future__ import annotations
 
@@ -13,32 +13,47 @@ import torch
 from torch import Tensor
 
 ERROR_AT_WHITE = 0.25
-"""Mean absolute error that an error map shows as white."""
+"""Mean absolute error, of colours in [0, 1], from which on an error map is white."""
 
 
 def to_uint8(image: Tensor) -> np.ndarray:
-    """(H, W, 3) in [0, 1] to uint8, rounded."""
+    """Convert an `image` (H, W, 3) from [0, 1] to uint8, rounded."""
     return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 
 def heat(values: Tensor) -> Tensor:
-    """(H, W) in [0, 1] as black, red, yellow, white (H, W, 3)."""
+    """Map `values` (H, W) in [0, 1] to colours (H, W, 3) from black over red and yellow to white."""
     return torch.stack([3 * values, 3 * values - 1, 3 * values - 2], dim=-1).clamp(0, 1)
 
 
 def error_map(prediction: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """The mean absolute error over channels of two pictures (H, W, 3) uint8 as `heat` (H, W, 3) uint8."""
-    wrong = np.abs(prediction.astype(np.float32) - target).mean(-1) / 255
-    return to_uint8(heat(torch.from_numpy(wrong) / ERROR_AT_WHITE))
+    """Return an image (H, W, 3) uint8 of the absolute error, a mean over channels, in the colours of `heat`.
+
+    Args:
+        prediction, target: (H, W, 3) uint8 rendered and true image.
+    """
+    error = np.abs(prediction.astype(np.float32) - target).mean(-1) / 255
+    return to_uint8(heat(torch.from_numpy(error) / ERROR_AT_WHITE))
 
 
 def write_image(path: Path, image: Tensor) -> None:
-    """(H, W, 3) in [0, 1] as an 8-bit PNG; makes the folder."""
+    """Write an image, with 8 bits per channel.
+
+    Args:
+        path: file to write; its extension is the format, and its folder is created if missing.
+        image: (H, W, 3) colours in [0, 1].
+    """
     _write(path, to_uint8(image))
 
 
 def write_animation(path: Path, frames: Sequence[Tensor], fps: float) -> None:
-    """(H, W, 3) frames in [0, 1] as an endless animation; the ending (.gif, .webp, .png) chooses the format."""
+    """Write an endless animation.
+
+    Args:
+        path: file to write; its extension (.gif, .webp, .png) is the format, and its folder is created if missing.
+        frames: (H, W, 3) colours in [0, 1] of each frame.
+        fps: frames per second.
+    """
     _write(path, np.stack([to_uint8(frame) for frame in frames]), duration=1000 / fps, loop=0)
 
 
@@ -48,5 +63,5 @@ def _write(path: Path, pixels: np.ndarray, **options: Any) -> None:
         iio.imwrite(path, pixels, **options)
     except BaseException:
         with suppress(OSError):
-            path.unlink(missing_ok=True)  # half a picture is none
+            path.unlink(missing_ok=True)  # remove an incomplete file
         raise

@@ -14,21 +14,29 @@ from framework.base.device import to_float64
 from framework.base.extras import install_command
 
 MAX_PSNR = 100.0
-"""dB. Identical images would have infinity, which JSON cannot hold."""
+"""PSNR of identical images, dB, instead of infinity, which JSON cannot hold."""
 
 
 def psnr(prediction: Tensor, target: Tensor) -> float:
-    """Peak signal-to-noise ratio in dB for a peak of 1; 100 for identical images."""
+    """Compute the peak signal-to-noise ratio in dB for a peak of 1; 100 for identical images.
+
+    Args:
+        prediction, target: colours in [0, 1], of the same shape.
+    """
     error = (to_float64(prediction) - to_float64(target)).square().mean().clamp(min=10 ** (-MAX_PSNR / 10))
     return float(-10 * error.log10())
 
 
 def ssim(prediction: Tensor, target: Tensor) -> float:
-    """Structural similarity (Wang et al. 2004): data range 1, 11x11 Gaussian window with sigma 1.5.
+    """Compute the structural similarity (Wang et al. 2004) with an 11x11 Gaussian window, sigma 1.5, data range 1.
 
-    Averaged over the windows that lie inside the image and over channels.
+    It is averaged over the windows inside the image and over channels.
 
-    Raises: ValueError for an image smaller than the window.
+    Args:
+        prediction, target: (H, W, 3) colours in [0, 1].
+
+    Raises:
+        ValueError: if the image is smaller than the window.
     """
     if min(prediction.shape[:2]) < 11:
         raise ValueError(f"SSIM needs at least 11x11 pixels, not {prediction.shape[1]}x{prediction.shape[0]}")
@@ -50,9 +58,10 @@ def ssim(prediction: Tensor, target: Tensor) -> float:
 
 
 def load_lpips() -> tuple[Callable[[Tensor, Tensor], float] | None, str]:
-    """LPIPS with AlexNet (Zhang et al. 2018), where the `lpips` extra and the network's weights are present.
+    """Load LPIPS with AlexNet (Zhang et al. 2018), if the `lpips` extra and the network's weights are installed.
 
-    Returns: the metric, or None; and a line that says which, and why.
+    Returns:
+        The metric, a function of two images (H, W, 3) in [0, 1], or None; and the network's name, or why it is absent.
     """
     if (advice := install_command("lpips")) is not None:
         return None, f"absent: {advice}"
@@ -62,7 +71,7 @@ def load_lpips() -> tuple[Callable[[Tensor, Tensor], float] | None, str]:
     import lpips
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torchvision's notices about renamed arguments
+        warnings.simplefilter("ignore")  # torchvision warns of renamed arguments
         network = lpips.LPIPS(net="alex", verbose=False).eval()
 
     def measure(prediction: Tensor, target: Tensor) -> float:

@@ -1,4 +1,4 @@
-"""Pictures for people: a view beside its photograph, every part with a name, colour maps with their ranges."""
+"""Comparison images: a row of labelled panels with colour bars."""
 
 from __future__ import annotations
 
@@ -13,33 +13,36 @@ from torch import Tensor
 from framework.evaluation.images import ERROR_AT_WHITE, heat, to_uint8
 
 SMALLEST_WIDTH = 160
-"""Pixels of a part's width; smaller pictures are enlarged by a whole number."""
+"""Minimum width of a panel, pixels; smaller images are enlarged by a whole number."""
 TEXT_SHARE, SMALLEST_TEXT = 24, 12
-"""Text is this part of a part's width in height, but so many pixels at least."""
+"""Ratio of a panel's width to the height of text, and the minimum height of text, pixels."""
 INK, PAPER = (20, 20, 20), (255, 255, 255)
+"""Colours of text and background, 8-bit RGB."""
 
 
 @dataclass(frozen=True)
 class Panel:
-    """A part of a picture."""
+    """A labelled image, with an optional colour bar."""
 
     label: str
+    """Text above the image."""
     image: Tensor
-    """(H, W, 3) in [0, 1]."""
+    """(H, W, 3) colours in [0, 1]."""
     ends: tuple[str, str] | None = None
-    """Values at the two ends of the colour bar; None where there is no bar."""
+    """Texts at the two ends of the colour bar; None for no bar."""
     bar: Tensor | None = None
-    """(N, 3) colours of the bar from its first end to its last."""
+    """(N, 3) colours of the bar from left to right; None for no bar."""
 
 
 def view_panels(prediction: Tensor, target: Tensor, depth: Tensor, accumulation: Tensor) -> list[Panel]:
-    """Photograph, render, error, depth and opacity of a view.
+    """Return panels of the true image, render, error, depth and opacity of a view.
+
+    Depth is shown where opacity is above one half, from its 2nd to its 98th percentile there.
 
     Args:
-        prediction, target: (H, W, 3) render and photograph in [0, 1].
-        depth: (H, W) distance along the ray, scene units; shown where opacity is above one half, from its 2nd to its
-            98th percentile there.
-        accumulation: (H, W) opacity.
+        prediction, target: (H, W, 3) rendered and true image in [0, 1].
+        depth: (H, W) distance along the ray, scene units.
+        accumulation: (H, W) opacity, 0 to 1.
     """
     ramp = torch.linspace(0, 1, 256)
     error = (prediction - target).abs().mean(-1) / ERROR_AT_WHITE
@@ -58,7 +61,12 @@ def view_panels(prediction: Tensor, target: Tensor, depth: Tensor, accumulation:
 
 
 def depth_range(depth: Tensor, solid: Tensor) -> tuple[float, float]:
-    """2nd and 98th percentile of depths (H, W) where `solid` (H, W); of all where nothing is."""
+    """Return the 2nd and 98th percentile of the finite depths of solid pixels; 0 and 0 if there are none.
+
+    Args:
+        depth: (H, W) distances, scene units.
+        solid: (H, W) bool, pixels that count; all count if none is set.
+    """
     values = depth[solid] if bool(solid.any()) else depth.flatten()
     values = values[torch.isfinite(values)].double().sort().values
     if not len(values):
@@ -76,22 +84,22 @@ VIRIDIS = torch.tensor(
         [0.993, 0.906, 0.144],
     ]
 )  # fmt: skip
-"""matplotlib's colour map of that name at seventeen even places."""
+"""(17, 3) RGB in [0, 1] of matplotlib's colour map viridis at evenly spaced values."""
 
 
 def viridis(values: Tensor) -> Tensor:
-    """Values (...) in [0, 1] as colours (..., 3), lighter as they grow; NaN as 0."""
+    """Map `values` (...) in [0, 1] to colours (..., 3), lighter for larger values; NaN is taken as 0."""
     colors = VIRIDIS.to(values)
-    places = values.nan_to_num(0.0).clamp(0, 1) * (len(colors) - 1)
-    low = places.floor().long().clamp(max=len(colors) - 2)
-    return torch.lerp(colors[low], colors[low + 1], (places - low)[..., None])
+    scaled = values.nan_to_num(0.0).clamp(0, 1) * (len(colors) - 1)
+    low = scaled.floor().long().clamp(max=len(colors) - 2)
+    return torch.lerp(colors[low], colors[low + 1], (scaled - low)[..., None])
 
 
 def composed(panels: Sequence[Panel]) -> Tensor:
-    """Panels in a row, with a gap between them, labels above and colour bars below: (H', W', 3) in [0, 1].
+    """Compose panels in a row, with labels above and colour bars below, as an image (H', W', 3) in [0, 1].
 
     Args:
-        panels: all of one size. Small ones are enlarged by a whole number, each pixel becoming a square.
+        panels: panels of equal size. Small ones are enlarged by a whole number, without interpolation.
     """
     height, width = panels[0].image.shape[:2]
     factor = max(-(-SMALLEST_WIDTH // width), 1)

@@ -11,13 +11,13 @@ from framework.cameras.cameras import Cameras
 from framework.kernels.math import safe_normalize
 
 STOPS = 24
-"""Of an interpolated path's cameras, the share that is averaged with each is one in so many either way."""
+"""Ratio of the number of cameras to the standard deviation, in cameras, of the weights of an interpolated path."""
 
 
 def look_at(position: Tensor, target: Tensor, up: Tensor) -> Tensor:
-    """Camera-to-world (3, 4) of a camera at `position` (3,) that looks at `target` (3,), with `up` (3,) upwards.
+    """Return the camera-to-world pose (3, 4) of a camera at `position` (3,) that looks at `target` (3,).
 
-    Looking along `up` itself leaves the roll undetermined; x is then taken as the right-hand side's reference.
+    The `up` direction (3,) is upwards in the image; if the camera looks along it, +y is used instead.
     """
     back = safe_normalize(position - target)
     right = torch.linalg.cross(up, back)
@@ -28,9 +28,14 @@ def look_at(position: Tensor, target: Tensor, up: Tensor) -> Tensor:
 
 
 def orbit(cameras: Cameras, center: Tensor, num_frames: int) -> Cameras:
-    """Cameras on a horizontal circle around `center` (3,), looking at it.
+    """Return cameras on a horizontal circle, looking at its centre.
 
-    Height and radius are the mean ones of `cameras`; intrinsics are the first one's.
+    Height and radius are the means of the given cameras', and intrinsics those of the first.
+
+    Args:
+        cameras: M cameras.
+        center: (3,) centre, scene units.
+        num_frames: number of cameras on the circle.
     """
     offsets = cameras.camera_to_worlds[:, :, 3] - center
     height, radius = offsets[:, 2].mean(), offsets[:, :2].norm(dim=-1).mean()
@@ -42,15 +47,19 @@ def orbit(cameras: Cameras, center: Tensor, num_frames: int) -> Cameras:
 
 
 def interpolate(cameras: Cameras, num_frames: int) -> Cameras:
-    """Cameras along a smooth path past M cameras, in their order: a walk without the hand's shaking.
+    """Return cameras along a smooth path past given cameras, in their order, without the shaking of a hand.
 
-    A pose is the mean of those nearby in that order, weighted by a Gaussian; of rotations, the one closest to the mean
-    of their matrices. Intrinsics are the first one's.
+    A pose is the mean of poses nearby in that order, weighted by a Gaussian; its rotation is the one closest to the
+    mean of the matrices. Intrinsics are those of the first camera.
+
+    Args:
+        cameras: M cameras.
+        num_frames: number of cameras on the path.
     """
     count = len(cameras)
     width = max(count / STOPS, 0.5)
-    places = torch.linspace(0, count - 1, num_frames, dtype=torch.float64)
-    weights = torch.exp(-0.5 * ((places[:, None] - torch.arange(count)) / width).square())
+    positions = torch.linspace(0, count - 1, num_frames, dtype=torch.float64)
+    weights = torch.exp(-0.5 * ((positions[:, None] - torch.arange(count)) / width).square())
     weights = weights / weights.sum(-1, keepdim=True)
     means = torch.einsum("fm,mij->fij", weights, cameras.camera_to_worlds.double())
     u, _, vh = torch.linalg.svd(means[:, :, :3])
@@ -61,5 +70,5 @@ def interpolate(cameras: Cameras, num_frames: int) -> Cameras:
 
 
 def replace_poses(cameras: Cameras, poses: Tensor) -> Cameras:
-    """Cameras at `poses` (K, 3, 4) with the intrinsics of the first of `cameras`."""
+    """Return cameras with `poses` (K, 3, 4) and the intrinsics of the first of `cameras`."""
     return replace(cameras[torch.zeros(len(poses), dtype=torch.long)], camera_to_worlds=poses)

@@ -1,1 +1,1 @@
-"""Training: one trainer for every method."""
+"""Training of any method by one trainer."""

@@ -1,7 +1,7 @@
-"""Checkpoints: tensors and plain data only, written so that a killed process never leaves half of one.
+"""Checkpoints of tensors and plain data, written atomically, so that a killed process leaves no incomplete file.
 
-A file is what torch writes and a seal, which is a hash of it: torch does not look whether a tensor's bytes are still
-those that were written. Before there were seals, `format` was 1.
+A file is PyTorch's archive followed by a seal, the archive's SHA-256 hash: PyTorch itself does not check the bytes of
+tensors. Files of `format` 1 have no seal.
 """
 
 from __future__ import annotations
@@ -25,21 +25,27 @@ from framework.base.console import say
 from framework.base.errors import CheckpointError
 
 FOLDER = "nerfstudio_models"
+"""Name of the checkpoints' folder in a run's folder."""
 UNSEALED, SEALED = 1, 2
-"""What `format` may be."""
+"""Values of a checkpoint's `format`."""
 SEAL = b"\nsha256:"
-"""What stands before the hash, which ends the file."""
+"""Bytes before the hexadecimal hash at the end of the file."""
 PIECE = 2**24
-"""Bytes that are hashed at once."""
+"""Bytes that are read and hashed at a time."""
 SAFE_TORCH = "2.10"
-"""The first whose reader cannot be made to run code by a checkpoint, as far as is known (CVE-2026-24747)."""
+"""First version of PyTorch whose `weights_only` reader is not known to execute code (CVE-2026-24747)."""
 _NAME = re.compile(r"step-(\d{9})\.ckpt")
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Call `write(file)` on a temporary file beside `path`, flush it to disk and rename it.
 
-    Raises: OSError as it comes; `path` is then as it was, and no temporary file is left.
+    Args:
+        path: file to write.
+        write: function that writes the content to an open binary file.
+
+    Raises:
+        OSError: if the file cannot be written; `path` is then unchanged, and no temporary file is left.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -55,8 +61,8 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 
 def _flush_folder(folder: Path) -> None:
-    """Let the names in a folder reach the disk: the new one before older files are removed."""
-    with suppress(OSError):  # Windows opens no folders, and some file systems flush none
+    """Flush the names in a folder to disk, so that a new file is there before older ones are removed."""
+    with suppress(OSError):  # Windows cannot open folders, and some file systems cannot flush them
         opened = os.open(folder, os.O_RDONLY)
         try:
             os.fsync(opened)
@@ -65,32 +71,41 @@ def _flush_folder(folder: Path) -> None:
 
 
 def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bool, before: int | None = None) -> Path:
-    """Write `state` as step-%09d.ckpt; then, unless `keep_all`, remove all before it but one.
+    """Write a checkpoint; then, unless all are kept, remove all checkpoints of earlier steps but one.
 
-    Later ones stay: they were damaged, or the run would not have gone on from an earlier one, and push nothing out.
+    Checkpoints of later steps are damaged, as the run continued from an earlier one; they stay, and are not counted.
 
     Args:
-        before: the step of the one that stays, which the run has saved, or gone on from, last: a later one is damaged.
-            If there is none of that step, the last before `step` stays.
-    Raises: CheckpointError where it cannot be written; older checkpoints are untouched then.
+        folder: folder of the checkpoints, created if missing.
+        step: number of training steps done, which is in the file's name.
+        state: tensors and plain data.
+        keep_all: whether all checkpoints are kept.
+        before: step of the earlier checkpoint to keep, which the run last wrote or continued from. If None, or if there
+            is no such checkpoint, that of the last step before `step` is kept.
+
+    Returns:
+        The checkpoint's path.
+
+    Raises:
+        CheckpointError: if the file cannot be written; older checkpoints are then unchanged.
     """
     path = _path(folder, step)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        content = io.BytesIO()  # written by torch itself, a full disk is reported as "unexpected pos"
+        content = io.BytesIO()  # if torch writes to a full disk, it reports "unexpected pos"
         torch.save({"format": SEALED, **state}, content)
         content.seek(0, os.SEEK_END)
         content.write(SEAL + hashlib.sha256(content.getbuffer()).hexdigest().encode())
         write_atomically(path, lambda file: file.write(content.getbuffer()))
     except (OSError, RuntimeError) as error:
         raise CheckpointError(f"cannot write {path}: {error}; earlier checkpoints stand") from error
-    for remnant in folder.glob(".step-*.ckpt.*.tmp"):  # of a process that was killed while writing
+    for remnant in folder.glob(".step-*.ckpt.*.tmp"):  # left by a process that was killed while writing
         remnant.unlink(missing_ok=True)
     earlier = [other for other in list_checkpoints(folder) if other.name < path.name]
-    known = None if before is None else _path(folder, before)
-    staying = known if known in earlier else next(reversed(earlier), None)
+    previous = None if before is None else _path(folder, before)
+    kept = previous if previous in earlier else next(reversed(earlier), None)
     for old in earlier:
-        if not keep_all and old != staying:
+        if not keep_all and old != kept:
             old.unlink(missing_ok=True)
     return path
 
@@ -98,8 +113,8 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bo
 @cache
 def _warn_of(version: str) -> None:
     say(
-        f"torch {version} can be made to run code by a checkpoint that was made for that (CVE-2026-24747): "
-        f"load none from strangers, or upgrade torch to {SAFE_TORCH} or newer"
+        f"torch {version} can execute code from a manipulated checkpoint (CVE-2026-24747): "
+        f"do not load checkpoints from strangers, or upgrade torch to {SAFE_TORCH} or newer"
     )
 
 
@@ -108,23 +123,31 @@ def _path(folder: Path, step: int) -> Path:
 
 
 def list_checkpoints(folder: Path) -> list[Path]:
-    """Checkpoints in a folder, oldest first."""
+    """Return the checkpoints in `folder`, earliest step first."""
     return sorted(path for path in folder.glob("step-*.ckpt") if _NAME.fullmatch(path.name))
 
 
 def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
-    """Read a checkpoint. Nothing in it is executed (`weights_only`), unless torch is older than `SAFE_TORCH`.
+    """Read a checkpoint; no code in it is executed (`weights_only`) unless PyTorch is older than `SAFE_TORCH`.
 
-    Raises: CheckpointError where it is missing, not as it was written, or not one of ours.
+    Args:
+        path: file to read.
+        device: device of the tensors.
+
+    Returns:
+        The content, tensors and plain data.
+
+    Raises:
+        CheckpointError: if the file is missing, damaged, or not a checkpoint of this version.
     """
     if TorchVersion(torch.__version__) < SAFE_TORCH:
         _warn_of(torch.__version__)
     try:
         sealed = _is_sealed(path)
-        if uncompressed_size(path) > path.stat().st_size:  # torch compresses nothing, but would unfold what is
+        if uncompressed_size(path) > path.stat().st_size:  # torch writes uncompressed, but reads compressed
             raise CheckpointError(f"{path} is damaged: it would unfold to more than it holds")
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch's doubts about foreign pickles; they are refused below
+            warnings.simplefilter("ignore")  # torch warns of foreign pickles, which are refused below
             state = torch.load(path, map_location=device, weights_only=True)
     except CheckpointError:
         raise
@@ -141,40 +164,54 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
 
 
 def _is_sealed(path: Path) -> bool:
-    """Whether a file ends with a seal.
-
-    Raises: CheckpointError where it is not the seal of what stands before it; OSError as it comes.
-    """
+    """Return whether a file ends with a seal; raise CheckpointError if it is not the seal of the bytes before it."""
     length = len(SEAL) + 2 * hashlib.sha256().digest_size
     with path.open("rb") as file:
-        left = max(file.seek(0, os.SEEK_END) - length, 0)
-        file.seek(left)
+        remaining = max(file.seek(0, os.SEEK_END) - length, 0)
+        file.seek(remaining)
         seal = file.read()
         if not seal.startswith(SEAL):
             return False
         file.seek(0)
         digest = hashlib.sha256()
-        while left:
-            piece = file.read(min(left, PIECE))
+        while remaining:
+            piece = file.read(min(remaining, PIECE))
             digest.update(piece)
-            left -= len(piece)
+            remaining -= len(piece)
     if seal != SEAL + digest.hexdigest().encode():
-        raise CheckpointError(f"{path} is damaged: it is not as it was written")
+        raise CheckpointError(f"{path} is damaged: its content does not match its seal")
     return True
 
 
 def load_newest(folder: Path, device: torch.device | str = "cpu") -> dict[str, Any] | None:
-    """The newest readable checkpoint of a folder, or None where the folder has none: see `find_newest`."""
-    found = find_newest(folder, device)
-    return None if found is None else found[1]
+    """Return the content of the newest readable checkpoint in a folder, as `find_newest` does.
+
+    Args:
+        folder: folder of the checkpoints.
+        device: device of the tensors.
+
+    Returns:
+        The content; None if the folder has no checkpoint.
+
+    Raises:
+        CheckpointError: if there are checkpoints, but none can be read.
+    """
+    newest = find_newest(folder, device)
+    return None if newest is None else newest[1]
 
 
 def find_newest(folder: Path, device: torch.device | str = "cpu") -> tuple[Path, dict[str, Any]] | None:
-    """The newest readable checkpoint of a folder and its content, or None where the folder has none.
+    """Return the newest readable checkpoint in a folder; one that cannot be read is reported and skipped.
 
-    A damaged one is reported and the one before it is taken.
+    Args:
+        folder: folder of the checkpoints.
+        device: device of the tensors.
 
-    Raises: CheckpointError where there are checkpoints, but none can be read.
+    Returns:
+        The checkpoint's path and its content; None if the folder has no checkpoint.
+
+    Raises:
+        CheckpointError: if there are checkpoints, but none can be read.
     """
     paths = list_checkpoints(folder)
     for path in reversed(paths):

@@ -1,9 +1,9 @@
-"""A run's learning curve: how well it shows held-out images as training goes.
+"""Learning curves: PSNR and SSIM of held-out images over the training time.
 
-Evaluations over all held-out images are rare and as many as the user asked for. Between them a few images, evenly
-chosen and always the same, are looked at on a schedule by time, so that every run has a curve. Where whole images would
-take too long, every n-th row and column of their pixels stands for them: the same rays as of a whole image, so PSNR
-estimates that of the whole image without bias. SSIM is of the picture that those pixels make.
+Evaluations of all held-out images are rare, and their number is the user's choice. Between them a few images, evenly
+spaced and always the same, are evaluated on a schedule by time, so that every run has a curve. If whole images would
+take too long, only every n-th row and column of pixels is rendered. Their rays are those of the whole image, so that
+their PSNR estimates that of the whole image without bias. SSIM is computed on the image that those pixels form.
 """
 
 from __future__ import annotations
@@ -21,27 +21,26 @@ from framework.model import Model
 from framework.training.progress import StepReport
 
 FEW = 3
-"""Images that are looked at between evaluations over all."""
+"""Maximum number of images that are evaluated between evaluations of all images."""
 SHARE = 0.05
-"""Looking at them takes at most this share of the seconds of training."""
+"""Maximum time of these evaluations, as a fraction of the seconds of training."""
 MARGIN = 0.8
-"""Part of that share that is planned with; what a look will take is known from the one before only."""
+"""Fraction of that time that is planned; the next evaluation's time is estimated from that of the last."""
 SPACING = 1.15
-"""A look comes at the earliest after so many times the seconds of training of the one before."""
+"""Minimum ratio of the seconds of training at an evaluation and at the one before."""
 NUM_LOOKS = 10
-"""Pixels are left out where a run would not have time for so many looks."""
+"""Number of evaluations in a run for which the pixel stride is chosen."""
 PICTURE_SPEED = 2.0
-"""Before the first look, a ray of a picture is taken to be so many times as fast as one of training, which also learns
-from it. Measured: 2 to 7 times."""
+"""Assumed ratio, before the first evaluation, of rays per second in rendering and in training. Measured: 2 to 7."""
 MOST_PIXELS = 2**14
-"""Most pixels of an image that are looked at; more would tell little more."""
+"""Maximum number of evaluated pixels per image; more would add little precision."""
 LEAST_SIDE = 16
-"""Pixels along the shorter side of an image that are looked at, at least: SSIM needs 11."""
+"""Minimum number of evaluated pixels along the shorter side of an image; SSIM needs 11."""
 
 Entry: TypeAlias = (
     "tuple[float, int, float] | tuple[float, int, float, float | None, int | None, int, float | None, bool]"
 )
-"""A point as a checkpoint holds it, one of early versions having three values only."""
+"""A point in a checkpoint; points of early versions have the first three values only."""
 
 
 @dataclass(frozen=True)
@@ -49,46 +48,58 @@ class Point:
     """An evaluation during training."""
 
     seconds: float
-    """Seconds of training until then."""
+    """Seconds of training so far."""
     step: int
+    """Number of training steps done."""
     psnr: float
-    """Mean over images, dB."""
+    """Mean PSNR of the images, dB."""
     ssim: float | None = None
-    """Mean over images; None where they are too small, or where an early version wrote the point."""
+    """Mean SSIM of the images; None if they are too small, or in points of early versions."""
     images: int | None = None
-    """How many; None where an early version wrote the point."""
+    """Number of images; None in points of early versions."""
     pixel_stride: int = 1
-    """Every so many-th row and column of their pixels."""
+    """Distance between evaluated rows and columns, pixels."""
     evaluation_seconds: float | None = None
-    """Seconds the evaluation took; they are not part of `seconds`."""
+    """Seconds of the evaluation, which are not part of `seconds`."""
     full: bool = True
-    """Whether it is over all held-out images, or the --max-eval-images of them that were asked for."""
+    """Whether all held-out images were evaluated, or --max-eval-images of them."""
 
     def entry(self) -> Entry:
-        """For a checkpoint, which holds plain data."""
+        """Return the point as plain data, for a checkpoint."""
         return astuple(self)
 
 
 def in_order(*curves: Sequence[Entry]) -> list[Point]:
-    """All points in order of their steps."""
+    """Return the points of all `curves` in order of their steps."""
     points = [Point(*entry) for entries in curves for entry in entries]
     return sorted(points, key=lambda point: (point.step, point.full))
 
 
 def rows(points: Sequence[Point]) -> list[dict[str, Any]]:
-    """For learning_curve.json; a PSNR that is not finite, which JSON cannot hold, is null."""
+    """Return `points` as the rows of learning_curve.json; a PSNR that is not finite is None, as JSON lacks infinity."""
     return [{**asdict(point), "psnr": point.psnr if math.isfinite(point.psnr) else None} for point in points]
 
 
 def num_rays(sizes: Sequence[tuple[int, int]], stride: int, rays_per_pixel: int) -> int:
-    """Rays of every `stride`-th row and column of images of (height, width) `sizes`."""
+    """Return the number of rays to render every n-th row and column of some images.
+
+    Args:
+        sizes: (height, width) of each image, pixels.
+        stride: n, the distance between rendered rows and columns, pixels.
+        rays_per_pixel: rays per rendered pixel.
+    """
     return rays_per_pixel * sum(math.ceil(height / stride) * math.ceil(width / stride) for height, width in sizes)
 
 
 def pixel_stride(sizes: Sequence[tuple[int, int]], rays_per_pixel: int, rays: float) -> int:
-    """Smallest stride at which images of (height, width) `sizes` take about `rays` rays together at most.
+    """Return the smallest stride at which some images take at most about a given number of rays together.
 
-    None takes more than MOST_PIXELS pixels, and none becomes smaller than LEAST_SIDE by it.
+    With it, no image has more than MOST_PIXELS pixels, and no shorter side becomes less than LEAST_SIDE pixels.
+
+    Args:
+        sizes: (height, width) of each image, pixels.
+        rays_per_pixel: rays per rendered pixel.
+        rays: maximum number of rays of all images together.
     """
     largest = max(min(map(min, sizes)) // LEAST_SIDE, 1)
     most = max(height * width for height, width in sizes)
@@ -97,13 +108,13 @@ def pixel_stride(sizes: Sequence[tuple[int, int]], rays_per_pixel: int, rays: fl
 
 
 def is_due(points: Sequence[Point], seconds: float, cost: float, *, last: bool = False) -> bool:
-    """Whether a few images are looked at now.
+    """Return whether it is time to evaluate a few images.
 
     Args:
-        points: looks so far.
-        seconds: of training so far.
-        cost: seconds that a look will take.
-        last: whether training ends here, so that there is no later one.
+        points: evaluations of a few images so far.
+        seconds: seconds of training so far.
+        cost: estimated seconds of the evaluation.
+        last: whether training ends here, so that there is no later evaluation.
     """
     spent = sum(point.evaluation_seconds or 0.0 for point in points)
     if spent + cost > MARGIN * SHARE * seconds:
@@ -112,28 +123,32 @@ def is_due(points: Sequence[Point], seconds: float, cost: float, *, last: bool =
 
 
 class FewImages:
-    """The few held-out images of a run, and when they are looked at.
+    """The few held-out images of a run that are evaluated between evaluations of all images.
 
     Args:
-        dataset: held-out images.
-        limit: look at no more than this many; None for no limit, 0 for none.
-        rays_per_pixel: of pictures.
+        dataset: the held-out images.
+        limit: maximum number of images; None for no limit.
+        rays_per_pixel: rays per rendered pixel.
     """
 
     def __init__(self, dataset: Dataset, limit: int | None, rays_per_pixel: int) -> None:
-        shown = views_to_judge(dataset)
+        views = views_to_judge(dataset)
         self._dataset, self._rays_per_pixel = dataset, rays_per_pixel
-        self._views = [shown[place] for place in spread(len(shown), FEW if limit is None else min(limit, FEW))]
+        self._views = [views[index] for index in spread(len(views), FEW if limit is None else min(limit, FEW))]
         cameras = dataset.cameras
         self._sizes = [(int(cameras.heights[view]), int(cameras.widths[view])) for view in self._views]
 
     def look_if_due(self, model: Model, looks: Sequence[Entry], report: StepReport, *, last: bool) -> Point | None:
-        """Look at the images if it is time to.
+        """Evaluate the images if it is time to.
 
         Args:
-            looks: earlier ones.
-            report: the training step that was just done.
-            last: whether training ends with it.
+            model: the model.
+            looks: earlier evaluations of these images.
+            report: report of the last training step.
+            last: whether training ends with that step.
+
+        Returns:
+            The evaluation; None if it is not time.
         """
         if not self._views or (looks and not last and report.seconds < SPACING * looks[-1][0]):
             return None
@@ -143,33 +158,33 @@ class FewImages:
             return None
         start = time.perf_counter()
         found = self._measure(model, stride)
-        took = time.perf_counter() - start
-        return Point(report.seconds, report.step, found.psnr, found.ssim, len(self._views), stride, took, full=False)
+        cost = time.perf_counter() - start
+        return Point(report.seconds, report.step, found.psnr, found.ssim, len(self._views), stride, cost, full=False)
 
     def _plan(self, points: Sequence[Point], report: StepReport) -> tuple[int, float]:
-        """The stride of the next look, and how many seconds it will take.
+        """Return the pixel stride of the next evaluation and its estimated seconds.
 
-        The first look is of as few pixels as may be, for it shows how long a ray takes; the second chooses the stride
-        by what the whole run has time for, and all later ones keep it.
+        The first evaluation, of as few pixels as possible, measures the time of a ray; the second chooses the stride by
+        the time that the run allows, and all later ones keep it.
         """
         if not points:
             stride = pixel_stride(self._sizes, self._rays_per_pixel, 0)
             rate = PICTURE_SPEED * report.rays_per_second
             return stride, num_rays(self._sizes, stride, self._rays_per_pixel) / rate
-        before, took = points[-1].pixel_stride, points[-1].evaluation_seconds or 0.0
+        stride, cost = points[-1].pixel_stride, points[-1].evaluation_seconds or 0.0
         if len(points) > 1:
-            return before, took
-        rate = num_rays(self._sizes, before, self._rays_per_pixel) / max(took, 1e-6)
+            return stride, cost
+        rate = num_rays(self._sizes, stride, self._rays_per_pixel) / max(cost, 1e-6)
         allowed = MARGIN * SHARE * report.seconds / report.progress / NUM_LOOKS
         stride = pixel_stride(self._sizes, self._rays_per_pixel, rate * allowed)
         return stride, num_rays(self._sizes, stride, self._rays_per_pixel) / rate
 
     def _measure(self, model: Model, stride: int) -> Measured:
-        """Mean PSNR and SSIM of every `stride`-th row and column.
+        """Return the mean PSNR and SSIM of every `stride`-th row and column.
 
-        Photographs are shown in the mean appearance, whatever --eval-appearance says: finding one for each takes long.
+        Images are rendered with the mean appearance whatever --eval-appearance is: fitting one to each takes long.
         """
         background = evaluation_background(model)
-        found = [measure_view(model, self._dataset, view, background, stride) for view in self._views]
-        ssims = [one.ssim for one in found if one.ssim is not None]
-        return Measured(fmean(one.psnr for one in found), fmean(ssims) if len(ssims) == len(found) else None)
+        measured = [measure_view(model, self._dataset, view, background, stride) for view in self._views]
+        ssims = [image.ssim for image in measured if image.ssim is not None]
+        return Measured(fmean(image.psnr for image in measured), fmean(ssims) if len(ssims) == len(measured) else None)

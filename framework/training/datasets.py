@@ -1,4 +1,4 @@
-"""The images of a run, split by split."""
+"""Data sets of a run, by split."""
 
 from __future__ import annotations
 
@@ -13,23 +13,27 @@ def load_split(run: Run, split: Split) -> Dataset:
     """Parse and decode a split of a run's data.
 
     Args:
-        run: it says which data, which format, and how many pixels may be in memory.
-        split: train, val or test.
-    Raises: DataError where the data is missing, or as its format does.
+        run: the run, with the data's folder and format and the limit of pixels in memory.
+        split: part of the data set.
+
+    Raises:
+        DataError: if the data is missing or cannot be read.
     """
     memory = PixelMemory.of(run.config.cache_limit, run.config.cache_dir)
-    # Masks tell what counts in an evaluation, whatever they mean in training: its figures stay comparable.
+    # In an evaluation masked-out pixels are always ignored, so that metrics are comparable between runs.
     masks = run.config.masks if split == "train" else "ignored"
     return load_dataset(run.parse(split), split, memory, masks)
 
 
 def first_split(run: Run, splits: tuple[Split, ...]) -> Dataset | None:
-    """Parse and decode the first of several splits that can be read; each that cannot is reported.
+    """Parse and decode the first of several splits that can be read; splits that cannot are reported.
 
     Args:
-        run: as for `load_split`.
-        splits: in the order in which they are tried.
-    Returns: the images; None where no split can be read.
+        run: the run, as for `load_split`.
+        splits: splits in the order in which they are tried.
+
+    Returns:
+        The data set; None if no split can be read.
     """
     for split in splits:
         try:

@@ -1,4 +1,4 @@
-"""A run's folder belongs to one process at a time. The system keeps the lock, so it ends with its process, however."""
+"""The lock of a run's folder, which one process holds at a time; the system releases it when the process ends."""
 
 from __future__ import annotations
 
@@ -12,30 +12,34 @@ from pathlib import Path
 from framework.base.errors import ConfigError
 
 LOCK = ".lock"
-"""The file that is locked; it says by whom, and means nothing when it is there unlocked."""
+"""Name of the locked file. It names the process that holds the lock; unlocked, it means nothing."""
 
 
 @contextmanager
 def sole_user(folder: Path) -> Iterator[None]:
-    """Hold a run's folder, which is made where it is missing.
+    """Lock a run's folder for this process, within a `with` block.
 
-    Where the system or the file system has no locks, nothing is held.
+    On systems and file systems without locks, nothing is locked.
 
-    Raises: ConfigError where another process holds the folder, or it cannot be written.
+    Args:
+        folder: the run's folder, created if missing.
+
+    Raises:
+        ConfigError: if another process has locked the folder, or it cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        # A link could lead to a file of someone's, which would be written over.
+        # A symbolic link could point to another file, which would be overwritten.
         opened = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
     except OSError as error:
         raise ConfigError(f"cannot write the run's folder {folder}: {error.strerror or error}") from error
     try:
-        if not os.access(folder, os.W_OK):  # where a lock of before may be written to nevertheless
+        if not os.access(folder, os.W_OK):  # an old lock file may be writable in a read-only folder
             raise ConfigError(f"cannot write the run's folder {folder}: {os.strerror(errno.EACCES)}")
         if not _locked(opened):
-            who = os.read(opened, 200).decode("utf-8", "replace") or "another process"
-            raise ConfigError(f"{folder} is in use by {who}; wait until it has ended, or stop it")
-        with suppress(OSError):  # a full disk: then nobody is told who it is
+            owner = os.read(opened, 200).decode("utf-8", "replace") or "another process"
+            raise ConfigError(f"{folder} is in use by {owner}; wait until it has ended, or stop it")
+        with suppress(OSError):  # on a full disk, the owner stays unnamed
             os.ftruncate(opened, 0)
             os.write(opened, f"process {os.getpid()} on {platform.node()}".encode())
         yield
@@ -44,7 +48,7 @@ def sole_user(folder: Path) -> Iterator[None]:
 
 
 def _locked(opened: int) -> bool:
-    """Lock an open file; False where another has."""
+    """Lock an open file; return False if another process has locked it."""
     try:
         import fcntl
     except ImportError:  # Windows

@@ -1,4 +1,4 @@
-"""What a measurement was made on: a figure without it says nothing."""
+"""Description of the machine and the versions with which something was measured."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from framework.kernels import native
 
 
 def machine(device: torch.device | None = None) -> dict[str, Any]:
-    """Processor, cores, threads, memory, device, kernels, versions and commit, as plain data.
+    """Return processor, cores, threads, memory (GB), device, kernels, versions and commit, as plain data.
 
     Args:
-        device: what is computed on; the processor if None.
+        device: device of the computation; the CPU if None.
     """
     on_cuda = device is not None and device.type == "cuda"
     memory = machine_memory()
@@ -39,16 +39,16 @@ def machine(device: torch.device | None = None) -> dict[str, Any]:
 
 
 def kernels(device: torch.device | None = None) -> str:
-    """What computes on a device: a variant of the compiled kernels, or "reference", which is torch alone.
+    """Return the variant of the compiled kernels used on a device, or "reference" for PyTorch alone.
 
     Args:
-        device: the processor if None.
+        device: device of the computation; the CPU if None.
     """
     return native.variant() if device is None or device.type == "cpu" else "reference"
 
 
 def processor() -> str:
-    """The processor's name, as far as the system tells it."""
+    """Return the name of the CPU, or its architecture if the system does not name it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
@@ -58,7 +58,7 @@ def processor() -> str:
 
 
 def commit() -> str | None:
-    """The commit of the checkout that is run, with + where files differ from it; None for an installed package."""
+    """Return the commit of the running checkout, with + if files differ from it; None for an installed package."""
     root = Path(framework.__file__).parents[1]
     if not (root / ".git").exists():
         return None

@@ -1,4 +1,4 @@
-"""Adam and the learning rate over a run."""
+"""Adam, and the learning rate over a run."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from framework.model import Model, parts
 
 
 class Adam(torch.optim.Optimizer):
-    """Adam (Kingma and Ba 2015): torch's fused one, and a sparse one for groups with `sparse` set.
+    """Adam (Kingma and Ba 2015): PyTorch's fused one, and a sparse one for groups with `sparse` set.
 
-    A sparse group holds tables (E, F) of which a step uses few entries (`framework.kernels.adam`). Their gradient is
-    what the backward pass left in `deferred`, or else `grad`.
+    A sparse group holds tables (E, F) of which a step uses few entries (`framework.kernels.adam`). The gradient of a
+    table is the one that the backward pass left in `deferred`, or else `grad`.
 
     Args:
         groups: parameter groups.
-        deferred: of tables whose gradient is not added up by autograd.
-        lr, betas, eps: of groups that do not say.
+        deferred: gradients by table, for tables whose gradient is not accumulated by autograd.
+        lr, betas, eps: defaults for groups without their own.
     """
 
     def __init__(
@@ -41,9 +41,9 @@ class Adam(torch.optim.Optimizer):
         super().__init__(groups, {"lr": lr, "betas": betas, "eps": eps, "sparse": False})
         self.deferred = deferred
         self.entries_updated = 0
-        """Of sparse groups, over all steps."""
+        """Number of entries of sparse groups that were updated, summed over all steps."""
         self.entries_there = 0
-        """How many they were, added up over the same steps."""
+        """Number of entries of sparse groups, summed over all steps."""
         for group in self.param_groups:
             for parameter in group["params"]:
                 self._begin(parameter, group["sparse"])
@@ -57,24 +57,27 @@ class Adam(torch.optim.Optimizer):
             state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
 
     def zero_grad(self, set_to_none: bool = True) -> None:
-        """Forget gradients, those that wait included."""
+        """Clear all gradients, deferred ones included; they become None, whatever `set_to_none` is."""
         super().zero_grad(set_to_none=True)
         for gradient in self.deferred.values():
             gradient.clear()
 
     def first_bad(self) -> Tensor | None:
-        """The first parameter whose gradient is not finite; None where all are."""
+        """Return the first parameter whose gradient is not finite; None if all are finite."""
         for parameter in (p for group in self.param_groups for p in group["params"]):
-            waiting = self.deferred.get(parameter)
+            deferred = self.deferred.get(parameter)
             if parameter.grad is not None and not all_finite(parameter.grad):
                 return parameter
-            if waiting is not None and not waiting.finite():
+            if deferred is not None and not deferred.finite():
                 return parameter
         return None
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
-        """One update of every parameter that has a gradient. One that has another shape than before begins anew."""
+        """Update every parameter that has a gradient; `closure` is not used.
+
+        The state of a parameter whose shape has changed starts from zero.
+        """
         for group in self.param_groups:
             for parameter in group["params"]:
                 if self.state[parameter]["exp_avg"].shape != parameter.shape:
@@ -87,15 +90,17 @@ class Adam(torch.optim.Optimizer):
 
     @torch.no_grad()
     def change_rows(self, change: RowChange) -> None:
-        """Give a parameter other rows, and its state with them; fresh rows begin with a state of zeros.
+        """Replace rows of a parameter and of its state; the state of fresh rows is zero.
 
         Args:
-            change: which rows stay, and what is added.
-        Raises: ValueError for a parameter that this optimiser does not hold.
+            change: the parameter, its kept rows, and the rows to append.
+
+        Raises:
+            ValueError: if this optimiser does not hold the parameter.
         """
         parameter = change.parameter
         if parameter not in self.state:
-            raise ValueError("rows of a parameter were changed that the optimiser does not hold")
+            raise ValueError("rows were changed of a parameter that the optimiser does not hold")
         added = 0 if change.fresh is None else len(change.fresh)
         rows = parameter.index_select(0, change.kept)
         parameter.data = rows if change.fresh is None else torch.cat([rows, change.fresh.to(rows)])
@@ -107,12 +112,12 @@ class Adam(torch.optim.Optimizer):
                 state[name] = torch.cat([kept, kept.new_zeros(added, *kept.shape[1:])])
 
     def _step_sparse(self, parameter: Tensor, group: dict[str, Any]) -> None:
-        state, waiting = self.state[parameter], self.deferred.get(parameter)
+        state, deferred = self.state[parameter], self.deferred.get(parameter)
         moments = state["exp_avg"], state["exp_avg_sq"], state["seen"]
         settings = group["lr"], group["betas"], group["eps"]
         self.entries_there += len(parameter)
-        if waiting is not None and waiting.pending:
-            self.entries_updated += waiting.adam(parameter, *moments, *settings)
+        if deferred is not None and deferred.pending:
+            self.entries_updated += deferred.adam(parameter, *moments, *settings)
         if parameter.grad is not None:
             self.entries_updated += sparse_adam(parameter, parameter.grad, *moments, *settings)
 
@@ -126,21 +131,23 @@ class Adam(torch.optim.Optimizer):
 
 
 def make_optimizer(model: Model[Any], config: TrainConfig) -> Adam:
-    """Return Adam over the model's parameter groups, each remembering the rate it starts from as `initial_lr`.
+    """Return Adam over the model's parameter groups, each with its initial learning rate as `initial_lr`.
 
     Args:
-        model: says how its parameters are optimised (`Model.groups`).
-        config: the run's settings, which count where a group does not say.
-    Raises: ConfigError where the machine has less memory than it takes.
+        model: the model, whose parameter groups are those of `Model.groups`.
+        config: the run's settings, the defaults of the groups.
+
+    Raises:
+        ConfigError: if the parameters and Adam's state need more memory than the machine has.
     """
-    require(3.0 * 4 * model.size(), "the model's parameters and what Adam keeps of them")
+    require(3.0 * 4 * model.size(), "the model's parameters and Adam's state")
     groups = [_plain(group, config) for group in model.groups()]
     deferred = {module.table: module.deferred for module in parts(model, DefersGradient) if module.deferred is not None}
     return Adam(groups, deferred, config.learning_rate, (config.adam_beta1, config.adam_beta2), config.adam_eps)
 
 
 def _plain(group: ParameterGroup, config: TrainConfig) -> dict[str, Any]:
-    """Return a group as torch's optimisers take it."""
+    """Return a group in the form of PyTorch's optimisers."""
     settings = group.settings
     rate = config.learning_rate if settings.learning_rate is None else settings.learning_rate
     plain: dict[str, Any] = {"params": list(group.parameters), "name": settings.name, "lr": rate, "initial_lr": rate}
@@ -149,12 +156,12 @@ def _plain(group: ParameterGroup, config: TrainConfig) -> dict[str, Any]:
 
 
 def learning_rate_factor(config: TrainConfig, step: int, progress: float) -> float:
-    """What to multiply a group's first learning rate by.
+    """Return the learning rate as a fraction of the initial one.
 
     Args:
-        config: the schedule's name, final share and warm-up.
-        step: steps done.
-        progress: share of the budget spent, 0 to 1.
+        config: the run's settings: schedule, final fraction and warm-up steps.
+        step: number of training steps done.
+        progress: fraction of the budget spent, clamped to [0, 1].
     """
     progress = min(max(progress, 0.0), 1.0)
     warm_up = min(1.0, (step + 1) / config.lr_warmup_steps) if config.lr_warmup_steps else 1.0
@@ -172,7 +179,14 @@ def _decay(schedule: str, final: float, progress: float) -> float:
 
 
 def set_learning_rate(optimizer: torch.optim.Optimizer, config: TrainConfig, step: int, progress: float) -> None:
-    """Every group at its first rate times its schedule's factor: the run's, or that which the group names."""
+    """Set each group's learning rate for a step, by the run's schedule or the group's own.
+
+    Args:
+        optimizer: the optimiser, whose groups have their initial learning rate as `initial_lr`.
+        config: the run's settings.
+        step: number of training steps done.
+        progress: fraction of the budget spent, 0 to 1.
+    """
     usual = learning_rate_factor(config, step, progress)
     for group in optimizer.param_groups:
         own = group.get("schedule")
@@ -181,7 +195,15 @@ def set_learning_rate(optimizer: torch.optim.Optimizer, config: TrainConfig, ste
 
 
 def first_non_finite(model: Model, optimizer: Adam) -> str | None:
-    """The name of the first parameter that is not finite, or whose gradient is not; None where all are."""
+    """Return the name of the first parameter that is not finite or has such a gradient; None if there is none.
+
+    Args:
+        model: the model.
+        optimizer: the optimiser of its parameters.
+
+    Returns:
+        The parameter's name, with ".grad" if its gradient is not finite.
+    """
     bad = optimizer.first_bad()
     for name, parameter in model.named_parameters():
         if not all_finite(parameter):

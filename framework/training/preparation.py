@@ -1,4 +1,4 @@
-"""Before the first step: what the scene's profile says, and what the photographs' silhouettes save."""
+"""Preparation of training: the scene's profile, and space that the images' silhouettes show to be empty."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from framework.scene.silhouettes import Silhouettes, pixels_near, visual_hull
 def profile_of(
     method: str, config: TrainConfig, model: Model[Any], dataset: Dataset, decided: Sequence[Decision]
 ) -> SceneProfile:
-    """Return what the scene needs, and why.
+    """Return the profile of the scene, with each setting that was chosen by the data and the reason.
 
     Args:
-        method: its name, for people.
+        method: the method's name.
         config: the run's settings.
-        model: what will be trained.
-        dataset: images to learn from.
-        decided: what the method decided by the data.
+        model: the model to train.
+        dataset: the training images.
+        decided: settings that the method chose by the data.
     """
     scene, decisions = model.scene, []
     if dataset.opaque is not None and config.masks == "auto":
@@ -44,7 +44,7 @@ def profile_of(
         choice = "not used" if obstacle else f"{outside} is skipped from the start"
         decisions.append(Decision("silhouettes", choice, obstacle or "alpha shows them"))
     if scene.moving and not isinstance(model, LearnsMotion):
-        decisions.append(Decision("times", "ignored", f"{method} learns a still scene: what moves blurs"))
+        decisions.append(Decision("times", "ignored", f"{method} learns a still scene: moving objects are blurred"))
     if scene.appearance_varies and not isinstance(model, HasAppearance):
         decisions.append(Decision("light that differs", "ignored", f"{method} learns one light for all photographs"))
     if scene.poses == "device" and not isinstance(model, RefinesPoses):
@@ -53,14 +53,16 @@ def profile_of(
 
 
 def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: bool) -> Dataset:
-    """Empty the occupancy grids by the images' silhouettes.
+    """Empty the cells of the occupancy grids that are outside the images' silhouettes.
 
     Args:
         config: the run's settings.
-        model: whose samplers are told.
-        dataset: images to learn from.
-        fresh: the run begins; else the grids come from a checkpoint and are left as they are.
-    Returns: the data set without pixels that see nothing but emptied cells.
+        model: the model, whose samplers hold the grids.
+        dataset: the training images.
+        fresh: whether training starts; if not, the grids come from a checkpoint and are not changed.
+
+    Returns:
+        The data set, without pixels whose rays meet emptied cells only.
     """
     samplers = parts(model, SkipsCells)
     if not samplers or not isinstance(config, SamplingConfig) or not config.silhouette_cells:
@@ -75,7 +77,7 @@ def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset
             return dataset
         for sampler, hull in zip(samplers, hulls, strict=True):
             sampler.carve(hull)
-    # Of a scene that moves, a pixel that is empty at its time teaches about cells that are full at others.
+    # In a moving scene, a pixel that is empty at its time supervises cells that are occupied at other times.
     if not config.silhouette_pixels or moving or not all(bool(sampler.carved.any()) for sampler in samplers):
         return dataset
     near = [pixels_near(silhouettes, ~s.carved, s.box, s.resolution) for s in samplers]
@@ -83,7 +85,7 @@ def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset
 
 
 def _no_silhouettes(dataset: Dataset) -> str | None:
-    """Why the photographs' alpha cannot tell what is empty; None where it can."""
+    """Return why the images' alpha cannot show empty space; None if it can."""
     if not dataset.scene.has_alpha:
         return "no photograph has alpha"
     if isinstance(dataset.cameras, NdcCameras):

@@ -1,4 +1,4 @@
-"""How a run shows itself while it goes: a progress bar, TensorBoard, a learning curve."""
+"""Display of training while it runs: a progress bar, and curves and images for TensorBoard."""
 
 from __future__ import annotations
 
@@ -14,27 +14,30 @@ from torch import Tensor
 from framework.base.console import console, say
 
 SECONDS_BETWEEN_LINES = 15.0
+"""Seconds between lines of progress where there is no terminal."""
 
 
 @dataclass(frozen=True)
 class StepReport:
-    """What one training step showed."""
+    """Report of a training step."""
 
     step: int
-    """Steps done, this one included."""
+    """Number of training steps done, with this one."""
     seconds: float
-    """Training seconds so far."""
+    """Seconds of training so far."""
     progress: float
-    """Share of the budget spent."""
+    """Fraction of the budget spent, 0 to 1."""
     losses: dict[str, float]
-    """The batch's loss terms by name."""
+    """Loss terms of the batch, by name."""
     psnr: float
-    """Of the batch, dB, smoothed."""
+    """PSNR of the batches, dB, smoothed."""
     rays_per_second: float
+    """Rays of the batch per second of this step."""
     held_out_psnr: float | None
-    """Of the last look at a few held-out images, dB; None before the first."""
+    """PSNR of the last evaluation of a few held-out images, dB; None before the first."""
 
     def line(self) -> str:
+        """Return the report as a line of text."""
         held_out = "" if self.held_out_psnr is None else f", {self.held_out_psnr:.2f} dB on held-out images"
         return (
             f"step {self.step:,}  loss {sum(self.losses.values()):.5f}  PSNR {self.psnr:.2f} dB{held_out}  "
@@ -43,7 +46,11 @@ class StepReport:
 
 
 class ProgressBar:
-    """A bar on a terminal; a line every 15 seconds elsewhere."""
+    """A progress bar on a terminal; elsewhere, a line every 15 seconds.
+
+    Args:
+        title: text before the bar.
+    """
 
     def __init__(self, title: str) -> None:
         columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), TimeRemainingColumn())
@@ -62,7 +69,7 @@ class ProgressBar:
         self._bar.stop()
 
     def show(self, report: StepReport) -> None:
-        """Bring the bar up to date."""
+        """Show the `report` of the last training step."""
         self._bar.update(self._task, completed=report.progress, state=report.line())
         if not console.is_terminal and time.monotonic() - self._last_line > SECONDS_BETWEEN_LINES:
             self._last_line = time.monotonic()
@@ -70,7 +77,12 @@ class ProgressBar:
 
 
 class TensorBoard:
-    """Curves and pictures for TensorBoard; does nothing where switched off."""
+    """A writer of curves and images for TensorBoard.
+
+    Args:
+        folder: folder of the event files.
+        enabled: whether anything is written.
+    """
 
     def __init__(self, folder: Path, enabled: bool) -> None:
         self._writer: Any = None
@@ -80,15 +92,23 @@ class TensorBoard:
             self._writer = SummaryWriter(str(folder))
 
     def scalars(self, values: dict[str, float], step: int) -> None:
+        """Write `values` by name, for a training `step`."""
         if self._writer is not None:
             for name, value in values.items():
                 self._writer.add_scalar(name, value, step)
 
     def image(self, name: str, image: Tensor, step: int) -> None:
-        """`image` (H, W, 3) in [0, 1]."""
+        """Write an image.
+
+        Args:
+            name: its tag.
+            image: (H, W, 3) colours in [0, 1].
+            step: number of training steps done.
+        """
         if self._writer is not None:
             self._writer.add_image(name, image.clamp(0, 1), step, dataformats="HWC")
 
     def close(self) -> None:
+        """Close the event files."""
         if self._writer is not None:
             self._writer.close()

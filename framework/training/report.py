@@ -1,4 +1,4 @@
-"""A run's files about how it went: the evaluation's, with nerfstudio's keys, and the training's."""
+"""Reports of a run: its evaluation, with nerfstudio's keys, and a summary of its training."""
 
 from __future__ import annotations
 
@@ -14,12 +14,21 @@ from framework.training.run import Run, write_json, write_report
 from framework.training.trainer import Outcome, Trainer
 
 SUMMARY = "summary.json"
+"""Name of the summary in a run's folder."""
 
 
 def write_evaluation(path: Path, run: Run, checkpoint: Path, found: Evaluation, device: torch.device) -> None:
-    """`experiment_name, method_name, checkpoint, results`, and what was measured on each image.
+    """Write the metrics of an evaluation as JSON: nerfstudio's keys, and the metrics of each image.
 
-    Raises: ConfigError where it cannot be written.
+    Args:
+        path: file to write; its folder is created if missing.
+        run: the evaluated run.
+        checkpoint: the evaluated checkpoint, of which the name is written.
+        found: the metrics.
+        device: device of the evaluation.
+
+    Raises:
+        ConfigError: if the file cannot be written.
     """
     content = {
         "experiment_name": run.folder.parent.parent.name,
@@ -40,7 +49,12 @@ def write_evaluation(path: Path, run: Run, checkpoint: Path, found: Evaluation, 
 
 
 def write_summary(trainer: Trainer, outcome: Outcome) -> None:
-    """summary.json: how long training took, what it used, and on which machine."""
+    """Write summary.json: steps, seconds and memory of training, and the machine.
+
+    Args:
+        trainer: the trainer, after training.
+        outcome: reason for which training ended.
+    """
     state = trainer.state
     write_report(
         trainer.run.folder / SUMMARY,

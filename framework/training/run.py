@@ -1,12 +1,12 @@
-"""A run: a method, its settings, a data set, and the folder that everything about them goes into.
+"""A run: a method, its settings, a data set, and a folder for all its files.
 
 outputs/{experiment}/{method}/{YYYY-mm-dd_HHMMSS}/
     config.yml                    all settings, plain YAML
     dataparser_transforms.json    from the input's frame to the scene's
     nerfstudio_models/            checkpoints
-    scene_profile.json            what the scene needs and what was decided by it
-    learning_curve.json           seconds, step, PSNR, SSIM on held-out images, and on how many
-    skip_report.json              what was skipped, and what that saved
+    scene_profile.json            properties of the scene and the settings chosen by them
+    learning_curve.json           seconds, step, PSNR and SSIM of held-out images, and their number
+    skip_report.json              skipped work, and the time that it saved
     summary.json                  steps, seconds, rays, memory, parameters, and the machine
     eval.json, pictures/          the final evaluation
     events.out.tfevents.*         TensorBoard
@@ -34,31 +34,34 @@ from framework.data.dataset import DataParser, Dataset, ParsedScene, Split
 from framework.training.checkpoint import write_atomically
 
 CONFIG = "config.yml"
+"""Name of the settings in a run's folder."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """What is trained on what, with which settings."""
+    """A method, its settings, a data set and a folder."""
 
     method: str
     """Name of the method."""
     config: TrainConfig
-    """Its settings."""
+    """Settings of the method."""
     dataparser: str
     """Name of the data format."""
     parser: DataParser
-    """The data format with its flags."""
+    """Data format, with its flags."""
     folder: Path
-    """Where the run's files go."""
+    """Folder of the run's files."""
 
     @property
     def config_path(self) -> Path:
+        """Path of the run's config.yml."""
         return self.folder / CONFIG
 
     def parse(self, split: Split) -> ParsedScene:
-        """Read a split of the run's data.
+        """Read a `split` of the run's data.
 
-        Raises: DataError where it is not there any more, or as the format does.
+        Raises:
+            DataError: if the data is missing or cannot be read.
         """
         data = self.config.data
         if data is not None and not os.path.exists(data):
@@ -67,16 +70,22 @@ class Run:
 
 
 def run_folder(method: str, config: TrainConfig) -> Path:
-    """outputs/{experiment}/{method}/{timestamp}, from the settings and the clock."""
+    """Return the folder of a new run: outputs/{experiment}/{method}/{timestamp}.
+
+    Args:
+        method: the method's name.
+        config: the run's settings, which may name the experiment and the time stamp.
+    """
     experiment = config.experiment_name or (config.data.resolve().name if config.data else "procedural")
     timestamp = config.timestamp or datetime.now().strftime("%Y-%m-%d_%H%M%S")
     return config.output_dir / experiment / method / timestamp
 
 
 def create_folder(run: Run) -> None:
-    """Make the run's folder and write config.yml.
+    """Create the folder of `run` and write its config.yml.
 
-    Raises: ConfigError where the folder exists already or cannot be written.
+    Raises:
+        ConfigError: if the folder already holds a run or cannot be written.
     """
     if run.config_path.exists():
         raise ConfigError(
@@ -100,24 +109,32 @@ def create_folder(run: Run) -> None:
 
 
 def config_file(path: Path) -> Path:
-    """A run's config.yml, by its own name or its folder's.
+    """Return the path of a run's config.yml.
 
-    Raises: ConfigError for a folder that is no run's.
+    Args:
+        path: the file itself, or the run's folder.
+
+    Raises:
+        ConfigError: if `path` is a folder without one.
     """
     if not os.path.isdir(path) or (path / CONFIG).is_file():
         return path / CONFIG if os.path.isdir(path) else path
-    deeper = ("*", "*/*", "*/*/*")  # outputs/{experiment}/{method}/{timestamp}
-    runs = sorted((file for below in deeper for file in path.glob(f"{below}/{CONFIG}")), key=os.path.getmtime)
+    levels = ("*", "*/*", "*/*/*")  # outputs/{experiment}/{method}/{timestamp}
+    runs = sorted((file for level in levels for file in path.glob(f"{level}/{CONFIG}")), key=os.path.getmtime)
     newest = f"; the newest run in it is {runs[-1].parent}" if runs else ""
     raise ConfigError(f"{path} is not a run's folder, for it has no {CONFIG}{newest}")
 
 
 def read_run(path: Path) -> Run:
-    """A run, or a recipe for one, from a YAML file; of a folder, from its config.yml.
+    """Read a run, or a recipe for one, from a YAML file.
 
-    Keys are `method`, optionally `dataparser` (with `name` and the format's flags), and the method's settings.
+    Its keys are `method`, optionally `dataparser` (with `name` and the format's flags), and the method's settings.
 
-    Raises: ConfigError for an unknown method, format or key, or a value of the wrong type.
+    Args:
+        path: the file, or a run's folder, of which config.yml is read.
+
+    Raises:
+        ConfigError: if a method, format or key is unknown, or a value has the wrong type.
     """
     path = config_file(path)
     values = read_yaml(path)
@@ -139,13 +156,26 @@ def read_run(path: Path) -> Run:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Plain data as indented JSON, atomically."""
+    """Write plain data as indented JSON, atomically.
+
+    Args:
+        path: file to write.
+        content: plain data; numbers must be finite.
+
+    Raises:
+        OSError: if the file cannot be written.
+    """
     text = json.dumps(content, indent=2, allow_nan=False) + "\n"
     write_atomically(path, lambda file: file.write(text.encode()))
 
 
 def write_report(path: Path, content: Any) -> None:
-    """As `write_json`, but a full disk is only said: training, and what is in checkpoints, are worth more."""
+    """Write plain data as `write_json` does, but only warn if the file cannot be written, so that training continues.
+
+    Args:
+        path: file to write.
+        content: plain data; numbers must be finite.
+    """
     try:
         write_json(path, content)
     except OSError as error:
@@ -153,6 +183,11 @@ def write_report(path: Path, content: Any) -> None:
 
 
 def write_transforms(run: Run, dataset: Dataset) -> None:
-    """dataparser_transforms.json, as nerfstudio writes it."""
+    """Write dataparser_transforms.json in nerfstudio's format.
+
+    Args:
+        run: the run.
+        dataset: its data set, with the transform from the input's frame to the scene's.
+    """
     content = {"transform": dataset.transform.tolist(), "scale": dataset.scale}
     write_report(run.folder / "dataparser_transforms.json", content)

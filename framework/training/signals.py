@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: a run ends between two steps, any other command at once, and in order."""
+"""Handling of Ctrl-C and SIGTERM: training ends after a step, other commands at once, with their cleanup."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ Handler = Callable[[int, FrameType | None], Any]
 
 
 class Stopped(KeyboardInterrupt):
-    """Somebody stops the process: what SIGTERM raises, and Ctrl-C where more is to be said than that.
+    """The interruption of the process by a signal: SIGTERM, or Ctrl-C with a message.
 
     Args:
-        number: the signal.
-        message: what to say of it, where it is not known yet.
+        number: the signal's number.
+        message: text for the user; may be empty.
     """
 
     def __init__(self, number: int = signal.SIGINT, message: str = "") -> None:
@@ -30,36 +30,37 @@ class Stopped(KeyboardInterrupt):
 
 
 def exit_status(stop: KeyboardInterrupt) -> int:
-    """Exit status that a shell expects of a process that a signal ended: 130 after Ctrl-C, 143 after SIGTERM."""
+    """Return the exit status after an interruption `stop`: 130 after Ctrl-C, 143 after SIGTERM."""
     return 128 + signal_of(stop)
 
 
 def signal_of(stop: KeyboardInterrupt) -> int:
-    """The signal behind an interruption."""
+    """Return the number of the signal that caused the interruption `stop`."""
     return stop.number if isinstance(stop, Stopped) else signal.SIGINT
 
 
 @contextmanager
 def orderly_end() -> Iterator[None]:
-    """SIGTERM raises `Stopped`, as Ctrl-C raises KeyboardInterrupt, so that children and unfinished files are removed.
+    """Make SIGTERM raise `Stopped` within a `with` block, so that child processes and unfinished files are removed.
 
-    Only the main thread is told of signals; elsewhere this does nothing.
+    Only the main thread receives signals; in other threads this does nothing.
     """
 
     def end(number: int, frame: FrameType | None) -> None:
         raise Stopped(number)
 
-    # Where SIGTERM is ignored, whoever started this process wants it so.
-    ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) != signal.SIG_IGN
-    with handled((signal.SIGTERM,) if ours else (), end):
+    # SIGTERM stays ignored if the parent process has it ignored.
+    main = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) != signal.SIG_IGN
+    with handled((signal.SIGTERM,) if main else (), end):
         yield
 
 
 @contextmanager
 def stop_signals() -> Iterator[list[int]]:
-    """Ctrl-C and SIGTERM end the run after the step at hand; a second one ends it at once.
+    """Record Ctrl-C and SIGTERM within a `with` block, so that training can end after a step; a second ends it now.
 
-    Yields the list of signals received.
+    Yields:
+        The numbers of the signals received so far.
     """
     received: list[int] = []
 
@@ -67,7 +68,7 @@ def stop_signals() -> Iterator[list[int]]:
         received.append(number)
         for other, handler in before.items():
             signal.signal(other, handler)
-        with suppress(OSError, ValueError):  # not by `say`: what a signal interrupts may be a line being printed
+        with suppress(OSError, ValueError):  # not by `say`: the signal may have interrupted a print
             os.write(sys.stderr.fileno(), NOTED)
 
     with handled(NUMBERS, note) as before:
@@ -76,7 +77,15 @@ def stop_signals() -> Iterator[list[int]]:
 
 @contextmanager
 def handled(numbers: tuple[int, ...], handler: Handler) -> Iterator[dict[int, Any]]:
-    """Handle signals so; yields how they were handled before, and are again in the end. In the main thread only."""
+    """Handle signals within a `with` block, in the main thread only.
+
+    Args:
+        numbers: the signals' numbers.
+        handler: function that is called with the signal's number and the stack frame.
+
+    Yields:
+        The previous handlers by signal, which are restored at the end.
+    """
     before: dict[int, Any] = {number: signal.getsignal(number) for number in numbers}
     try:
         for number in numbers:

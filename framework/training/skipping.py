@@ -1,4 +1,4 @@
-"""What a run skipped, and what that saved: printed at its end and written to skip_report.json."""
+"""Report of the work that a run skipped and the time that it saved, printed and written to skip_report.json."""
 
 from __future__ import annotations
 
@@ -21,35 +21,36 @@ if TYPE_CHECKING:
     from framework.training.trainer import Trainer
 
 PROBE_RAYS = 1024
+"""Number of random training rays on which the savings are measured."""
 LEAST_TOLD = 0.005
-"""Share from which on what is skipped is told to people."""
+"""Minimum skipped fraction that is printed."""
 
 
 @dataclass(frozen=True)
 class Rung:
-    """One thing that is skipped."""
+    """One kind of work that is skipped."""
 
     name: str
-    """What."""
+    """Name of the skipped work."""
     skipped: float
-    """Share of all that there is, 0 to 1."""
+    """Skipped fraction of all such work, 0 to 1."""
     rendering_saved: float | None
-    """How many times longer the probe's rays take to render without it; None where it saves nothing in rendering."""
+    """Seconds to render the probe's rays without skipping over those with it; None if rendering is not affected."""
     switch: str
-    """How to turn it off."""
+    """Flag that turns it off."""
     says: str
-    """What was skipped and what that saved, for people."""
+    """Description for people."""
 
 
 def lines(rungs: list[Rung]) -> list[str]:
-    """For people; without what saved nothing."""
-    told = [f"  {rung.says}" for rung in rungs if rung.skipped >= LEAST_TOLD]
-    return ["left out:", *told] if told else []
+    """Return lines of text for people; `rungs` that skipped less than LEAST_TOLD are omitted."""
+    descriptions = [f"  {rung.says}" for rung in rungs if rung.skipped >= LEAST_TOLD]
+    return ["left out:", *descriptions] if descriptions else []
 
 
 @torch.no_grad()
 def skip_report(trainer: Trainer) -> list[Rung]:
-    """Measure a trained run's rungs on a probe of random training rays. Empty where a method skips nothing."""
+    """Measure the work that the model of `trainer` skips, on random training rays; empty if it skips nothing."""
     model, rungs = trainer.model, []
     samplers = parts(model, SkipsCells)
     if samplers and isinstance(model, RayModel):
@@ -92,7 +93,7 @@ def _sampling_rungs(trainer: Trainer, model: RayModel[Any], samplers: list[Skips
             _along_rays("behind opaque surfaces", visible_count, count, unhidden / usual),
         ),
     ]
-    if drawn is not None and (kept is None or len(drawn) < len(kept)):  # else masks alone say what is drawn
+    if drawn is not None and (kept is None or len(drawn) < len(kept)):  # otherwise masks alone choose the drawn pixels
         share = 1 - len(drawn) / len(trainer.train_set.pixels if kept is None else kept)
         says = f"pixels that show only background: {share:.0%} of all are never drawn"
         if share < 1:
@@ -102,14 +103,14 @@ def _sampling_rungs(trainer: Trainer, model: RayModel[Any], samplers: list[Skips
 
 
 def _along_rays(place: str, before: int, after: int, faster: float) -> str:
-    """A line about samples of the probe's rays that are not taken."""
-    left_out = 1 - after / max(before, 1)
+    """Return a line about skipped samples of the probe's rays."""
+    skipped = 1 - after / max(before, 1)
     a_ray = f"{after / PROBE_RAYS:.1f} a ray instead of {before / PROBE_RAYS:.1f}"
-    return f"{place}: {left_out:.0%} of samples, {a_ray}; renders {faster:.1f} x as fast"
+    return f"{place}: {skipped:.0%} of samples, {a_ray}; renders {faster:.1f} x as fast"
 
 
 def _probe(model: RayModel[Any], rays: Rays) -> tuple[float, int]:
-    """Seconds to render the rays, and samples evaluated for them."""
+    """Return the seconds to render the rays and the number of evaluated samples."""
     was_training = model.training
     model.eval()
     background = torch.zeros(3, device=model.device)
@@ -125,7 +126,7 @@ def _probe(model: RayModel[Any], rays: Rays) -> tuple[float, int]:
 
 @contextmanager
 def _changed(samplers: list[SkipsCells], early_stop: float | None = None, occupied: bool = False) -> Iterator[None]:
-    """Samplers without early stop, or with a full grid, for a while."""
+    """Change early stop, or mark all cells occupied, within a `with` block."""
     before = [(s.early_stop, s.occupied.clone()) for s in samplers]
     try:
         for sampler in samplers:
@@ -143,5 +144,5 @@ def _changed(samplers: list[SkipsCells], early_stop: float | None = None, occupi
 
 
 def as_plain(rungs: list[Rung]) -> list[dict[str, Any]]:
-    """For JSON."""
+    """Return `rungs` as plain data, for JSON."""
     return [asdict(rung) for rung in rungs]

@@ -1,4 +1,4 @@
-"""One training step of any method: the trainer, the method checks and the stress tests all take it here."""
+"""One training step of any method, used by the trainer, the method checks and the stress tests."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from framework.training.optim import Adam, set_learning_rate
 
 @dataclass(frozen=True)
 class StepResult:
-    """What a step showed."""
+    """Result of a training step."""
 
     loss: Loss
-    """The batch's loss; its terms still hold the graph."""
+    """Loss of the batch; its terms still hold the graph."""
     squared_errors: Tensor
-    """The mean over channels of each pixel's squared error, shaped as the batch's pixels."""
+    """Squared error of each pixel, a mean over channels, in the shape of the batch's pixels."""
     finite: bool
-    """Whether the loss and all gradients were; the step was dropped where they were not."""
+    """Whether the loss and all gradients were finite; if not, the step was dropped."""
 
 
 def train_step(model: Model[Any], optimizer: Adam, batch: Any, step: int, progress: float) -> StepResult:
-    """Take one step: forward, backward, Adam. A step that is not finite changes no parameter.
+    """Take one training step: forward, backward, Adam. A step that is not finite changes no parameter.
 
     Args:
-        model: what is trained.
-        optimizer: holds all of its parameters.
-        batch: what is learnt from.
-        step: training steps done.
-        progress: share of the budget spent.
+        model: the model to train.
+        optimizer: the optimiser of all its parameters.
+        batch: pixels or views, as the model's loss takes them.
+        step: number of training steps done.
+        progress: fraction of the budget spent, 0 to 1.
     """
     set_learning_rate(optimizer, model.config, step, progress)
     loss = forward(model, batch, step, progress, model.uses_bfloat16)
@@ -47,14 +47,14 @@ def train_step(model: Model[Any], optimizer: Adam, batch: Any, step: int, progre
 
 
 def forward(model: Model[Any], batch: Any, step: int, progress: float, bfloat16: bool = False) -> Loss:
-    """Return what a model makes of a batch, in training mode.
+    """Return the loss of a model on a batch, in training mode.
 
     Args:
-        model: what is trained.
-        batch: what is learnt from.
-        step: training steps done.
-        progress: share of the budget spent.
-        bfloat16: run networks in bfloat16. It has float32's range, so no gradient scaling is needed.
+        model: the model to train.
+        batch: pixels or views, as the model's loss takes them.
+        step: number of training steps done.
+        progress: fraction of the budget spent, 0 to 1.
+        bfloat16: whether networks run in bfloat16, which has the range of float32 and needs no gradient scaling.
     """
     model.train()
     with torch.autocast(model.device.type, torch.bfloat16, enabled=bfloat16):
@@ -63,12 +63,14 @@ def forward(model: Model[Any], batch: Any, step: int, progress: float, bfloat16:
 
 
 def backward(loss: Tensor, optimizer: Adam) -> bool:
-    """Leave the gradients of a loss where the optimiser finds them.
+    """Compute the gradients of a loss, for the optimiser's next step.
 
     Args:
-        loss: a scalar. One without a gradient, as where every ray meets nothing, leaves none.
-        optimizer: forgets the gradients of the step before.
-    Returns: whether the loss and all gradients are finite.
+        loss: a scalar; without a graph, as when no ray has a sample, all gradients stay empty.
+        optimizer: the optimiser, whose gradients of the previous step are cleared.
+
+    Returns:
+        Whether the loss and all gradients are finite.
     """
     optimizer.zero_grad(set_to_none=True)
     if not bool(torch.isfinite(loss)):

@@ -1,4 +1,4 @@
-"""A trained run from its folder: what evaluation, rendering and export start from."""
+"""Trained runs, loaded from their folders for evaluation, rendering and export."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from framework.training.run import Run, read_run
 
 @dataclass(frozen=True)
 class Trained:
-    """A run with its model, ready to render."""
+    """A run with its trained model."""
 
     run: Run
-    """Method, settings and folder."""
+    """Method, settings, data and folder."""
     model: Model[Any]
-    """In evaluation mode, on its device."""
+    """Model in evaluation mode, on the device."""
     checkpoint: Path
-    """Where its parameters came from."""
+    """File from which the parameters were read."""
     content: dict[str, Any]
-    """The checkpoint, for transform, scale and state."""
+    """Content of the checkpoint, with transform, scale and state."""
 
 
 def load_trained(
@@ -43,16 +43,19 @@ def load_trained(
     rays_per_pixel: RaysPerPixel | None = None,
     eval_appearance: Literal["mean", "half"] | None = None,
 ) -> Trained:
-    """Load a run's model.
+    """Load a run with its trained model.
 
     Args:
-        config_path: the run's config.yml.
-        checkpoint: which one; the newest readable if None.
+        config_path: the run's config.yml, or its folder.
+        checkpoint: checkpoint to load; the newest readable one if None.
         device_type: auto, cpu, cuda or mps.
-        data: where the data is now, if it has moved.
-        rays_per_pixel: of which pictures are made, if not as the run says.
-        eval_appearance: of held-out photographs, likewise.
-    Raises: ConfigError or CheckpointError where something is missing or does not fit.
+        data: folder of the data, if it has moved; the run's if None.
+        rays_per_pixel: rays per rendered pixel; the run's if None.
+        eval_appearance: appearance of held-out images; the run's if None.
+
+    Raises:
+        ConfigError: if the run's settings are missing or do not fit.
+        CheckpointError: if there is no readable checkpoint, or it does not fit the settings.
     """
     run = read_run(config_path)
     machine = dataclasses.replace(run.config.machine, device_type=device_type)
@@ -66,10 +69,10 @@ def load_trained(
     run = dataclasses.replace(run, config=config)
     device = choose_device(machine)
     if checkpoint is None:
-        found = find_newest(run.folder / FOLDER, device)
-        if found is None:
+        newest = find_newest(run.folder / FOLDER, device)
+        if newest is None:
             raise CheckpointError(f"{run.folder / FOLDER} holds no checkpoint")
-        path, content = found
+        path, content = newest
     else:
         path, content = checkpoint, load_checkpoint(checkpoint, device)
     model = restored_model(run.method, config, content, device)
@@ -77,10 +80,7 @@ def load_trained(
 
 
 def _changed(config: TrainConfig, method: str, kind: type[TrainConfig], **values: Any) -> TrainConfig:
-    """Return settings with those of `values` changed that are not None.
-
-    Raises: ConfigError where a method's settings have none of that kind.
-    """
+    """Return settings with the `values` that are not None; raise ConfigError if the method has no such settings."""
     given = {name: value for name, value in values.items() if value is not None}
     if given and not isinstance(config, kind):
         flag = next(iter(given)).replace("_", "-")
@@ -89,9 +89,15 @@ def _changed(config: TrainConfig, method: str, kind: type[TrainConfig], **values
 
 
 def build_model(method: str, config: TrainConfig, scene: Scene) -> Model[Any]:
-    """A method's model with fresh parameters.
+    """Return a method's model with fresh parameters.
 
-    Raises: ConfigError where the machine has less memory than it takes.
+    Args:
+        method: the method's name.
+        config: the run's settings.
+        scene: properties of the data.
+
+    Raises:
+        ConfigError: if the model needs more memory than the machine has.
     """
     declared = load_method(method)
     try:
@@ -103,12 +109,17 @@ def build_model(method: str, config: TrainConfig, scene: Scene) -> Model[Any]:
 
 
 def restored_model(method: str, config: TrainConfig, checkpoint: dict[str, Any], device: torch.device) -> Model[Any]:
-    """A checkpoint's model on `device`, in evaluation mode.
+    """Return the model of a checkpoint, in evaluation mode.
 
     Args:
-        checkpoint: its content; the model is made for the scene in it.
-    Raises: CheckpointError where that lacks the scene, the settings make no model of it, or parameters have other names
-        or sizes.
+        method: the method's name.
+        config: the run's settings.
+        checkpoint: content of the checkpoint, with the scene for which the model is built.
+        device: device of the model.
+
+    Raises:
+        CheckpointError: if the checkpoint has no scene, no model can be built with the settings, or its parameters have
+            other names or sizes.
     """
     try:
         scene = Scene.of(checkpoint.get("scene")).to("cpu")
@@ -128,8 +139,12 @@ def restore_model(model: Model[Any], checkpoint: dict[str, Any], method: str | N
     """Load a checkpoint's parameters into a model.
 
     Args:
-        method: the model's, where it is known.
-    Raises: CheckpointError where the checkpoint is another method's, or names or sizes differ.
+        model: the model.
+        checkpoint: content of the checkpoint.
+        method: name of the model's method; None to accept a checkpoint of any.
+
+    Raises:
+        CheckpointError: if the checkpoint is of another method, or its parameters have other names or sizes.
     """
     made_by = checkpoint.get("method")
     if None not in (made_by, method) and made_by != method:
@@ -142,7 +157,7 @@ def restore_model(model: Model[Any], checkpoint: dict[str, Any], method: str | N
 
 
 def _difference(expected: dict[str, Any], found: Any) -> str:
-    """The first parameter that a checkpoint has of another size, or has not; empty where that is not the reason."""
+    """Return the first difference of names or sizes of parameters, for people; empty if there is none."""
     if not isinstance(found, dict) or not all(isinstance(value, Tensor) for value in found.values()):
         return ""
     for name, value in expected.items():
@@ -160,5 +175,5 @@ def _size(value: Tensor) -> str:
 
 
 def _short(error: BaseException) -> str:
-    """What torch says in many lines, in one."""
+    """Return the message of an error on one line, at most 300 characters."""
     return (" ".join(str(error).split()) or type(error).__name__)[:300]

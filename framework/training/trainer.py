@@ -1,4 +1,4 @@
-"""One trainer for every method: steps, checkpoints, periodic evaluation, and when to stop."""
+"""The trainer of every method: training steps, checkpoints, periodic evaluation and stopping criteria."""
 
 from __future__ import annotations
 
@@ -38,65 +38,66 @@ from framework.training.step import train_step
 from framework.training.trained import build_model, restore_model
 
 STEPS_PER_LOG = 25
+"""Steps between points of TensorBoard's curves."""
 PICTURE_SHARE = 0.1
-"""Pictures for TensorBoard are left out where they would take more than this share of the training time."""
+"""Maximum time for TensorBoard's images, as a fraction of the training time."""
 TOLD_SECONDS = 0.5
-"""Preparation that takes longer is said."""
+"""Seconds of preparation from which on they are reported."""
 MAX_BAD_STEPS = 10
-"""Non-finite steps in a row after which a run stops."""
+"""Number of consecutive non-finite steps after which a run stops."""
 FIRST_SAMPLES_PER_RAY = 256.0
-"""What is assumed before anything is known, when the batch follows the number of samples."""
+"""Initial estimate of samples per ray, if the batch size depends on it."""
 SMALLEST_BATCH, LARGEST_BATCH = 64, 2**17
-"""Rays in a step, when their number follows the samples."""
+"""Minimum and maximum number of rays per step, if it depends on the number of samples."""
 
 
 @dataclass
 class State:
-    """What changes as a run goes, besides parameters; a checkpoint holds all of it."""
+    """State of a run besides its parameters, saved in every checkpoint."""
 
     step: int = 0
-    """Steps done."""
+    """Number of training steps done."""
     seconds: float = 0.0
     """Seconds of training, without evaluation and saving."""
     rays: int = 0
-    """Rays trained on."""
+    """Number of rays trained on."""
     skipped: int = 0
-    """Steps dropped because a loss or gradient was not finite."""
+    """Number of steps dropped because a loss or gradient was not finite."""
     samples_per_ray: float = FIRST_SAMPLES_PER_RAY
-    """Running mean."""
+    """Running mean of samples per ray."""
     train_mse: float = 1.0
-    """Running mean over batches, uncorrected."""
+    """Running mean of the batches' squared error, without bias correction."""
     curve: tuple[Entry, ...] = ()
-    """Each evaluation over all images."""
+    """Evaluations of all held-out images."""
     looks: tuple[Entry, ...] = ()
-    """Each look at a few images."""
+    """Evaluations of a few held-out images."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How training ended."""
+    """End of training: its reason and the last checkpoint."""
 
     reason: str
-    """Why it stopped."""
+    """Reason for which training stopped, for people."""
     stopped_by: int | None
-    """The signal by which somebody stopped it; None where it came to its end."""
+    """Number of the signal that stopped training; None if no signal did."""
     checkpoint: Path
-    """The last state."""
+    """Path of the last checkpoint."""
 
     @property
     def interrupted(self) -> bool:
-        """Whether somebody stopped it."""
+        """True if a signal stopped training."""
         return self.stopped_by is not None
 
 
 class Trainer:
-    """Trains one run.
+    """Trainer of one run.
 
     Args:
         run: method, settings and folder.
-        train_set: images to learn from, on the device.
-        eval_set: images of the periodic evaluation, or None for none.
-        source: where batches come from; as the model and the settings ask if None.
+        train_set: training images, on the device.
+        eval_set: images of the periodic evaluation; None for no evaluation.
+        source: source of the batches; chosen by the model and the settings if None.
     """
 
     def __init__(
@@ -124,10 +125,11 @@ class Trainer:
 
     @property
     def checkpoint_folder(self) -> Path:
+        """Folder of the run's checkpoints."""
         return self.run.folder / FOLDER
 
     def save(self) -> Path:
-        """Write a checkpoint from which training goes on with the same bits."""
+        """Write a checkpoint, from which training continues with the same bits, and return its path."""
         self._last_save = self.state.seconds
         scene = self.model.scene
         content = {
@@ -147,9 +149,10 @@ class Trainer:
         return path
 
     def restore(self, checkpoint: dict[str, Any]) -> None:
-        """Continue from a checkpoint's content.
+        """Continue from the content of a `checkpoint`.
 
-        Raises: CheckpointError where it belongs to another method or other sizes.
+        Raises:
+            CheckpointError: if it is of another method, or its parameters have other sizes.
         """
         restore_model(self.model, checkpoint, self.run.method)
         try:
@@ -166,7 +169,11 @@ class Trainer:
         self._last_eval = self.state.curve[-1][0] if self.state.curve else 0.0
 
     def restore_as_configured(self) -> None:
-        """Start from --load-checkpoint or --load-dir, where given."""
+        """Restore the checkpoint of --load-checkpoint or --load-dir, if given.
+
+        Raises:
+            CheckpointError: if there is no such checkpoint, or it does not fit.
+        """
         if self.config.load_checkpoint is not None:
             self.restore(load_checkpoint(self.config.load_checkpoint, self.device))
         elif self.config.load_dir is not None:
@@ -178,9 +185,11 @@ class Trainer:
     # -- the run ----------------------------------------------------------------------------------------------
 
     def train(self) -> Outcome:
-        """Train until a budget is spent, a target is met, or somebody stops it; then save.
+        """Train until the budget is spent, the target is reached or a signal arrives; then save.
 
-        Raises: DivergenceError after ten non-finite steps in a row; the last checkpoint stands.
+        Raises:
+            DivergenceError: after MAX_BAD_STEPS consecutive non-finite steps; earlier checkpoints remain.
+            CheckpointError: if the last checkpoint cannot be written.
         """
         self.prepare()
         enabled = self.config.vis == "tensorboard"
@@ -193,12 +202,12 @@ class Trainer:
                 report = self.train_step()
                 bar.show(report)
                 self._log(report, board)
-                self._evaluate_if_due(board)  # before saving: a run that goes on from here does not come back to it
+                self._evaluate_if_due(board)  # before saving, so that a resumed run does not repeat it
                 self._look_if_due(report, board, last=not stopped and self._reason_to_stop(stopped) is not None)
                 if self._due_to_save():
                     self._try_to_save()
             self._write_curve()
-            checkpoint = self.save()  # a first Ctrl-C does not break it off
+            checkpoint = self.save()  # a first Ctrl-C does not interrupt it
         return Outcome(reason, next(iter(stopped), None), checkpoint)
 
     def _reason_to_stop(self, stopped: list[int]) -> str | None:
@@ -215,20 +224,20 @@ class Trainer:
 
     @property
     def progress(self) -> float:
-        """Share of the budget spent, steps or seconds, whichever is further."""
+        """Fraction of the budget spent, 0 to 1: of steps or seconds, whichever is larger."""
         done = self.state.step / self.config.max_num_iterations
         if self.config.max_seconds is not None:
             done = max(done, self.state.seconds / self.config.max_seconds)
         return min(done, 1.0)
 
     def profile(self) -> SceneProfile:
-        """Return what the scene needs, and why."""
+        """Return the profile of the scene, with the settings chosen by it."""
         return profile_of(self.run.method, self.config, self.model, self.train_set, self.decisions)
 
     def prepare(self) -> None:
-        """Skip what the images' silhouettes show to be empty, and start from the images, once, before the first step.
+        """Mark space outside the images' silhouettes as empty, and start from the images, once, before the first step.
 
-        It counts as training time, and is said.
+        Its time counts as training time.
         """
         if self._prepared:
             return
@@ -245,9 +254,10 @@ class Trainer:
             say(f"prepared in {seconds:.1f} s, which count as training")
 
     def train_step(self) -> StepReport:
-        """Draw a batch and take one step, after `prepare`.
+        """Draw a batch and take one training step; `prepare` is called first.
 
-        Raises: DivergenceError after ten non-finite steps in a row.
+        Raises:
+            DivergenceError: after MAX_BAD_STEPS consecutive non-finite steps.
         """
         self.prepare()
         with torch_on_one_thread(self.model.runs_on_kernels):
@@ -277,7 +287,7 @@ class Trainer:
         )
 
     def _request(self) -> Request:
-        """Return what the next step draws: rays through pixels' centres at first, later those that pictures are of."""
+        """Return the next batch's size: one ray per pixel at first, later as many as in rendering."""
         config = self.config
         if not isinstance(config, RayConfig):
             return Request(self.state.step, 0)
@@ -293,7 +303,7 @@ class Trainer:
         return min(max(wanted, SMALLEST_BATCH), LARGEST_BATCH)
 
     def _count_bad(self, finite: bool) -> None:
-        """Count steps that were dropped; too many in a row end the run."""
+        """Count dropped steps; raise DivergenceError after too many in a row."""
         self._bad_in_a_row = 0 if finite else self._bad_in_a_row + 1
         self.state.skipped += not finite
         if self._bad_in_a_row >= MAX_BAD_STEPS:
@@ -309,13 +319,13 @@ class Trainer:
         state.seconds += seconds
         state.rays += num_rays
         state.samples_per_ray += 0.2 * (num_samples / max(num_rays, 1) - state.samples_per_ray)
-        if math.isfinite(mse):  # a dropped step's may not be, and a running mean never forgets a NaN
+        if math.isfinite(mse):  # a dropped step's may be NaN, which would stay in the mean
             state.train_mse += max(0.02, 1 / state.step) * (mse - state.train_mse)
 
     def _train_psnr(self) -> float:
         return min(-10 * float(torch.tensor(max(self.state.train_mse, 1e-12)).log10()), MAX_PSNR)
 
-    # -- looking on -------------------------------------------------------------------------------------------
+    # -- evaluation -------------------------------------------------------------------------------------------
 
     def _log(self, report: StepReport, board: TensorBoard) -> None:
         if report.step % STEPS_PER_LOG == 0:
@@ -331,7 +341,7 @@ class Trainer:
             board.scalars(values, report.step)
 
     def _evaluate_if_due(self, board: TensorBoard) -> None:
-        """Periodic evaluation; its time does not count as training."""
+        """Evaluate one or all held-out images if it is time to; this does not count as training time."""
         config, step = self.config, self.state.step
         if self.eval_set is None or config.max_eval_images == 0:
             return
@@ -350,17 +360,17 @@ class Trainer:
         due = every is not None and self.state.seconds - self._last_eval >= every
         if due or step % config.steps_per_eval_all_images == 0:
             self._last_eval, start = self.state.seconds, time.perf_counter()
-            found = evaluate(self.model, self.eval_set, max_images=config.max_eval_images, title="Evaluating")
-            psnr, ssim, images = (found.results[name] for name in ("psnr", "ssim", "num_images"))
-            took = time.perf_counter() - start
-            point = Point(self.state.seconds, step, psnr, ssim, images, evaluation_seconds=took)
+            evaluation = evaluate(self.model, self.eval_set, max_images=config.max_eval_images, title="Evaluating")
+            psnr, ssim, images = (evaluation.results[name] for name in ("psnr", "ssim", "num_images"))
+            cost = time.perf_counter() - start
+            point = Point(self.state.seconds, step, psnr, ssim, images, evaluation_seconds=cost)
             self.state.curve += (point.entry(),)
             board.scalars({"eval/psnr": psnr} | ({} if ssim is None else {"eval/ssim": ssim}), step)
-            say(f"{self.state.seconds:5.0f} s  step {step:,}  {found.line()}")
+            say(f"{self.state.seconds:5.0f} s  step {step:,}  {evaluation.line()}")
             self._write_curve()
 
     def _look_if_due(self, report: StepReport, board: TensorBoard, last: bool) -> None:
-        """A look at a few held-out images; its time does not count as training either."""
+        """Evaluate a few held-out images if it is time to; this does not count as training time either."""
         if self._few is None:
             return
         point = self._few.look_if_due(self.model, self.state.looks, report, last=last)
@@ -374,13 +384,13 @@ class Trainer:
         write_report(self.run.folder / "learning_curve.json", rows(in_order(self.state.curve, self.state.looks)))
 
     def _due_to_save(self) -> bool:
-        if self._bad_in_a_row:  # what is saved now might be ruined, and would push out what is not
+        if self._bad_in_a_row:  # the parameters may be damaged; keep older checkpoints
             return False
         aged = self.state.seconds - self._last_save >= self.config.seconds_per_save
         return aged or self.state.step % self.config.steps_per_save == 0
 
     def _try_to_save(self) -> None:
-        """A full disk must not end a run that still fits into memory: it is reported, and tried again later."""
+        """Save a checkpoint; on failure, as with a full disk, warn and train on, to try again later."""
         try:
             self.save()
         except CheckpointError as error:

@@ -1,1 +1,1 @@
-"""Measurements that anybody can repeat: `ns-bench`."""
+"""Benchmarks of `ns-bench`: repeatable measurements of speed and error."""

@@ -1,8 +1,8 @@
-"""What each part of instant-ngp is worth: trained with one part switched off, or on, in turn.
+"""Effect of each part of instant-ngp: training with one part switched off, or on, in turn.
 
-Every variant is trained with every seed, the variants in turn, so that a machine whose speed drifts treats them alike.
-Reported are seconds of training to the target PSNR on validation views and the final PSNR on all test views: means over
-seeds, with the standard deviation of a single run.
+Each variant is trained with each seed. The variants alternate, so that a drift of the machine's speed affects all of
+them. Reported are the seconds of training to the target PSNR on validation views and the final PSNR on all test views:
+means over seeds, with the standard deviation of a single run.
 """
 
 from __future__ import annotations
@@ -33,10 +33,11 @@ VARIANTS: dict[str, list[str]] = {
     "no view dependence": ["--view-dependence", "False"],
     "one ray a pixel": ["--rays-per-pixel", "1"],
 }
+"""Flags of ns-train for each variant."""
 VIEWS = 4
-"""Validation views of the learning curve."""
+"""Number of validation views of the learning curve."""
 CURVE_POINTS = 9
-"""Evaluations on those views during a run."""
+"""Number of evaluations of those views during a run."""
 
 
 def measure(data: Path, seconds: float, seeds: int, target: float) -> dict[str, Any]:
@@ -45,20 +46,22 @@ def measure(data: Path, seconds: float, seeds: int, target: float) -> dict[str, 
     Args:
         data: folder of the data set.
         seconds: seconds of training of each run.
-        seeds: runs of each variant.
-        target: PSNR, dB, the time to which is reported.
-    Returns: what was asked for and a row for each variant, as plain data.
+        seeds: number of runs of each variant.
+        target: PSNR, dB, to which the time is reported.
+
+    Returns:
+        The machine, the arguments and a row for each variant, as plain data.
     """
     runs: dict[str, list[tuple[float | None, float]]] = {name: [] for name in VARIANTS}
     for seed in range(seeds):
         for name, switches in VARIANTS.items():
             runs[name].append(train(data, seconds, seed, target, switches))
             say(f"seed {seed}  {name}: {runs[name][-1]}")
-    rows = [summary(name, found) for name, found in runs.items()]
+    rows = [summary(name, results) for name, results in runs.items()]
     for row in rows:
         say(str(row))
-    asked = {"seconds": seconds, "seeds": seeds, "target, dB": target}
-    return {"machine": machine(), "kernels": native.variant(), **asked, "rows": rows}
+    arguments = {"seconds": seconds, "seeds": seeds, "target, dB": target}
+    return {"machine": machine(), "kernels": native.variant(), **arguments, "rows": rows}
 
 
 def train(data: Path, seconds: float, seed: int, target: float, switches: list[str]) -> tuple[float | None, float]:
@@ -67,10 +70,12 @@ def train(data: Path, seconds: float, seed: int, target: float, switches: list[s
     Args:
         data: folder of the data set.
         seconds: seconds of training.
-        seed: seed of the run.
+        seed: random seed.
         target: PSNR, dB.
-        switches: flags of ns-train that make the variant.
-    Returns: seconds to the target, None where it was not met, and the final PSNR, dB.
+        switches: flags of ns-train for the variant.
+
+    Returns:
+        Seconds to the target, None if it was not reached, and the final PSNR, dB.
     """
     with tempfile.TemporaryDirectory() as folder:
         command = python_command("framework.cli.train", "instant-ngp", "--data", data)
@@ -86,12 +91,14 @@ def train(data: Path, seconds: float, seed: int, target: float, switches: list[s
 
 
 def crossing(curve: list[tuple[float, float]], target: float) -> float | None:
-    """Find when a curve first meets a target, between its points by straight lines.
+    """Return the seconds at which a curve first reaches a target, by linear interpolation.
 
     Args:
         curve: (seconds, PSNR) in the order of time.
         target: PSNR, dB.
-    Returns: seconds; None where the target is not met.
+
+    Returns:
+        Seconds; None if the target is not reached.
     """
     for (t0, p0), (t1, p1) in pairwise(curve):
         if p1 >= target > p0:
@@ -103,7 +110,7 @@ def summary(name: str, found: list[tuple[float | None, float]]) -> dict[str, Any
     """Average a variant's runs over seeds.
 
     Args:
-        name: the variant.
+        name: the variant's name.
         found: seconds to the target and final PSNR of each run, as from `train`.
     """
     times, psnrs = [t for t, _ in found if t is not None], [p for _, p in found]

@@ -1,8 +1,8 @@
-"""Memory and speed of a large image set under --cache-limit, beside a small set held in memory.
+"""Memory and speed of training with a large image set under --cache-limit, and with a small one in memory.
 
 Renders of the embedded scene are enlarged to images of the given size. instant-ngp is trained on them with their pixels
-in a file, and on the same images at a quarter of the width with all pixels in memory, each in a process of its own. The
-page cache is warm, since the file has just been written.
+in a file, and on the same images at a quarter of the width with all pixels in memory, each in its own process. The page
+cache is warm, as the file has just been written.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from framework.training.run import Run, create_folder
 from framework.training.trainer import Trainer
 
 RENDERED = 200
-"""Width and height of the renders that are enlarged."""
+"""Width and height of the renders before they are enlarged, pixels."""
 WARM_UP = 0.25
-"""Share of the time after which speed is measured: by then the grid has found what is empty."""
+"""Fraction of the time after which speed is measured, as the occupancy grid has then found empty space."""
 SETS = (("small, in memory", 4, False), ("large, from a file", 1, True), ("again", 1, True))
-"""Name, what the width and height are divided by, whether pixels are read from a file."""
+"""Name of each set, divisor of width and height, and whether pixels are read from a file."""
 
 
 def measure(images: int, size: tuple[int, int], seconds: float, limit: float, folder: Path | None) -> dict[str, Any]:
@@ -43,11 +43,13 @@ def measure(images: int, size: tuple[int, int], seconds: float, limit: float, fo
 
     Args:
         images: number of images.
-        size: width and height of the large ones, pixels.
-        seconds: seconds of training.
-        limit: MB of decoded pixels that may be in memory.
-        folder: where images and cache are written; a temporary folder if None.
-    Returns: what was asked for and what `trained_on` returns for each set, as plain data.
+        size: width and height of the large images, pixels.
+        seconds: seconds of training on each set.
+        limit: maximum memory of decoded pixels, MB.
+        folder: folder of images and cache; the system's temporary folder if None.
+
+    Returns:
+        The machine, the arguments and the result of `trained_on` for each set, as plain data.
     """
     content: dict[str, Any] = {"machine": machine(), "images": images, "size": list(size), "seconds": seconds}
     parser = load_dataparser("procedural")(size=RENDERED, num_train=images)  # type: ignore[call-arg]
@@ -57,21 +59,21 @@ def measure(images: int, size: tuple[int, int], seconds: float, limit: float, fo
             data = Path(name) / f"data-{divisor}"
             if not data.is_dir():
                 enlarge(renders, data, size[0] // divisor, size[1] // divisor)
-            asked = json.dumps([str(data), name, seconds, limit if cached else None])
-            printed = output_of(python_command("framework.tools.benchmarks.cache", asked))
-            content[kind] = json.loads(printed.splitlines()[-1])
+            arguments = json.dumps([str(data), name, seconds, limit if cached else None])
+            output = output_of(python_command("framework.tools.benchmarks.cache", arguments))
+            content[kind] = json.loads(output.splitlines()[-1])
             say(f"{kind} {json.dumps(content[kind])}")
     return content
 
 
 def enlarge(source: Path, target: Path, width: int, height: int) -> None:
-    """Write renders over black, enlarged to the height of the images and centred, with cameras to match.
+    """Write renders over black, enlarged to the images' height and centred, with matching cameras.
 
     Args:
         source: folder of a data set in the blender format, with square renders.
-        target: folder to make, in the same format.
-        width: of the images, pixels.
-        height: of the images, pixels.
+        target: folder to create, in the same format.
+        width: width of the images, pixels.
+        height: height of the images, pixels.
     """
     (target / "train").mkdir(parents=True)
     content = json.loads((source / "transforms_train.json").read_text())
@@ -93,10 +95,12 @@ def trained_on(data: Path, folder: Path, seconds: float, limit: float | None) ->
 
     Args:
         data: folder of the data set, in the blender format.
-        folder: where the cache is written.
+        folder: folder of the cache.
         seconds: seconds of training.
-        limit: MB of decoded pixels that may be in memory; all of them if None.
-    Returns: memory before, while loading and while training, MB; speed; and what reading cost.
+        limit: maximum memory of decoded pixels, MB; None for no limit.
+
+    Returns:
+        Memory before, during loading and during training, MB; speed; and the time spent waiting for pixels.
     """
     cache_limit = math.inf if limit is None else limit
     config = dataclasses.replace(load_method("instant-ngp").config, data=data, vis="none", max_seconds=seconds)
@@ -115,24 +119,24 @@ def trained_on(data: Path, folder: Path, seconds: float, limit: float | None) ->
 
 
 def train(trainer: Trainer, seconds: float) -> dict[str, Any]:
-    """Train, and measure memory and speed.
+    """Train and measure memory and speed.
 
     Args:
-        trainer: of a new run.
+        trainer: trainer of a new run.
         seconds: seconds of training.
     """
-    state, most, waited = trainer.state, {"RssAnon": 0.0, "RssFile": 0.0}, [0.0]
+    state, peaks, waited = trainer.state, {"RssAnon": 0.0, "RssFile": 0.0}, [0.0]
     PixelStream.look_up = timed_into(PixelStream.look_up, waited)  # type: ignore[method-assign]
     rays = since = wait = 0.0
     while state.seconds < seconds:
         trainer.train_step()
-        now = status(*most)
-        most = {name: max(most[name], now.get(name, 0.0)) for name in most}
+        memory = status(*peaks)
+        peaks = {name: max(peaks[name], memory.get(name, 0.0)) for name in peaks}
         if not since and state.seconds > WARM_UP * seconds:
             rays, since, wait = state.rays, state.seconds, waited[0]
     measured = state.seconds - since
     return {
-        "training": {**status("VmHWM"), **most},
+        "training": {**status("VmHWM"), **peaks},
         "steps": state.step,
         "rays per second": round((state.rays - rays) / measured),
         "rays in the last step": round((trainer.model.samples_per_step or 0) / state.samples_per_ray),
@@ -142,38 +146,38 @@ def train(trainer: Trainer, seconds: float) -> dict[str, Any]:
 
 
 def status(*names: str) -> dict[str, float]:
-    """Read figures of this process's memory, MB; none where the system does not give them.
+    """Return memory sizes of this process, MB; empty if the system does not report them.
 
     Args:
-        names: lines of /proc/self/status.
+        names: names of lines of /proc/self/status.
     """
     try:
         lines = Path("/proc/self/status").read_text().splitlines()
     except OSError:
         return {}
-    found = {line.split(":")[0]: line.split(":")[1] for line in lines}
-    return {name: round(int(found[name].split()[0]) * 1024 / 1e6, 1) for name in names if name in found}
+    values = {line.split(":")[0]: line.split(":")[1] for line in lines}
+    return {name: round(int(values[name].split()[0]) * 1024 / 1e6, 1) for name in names if name in values}
 
 
 def forget_peak() -> None:
-    """Make VmHWM the peak of what follows, where the system allows it."""
+    """Reset VmHWM, the peak of memory, if the system allows it."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
 
 
 def timed_into(function: Callable[..., Any], spent: list[float]) -> Callable[..., Any]:
-    """Wrap a function so that the seconds of its calls are added up.
+    """Return a function that adds the seconds of its calls to a sum.
 
     Args:
-        function: what is called.
-        spent: its one element is the sum.
+        function: function to call.
+        spent: a list of one element, the sum.
     """
 
     def timed(*arguments: Any) -> Any:
         start = time.perf_counter()
-        out = function(*arguments)
+        result = function(*arguments)
         spent[0] += time.perf_counter() - start
-        return out
+        return result
 
     return timed
 

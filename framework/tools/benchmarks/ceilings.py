@@ -1,4 +1,4 @@
-"""What this machine can do at all: the ceilings that kernels are held against."""
+"""Limits of the machine, with which the times of kernels are compared: copying, matrix products and gathers."""
 
 from __future__ import annotations
 
@@ -9,41 +9,41 @@ from dataclasses import dataclass, field
 import torch
 
 TABLES = (1, 8, 64)
-"""MB of the tables that are gathered from."""
+"""Sizes of the tables from which is gathered, MiB."""
 
 
 @dataclass(frozen=True)
 class Work:
-    """What a kernel has to do for each sample, ray, entry or pixel, whatever else it does."""
+    """Minimum work of a kernel per sample, ray, entry or pixel."""
 
     bytes: float = 0.0
-    """Read or written in order."""
+    """Bytes read or written in order."""
     gathers: float = 0.0
-    """Of 8 bytes at places that nobody knows beforehand."""
+    """Number of reads of 8 bytes at random places."""
     table_bytes: float = 0.0
-    """Of what is gathered from."""
+    """Size of the table from which is gathered, bytes."""
     flops: float = 0.0
-    """Of matrix products; a multiplication and an addition are two."""
+    """Floating-point operations of matrix products; a multiplication and an addition are two."""
     bfloat16: bool = False
-    """Whether the products are of bfloat16."""
+    """Whether the products are in bfloat16."""
 
 
 @dataclass(frozen=True)
 class Ceilings:
-    """Measured with torch, on all threads."""
+    """Maximum rates of the machine, measured with torch on all threads."""
 
     copy: float
     """Bytes read and written, 1/s."""
     float32: float
-    """Of a product of matrices of 1024 x 1024, FLOP/s."""
+    """Product of 1024 x 1024 matrices, FLOP/s."""
     bfloat16: float
-    """The same in bfloat16."""
+    """Product of such matrices in bfloat16, FLOP/s."""
     gathers: dict[int, float] = field(default_factory=dict)
-    """Of 8 bytes, 1/s, by the table's MB."""
+    """Random reads of 8 bytes, 1/s, by the size of the table, MiB."""
 
     @classmethod
     def measured(cls) -> Ceilings:
-        """The best of eight runs each, now."""
+        """Measure the limits, each as the best of eight runs."""
         source = torch.rand(2**25)
         target = torch.empty_like(source)
         a, b = torch.rand(1024, 1024), torch.rand(1024, 1024)
@@ -61,17 +61,17 @@ class Ceilings:
         )
 
     def seconds(self, work: Work) -> float:
-        """What the slowest part of some work takes at its ceiling's rate, the others being free.
+        """Return the seconds of the slowest part of some `work` at its maximum rate.
 
-        Gathers are held against those at random from the smallest table measured that is no smaller. Neighbours in
-        space share much of what they gather, so a kernel may well be faster than that.
+        For gathers, the rate is that of random reads from the smallest measured table that is large enough. Neighbours
+        in space read many of the same entries, so that a kernel can be faster.
         """
         size = next((size for size in TABLES if size * 2**20 >= work.table_bytes), TABLES[-1])
         products = self.bfloat16 if work.bfloat16 else self.float32
         return max(work.bytes / self.copy, work.gathers / self.gathers[size], work.flops / products)
 
     def lines(self) -> list[str]:
-        """For people."""
+        """Return the limits as lines of text."""
         gathers = ", ".join(f"{rate / 1e9:.2f} from {size} MB" for size, rate in self.gathers.items())
         return [
             f"copy {self.copy / 1e9:.1f} GB/s",
@@ -81,9 +81,9 @@ class Ceilings:
 
 
 def _best(run: Callable[[], object]) -> float:
-    spent = []
+    times = []
     for _ in range(8):
         start = time.perf_counter()
         run()
-        spent.append(time.perf_counter() - start)
-    return min(spent)
+        times.append(time.perf_counter() - start)
+    return min(times)

@@ -1,4 +1,4 @@
-"""Measurements in processes of their own, where what ran before leaves nothing behind."""
+"""Measurements in separate processes, which earlier measurements cannot affect."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ def output_of(command: Sequence[str]) -> str:
 
     Args:
         command: a program and its arguments, as from `python_command`.
-    Raises: NerfloomError with the last line of its standard error where it fails.
+
+    Raises:
+        NerfloomError: if it fails; the message has the last line of its standard error.
     """
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
-        said = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
-        raise NerfloomError(f"a process of the benchmark failed: {said[-1]}")
+        lines = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
+        raise NerfloomError(f"a process of the benchmark failed: {lines[-1]}")
     return done.stdout

@@ -1,12 +1,12 @@
-"""Scenes whose volume-rendering integral is known: the truth against which samplers are measured.
+"""Scenes whose volume-rendering integral is known, for measuring the errors of samplers.
 
 With tau(t) the integral of density from a ray's near end to the distance t, a pixel is (Max 1995; NeRF, equation 1)
 
     C = integral of exp(-tau) sigma c dt + exp(-tau(far)) background.
 
-Where density is constant and colour linear this is elementary (`Solids`). Of Gaussians tau is a sum of error functions,
-and what is left is the integral of an analytic function, for which Gauss and Legendre's quadrature is exact to rounding
-(`Blobs`). All matter lies in `BOX`.
+For constant density and linear colour this is elementary (`Solids`). For Gaussians, tau is a sum of error functions,
+and the integrand is analytic, so that Gauss-Legendre quadrature is exact up to rounding (`Blobs`). All matter is in
+`BOX`.
 """
 
 from __future__ import annotations
@@ -27,28 +27,29 @@ from framework.geometry.points import Points
 from framework.geometry.rays import Rays
 
 Triple = tuple[float, float, float]
+"""A position, a direction or a colour."""
 
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
-"""(2, 3) smallest and largest corner of the space in which every scene lies."""
+"""(2, 3) minimum and maximum corner of the box that contains every scene."""
 PANELS, ORDER = 64, 16
-"""Of Gauss and Legendre's quadrature along a ray."""
+"""Number of panels of Gauss-Legendre quadrature along a ray, and nodes per panel."""
 
 
 class Light(NamedTuple):
-    """What reaches the eye along R rays, float64."""
+    """Colours and opacities of R rays, float64."""
 
     color: Tensor
-    """(R, 3) over the background."""
+    """(R, 3) colours over the background."""
     opacity: Tensor
-    """(R,)"""
+    """(R,) opacities, 0 to 1."""
 
 
 class ClosedForm(Field):
-    """A field whose pixels are known, in any float type. Its features are its colours, alike from all sides."""
+    """A field whose rendered colours are known, in any float type; its features are its colours."""
 
     @abstractmethod
     def truth(self, rays: Rays, background: Tensor) -> Light:
-        """What R rays see over `background` (3,), between their near and far ends."""
+        """Compute colours and opacities of R `rays` over a `background` (3,), between their near and far ends."""
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         return features
@@ -61,25 +62,29 @@ class Shape(Protocol):
     """A convex part of space."""
 
     def contains(self, positions: Tensor) -> Tensor:
-        """(N,) bool, whether positions (N, 3) lie in it."""
+        """Return whether `positions` (N, 3) are inside, (N,) bool; the boundary is inside."""
 
     def crossing(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Distances (R,) at which rays (R, 3) enter and leave it; the same one for a ray that misses."""
+        """Return the distances (R,) at which rays enter and leave; both are equal for a ray that misses.
+
+        Args:
+            origins, directions: (R, 3) rays.
+        """
 
 
 @dataclass(frozen=True)
 class Ball:
-    """All that is nearer to `center` than `radius`."""
+    """The ball of a `radius` around a `center`."""
 
     radius: float
     center: Triple = (0.0, 0.0, 0.0)
 
     def contains(self, positions: Tensor) -> Tensor:
-        """As `Shape.contains`."""
+        """Return whether `positions` (N, 3) are inside, as `Shape.contains`."""
         return (positions - positions.new_tensor(self.center)).square().sum(-1) <= self.radius**2
 
     def crossing(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """As `Shape.crossing`."""
+        """Intersect rays of `origins` and `directions` (R, 3), as `Shape.crossing`."""
         nearest, squared = _nearest(origins, directions, self.center)
         half = ((self.radius**2 - squared).clamp(min=0) / directions.square().sum(-1)).sqrt()
         return nearest - half, nearest + half
@@ -87,18 +92,18 @@ class Ball:
 
 @dataclass(frozen=True)
 class Block:
-    """The box between two corners, faces included."""
+    """The box between the corners `low` and `high`, faces included."""
 
     low: Triple
     high: Triple
 
     def contains(self, positions: Tensor) -> Tensor:
-        """As `Shape.contains`."""
+        """Return whether `positions` (N, 3) are inside, as `Shape.contains`."""
         low, high = positions.new_tensor(self.low), positions.new_tensor(self.high)
         return ((positions >= low) & (positions <= high)).all(-1)
 
     def crossing(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """As `Shape.crossing`."""
+        """Intersect rays of `origins` and `directions` (R, 3), as `Shape.crossing`."""
         return intersect_box(origins, directions, origins.new_tensor((self.low, self.high)))
 
 
@@ -107,23 +112,24 @@ class Medium:
     """Matter of constant density and linear colour."""
 
     shape: Shape
+    """Region of the matter."""
     density: float
-    """1/length."""
+    """Density, 1/length."""
     color: Triple = (0.0, 0.0, 0.0)
-    """At the origin."""
+    """Colour at the origin."""
     slope: Triple = (0.0, 0.0, 0.0)
-    """By how much red grows along x, green along y, blue along z, 1/length."""
+    """Derivatives of red along x, green along y and blue along z, 1/length."""
 
     def colors(self, positions: Tensor) -> Tensor:
-        """(N, 3) at positions (N, 3)."""
+        """Return colours (N, 3) at `positions` (N, 3)."""
         return positions.new_tensor(self.color) + positions.new_tensor(self.slope) * positions
 
 
 class Solids(ClosedForm):
-    """Media of constant density. Where several lie, the last one named is there alone, so that they can be nested.
+    """Media of constant density, which may be nested: where several overlap, only the last one counts.
 
     Args:
-        media: the outer ones before the inner ones.
+        media: the media, outer ones before inner ones.
     """
 
     def __init__(self, *media: Medium) -> None:
@@ -140,7 +146,7 @@ class Solids(ClosedForm):
         return sigma, color
 
     def truth(self, rays: Rays, background: Tensor) -> Light:
-        """Added up over the stretches between surfaces, each of which is one medium's."""
+        """Sum over the intervals between surfaces, each of which is in one medium."""
         origins, directions, nears, fars = _double(rays)
         crossings = [t for medium in self.media for t in medium.shape.crossing(origins, directions)]
         ends = torch.stack([nears, fars, *crossings], dim=-1)
@@ -148,22 +154,22 @@ class Solids(ClosedForm):
         starts, lengths = ends[:, :-1], ends.diff(dim=-1)
         sigma, _ = self._along(origins, directions, starts + lengths / 2)
         tau = sigma * lengths
-        # Of a linear colour, what a stretch sends out is the colour at the mean place where its light is stopped.
+        # An interval of linear colour emits the colour at the mean position at which light is stopped.
         _, color = self._along(origins, directions, starts + lengths * mean_place(tau))
         weights = torch.exp(-(tau.cumsum(-1) - tau)) * -torch.expm1(-tau)
-        spent = tau.sum(-1)
-        return _over(background, (weights[..., None] * color).sum(1), spent)
+        depth = tau.sum(-1)
+        return _over(background, (weights[..., None] * color).sum(1), depth)
 
     def _along(self, origins: Tensor, directions: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Density (R, B) and colour (R, B, 3) at distances t (R, B)."""
+        """Return density (R, B) and colour (R, B, 3) at distances t (R, B)."""
         sigma, color = self.density(Points(_points(origins, directions, t)))
         return sigma.view(t.shape), color.view(*t.shape, 3)
 
 
 def mean_place(tau: Tensor) -> Tensor:
-    """The mean place, from 0 at its start to 1, at which a homogeneous stretch of optical depth tau stops light.
+    """Return the mean position, 0 to 1, at which a homogeneous interval of optical depth `tau` stops light.
 
-    1 / tau - 1 / (exp(tau) - 1), which is 1/2 where the stretch is thin.
+    It is 1 / tau - 1 / (exp(tau) - 1), and tends to 1/2 for small tau.
     """
     thin = tau < 1e-2
     safe = torch.where(thin, torch.ones_like(tau), tau)
@@ -175,22 +181,30 @@ def mean_place(tau: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Gaussian:
-    """Matter whose density falls as a Gaussian, alike in all directions."""
+    """Matter whose density is an isotropic Gaussian."""
 
     center: Triple
+    """Position of the peak."""
     deviation: float
-    """Length at which density is exp(-1/2) of its peak."""
+    """Standard deviation, length."""
     peak: float
-    """1/length."""
+    """Density at the centre, 1/length."""
     color: Triple
+    """Colour, the same everywhere."""
 
     def density(self, positions: Tensor) -> Tensor:
-        """(N,) at positions (N, 3)."""
+        """Return density (N,), 1/length, at `positions` (N, 3)."""
         squared = (positions - positions.new_tensor(self.center)).square().sum(-1)
         return self.peak * torch.exp(-squared / (2 * self.deviation**2))
 
     def optical_depth(self, origins: Tensor, directions: Tensor, starts: Tensor, t: Tensor) -> Tensor:
-        """(R, B) between distances starts (R,) and t (R, B) along rays (R, 3)."""
+        """Return the optical depth (R, B) of intervals of rays.
+
+        Args:
+            origins, directions: (R, 3) rays.
+            starts: (R,) distances at which the intervals start.
+            t: (R, B) distances at which they end.
+        """
         nearest, squared = _nearest(origins, directions, self.center)
         width = self.deviation * math.sqrt(2) / directions.norm(dim=-1)
         whole = self.peak * torch.exp(-squared / (2 * self.deviation**2)) * width * math.sqrt(math.pi) / 2
@@ -199,7 +213,11 @@ class Gaussian:
 
 
 class Blobs(ClosedForm):
-    """Gaussians that lie in one another: densities add up, and each sends out its own colour."""
+    """Overlapping Gaussians, whose densities add up; each emits its own colour.
+
+    Args:
+        gaussians: the Gaussians.
+    """
 
     def __init__(self, *gaussians: Gaussian) -> None:
         super().__init__()
@@ -209,31 +227,31 @@ class Blobs(ClosedForm):
         positions = points.positions
         sigma, color = positions.new_zeros(len(positions)), torch.zeros_like(positions)
         for gaussian in self.gaussians:
-            own = gaussian.density(positions)
-            sigma = sigma + own
-            color = color + own[:, None] * positions.new_tensor(gaussian.color)
+            density = gaussian.density(positions)
+            sigma = sigma + density
+            color = color + density[:, None] * positions.new_tensor(gaussian.color)
         return sigma, color / sigma.clamp(min=torch.finfo(sigma.dtype).tiny)[:, None]
 
     def truth(self, rays: Rays, background: Tensor) -> Light:
-        """Opacity in closed form; colour by quadrature of an integrand whose optical depth is in closed form."""
+        """Compute opacity in closed form, and colour by quadrature with optical depths in closed form."""
         origins, directions, nears, fars = _double(rays)
         nodes, shares = (torch.from_numpy(v).to(nears) for v in gauss_legendre(PANELS, ORDER))
         t = torch.lerp(nears[:, None], fars[:, None], nodes)
         sigma, color = self.density(Points(_points(origins, directions, t)))
         in_front = self.optical_depth(rays, t)
         weights = torch.exp(-in_front) * sigma.view(t.shape) * shares * (fars - nears)[:, None]
-        spent = self.optical_depth(rays, fars[:, None])[:, 0]
-        return _over(background, (weights[..., None] * color.view(*t.shape, 3)).sum(1), spent)
+        depth = self.optical_depth(rays, fars[:, None])[:, 0]
+        return _over(background, (weights[..., None] * color.view(*t.shape, 3)).sum(1), depth)
 
     def optical_depth(self, rays: Rays, t: Tensor) -> Tensor:
-        """(R, B) float64, from the rays' near ends to distances t (R, B)."""
+        """Return the optical depth (R, B) float64 of `rays` from their near ends to distances `t` (R, B)."""
         origins, directions, nears, _ = _double(rays)
         parts = [g.optical_depth(origins, directions, nears, t) for g in self.gaussians]
         return torch.stack(parts).sum(0)
 
 
 def gauss_legendre(panels: int, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights, (panels * order,) each, that integrate over [0, 1] in equal panels."""
+    """Return nodes and weights of quadrature over [0, 1] in equal `panels` of `order` nodes, (panels * order,) each."""
     nodes, weights = np.polynomial.legendre.leggauss(order)
     within = (nodes + 1) / 2
     return ((np.arange(panels)[:, None] + within) / panels).ravel(), np.tile(weights / 2 / panels, panels)
@@ -243,42 +261,42 @@ def gauss_legendre(panels: int, order: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _double(rays: Rays) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Origins, directions, near and far ends in float64."""
+    """Return origins, directions, near and far ends in float64."""
     return rays.origins.double(), rays.directions.double(), rays.nears.double(), rays.fars.double()
 
 
 def _points(origins: Tensor, directions: Tensor, t: Tensor) -> Tensor:
-    """(R * B, 3) at distances t (R, B)."""
+    """Return positions (R * B, 3) at distances t (R, B)."""
     return (origins[:, None] + t[..., None] * directions[:, None]).view(-1, 3)
 
 
 def _nearest(origins: Tensor, directions: Tensor, center: Triple) -> tuple[Tensor, Tensor]:
-    """The distance (R,) at which rays come nearest to a point, and the square of how near that is."""
+    """Return the distance (R,) along rays to the point nearest to `center`, and its squared distance from it (R,)."""
     to_center = origins.new_tensor(center) - origins
     nearest = (to_center * directions).sum(-1) / directions.square().sum(-1)
     return nearest, (nearest[:, None] * directions - to_center).square().sum(-1)
 
 
-def _over(background: Tensor, color: Tensor, spent: Tensor) -> Light:
-    """Light (R, 3) that matter sends out along rays of optical depth `spent` (R,), over what is behind."""
-    return Light(color + torch.exp(-spent)[:, None] * background.double(), -torch.expm1(-spent))
+def _over(background: Tensor, color: Tensor, depth: Tensor) -> Light:
+    """Return emitted colours (R, 3) of rays of optical depth (R,), composited over the background."""
+    return Light(color + torch.exp(-depth)[:, None] * background.double(), -torch.expm1(-depth))
 
 
 # -- scenes -------------------------------------------------------------------------------------------------------
 
 
 def scenes() -> dict[str, ClosedForm]:
-    """Every scene by its name, each hard in its own way."""
+    """Return all scenes by name."""
     corners = product((-0.5, 0.5), repeat=3)
     return {
-        # Thin and everywhere: nothing can be skipped.
+        # Thin everywhere: no sample can be skipped.
         "fog": Solids(Medium(Block((-0.8, -0.7, -0.6), (0.8, 0.7, 0.6)), 0.6, (0.5, 0.5, 0.5), (0.5, 0.5, 0.5))),
-        # Jumps of density and colour.
+        # Discontinuous density and colour.
         "nested": Solids(
             Medium(Ball(0.75), 1.5, (0.2, 0.4, 0.8), (0.2, 0.2, 0.2)),
             Medium(Ball(0.35, (0.1, 0.0, 0.05)), 20.0, (0.8, 0.5, 0.1)),
         ),
-        # Smooth.
+        # Smooth density.
         "blobs": Blobs(
             Gaussian((0.0, 0.0, 0.0), 0.10, 18.0, (0.9, 0.2, 0.1)),
             Gaussian((0.25, 0.1, -0.1), 0.08, 25.0, (0.1, 0.7, 0.3)),
@@ -286,9 +304,9 @@ def scenes() -> dict[str, ClosedForm]:
             Gaussian((-0.1, -0.3, -0.2), 0.09, 20.0, (0.9, 0.8, 0.2)),
             Gaussian((0.2, -0.15, 0.3), 0.07, 30.0, (0.5, 0.1, 0.6)),
         ),
-        # A surface: even steps pass over it.
+        # A thin surface, which evenly spaced samples may miss.
         "shell": Solids(Medium(Ball(0.7), 200.0, (0.5, 0.5, 0.5), (0.6, 0.6, 0.6)), Medium(Ball(0.68), 0.0)),
-        # Mostly empty: what skipping is for.
+        # Mostly empty, so that skipping saves most.
         "sparse": Solids(
             *(Medium(Ball(0.1, (x, y, z)), 60.0, (0.5, 0.5, 0.5), (0.7, 0.7, 0.7)) for x, y, z in corners)
         ),

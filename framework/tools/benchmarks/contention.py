@@ -1,8 +1,8 @@
 """Speed of training and rendering beside other programs.
 
-instant-ngp runs alone, beside busy loops of several kinds, and beside itself. Reported is what share of its speed alone
-is left, and what share of the cores would be fair: a share above the fair one means that the loops got less than
-theirs. Nothing else should run meanwhile.
+instant-ngp runs alone, beside busy loops of several kinds, and beside itself. Reported are its speed as a fraction of
+that alone, and its fair share of the cores. A fraction above the fair share means that the loops got less than theirs.
+No other programs should run meanwhile.
 """
 
 from __future__ import annotations
@@ -31,42 +31,47 @@ from framework.training.machine import machine
 from framework.training.trainer import Trainer
 
 LOOP = "import time\nend = time.monotonic() + {seconds}\nwhile time.monotonic() < end: pass"
+"""Program of a busy loop."""
 WORK = ("training", "rendering")
+"""Kinds of work that are measured."""
 SETTINGS_FOR = 45.0
-"""Seconds of training for which the method chooses its settings."""
+"""Time budget, seconds, for which the method chooses its settings."""
 STEPS_BEFORE_RENDERING = 300
+"""Training steps before rendering is measured."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One condition."""
+    """A condition under which speed is measured."""
 
     name: str
+    """Name of the condition."""
     loops: int = 0
-    """Busy loops beside the training, each of one thread."""
+    """Number of busy loops beside the training, each of one thread."""
     nice: int = 0
     """Niceness of the loops."""
     own_group: bool = False
-    """The loops are started from a session of their own, which the system's scheduler treats as one."""
+    """Whether the loops have a session of their own, which the scheduler treats as one process."""
     trainings: int = 1
-    """Trainings at once."""
+    """Number of simultaneous trainings."""
     environment: tuple[tuple[str, str], ...] = ()
     """Environment variables of the trainings."""
 
     def fair_share(self, cores: int) -> float:
-        """Compute the fair share of the cores for one training with a thread on each core.
+        """Return the fair share of the cores for one training with a thread on each core.
 
         Args:
-            cores: cores of the machine.
+            cores: number of cores of the machine.
         """
         if self.own_group:
             return 0.5
-        weight = 1.0 if self.nice == 0 else 15 / 1024  # the scheduler's for nice 19
+        weight = 1.0 if self.nice == 0 else 15 / 1024  # the scheduler's weight of nice 19
         return cores / (cores * self.trainings + self.loops * weight)
 
 
 PASSIVE = (("OMP_WAIT_POLICY", "PASSIVE"),)
 ALONE = Row("nothing")
+"""The condition without other programs."""
 ROWS = (
     ALONE,
     Row("two loops, nice 19", loops=2, nice=19),
@@ -86,10 +91,15 @@ def measure(data: Path, seconds: float, parts: Sequence[str] = (), works: Sequen
     Args:
         data: folder of the data set.
         seconds: seconds of each measurement.
-        parts: names of conditions, or parts of names; all conditions if empty. Running alone is always measured.
-        works: what is measured: training, rendering or both.
-    Returns: a row for each condition, as plain data.
-    Raises: ConfigError where a name is no condition's; DataError where no format recognises the data.
+        parts: names of conditions, or parts of names; all conditions if empty. `ALONE` is always measured.
+        works: work to measure: training, rendering or both.
+
+    Returns:
+        A row for each condition, as plain data.
+
+    Raises:
+        ConfigError: if no condition has such a name.
+        DataError: if no format recognises the data.
     """
     find_data(data)
     rows, cores = chosen(parts), os.cpu_count() or 1
@@ -107,11 +117,13 @@ def measure(data: Path, seconds: float, parts: Sequence[str] = (), works: Sequen
 
 
 def chosen(parts: Sequence[str]) -> list[Row]:
-    """Select conditions by parts of their names; running alone is always among them, since shares are of its speed.
+    """Return the conditions with given names; `ALONE` is always among them, as speeds are fractions of its speed.
 
     Args:
         parts: names or parts of names; all conditions if empty.
-    Raises: ConfigError where one is no part of any name.
+
+    Raises:
+        ConfigError: if one is not part of any name.
     """
     for part in parts:
         if not any(part in row.name for row in ROWS):
@@ -120,15 +132,17 @@ def chosen(parts: Sequence[str]) -> list[Row]:
 
 
 def beside(row: Row, work: str, data: Path, seconds: float, cores: int) -> dict[str, Any]:
-    """Measure every training or rendering of a condition, each in a process of its own.
+    """Measure all trainings or renderings of a condition, each in its own process.
 
     Args:
         row: the condition.
         work: training or rendering.
         data: folder of the data set.
         seconds: seconds of the measurement.
-        cores: cores of the machine.
-    Returns: the fair share, and what `child` returns, as a list over the processes.
+        cores: number of cores of the machine.
+
+    Returns:
+        The fair share, and each figure of `child` as a list over the processes.
     """
     command = python_command("framework.tools.benchmarks.contention", work, data, seconds)
     environment = {**os.environ, **dict(row.environment)}
@@ -137,31 +151,35 @@ def beside(row: Row, work: str, data: Path, seconds: float, cores: int) -> dict[
 
         def started(words: list[str], **options: Any) -> subprocess.Popen[str]:
             process = stack.enter_context(subprocess.Popen(words, **options))
-            stack.callback(process.kill)  # before it is waited for, whatever happens
+            stack.callback(process.kill)  # runs before the context manager waits for the process
             return process
 
         children = [started(command, env=environment, **pipes) for _ in range(row.trainings)]
         for process in children:
             wait_for(process, "ready")
-        loop = [sys.executable, "-c", LOOP.format(seconds=20 * seconds)]  # it ends by itself should we be killed
+        loop = [sys.executable, "-c", LOOP.format(seconds=20 * seconds)]  # it ends by itself if this process is killed
         for _ in range(row.loops):
             started(["nice", "-n", str(row.nice), *loop], start_new_session=row.own_group)
         time.sleep(0.5)
         for process in children:
             print("go", file=process.stdin, flush=True)
-        found = [json.loads(wait_for(process, "{")) for process in children]
-    figures = {key: [one[key] for one in found] for key in found[0]}
+        results = [json.loads(wait_for(process, "{")) for process in children]
+    figures = {key: [result[key] for result in results] for key in results[0]}
     return {"beside": row.name, "fair share": round(row.fair_share(cores), 2), **figures}
 
 
 def wait_for(process: subprocess.Popen[str], start: str) -> str:
-    """Read a process's output up to the next line with a given beginning.
+    """Read a process's output up to the next line with a given start.
 
     Args:
-        process: started with a pipe for its output.
-        start: the beginning.
-    Returns: the line.
-    Raises: NerfloomError where the process ends before.
+        process: process with a pipe for its output.
+        start: start of the line.
+
+    Returns:
+        The line.
+
+    Raises:
+        NerfloomError: if the process ends before.
     """
     for line in process.stdout or ():
         if line.startswith(start):
@@ -170,20 +188,22 @@ def wait_for(process: subprocess.Popen[str], start: str) -> str:
 
 
 def child(work: str, data: Path, seconds: float) -> dict[str, float]:
-    """Train or render once a line arrives on standard input, and measure how fast that goes.
+    """Wait for a line on standard input, then train or render and measure the speed.
 
     Args:
         work: training or rendering.
         data: folder of the data set.
         seconds: seconds of the measurement.
-    Returns: steps or images a second, and seconds of the first, the longest and the median one.
+
+    Returns:
+        Steps or images per second, and the seconds of the first, the longest and the median one.
     """
     with tempfile.TemporaryDirectory() as folder:
         trainer = endless_trainer("instant-ngp", data, SETTINGS_FOR, Path(folder))
         once = rendering(trainer) if work == "rendering" else lambda _: trainer.train_step()
         print("ready", native.variant(), flush=True)
         sys.stdin.readline()
-        first = timed(once, 0)  # of a training: with the silhouettes
+        first = timed(once, 0)  # the first training step includes silhouettes
         times: list[float] = []
         while sum(times) < seconds:
             times.append(timed(once, len(times) + 1))
@@ -199,7 +219,7 @@ def rendering(trainer: Trainer) -> Callable[[int], object]:
     """Train for a few steps, and return a function that renders a test view by its number.
 
     Args:
-        trainer: of a run whose data has test images.
+        trainer: trainer of a run whose data has test images.
     """
     views = load_split(trainer.run, "test")
     for _ in range(STEPS_BEFORE_RENDERING):
@@ -209,10 +229,10 @@ def rendering(trainer: Trainer) -> Callable[[int], object]:
 
 
 def timed(function: Callable[[int], object], number: int) -> float:
-    """Measure the seconds that a call takes.
+    """Return the seconds of a call.
 
     Args:
-        function: what is called.
+        function: function to call.
         number: its argument.
     """
     start = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Curves of error against evaluations: where they meet an error, and their pictures."""
+"""Curves of error against evaluations of a field: evaluations needed for an error, and plots."""
 
 from __future__ import annotations
 
@@ -12,28 +12,31 @@ from framework.base.console import say
 from framework.tools.comparison import plots
 
 LEAST_ERROR = 1e-12
-"""Stands for 0, which has no logarithm."""
+"""Replacement of an error of 0, which has no logarithm."""
 
 
 class Curve(NamedTuple):
-    """One sampler's errors on one scene, in the order of its sweep."""
+    """Errors of a sampler on a scene, in the order of the sweep."""
 
     evaluations: list[float]
-    """Of the field, a ray."""
+    """Evaluations of the field per ray."""
     in_all: list[float]
-    """With those of what says where to look."""
+    """Evaluations of the field and of coarse fields or proposals per ray."""
     errors: list[float]
-    """Mean absolute error of a colour channel."""
+    """Mean absolute errors of a colour channel."""
     half_widths: list[float]
-    """Of the errors' 95 % intervals."""
+    """Half widths of the errors' 95 % confidence intervals."""
 
 
 def evaluations_needed(evaluations: Sequence[float], errors: Sequence[float], target: float) -> float | None:
-    """Evaluations at which a curve first meets an error; a power law is assumed between neighbouring points.
+    """Return the evaluations at which a curve first reaches an error, by a power law between neighbouring points.
 
     Args:
-        evaluations, errors: of as many points, in the order of the sweep.
-    Returns: None where no point meets it; the first point's evaluations where that does already.
+        evaluations, errors: coordinates of the points, in the order of the sweep.
+        target: the error.
+
+    Returns:
+        Evaluations; those of the first point if it reaches the error, None if no point does.
     """
     if errors and errors[0] <= target:
         return evaluations[0]
@@ -45,11 +48,16 @@ def evaluations_needed(evaluations: Sequence[float], errors: Sequence[float], ta
 
 
 def draw(curves: dict[str, dict[str, Curve]], folder: Path) -> list[Path]:
-    """A picture of each scene, with a curve for each sampler: error over evaluations of the field, both logarithmic.
+    """Draw a plot for each scene, with a curve for each sampler: error over evaluations of the field, both logarithmic.
 
-    Where others say where to look, a dashed line is over all evaluations.
+    For samplers with coarse fields or proposals, a dashed line is over all evaluations.
 
-    Returns: the pictures' paths; none where matplotlib is absent, which is said.
+    Args:
+        curves: curves by scene and sampler.
+        folder: folder of the plots, created if missing.
+
+    Returns:
+        Paths of the plots; empty if matplotlib is not installed, which is reported.
     """
     if not plots.available():
         say(plots.MISSING)

@@ -1,7 +1,7 @@
-"""Time and error of each compiled kernel against its torch reference, beside the ceilings.
+"""Time and error of each compiled kernel and of its torch reference, with the machine's limits.
 
-Both run in one process, in turn, on one thread and on all. Errors are of both, against float64. NERFLOOM_KERNELS=avx2
-in the environment forces that variant.
+Both run in one process, in turn, on one thread and on all. Errors of both are against float64. NERFLOOM_KERNELS=avx2 in
+the environment selects that variant.
 """
 
 from __future__ import annotations
@@ -42,41 +42,46 @@ LENSES: tuple[tuple[str, list[float]], ...] = (
     ("opencv", [-0.28, 0.09, 6e-4, -9e-4, 0, 0, 0, 0, 0]),
     ("fisheye", [0.04, -0.01, 3e-3, -6e-4]),
 )
-"""Models, and coefficients of the usual strength."""
+"""Lens models, with typical coefficients."""
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Against float64: the largest error over the largest value, and root mean squares of gradients over theirs.
+    """Relative errors against float64.
 
-    The largest error of a gradient would tell little where it jumps: at a cell's face, and where a ReLU switches.
+    The maximum error of a gradient would say little, as gradients are discontinuous at faces of cells and with ReLU.
     """
 
     value: float
+    """Maximum error over the maximum value."""
     gradient: float | None
-    """The worst input's; None without gradients."""
+    """Root mean square of the error over that of the gradient, for the worst input; None without gradients."""
 
 
 @dataclass(frozen=True)
 class Kernel:
-    """A compiled kernel, and what it is held against."""
+    """The compiled kernel `name` and its reference."""
 
     name: str
     unit: str
-    """What it works on: sample, ray, entry or pixel."""
+    """Unit of its work: sample, ray, entry or pixel."""
     count: int
-    """How many at once."""
+    """Number of units per run."""
     runs: tuple[Run, Run]
-    """Compiled, and the reference."""
+    """Runs of the compiled kernel and of the reference."""
     work: Work | None
-    """Of the forward pass, for each of them; None where no ceiling says anything."""
+    """Work of the forward pass per unit; None if no limit applies."""
     errors: Callable[[], tuple[Errors, Errors]] | None = None
-    """Of the compiled kernel and of the reference in float32."""
+    """Function that returns the errors of the compiled kernel and of the reference in float32."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """What was measured of a kernel; all times are ns for each of what it works on."""
+    """Measurements of `kernel` with `count` units per run on some `threads`; times are ns per `unit`.
+
+    Times are `forward` and `backward`, the reference's `reference_forward` and `reference_backward`; `errors` and
+    `reference_errors` are those of each.
+    """
 
     kernel: str
     unit: str
@@ -87,9 +92,9 @@ class Row:
     reference_forward: float
     reference_backward: float | None
     speed_up: float
-    """Median ratio of neighbouring runs, forward and backward together."""
+    """Median ratio of the times of neighbouring runs, forward and backward together."""
     at_ceiling: float | None
-    """Of the forward pass at the rate of the slowest ceiling, on all threads."""
+    """Time of the forward pass at the machine's limit, on all threads."""
     errors: Errors | None
     reference_errors: Errors | None
 
@@ -98,10 +103,14 @@ def measure(samples: int, repeats: int) -> tuple[list[Row], dict[str, Any]]:
     """Measure every kernel and print a table.
 
     Args:
-        samples: in a batch.
-        repeats: of which medians are taken.
-    Returns: rows, and all as plain data with the machine and its ceilings.
-    Raises: ConfigError where there are no compiled kernels.
+        samples: number of samples in a batch.
+        repeats: number of runs, of which medians are taken.
+
+    Returns:
+        The rows, and rows, machine and limits as plain data.
+
+    Raises:
+        ConfigError: if there are no compiled kernels.
     """
     if not native.available():
         raise ConfigError("there are no compiled kernels to measure; reinstall nerfloom with a C++ compiler at hand")
@@ -116,7 +125,7 @@ def measure(samples: int, repeats: int) -> tuple[list[Row], dict[str, Any]]:
 
 
 def measured(kernel: Kernel, ceilings: Ceilings, repeats: int, all_threads: int) -> list[Row]:
-    """One kernel's rows, on 1 thread and on all."""
+    """Measure a `kernel` in `repeats` runs, on 1 thread and on `all_threads`, with `ceilings` of the machine."""
     rows = []
     errors, reference_errors = kernel.errors() if kernel.errors else (None, None)
     at_ceiling = ceilings.seconds(kernel.work) * 1e9 if kernel.work else None
@@ -149,12 +158,12 @@ def measured(kernel: Kernel, ceilings: Ceilings, repeats: int, all_threads: int)
 
 
 def table(rows: Sequence[Row]) -> Table:
-    """For people: what fits a line of a terminal."""
-    found = Table(title="ns a sample, ray, entry or pixel", title_justify="left", box=SIMPLE, padding=(0, 1, 0, 0))
+    """Return a table of `rows`, as wide as a terminal."""
+    grid = Table(title="ns a sample, ray, entry or pixel", title_justify="left", box=SIMPLE, padding=(0, 1, 0, 0))
     for heading in ("kernel", "forward", "backward", "torch", "speed-up", "error"):
-        found.add_column(heading, justify="left" if heading == "kernel" else "right", no_wrap=heading != "kernel")
+        grid.add_column(heading, justify="left" if heading == "kernel" else "right", no_wrap=heading != "kernel")
     for row in rows:
-        found.add_row(
+        grid.add_row(
             row.kernel,
             f"{row.forward:.1f}",
             "" if row.backward is None else f"{row.backward:.1f}",
@@ -162,14 +171,14 @@ def table(rows: Sequence[Row]) -> Table:
             f"{row.speed_up:.1f}",
             "" if row.errors is None else f"{row.errors.value:.0e}",
         )
-    return found
+    return grid
 
 
 # -- the kernels --------------------------------------------------------------------------------------------------
 
 
 def kernels(count: int) -> Iterator[Kernel]:
-    """Every kernel, in batches of `count` samples."""
+    """Yield all kernels, with batches of `count` samples."""
     torch.manual_seed(0)
     positions = rays_and_positions(count)[1]
     for log2 in (15, 17, 19):
@@ -213,7 +222,14 @@ def of_function(
     work: Work,
     backward: bool = True,
 ) -> Kernel:
-    """A function of tensors, the first of which has a row for each sample."""
+    """Return the kernel `name`, a function of tensors, of which the first has a row per sample.
+
+    Args:
+        inputs: arguments of both functions.
+        compiled, reference: the functions.
+        work: work of the forward pass per sample.
+        backward: whether the backward pass is measured too.
+    """
     return Kernel(
         name,
         "sample",
@@ -227,15 +243,15 @@ def of_function(
 def errors(
     function: Callable[..., Tensor], truth: Callable[..., Tensor], inputs: Sequence[Tensor], backward: bool
 ) -> Errors:
-    """Of a function in float32 against another in float64."""
+    """Return errors at `inputs` of `function` in float32 against `truth` in float64; of gradients if `backward`."""
     (value, *gradients), (exact, *exact_gradients) = (
         _value_and_gradients(run, inputs, kind, backward)
         for run, kind in ((function, torch.float32), (truth, torch.float64))
     )
     worst = [
-        ((found.double() - right).square().mean() / right.square().mean()).sqrt().item()
-        for found, right in zip(gradients, exact_gradients, strict=True)
-        if right.abs().max() > 0
+        ((gradient.double() - true).square().mean() / true.square().mean()).sqrt().item()
+        for gradient, true in zip(gradients, exact_gradients, strict=True)
+        if true.abs().max() > 0
     ]
     largest = ((value.double() - exact).abs().max() / exact.abs().max()).item()
     return Errors(largest, max(worst) if worst else None)
@@ -252,7 +268,7 @@ def _value_and_gradients(
 
 
 def rays_and_positions(count: int) -> tuple[Rays, Tensor]:
-    """Rays through the unit box, 16 points close together on each: what a trained scene's samples look like."""
+    """Return rays through the unit box, and `count` positions, 16 close together per ray as in a trained scene."""
     origins = normalize(torch.randn(count // 16, 3), dim=-1) * 2 + 0.5
     directions = normalize(torch.rand(count // 16, 3) - origins, dim=-1)
     rays = Rays(origins, directions, torch.zeros(count // 16), torch.full((count // 16,), 9.0))
@@ -262,18 +278,18 @@ def rays_and_positions(count: int) -> tuple[Rays, Tensor]:
 
 
 Described = tuple[list[Tensor], Callable[..., Tensor], Callable[..., Tensor], Work]
-"""Inputs, the compiled function, the reference, and the work."""
+"""Inputs, compiled function, reference, and work."""
 
 
 def _hash_grid(positions: Tensor, log2: int, of_positions: bool) -> Described:
     layout = HashGridLayout.build(16, 16, 1024, log2)
     values = torch.randn(layout.num_entries, 2)
-    # The positions are detached where nobody asks for their gradient: most fields do not.
-    kept = (lambda x: x) if of_positions else torch.Tensor.detach
+    # Without gradients of positions, as in most fields, they are detached.
+    attached = (lambda x: x) if of_positions else torch.Tensor.detach
     return (
         [positions, values],
-        lambda x, t: hash_grid(kept(x), t, layout),
-        lambda x, t: hash_grid_reference(kept(x), t, layout),
+        lambda x, t: hash_grid(attached(x), t, layout),
+        lambda x, t: hash_grid_reference(attached(x), t, layout),
         Work(bytes=4 * (3 + 32), gathers=16 * 8, table_bytes=values.nbytes),
     )
 
@@ -312,7 +328,7 @@ def _compositing(count: int) -> Described:
 
 
 def _plane_lookup(name: str, layout: PlanesLayout, features: int, count: int) -> Kernel:
-    """Against torch's `grid_sample`; what is read is held against copying, for a corner's features lie together."""
+    """Compare with torch's `grid_sample`; the limit is copying, as the features of a corner are adjacent."""
     positions = torch.rand(count, layout.dims)
     values = torch.rand(layout.num_entries, features) + 0.5
     gradient = torch.randn(count, layout.num_groups * features)
@@ -339,7 +355,7 @@ def _plane_lookup(name: str, layout: PlanesLayout, features: int, count: int) ->
 
 
 def _marching() -> Kernel:
-    """All samples of 8192 rays through a grid of which 3 % are occupied."""
+    """Find all samples of 8192 rays through a grid with 3 % of its cells occupied."""
     rays, _ = rays_and_positions(8192 * 16)
     centers = (torch.cartesian_prod(*[torch.arange(128)] * 3) + 0.5) / 128 - 0.5
     grid = Occupancy((centers.norm(dim=-1) - 0.3).abs() < 0.015, BOX, 128)
@@ -354,7 +370,7 @@ def _marching() -> Kernel:
 
 
 def _updating() -> Kernel:
-    """Sparse Adam on a table of which half of the entries have a gradient."""
+    """Update a table by sparse Adam, with a gradient for half of the entries."""
     entries = 2**19
     grad = torch.randn(entries, 2) * (torch.rand(entries, 1) < 0.5)
     updated = int((grad != 0).any(dim=1).sum())
@@ -363,12 +379,12 @@ def _updating() -> Kernel:
         values, mean, square, uses = torch.randn(entries, 2), *torch.zeros(2, entries, 2), torch.zeros(entries)
 
         def step() -> Sequence[float]:
-            mine = grad.clone()
-            return once(lambda: update(values, mine, mean, square, uses, 1e-2, (0.9, 0.95), 1e-15))()
+            fresh = grad.clone()
+            return once(lambda: update(values, fresh, mean, square, uses, 1e-2, (0.9, 0.95), 1e-15))()
 
         return step
 
-    work = Work(bytes=4 * (2 * 4 + 1) * 2)  # value, gradient and both moments of 2, and its uses: read and written
+    work = Work(bytes=4 * (2 * 4 + 1) * 2)  # 2 values, gradients and moments of both kinds, and uses: read and written
     runs = steps(sparse_adam), steps(sparse_adam_reference)
     return Kernel("sparse Adam, half of 2^19 x 2", "entry", updated, runs, work)
 
@@ -393,10 +409,10 @@ def _similarity() -> Kernel:
 
 
 def _ray_generation(model: str, lens: list[float]) -> Kernel:
-    """Rays through 8192 pixels of photographs of 1600 x 1200 by a lens of the usual strength."""
+    """Compute rays through 8192 pixels of images of 1600 x 1200 with a typical lens."""
     focal, cx, cy, width, height = (torch.tensor([value]) for value in (1100.0, 800.0, 600.0, 1600, 1200))
-    bent = torch.tensor([lens]) if lens else None
-    cameras = Cameras(torch.eye(4)[None, :3], focal, focal, cx, cy, width, height, model, bent)
+    coefficients = torch.tensor([lens]) if lens else None
+    cameras = Cameras(torch.eye(4)[None, :3], focal, focal, cx, cy, width, height, model, coefficients)
     flat = torch.randint(1600 * 1200, (8192,))
     runs = once(lambda: cameras.pixel_rays(flat, 0.1, 9.0)), once(lambda: cameras.pixel_rays_reference(flat, 0.1, 9.0))
     return Kernel(f"rays of {model} cameras", "ray", len(flat), runs, Work(bytes=8 + 4 * (3 + 3 + 2)))

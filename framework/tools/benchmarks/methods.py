@@ -19,11 +19,18 @@ STANDARD = (
     "vanilla-nerf --sampler occupancy",
     "dnerf --sampler occupancy --canonical hash-grid",
 )
-"""Every built-in method, as it is meant to be used on a processor."""
+"""All built-in methods, with the flags with which they are meant to be used on a CPU."""
 
 
 def standard_plan(data: Path | None, max_seconds: float, repeats: int, folder: Path) -> Plan:
-    """The standard comparison on a data set; on the embedded scene if None."""
+    """Return the plan of the standard comparison.
+
+    Args:
+        data: folder of the data set; the embedded scene if None.
+        max_seconds: seconds of training of each method.
+        repeats: number of runs of each method, with different seeds.
+        folder: folder of runs and report.
+    """
     conditions = Conditions(
         data=None if data is None else str(data.resolve()),
         data_flags=(),
@@ -39,7 +46,7 @@ def standard_plan(data: Path | None, max_seconds: float, repeats: int, folder: P
 
 
 def published(folder: Path) -> dict[str, Any]:
-    """A comparison's results without what only means something on the machine that made them."""
+    """Return the results of the comparison in `folder`, without paths of the machine."""
     content = read_json(folder / "results.json") or {}
     conditions = {**content["conditions"], "data": Path(content["conditions"]["data"] or "procedural").name}
     runs = [{name: value for name, value in run.items() if name != "folder"} for run in content["runs"]]
@@ -49,9 +56,14 @@ def published(folder: Path) -> dict[str, Any]:
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
-    """The report's picture of time against error, as a file of its own; where it cannot be drawn, that is said."""
+    """Write the report's plot of time against error as a file; report it if it cannot be drawn.
+
+    Args:
+        rows: rows of the comparison's table.
+        path: file to write; its folder is created if missing.
+    """
     if not any(row.runs for row in rows):
-        say("no picture of time against error: no method came to its end")
+        say("no plot of time against error: no method finished")
     elif not plots.available():
         say(plots.MISSING)
     else:

@@ -1,4 +1,4 @@
-"""Features in planes and lines by torch's `grid_sample`: what the compiled lookup is held against."""
+"""Features of planes and lines by torch's `grid_sample`, with which the compiled lookup is compared."""
 
 from __future__ import annotations
 
@@ -12,19 +12,24 @@ from framework.kernels.planes import PlanesLayout
 
 
 def layouts() -> list[tuple[str, PlanesLayout, int]]:
-    """Names, layouts and features of K-Planes, still and moving, and of TensoRF."""
+    """Return names, layouts and features per group of K-Planes, still and moving, and of TensoRF."""
     scales = tuple((64 << s,) * 3 for s in range(4))
     moving = tuple((64 << s,) * 3 + (25,) for s in range(4))
-    across = (((0, 1), (2,)), ((0, 2), (1,)), ((1, 2), (0,)))
+    vm = (((0, 1), (2,)), ((0, 2), (1,)), ((1, 2), (0,)))
     return [
         ("K-Planes, 4 scales to 512, 3 planes of 32", PlanesLayout.build(scales), 32),
         ("K-Planes, 4 scales to 512, 6 planes of 32", PlanesLayout.build(moving), 32),
-        ("TensoRF VM, 300^3, 48", PlanesLayout.build(((300,) * 3,) * 3, across), 48),
+        ("TensoRF VM, 300^3, 48", PlanesLayout.build(((300,) * 3,) * 3, vm), 48),
     ]
 
 
 def planes_of(table: Tensor, layout: PlanesLayout) -> list[Tensor]:
-    """Every factor as an image (1, F, H, W) of its own, as K-Planes' code has them; group by group."""
+    """Return each factor as an image (1, F, H, W), as in the code of K-Planes, group by group.
+
+    Args:
+        table: (E, F) entries of all factors.
+        layout: axes and resolutions of the factors.
+    """
     return [
         layout.factor(table, group, index).permute(2, 0, 1)[None].contiguous()
         for group, factors in enumerate(layout.axes)
@@ -33,16 +38,22 @@ def planes_of(table: Tensor, layout: PlanesLayout) -> list[Tensor]:
 
 
 def grid_samples(positions: Tensor, images: list[Tensor], layout: PlanesLayout) -> Tensor:
-    """Features (N, G * F) at positions (N, D) in [0, 1], from the images of `planes_of`."""
-    left, groups = iter(images), []
+    """Return features (N, G * F): products of the factors of each of G groups.
+
+    Args:
+        positions: (N, D) positions in [0, 1].
+        images: factors as from `planes_of`.
+        layout: axes and resolutions of the factors.
+    """
+    remaining, groups = iter(images), []
     for factors in layout.axes:
-        found = []
+        values = []
         for axes in factors:
-            where = positions[:, list(axes)]
+            coordinates = positions[:, list(axes)]
             if len(axes) == 1:
-                where = torch.cat([where, torch.zeros(len(positions), 1)], dim=1)
-            places = where[None, None] * 2 - 1
-            image = grid_sample(next(left), places, align_corners=True, padding_mode="border")
-            found.append(image[0, :, 0].t())
-        groups.append(reduce(torch.mul, found))
+                coordinates = torch.cat([coordinates, torch.zeros(len(positions), 1)], dim=1)
+            grid = coordinates[None, None] * 2 - 1
+            image = grid_sample(next(remaining), grid, align_corners=True, padding_mode="border")
+            values.append(image[0, :, 0].t())
+        groups.append(reduce(torch.mul, values))
     return torch.cat(groups, dim=-1)

@@ -1,10 +1,10 @@
-"""What refining camera poses mends: the embedded scene with its training poses disturbed.
+"""Effect of refining camera poses, on the embedded scene with disturbed training poses.
 
-Every training camera is turned by an angle about a random axis and moved by a share of its distance from the scene's
-middle in a random direction. Four runs: exact poses; disturbed poses as they are; disturbed poses refined, by SO3xR3
-and by SE3. Reported are the errors of the poses before and after, once the best similarity between them and the true
-ones is taken out, and the PSNR on test views, whose cameras are brought into the frame of the disturbed poses by a
-similarity.
+Each training camera is rotated about a random axis, and moved in a random direction by a fraction of its distance from
+the centre of the scene. There are four runs: exact poses, disturbed poses without refinement, and disturbed poses
+refined by SO3xR3 and by SE3. Reported are the errors of the poses before and after, once the best similarity transform
+to the true ones is removed, and the PSNR of test views, whose cameras are transformed to the frame of the disturbed
+poses by a similarity.
 """
 
 from __future__ import annotations
@@ -41,9 +41,11 @@ def measure(method: str, seconds: float, degrees: float, percent: float) -> dict
     Args:
         method: name of the method.
         seconds: seconds of training of each run.
-        degrees: angle by which each camera is turned.
-        percent: distance by which each camera is moved, in percent of its distance from the origin.
-    Returns: what was asked for and a row for each run, as plain data.
+        degrees: angle by which each camera is rotated, degrees.
+        percent: distance by which each camera is moved, per cent of its distance from the origin.
+
+    Returns:
+        The machine, the arguments and a row for each run, as plain data.
     """
     embedded = load_dataparser(SCENE)()
     exact, test = (load_dataset(embedded.parse(None, split), split) for split in ("train", "test"))
@@ -60,26 +62,26 @@ def measure(method: str, seconds: float, degrees: float, percent: float) -> dict
         trainer = trained(method, data, seconds, optimizer)
         rows.append({"run": name, **errors(trainer, data, exact, test)})
         say(str(rows[-1]))
-    asked = {"seconds": seconds, "degrees": degrees, "percent": percent, "method": method}
-    return {"machine": machine(), **asked, "rows": rows}
+    arguments = {"seconds": seconds, "degrees": degrees, "percent": percent, "method": method}
+    return {"machine": machine(), **arguments, "rows": rows}
 
 
 def disturb(cameras: Cameras, degrees: float, share: float) -> Cameras:
-    """Turn cameras about random axes, and move them in random directions.
+    """Rotate cameras about random axes, and move them in random directions.
 
     Args:
         cameras: N cameras.
-        degrees: angle of each turn.
-        share: length of each move, relative to the camera's distance from the origin.
+        degrees: angle of each rotation, degrees.
+        share: length of each displacement, as a fraction of the camera's distance from the origin.
     """
-    draws = torch.Generator().manual_seed(0)
+    generator = torch.Generator().manual_seed(0)
     count, angle = len(cameras), math.radians(degrees)
-    axes, steps = (torch.nn.functional.normalize(torch.randn(count, 3, generator=draws), dim=-1) for _ in range(2))
-    turns = torch.linalg.matrix_exp(cross_matrix(angle * axes))
+    axes, steps = (torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1) for _ in range(2))
+    rotations = torch.linalg.matrix_exp(cross_matrix(angle * axes))
     centres = cameras.camera_to_worlds[:, :, 3]
     moved = centres + share * centres.norm(dim=-1, keepdim=True) * steps
-    turned = turns @ cameras.camera_to_worlds[:, :, :3]
-    return replace(cameras, camera_to_worlds=torch.cat([turned, moved[:, :, None]], dim=-1))
+    rotated = rotations @ cameras.camera_to_worlds[:, :, :3]
+    return replace(cameras, camera_to_worlds=torch.cat([rotated, moved[:, :, None]], dim=-1))
 
 
 def trained(method: str, data: Dataset, seconds: float, camera_optimizer: str) -> Trainer:
@@ -89,8 +91,10 @@ def trained(method: str, data: Dataset, seconds: float, camera_optimizer: str) -
         method: name of the method.
         data: training images with cameras.
         seconds: seconds of training.
-        camera_optimizer: how poses are refined, as by the flag of that name.
-    Raises: ConfigError for a method that refines no poses.
+        camera_optimizer: refinement of the poses, as for the flag of that name.
+
+    Raises:
+        ConfigError: if the method cannot refine poses.
     """
     config: Any = load_method(method).config
     if not hasattr(config, "camera_optimizer"):
@@ -105,19 +109,19 @@ def trained(method: str, data: Dataset, seconds: float, camera_optimizer: str) -
 
 
 def errors(trainer: Trainer, data: Dataset, exact: Dataset, test: Dataset) -> dict[str, float]:
-    """Compute the errors of a run's poses, and its PSNR.
+    """Return the errors of a run's poses, and its PSNR.
 
     Args:
-        trainer: the run at its end.
-        data: training images with the poses that it was given.
+        trainer: the trainer, after training.
+        data: training images with the poses that the run was given.
         exact: training images with the true poses.
         test: test images with the true poses.
     """
     refinement = next((m for m in trainer.model.modules() if isinstance(m, PoseRefinement)), None)
-    found = data.cameras if refinement is None else refinement.refined(data.cameras)
+    refined = data.cameras if refinement is None else refinement.refined(data.cameras)
     truth = exact.cameras.camera_to_worlds
-    before, after = pose_errors(data.cameras.camera_to_worlds, truth), pose_errors(found.camera_to_worlds, truth)
-    carried = carry(test.cameras, truth, data.cameras.camera_to_worlds)  # from there the model carries them on
+    before, after = pose_errors(data.cameras.camera_to_worlds, truth), pose_errors(refined.camera_to_worlds, truth)
+    carried = carry(test.cameras, truth, data.cameras.camera_to_worlds)  # the model refines them further
     return {
         "median angle before, degrees": round(before.median_angle, 4),
         "median angle after, degrees": round(after.median_angle, 4),
@@ -129,10 +133,10 @@ def errors(trainer: Trainer, data: Dataset, exact: Dataset, test: Dataset) -> di
 
 
 def carry(cameras: Cameras, truth: Tensor, given: Tensor) -> Cameras:
-    """Bring cameras from the frame of the true poses into that of other poses.
+    """Transform cameras from the frame of the true poses to that of other poses, by the best similarity.
 
     Args:
-        cameras: in the frame of `truth`.
+        cameras: cameras in the frame of `truth`.
         truth: (N, 3, 4) true poses.
         given: (N, 3, 4) the other poses of the same cameras.
     """

@@ -1,4 +1,4 @@
-"""Poses found by ns-process-data beside those of a COLMAP model of the same images, matched by name."""
+"""Comparison of poses from ns-process-data with those of a COLMAP model of the same images, matched by name."""
 
 from __future__ import annotations
 
@@ -16,33 +16,37 @@ from framework.tools.processing.transforms import opengl_pose
 
 
 def compare(processed: Path, model_folder: Path) -> dict[str, Any]:
-    """Compare poses, once the best similarity between the two sets is taken out.
+    """Compare two sets of poses, once the best similarity transform between them is removed.
 
     Args:
-        processed: folder with transforms.json, as ns-process-data writes it.
+        processed: folder with transforms.json, from ns-process-data.
         model_folder: folder with cameras.bin, images.bin and points3D.bin.
-    Returns: median and largest errors, angles in degrees and centres relative to the extent of the cameras; how many of
-        the model's images have a pose in the processed folder; and the summary of the processing.
-    Raises: DataError where the two have no image in common.
+
+    Returns:
+        Median and maximum errors, angles in degrees and centres relative to the extent of the cameras; the number of
+        the model's images with a pose in the processed folder; and the summary of the processing.
+
+    Raises:
+        DataError: if no image is in both.
     """
     transforms = json.loads((processed / "transforms.json").read_text())
-    found = {
+    processed_poses = {
         frame.get("source_path", Path(frame["file_path"]).name): np.array(frame["transform_matrix"])
         for frame in transforms["frames"]
     }
     model = read_model(lambda _: None, model_folder)
-    given = {name: opengl_pose(world_to_camera) for name, (_, _, world_to_camera) in model.images.items()}
-    names = sorted(found.keys() & given.keys())
+    model_poses = {name: opengl_pose(world_to_camera) for name, (_, _, world_to_camera) in model.images.items()}
+    names = sorted(processed_poses.keys() & model_poses.keys())
     if not names:
         raise DataError(f"{processed} and {model_folder} have no image in common; both name images by their files")
     errors = pose_errors(
-        torch.from_numpy(np.stack([found[name] for name in names])),
-        torch.from_numpy(np.stack([given[name] for name in names])),
+        torch.from_numpy(np.stack([processed_poses[name] for name in names])),
+        torch.from_numpy(np.stack([model_poses[name] for name in names])),
     )
     summary = processed / "colmap" / "summary.json"
     return {
         "registered": len(names),
-        "given": len(given),
+        "given": len(model_poses),
         "median_angle_degrees": errors.median_angle,
         "largest_angle_degrees": float(errors.angles.max()),
         "median_center_relative_to_extent": errors.median_distance,

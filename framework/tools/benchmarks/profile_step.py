@@ -1,4 +1,4 @@
-"""Where the time of a training step goes: to each compiled kernel, and to Python and torch."""
+"""Time of a training step: of each compiled kernel, and of Python and torch."""
 
 from __future__ import annotations
 
@@ -13,18 +13,20 @@ from framework.tools.benchmarks.workload import endless_trainer
 from framework.training.machine import machine
 
 MEASURED = 200
-"""Steps over which times are averaged."""
+"""Number of steps over which times are averaged."""
 
 
 def measure(data: Path, method: str, steps: int, max_seconds: float) -> dict[str, Any]:
-    """Train a method, measure `MEASURED` steps more, and print a line for each kernel.
+    """Train a method, measure `MEASURED` further steps, and print a line for each kernel.
 
     Args:
         data: folder of the data set.
         method: name of the method.
-        steps: steps before the measurement: until then the occupancy grid has found what is empty.
-        max_seconds: seconds of training for which the method chooses its settings.
-    Returns: ms a step in all and by kernel, as plain data.
+        steps: training steps before the measurement, in which the occupancy grid finds empty space.
+        max_seconds: time budget, seconds, for which the method chooses its settings.
+
+    Returns:
+        Milliseconds per step, in total and by kernel, as plain data.
     """
     with tempfile.TemporaryDirectory() as folder:
         trainer = endless_trainer(method, data, max_seconds, Path(folder))

@@ -1,8 +1,8 @@
-"""How far a pixel is off for how many evaluations of the field: every sampler, on scenes known in closed form.
+"""Error of colours against evaluations of the field, for every sampler, on scenes known in closed form.
 
-Rays are random, from around the scene, over white. `sweep` measures the colour's error as a sampler's count grows, and
-`costs` says how many evaluations an error takes. `skipping` measures what it changes to pass over empty cells, and to
-end rays early, on many more rays: for the latter a bound is stated, and `Skip.kept` says whether it holds.
+Rays are random, from around the scene, over white. `sweep` measures the error for increasing numbers of samples, and
+`costs` computes the evaluations needed for an error. `skipping` measures, on many more rays, how skipping empty cells
+and ending rays early change colours; for the latter there is an error bound, and `Skip.kept` is whether it holds.
 """
 
 from __future__ import annotations
@@ -41,28 +41,29 @@ from framework.tools.benchmarks.sampling import (
 from framework.training.machine import machine
 
 TARGETS = (1e-2, 1e-3, 1e-4)
-"""Mean errors whose cost is told."""
+"""Mean errors for which the number of evaluations is reported."""
 THRESHOLDS = (1e-1, 1e-2, 1e-3, 1e-4)
-"""Transmittances at which rays are ended, each the stated bound of the error that this makes."""
+"""Transmittances at which rays end, each of which is the bound of the error."""
 STEPS = 512
-"""Along the box's diagonal where skipping is measured: the framework's own."""
+"""Steps along the box's diagonal when skipping is measured; the framework's default."""
 RAYS_AT_ONCE, SKIPPING_RAYS_AT_ONCE = 512, 4096
+"""Rays per batch in the sweep, and when skipping is measured."""
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is measured."""
+    """Size of the measurement."""
 
     counts: tuple[int, ...] = (8, 16, 32, 64, 128, 256, 512)
-    """The sweep; what a count means is the sampler's (`sampling.renderers`)."""
+    """Counts of the sweep, which each sampler multiplies (`sampling.renderers`)."""
     rays: int = 4096
-    """At each point of the sweep."""
+    """Number of rays at each point of the sweep."""
     skipping_rays: int = 100_000
-    """On which skipping is measured."""
+    """Number of rays on which skipping is measured."""
     fit_steps: int = 400
-    """In which proposals learn a scene."""
+    """Training steps of the proposals."""
     grid_resolution: int = 128
-    """Cells along an axis of the occupancy grid."""
+    """Cells per axis of the occupancy grid."""
 
 
 FULL = Sizes()
@@ -71,51 +72,56 @@ QUICK = Sizes(counts=(8, 16, 32, 64), rays=1024, skipping_rays=10_000, fit_steps
 
 @dataclass(frozen=True)
 class Row:
-    """One point of the sweep."""
+    """A point of the sweep: the errors of `sampler` with `count` on `scene`."""
 
     scene: str
     sampler: str
     count: int
     evaluations: float
-    """Of the field, a ray."""
+    """Evaluations of the field per ray."""
     coarse_evaluations: float
-    """Of a coarse field or of proposals, which say where to look, a ray."""
+    """Evaluations of a coarse field or of proposals per ray."""
     mean_error: float
-    """Absolute, over rays and colour channels."""
+    """Mean absolute error over rays and colour channels."""
     half_width: float
-    """Of the mean's 95 % interval, for rays are random, and jittered places too."""
+    """Half width of the mean's 95 % confidence interval."""
     max_error: float
+    """Maximum absolute error of a colour channel."""
 
 
 @dataclass(frozen=True)
 class Skip:
-    """What skipping changes."""
+    """Differences of colours with and without skipping samples."""
 
     scene: str
+    """Name of the scene."""
     skipped: str
-    """Empty cells, or what is hidden."""
+    """Kind of the skipped samples: in empty cells, or hidden."""
     bound: float | None
-    """Of the largest error, as stated; None where nothing is."""
+    """Bound of the maximum difference; None if there is none."""
     mean_error: float
-    """Absolute difference to the same steps without skipping, over rays and colour channels."""
+    """Mean absolute difference over rays and colour channels."""
     max_error: float
+    """Maximum absolute difference of a colour channel."""
     kept: bool | None
-    """Whether the largest error is within the bound."""
+    """Whether the maximum difference is within the bound; None without a bound."""
     evaluations: float
-    """Of the field, a ray."""
+    """Evaluations of the field per ray."""
     evaluations_without: float
-    """Without skipping."""
+    """Evaluations of the field per ray without skipping."""
 
 
 def main(output: Path, plots: Path | None = None, quick: bool = False, seed: int = 0) -> dict[str, Any]:
-    """Measure every sampler on every scene, print what was found, and write it down.
+    """Measure every sampler on every scene, and print and write the results.
 
     Args:
-        output: the JSON.
-        plots: folder for a picture of each scene's curves; none if None.
-        quick: fewer rays, counts and steps: sooner done, and rougher.
-        seed: of rays, jitter and the proposals' tables.
-    Returns: what the JSON holds.
+        output: JSON file to write.
+        plots: folder for a plot of each scene's curves; no plots if None.
+        quick: whether fewer rays, counts and steps are used.
+        seed: random seed of rays, jitter and proposals.
+
+    Returns:
+        The content of the JSON file.
     """
     sizes = QUICK if quick else FULL
     rows: list[Row] = []
@@ -161,7 +167,15 @@ def sweep(
     sizes: Sizes,
     seed: int,
 ) -> list[Row]:
-    """Every sampler's errors on a scene, all on the same rays; `proposals` and `grids` as for `sampling.renderers`."""
+    """Measure the errors of every sampler on a scene, all on the same rays.
+
+    Args:
+        name: name of the scene.
+        scene: the scene.
+        proposals, grids: as for `sampling.renderers`.
+        sizes: size of the measurement.
+        seed: random seed of rays and jitter.
+    """
     rays = random_rays(sizes.rays, seed)
     truth = torch.cat([scene.truth(part, WHITE).color for part in _parts(rays, RAYS_AT_ONCE)])
     rows = []
@@ -173,18 +187,25 @@ def sweep(
 
 
 def measured(scene: str, sampler: str, count: int, render: Renderer, rays: Rays, truth: Tensor) -> Row:
-    """The error of a renderer's colours of R rays against the true ones (R, 3), float64."""
+    """Measure the errors of rendered colours.
+
+    Args:
+        scene, sampler, count: as for `Row`.
+        render: the renderer.
+        rays: R rays.
+        truth: (R, 3) float64 true colours.
+    """
     pictures = [render(part) for part in _parts(rays, RAYS_AT_ONCE)]
     errors = (torch.cat([picture.color for picture in pictures]).double() - truth).abs()
-    of_rays = errors.mean(-1)
+    ray_errors = errors.mean(-1)
     return Row(
         scene,
         sampler,
         count,
         evaluations=sum(picture.evaluations for picture in pictures) / len(rays),
         coarse_evaluations=sum(picture.coarse_evaluations for picture in pictures) / len(rays),
-        mean_error=of_rays.mean().item(),
-        half_width=1.96 * of_rays.std().item() / math.sqrt(len(rays)),
+        mean_error=ray_errors.mean().item(),
+        half_width=1.96 * ray_errors.std().item() / math.sqrt(len(rays)),
         max_error=errors.max().item(),
     )
 
@@ -194,19 +215,19 @@ def _parts(rays: Rays, size: int) -> list[Rays]:
 
 
 def curves(rows: Iterable[Row]) -> dict[str, dict[str, Curve]]:
-    """Rows by scene and sampler."""
-    found: dict[str, dict[str, Curve]] = {}
+    """Group `rows` of a sweep to curves by scene and sampler."""
+    by_scene: dict[str, dict[str, Curve]] = {}
     for row in rows:
-        curve = found.setdefault(row.scene, {}).setdefault(row.sampler, Curve([], [], [], []))
+        curve = by_scene.setdefault(row.scene, {}).setdefault(row.sampler, Curve([], [], [], []))
         curve.evaluations.append(row.evaluations)
         curve.in_all.append(row.evaluations + row.coarse_evaluations)
         curve.errors.append(row.mean_error)
         curve.half_widths.append(row.half_width)
-    return found
+    return by_scene
 
 
 def costs(rows: Iterable[Row]) -> list[dict[str, Any]]:
-    """Evaluations a ray that each of `TARGETS` takes, by scene and sampler; None where it is not met."""
+    """Return the evaluations per ray for each of `TARGETS` from `rows` of a sweep; None if a target is not reached."""
     return [
         {
             "scene": scene,
@@ -226,40 +247,56 @@ def costs(rows: Iterable[Row]) -> list[dict[str, Any]]:
 
 @torch.no_grad()
 def skipping(name: str, scene: ClosedForm, grid: OccupancySampler, num_rays: int, seed: int) -> list[Skip]:
-    """What a filled grid of `STEPS` steps changes against a full one, and what each of `THRESHOLDS` does beyond."""
+    """Measure the effect of an occupancy grid on colours, and that of ending rays at each of `THRESHOLDS` with it.
+
+    Args:
+        name: name of the scene.
+        scene: the scene.
+        grid: a filled grid of `STEPS` steps.
+        num_rays: number of rays.
+        seed: random seed of the rays.
+    """
     everything, cells = partial(marched, scene, full_grid(STEPS), 0.0), partial(marched, scene, grid, 0.0)
-    found = [changed(name, "empty cells", None, cells, everything, num_rays, seed)]
+    skips = [changed(name, "empty cells", None, cells, everything, num_rays, seed)]
     for threshold in THRESHOLDS:
         stopped = partial(marched, scene, grid, threshold)
-        found.append(changed(name, "hidden", threshold, stopped, cells, num_rays, seed))
-    return found
+        skips.append(changed(name, "hidden", threshold, stopped, cells, num_rays, seed))
+    return skips
 
 
 def changed(
     scene: str, skipped: str, bound: float | None, render: Renderer, without: Renderer, num_rays: int, seed: int
 ) -> Skip:
-    """How two renderers differ in the colours of random rays, and in evaluations.
+    """Measure the differences of two renderers in the colours of random rays, and their evaluations.
 
-    A NaN among the differences stays one, and keeps no bound.
+    A NaN among the differences makes the maximum NaN, which is within no bound.
+
+    Args:
+        scene, skipped, bound: as for `Skip`.
+        render: renderer with skipping.
+        without: renderer without skipping.
+        num_rays: number of rays.
+        seed: random seed of the rays.
     """
-    differences, asked, asked_without = [], 0, 0
+    differences, evaluations, evaluations_without = [], 0, 0
     for start in range(0, num_rays, SKIPPING_RAYS_AT_ONCE):
         rays = random_rays(min(SKIPPING_RAYS_AT_ONCE, num_rays - start), stream_seed(seed, start))
         picture, full = render(rays), without(rays)
         differences.append((picture.color - full.color).abs())
-        asked, asked_without = asked + picture.evaluations, asked_without + full.evaluations
+        evaluations += picture.evaluations
+        evaluations_without += full.evaluations
     difference = torch.cat(differences)
     largest = difference.max().item()
     kept = None if bound is None else largest <= bound
     mean = difference.double().mean().item()
-    return Skip(scene, skipped, bound, mean, largest, kept, asked / num_rays, asked_without / num_rays)
+    return Skip(scene, skipped, bound, mean, largest, kept, evaluations / num_rays, evaluations_without / num_rays)
 
 
-# -- for people ---------------------------------------------------------------------------------------------------
+# -- tables -------------------------------------------------------------------------------------------------------
 
 
 def cost_table(needed: list[dict[str, Any]]) -> Table:
-    """Evaluations of the field a ray by scene, sampler and mean error; with the coarse ones, in brackets."""
+    """Return a table of `needed`, the result of `costs`: evaluations of the field, and with coarse ones in brackets."""
     table = Table(title="evaluations a ray for a mean error of colour (with coarse ones)", title_justify="left")
     for heading in ("scene", "sampler", *(f"{target:.0e}" for target in TARGETS)):
         table.add_column(heading, justify="left" if heading in ("scene", "sampler") else "right")
@@ -277,7 +314,7 @@ def _cost(cell: dict[str, Any]) -> str:
 
 
 def skip_table(skips: list[Skip]) -> Table:
-    """What skipping changes, and saves."""
+    """Return a table of `skips`: differences of colours, and saved evaluations."""
     table = Table(title="what skipping changes of a colour, and the evaluations it saves", title_justify="left")
     for heading in ("scene", "skipped", "bound", "largest", "mean", "kept", "saved"):
         table.add_column(heading, justify="left" if heading in ("scene", "skipped") else "right")

@@ -1,7 +1,7 @@
-"""Every sampler of the framework, ready to render a scene, with evaluations of the field counted.
+"""Rendering of scenes with every sampler of the framework, with evaluations of the field counted.
 
-They are counted where they are asked for, those whose result was dropped in the end included. Those of a coarse field
-or of proposals are counted apart, for proposals are much smaller than the field.
+All evaluations are counted, including those whose result is not used. Those of a coarse field or of proposals are
+counted separately, as proposals are much smaller than the field.
 """
 
 from __future__ import annotations
@@ -29,45 +29,51 @@ from framework.samplers.uniform import UniformSampler
 from framework.tools.benchmarks.closed_forms import BOX
 
 WHITE = torch.ones(3)
-"""The background."""
+"""(3,) background."""
 DISTANCE, NEAR, FAR = 4.0, 2.0, 6.0
-"""Of the eye from the scene's middle, and a ray's ends: as in NeRF's synthetic scenes."""
+"""Distance of ray origins from the scene's centre, and near and far ends, as in NeRF's synthetic scenes."""
 EARLY_STOP = 1e-4
-"""Transmittance at which the sampler "early stop" ends a ray: the framework's own when it renders."""
+"""Transmittance at which the sampler "early stop" ends a ray; the framework's default in rendering."""
 GRID_STEPS = 1024
-"""Training steps in which an occupancy grid is filled: those of its shuffled visits, and three times as many."""
+"""Training steps in which an occupancy grid is filled, four times its warm-up."""
 FIT_RAYS = 1024
-"""In a step of fitting proposals."""
+"""Rays per step of training proposals."""
 
 
 def random_rays(count: int, seed: int) -> Rays:
-    """From all sides, towards places spread evenly in the largest ball that the scene's box holds."""
-    draws = torch.Generator().manual_seed(seed)
-    origins, outwards = (normalize(torch.randn(count, 3, generator=draws), dim=-1) for _ in range(2))
-    origins, places = DISTANCE * origins, outwards * torch.rand(count, 1, generator=draws) ** (1 / 3)
+    """Return random rays from all sides to positions uniform in the largest ball in the scene's box.
+
+    Args:
+        count: number of rays.
+        seed: random seed.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    origins, outwards = (normalize(torch.randn(count, 3, generator=generator), dim=-1) for _ in range(2))
+    origins, targets = DISTANCE * origins, outwards * torch.rand(count, 1, generator=generator) ** (1 / 3)
     ends = torch.full((count,), NEAR), torch.full((count,), FAR)
-    return Rays(origins, normalize(places - origins, dim=-1), *ends)
+    return Rays(origins, normalize(targets - origins, dim=-1), *ends)
 
 
 # -- rendering ----------------------------------------------------------------------------------------------------
 
 
 class Picture(NamedTuple):
-    """What a sampler made of R rays."""
+    """Colours of R rays and the evaluations that they took."""
 
     color: Tensor
-    """(R, 3)"""
+    """(R, 3) colours."""
     evaluations: int
-    """Of the field."""
+    """Number of evaluations of the field."""
     coarse_evaluations: int
-    """Of what says where to look."""
+    """Number of evaluations of a coarse field or of proposals."""
 
 
 Renderer = Callable[[Rays], Picture]
+"""Function that renders rays."""
 
 
 class Counted(Field):
-    """A field that counts at how many positions its density is asked for."""
+    """A `field` that counts the positions at which its density is evaluated."""
 
     def __init__(self, field: Field) -> None:
         super().__init__()
@@ -82,38 +88,65 @@ class Counted(Field):
 
 
 def render(field: Field, sampler: Sampler, rays: Rays, jitter: bool) -> Rendered:
-    """Return what a field shows, by a sampler, over white.
+    """Render a field with a sampler, over white.
 
     Args:
         field: density and colour.
-        sampler: where the field is asked.
+        sampler: chooses the samples.
         rays: R rays.
-        jitter: random positions or fixed ones.
+        jitter: whether sample positions are random.
     """
     return VolumeRenderer().render(rays, sampler.sample(rays, field, jitter), field, WHITE)
 
 
 def sampled(scene: Field, sampler: Sampler, jitter: bool, rays: Rays) -> Picture:
-    """By a sampler that asks nothing but the field."""
+    """Render a scene with a sampler that evaluates nothing but the field.
+
+    Args:
+        scene: the scene.
+        sampler: chooses the samples.
+        jitter: whether sample positions are random.
+        rays: R rays.
+    """
     field = Counted(scene)
     return Picture(render(field, sampler, rays, jitter).rgb, field.count, 0)
 
 
 def hierarchical(scene: Field, counts: tuple[int, int], rays: Rays) -> Picture:
-    """By inverting the distribution that stratified samples found, the field being its own coarse one."""
+    """Render a scene with hierarchical sampling, with the field also as the coarse one.
+
+    Args:
+        scene: the scene.
+        counts: samples per ray of the coarse field, and further ones of the fine field.
+        rays: R rays.
+    """
     coarse, fine = Counted(scene), Counted(scene)
     sampler = HierarchicalSampler(coarse, *counts)
     return Picture(render(fine, sampler, rays, False).rgb, fine.count, coarse.count)
 
 
 def proposed(scene: Field, sampler: ProposalSampler, counts: tuple[int, ...], rays: Rays) -> Picture:
-    """By proposals, asked for `counts` intervals in turn, whatever they were fitted with."""
+    """Render a scene with proposals.
+
+    Args:
+        scene: the scene.
+        sampler: proposals trained on the scene.
+        counts: intervals per ray of each proposal and of the field, whatever the proposals were trained with.
+        rays: R rays.
+    """
     sampler.counts = counts
     return sampled(scene, sampler, False, rays)._replace(coarse_evaluations=sum(counts[:-1]) * len(rays))
 
 
 def marched(scene: Field, sampler: OccupancySampler, early_stop: float, rays: Rays) -> Picture:
-    """By marching through a grid, until transmittance is below `early_stop`."""
+    """Render a scene by marching through an occupancy grid.
+
+    Args:
+        scene: the scene.
+        sampler: the filled grid.
+        early_stop: transmittance at which rays end.
+        rays: R rays.
+    """
     sampler.early_stop = early_stop
     return sampled(scene, sampler, False, rays)
 
@@ -121,13 +154,15 @@ def marched(scene: Field, sampler: OccupancySampler, early_stop: float, rays: Ra
 def renderers(
     scene: Field, proposals: ProposalSampler, grids: Callable[[int], OccupancySampler], count: int
 ) -> dict[str, Renderer]:
-    """Every sampler with a count, which means such numbers of samples that all make as many evaluations, more or less.
+    """Return a renderer for each sampler, by name, all with about the same number of evaluations.
 
-    The shares between levels are the framework's defaults. "even steps" marches with nothing skipped.
+    The ratios between levels are the framework's defaults. "even steps" marches without skipping.
 
     Args:
-        proposals: fitted to the scene.
-        grids: from a number of steps along the box's diagonal to a filled grid.
+        scene: the scene.
+        proposals: proposals trained on the scene.
+        grids: function from the number of steps along the box's diagonal to a filled grid.
+        count: unit of the numbers of samples, steps and intervals.
     """
     return {
         "uniform": partial(sampled, scene, UniformSampler(4 * count), False),
@@ -140,16 +175,23 @@ def renderers(
     }
 
 
-# -- what samplers learn of a scene -------------------------------------------------------------------------------
+# -- fitting samplers to a scene -----------------------------------------------------------------------------------
 
 
 def full_grid(num_steps: int) -> OccupancySampler:
-    """A grid that skips nothing."""
+    """Return a grid that skips nothing, for marching in `num_steps` along the box's diagonal."""
     return OccupancySampler(BOX, 4, num_steps).eval()
 
 
 def filled_grid(scene: Field, resolution: int, seed: int, num_steps: int) -> OccupancySampler:
-    """A grid that its own updates have filled, for marching in `num_steps` along the box's diagonal."""
+    """Return a grid that is filled by its own updates.
+
+    Args:
+        scene: the scene.
+        resolution: cells per axis.
+        seed: random seed.
+        num_steps: marching steps along the box's diagonal.
+    """
     sampler = OccupancySampler(BOX, resolution, num_steps)
     for step in range(GRID_STEPS + 1):
         seed_step(seed, step)
@@ -158,15 +200,24 @@ def filled_grid(scene: Field, resolution: int, seed: int, num_steps: int) -> Occ
 
 
 def fitted_proposals(scene: Field, steps: int, seed: int) -> tuple[ProposalSampler, float]:
-    """Proposals that have learnt a scene by their own loss, and the seconds it took."""
+    """Train proposals on a scene with their own loss.
+
+    Args:
+        scene: the scene.
+        steps: number of training steps.
+        seed: random seed.
+
+    Returns:
+        The proposals, and the seconds of training.
+    """
     torch.manual_seed(seed)
     sampler = ProposalSampler(BOX, anneal_steps=steps // 2)
-    how = ProposalSampler.optimised
-    assert how is not None
-    assert how.learning_rate is not None
-    assert how.betas is not None
-    assert how.eps is not None
-    optimizer = torch.optim.Adam(sampler.parameters(), how.learning_rate, how.betas, how.eps)
+    settings = ProposalSampler.optimised
+    assert settings is not None
+    assert settings.learning_rate is not None
+    assert settings.betas is not None
+    assert settings.eps is not None
+    optimizer = torch.optim.Adam(sampler.parameters(), settings.learning_rate, settings.betas, settings.eps)
     start = time.perf_counter()
     for step in range(steps):
         seed_step(seed, step)

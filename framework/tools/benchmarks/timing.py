@@ -1,4 +1,4 @@
-"""Times of two ways to do the same, in alternating runs: a machine whose speed drifts disturbs neighbours alike."""
+"""Times of two implementations in alternating runs, so that a drift of the machine's speed affects both."""
 
 from __future__ import annotations
 
@@ -11,22 +11,29 @@ from typing import Any
 from torch import Tensor
 
 Run = Callable[[], Sequence[float]]
-"""Does something once. Returns: the seconds of each of its stages."""
+"""Function that does some work once and returns the seconds of each of its stages."""
 
 
 @dataclass(frozen=True)
 class Times:
-    """Of both ways."""
+    """Times of two implementations."""
 
     compiled: list[float]
-    """Median seconds of each stage."""
+    """Median seconds of each stage of the first."""
     reference: list[float]
+    """Median seconds of each stage of the second."""
     speed_up: float
-    """Median of the ratios of neighbouring runs, all stages together."""
+    """Median ratio of the second's time to the first's, of neighbouring runs with all stages."""
 
 
 def alternating(compiled: Run, reference: Run, repeats: int) -> Times:
-    """Run both in turn, so many times each after one to warm up."""
+    """Run two implementations in turn, after a run of each to warm up.
+
+    Args:
+        compiled: the first implementation.
+        reference: the second implementation.
+        repeats: number of measured runs of each.
+    """
     runs = [(compiled(), reference()) for _ in range(repeats + 1)][1:]
     ours, theirs = zip(*runs, strict=True)
     ratios = [sum(their) / sum(our) for our, their in runs]
@@ -38,7 +45,7 @@ def _medians(runs: Sequence[Sequence[float]]) -> list[float]:
 
 
 def once(run: Callable[[], Any]) -> Run:
-    """Something of one stage."""
+    """Return a measurement of `run` as one stage."""
 
     def timed() -> list[float]:
         start = time.perf_counter()
@@ -51,12 +58,13 @@ def once(run: Callable[[], Any]) -> Run:
 def differentiated(
     function: Callable[..., Tensor], inputs: Sequence[Tensor], gradient: Tensor | None, backward: bool = True
 ) -> Run:
-    """A function of tensors forward and, as a second stage, backward.
+    """Return a measurement of a function of tensors, with the stages forward and backward.
 
     Args:
-        inputs: its arguments, of which derivatives are taken.
-        gradient: of the value; ones if None.
-        backward: whether there is a second stage.
+        function: the function.
+        inputs: its arguments, which require gradients.
+        gradient: gradient of the function's value; ones if None.
+        backward: whether the backward stage is run.
     """
 
     def timed() -> list[float]:

@@ -1,4 +1,4 @@
-"""The training that benchmarks of speed measure."""
+"""The trainer of benchmarks of speed."""
 
 from __future__ import annotations
 
@@ -13,21 +13,22 @@ from framework.training.trainer import Trainer
 
 
 def endless_trainer(method: str, data: Path, seconds: float, folder: Path) -> Trainer:
-    """Build a trainer with the settings for a given time, but without its end.
+    """Return a trainer with the settings for a time budget, but without the budget.
 
-    With `max_seconds` the learning rate falls with the clock: a run that ended while it is measured would not do what
-    it does on the way.
+    With a budget, the learning rate would fall over time, and a run that reached its end would not be typical.
 
     Args:
         method: name of the method.
-        data: folder of the data set; its format is recognised.
-        seconds: seconds of training for which the method chooses its settings.
-        folder: where the run's folder is made.
-    Raises: DataError where no format recognises the data.
+        data: folder of the data set, whose format is recognised.
+        seconds: time budget, seconds, for which the method chooses its settings.
+        folder: folder in which the run's folder is created.
+
+    Raises:
+        DataError: if no format recognises the data.
     """
-    found, name = find_data(data)
+    data_folder, name = find_data(data)
     declared = load_method(method)
-    config = dataclasses.replace(declared.config, data=found, vis="none", max_seconds=seconds)
+    config = dataclasses.replace(declared.config, data=data_folder, vis="none", max_seconds=seconds)
     run = Run(method, config, name, load_dataparser(name)(), folder / "run")
     train_set = load_split(run, "train")
     config, _ = declared.decide(config, train_set.scene)

@@ -1,1 +1,1 @@
-"""Hard scenes and conditions that a method is run through: what each does, and what came of it."""
+"""Stress tests of methods: hard scenes and conditions, runs under them, and verdicts."""

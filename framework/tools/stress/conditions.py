@@ -1,8 +1,8 @@
-"""The hard conditions: what each does to the photographs and to the run, and what is then expected of a method.
+"""Hard conditions: the changes of images and settings that each makes, and the outcome that is expected.
 
-Everywhere: no crash, nothing that is not finite at the end, and no step dropped but those whose pixels were spoiled.
-How much worse than the plain run it may be is said by each condition; where more is lost for a reason that no method
-can help, the condition says that too.
+Under every condition, a run must not crash, must end with finite parameters, and may drop only steps with spoiled
+pixels. Each condition has a maximum loss of PSNR against the plain run; if a larger loss has a reason that no method
+can avoid, the condition names it.
 """
 
 from __future__ import annotations
@@ -21,19 +21,20 @@ from framework.tools.stress.variants import first_image, moved, one_pixel, plain
 from framework.tools.testing.ball import RADIUS
 
 ALLOWED = 2.0
-"""dB that a short run may lose before it is called degraded: a choice, whose control is what `another-seed` loses."""
+"""Default maximum loss of PSNR, dB; compare the loss of `another-seed`."""
 ALLOWED_OF_OTHER_PICTURES = 5.0
-"""The same where the pictures that are judged show more or less than the plain run's, so that figures compare roughly.
+"""Maximum loss of PSNR, dB, if the test views show more or less of the ball than those of the plain run.
 
-Pictures that are easier than the plain ones (all white, black or transparent), or that show as much of the ball (4
-degrees), have to be as good: for those it is `ALLOWED`.
+For test views that are easier than the plain ones (all white, black or transparent), or that show as much of the ball
+(4 degrees), it is `ALLOWED`.
 """
 
 A_THIRD = "a third of the steps teach nothing, as they should"
 
 Change = Callable[[Views], Views]
+"""Function from the plain images to the changed ones."""
 Settings = Callable[[TrainConfig], dict[str, Any]]
-"""From the plain run's settings to those that are changed, as plain values."""
+"""Function from the settings of the plain run to the changed ones, as plain values by name."""
 
 
 def _same(views: Views) -> Views:
@@ -46,39 +47,39 @@ def _none(config: TrainConfig) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Condition:
-    """What is hard, and what is expected."""
+    """A hard condition and the outcome that is expected."""
 
     name: str
-    """For the command line and the table."""
+    """Name for the command line and the table."""
     what: str
-    """What is done, for people."""
+    """Description for people."""
     change: Change = _same
-    """To the photographs."""
+    """Change of the images."""
     settings: Settings = _none
-    """To the run's settings."""
+    """Changed settings of the run."""
     rays: int | None = None
-    """Rays in a step, whatever the method would take; as many as it takes if None."""
+    """Number of rays per step; the method's if None."""
     spoil: Spoil | None = None
-    """To every third batch."""
+    """Change of every third batch; none if None."""
     allowed: float = ALLOWED
-    """dB lost against the plain run before it is called degraded."""
+    """Maximum loss of PSNR against the plain run, dB; with more, the outcome is degraded."""
     reason: str | None = None
-    """Why more may be lost; None where nothing would explain it."""
+    """Reason why more may be lost; None if there is none."""
     may_refuse: bool = False
-    """A clear refusal (NerfloomError) is as good an answer as a result."""
+    """Whether a clear error (NerfloomError) is as good as a result."""
     may_skip: bool = False
-    """Any step may be dropped because it is not finite."""
+    """Whether any step may be dropped because it is not finite."""
     ball_only: bool = False
-    """It needs pictures from elsewhere, which can be made of the ball, and not of somebody's data."""
+    """Whether it needs images from other positions, which can be rendered of the ball only."""
 
 
 def _both(change: Callable[[Dataset], Dataset]) -> Change:
-    """Change the photographs that are learnt from and those that judge."""
+    """Return a change of training and test images."""
     return lambda views: views.each(change)
 
 
 def _train(change: Callable[[Dataset], Dataset]) -> Change:
-    """Change the photographs that are learnt from."""
+    """Return a change of the training images alone."""
     return lambda views: replace(views, train=change(views.train))
 
 
@@ -90,14 +91,14 @@ def _fixed(**settings: Any) -> Settings:
     return lambda config: settings
 
 
-# Why more may be lost, where that is shared or long.
+# Reasons why more may be lost, if shared or long.
 UNIT = "density is per unit of length, and starts at about 1: a format that does not place cameras wants --scale-factor"
 FAR_OFF = "float32 resolves 0.001 there, and frequency encodings nothing: such a scene should be placed"
 
 PLAIN = Condition("plain", "nothing hard: what the others are compared with")
 CONDITIONS = (
     PLAIN,
-    # -- what the photographs show
+    # -- images
     Condition("all-white", "white opaque photographs", _both(lambda d: plain_colored(d, 255))),
     Condition("all-black", "black opaque photographs", _both(lambda d: plain_colored(d, 0))),
     Condition("all-transparent", "photographs of nothing, alpha 0", _both(transparent)),
@@ -110,7 +111,7 @@ CONDITIONS = (
         reason="a dozen pixels are all that there is, each the mean of a picture of which its ray sees the middle",
     ),
     Condition("duplicate-cameras", "every photograph and its camera twice", _train(twice)),
-    # -- how it is looked at
+    # -- cameras
     Condition(
         "field-of-view-4",
         "pictures 4 degrees wide, from as far away as that takes",
@@ -133,7 +134,7 @@ CONDITIONS = (
         reason="matter right before the cameras explains a few photographs as well as walls do",
         ball_only=True,
     ),
-    # -- where the scene is: see `variants.moved` for the two ways in which it arrives
+    # -- units and origin: see `variants.moved` for the two ways in which formats place a scene
     Condition("scale-1e-6", "a scene a million times smaller, not placed", _moved(1e-6), reason=UNIT),
     Condition("scale-1e6", "a scene a million times larger, not placed", _moved(1e6), reason=UNIT),
     Condition("shift-1e4", "a scene 10,000 units off along each axis, not placed", _moved(shift=1e4), reason=FAR_OFF),
@@ -141,7 +142,7 @@ CONDITIONS = (
     Condition("scale-1e-6-placed", "a scene a million times smaller, then placed", _moved(1e-6, placed=True)),
     Condition("scale-1e6-placed", "a scene a million times larger, then placed", _moved(1e6, placed=True)),
     Condition("shift-1e4-placed", "a scene 10,000 units off, then placed", _moved(shift=1e4, placed=True)),
-    # -- how it is trained
+    # -- training
     Condition(
         "another-seed",
         "the plain run from another seed: what runs differ by anyway",
@@ -164,12 +165,12 @@ CONDITIONS = (
     Condition(
         "1-ray",
         "one ray a step",
-        settings=_fixed(train_rays_per_pixel_from=1.0),  # never several through a pixel
+        settings=_fixed(train_rays_per_pixel_from=1.0),  # never several rays per pixel
         rays=1,
         reason="it sees no more pixels than it does steps",
     ),
     Condition("8192-rays", "8192 rays a step", rays=8192, reason="steps take longer: fewer may fit into the time"),
-    # -- what should have been refused
+    # -- invalid data
     Condition("nan-pixels", "a NaN pixel in every third batch", spoil=spoiled_pixel(math.nan), reason=A_THIRD),
     Condition("inf-pixels", "an infinite pixel in every third batch", spoil=spoiled_pixel(math.inf), reason=A_THIRD),
     Condition(
@@ -183,12 +184,13 @@ CONDITIONS = (
 
 
 def select(names: Sequence[str]) -> list[Condition]:
-    """The conditions of these names, in their usual order, behind the plain run; all if none is named.
+    """Return the plain run and the conditions with the given `names`, in the order of `CONDITIONS`; all without names.
 
-    Raises: ConfigError for an unknown name, with the nearest.
+    Raises:
+        ConfigError: if there is no such condition; the message suggests the nearest.
     """
-    known = [condition.name for condition in CONDITIONS]
+    all_names = [condition.name for condition in CONDITIONS]
     for name in names:
-        if name not in known:
-            raise ConfigError(f"--only: there is no condition '{name}'. {nearest(name, known)}")
+        if name not in all_names:
+            raise ConfigError(f"--only: there is no condition '{name}'. {nearest(name, all_names)}")
     return [condition for condition in CONDITIONS if condition is PLAIN or not names or condition.name in names]

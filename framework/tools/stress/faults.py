@@ -1,8 +1,8 @@
-"""Values that are not finite, put where checks on the data would have kept them out.
+"""Injection of values that are not finite behind the checks that would refuse them.
 
-Photographs are uint8 and hold no NaN, and formats refuse a pose that is not finite (`cameras.check_pose`). But a format
-may forget to look, and floating-point inputs may come one day. So pixels are spoiled in the batch, after it was drawn,
-and a pose in the data set, after it was read: what is tested is the trainer, the samplers and the kernels.
+Images are uint8 and hold no NaN, and formats refuse a pose that is not finite (`cameras.check_pose`). But a format may
+lack the check, and floating-point images may be supported later. Therefore pixels are spoiled in the batch, after it
+was drawn, and a pose in the data set, after it was read. This tests the trainer, the samplers and the kernels.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from typing import Any
 from framework.data.dataset import Dataset
 
 EVERY = 3
-"""Batches of which the first is spoiled: often, but not the ten in a row that end a run."""
+"""Distance between spoiled batches. More than one, as ten non-finite steps in a row end a run."""
 
 Spoil = Callable[[Any, int], Any]
-"""From a batch and the step's number to the batch that is learnt from."""
+"""Function from a batch and the number of the step to the spoiled batch."""
 
 
 def spoiled_pixel(value: float) -> Spoil:
-    """One pixel of every third batch, the first included, shows `value` in all channels.
+    """Return a function that sets all channels of a pixel to `value` in every third batch, from the first.
 
-    So many steps cannot but be dropped (`spoiled_batches`): whoever drops fewer has hidden what was wrong.
+    At least as many steps must be dropped (`spoiled_batches`); a method that drops fewer hides the fault.
     """
 
     def spoil(batch: Any, step: int) -> Any:
@@ -37,12 +37,12 @@ def spoiled_pixel(value: float) -> Spoil:
 
 
 def spoiled_batches(steps: int) -> int:
-    """How many of the first `steps` batches are spoiled."""
+    """Return the number of spoiled batches among the first `steps` batches."""
     return -(-steps // EVERY)
 
 
 def spoiled_pose(dataset: Dataset, value: float) -> Dataset:
-    """The first camera's pose is `value` throughout."""
+    """Set all entries of the first camera's pose in `dataset` to `value`."""
     poses = dataset.cameras.camera_to_worlds.clone()
     poses[0] = value
     scene = replace(dataset.scene, camera_to_worlds=poses)

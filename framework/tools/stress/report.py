@@ -1,4 +1,4 @@
-"""What became of one method or several: with which settings they ran, and a table of conditions by methods."""
+"""Results of stress tests: the settings of each method, and a table of conditions by methods."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from framework.training.run import Run
 
 @dataclass(frozen=True)
 class Result:
-    """What became of a method."""
+    """Outcomes of a method under all conditions."""
 
     method: str
-    """With its flags, as it was asked for."""
+    """Name of the method, with its flags."""
     machine: dict[str, Any]
-    """What it ran on: processor, threads, kernels, versions, commit (`framework.training.machine`)."""
+    """Processor, threads, kernels, versions and commit (`framework.training.machine`)."""
     settings: dict[str, Any]
-    """Of its plain run."""
+    """Settings of the plain run."""
     verdicts: tuple[Verdict, ...]
-    """One for each condition, in their order."""
+    """Verdict of each condition, in the order of the conditions."""
 
 
 def settings_of(run: Run, budget: Budget, scene: Scene) -> dict[str, Any]:
-    """Return the plain run's settings as plain values, less those that name files and folders of a machine.
+    """Return the settings of the plain run as plain values, without paths.
 
     Args:
         run: the method and its settings.
-        budget: how long it trains.
-        scene: facts about the plain images.
+        budget: length of the run.
+        scene: properties of the plain images.
     """
     method = load_method(run.method)
     config = shortened(run.config, budget, method, scene)
@@ -44,7 +44,7 @@ def settings_of(run: Run, budget: Budget, scene: Scene) -> dict[str, Any]:
 
 
 def table(results: Sequence[Result]) -> list[list[str]]:
-    """Rows of text: the methods' names, then for each condition what each method made of it (`Verdict.cell`)."""
+    """Return rows of text: the methods of `results`, then each condition with a `Verdict.cell` per method."""
     rows = [["condition", *(result.method for result in results)]]
     for row in zip(*(result.verdicts for result in results), strict=True):
         rows.append([row[0].name, *(verdict.cell() for verdict in row)])
@@ -52,7 +52,7 @@ def table(results: Sequence[Result]) -> list[list[str]]:
 
 
 def notes(results: Sequence[Result]) -> list[str]:
-    """Why what is no pass is none, in a line each."""
+    """Return a line for each verdict of `results` that is no pass, with its reason."""
     return [
         f"{result.method}, {verdict.name}: {verdict.outcome}: {verdict.error or verdict.reason}"
         for result in results
@@ -62,14 +62,15 @@ def notes(results: Sequence[Result]) -> list[str]:
 
 
 def markdown(results: Sequence[Result]) -> str:
-    """The table, the notes, and what it all ran on, to be put into a document."""
+    """Return the table, the notes and the machine of `results`, as Markdown."""
     head, *body = table(results)
     rows = "\n".join(_row(cells) for cells in (head, ["---"] * len(head), *body))
     lines = "\n".join(f"- {note}" for note in notes(results))
-    on = results[0].machine
-    where = f"{on['processor']}, {on['device']}, {on['threads']} threads, {on['kernels']} kernels"
-    version = f"torch {on['torch']}, nerfloom {on['nerfloom']}" + (f" at {on['commit']}" if on["commit"] else "")
-    return "\n\n".join(filter(None, (rows, lines, f"{where}; {version}."))) + "\n"
+    facts = results[0].machine
+    hardware = f"{facts['processor']}, {facts['device']}, {facts['threads']} threads, {facts['kernels']} kernels"
+    commit = f" at {facts['commit']}" if facts["commit"] else ""
+    version = f"torch {facts['torch']}, nerfloom {facts['nerfloom']}{commit}"
+    return "\n\n".join(filter(None, (rows, lines, f"{hardware}; {version}."))) + "\n"
 
 
 def _row(cells: Sequence[str]) -> str:

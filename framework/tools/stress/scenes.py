@@ -1,7 +1,7 @@
-"""The scenes that hard conditions start from: a ball made in memory, or a few photographs of somebody's data, reduced.
+"""Plain scenes of the stress tests: a ball rendered in memory, or a few reduced images of a data set.
 
-The ball stands at the origin and is coloured by its normal n: 0.5 + 0.5 n. From within it is a room of the same
-colours. So everything that its pictures should show is known in closed form.
+The ball is at the origin, and its colour is 0.5 + 0.5 n for the normal n, outside and inside. Its images are known in
+closed form.
 """
 
 from __future__ import annotations
@@ -26,34 +26,34 @@ from framework.tools.testing.ball import RADIUS, cameras_at, trace
 HALF_SIZE = 1.5
 """Half the edge of the ball's box, scene units. Every ray of FIELD_OF_VIEW or less meets the box."""
 FIELD_OF_VIEW, SIZE = 30.0, 24
-"""Of the ball's pictures, degrees; and their width and height, pixels."""
+"""Angle of view of the ball's images, degrees, and their width and height, pixels."""
 SHARE = 0.7
-"""Of a picture's width that the ball takes, seen from outside."""
+"""Diameter of the ball in an image from outside, as a fraction of the image's width."""
 NUM_TRAIN, NUM_TEST = 12, 4
-"""Photographs to learn from, and to be judged by."""
+"""Number of training and of test images."""
 LONGER_SIDE = 48
-"""Pixels to which photographs of somebody's data are reduced, or a few more: by a whole number."""
+"""Minimum longer side of the reduced images of a data set, pixels; the factor is a whole number."""
 NEAREST = 0.02
-"""Distance from cameras among the scene at which it may start."""
+"""Minimum near distance, scene units, for cameras inside the box."""
 RAYS_PER_PIXEL = 16
-"""Of the ball's pictures: a photograph's pixel is an area."""
+"""Rays per pixel of the ball's images, whose pixels are means over their area."""
 
 
 @dataclass(frozen=True)
 class Views:
-    """Photographs of one scene."""
+    """Training and test images of a scene."""
 
     train: Dataset
-    """To learn from."""
+    """Training images."""
     test: Dataset
-    """To be judged by."""
+    """Test images."""
 
     def each(self, change: Callable[[Dataset], Dataset]) -> Views:
-        """Both sets changed alike."""
+        """Return the result of `change` on both sets."""
         return Views(change(self.train), change(self.test))
 
     def to(self, device: torch.device | str) -> Views:
-        """The same photographs on `device`."""
+        """Return the images on `device`."""
         return self.each(lambda dataset: dataset.to(device))
 
 
@@ -61,25 +61,25 @@ class Views:
 
 
 def ball_views(field_of_view: float = FIELD_OF_VIEW, distance: float | None = None) -> Views:
-    """The ball from all sides, as a format delivers it that is not placed: the box is stated, not found.
+    """Return images of the ball from all sides, with a given box, as from a format that does not place cameras.
 
     Args:
-        field_of_view: of the pictures, degrees.
-        distance: of the cameras from the ball's centre, at which they look; less than RADIUS is inside. If None, the
-            distance from which the ball takes SHARE of a picture's width.
+        field_of_view: angle of view of the images, degrees.
+        distance: distance of the cameras from the ball's centre, to which they look; inside if less than RADIUS. If
+            None, the distance at which the ball takes SHARE of the images' width.
     """
-    away = distance_for(field_of_view) if distance is None else distance
-    train, test = (away * directions(count, turn) for count, turn in ((NUM_TRAIN, 0.0), (NUM_TEST, 1.0)))
+    radius = distance_for(field_of_view) if distance is None else distance
+    train, test = (radius * directions(count, turn) for count, turn in ((NUM_TRAIN, 0.0), (NUM_TEST, 1.0)))
     return Views(ball_dataset(train, field_of_view), ball_dataset(test, field_of_view))
 
 
 def distance_for(field_of_view: float) -> float:
-    """From where the ball takes SHARE of a picture's width; `field_of_view` in degrees."""
+    """Return the distance at which the ball takes SHARE of an image's width; `field_of_view` is in degrees."""
     return RADIUS / math.sin(math.atan(SHARE * math.tan(math.radians(field_of_view) / 2)))
 
 
 def directions(count: int, turn: float = 0.0) -> Tensor:
-    """(count, 3) float64 unit vectors, spread evenly (Fibonacci lattice) and turned about z by `turn` radians."""
+    """Return `count` unit vectors (count, 3) float64 on a Fibonacci lattice, rotated about z by `turn` radians."""
     index = torch.arange(count, dtype=torch.float64) + 0.5
     height = 1 - 2 * index / count
     angle = turn + index * math.pi * (3 - 5**0.5)
@@ -88,7 +88,12 @@ def directions(count: int, turn: float = 0.0) -> Tensor:
 
 
 def ball_dataset(positions: Tensor, field_of_view: float) -> Dataset:
-    """Photographs of the ball from positions (M, 3) float64, all equally far from its centre."""
+    """Return images of the ball.
+
+    Args:
+        positions: (M, 3) float64 camera positions, all at the same distance from the centre, scene units.
+        field_of_view: angle of view of the images, degrees.
+    """
     cameras = cameras_at(positions, field_of_view, SIZE)
     pixels = as_decoded(photograph(cameras))
     distance, reach = float(positions.norm(dim=-1).max()), HALF_SIZE * 3**0.5
@@ -107,7 +112,7 @@ def ball_dataset(positions: Tensor, field_of_view: float) -> Dataset:
 
 
 def photograph(cameras: Cameras) -> Tensor:
-    """(P, 4) uint8 what cameras see of the ball, image after image: means over pixels, straight alpha."""
+    """Render the ball with `cameras`: RGB with straight alpha (P, 4) uint8, image after image, means over pixels."""
     flat = torch.arange(int(cameras.offsets[-1]))
     rays = cameras.pixel_rays(flat, 0.0, 1.0, subpixels=subpixels(RAYS_PER_PIXEL))
     normals, hits = trace(rays.origins.double(), rays.directions.double())
@@ -117,13 +122,18 @@ def photograph(cameras: Cameras) -> Tensor:
     return (rgba * 255).round().to(torch.uint8)
 
 
-# -- somebody's data ----------------------------------------------------------------------------------------------
+# -- data sets ----------------------------------------------------------------------------------------------------
 
 
 def data_views(parser: DataParser, data: Path | None) -> Views:
-    """A few photographs of a data set, evenly spread over each split and reduced.
+    """Return a few images of a data set, evenly spaced in each split and reduced.
 
-    Raises: DataError where a split cannot be read.
+    Args:
+        parser: the data format, with its flags.
+        data: folder of the data set; None for the embedded scene.
+
+    Raises:
+        DataError: if a split cannot be read.
     """
     return Views(_few(parser, data, "train", NUM_TRAIN), _few(parser, data, "test", NUM_TEST))
 
@@ -135,9 +145,13 @@ def _few(parser: DataParser, data: Path | None, split: Split, count: int) -> Dat
 
 
 def reduced(dataset: Dataset, side: int) -> Dataset:
-    """Photographs reduced by the largest whole number that leaves the longest side `side` pixels or more.
+    """Return images reduced by the largest whole number with which the longest side has at least `side` pixels.
 
-    A reduced pixel counts where masks leave all of what it is made from. Depth images are left out.
+    A reduced pixel counts if masks keep all pixels that it is made of. Depth images are omitted.
+
+    Args:
+        dataset: the images.
+        side: minimum longer side of the largest image, pixels.
     """
     factor = max(dataset.scene.image_size // side, 1)
 
@@ -151,17 +165,17 @@ def reduced(dataset: Dataset, side: int) -> Dataset:
 
 
 def _box_filtered(image: Tensor, factor: int) -> Tensor:
-    """An image (H, W, 3 or 4) reduced by a whole number, as (H' W', 4)."""
+    """Return an image (H, W, 3 or 4) reduced by a whole number, as (H' W', 4)."""
     rgba = torch.full((*image.shape[:2], 4), 255, dtype=torch.uint8)
     rgba[..., : image.shape[-1]] = image
     return torch.from_numpy(np.ascontiguousarray(reduce_image(rgba.numpy(), factor))).view(-1, 4)
 
 
-# -- other photographs in a data set ------------------------------------------------------------------------------
+# -- replacement of images ----------------------------------------------------------------------------------------
 
 
 def as_decoded(pixels: Tensor) -> Tensor:
-    """Pixels (P, 3 or 4) without an alpha that says nothing, for that is how photographs are decoded."""
+    """Return `pixels` (P, 3 or 4) as they are decoded from files: without alpha if it is 255 everywhere."""
     opaque = pixels.shape[1] == 4 and bool((pixels[:, 3] == 255).all())
     return pixels[:, :3].contiguous() if opaque else pixels
 
@@ -169,12 +183,13 @@ def as_decoded(pixels: Tensor) -> Tensor:
 def with_photographs(
     dataset: Dataset, pixels: Tensor, cameras: Cameras | None = None, kept: PixelSet | None = None
 ) -> Dataset:
-    """The data set with other photographs, what is told of them included.
+    """Return a data set with other images, and its scene's properties changed accordingly.
 
     Args:
-        pixels: (P, 3 or 4) uint8.
-        cameras: as many as before; the same if None.
-        kept: what counts of the pixels; all if None.
+        dataset: the data set.
+        pixels: (P, 3 or 4) uint8 pixels of all images.
+        cameras: cameras of the images; those of `dataset` if None.
+        kept: pixels that count; all if None.
     """
     cameras = dataset.cameras if cameras is None else cameras
     pixels = as_decoded(pixels)
@@ -201,7 +216,16 @@ def with_photographs(
 
 
 def kept_of(dataset: Dataset, images: Iterable[int], change: Callable[[Tensor], Tensor]) -> PixelSet | None:
-    """What masks leave of some images when each mask (H, W) is changed; None where there are no masks."""
+    """Return the pixels of some images that changed masks keep.
+
+    Args:
+        dataset: the images.
+        images: indices of the images.
+        change: function from a mask (H, W) to the changed one.
+
+    Returns:
+        The kept pixels, counted through the given images; None if there are no masks.
+    """
     masks = (dataset.kept_of(index) for index in images)
     changed = [change(mask).reshape(-1) for mask in masks if mask is not None]
     return PixelSet.of_mask(torch.cat(changed)) if changed else None

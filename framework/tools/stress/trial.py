@@ -1,6 +1,6 @@
-"""One short run under one condition, in this process: training, evaluation, and whether all is finite at the end.
+"""A short run under a condition: training, evaluation, and a check that the result is finite.
 
-A crash of the process itself, as in a compiled kernel, cannot be caught here and ends everything.
+It runs in this process, so that a crash, as in a compiled kernel, ends the process.
 """
 
 from __future__ import annotations
@@ -35,46 +35,47 @@ from framework.training.signals import Stopped
 from framework.training.trainer import Trainer
 
 MOST_RAYS, MOST_SAMPLES = 512, 2**14
-"""In a step, so that a large network takes some hundred steps in a minute. Small pictures need no more."""
+"""Maximum number of rays and of samples per step, so that a large network does hundreds of steps in a minute."""
 NEVER = 10**9
+"""Steps or seconds between checkpoints, more than any run has."""
 
 
 @dataclass(frozen=True)
 class Budget:
-    """How long each run trains: until either is spent."""
+    """Length of a run, in steps and seconds, whichever is reached first."""
 
     steps: int
-    """Steps of training."""
+    """Maximum number of training steps."""
     seconds: float | None
-    """Seconds of training; without limit if None."""
+    """Maximum seconds of training; None for no limit."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What one run showed."""
+    """Result of a run."""
 
     psnr: float | None = None
-    """Of the test views, dB; None where there is no finite one."""
+    """PSNR of the test views, dB; None if there is no finite one."""
     steps: int = 0
-    """Steps done."""
+    """Number of training steps done."""
     skipped: int = 0
-    """Of these, dropped because they were not finite."""
+    """Number of steps dropped because they were not finite."""
     seconds: float = 0.0
-    """Of training."""
+    """Seconds of training."""
     error: str | None = None
-    """Why nothing came of it that can be used, in a line."""
+    """Message of the error, or of the value that is not finite, on one line; None without either."""
     refused: bool = False
-    """Whether it was the framework that said so, in words for a user (NerfloomError)."""
+    """Whether the error is one for users (NerfloomError)."""
     learnt: float | None = None
-    """dB above pictures that show the background alone, which a run has for nothing; None where there is no PSNR."""
+    """PSNR minus that of images of the background alone, dB; None if there is no PSNR."""
 
 
 class StressedSource(BatchSource):
-    """Batches as a condition wants them.
+    """A source of batches changed by a condition.
 
     Args:
-        source: draws them.
-        condition: how many rays a step has, and what is wrong with its pixels.
+        source: source of the unchanged batches.
+        condition: the condition, with the number of rays per step and the change of batches.
     """
 
     def __init__(self, source: BatchSource, condition: Condition) -> None:
@@ -94,22 +95,26 @@ class StressedSource(BatchSource):
 
 
 def attempt(condition: Condition, run: Run, views: Views, budget: Budget) -> Trial:
-    """Train and judge a run under a condition. Whatever goes wrong is told in the result.
+    """Train and evaluate a run under a condition; errors become part of the result.
 
     Args:
+        condition: the condition.
         run: the method and its settings; its folder is not used.
-        views: the plain photographs.
-    Raises: Stopped where somebody stops it.
+        views: the plain images.
+        budget: length of the run.
+
+    Raises:
+        Stopped: if a signal stops the run.
     """
     with TemporaryDirectory() as folder:
         try:
-            return _trained_and_judged(condition, replace(run, folder=Path(folder)), views, budget)
+            return _trained_and_evaluated(condition, replace(run, folder=Path(folder)), views, budget)
         except (Exception, SystemExit) as error:
             line = in_a_line(error).replace(folder, "the run's folder")
             return Trial(error=line, refused=isinstance(error, NerfloomError))
 
 
-def _trained_and_judged(condition: Condition, run: Run, views: Views, budget: Budget) -> Trial:
+def _trained_and_evaluated(condition: Condition, run: Run, views: Views, budget: Budget) -> Trial:
     method = load_method(run.method)
     config = shortened(run.config, budget, method, views.train.scene)
     config = from_plain(config, condition.settings(config), condition.name)
@@ -119,21 +124,21 @@ def _trained_and_judged(condition: Condition, run: Run, views: Views, budget: Bu
     if (number := trainer.train().stopped_by) is not None:
         raise Stopped(number)
     state = trainer.state
-    reached = float(evaluate(trainer.model, changed.test).results["psnr"])
-    done = Trial(steps=state.step, skipped=state.skipped, seconds=state.seconds, error=unsound(trainer, changed.test))
-    if not math.isfinite(reached):
-        return replace(done, error=done.error or "the PSNR of the test views is not finite")
-    return replace(done, psnr=reached, learnt=reached - blank_psnr(trainer.model, changed.test))
+    test_psnr = float(evaluate(trainer.model, changed.test).results["psnr"])
+    trial = Trial(steps=state.step, skipped=state.skipped, seconds=state.seconds, error=unsound(trainer, changed.test))
+    if not math.isfinite(test_psnr):
+        return replace(trial, error=trial.error or "the PSNR of the test views is not finite")
+    return replace(trial, psnr=test_psnr, learnt=test_psnr - blank_psnr(trainer.model, changed.test))
 
 
 def shortened(config: TrainConfig, budget: Budget, method: Method, scene: Scene) -> TrainConfig:
-    """Return the settings of a short run: the budget, small steps, and nothing written but the last checkpoint.
+    """Return the settings of a short run, with small steps and no files but the last checkpoint.
 
     Args:
         config: the run's settings.
-        budget: how long it trains.
-        method: decides how many samples a step has, where that is left to it.
-        scene: facts about the plain images.
+        budget: length of the run.
+        method: the method, which fills in the number of samples per step if left open.
+        scene: properties of the plain images.
     """
     config = replace(
         config,
@@ -155,16 +160,25 @@ def shortened(config: TrainConfig, budget: Budget, method: Method, scene: Scene)
 
 
 def blank_psnr(model: Model[Any], test: Dataset) -> float:
-    """PSNR of pictures that show the background alone, dB, a mean over views; what masks ignore counts too."""
+    """Return the mean PSNR of images of the background alone, dB; masked-out pixels count too.
+
+    Args:
+        model: the model, with its background.
+        test: the test images.
+    """
     background = evaluation_background(model)
-    shown = (composite(test.image(index).float() / 255, background) for index in range(len(test)))
-    return fmean(psnr(background.expand_as(photograph), photograph) for photograph in shown)
+    images = (composite(test.image(index).float() / 255, background) for index in range(len(test)))
+    return fmean(psnr(background.expand_as(image), image) for image in images)
 
 
 def unsound(trainer: Trainer, test: Dataset) -> str | None:
-    """What is not finite in a trained model, its running error, or its picture of the first test view; None if all is.
+    """Return which parameter, running error or value of the first test view is not finite; None if all are.
 
-    Looked for by value: a PSNR alone would not tell an infinite colour, for pictures are cut to [0, 1] first.
+    The PSNR alone would not show an infinite colour, as it is computed on colours clamped to [0, 1].
+
+    Args:
+        trainer: the trainer, after training.
+        test: the test images.
     """
     for name, parameter in trainer.model.named_parameters():
         if not all_finite(parameter):
@@ -179,6 +193,6 @@ def unsound(trainer: Trainer, test: Dataset) -> str | None:
 
 
 def in_a_line(error: BaseException) -> str:
-    """An error in a line; of one that was not meant for users, its type too."""
+    """Return the message of an `error` on one line, with its type unless it is a NerfloomError."""
     words = " ".join(str(error).split())
     return words if isinstance(error, NerfloomError) else f"{type(error).__name__}: {words}"

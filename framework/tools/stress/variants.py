@@ -1,4 +1,4 @@
-"""Hard variants of a scene: pure functions from photographs with poses to others."""
+"""Hard variants of a scene: pure functions from data sets to data sets."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from framework.cameras.poses import place
 from framework.data.dataset import Dataset
 from framework.tools.stress.scenes import Views, kept_of, with_photographs
 
-# -- what the photographs show ------------------------------------------------------------------------------------
+# -- images ---------------------------------------------------------------------------------------------------------
 
 
 def plain_colored(dataset: Dataset, level: int) -> Dataset:
-    """Photographs that are `level` (0 to 255) everywhere in all channels, and opaque."""
+    """Return `dataset` with opaque images that are `level`, 0 to 255, in all pixels and channels."""
     return with_photographs(dataset, torch.full((len(dataset.pixels), 3), level, dtype=torch.uint8))
 
 
 def transparent(dataset: Dataset) -> Dataset:
-    """Photographs of nothing: alpha is 0 everywhere."""
+    """Return `dataset` with fully transparent images."""
     return with_photographs(dataset, torch.zeros(len(dataset.pixels), 4, dtype=torch.uint8))
 
 
 def one_pixel(dataset: Dataset) -> Dataset:
-    """Each photograph as the one pixel that is its mean; the cameras see what they saw."""
+    """Return `dataset` with each image reduced to one pixel, its mean, and cameras with the same angle of view."""
     pixels = torch.stack([mean_color(dataset.image(index)) for index in range(len(dataset))])
     cameras = dataset.cameras
     widths, heights, ones = cameras.widths, cameras.heights, torch.ones_like(cameras.widths)
@@ -43,7 +43,7 @@ def one_pixel(dataset: Dataset) -> Dataset:
 
 
 def mean_color(image: Tensor) -> Tensor:
-    """(C,) uint8 the mean of an image (H, W, C); of four channels the colours count as far as they are opaque."""
+    """Return the mean colour (C,) uint8 of an `image` (H, W, C); if C is 4, colours are weighted by alpha."""
     values = image.reshape(-1, image.shape[-1]).double()
     color, alpha = values[:, :3], values[:, 3:]
     if alpha.shape[1] == 0:
@@ -52,11 +52,11 @@ def mean_color(image: Tensor) -> Tensor:
     return torch.cat([mean, alpha.mean(0)]).round().to(torch.uint8)
 
 
-# -- which photographs there are ----------------------------------------------------------------------------------
+# -- selection of images ------------------------------------------------------------------------------------------
 
 
 def chosen(dataset: Dataset, images: list[int]) -> Dataset:
-    """Some of the photographs, each as often as it is named."""
+    """Return `dataset` with the `images` of the given indices, which may be repeated."""
     index = torch.tensor(images)
     pixels = torch.cat([dataset.image(image).flatten(0, 1) for image in images])
     changed = with_photographs(dataset, pixels, dataset.cameras[index], kept_of(dataset, images, lambda mask: mask))
@@ -65,43 +65,48 @@ def chosen(dataset: Dataset, images: list[int]) -> Dataset:
 
 
 def first_image(dataset: Dataset) -> Dataset:
-    """The first photograph alone."""
+    """Return `dataset` with the first image alone."""
     return chosen(dataset, [0])
 
 
 def twice(dataset: Dataset) -> Dataset:
-    """Every photograph and its camera twice."""
+    """Return `dataset` with each image and its camera twice."""
     return chosen(dataset, [*range(len(dataset))] * 2)
 
 
-# -- where the scene is -------------------------------------------------------------------------------------------
+# -- units and origin ---------------------------------------------------------------------------------------------
 
 
 def moved(views: Views, scale: float = 1.0, shift: float = 0.0, placed: bool = False) -> Views:
-    """The scene in another unit and elsewhere: each place x becomes scale * x + shift, the same along every axis.
+    """Return a scene in another unit and at another place: position x becomes scale * x + shift along each axis.
 
-    That can reach a method in two ways, and both are fair:
+    Formats place such a scene in one of two ways:
 
-    - As blender's format delivers it, which takes cameras as they are: box, near and far are the user's (--half-size,
-      --near, --far), so they are given in the same unit and about the same middle. The method is told all of it.
-    - `placed`, as formats of captures deliver it: the cameras' mean position becomes the origin and their positions
-      fit into [-1, 1] (`framework.cameras.poses.place`), in float64, for that is what files of text hold; only then
-      are they rounded. The orientation is left as it is, so that the box can follow exactly. What is left of scale and
-      shift is rounding.
+    - Not `placed`: the blender format takes cameras as they are, and box, near and far are the user's (--half-size,
+      --near, --far), in the same unit and with the same centre. Therefore they are transformed like the cameras.
+    - `placed`: formats of captures move the cameras' mean position to the origin and scale positions to [-1, 1]
+      (`framework.cameras.poses.place`), in float64, as text files hold it, and round afterwards. The orientation is
+      kept, so that the box can be transformed exactly. Only rounding errors of scale and shift remain.
 
     All is computed in float64 and rounded once.
+
+    Args:
+        views: the images.
+        scale: new units per old unit.
+        shift: displacement along each axis, new units.
+        placed: whether cameras are placed as those of captures.
     """
     factor, offset = scale, torch.full((3,), shift, dtype=torch.float64)
     if placed:
         poses = torch.cat([dataset.cameras.camera_to_worlds for dataset in (views.train, views.test)]).double()
         poses[:, :, 3] = factor * poses[:, :, 3] + offset
-        found = place(poses, orientation="none")
-        factor, offset = found.scale * factor, found.scale * (offset + found.transform[:, 3].double())
+        placement = place(poses, orientation="none")
+        factor, offset = placement.scale * factor, placement.scale * (offset + placement.transform[:, 3].double())
     return views.each(partial(_mapped, factor=factor, offset=offset))
 
 
 def _mapped(dataset: Dataset, factor: float, offset: Tensor) -> Dataset:
-    """Every place x as factor * x + offset (3,) float64, and what leads from the input's frame to the scene's."""
+    """Return `dataset` with each position x at factor * x + offset (3,), and the transform from the input changed."""
     poses, scene = dataset.cameras.camera_to_worlds.to(torch.float64, copy=True), dataset.scene
     poses[:, :, 3] = factor * poses[:, :, 3] + offset
     cameras = replace(dataset.cameras, camera_to_worlds=poses.float())

@@ -1,4 +1,4 @@
-"""What is said of a run under a condition, beside the plain run."""
+"""Verdicts on runs under hard conditions, compared with the plain run."""
 
 from __future__ import annotations
 
@@ -14,35 +14,36 @@ from framework.tools.stress.trial import Budget, Trial, attempt
 from framework.training.run import Run
 
 Outcome = Literal["pass", "degraded", "refused", "fail"]
-"""refused: with a clear error, where that is as good an answer as a result."""
+"""Outcome of a run. refused: it ended with a clear error, which is as good as a result."""
 LEAST_LEARNT = 3.0
-"""dB above empty pictures that a plain run must reach: beside one that has learnt nothing, everything passes."""
+"""Minimum PSNR of the plain run above that of empty images, dB; compared with less, every run would pass."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A line of the table."""
+    """Outcome of a run under a condition."""
 
     name: str
-    """The condition."""
+    """Name of the condition."""
     outcome: Outcome
+    """Outcome of the run."""
     psnr: float | None
-    """Of the test views, dB; None where there is none."""
+    """PSNR of the test views, dB; None if there is no finite one."""
     lost: float | None
-    """dB less than the plain run; negative where it is better, None where either has no PSNR."""
+    """PSNR of the plain run minus this one's, dB; None if either has none."""
     skipped: int
-    """Steps dropped because they were not finite."""
+    """Number of steps dropped because they were not finite."""
     steps: int
-    """Steps done."""
+    """Number of training steps done."""
     seconds: float
-    """Of training."""
+    """Seconds of training."""
     error: str | None
-    """Why it failed or was refused, in a line."""
+    """Message of the error with which it failed or was refused; None if it did not."""
     reason: str | None
-    """What makes it degraded, and whether that was to be expected."""
+    """Reasons why it is degraded; None if it is not."""
 
     def line(self) -> str:
-        """For people."""
+        """Return the verdict as a line of text."""
         psnr = "" if self.psnr is None else f"  {self.psnr:.2f} dB"
         lost = "" if self.lost is None else f" ({0.0 - self.lost:+.2f})"
         steps = f"  {self.steps} steps" if self.steps else ""
@@ -50,7 +51,7 @@ class Verdict:
         return f"{self.outcome}{psnr}{lost}{steps}{skipped}  " + (self.error or self.reason or "")
 
     def cell(self) -> str:
-        """For a table: the outcome, and dB more or less than the plain run; of the plain run itself, its PSNR."""
+        """Return the text of a table's cell: the outcome and the difference of PSNR, or the PSNR of the plain run."""
         if self.psnr is None:
             return self.outcome
         if self.lost is None or self.name == PLAIN.name:
@@ -59,13 +60,16 @@ class Verdict:
 
 
 def verdicts(run: Run, views: Views, conditions: Sequence[Condition], budget: Budget) -> Iterator[Verdict]:
-    """Run a method under one condition after the other; a failure does not stop the rest.
+    """Run a method under one condition after the other, and yield a verdict on each; a failure does not stop the rest.
 
     Args:
         run: the method and its settings.
-        views: the plain photographs.
-        conditions: the plain one first, for the others are compared with it.
-    Raises: Stopped where somebody stops it.
+        views: the plain images.
+        conditions: the conditions, `PLAIN` first, with which the others are compared.
+        budget: length of each run.
+
+    Raises:
+        Stopped: if a signal stops a run.
     """
     plain = None
     for number, condition in enumerate(conditions, start=1):
@@ -78,7 +82,13 @@ def verdicts(run: Run, views: Views, conditions: Sequence[Condition], budget: Bu
 
 
 def verdict_of(condition: Condition, trial: Trial, plain: float | None) -> Verdict:
-    """Judge what a run showed; `plain` is the plain run's PSNR, dB, None where it has none."""
+    """Return the verdict on a run.
+
+    Args:
+        condition: condition of the run.
+        trial: result of the run.
+        plain: PSNR of the plain run, dB; None if it has none.
+    """
     lost = None if plain is None or trial.psnr is None else plain - trial.psnr
     reason = None
     if trial.error is not None:
@@ -92,14 +102,14 @@ def verdict_of(condition: Condition, trial: Trial, plain: float | None) -> Verdi
 
 
 def _weaknesses(condition: Condition, trial: Trial, lost: float | None) -> list[str]:
-    found = []
+    weaknesses = []
     if condition is PLAIN and trial.learnt is not None and trial.learnt < LEAST_LEARNT:
-        found.append(f"only {trial.learnt:.1f} dB better than empty pictures: too little to compare others with")
+        weaknesses.append(f"only {trial.learnt:.1f} dB better than empty pictures: too little to compare others with")
     if lost is not None and lost > condition.allowed:
-        found.append(condition.reason or f"not to be expected: at most {condition.allowed:g} dB may be lost")
+        weaknesses.append(condition.reason or f"not to be expected: at most {condition.allowed:g} dB may be lost")
     spoiled = 0 if condition.spoil is None else spoiled_batches(trial.steps)
     if trial.skipped < spoiled:
-        found.append(f"{spoiled - trial.skipped} of {spoiled} spoiled batches were learnt from")
+        weaknesses.append(f"{spoiled - trial.skipped} of {spoiled} spoiled batches were learnt from")
     if trial.skipped > spoiled and not condition.may_skip:
-        found.append(f"{trial.skipped - spoiled} of {trial.steps} steps were not finite")
-    return found
+        weaknesses.append(f"{trial.skipped - spoiled} of {trial.steps} steps were not finite")
+    return weaknesses

@@ -1,4 +1,4 @@
-"""Checks for a method's author: does it keep what the trainer and the evaluator rely on?
+"""Checks that a method fulfils the requirements of the trainer and the evaluator.
 
 In a test of your package:
 

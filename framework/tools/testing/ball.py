@@ -1,4 +1,4 @@
-"""A ball of which every picture is known in closed form: its colour tells where its surface faces."""
+"""A ball that is rendered in closed form, whose colour depends on the direction of its normal."""
 
 from __future__ import annotations
 
@@ -15,29 +15,31 @@ RADIUS = 0.7
 
 
 def trace(origins: Tensor, unit_directions: Tensor, centers: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Outward unit normals (R, 3) where rays first meet a ball's surface, and whether they do, (R,) bool.
-
-    A ray that starts inside meets the surface on its way out. Where a ray meets nothing, its normal means nothing.
+    """Intersect rays with the surface of a ball; a ray that starts inside meets it on the way out.
 
     Args:
         origins, unit_directions: (R, 3) rays.
-        centers: (3,) or (R, 3) of the ball; the origin if None.
+        centers: (3,) or (R, 3) centre of the ball for each ray, scene units; the origin if None.
+
+    Returns:
+        Outward unit normals (R, 3) at the first intersection, undefined without one, and whether there is one (R,).
     """
     from_center = origins if centers is None else origins - centers
     middle = -(from_center * unit_directions).sum(-1)
     nearest = from_center + middle[:, None] * unit_directions
     squared = RADIUS**2 - nearest.square().sum(-1)
     half = squared.clamp(min=0).sqrt()
-    first = torch.where(middle > half, -half, half)  # from the nearest point
+    first = torch.where(middle > half, -half, half)  # distance from the nearest point
     return (nearest + first[:, None] * unit_directions) / RADIUS, (squared > 0) & (middle + first > 0)
 
 
 def cameras_at(positions: Tensor, field_of_view: float, size: int) -> Cameras:
-    """Cameras at positions (M, 3) that look at the origin, z being up.
+    """Return cameras that look at the origin, with +z up.
 
     Args:
-        field_of_view: degrees.
-        size: width and height of the pictures, pixels.
+        positions: (M, 3) their positions, scene units.
+        field_of_view: horizontal and vertical angle of view, degrees.
+        size: width and height of the images, pixels.
     """
     target, up = torch.zeros(3, dtype=positions.dtype), torch.tensor([0.0, 0.0, 1.0], dtype=positions.dtype)
     poses = torch.stack([look_at(position, target, up) for position in positions]).float()

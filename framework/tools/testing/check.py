@@ -1,4 +1,4 @@
-"""All checks of a method, and which of them make sense only where others hold."""
+"""The list of all checks of a method, and the functions that run them."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from framework.tools.testing.subject import Subject
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that is asked of every method."""
+    """A requirement of every method."""
 
     name: str
-    """What findings call it."""
+    """Name of the check in findings."""
     run: Callable[[Subject], str]
-    """Says in a line what it found; raises Fault, or lets through what the method raises, where that is wrong."""
+    """Function that returns a line for people; it raises Fault, or any error of the method, if the check fails."""
     needs: tuple[str, ...] = ()
-    """Checks without which it would only find again what they have found, as far as they are made."""
+    """Names of the checks that must pass before this one, if they are run."""
     rays_only: bool = False
-    """It is made of a `RayModel` only."""
+    """Whether the check is only for models that are a `RayModel`."""
 
 
 CHECKS = (
@@ -51,27 +51,29 @@ CHECKS = (
     Check("nan rays", rendering.check_nan_rays, ("chunks",), rays_only=True),
     Check("checkpoint", storage.check_checkpoint, ("training",)),
 )
-"""In the order in which they are made."""
+"""All checks, in the order in which they run."""
 
 
 def check_method(method: Method, name: str = "the method", config: TrainConfig | None = None) -> list[Finding]:
-    """Whether a method keeps what the trainer and the evaluator rely on, on small scenes made in memory.
+    """Check that a method fulfils the requirements of the trainer and the evaluator, on small scenes made in memory.
 
-    It takes seconds on the processor where the model is small; a config with fewer layers, levels or cells makes it so.
+    On the CPU it takes seconds if the model is small, so give a config with few layers, levels or cells.
 
     Args:
-        method: as its entry point names it.
-        name: what messages call it.
-        config: settings to check it with; the method's own if None.
-    Returns: what each check found. One that needs what another has found broken is left out, so where nothing is
-        wrong all of `CHECKS` are there. What the method raises becomes a finding.
+        method: the method.
+        name: its name in messages.
+        config: settings to check it with; the method's defaults if None.
+
+    Returns:
+        A finding for each of `CHECKS` that was run. Checks that need a failed one are omitted. An error that the method
+        raises becomes a finding.
     """
     subject, findings = Subject(method, name, config), dict[str, Finding]()
     casts_rays = isinstance(method.model, type) and issubclass(method.model, RayModel)
-    made = [check for check in CHECKS if casts_rays or not check.rays_only]
-    names = {check.name for check in made}
+    checks = [check for check in CHECKS if casts_rays or not check.rays_only]
+    names = {check.name for check in checks}
     with torch.random.fork_rng(devices=[]), torch.enable_grad():
-        for check in made:
+        for check in checks:
             if all(need in findings and findings[need].ok for need in check.needs if need in names):
                 findings[check.name] = _finding(check, subject)
     return list(findings.values())
@@ -85,9 +87,15 @@ def _finding(check: Check, subject: Subject) -> Finding:
 
 
 def assert_method(method: Method, name: str = "the method", config: TrainConfig | None = None) -> None:
-    """Check a method in a test. Arguments as for `check_method`.
+    """Check a method in a test.
 
-    Raises: AssertionError that lists all that is wrong.
+    Args:
+        method: the method.
+        name: its name in messages.
+        config: settings to check it with; the method's defaults if None.
+
+    Raises:
+        AssertionError: if a check fails; the message has a line for each that does.
     """
     failed = [finding for finding in check_method(method, name, config) if not finding.ok]
     if failed:

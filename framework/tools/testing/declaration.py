@@ -1,4 +1,7 @@
-"""Checks of what a method declares: its settings and its summary."""
+"""Checks of a method's settings and summary.
+
+Each check returns a line for people, and raises Fault if it fails.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from framework.tools.testing.subject import Subject
 
 
 def check_config(subject: Subject) -> str:
-    """Settings are a frozen dataclass derived from TrainConfig, and survive config.yml."""
+    """Check that the settings of `subject` are a frozen dataclass derived from TrainConfig, and survive config.yml."""
     config = subject.config
     kind = type(config)
     if not isinstance(config, TrainConfig):
@@ -23,20 +26,20 @@ def check_config(subject: Subject) -> str:
     if "__dataclass_fields__" not in vars(kind) and inspect.get_annotations(kind):
         raise Fault(f"{kind.__name__} is no dataclass of its own; write @dataclass(frozen=True) above it")
     decided, _ = subject.method.decide(config, subject.still.scene)
-    for what, before in (("the settings", config), ("decided settings", decided)):
+    for label, before in (("the settings", config), ("decided settings", decided)):
         written = yaml.safe_dump(to_plain(before))
         after = from_plain(subject.method.config, yaml.safe_load(written), "config.yml")
         if after != before:
             lost = [f.name for f in fields(before) if getattr(after, f.name) != getattr(before, f.name)]
             raise Fault(
-                f"{what} do not survive config.yml ({', '.join(lost) or type(before).__name__}); a setting is a bool, "
+                f"{label} do not survive config.yml ({', '.join(lost) or type(before).__name__}); a setting is a bool, "
                 "a number, a string, a Path, a Literal, a tuple of those, or a dataclass of those"
             )
     return f"{len(fields(config))} settings survive config.yml"
 
 
 def check_summary(subject: Subject) -> str:
-    """The module has a docstring, whose first line is the method's summary."""
+    """Check that the module of `subject` has a docstring, whose first line is the method's summary."""
     module = type(subject.method.config).__module__
     docstring = getattr(sys.modules.get(module), "__doc__", None) or ""
     summary = docstring.strip().split("\n")[0]

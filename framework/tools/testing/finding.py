@@ -1,4 +1,4 @@
-"""What a check says."""
+"""Results of checks."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ class Finding:
     ok: bool
     """Whether the method passed it."""
     detail: str
-    """One line: what was found, where, and, if it is wrong, what to do."""
+    """A line for people: the result, and if the check failed, the scene and the remedy."""
 
     def line(self) -> str:
-        """The finding as it is printed."""
+        """Return the finding as a line of text."""
         return f"{'ok' if self.ok else 'WRONG':<6}{self.check}: {self.detail}"
 
 
 class Fault(Exception):
-    """What a check found wrong, in one line."""
+    """Failure of a check, with a message on one line."""

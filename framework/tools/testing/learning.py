@@ -1,4 +1,7 @@
-"""Checks of how a model learns: its loss, its gradients, and that training is repeatable and leads somewhere."""
+"""Checks of a model's loss and gradients, and of training: that it is reproducible and reduces the error.
+
+Each check returns a line for people, and raises Fault if it fails.
+"""
 
 from __future__ import annotations
 
@@ -18,18 +21,19 @@ from framework.tools.testing.subject import STEPS, Learner, Subject
 from framework.training.optim import first_non_finite
 
 FIRST_STEPS = 3
-"""Whose gradients are looked at."""
+"""Steps of which the gradients are checked."""
 GRADIENT_STEPS = 40
-"""Within which every parameter must have had a gradient: proposals have none until they fall short."""
+"""Steps within which each parameter must have had a gradient; proposals have one only where they are too low."""
 REPEATED_STEPS = 2
-"""After which two models are compared."""
+"""Steps after which two models are compared."""
 RAYS_PER_PIXEL = 4
+"""Rays per pixel of the second checked batch."""
 LEARNT = 0.8
-"""The most that may be left of the error after STEPS steps, as a share."""
+"""Maximum error after STEPS steps, as a fraction of the initial one."""
 
 
 def check_loss(subject: Subject) -> str:
-    """`loss` returns named scalars that are finite and lead back to the parameters, also of several rays a pixel."""
+    """Check that the loss of `subject` is finite named scalars with a gradient, with one and several rays per pixel."""
 
     def look(learner: Learner) -> None:
         for count in (1, RAYS_PER_PIXEL) if learner.model.batches == "pixels" else (1,):
@@ -58,19 +62,19 @@ def _require_loss(loss: Loss, batch: Any, of: str) -> None:
 
 
 def check_groups(subject: Subject) -> str:
-    """`groups` holds every parameter exactly once."""
+    """Check that the `groups` of `subject` have every parameter exactly once."""
 
     def look(learner: Learner) -> None:
-        known = {id(parameter): name for name, parameter in learner.model.named_parameters()}
-        held = Counter(id(p) for group in learner.model.groups() for p in group.parameters)
-        if strangers := held.keys() - known.keys():
+        names = {id(parameter): name for name, parameter in learner.model.named_parameters()}
+        counts = Counter(id(p) for group in learner.model.groups() for p in group.parameters)
+        if others := counts.keys() - names.keys():
             raise Fault(
-                f"groups() holds tensors that are no parameters of the model, {len(strangers)} of them; "
+                f"groups() holds tensors that are no parameters of the model, {len(others)} of them; "
                 "make each an attribute that is a torch.nn.Parameter"
             )
-        if twice := [known[key] for key, count in held.items() if count > 1]:
+        if twice := [names[key] for key, count in counts.items() if count > 1]:
             raise Fault(f"{_names(twice)} more than once in groups()")
-        if missing := [name for name, p in learner.model.named_parameters() if p.requires_grad and not held[id(p)]]:
+        if missing := [name for name, p in learner.model.named_parameters() if p.requires_grad and not counts[id(p)]]:
             raise Fault(f"{_names(missing)} in no group of groups(), and never updated")
 
     subject.on_each_scene(look)
@@ -78,7 +82,7 @@ def check_groups(subject: Subject) -> str:
 
 
 def check_gradients(subject: Subject) -> str:
-    """In the first steps, parameters and their gradients are finite."""
+    """Check that parameters of `subject` and their gradients are finite in the first steps."""
 
     def look(learner: Learner) -> None:
         for step in range(FIRST_STEPS):
@@ -92,18 +96,18 @@ def check_gradients(subject: Subject) -> str:
 
 
 def check_unused(subject: Subject) -> str:
-    """Every parameter that asks for a gradient gets one, sooner or later."""
+    """Check that parameters of `subject` that require a gradient have one within GRADIENT_STEPS steps."""
 
     def look(learner: Learner) -> None:
-        waiting = {name for name, parameter in learner.model.named_parameters() if parameter.requires_grad}
+        unused = {name for name, parameter in learner.model.named_parameters() if parameter.requires_grad}
         for _ in range(GRADIENT_STEPS):
             learner.step_backward()
-            waiting -= {name for name, p in learner.model.named_parameters() if _has_gradient(learner, p)}
-            if not waiting:
+            unused -= {name for name, p in learner.model.named_parameters() if _has_gradient(learner, p)}
+            if not unused:
                 return
             learner.descend()
         raise Fault(
-            f"{_names(sorted(waiting))} without a gradient, or with one of zeros, in each of {GRADIENT_STEPS} steps; "
+            f"{_names(sorted(unused))} without a gradient, or with one of zeros, in each of {GRADIENT_STEPS} steps; "
             "use it, or set requires_grad to False"
         )
 
@@ -112,7 +116,7 @@ def check_unused(subject: Subject) -> str:
 
 
 def _has_gradient(learner: Learner, parameter: Tensor) -> bool:
-    """Whether some entry has a gradient that is not zero, which of sparse tables may still wait to be added up."""
+    """Return whether any entry has a gradient other than zero; those of sparse tables may be deferred."""
     deferred = learner.optimizer.deferred.get(parameter)
     if deferred is not None and deferred.pending:
         return True
@@ -120,13 +124,13 @@ def _has_gradient(learner: Learner, parameter: Tensor) -> bool:
 
 
 def _names(names: list[str]) -> str:
-    """Some names, as the subject of a sentence."""
+    """Return up to four of the names, as the subject of a sentence."""
     some = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
     return f"{some} {'is' if len(names) == 1 else 'are'}"
 
 
 def check_repetition(subject: Subject) -> str:
-    """The same seed gives the same bits."""
+    """Check that training `subject` is reproducible: the same seed gives the same bits."""
     learners = [subject.learner(), subject.learner()]
     for learner in learners:
         for _ in range(REPEATED_STEPS):
@@ -136,7 +140,16 @@ def check_repetition(subject: Subject) -> str:
 
 
 def require_same(one: Learner, other: Learner, when: str, remedy: str) -> None:
-    """Raises: Fault where two models differ in a bit of what they keep."""
+    """Check that the parameters and buffers of two models are equal to the bit.
+
+    Args:
+        one, other: the models.
+        when: start of the message, such as "after 2 steps".
+        remedy: end of the message, what to do.
+
+    Raises:
+        Fault: if a parameter or buffer differs.
+    """
     first, second = one.model.state_dict(), other.model.state_dict()
     different = [name for name, value in first.items() if not torch.equal(value, second[name])]
     if different:
@@ -144,7 +157,7 @@ def require_same(one: Learner, other: Learner, when: str, remedy: str) -> None:
 
 
 def check_training(subject: Subject) -> str:
-    """Training goes on for a while without an error, the loss staying finite."""
+    """Check that training `subject` for STEPS steps raises no error and that the loss stays finite."""
     history = subject.trained.history
     bad = [step for step, loss in enumerate(history) if not math.isfinite(loss)]
     if bad:
@@ -153,7 +166,7 @@ def check_training(subject: Subject) -> str:
 
 
 def check_learning(subject: Subject) -> str:
-    """What is trained shows the photographs better than what is not."""
+    """Check that training `subject` for STEPS steps reduces the squared error of images."""
     before, after = subject.learner().error(), subject.trained.error()
     change = f"from {before:.3g} to {after:.3g} in {STEPS} steps"
     if not after < LEARNT * before:
@@ -165,7 +178,7 @@ def check_learning(subject: Subject) -> str:
 
 
 def check_nan_colors(subject: Subject) -> str:
-    """A photograph's NaN is seen in the loss, so that the trainer drops the step."""
+    """Check that a NaN in an image makes the loss of `subject` NaN, so that the trainer drops the step."""
     learner = subject.learner()
     batch = learner.batch()
     rgb = batch.rgb.clone()
@@ -177,7 +190,7 @@ def check_nan_colors(subject: Subject) -> str:
 
 
 def check_bfloat16(subject: Subject) -> str:
-    """Under autocast a step works, and pictures and losses are float32 and finite."""
+    """Check that a step of `subject` under bfloat16 autocast works, with finite float32 colours and losses."""
 
     def look(learner: Learner) -> None:
         batch = learner.batch()

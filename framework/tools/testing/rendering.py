@@ -1,4 +1,7 @@
-"""Checks of building a model and of the pictures it renders."""
+"""Checks of building a model and of rendering.
+
+Each check returns a line for people, and raises Fault if it fails.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +20,13 @@ from framework.tools.testing.finding import Fault
 from framework.tools.testing.subject import STRIDE, Learner, Subject
 
 TOLERANCE = 1e-3
-"""Of colours and opacities that should be the same."""
+"""Maximum difference of colours and opacities that should be equal."""
 CHUNK = 100
-"""Rays at a time where a picture is rendered in parts."""
+"""Number of rays per part when an image is rendered in parts."""
 
 
 def check_build(subject: Subject) -> str:
-    """`model(config, scene)` makes a Model with something to learn, whatever the scene."""
+    """Check that `subject` builds a Model with parameters on each scene."""
 
     model = subject.method.model
     if not (isinstance(model, type) and issubclass(model, Model)):
@@ -38,7 +41,7 @@ def check_build(subject: Subject) -> str:
 
 
 def check_render(subject: Subject) -> str:
-    """`render` fills in every field of Rendered, with the right shapes and finite numbers."""
+    """Check that `subject` renders every field of Rendered with its shape and finite values."""
 
     def look(learner: Learner) -> None:
         batch = learner.batch()
@@ -50,7 +53,16 @@ def check_render(subject: Subject) -> str:
 
 
 def require_rendered(rendered: Rendered, count: int, when: str) -> None:
-    """Raises: Fault where a picture of `count` rays lacks something."""
+    """Check the shapes and values of rendered rays.
+
+    Args:
+        rendered: the rendered rays.
+        count: number of rays.
+        when: start of the message, such as "in training".
+
+    Raises:
+        Fault: if a field has another shape or type, or a value is not finite or out of range.
+    """
     shapes: dict[str, tuple[int, ...]] = {"rgb": (count, 3)}
     shapes |= {name: (count,) for name in ("depth", "median_depth", "accumulation")}
     values = {name: getattr(rendered, name) for name in shapes}
@@ -85,7 +97,7 @@ def _require(value: Tensor, shape: tuple[int, ...], what: str) -> None:
 
 
 def check_view(subject: Subject) -> str:
-    """`render_view` fills in every field of Picture, with the right shapes and finite numbers."""
+    """Check that `subject` renders every field of Picture with its shape and finite values."""
 
     def look(learner: Learner) -> None:
         learner.model.train()
@@ -104,7 +116,7 @@ def check_view(subject: Subject) -> str:
 
 
 def check_few_rays(subject: Subject) -> str:
-    """No rays give an empty picture, and one ray a picture of one pixel."""
+    """Check that `subject` renders 0 rays and 1 ray."""
 
     def look(learner: Learner) -> None:
         batch = learner.batch()
@@ -123,14 +135,14 @@ def check_few_rays(subject: Subject) -> str:
 
 
 def check_background(subject: Subject) -> str:
-    """The background shows as far as a ray is not opaque, and where the box is missed altogether."""
+    """Check that `subject` shows the background as far as rays are not opaque, and wherever they miss the box."""
     learner = subject.learner()
     if not isinstance(learner.model, RayModel):
         dark, light = (learner.picture(background=value) for value in (0.0, 1.0))
         _require_change(light.rgb - dark.rgb, light.accumulation[..., None], "a picture")
         return "it shows as far as pixels are not opaque"
     rays = learner.view().rays
-    away = replace(rays, directions=-rays.directions)  # the cameras stand outside the box and look at it
+    away = replace(rays, directions=-rays.directions)  # the cameras are outside the box and look at it
     _require_background(learner, rays, "rays through the box")
     opaque = float(_require_background(learner, away, "rays that miss the box").max())
     if _ends_at_the_box(learner.model) and opaque > TOLERANCE:
@@ -139,14 +151,14 @@ def check_background(subject: Subject) -> str:
 
 
 def _require_background(learner: Learner, rays: Rays, what: str) -> Tensor:
-    """The opacity (R,) of rays, after a look at what black and white behind them change."""
+    """Return the opacity (R,) of rays; raise Fault if colours do not contain the background accordingly."""
     dark, light = (learner.show(rays, torch.full((3,), value)) for value in (0.0, 1.0))
     _require_change(light.rgb - dark.rgb, light.accumulation[:, None], what)
     return light.accumulation
 
 
 def _require_change(change: Tensor, accumulation: Tensor, what: str) -> None:
-    """Raises: Fault where colours do not change with the background as far as the opacity says."""
+    """Raise Fault if the change of colours from a black to a white background is not 1 - opacity."""
     transparency = 1 - accumulation
     if not bool(((change - transparency).abs() <= TOLERANCE).all()):
         raise Fault(
@@ -156,12 +168,12 @@ def _require_change(change: Tensor, accumulation: Tensor, what: str) -> None:
 
 
 def _ends_at_the_box(model: Model) -> bool:
-    """Whether a model's samplers look at nothing outside the box."""
+    """Return whether the model's samplers place no sample outside the box."""
     return bool(parts(model, SkipsCells)) or any(not sampler.unbounded for sampler in parts(model, ProposalSampler))
 
 
 def check_evaluation(subject: Subject) -> str:
-    """In evaluation a picture is the same each time."""
+    """Check that rendering `subject` in evaluation is deterministic."""
     learner = subject.trained
     first, second = (learner.picture(seed=seed).rgb for seed in (1, 2))
     if not torch.equal(first, second):
@@ -173,12 +185,12 @@ def check_evaluation(subject: Subject) -> str:
 
 
 def check_chunks(subject: Subject) -> str:
-    """A ray's colour does not depend on which others are rendered with it."""
+    """Check that a ray's colour from `subject` does not depend on the other rays of a batch."""
     learner = subject.trained
     view = learner.view()
     whole = learner.show(view.rays, view.background)
-    ends = [slice(start, start + CHUNK) for start in range(0, len(view.rays), CHUNK)]
-    parts = [learner.show(view.rays[part], view.background[part]) for part in ends]
+    slices = [slice(start, start + CHUNK) for start in range(0, len(view.rays), CHUNK)]
+    parts = [learner.show(view.rays[part], view.background[part]) for part in slices]
     for name in ("rgb", "accumulation"):
         worst = float((torch.cat([getattr(part, name) for part in parts]) - getattr(whole, name)).abs().max())
         if not worst <= TOLERANCE:
@@ -190,16 +202,16 @@ def check_chunks(subject: Subject) -> str:
 
 
 def check_nan_rays(subject: Subject) -> str:
-    """A ray that is not finite spoils its own colour only."""
+    """Check that a ray that is not finite does not change the colours of other rays of `subject`."""
     learner = subject.trained
     view = learner.view()
     whole = learner.show(view.rays, view.background).rgb
     broken = len(view.rays) // 2
     others = torch.arange(len(view.rays)) != broken
-    found = learner.show(_with_nan(view.rays, broken), view.background).rgb
-    spoilt = ~((found - whole)[others].abs() <= TOLERANCE).all(-1)
-    if bool(spoilt.any()):
-        raise Fault(f"a ray whose origin is NaN changes the colours of {int(spoilt.sum())} of {len(spoilt)} other rays")
+    rgb = learner.show(_with_nan(view.rays, broken), view.background).rgb
+    wrong = ~((rgb - whole)[others].abs() <= TOLERANCE).all(-1)
+    if bool(wrong.any()):
+        raise Fault(f"a ray whose origin is NaN changes the colours of {int(wrong.sum())} of {len(wrong)} other rays")
     return "a ray that is NaN spoils its own colour only"
 
 

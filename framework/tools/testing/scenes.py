@@ -1,4 +1,4 @@
-"""Scenes for checks: a ball whose colour tells where its surface faces, traced in closed form."""
+"""Scenes for checks: a ball that is coloured by its normals and rendered in closed form."""
 
 from __future__ import annotations
 
@@ -15,57 +15,57 @@ from framework.geometry.rays import Rays
 from framework.tools.testing.ball import cameras_at, trace
 
 COUNT, SIZE = 8, 24
-"""Photographs, and their width and height, pixels."""
+"""Number of images, and their width and height, pixels."""
 DISTANCE = 3.0
-"""Of the cameras from the origin, scene units. The box reaches from -1 to 1."""
+"""Distance of the cameras from the origin, scene units. The box is [-1, 1]^3."""
 FIELD_OF_VIEW = 40.0
-"""Degrees."""
+"""Angle of view of the cameras, degrees."""
 RISE = 0.25
-"""How far up and down the ball goes that moves, scene units."""
+"""Maximum height of the moving ball above and below the origin, scene units."""
 
 
 def ball_in_a_box() -> Dataset:
-    """A ball at the origin; what is around it is transparent."""
-    colors, shown = _ball(_rays(), torch.zeros(3))
-    return _dataset(torch.cat([colors, shown[:, None]], dim=-1))
+    """Return images of a ball at the origin, transparent around it."""
+    colors, hits = _ball(_rays(), torch.zeros(3))
+    return _dataset(torch.cat([colors, hits[:, None]], dim=-1))
 
 
 def ball_under_a_sky() -> Dataset:
-    """The same in front of a sky that is infinitely far away: photographs without alpha, a scene without end."""
+    """Return images of a ball at the origin before a sky at infinity: without alpha, in an unbounded scene."""
     rays = _rays()
-    colors, shown = _ball(rays, torch.zeros(3))
-    return _dataset(torch.where(shown[:, None] > 0, colors, 0.5 + 0.4 * rays.directions), unbounded=True)
+    colors, hits = _ball(rays, torch.zeros(3))
+    return _dataset(torch.where(hits[:, None] > 0, colors, 0.5 + 0.4 * rays.directions), unbounded=True)
 
 
 def moving_ball() -> Dataset:
-    """A ball that rises from photograph to photograph; what is around it is transparent."""
+    """Return images of a ball that rises over time, transparent around it."""
     rays, times = _rays(), torch.linspace(0, 1, COUNT)
     assert rays.camera_indices is not None
     heights = RISE * (2 * times[rays.camera_indices] - 1)
-    colors, shown = _ball(rays, heights[:, None] * torch.tensor([0.0, 0.0, 1.0]))
-    return _dataset(torch.cat([colors, shown[:, None]], dim=-1), times)
+    colors, hits = _ball(rays, heights[:, None] * torch.tensor([0.0, 0.0, 1.0]))
+    return _dataset(torch.cat([colors, hits[:, None]], dim=-1), times)
 
 
 def _cameras() -> Cameras:
-    """Around the origin and looking at it, some from above and some from below."""
-    turn = torch.arange(COUNT) * (2 * math.pi / COUNT)
-    back = normalize(torch.stack([turn.cos(), turn.sin(), 0.5 * (3 * turn).sin()], dim=-1), dim=-1)
+    """Return cameras around the origin that look at it, some from above and some from below."""
+    angle = torch.arange(COUNT) * (2 * math.pi / COUNT)
+    back = normalize(torch.stack([angle.cos(), angle.sin(), 0.5 * (3 * angle).sin()], dim=-1), dim=-1)
     return cameras_at(DISTANCE * back, FIELD_OF_VIEW, SIZE)
 
 
 def _rays() -> Rays:
-    """Through every pixel of every photograph."""
+    """Return rays through all pixels of all images."""
     return _cameras().pixel_rays(torch.arange(COUNT * SIZE * SIZE), 0.0, 2 * DISTANCE)
 
 
 def _ball(rays: Rays, centers: Tensor) -> tuple[Tensor, Tensor]:
-    """Colours (R, 3) of balls around `centers`, (R, 3) or (3,), and 1 where (R,) a ray meets its ball, else 0."""
+    """Return colours (R, 3) of balls with centres (R, 3) or (3,), and whether each ray meets its ball (R,), 1 or 0."""
     normals, hits = trace(rays.origins, rays.directions, centers)
     return 0.5 + 0.4 * normals.clamp(-1, 1), hits.float()
 
 
 def _dataset(colors: Tensor, times: Tensor | None = None, unbounded: bool = False) -> Dataset:
-    """Photographs with colours (P, 3 or 4) in [0, 1]."""
+    """Return a data set of images with colours (P, 3 or 4) in [0, 1]."""
     cameras = _cameras()
     scene = Scene(
         box=torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]),

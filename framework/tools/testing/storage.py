@@ -1,4 +1,4 @@
-"""The check of checkpoints: what is loaded shows the same and learns on as if nothing had happened."""
+"""The check of checkpoints, which returns a line for people and raises Fault if it fails."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from framework.training.trained import restore_model
 
 
 def check_checkpoint(subject: Subject) -> str:
-    """A model that is loaded renders the same picture, and takes the same next step, bit for bit."""
+    """Check that a model of `subject`, loaded from a checkpoint, renders and trains as the saved one, to the bit."""
     trained, loaded = subject.trained, subject.learner(seed=SEED + 1)
-    _hand_over(trained, loaded)
+    _load_saved(trained, loaded)
     before, after = (learner.picture() for learner in (trained, loaded))
     remedy = "what a model remembers must be a parameter or a buffer (register_buffer), so that state_dict() holds it"
     for name in ("rgb", "median_depth", "accumulation"):
@@ -29,8 +29,8 @@ def check_checkpoint(subject: Subject) -> str:
     return "a loaded one gives the same picture and the same next step, bit for bit"
 
 
-def _hand_over(trained: Learner, fresh: Learner) -> None:
-    """Load into one what the other saves."""
+def _load_saved(trained: Learner, fresh: Learner) -> None:
+    """Save the trained model and optimiser, and load them into the fresh ones."""
     content = {"model": trained.model.state_dict(), "optimizer": trained.optimizer.state_dict()}
     with tempfile.TemporaryDirectory() as folder:
         content = load_checkpoint(save_checkpoint(Path(folder), trained.done, content, keep_all=True))

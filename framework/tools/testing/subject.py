@@ -1,4 +1,4 @@
-"""A method under test: how checks build, train and show it."""
+"""The method under test: functions with which checks build, train and render it."""
 
 from __future__ import annotations
 
@@ -31,26 +31,26 @@ from framework.training.optim import Adam, make_optimizer, set_learning_rate
 from framework.training.step import backward, forward
 
 RAYS = 256
-"""In a step, at most."""
+"""Maximum number of pixels in a step."""
 STEPS = 60
-"""Of the training that several checks look at."""
+"""Training steps of the model that several checks share."""
 BUDGET = 200
-"""Steps that schedules take the run to have; checks train for the first of them."""
+"""Number of steps for which schedules are computed; checks take the first of them."""
 SEED = 42
 STRIDE = 3
-"""Of an image's rows and columns, one in so many is shown when a picture is judged."""
+"""Distance between the rendered rows and columns of an image."""
 SHOWN_EVERY = 9
-"""Of all pixels, one in so many is shown when rays are judged."""
+"""Distance between rendered pixels, counted through all images, if rays are rendered."""
 
 
 class Learner:
-    """A model that takes the trainer's steps on one scene.
+    """A model that is trained on one scene, with the trainer's steps.
 
     Args:
-        method: what is trained.
-        config: its settings.
-        dataset: the scene's images.
-        seed: of the model's first parameters.
+        method: the method.
+        config: the method's settings.
+        dataset: images of the scene.
+        seed: random seed of the initial parameters.
     """
 
     def __init__(self, method: Method, config: TrainConfig, dataset: Dataset, seed: int) -> None:
@@ -60,35 +60,35 @@ class Learner:
         self.model: Model[Any] = method.build(self.config, dataset.scene)
         self.source = make_source(self.model.batches, dataset, self.config)
         self.done = 0
-        """Steps taken."""
+        """Number of training steps done."""
         self.history: list[float] = []
-        """The loss before each."""
+        """Loss before each step."""
         self.has_gradient = False
-        """Whether the last loss leads back to the parameters; it does not where every ray meets nothing."""
+        """Whether the last loss has a graph; it has none if no ray has a sample."""
 
     @cached_property
     def optimizer(self) -> Adam:
-        """As the trainer makes it."""
+        """The trainer's optimiser of the model."""
         return make_optimizer(self.model, self.config)
 
     # -- learning ---------------------------------------------------------------------------------------------
 
     def batch(self, rays_per_pixel: int = 1) -> Any:
-        """Return what the next step learns from.
+        """Return the batch of the next step.
 
         Args:
-            rays_per_pixel: rays through each pixel, where it is pixels.
+            rays_per_pixel: rays through each pixel, if the batch is of pixels.
         """
         seed_step(SEED, self.done)
         count = min(self.config.num_rays_per_batch, RAYS) if isinstance(self.config, RayConfig) else 0
         return self.source.draw(Request(self.done, count, rays_per_pixel))
 
     def rendered(self, rays: Rays, background: Tensor) -> Rendered:
-        """Return what rays show as the next step sees it; of a model that casts rays.
+        """Render rays as in the next training step; the model must cast rays.
 
         Args:
             rays: R rays.
-            background: (R, 3) or (3,).
+            background: (R, 3) or (3,) colour behind transparent rays.
         """
         self.model.train()
         self.model.before_step(self.done, self.done / BUDGET)
@@ -96,33 +96,33 @@ class Learner:
 
     @property
     def rays_model(self) -> RayModel[Any]:
-        """The model, which casts rays."""
+        """The model, which must cast rays."""
         assert isinstance(self.model, RayModel)
         return self.model
 
     def loss(self, batch: Any, bfloat16: bool = False) -> Loss:
-        """Return what the method makes of a batch in the next step.
+        """Return the loss of a batch in the next step.
 
         Args:
-            batch: what is learnt from.
-            bfloat16: run networks in bfloat16.
+            batch: pixels or views, as the model's loss takes them.
+            bfloat16: whether networks run in bfloat16.
         """
         return forward(self.model, batch, self.done, self.done / BUDGET, bfloat16)
 
     def step(self) -> None:
-        """Take one step of training."""
+        """Take one training step."""
         self.step_backward()
         self.descend()
 
     def step_backward(self) -> None:
-        """Take the first half of a step: its gradients."""
+        """Take the first half of a training step: compute the gradients."""
         self.backward(self.loss(self.batch()))
 
     def backward(self, loss: Loss) -> None:
-        """Leave the gradients of a loss where the optimiser finds them.
+        """Compute the gradients of a loss, for `descend`.
 
         Args:
-            loss: of a batch.
+            loss: loss of a batch.
         """
         total = loss.total
         self.has_gradient = total.requires_grad
@@ -130,7 +130,7 @@ class Learner:
         self.history.append(float(total.detach()))
 
     def descend(self) -> None:
-        """Take the second half: the optimiser's step, where there are gradients, and what the model does then."""
+        """Take the second half of a training step: update the parameters, if there are gradients."""
         set_learning_rate(self.optimizer, self.config, self.done, self.done / BUDGET)
         if self.has_gradient:
             self.optimizer.step()
@@ -138,39 +138,39 @@ class Learner:
             self.optimizer.change_rows(change)
         self.done += 1
 
-    # -- looking ----------------------------------------------------------------------------------------------
+    # -- rendering --------------------------------------------------------------------------------------------
 
     def view(self) -> PixelBatch:
-        """Return some pixels of every image, over white."""
+        """Return every SHOWN_EVERY-th pixel of all images, over white."""
         flat = torch.arange(0, len(self.dataset.pixels), SHOWN_EVERY)
         return gather_batch(self.dataset, flat, background_colors("white", len(flat), flat.device))
 
     @torch.no_grad()
     def show(self, rays: Rays, background: Tensor, seed: int = SEED) -> Rendered:
-        """Return what rays show as the evaluator sees it: of no training camera, whatever was drawn before.
+        """Render rays as in an evaluation, as those of no training camera.
 
         Args:
             rays: R rays.
-            background: (R, 3) or (3,).
-            seed: of torch's generator.
+            background: (R, 3) or (3,) colour behind transparent rays.
+            seed: random seed.
         """
         self.model.eval()
         seed_step(seed, 0)
         return self.rays_model.render(replace(rays, camera_indices=None), background)
 
     def picture(self, index: int = 0, background: float = 1.0, seed: int = SEED) -> Picture:
-        """Return the picture of a view as the evaluator sees it.
+        """Render every STRIDE-th row and column of a view, as in an evaluation.
 
         Args:
-            index: which image's view.
-            background: all channels of the colour behind it.
-            seed: of torch's generator.
+            index: index of the view's image.
+            background: grey level behind transparent pixels, in [0, 1].
+            seed: random seed.
         """
         seed_step(seed, 0)
         return self.model.render_view(self.dataset.view(index, STRIDE), torch.full((3,), background))
 
     def error(self) -> float:
-        """Return the mean squared error of some pixels of every image, over white."""
+        """Return the mean squared error of every STRIDE-th row and column of all images, over white."""
         errors = []
         for index in range(len(self.dataset)):
             rgba = every(self.dataset.image(index), STRIDE).float() / 255
@@ -179,12 +179,12 @@ class Learner:
 
 
 class Subject:
-    """The method under test.
+    """A method under test, with its settings and scenes.
 
     Args:
-        method: what is tested.
-        name: what messages call it.
-        config: its settings; its own if None.
+        method: the method.
+        name: its name in messages.
+        config: its settings; the method's defaults if None.
     """
 
     def __init__(self, method: Method, name: str, config: TrainConfig | None) -> None:
@@ -193,45 +193,51 @@ class Subject:
 
     @cached_property
     def still(self) -> Dataset:
-        """A still scene in a box, whose photographs have alpha."""
+        """Images with alpha of a still scene in a box."""
         return ball_in_a_box()
 
     @cached_property
     def scenes(self) -> dict[str, Dataset]:
-        """All that the method has to cope with, by what messages call it."""
+        """Data sets of all scenes for the method, by their names in messages."""
         scenes = {"a still scene in a box": self.still, "photographs without alpha or box": ball_under_a_sky()}
         if issubclass(self.method.model, LearnsMotion):
             scenes["a scene that moves"] = moving_ball()
         return scenes
 
     def learner(self, dataset: Dataset | None = None, seed: int = SEED) -> Learner:
-        """A fresh model on a scene; on the still one if None."""
+        """Return a fresh model on a scene.
+
+        Args:
+            dataset: images of the scene; of the still one if None.
+            seed: random seed of the initial parameters.
+        """
         return Learner(self.method, self.config, dataset or self.still, seed)
 
     @cached_property
     def trained(self) -> Learner:
-        """A model after STEPS steps on the still scene."""
+        """A model trained for STEPS steps on the still scene."""
         learner = self.learner()
         for _ in range(STEPS):
             learner.step()
         return learner
 
     def on_each_scene(self, look: Callable[[Learner], None]) -> None:
-        """Let `look` judge a fresh model on each of `scenes`.
+        """Call `look` with a fresh model on each of `scenes`.
 
-        Raises: Fault that names the scene.
+        Raises:
+            Fault: if `look` raises an error; the message names the scene.
         """
-        for where, dataset in self.scenes.items():
+        for scene, dataset in self.scenes.items():
             try:
                 look(self.learner(dataset))
             except Exception as error:
-                raise Fault(f"on {where}: {self.described(error)}") from error
+                raise Fault(f"on {scene}: {self.described(error)}") from error
 
     def described(self, error: Exception) -> str:
-        """An error in one line, with the last line of the method's own file that led to it."""
+        """Return the message of an `error` on one line, with the last line of the method's file in its traceback."""
         if isinstance(error, Fault):
             return str(error)
-        said = " ".join(f"{type(error).__name__}: {error}".split())[:300]
+        message = " ".join(f"{type(error).__name__}: {error}".split())[:300]
         file = getattr(sys.modules.get(type(self.method.config).__module__), "__file__", None)
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
-        return f"{said} ({Path(str(file)).name}, line {lines[-1]})" if lines else said
+        return f"{message} ({Path(str(file)).name}, line {lines[-1]})" if lines else message

@@ -265,7 +265,11 @@ def _surfaces(config: GaussianSplattingConfig, dataset: Dataset) -> tuple[Tensor
     seconds, count = config.field_seconds, config.start_gaussians
     assert seconds is not None and count is not None
     field = replace(
-        load_method("instant-ngp").config, max_seconds=seconds, vis="none", machine=config.machine, background=config.background
+        load_method("instant-ngp").config,
+        max_seconds=seconds,
+        vis="none",
+        machine=config.machine,
+        background=config.background,
     )
     trainer = Trainer(Run("instant-ngp", field, "", cast("Any", None), Path()), dataset, None)
     while trainer.state.seconds < seconds:

@@ -120,7 +120,9 @@ def project_reference(
     fx, fy, cx, cy = camera.intrinsics
     pose = camera.pose.to(means)
     at = means @ pose[:, :3].T + pose[:, 3]
-    everything = torch.cat([at, log_scales.exp(), rotations, logits[:, None], colors, harmonics[..., :basis].flatten(1)], 1)
+    everything = torch.cat(
+        [at, log_scales.exp(), rotations, logits[:, None], colors, harmonics[..., :basis].flatten(1)], 1
+    )
     finite = everything.isfinite().all(1) & (rotations.square().sum(1) > 1e-24)
     shown = finite & (at[:, 2] > camera.near)
     kept = shown.nonzero()[:, 0]

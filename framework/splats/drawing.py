@@ -82,7 +82,9 @@ def draw(gaussians: Gaussians, camera: SplatCamera, background: Tensor, degree: 
 
 
 @torch.no_grad()
-def draw_view(gaussians: Gaussians, view: View, background: Tensor, near: float, far: float, antialiased: bool) -> Picture:
+def draw_view(
+    gaussians: Gaussians, view: View, background: Tensor, near: float, far: float, antialiased: bool
+) -> Picture:
     """Draw what a view shows.
 
     Args:

@@ -30,7 +30,9 @@ def from_points(points: Tensor, colors: Tensor, degree: int, opacity: float = OP
     turn[:, 0] = 1
     logits = points.new_full((count,), opacity).logit()
     harmonics = points.new_zeros(count, 3, (degree + 1) ** 2 - 1)
-    return Gaussians(points, distance.log()[:, None].expand(-1, 3).clone(), turn, logits, (colors - 0.5) / DC, harmonics)
+    return Gaussians(
+        points, distance.log()[:, None].expand(-1, 3).clone(), turn, logits, (colors - 0.5) / DC, harmonics
+    )
 
 
 def neighbour_distance(points: Tensor) -> Tensor:

@@ -28,6 +28,8 @@ from framework.splats.start import from_points, hull_points, seen_colors
 
 HULL_CELLS = 128
 """Cells of the visual hull along an axis."""
+FIELD_STEPS = 120
+"""The least steps of the field on whose surfaces Gaussians start: a busy machine may take few in the time."""
 FIELD_OPACITY, FIELD_SIZE = 0.5, 0.7
 """Of Gaussians on a field's surfaces at the start: opacity, and standard deviation in distances to neighbours."""
 
@@ -123,16 +125,16 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         super().__init__(config, scene)
         rate, higher = config.learning_rate, (config.degree + 1) ** 2 - 1
 
-        def table(width: int, name: str, times: float, schedule: Literal["constant", "exponential"]) -> _Table:
+        def table(width: int, name: str, times: float, schedule: Literal["constant"] | None = "constant") -> _Table:
             return _Table(width, Optimised(name, times * rate, schedule=schedule, sparse=True))
 
         self.extent = _extent(scene)
-        self.means = table(3, "means", config.position_rate / 5e-3 * self.extent, "exponential")
-        self.log_scales = table(3, "scales", 1.0, "constant")
-        self.rotations = table(4, "rotations", 0.2, "constant")
-        self.logits = table(1, "opacities", 10.0, "constant")
-        self.colors = table(3, "colors", 0.5, "constant")
-        self.harmonics = table(3 * higher, "harmonics", 0.025, "constant")
+        self.means = table(3, "means", config.position_rate / rate * self.extent, None)
+        self.log_scales = table(3, "scales", 1.0)
+        self.rotations = table(4, "rotations", 0.2)
+        self.logits = table(1, "opacities", 10.0)
+        self.colors = table(3, "colors", 0.5)
+        self.harmonics = table(3 * higher, "harmonics", 0.025)
         self.progress = 0.0
 
     @property
@@ -272,7 +274,7 @@ def _surfaces(config: GaussianSplattingConfig, dataset: Dataset) -> tuple[Tensor
         background=config.background,
     )
     trainer = Trainer(Run("instant-ngp", field, "", cast("Any", None), Path()), dataset, None)
-    while trainer.state.seconds < seconds:
+    while trainer.state.seconds < seconds or trainer.state.step < FIELD_STEPS:
         trainer.train_step()
     model = trainer.model.eval()
     points, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]

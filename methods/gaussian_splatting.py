@@ -6,6 +6,7 @@ where they are needed as in Kheradmand et al., "3D Gaussian Splatting as Markov 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,8 +17,9 @@ from torch import Tensor, nn
 
 from framework import Decision, Loss, Method, Model, Optimised, Picture, RowChange, Scene, TrainConfig, View, ViewBatch
 from framework.base.config import AT_LEAST_0, Range
-from framework.base.console import say
+from framework.base.console import say, track
 from framework.base.decisions import Choice, fill
+from framework.base.errors import ConfigError
 from framework.data.dataset import Dataset
 from framework.kernels.ssim import ssim
 from framework.scene.silhouettes import Silhouettes, visual_hull
@@ -25,24 +27,34 @@ from framework.splats.drawing import draw, draw_view, splat_camera
 from framework.splats.gaussians import MAX_DEGREE, Gaussians
 from framework.splats.mcmc import moved, shaken
 from framework.splats.start import from_points, hull_points, seen_colors
+from framework.training.optim import learning_rate_factor
 
+STEPS_PER_SECOND = 25
+"""Training steps a second, about, of 400 x 400 pixels on two cores; for what is decided by the budget."""
+NOISE, PENALTY = 5e5, 0.01
+"""Noise and both penalties (Kheradmand et al. 2024), where Gaussians have to find their places."""
+WITHOUT_IMAGES = 1_000
+"""Maximum number of Gaussians of a model that has seen no images yet."""
 HULL_CELLS = 128
 """Cells of the visual hull along an axis."""
-FIELD_STEPS = 120
-"""The least steps of the field on whose surfaces Gaussians start: a busy machine may take few in the time."""
+SMALLEST_SSIM = 11
+"""Pixels of an image's shorter side from which it has an SSIM."""
 FIELD_OPACITY, FIELD_SIZE = 0.5, 0.7
 """Of Gaussians on a field's surfaces at the start: opacity, and standard deviation in distances to neighbours."""
 
 
 @dataclass(frozen=True)
 class GaussianSplattingConfig(
-    TrainConfig, max_num_iterations=30_000, learning_rate=5e-3, lr_schedule="exponential", lr_final=0.1, adam_eps=1e-15
+    TrainConfig, max_num_iterations=30_000, learning_rate=5e-3, lr_final=0.1, adam_beta2=0.99, adam_eps=1e-15
 ):
     """Settings of gaussian-splatting."""
 
     RANGES: ClassVar[dict[str, Range]] = {
         "num_gaussians": (1, 10_000_000),
         "start_gaussians": (1, 10_000_000),
+        "field_steps": (1, math.inf),
+        "rate_factor": AT_LEAST_0,
+        "position_rate": AT_LEAST_0,
         "degree": (0, MAX_DEGREE),
         "ssim_weight": (0, 1),
         "growth_end": (0, 1),
@@ -54,51 +66,60 @@ class GaussianSplattingConfig(
     }
     """Allowed range of each numeric setting."""
     num_gaussians: int | None = None
-    """The most Gaussians; by the time there is if not given."""
-    start_gaussians: int | None = None
-    """Gaussians at the start, where they do not start at the points of a reconstruction."""
+    """Maximum number of Gaussians; by the budget if not given."""
     start: Literal["auto", "points", "field", "silhouettes", "random"] = "auto"
-    """Where they start: at the points of a reconstruction, on surfaces that a short run of instant-ngp finds, along the
-    silhouettes' hull, or anywhere in the box."""
-    field_seconds: float | None = None
-    """Seconds for which instant-ngp is trained first, where Gaussians start on its surfaces."""
+    """Where Gaussians start: at the points of a reconstruction, on surfaces that a short run of instant-ngp finds, in
+    the visual hull of the images' silhouettes, or anywhere in the box. auto: the first of points and field that there
+    is."""
+    start_gaussians: int | None = None
+    """Gaussians at the start, except at the points of a reconstruction; two thirds of the maximum if not given."""
+    field_steps: int | None = None
+    """Training steps of that field; by the budget if not given."""
+    rate_factor: float | None = None
+    """Factor of all learning rates; by the budget if not given, as fewer steps have to go farther."""
+    position_rate: float = 8e-5
+    """Learning rate of centres before that factor, per scene extent (the cameras' largest distance from their mean)."""
     degree: int = 3
     """Highest degree of the spherical harmonics that colours are made of."""
     ssim_weight: float = 0.2
-    """Share of 1 - SSIM in the loss; the rest is the absolute error."""
+    """Weight of 1 - SSIM in the loss; the absolute error has the rest."""
     antialiased: bool = False
-    """Make up for the width that each Gaussian has at least on an image by its opacity (Mip-Splatting)."""
+    """Compensate the minimum width of a Gaussian on an image by its opacity (Mip-Splatting)."""
     growth_end: float = 0.8
     """Share of the budget after which no Gaussian is added or moved."""
     steps_per_move: int = 100
     """Steps between two moves of Gaussians that have become transparent."""
-    noise: float = 5e5
-    """Noise of nearly transparent Gaussians, times the learning rate of centres."""
-    opacity_penalty: float = 0.01
-    """Weight of the mean opacity in the loss."""
-    scale_penalty: float = 0.01
-    """Weight of the mean scale in the loss."""
-    reduced_until: float = 0.25
+    noise: float | None = None
+    """Noise of nearly transparent Gaussians, times the learning rate of centres; by the start if not given."""
+    opacity_penalty: float | None = None
+    """Weight of the mean opacity in the loss; by the start if not given."""
+    scale_penalty: float | None = None
+    """Weight of the mean scale, in scene extents, in the loss; by the start if not given."""
+    reduced_until: float = 0.0
     """Share of the budget in which images are half as wide and high."""
-    position_rate: float = 1.6e-4
-    """Learning rate of centres, in times the cameras' mean distance from the scene's middle."""
 
 
 def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplattingConfig, list[Decision]]:
-    """Return the settings with what the scene and the budget decide, and why.
+    """Return the settings with what the budget decides, and why.
 
     Args:
         config: settings, some of which may be open.
         scene: facts about the data.
     """
-    seconds = config.max_seconds
-    count = 1_000_000 if seconds is None else int(min(max(1_000 * seconds, 20_000), 200_000))
-    return fill(
+    seconds = min(config.max_seconds or math.inf, config.max_num_iterations / STEPS_PER_SECOND)
+    count = int(min(max(8_000 * math.sqrt(seconds), 20_000), 1_000_000))
+    factor = min(max((30_000 / (STEPS_PER_SECOND * seconds)) ** 0.44, 1.0), 5.0)
+    why = "that suits the time"
+    config, made = fill(config, Choice("num_gaussians", count, why, "Gaussians", f"up to {count:,}"))
+    assert config.num_gaussians is not None
+    first = max(config.num_gaussians * 2 // 3, 1)
+    config, more = fill(
         config,
-        Choice("num_gaussians", count, "that suits the time", "Gaussians", f"up to {count:,}"),
-        Choice("field_seconds", 5.0 if seconds is None else min(max(0.1 * seconds, 3.0), 15.0), "a tenth of the time"),
-        Choice("start_gaussians", count // 4, "a quarter of them", "Gaussians at the start", f"{count // 4:,}"),
+        Choice("start_gaussians", first, "the others are added", "Gaussians at the start", f"{first:,}"),
+        Choice("field_steps", int(min(max(2 * seconds, 120), 400)), why, "steps of a field to start from"),
+        Choice("rate_factor", round(factor, 2), "fewer steps have to go farther", "factor of learning rates"),
     )
+    return config, made + more
 
 
 class _Table(nn.Module):
@@ -120,22 +141,32 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
     """Gaussians that are drawn onto whole images."""
 
     batches: ClassVar[Literal["pixels", "views"]] = "views"
+    found: Tensor
+    """Whether the first Gaussians lay on surfaces, so that none has to look for its place."""
 
     def __init__(self, config: GaussianSplattingConfig, scene: Scene) -> None:
         super().__init__(config, scene)
-        rate, higher = config.learning_rate, (config.degree + 1) ** 2 - 1
+        higher, factor = (config.degree + 1) ** 2 - 1, config.rate_factor
+        assert factor is not None
+        rate = factor * config.learning_rate
 
         def table(width: int, name: str, times: float, schedule: Literal["constant"] | None = "constant") -> _Table:
             return _Table(width, Optimised(name, times * rate, schedule=schedule, sparse=True))
 
         self.extent = _extent(scene)
-        self.means = table(3, "means", config.position_rate / rate * self.extent, None)
+        self.position_rate = factor * config.position_rate * self.extent
+        self.means = table(3, "means", self.position_rate / rate, None)
         self.log_scales = table(3, "scales", 1.0)
         self.rotations = table(4, "rotations", 0.2)
         self.logits = table(1, "opacities", 10.0)
         self.colors = table(3, "colors", 0.5)
         self.harmonics = table(3 * higher, "harmonics", 0.025)
+        self.register_buffer("found", torch.tensor(False))
         self.progress = 0.0
+        assert config.start_gaussians is not None
+        box = scene.box
+        anywhere = box[0] + torch.rand(min(config.start_gaussians, WITHOUT_IMAGES), 3) * (box[1] - box[0])
+        self._set(from_points(anywhere, torch.full_like(anywhere, 0.5), config.degree))
 
     @property
     def runs_on_kernels(self) -> bool:
@@ -144,6 +175,10 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
     @property
     def uses_bfloat16(self) -> bool:
         return False  # there is no network
+
+    def _chosen(self, given: float | None, otherwise: float) -> float:
+        """Return a setting that is by the start if not given: Gaussians on surfaces need no search for places."""
+        return given if given is not None else (0.0 if bool(self.found) else otherwise)
 
     def parameters_of_gaussians(self) -> list[nn.Parameter]:
         """Return the six tables."""
@@ -167,32 +202,41 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         Args:
             dataset: images to learn from.
         """
-        if self.config.start == "field":
+        kind = self.config.start
+        if kind == "auto":
+            kind = "field" if dataset.points is None else "points"
+        if kind == "field":
             with torch.enable_grad():
                 points, colors = _surfaces(self.config, dataset)
-            self._set(from_points(points, colors, self.config.degree, FIELD_OPACITY, FIELD_SIZE))
-            how = "on a field's surfaces"
+            first = from_points(points, colors, self.config.degree, FIELD_OPACITY, FIELD_SIZE)
         else:
-            points, how = self._first_points(dataset)
-            self._set(from_points(points, seen_colors(points, dataset), self.config.degree))
-        say(f"  {len(points):,} Gaussians start {how}")
-
-    def _first_points(self, dataset: Dataset) -> tuple[Tensor, str]:
-        start, count, scene = self.config.start, self.config.start_gaussians, self.scene
-        assert count is not None
-        if start in ("auto", "points") and dataset.points is not None:
-            return dataset.points.to(self.device), "at the reconstruction's points"
-        if start in ("auto", "silhouettes") and scene.has_alpha and dataset.cameras.model == "pinhole":
-            box = scene.box.to(self.device)
-            hull = visual_hull(Silhouettes.of(dataset), box, HULL_CELLS)
-            if bool(hull.any()):
-                return hull_points(hull, box, HULL_CELLS, count), "along the silhouettes' hull"
-        box = scene.box.to(self.device)
-        return box[0] + torch.rand(count, 3, device=self.device) * (box[1] - box[0]), "anywhere in the box"
+            points = self._first_points(kind, dataset)
+            first = from_points(points, seen_colors(points, dataset), self.config.degree)
+        self._set(first)
+        self.found.fill_(kind == "field")
+        where = {"points": "at the points of a reconstruction", "field": "on the surfaces of a field"}
+        where |= {"silhouettes": "in the visual hull", "random": "anywhere in the box"}
+        say(f"  {len(first):,} Gaussians start {where[kind]}")
 
     def _set(self, gaussians: Gaussians) -> None:
         for parameter, values in zip(self.parameters_of_gaussians(), vars(gaussians).values(), strict=True):
             parameter.data = values.reshape(len(gaussians), parameter.shape[1]).contiguous()
+
+    def _first_points(self, kind: str, dataset: Dataset) -> Tensor:
+        count, box = self.config.start_gaussians, self.scene.box.to(self.device)
+        assert count is not None
+        if kind == "points":
+            if dataset.points is None:
+                raise ConfigError("--start points: the data has no points of a reconstruction; leave out --start")
+            return dataset.points.to(self.device)
+        if kind == "silhouettes":
+            if not self.scene.has_alpha or dataset.cameras.model != "pinhole":
+                raise ConfigError("--start silhouettes needs pinhole images with alpha; leave out --start")
+            hull = visual_hull(Silhouettes.of(dataset), box, HULL_CELLS)
+            if bool(hull.any()):
+                return hull_points(hull, box, HULL_CELLS, count)
+            say("warning: the images' alpha leaves no part of the box; Gaussians start anywhere in it")
+        return box[0] + torch.rand(count, 3, device=self.device) * (box[1] - box[0])
 
     # -- training ---------------------------------------------------------------------------------------------
 
@@ -206,21 +250,17 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         target = batch.rgb if reduced == 1 else _halved(batch.rgb)
         gaussians = self._all()
         rgb = draw(gaussians, camera, batch.background, self._degree).rgb
+        if batch.kept is not None:  # what does not count is as it should be
+            kept = batch.kept if reduced == 1 else _halved(batch.kept[..., None].float())[..., 0] == 1
+            target = torch.where(kept[..., None], target, rgb.detach())
         terms = {"rgb": (1 - config.ssim_weight) * (rgb - target).abs().mean()}
-        if config.ssim_weight > 0:
+        if config.ssim_weight > 0 and min(rgb.shape[:2]) >= SMALLEST_SSIM:
             terms["ssim"] = config.ssim_weight * (1 - ssim(rgb, target))
-        if config.opacity_penalty > 0:
-            terms["opacity"] = config.opacity_penalty * torch.sigmoid(gaussians.logits).mean()
-        if config.scale_penalty > 0:
-            terms["scale"] = config.scale_penalty / self.extent * gaussians.log_scales.exp().mean()
-        shown = rgb.detach()
-        if reduced == 2:
-            shown = shown.repeat_interleave(2, 0).repeat_interleave(2, 1)
-            shown = torch.nn.functional.pad(
-                shown.permute(2, 0, 1)[None],
-                (0, batch.rgb.shape[1] - shown.shape[1], 0, batch.rgb.shape[0] - shown.shape[0]),
-                mode="replicate",
-            )[0].permute(1, 2, 0)
+        if (weight := self._chosen(config.opacity_penalty, PENALTY)) > 0:
+            terms["opacity"] = weight * torch.sigmoid(gaussians.logits).mean()
+        if (weight := self._chosen(config.scale_penalty, PENALTY)) > 0:
+            terms["scale"] = weight / self.extent * gaussians.log_scales.exp().mean()
+        shown = rgb.detach() if reduced == 1 else _doubled(rgb.detach(), batch.rgb)
         return Loss(terms, shown)
 
     @property
@@ -231,9 +271,9 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
     @torch.no_grad()
     def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
         config = self.config
-        rate = 0.01**progress * config.position_rate * self.extent
-        if config.noise > 0:
-            which, by = shaken(self.gaussians(), config.noise * rate)
+        if (noise := self._chosen(config.noise, NOISE)) > 0:
+            rate = self.position_rate * learning_rate_factor(config, step, progress)
+            which, by = shaken(self.gaussians(), noise * rate)
             self.means.values.data[which] += by
         if step % config.steps_per_move != config.steps_per_move - 1 or progress > config.growth_end:
             return ()
@@ -264,23 +304,25 @@ def _surfaces(config: GaussianSplattingConfig, dataset: Dataset) -> tuple[Tensor
     from framework.training.run import Run
     from framework.training.trainer import Trainer
 
-    seconds, count = config.field_seconds, config.start_gaussians
-    assert seconds is not None and count is not None
+    steps, count = config.field_steps, config.start_gaussians
+    assert steps is not None
+    assert count is not None
     field = replace(
         load_method("instant-ngp").config,
-        max_seconds=seconds,
+        max_num_iterations=steps,
         vis="none",
         machine=config.machine,
         background=config.background,
     )
     trainer = Trainer(Run("instant-ngp", field, "", cast("Any", None), Path()), dataset, None)
-    while trainer.state.seconds < seconds or trainer.state.step < FIELD_STEPS:
+    for _ in track(range(steps), "Looking for surfaces", total=steps):
         trainer.train_step()
     model = trainer.model.eval()
     points, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
     while (left := count - sum(map(len, points))) > 0 and len(points) < 16:
         found = joined(surface_points(cast("Any", model), dataset, 2 * left, None))
-        points.append(found.positions[:left]), colors.append(found.colors[:left])
+        points.append(found.positions[:left])
+        colors.append(found.colors[:left])
     return torch.cat(points).to(dataset.device), torch.cat(colors).to(dataset.device)
 
 
@@ -293,9 +335,16 @@ def _extent(scene: Scene) -> float:
 
 
 def _halved(image: Tensor) -> Tensor:
-    """Return an image (H, W, 3) of half the size, each pixel the mean of four."""
+    """Return an image (H, W, C) of half the size, each pixel the mean of four."""
     height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
-    return image[:height, :width].reshape(height // 2, 2, width // 2, 2, 3).mean((1, 3))
+    return image[:height, :width].reshape(height // 2, 2, width // 2, 2, -1).mean((1, 3))
+
+
+def _doubled(image: Tensor, whole: Tensor) -> Tensor:
+    """Return an image of half the size as large as the whole one, of which it takes an odd last row or column."""
+    out = whole.clone()
+    out[: 2 * image.shape[0], : 2 * image.shape[1]] = image.repeat_interleave(2, 0).repeat_interleave(2, 1)
+    return out
 
 
 METHOD = Method(GaussianSplattingConfig(), paper="arXiv:2308.04079", model=GaussianSplatting, decide=decide)

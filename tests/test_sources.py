@@ -20,7 +20,7 @@ def images(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 
 def test_a_view_is_a_whole_image_over_its_background(images: Dataset) -> None:
-    source = ViewSource(images, "random")
+    source = ViewSource(images, "random", 7)
     drawn = []
     for step in range(40):
         seed_step(3, step)
@@ -49,7 +49,7 @@ def test_the_seed_and_the_step_decide_which_view_is_drawn(images: Dataset) -> No
         found = []
         for step in range(12):
             seed_step(seed, step)
-            batch = ViewSource(images, "random").draw(Request(step, 0))
+            batch = ViewSource(images, "random", 7).draw(Request(step, 0))
             found.append((batch.index, batch.background.tolist()))
         return found
 
@@ -60,7 +60,7 @@ def test_the_seed_and_the_step_decide_which_view_is_drawn(images: Dataset) -> No
 
 @pytest.mark.parametrize(("background", "value"), [("white", 1.0), ("black", 0.0)])
 def test_a_fixed_background_is_the_same_in_every_view(images: Dataset, background: str, value: float) -> None:
-    source = ViewSource(images, background)
+    source = ViewSource(images, background, 7)
     assert all(source.draw(Request(step, 0)).background.tolist() == [value] * 3 for step in range(3))
 
 

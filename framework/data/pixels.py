@@ -67,6 +67,8 @@ class ViewBatch:
     """(3,) what shows where the image is transparent."""
     alpha: Tensor | None = None
     """(H, W) opacity, where the images have it."""
+    kept: Tensor | None = None
+    """(H, W) bool, pixels that count; None for all."""
 
     def __len__(self) -> int:
         return self.rgb.shape[0] * self.rgb.shape[1]

@@ -127,27 +127,41 @@ class PixelSource(BatchSource):
 
 
 class ViewSource(BatchSource):
-    """A source of whole images, one per step, drawn uniformly.
+    """A source of whole images, one per step, in an order that is drawn anew for each pass over them.
 
     Args:
         dataset: the images.
         background: background of transparent pixels; if "random", one colour for the whole image.
+        seed: the seed of the run.
     """
 
-    def __init__(self, dataset: Dataset, background: Background) -> None:
-        self.dataset, self.background = dataset, background
+    def __init__(self, dataset: Dataset, background: Background, seed: int) -> None:
+        self.dataset, self.background, self.seed = dataset, background, seed
+        self._order: tuple[int, list[int]] | None = None
 
     def draw(self, request: Request) -> ViewBatch:
         dataset = self.dataset
-        index = int(torch.randint(len(dataset), ()))
+        index = self._index(request.step)
         behind = background_colors(self.background, 1, dataset.device)[0]
         rgba = dataset.image(index).float() / 255
         alpha = rgba[..., 3] if rgba.shape[-1] == 4 else None
         view = View.of(dataset.cameras, index, dataset.times)
-        return ViewBatch(index, view, composite(rgba, behind), behind, alpha)
+        kept = None
+        if dataset.kept is not None:
+            first, last = dataset.cameras.offsets[index : index + 2].tolist()
+            kept = dataset.kept.mask(first, last).view(rgba.shape[:2])
+        return ViewBatch(index, view, composite(rgba, behind), behind, alpha, kept)
+
+    def _index(self, step: int) -> int:
+        """Return the image of a training step, a function of the seed and the step alone."""
+        epoch, place = divmod(step, len(self.dataset))
+        if self._order is None or self._order[0] != epoch:
+            generator = torch.Generator().manual_seed((self.seed * 1_000_003 + epoch) % 2**63)
+            self._order = epoch, torch.randperm(len(self.dataset), generator=generator).tolist()
+        return self._order[1][place]
 
     def drawing_from(self, dataset: Dataset) -> ViewSource:
-        return ViewSource(dataset, self.background)
+        return ViewSource(dataset, self.background, self.seed)
 
 
 def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource:
@@ -160,6 +174,6 @@ def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource
     """
     background = training_background(config.background, dataset.scene.has_alpha)
     if kind == "views":
-        return ViewSource(dataset, background)
+        return ViewSource(dataset, background, config.machine.seed)
     by_error = isinstance(config, RayConfig) and config.draw_by_error
     return PixelSource(dataset, background, config.machine.seed, by_error)

@@ -15,7 +15,7 @@ from framework.kernels.splat_blend import CHANNELS, blend
 from framework.kernels.splat_project import SplatCamera, project_gaussians
 from framework.kernels.splat_tiles import tile_lists
 from framework.rendering.rendered import Picture
-from framework.splats.gaussians import Gaussians
+from framework.splats.gaussians import MAX_DEGREE, Gaussians
 
 DRAWN = ("pinhole", "opencv")
 """Camera models that Gaussians can be drawn for."""
@@ -73,7 +73,7 @@ def draw(gaussians: Gaussians, camera: SplatCamera, background: Tensor, degree: 
         background: (3,) colour behind everything.
         degree: highest degree of the harmonics that counts.
     """
-    records, dropped = project_gaussians(*vars(gaussians).values(), camera=camera, degree=degree)
+    records, dropped = _projected(gaussians, camera, degree)
     if records.requires_grad:
         records.retain_grad()
     lists = tile_lists(records, camera.width, camera.height)
@@ -97,7 +97,7 @@ def draw_view(
     Raises: ConfigError for a camera model that is not among `DRAWN`.
     """
     camera = splat_camera(view.camera, near, antialiased)
-    records, _ = project_gaussians(*vars(gaussians).values(), camera=camera)
+    records, _ = _projected(gaussians, camera)
     lists = tile_lists(records, camera.width, camera.height)
     image, through, median = blend(
         records, lists, camera.width, camera.height, background, CHANNELS["normals"], median=True
@@ -109,3 +109,11 @@ def draw_view(
     parts = (image[..., :3], depth, torch.where(median > 0, median, far), opacity, normals)
     rgb, depth, median, opacity, normals = (every(part, view.stride) for part in parts)
     return Picture(rgb, depth, median, opacity, normals)
+
+
+def _projected(gaussians: Gaussians, camera: SplatCamera, degree: int = MAX_DEGREE) -> tuple[Tensor, int]:
+    """Project Gaussians to an image."""
+    g = gaussians
+    return project_gaussians(
+        g.means, g.log_scales, g.rotations, g.logits, g.colors, g.harmonics, camera=camera, degree=degree
+    )

@@ -25,9 +25,9 @@ from framework.evaluation.evaluator import evaluate, evaluation_background, time
 from framework.evaluation.metrics import MAX_PSNR
 from framework.evaluation.panels import composed, view_panels
 from framework.kernels.native import torch_on_one_thread
+from framework.model import StartsFromImages
 from framework.scene.profile import SceneProfile
 from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest, save_checkpoint
-from framework.model import StartsFromImages
 from framework.training.curve import Entry, FewImages, Point, in_order, rows
 from framework.training.optim import first_non_finite, make_optimizer
 from framework.training.preparation import profile_of, skip_by_silhouettes

@@ -50,6 +50,13 @@ TINY: dict[str, dict[str, Any]] = {
         "num_steps": 64,
         "samples_per_batch": 4096,
     },
+    "gaussian-splatting": {
+        "num_gaussians": 600,
+        "start_gaussians": 400,
+        "start": "silhouettes",
+        "steps_per_move": 10,
+        "rate_factor": 3.0,
+    },
     "tensorf": {
         "density_components": 8,
         "appearance_components": 8,

@@ -36,9 +36,9 @@ def moved(gaussians: Gaussians, added: int) -> tuple[Tensor, Gaussians] | None:
     wanted = int((~alive).sum()) + added
     if wanted == 0 or not bool(alive.any()):
         return None
-    weight = torch.where(alive, opacity, 0).double().cumsum(0)
+    weight = torch.where(alive, opacity, 0).cumsum(0)
     draws = (torch.arange(wanted, device=weight.device) + torch.rand(wanted, device=weight.device)) / wanted
-    sources = torch.searchsorted(weight, draws.to(weight) * weight[-1]).clamp(max=len(weight) - 1)
+    sources = torch.searchsorted(weight, draws * weight[-1]).clamp(max=len(weight) - 1)
     copies = torch.bincount(sources, minlength=len(gaussians)).clamp(max=MOST_COPIES - 1)
     chosen = copies.nonzero()[:, 0]
     count = copies[chosen] + 1
@@ -61,17 +61,17 @@ def shared(logits: Tensor, log_scales: Tensor, counts: Tensor) -> tuple[Tensor, 
         counts: (K,) int64 n, how many it becomes; at most MOST_COPIES.
     Returns: (K,) and (K, 3).
     """
-    alpha = torch.sigmoid(logits.double()).clamp(1e-6, 1 - 1e-6)
+    alpha = torch.sigmoid(logits).clamp(1e-6, 1 - 1e-6)
     each = -torch.expm1(torch.log1p(-alpha) / counts)
     most = int(counts.max()) if len(counts) else 1
     # sum_{i=1}^{n} binom(i-1, k) = binom(n, k+1)
-    k = torch.arange(most, device=alpha.device, dtype=torch.float64)
-    n = counts.double()[:, None]
+    k = torch.arange(most, device=alpha.device, dtype=alpha.dtype)
+    n = counts.to(alpha)[:, None]
     log_binomial = torch.lgamma(n + 1) - math.lgamma(1) - torch.lgamma(k + 2) - torch.lgamma((n - k).clamp(min=1))
     terms = torch.exp(log_binomial + (k + 1) * each.log()[:, None]) / (k + 1).sqrt() * (1 - 2 * (k % 2))
     total = terms.masked_fill(k[None] >= n, 0).sum(1)
     factor = alpha / total.clamp(min=1e-12)
-    return torch.logit(each.clamp(DEAD, 1 - 1e-6)).to(logits), log_scales + factor.log()[:, None].to(log_scales)
+    return torch.logit(each.clamp(DEAD, 1 - 1e-6)), log_scales + factor.log()[:, None]
 
 
 @torch.no_grad()

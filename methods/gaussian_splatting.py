@@ -187,7 +187,9 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
 
     def _all(self) -> Gaussians:
         means, log_scales, rotations, logits, colors, harmonics = self.parameters_of_gaussians()
-        return Gaussians(means, log_scales, rotations, logits[:, 0], colors, harmonics.view(len(means), 3, -1))
+        return Gaussians(
+            means, log_scales, rotations, logits[:, 0], colors, harmonics.view(len(means), 3, harmonics.shape[1] // 3)
+        )
 
     def gaussians(self) -> Gaussians:
         """Return them, without gradient."""
@@ -209,7 +211,10 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
             with torch.enable_grad():
                 points, colors = _surfaces(self.config, dataset)
             first = from_points(points, colors, self.config.degree, FIELD_OPACITY, FIELD_SIZE)
-        else:
+            if not len(points):
+                say("warning: the field has found no surfaces")
+                kind = "random"
+        if kind != "field":
             points = self._first_points(kind, dataset)
             first = from_points(points, seen_colors(points, dataset), self.config.degree)
         self._set(first)

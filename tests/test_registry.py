@@ -163,7 +163,9 @@ def test_an_entry_point_that_names_no_attribute_is_told_and_the_rest_goes_on(
 
 
 def test_methods_that_live_elsewhere(environment: Callable[..., Path]) -> None:
-    with pytest.raises(ConfigError, match=r"no method 'splatfacto': .*pip install nerfstudio, ns-train splatfacto"):
+    with pytest.raises(ConfigError, match=r"no method 'generfacto': .*pip install nerfstudio, ns-train generfacto"):
+        registry.load_method("generfacto")
+    with pytest.raises(ConfigError, match=r"no method 'splatfacto': here it is called 'gaussian-splatting'"):
         registry.load_method("splatfacto")
     assert not set(ELSEWHERE) & set(registry.registered("methods"))
     environment(
@@ -176,7 +178,7 @@ def test_methods_that_live_elsewhere(environment: Callable[..., Path]) -> None:
 def test_what_is_said_to_be_here_is_here() -> None:
     """Names in quotation marks are methods of ours."""
     named = {name for said in ELSEWHERE.values() for name in re.findall(r"'([a-z-]+)'", said)}
-    assert named == {"dnerf", "instant-ngp", "kplanes", "nerfacto", "vanilla-nerf"}
+    assert named == {"dnerf", "gaussian-splatting", "instant-ngp", "kplanes", "nerfacto", "vanilla-nerf"}
     assert named <= set(registry.registered("methods"))
 
 

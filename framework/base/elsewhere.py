@@ -4,15 +4,17 @@ from __future__ import annotations
 
 _NERFSTUDIO = "it is a method of nerfstudio (pip install nerfstudio, ns-train {name})"
 _PLUGIN = "it is a plugin of nerfstudio (pip install git+https://github.com/{repository}, ns-train {name})"
-_GAUSSIANS = "Gaussians are rasterised, and all methods here sample along rays"
+_GAUSSIANS = "here it is called 'gaussian-splatting'"
 _SURFACES = "no method here learns surfaces yet"
 _LARGER = "here it is 'nerfacto' with larger settings:"
 _ZIP_NERF = "the authors' code is https://github.com/jonbarron/camp_zipnerf; 'nerfacto' comes closest here"
 _MIP_NERF = "the authors' code is https://github.com/google/mipnerf; 'vanilla-nerf' comes closest here"
 
 ELSEWHERE: dict[str, str] = {
-    "splatfacto": f"{_GAUSSIANS}; {_NERFSTUDIO.format(name='splatfacto')}",
-    "gaussian-splatting": f"{_GAUSSIANS}; the authors' code is https://github.com/graphdeco-inria/gaussian-splatting",
+    "splatfacto": _GAUSSIANS,
+    "splatfacto-big": f"{_GAUSSIANS}; --num-gaussians says how many it may have",
+    "3dgs": _GAUSSIANS,
+    "gsplat": _GAUSSIANS,
     "neus": f"{_SURFACES}; {_NERFSTUDIO.format(name='neus')}",
     "neus-facto": f"{_SURFACES}; {_NERFSTUDIO.format(name='neus-facto')}",
     "generfacto": _NERFSTUDIO.format(name="generfacto"),
@@ -30,7 +32,6 @@ ELSEWHERE: dict[str, str] = {
     "instant-ngp-bounded": "here it is called 'instant-ngp', and the scene's profile says whether it is bounded",
     "nerfacto-big": f"{_LARGER} --max-resolution 4096 --log2-table-size 21 --hidden-width 128",
     "nerfacto-huge": f"{_LARGER} --max-resolution 8192 --log2-table-size 21 --hidden-width 256",
-    "splatfacto-big": f"{_GAUSSIANS}; {_NERFSTUDIO.format(name='splatfacto-big')}",
     "semantic-nerfw": "here 'nerfacto' learns appearance if the light differs between images; none learns semantics",
     "nerfplayer-nerfacto": "for moving scenes there are 'kplanes' and 'dnerf'",
     "nerfplayer-ngp": "for moving scenes there are 'kplanes' and 'dnerf'",

@@ -122,10 +122,9 @@ class Evaluation:
         """Return the results as a line of text."""
         r = self.results
         ssim, lpips = ("absent" if r[name] is None else f"{r[name]:.4f}" for name in ("ssim", "lpips"))
-        return (
-            f"PSNR {r['psnr']:.2f} dB  SSIM {ssim}  LPIPS {lpips}  "
-            f"{r['num_rays_per_sec'] / 1e3:.1f}k rays/s  {1 / r['fps']:.2f} s/image  ({r['num_images']} images)"
-        )
+        rays = r["num_rays_per_sec"]  # 0 of a method that casts none
+        speed = f"{rays / 1e3:.1f}k rays/s  {1 / r['fps']:.2f} s/image" if rays else f"{r['fps']:.1f} images/s"
+        return f"PSNR {r['psnr']:.2f} dB  SSIM {ssim}  LPIPS {lpips}  {speed}  ({r['num_images']} images)"
 
 
 def evaluate(

@@ -1,0 +1,150 @@
+"""gaussian-splatting as a method: what the budget decides, starts, masks, pictures, and checkpoints of other sizes."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from framework import ConfigError, View
+from framework.cameras.cameras import Cameras
+from framework.data.pixels import ViewBatch
+from framework.data.scene import Scene
+from framework.splats.drawing import draw_view, splat_camera
+from framework.splats.gaussians import Gaussians, HasGaussians
+from framework.training.checkpoint import load_checkpoint
+from methods.gaussian_splatting import METHOD, GaussianSplatting, GaussianSplattingConfig, decide
+from tests.training.helpers import tiny_trainer
+
+SCENE = Scene(torch.tensor([[-1.0] * 3, [1.0] * 3]), 1.0, 6.0, 4, True, False, 32)
+
+
+def camera(model: str = "pinhole", distance: float = 3.0) -> Cameras:
+    """One camera on the z axis that looks at the origin."""
+    pose = torch.eye(4)[None, :3].clone()
+    pose[0, 2, 3] = distance
+    size = torch.tensor([33])
+    return Cameras(pose, *(torch.tensor([v]) for v in (40.0, 40.0, 16.5, 16.5)), size, size, model)
+
+
+def ball(logit: float = 20.0, **changes: Any) -> Gaussians:
+    """One opaque flat Gaussian at the origin, facing the camera."""
+    flat = torch.tensor([[0.2, 0.2, 0.01]]).log()
+    turn, rest = torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1, 3, 0)
+    whole = Gaussians(torch.zeros(1, 3), flat, turn, torch.tensor([logit]), torch.ones(1, 3), rest)
+    return dataclasses.replace(whole, **changes)
+
+
+@pytest.mark.parametrize(("less", "more"), [(20.0, 60.0), (60.0, 300.0), (300.0, 3000.0)])
+def test_more_time_has_more_gaussians_and_smaller_steps(less: float, more: float) -> None:
+    first, last = (decide(GaussianSplattingConfig(max_seconds=s), SCENE)[0] for s in (less, more))
+    assert first.num_gaussians is not None
+    assert last.num_gaussians is not None
+    assert first.num_gaussians < last.num_gaussians
+    assert first.rate_factor is not None
+    assert last.rate_factor is not None
+    assert first.rate_factor >= last.rate_factor >= 1
+
+
+def test_what_is_given_stays() -> None:
+    config, made = decide(GaussianSplattingConfig(num_gaussians=77, rate_factor=2.0), SCENE)
+    assert (config.num_gaussians, config.rate_factor) == (77, 2.0)
+    assert not [one for one in made if one.option in ("Gaussians", "factor of learning rates")]
+
+
+def test_a_picture_tells_depth_opacity_and_normals() -> None:
+    view = View(camera())
+    picture = draw_view(ball(), view, torch.zeros(3), near=0.1, far=9.0, antialiased=False)
+    assert picture.size == (33, 33)
+    assert float(picture.depth[16, 16]) == pytest.approx(3.0, abs=1e-4)
+    assert float(picture.median_depth[16, 16]) == pytest.approx(3.0, abs=1e-4)
+    assert float(picture.accumulation[16, 16]) == pytest.approx(0.999, abs=1e-5)
+    assert picture.normals is not None
+    torch.testing.assert_close(picture.normals[16, 16], torch.tensor([0.0, 0.0, 1.0]))
+    assert float(picture.depth[0, 0]) == float(picture.median_depth[0, 0]) == 9.0
+    assert float(picture.accumulation[0, 0]) == 0
+    coarse = draw_view(ball(), dataclasses.replace(view, stride=4), torch.zeros(3), 0.1, 9.0, False)
+    torch.testing.assert_close(coarse.rgb, picture.rgb[2::4, 2::4])
+
+
+def test_the_image_position_is_the_cameras() -> None:
+    """A small Gaussian is brightest where the framework's cameras project its centre, with and without a lens."""
+    bent = dataclasses.replace(camera("opencv"), lens=torch.tensor([[0.2, -0.1, 0.01, -0.02, 0, 0, 0, 0, 0]]))
+    for one in (camera(), bent):
+        center = torch.tensor([[0.4, -0.7, 0.3]])
+        column, row, seen = one.project(center, 0)
+        assert bool(seen)
+        small = ball(means=center, log_scales=torch.full((1, 3), -4.0))
+        image = draw_view(small, View(one), torch.zeros(3), 0.1, 9.0, False).rgb[..., 0]
+        rows, columns = torch.meshgrid(torch.arange(33.0), torch.arange(33.0), indexing="ij")
+        assert float((image * rows).sum() / image.sum()) == pytest.approx(float(row), abs=0.05)
+        assert float((image * columns).sum() / image.sum()) == pytest.approx(float(column), abs=0.05)
+
+
+def test_a_camera_that_cannot_be_drawn_for_is_refused() -> None:
+    with pytest.raises(ConfigError, match="cannot be drawn for fisheye cameras, only for pinhole and opencv"):
+        splat_camera(camera("fisheye"), 0.1)
+
+
+@pytest.mark.parametrize(("start", "match"), [("points", "no points of a reconstruction")])
+def test_a_start_that_the_data_has_not_is_refused(start: str, match: str, shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path / "run", start=start)
+    with pytest.raises(ConfigError, match=match):
+        trainer.prepare()
+
+
+def test_masked_pixels_teach_nothing() -> None:
+    torch.manual_seed(3)
+    config, _ = decide(GaussianSplattingConfig(num_gaussians=300, opacity_penalty=0.0, scale_penalty=0.0), SCENE)
+    model = GaussianSplatting(config, SCENE)
+    kept = torch.zeros(33, 33, dtype=torch.bool)
+    kept[:, :12] = True
+    gradients = []
+    for other in (0.0, 1.0):
+        target = torch.full((33, 33, 3), 0.3)
+        target[:, 12:] = other
+        batch = ViewBatch(0, View(camera()), target, torch.zeros(3), kept=kept)
+        model.zero_grad()
+        model.loss(batch, 0).total.backward()
+        gradients.append([p.grad.clone() for p in model.parameters() if p.grad is not None])
+    assert gradients[0]
+    for first, second in zip(*gradients, strict=True):
+        assert torch.equal(first, second)
+    assert any(float(first.abs().sum()) > 0 for first in gradients[0])
+
+
+def test_a_field_shows_where_to_start(shared_tiny: Path, tmp_path: Path) -> None:
+    """After no step of its own, better than anywhere in the box; the same bits each time."""
+    from framework.evaluation.evaluator import evaluate
+
+    psnr, bits = {}, []
+    for start in ("field", "field", "random"):
+        settings = {"start": start, "field_steps": 25, "start_gaussians": 2_000, "num_gaussians": 2_000}
+        trainer = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path / f"{start}{len(bits)}", True, **settings)
+        trainer.prepare()
+        assert trainer.eval_set is not None
+        psnr[start] = evaluate(trainer.model, trainer.eval_set).results["psnr"]
+        bits.append(torch.cat([p.detach().flatten() for p in trainer.model.parameters()]))
+    print(psnr)
+    assert psnr["field"] > psnr["random"] + 3
+    assert torch.equal(bits[0], bits[1])
+
+
+def test_a_checkpoint_has_as_many_gaussians_as_it_has(shared_tiny: Path, tmp_path: Path) -> None:
+    first = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path / "first")
+    for _ in range(25):
+        first.train_step()
+    count = len(first.model.gaussians())  # type: ignore[operator]
+    assert count > 400
+    second = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path / "second")
+    second.restore(load_checkpoint(first.save()))
+    assert isinstance(second.model, HasGaussians)
+    assert len(second.model.gaussians()) == count
+    second.train_step()
+    assert second.state.step == 26
+
+
+def test_the_method_is_declared() -> None:
+    assert METHOD.model is GaussianSplatting
+    assert METHOD.field is None

@@ -1,0 +1,74 @@
+"""First Gaussians: as large as their neighbours are far, coloured as the nearest images show them."""
+
+import itertools
+from pathlib import Path
+
+import pytest
+import torch
+
+from dataparsers.blender import Blender
+from framework.data.dataset import load_dataset
+from framework.splats.gaussians import DC
+from framework.splats.start import from_points, hull_points, morton, neighbour_distance, seen_colors
+
+
+@pytest.mark.parametrize("count", [2, 3, 5, 500, 20_000])
+def test_distances_to_neighbours(count: int) -> None:
+    torch.manual_seed(count)
+    points = torch.randn(count, 3) * torch.tensor([1.0, 3.0, 0.02])
+    found = neighbour_distance(points)
+    some = torch.randperm(count)[:500]
+    true = torch.cdist(points[some].double(), points.double()).sort(1).values[:, 1:4].mean(1)
+    assert bool((found[some] >= true * (1 - 1e-4)).all())
+    assert float((found[some].double() / true).mean()) < 1.15
+
+
+def test_one_point_and_equal_points_have_a_size() -> None:
+    assert neighbour_distance(torch.zeros(1, 3)).tolist() == [1.0]
+    assert bool(from_points(torch.zeros(9, 3), torch.zeros(9, 3), 0).log_scales.isfinite().all())
+
+
+def test_morton_interleaves_bits() -> None:
+    cells = torch.tensor([*itertools.product((0, 1, 5, 2**20 - 1), repeat=3)])
+    for cell, code in zip(cells.tolist(), morton(cells).tolist(), strict=True):
+        bits = [(cell[i % 3] >> (i // 3) & 1) << i for i in range(60)]
+        assert code == sum(bits)
+
+
+def test_points_become_round_gaussians_of_their_colour() -> None:
+    points, colors = torch.rand(50, 3), torch.rand(50, 3)
+    gaussians = from_points(points, colors, degree=2, opacity=0.3)
+    assert gaussians.degree == 2
+    torch.testing.assert_close(0.5 + DC * gaussians.colors, colors)
+    torch.testing.assert_close(torch.sigmoid(gaussians.logits), torch.full((50,), 0.3))
+    assert torch.equal(gaussians.log_scales[:, 0], gaussians.log_scales[:, 2])
+    assert float(gaussians.harmonics.abs().sum()) == 0
+
+
+def test_colours_are_those_of_the_nearest_image(shared_tiny: Path) -> None:
+    dataset = load_dataset(Blender().parse(shared_tiny, "train"), "train")
+    image, height = dataset.image(0), int(dataset.cameras.heights[0])
+    opaque = (image[..., 3] == 255).nonzero()
+    row, column = opaque[len(opaque) // 2].tolist()
+    pixel = torch.tensor([row * int(dataset.cameras.widths[0]) + column])
+    assert height > row
+    rays = dataset.cameras.pixel_rays(pixel, 0.1, 10.0)
+    just_before = rays.origins + 0.05 * rays.directions  # no other camera is as near
+    found = seen_colors(just_before, dataset, views=1)[0]
+    torch.testing.assert_close(found, image[row, column, :3].float() / 255)
+
+
+def test_what_no_image_shows_is_grey(shared_tiny: Path) -> None:
+    dataset = load_dataset(Blender().parse(shared_tiny, "train"), "train")
+    assert seen_colors(torch.full((1, 3), 1e5), dataset).tolist() == [[0.5] * 3]
+
+
+def test_points_on_a_hull_lie_in_its_outer_cells() -> None:
+    n = 8
+    cells = torch.zeros(n, n, n, dtype=torch.bool)
+    cells[2:6, 2:6, 2:6] = True
+    box = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
+    points = hull_points(cells.flatten(), box, n, 500)
+    at = ((points + 1) / 2 * n).long()
+    assert bool(((at >= 2) & (at < 6)).all())
+    assert bool(((at == 2) | (at == 5)).any(1).all())

@@ -114,13 +114,14 @@ def test_masked_pixels_teach_nothing() -> None:
     assert any(float(first.abs().sum()) > 0 for first in gradients[0])
 
 
+@pytest.mark.slow
 def test_a_field_shows_where_to_start(shared_tiny: Path, tmp_path: Path) -> None:
     """After no step of its own, better than anywhere in the box; the same bits each time."""
     from framework.evaluation.evaluator import evaluate
 
     psnr, bits = {}, []
     for start in ("field", "field", "random"):
-        settings = {"start": start, "field_steps": 25, "start_gaussians": 2_000, "num_gaussians": 2_000}
+        settings = {"start": start, "field_steps": 60, "start_gaussians": 2_000, "num_gaussians": 2_000}
         trainer = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path / f"{start}{len(bits)}", True, **settings)
         trainer.prepare()
         assert trainer.eval_set is not None

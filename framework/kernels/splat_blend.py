@@ -29,33 +29,43 @@ MAX_ALPHA = 0.999
 OPAQUE = 1e-4
 """Transmittance below which a pixel is done."""
 CHANNELS = {"rgb": 3, "distance": 4, "normals": 7}
-"""What an image has: colours; also the sum of weight times distance; also that of the normals."""
+"""Content of an image -> its channels: colours; then the sum of weight times distance; then that of the normals."""
 
 
 class Blended(NamedTuple):
-    """What an image shows."""
+    """The Gaussians on an image, blended."""
 
     image: Tensor
-    """(H, W, C) colours over the background, then distance and normals, if asked for, times the weights."""
+    """(H, W, C) colours over the background, then, if asked for, the sums of weight times distance and of weight times
+    normal."""
     transmittance: Tensor
-    """(H, W) share of the light that comes from behind everything."""
+    """(H, W) share of the background's light that arrives."""
     median: Tensor | None
-    """(H, W) distance at which half of the light is gone, 0 where it never is; None if not asked for."""
+    """(H, W) distance from the camera at which transmittance falls to 1/2 or below, 0 where it never does; None if not
+    asked for."""
 
 
 def blend(
-    records: Tensor, lists: TileLists, width: int, height: int, background: Tensor, channels: int = 3, median: bool = False
-) -> Blended:  # fmt: skip
+    records: Tensor,
+    lists: TileLists,
+    width: int,
+    height: int,
+    background: Tensor,
+    channels: int = 3,
+    median: bool = False,
+) -> Blended:
     """Blend the Gaussians on an image.
 
+    The image does not depend on the columns CUT and REACH_X of the records. The compiled form puts the sums over pixels
+    of the absolute gradients of x and y there instead (AbsGS, Ye et al. 2024).
+
     Args:
-        records: (N, RECORD) Gaussians on the image. Its gradient has, in the columns CUT and REACH_X, what nothing
-            depends on: the sums over pixels of the absolute gradients of x and y (AbsGS, Ye et al. 2024), if compiled.
-        lists: which of them each tile shows.
-        width, height: of the image, pixels.
-        background: (3,) colour behind everything; without gradient.
-        channels: a value of `CHANNELS`; with normals there is no gradient.
-        median: whether to find the median distance.
+        records: (N, RECORD) Gaussians on the image.
+        lists: Gaussians that each tile may show.
+        width, height: size of the image, pixels.
+        background: (3,) colour behind everything. It gets no gradient.
+        channels: number of channels, a value of `CHANNELS`. Normals have a gradient only in the reference.
+        median: whether to find the median distance. It has no gradient.
     """
     background = background.detach()
     return BLEND((records, background), records, lists, width, height, background, channels, median)
@@ -64,7 +74,16 @@ def blend(
 def blend_reference(
     records: Tensor, lists: TileLists, width: int, height: int, background: Tensor, channels: int, median: bool
 ) -> Blended:
-    """Blend in torch, tile by tile, in any float type. Arguments as for `blend`."""
+    """Compute `blend` in torch, tile by tile, on any device and in any float type.
+
+    Args:
+        records: (N, RECORD) Gaussians on the image.
+        lists: Gaussians that each tile may show.
+        width, height: size of the image, pixels.
+        background: (3,) colour behind everything.
+        channels: number of channels, a value of `CHANNELS`.
+        median: whether to find the median distance.
+    """
     columns, rows = -(-width // TILE), -(-height // TILE)
     device, dtype = records.device, records.dtype
     behind = torch.cat([background.to(records), records.new_zeros(channels - 3)])

@@ -37,34 +37,35 @@ MIN_ALPHA = 1 / 255
 DC = 0.28209479177387814
 """The harmonic of degree 0."""
 MARGIN = 0.15
-"""Beyond the image's edge by this share of its size, J is taken as at that bound: farther out it grows endlessly."""
+"""Share of the image's size beyond its edge up to which J is that of the centre; farther out, where it would grow
+without bound, it is that of the nearest place within."""
 DEGREES = {0: 0, 1: 3, 2: 8, 3: 15}
-"""Degree of the harmonics -> how many there are beyond the first."""
+"""Degree of the harmonics -> their number beyond the first."""
 
 
 @dataclass(frozen=True)
 class SplatCamera:
-    """One pinhole camera, or one with a lens, as splatting sees it."""
+    """A pinhole camera, or one with OpenCV's lens distortion."""
 
     pose: Tensor
-    """(3, 4) from the scene to the camera's frame, x right, y down, z forward; it may require a gradient."""
+    """(3, 4) transform from the scene to the camera's frame: x right, y down, z forward. It may require a gradient."""
     intrinsics: tuple[float, float, float, float]
-    """fx, fy, cx, cy in pixels; the first pixel's centre lies at (0.5, 0.5)."""
+    """Focal lengths and principal point fx, fy, cx, cy, pixels; the first pixel's centre lies at (0.5, 0.5)."""
     width: int
-    """Of the image, pixels."""
+    """Width of the image, pixels."""
     height: int
-    """Of the image, pixels."""
+    """Height of the image, pixels."""
     near: float = 0.01
-    """What is nearer along the optical axis is not drawn, scene units."""
+    """Smallest depth along the optical axis at which a centre is drawn, scene units."""
     blur: float = 0.3
-    """Added to both variances on the image, pixels^2."""
+    """Variance added in both directions on the image, pixels^2."""
     antialiased: bool = False
     """Whether opacity makes up for the blur."""
     lens: Distortion | None = None
-    """The lens's distortion; None of a pinhole camera."""
+    """Distortion of the projection "opencv"; None for a pinhole camera."""
 
     def plain(self) -> list[float]:
-        """Return all as 33 numbers for a kernel."""
+        """Return the camera as 33 numbers for a kernel."""
         pose = self.pose.detach().double().cpu()
         lens = [0.0] * 12
         if self.lens is not None:
@@ -81,24 +82,33 @@ def project_gaussians(
 ) -> tuple[Tensor, int]:  # fmt: skip
     """Project N Gaussians to an image.
 
+    All parameters and the camera's pose get gradients. Normals and the columns CUT, REACH_X and REACH_Y pass none on.
+
     Args:
         means: (N, 3) centres, scene coordinates.
-        log_scales: (N, 3) logarithm of the standard deviations.
+        log_scales: (N, 3) logarithms of the standard deviations along the axes, of scene units.
         rotations: (N, 4) quaternions w, x, y, z of any length but 0.
-        logits: (N,) opacity before the sigmoid.
+        logits: (N,) opacities before the sigmoid.
         colors: (N, 3) coefficients of the harmonic of degree 0; 0 is grey.
-        harmonics: (N, 3, K) coefficients of the degrees from 1, K being 0, 3, 8 or 15.
-        camera: the image.
-        degree: highest degree of the harmonics that counts; those that are not there do not.
-    Returns: records (N, RECORD), all zeros for a Gaussian that the image does not show; and how many are left out as
-        they are not finite. Gradients go to all parameters and to the camera's pose, not to normals.
+        harmonics: (N, 3, K) coefficients of the degrees from 1; K is 0, 3, 8 or 15.
+        camera: the camera.
+        degree: highest degree of the harmonics that is used, 0 to 3; higher ones than `harmonics` has are left out.
+
+    Returns:
+        Records (N, RECORD), all zeros for a Gaussian that the image does not show, and the number of Gaussians that are
+        left out because a parameter is not finite or a quaternion is 0.
+
+    Raises:
+        ValueError: if there is another number of harmonics.
     """
+    if harmonics.shape[2] not in DEGREES.values():
+        raise ValueError(f"there are 0, 3, 8 or 15 harmonics beyond the first, not {harmonics.shape[2]}")
     tensors = (means, log_scales, rotations, logits, colors, harmonics, camera.pose)
     return PROJECT(tensors, *tensors[:-1], camera, min(DEGREES[degree], harmonics.shape[2]))
 
 
 def rotation_matrices(quaternions: Tensor) -> Tensor:
-    """Return the rotations (N, 3, 3) of quaternions w, x, y, z.
+    """Return the rotation matrices (N, 3, 3) of quaternions w, x, y, z.
 
     Args:
         quaternions: (N, 4), of any length but 0.
@@ -116,7 +126,16 @@ def project_reference(
     means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
     camera: SplatCamera, basis: int,
 ) -> tuple[Tensor, int]:  # fmt: skip
-    """Project in torch, in any float type. Arguments as for `project_gaussians`, `basis` being how many harmonics."""
+    """Compute `project_gaussians` in torch, on any device and in any float type.
+
+    Args:
+        means, log_scales, rotations, logits, colors, harmonics: parameters of the Gaussians.
+        camera: the camera.
+        basis: number of harmonics that are used beyond the first: 0, 3, 8 or 15.
+
+    Returns:
+        Records (N, RECORD), and the number of Gaussians that are left out.
+    """
     fx, fy, cx, cy = camera.intrinsics
     pose = camera.pose.to(means)
     at = means @ pose[:, :3].T + pose[:, 3]

@@ -136,33 +136,16 @@ def project_reference(
     Returns:
         Records (N, RECORD), and the number of Gaussians that are left out.
     """
-    fx, fy, cx, cy = camera.intrinsics
     pose = camera.pose.to(means)
     at = means @ pose[:, :3].T + pose[:, 3]
-    everything = torch.cat(
-        [at, log_scales.exp(), rotations, logits[:, None], colors, harmonics[..., :basis].flatten(1)], 1
-    )
+    everything = torch.cat([at, log_scales, rotations, logits[:, None], colors, harmonics[..., :basis].flatten(1)], 1)
     finite = everything.isfinite().all(1) & (rotations.square().sum(1) > 1e-24)
     shown = finite & (at[:, 2] > camera.near)
     kept = shown.nonzero()[:, 0]
     at = at[kept]
     axes = rotation_matrices(rotations[kept])
-    x, y, over = at[:, 0] / at[:, 2], at[:, 1] / at[:, 2], 1 / at[:, 2]
-    low_x, high_x = (-MARGIN * camera.width - cx) / fx, ((1 + MARGIN) * camera.width - cx) / fx
-    low_y, high_y = (-MARGIN * camera.height - cy) / fy, ((1 + MARGIN) * camera.height - cy) / fy
-    nothing = torch.zeros_like(x)
-    to_plane = torch.stack(
-        [over, nothing, -x.clamp(low_x, high_x) * over, nothing, over, -y.clamp(low_y, high_y) * over], -1
-    ).unflatten(-1, (2, 3))
-    within = torch.ones_like(x, dtype=torch.bool)
-    if camera.lens is not None:
-        within = torch.hypot(x, y) < camera.lens.reach.flatten()[0].to(x)
-        inside_x, inside_y = x.masked_fill(~within, 0), y.masked_fill(~within, 0)
-        coefficients = camera.lens.coefficients.reshape(1, -1).expand(len(x), -1).to(x)
-        x, y, (uu, uv, vv) = distort(inside_x, inside_y, coefficients)
-        to_plane = torch.stack([uu, uv, uv, vv], -1).detach().unflatten(-1, (2, 2)) @ to_plane
-    focal = torch.tensor([fx, fy], dtype=at.dtype, device=at.device)
-    rows = focal[:, None] * to_plane @ pose[:, :3] @ axes * log_scales[kept].exp()[:, None]  # (K, 2, 3)
+    center_x, center_y, to_image, within = _onto_image(at, camera)
+    rows = to_image @ pose[:, :3] @ axes * log_scales[kept].exp()[:, None]  # (K, 2, 3)
     first, second = rows.unbind(1)
     b = (first * second).sum(-1)
     spread_x, spread_y = first.square().sum(-1), second.square().sum(-1)
@@ -176,7 +159,6 @@ def project_reference(
     cut = (opacity / MIN_ALPHA).log()
     reach_x, reach_y = ((2 * cut.clamp(min=0) * variance).sqrt() for variance in (a, c))
     u_x = (c / (2 * det)).sqrt()
-    center_x, center_y = fx * x + cx, fy * y + cy
     center = -pose[:, :3].T @ pose[:, 3]
     directions = torch.nn.functional.normalize(means[kept] - center, dim=-1)
     rgb = 0.5 + DC * colors[kept]
@@ -196,6 +178,27 @@ def project_reference(
     table = torch.stack(columns, -1)
     sound = visible & table.isfinite().all(1)
     return records.index_copy(0, kept[sound], table[sound]), int((~finite).sum())
+
+
+def _onto_image(at: Tensor, camera: SplatCamera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return positions x, y (K,) on the image of points (K, 3), Jacobians (K, 2, 3), and whether the lens shows them."""
+    fx, fy, cx, cy = camera.intrinsics
+    x, y, over = at[:, 0] / at[:, 2], at[:, 1] / at[:, 2], 1 / at[:, 2]
+    low_x, high_x = (-MARGIN * camera.width - cx) / fx, ((1 + MARGIN) * camera.width - cx) / fx
+    low_y, high_y = (-MARGIN * camera.height - cy) / fy, ((1 + MARGIN) * camera.height - cy) / fy
+    nothing = torch.zeros_like(x)
+    to_plane = torch.stack(
+        [over, nothing, -x.clamp(low_x, high_x) * over, nothing, over, -y.clamp(low_y, high_y) * over], -1
+    ).unflatten(-1, (2, 3))
+    within = torch.ones_like(x, dtype=torch.bool)
+    if camera.lens is not None:
+        within = torch.hypot(x, y) < camera.lens.reach.flatten()[0].to(x)
+        inside_x, inside_y = x.masked_fill(~within, 0), y.masked_fill(~within, 0)
+        coefficients = camera.lens.coefficients.reshape(1, -1).expand(len(x), -1).to(x)
+        x, y, (uu, uv, vv) = distort(inside_x, inside_y, coefficients)
+        to_plane = torch.stack([uu, uv, uv, vv], -1).detach().unflatten(-1, (2, 2)) @ to_plane
+    focal = torch.tensor([fx, fy], dtype=at.dtype, device=at.device)
+    return fx * x + cx, fy * y + cy, focal[:, None] * to_plane, within
 
 
 PROJECT = Operation("project_gaussians", project_reference)

@@ -137,12 +137,12 @@ def project_reference(
         Records (N, RECORD), and the number of Gaussians that are left out.
     """
     pose = camera.pose.to(means)
-    at = means @ pose[:, :3].T + pose[:, 3]
-    everything = torch.cat([at, log_scales, rotations, logits[:, None], colors, harmonics[..., :basis].flatten(1)], 1)
+    with torch.no_grad():  # apart from `at`, since the gradient of the pose would be NaN times 0
+        depth = means @ pose[2, :3] + pose[2, 3]
+    everything = torch.cat([means, log_scales, rotations, logits[:, None], colors, harmonics[..., :basis].flatten(1)], 1)
     finite = everything.isfinite().all(1) & (rotations.square().sum(1) > 1e-24)
-    shown = finite & (at[:, 2] > camera.near)
-    kept = shown.nonzero()[:, 0]
-    at = at[kept]
+    kept = (finite & (depth > camera.near)).nonzero()[:, 0]
+    at = means[kept] @ pose[:, :3].T + pose[:, 3]
     axes = rotation_matrices(rotations[kept])
     center_x, center_y, to_image, within = _onto_image(at, camera)
     rows = to_image @ pose[:, :3] @ axes * log_scales[kept].exp()[:, None]  # (K, 2, 3)
@@ -155,7 +155,7 @@ def project_reference(
     det = det_0 + blur * (spread_x + spread_y) + blur * blur
     opacity = torch.sigmoid(logits[kept])
     if camera.antialiased:
-        opacity = opacity * (det_0 / det).sqrt()
+        opacity = opacity * (det_0 / det).clamp(min=1e-30).sqrt()
     cut = (opacity / MIN_ALPHA).log()
     reach_x, reach_y = ((2 * cut.clamp(min=0) * variance).sqrt() for variance in (a, c))
     u_x = (c / (2 * det)).sqrt()
@@ -181,7 +181,7 @@ def project_reference(
 
 
 def _onto_image(at: Tensor, camera: SplatCamera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return positions x, y (K,) on the image of points (K, 3), Jacobians (K, 2, 3), and whether the lens shows them."""
+    """Return the positions x, y (K,) on the image of points (K, 3), Jacobians (K, 2, 3), and what the lens shows."""
     fx, fy, cx, cy = camera.intrinsics
     x, y, over = at[:, 0] / at[:, 2], at[:, 1] / at[:, 2], 1 / at[:, 2]
     low_x, high_x = (-MARGIN * camera.width - cx) / fx, ((1 + MARGIN) * camera.width - cx) / fx

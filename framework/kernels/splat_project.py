@@ -139,7 +139,8 @@ def project_reference(
     pose = camera.pose.to(means)
     with torch.no_grad():  # apart from `at`, since the gradient of the pose would be NaN times 0
         depth = means @ pose[2, :3] + pose[2, 3]
-    everything = torch.cat([means, log_scales, rotations, logits[:, None], colors, harmonics[..., :basis].flatten(1)], 1)
+    harmonics = harmonics[..., :basis]
+    everything = torch.cat([means, log_scales, rotations, logits[:, None], colors, harmonics.flatten(1)], 1)
     finite = everything.isfinite().all(1) & (rotations.square().sum(1) > 1e-24)
     kept = (finite & (depth > camera.near)).nonzero()[:, 0]
     at = means[kept] @ pose[:, :3].T + pose[:, 3]
@@ -164,7 +165,7 @@ def project_reference(
     rgb = 0.5 + DC * colors[kept]
     if basis:
         values = spherical_harmonics_reference(directions, {3: 2, 8: 3, 15: 4}[basis])[:, 1:]
-        rgb = rgb + (harmonics[kept][..., :basis] * values[:, None]).sum(-1)
+        rgb = rgb + (harmonics[kept] * values[:, None]).sum(-1)
     with torch.no_grad():
         normals = axes[torch.arange(len(kept), device=kept.device), :, log_scales[kept].argmin(-1)]
         normals = torch.where((normals * directions).sum(-1, keepdim=True) > 0, -normals, normals)

@@ -30,7 +30,7 @@ BOUND = 0.15
 
 
 def scene(count: int, harmonics: int = 15, spread: float = 1.0) -> list[Tensor]:
-    """Return parameters of Gaussians four units in front of a camera, and its pose, which is nearly that of the scene."""
+    """Return parameters of Gaussians four units in front of a camera, and its pose, which is a small motion."""
     means = torch.randn(count, 3) * spread
     means[:, 2] = means[:, 2] / 2 + 4
     turn = 0.1 * torch.randn(3, 3)
@@ -109,7 +109,7 @@ def bent(at: Tensor) -> Tensor:
 
 
 def projected(given: Sequence[Tensor], view: SplatCamera, degree: int) -> Projection:
-    """Project Gaussians: parameters and pose in float64, of `view` all but the pose. The lens's Jacobian is a constant."""
+    """Project Gaussians, all of `view` but its pose being used. The lens's Jacobian is a constant."""
     means, log_scales, rotations, logits, colors, harmonics, pose = given
     fx, fy, cx, cy = view.intrinsics
     focal, middle = torch.tensor([[fx, fy], [cx, cy]], dtype=torch.float64)
@@ -206,7 +206,7 @@ def drawn(
 ) -> Blended:  # fmt: skip
     """Draw Gaussians by the three operations; `given` are the parameters and the pose."""
     *parameters, pose = given
-    records, _ = project_gaussians(*parameters, replace(view, pose=pose), degree)  # type: ignore[arg-type]
+    records, _ = project_gaussians(*parameters, replace(view, pose=pose), degree)
     return blend(records, tile_lists(records, view.width, view.height), view.width, view.height,
                  background.to(records), channels, median)  # fmt: skip
 

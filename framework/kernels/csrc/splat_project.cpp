@@ -369,27 +369,25 @@ EXPORT int splat_project_backward(const float* means, const float* log_scales, c
                 const Floats over_c = 1.0f / g.c, over_det = 1.0f / g.det;
                 const Floats v_y = square_root(0.5f * over_c), u_x = square_root(0.5f * g.c * over_det);
                 const Floats u_y = -g.b * over_c * u_x;
-                const Floats of_log_det = -0.5f * (d[U_X] * u_x + d[U_Y] * u_y);
-                Floats of_a = of_log_det * g.c * over_det;
-                Floats of_b = -d[U_Y] * over_c * u_x - 2 * of_log_det * g.b * over_det;
-                Floats of_c = 0.5f * over_c * (d[U_X] * u_x - d[U_Y] * u_y - d[V_Y] * v_y) + of_log_det * g.a * over_det;
-                Floats of_t0[3], of_t1[3];
+                Floats of_det = -0.5f * over_det * (d[U_X] * u_x + d[U_Y] * u_y);
+                const Floats of_b = -d[U_Y] * over_c * u_x;
+                const Floats of_c = 0.5f * over_c * (d[U_X] * u_x - d[U_Y] * u_y - d[V_Y] * v_y);
                 const Floats of_base = d[OPACITY] * g.factor;
-                for (int k = 0; k < 3; k++) {
-                    of_t0[k] = 2 * of_a * g.t0[k] + of_b * g.t1[k];
-                    of_t1[k] = 2 * of_c * g.t1[k] + of_b * g.t0[k];
-                }
-                if (camera.antialiased) {  // factor = sqrt(det0 / det), det also as a function of a, b, c
+                Floats of_det0{};
+                if (camera.antialiased) {  // factor = sqrt(det0 / det)
                     const Floats of_factor = d[OPACITY] * g.base;
-                    const Floats by_det = -0.5f * of_factor * g.factor * over_det;
-                    const Floats of_det0 = 0.5f * of_factor / larger(g.factor * g.det, splat(1e-30f));
-                    for (int k = 0; k < 3; k++) {
-                        const int i = (k + 1) % 3, j = (k + 2) % 3;
-                        of_t0[k] += by_det * 2 * (g.c * g.t0[k] - g.b * g.t1[k]);
-                        of_t1[k] += by_det * 2 * (g.a * g.t1[k] - g.b * g.t0[k]);
-                        of_t0[k] += 2 * of_det0 * (g.t1[i] * g.cross[j] - g.t1[j] * g.cross[i]);
-                        of_t1[k] += 2 * of_det0 * (g.cross[i] * g.t0[j] - g.cross[j] * g.t0[i]);
-                    }
+                    of_det -= 0.5f * of_factor * g.factor * over_det;
+                    of_det0 = 0.5f * of_factor / larger(g.factor * g.det, splat(1e-30f));
+                }
+                // det = det0 + blur (|t0|^2 + |t1|^2) + blur^2, det0 = |t0 x t1|^2; through a, b and c it would cancel.
+                of_det0 += of_det;
+                Floats of_t0[3], of_t1[3];
+                for (int k = 0; k < 3; k++) {
+                    const int i = (k + 1) % 3, j = (k + 2) % 3;
+                    of_t0[k] = of_b * g.t1[k] + 2 * camera.blur * of_det * g.t0[k] +
+                               2 * of_det0 * (g.t1[i] * g.cross[j] - g.t1[j] * g.cross[i]);
+                    of_t1[k] = of_b * g.t0[k] + 2 * (of_c + camera.blur * of_det) * g.t1[k] +
+                               2 * of_det0 * (g.cross[i] * g.t0[j] - g.cross[j] * g.t0[i]);
                 }
                 give(of_logits, 1, 0, of_base * g.base * (1.0f - g.base));
 

@@ -151,18 +151,20 @@ def test_normals_are_of_the_shortest_axis_and_face_the_camera(axis: int) -> None
 
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize(
-    "sizes", [(2.0, -9.5, -9.5), (0.0, 0.0, -12.0), (-9.0, -10.0, -8.0), (4.0, -20.0, 4.0)], ids=str
+    ("sizes", "bound"),
+    [((2.0, -9.5, -9.5), 1e-4), ((0.0, 0.0, -12.0), 1e-4), ((-9.0, -10.0, -8.0), 1e-4), ((4.0, -20.0, 4.0), 1e-2)],
+    ids=["needles", "discs", "dust", "sheets around the camera"],
 )
-def test_needles_discs_and_dust(sizes: tuple[float, float, float], antialiased: bool) -> None:
-    """Up to 100 000 times as long as they are thick."""
+def test_far_from_round(sizes: tuple[float, float, float], bound: float, antialiased: bool) -> None:
+    """Up to 100 000 times as long as they are thick. With antialiasing, needles and dust are not seen."""
     torch.manual_seed(1)
     given = scene(30)
     given[1] = torch.tensor(sizes).expand(30, 3).contiguous()
     given[3] += 1
     found = compared(given, camera(40, 36, antialiased=antialiased))
     assert found.share > 0.8
-    assert max(found.image, found.transmittance) < 2e-4, found
-    assert all(error < 2e-3 for error in found.gradients.values()), found
+    assert max(found.image, found.transmittance) < 1e-4, found
+    assert all(error < bound for error in found.gradients.values()), found
 
 
 def test_giants_fill_the_image() -> None:

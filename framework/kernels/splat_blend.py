@@ -85,23 +85,10 @@ def blend_reference(
         median: whether to find the median distance.
     """
     columns, rows = -(-width // TILE), -(-height // TILE)
-    device, dtype = records.device, records.dtype
     behind = torch.cat([background.to(records), records.new_zeros(channels - 3)])
-    starts = lists.offsets.tolist()
-    within = torch.arange(TILE, device=device)
-    offset_y, offset_x = (part.flatten() for part in torch.meshgrid(within, within, indexing="ij"))
     tiles, left, middles = [], [], []
     for tile in range(columns * rows):
-        listed = records[lists.ids[starts[tile] : starts[tile + 1]].long()]
-        x = (tile % columns * TILE + offset_x).to(dtype) + 0.5
-        y = (tile // columns * TILE + offset_y).to(dtype) + 0.5
-        dx, dy = x[:, None] - listed[:, 0], y[:, None] - listed[:, 1]
-        q = (listed[:, 2] * dx + listed[:, 3] * dy) ** 2 + (listed[:, 4] * dy) ** 2
-        alpha = (listed[:, OPACITY] * torch.exp(-q)).clamp(max=MAX_ALPHA)
-        alpha = alpha.masked_fill(q >= listed[:, CUT], 0)
-        through = torch.cat([torch.ones_like(alpha[:, :1]), (1 - alpha).cumprod(1)], 1)
-        done = through[:, :-1] < OPAQUE
-        weights = (alpha * through[:, :-1]).masked_fill(done, 0)
+        listed, weights, through = _weights(records, lists, tile, columns)
         rest = 1 - weights.sum(1)
         tiles.append(weights @ listed[:, RGB : RGB + channels] + rest[:, None] * behind)
         left.append(rest)
@@ -113,6 +100,39 @@ def blend_reference(
         return grid.reshape(rows * TILE, columns * TILE, -1)[:height, :width]
 
     return Blended(joined(tiles), joined(left)[..., 0], joined(middles)[..., 0] if median else None)
+
+
+def _weights(records: Tensor, lists: TileLists, tile: int, columns: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return records (M, RECORD) of a tile's list, weights (P, M) in its P pixels, and transmittances (P, M + 1)."""
+    first, last = lists.offsets[tile : tile + 2].tolist()
+    listed = records[lists.ids[first:last].long()]
+    within = torch.arange(TILE, device=records.device)
+    offset_y, offset_x = (part.flatten() for part in torch.meshgrid(within, within, indexing="ij"))
+    x = (tile % columns * TILE + offset_x).to(records.dtype) + 0.5
+    y = (tile // columns * TILE + offset_y).to(records.dtype) + 0.5
+    dx, dy = x[:, None] - listed[:, 0], y[:, None] - listed[:, 1]
+    q = (listed[:, 2] * dx + listed[:, 3] * dy) ** 2 + (listed[:, 4] * dy) ** 2
+    alpha = (listed[:, OPACITY] * torch.exp(-q)).clamp(max=MAX_ALPHA)
+    alpha = alpha.masked_fill(q >= listed[:, CUT], 0)
+    through = torch.cat([torch.ones_like(alpha[:, :1]), (1 - alpha).cumprod(1)], 1)
+    return listed, (alpha * through[:, :-1]).masked_fill(through[:, :-1] < OPAQUE, 0), through
+
+
+def blended_pairs(records: Tensor, lists: TileLists, width: int, height: int) -> int:
+    """Return the number of pairs of a Gaussian and a pixel into which it is blended, for measurements.
+
+    Args:
+        records: (N, RECORD) Gaussians on the image.
+        lists: Gaussians that each tile may show.
+        width, height: size of the image, pixels.
+    """
+    columns, rows = -(-width // TILE), -(-height // TILE)
+    total = 0
+    for tile in range(columns * rows):
+        weights = _weights(records.detach(), lists, tile, columns)[1].view(TILE, TILE, -1)
+        inside = weights[: height - tile // columns * TILE, : width - tile % columns * TILE]
+        total += int((inside > 0).sum())
+    return total
 
 
 BLEND = Operation("blend", blend_reference)

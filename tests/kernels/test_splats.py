@@ -214,3 +214,29 @@ def test_gradients_of_image_and_transmittance_add_up() -> None:
     second = torch.autograd.grad(through, ours)
     for whole, one, other in zip(both, first, second, strict=True):
         assert relative_error(one + other, whole) < BOUND
+
+
+@needs_kernels
+def test_nothing_is_read_that_was_not_written() -> None:
+    """New memory is filled with NaN. Many entries of the lists are behind what is opaque, and many rows not visible."""
+    torch.manual_seed(10)
+    given, view = scene(1003), camera(37, 41, antialiased=True)
+    given[1] += 1.5
+    given[3] += 6
+
+    def run() -> list[Tensor]:
+        ours = leaves(given)
+        found = drawn(ours, view, 4, degree=2, median=True)
+        assert found.median is not None
+        slopes = torch.autograd.grad(found.image.sum() + found.transmittance.sum(), ours)
+        return [found.image.detach(), found.transmittance.detach(), found.median, *slopes]
+
+    expected = run()
+    torch.use_deterministic_algorithms(True)  # which fills memory, too
+    try:
+        filled = run()
+    finally:
+        torch.use_deterministic_algorithms(False)
+    for value, truth in zip(filled, expected, strict=True):
+        assert bool(value.isfinite().all())
+        assert torch.equal(value, truth)

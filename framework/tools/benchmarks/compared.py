@@ -31,7 +31,7 @@ class Kernel:
 
     name: str
     unit: str
-    """Unit of its work: sample, ray, entry or pixel."""
+    """Unit of its work: sample, ray, entry, pixel, Gaussian, or pair of a Gaussian and a pixel."""
     count: int
     """Number of units per run."""
     runs: tuple[Run, Run]

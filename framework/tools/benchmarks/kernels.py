@@ -34,9 +34,12 @@ from framework.kernels.ssim import ssim, ssim_reference
 from framework.tools.benchmarks.ceilings import Ceilings, Work
 from framework.tools.benchmarks.compared import Errors, Kernel, errors, of_function
 from framework.tools.benchmarks.plane_lookups import grid_samples, layouts, planes_of
+from framework.tools.benchmarks.splatting import splatting
 from framework.tools.benchmarks.timing import Run, alternating, differentiated, once
 from framework.training.machine import machine
 
+UNITS = "sample, ray, entry, pixel, Gaussian or pair"
+"""Units of the kernels' work."""
 BOX = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
 LENSES: tuple[tuple[str, list[float]], ...] = (
     ("pinhole", []),
@@ -130,7 +133,7 @@ def measured(kernel: Kernel, ceilings: Ceilings, repeats: int, all_threads: int)
 
 def table(rows: Sequence[Row]) -> Table:
     """Return a table of `rows`, as wide as a terminal."""
-    grid = Table(title="ns a sample, ray, entry or pixel", title_justify="left", box=SIMPLE, padding=(0, 1, 0, 0))
+    grid = Table(title=f"ns a {UNITS}", title_justify="left", box=SIMPLE, padding=(0, 1, 0, 0))
     for heading in ("kernel", "forward", "backward", "torch", "speed-up", "error"):
         grid.add_column(heading, justify="left" if heading == "kernel" else "right", no_wrap=heading != "kernel")
     for row in rows:
@@ -181,6 +184,7 @@ def kernels(count: int) -> Iterator[Kernel]:
     yield _marching()
     yield _updating()
     yield _similarity()
+    yield from splatting()
     for model, lens in LENSES:
         yield _ray_generation(model, lens)
 

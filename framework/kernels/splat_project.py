@@ -223,11 +223,12 @@ class _Project(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         *parameters, records, settings = ctx.saved_tensors
+        gradient = gradient.contiguous()  # kept until the kernel has read it
         out = [torch.empty_like(parameter) for parameter in parameters]
         pose = torch.empty(3, 4) if ctx.needs_input_grad[-1] else None
         _backward(
             *_addresses(parameters), *_sizes(parameters, ctx.basis), settings.data_ptr(), records.data_ptr(),
-            native.pointer(gradient.contiguous(), "the gradient", (len(records), RECORD)),
+            native.pointer(gradient, "the gradient", (len(records), RECORD)),
             *(tensor.data_ptr() for tensor in out), None if pose is None else pose.data_ptr(), native.threads(),
         )  # fmt: skip
         return None, None, None, *out, pose

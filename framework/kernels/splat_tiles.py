@@ -81,9 +81,10 @@ _bin = native.Function("splat_bin", "pqpqiiqppppi", "q")
 
 @TILES.implementation(CPP)
 def _compiled(records: Tensor, width: int, height: int) -> TileLists:
+    records = records.contiguous()  # kept until the kernels have read it
     count, threads = len(records), native.threads()
     tiles = -(-width // TILE) * -(-height // TILE)
-    address = native.pointer(records.contiguous(), "the records", (count, RECORD))
+    address = native.pointer(records, "the records", (count, RECORD))
 
     def room(size: int) -> Tensor:
         return torch.empty(size, dtype=torch.int32)

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from framework.geometry.lenses import Distortion
 from framework.kernels.splat_blend import MAX_ALPHA, OPAQUE, blend
 from framework.kernels.splat_project import MIN_ALPHA, SplatCamera, project_gaussians, project_reference
 from framework.kernels.splat_tiles import tile_lists
@@ -395,3 +396,21 @@ def test_what_is_refused() -> None:
     image = blend(leaf, lists._replace(firsts=lists.firsts + 1000), 20, 20, BLACK).image
     with pytest.raises(IndexError, match="slots: index"):
         image.sum().backward()
+
+
+def test_beyond_a_lenss_reach_nothing_is_drawn() -> None:
+    """A barrel lens of k1 = -0.3 would fold back what is farther than 1 / sqrt(0.9) from its axis."""
+    lens = Distortion.of("opencv", torch.tensor([[-0.3] + [0.0] * 8]))
+    view = SplatCamera(torch.eye(3, 4), (50.0, 50.0, 40.0, 40.0), 80, 80, lens=lens)
+    across = torch.tensor([0.0, 0.5, 1.04, 1.07, 1.2, 1.8, -1.2, -0.5])
+    rows = [torch.zeros(8, count) for count in (3, 3, 4, 3)]
+    rows[0][:, 0], rows[0][:, 2] = across, 1.0
+    rows[1] -= 5
+    rows[2][:, 0] = 1
+    records, dropped = project_gaussians(*rows[:3], torch.zeros(8), rows[3], torch.zeros(8, 3, 0), view)
+    within = across.abs() < 0.9**-0.5
+    assert dropped == 0
+    assert torch.equal(records[:, 6] > 0, within)
+    bent = 40 + 50 * (across - 0.3 * across**3)
+    torch.testing.assert_close(records[within, 0], bent[within])
+    assert not records[~within].any()

@@ -132,6 +132,15 @@ def test_the_same_lists_on_any_number_of_threads() -> None:
     assert all(torch.equal(a, b) for lists in found[1:] for a, b in zip(lists, found[0], strict=True))
 
 
+@needs_kernels
+def test_records_in_another_order_in_memory() -> None:
+    torch.manual_seed(5)
+    records = records_of(scene(3000), 100, 80)
+    expected = tile_lists(records, 100, 80)
+    found = tile_lists(records.t().contiguous().t(), 100, 80)
+    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+
+
 @FORMS
 @pytest.mark.parametrize("count", [0, 9])
 def test_lists_of_nothing(form: Form, count: int) -> None:

@@ -41,8 +41,8 @@ BUGS = (
         "splats-gradients-in-another-order",
         "splats",
         PROJECT,
-        'native.pointer(gradient.contiguous(), "the gradient", (len(records), RECORD)),',
-        "gradient.data_ptr(),",
+        "gradient = gradient.contiguous()  # kept until the kernel has read it",
+        "gradient = gradient.as_strided((len(records), RECORD), (RECORD, 1))",
         "a gradient that is laid out otherwise is read as if it were not",
     ),
     Bug(

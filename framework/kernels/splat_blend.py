@@ -29,33 +29,43 @@ MAX_ALPHA = 0.999
 OPAQUE = 1e-4
 """Transmittance below which a pixel is done."""
 CHANNELS = {"rgb": 3, "distance": 4, "normals": 7}
-"""What an image has: colours; also the sum of weight times distance; also that of the normals."""
+"""Content of an image -> its channels: colours; then the sum of weight times distance; then that of the normals."""
 
 
 class Blended(NamedTuple):
-    """What an image shows."""
+    """The Gaussians on an image, blended."""
 
     image: Tensor
-    """(H, W, C) colours over the background, then distance and normals, if asked for, times the weights."""
+    """(H, W, C) colours over the background, then, if asked for, the sums of weight times distance and of weight times
+    normal."""
     transmittance: Tensor
-    """(H, W) share of the light that comes from behind everything."""
+    """(H, W) share of the background's light that arrives."""
     median: Tensor | None
-    """(H, W) distance at which half of the light is gone, 0 where it never is; None if not asked for."""
+    """(H, W) distance from the camera at which transmittance falls to 1/2 or below, 0 where it never does; None if not
+    asked for."""
 
 
 def blend(
-    records: Tensor, lists: TileLists, width: int, height: int, background: Tensor, channels: int = 3, median: bool = False
-) -> Blended:  # fmt: skip
+    records: Tensor,
+    lists: TileLists,
+    width: int,
+    height: int,
+    background: Tensor,
+    channels: int = 3,
+    median: bool = False,
+) -> Blended:
     """Blend the Gaussians on an image.
 
+    The image does not depend on the columns CUT and REACH_X of the records. The compiled form puts the sums over pixels
+    of the absolute gradients of x and y there instead (AbsGS, Ye et al. 2024).
+
     Args:
-        records: (N, RECORD) Gaussians on the image. Its gradient has, in the columns CUT and REACH_X, what nothing
-            depends on: the sums over pixels of the absolute gradients of x and y (AbsGS, Ye et al. 2024), if compiled.
-        lists: which of them each tile shows.
-        width, height: of the image, pixels.
-        background: (3,) colour behind everything; without gradient.
-        channels: a value of `CHANNELS`; with normals there is no gradient.
-        median: whether to find the median distance.
+        records: (N, RECORD) Gaussians on the image.
+        lists: Gaussians that each tile may show.
+        width, height: size of the image, pixels.
+        background: (3,) colour behind everything. It gets no gradient.
+        channels: number of channels, a value of `CHANNELS`. Normals have a gradient only in the reference.
+        median: whether to find the median distance. It has no gradient.
     """
     background = background.detach()
     return BLEND((records, background), records, lists, width, height, background, channels, median)
@@ -64,25 +74,21 @@ def blend(
 def blend_reference(
     records: Tensor, lists: TileLists, width: int, height: int, background: Tensor, channels: int, median: bool
 ) -> Blended:
-    """Blend in torch, tile by tile, in any float type. Arguments as for `blend`."""
+    """Compute `blend` in torch, tile by tile, on any device and in any float type.
+
+    Args:
+        records: (N, RECORD) Gaussians on the image.
+        lists: Gaussians that each tile may show.
+        width, height: size of the image, pixels.
+        background: (3,) colour behind everything.
+        channels: number of channels, a value of `CHANNELS`.
+        median: whether to find the median distance.
+    """
     columns, rows = -(-width // TILE), -(-height // TILE)
-    device, dtype = records.device, records.dtype
     behind = torch.cat([background.to(records), records.new_zeros(channels - 3)])
-    starts = lists.offsets.tolist()
-    within = torch.arange(TILE, device=device)
-    offset_y, offset_x = (part.flatten() for part in torch.meshgrid(within, within, indexing="ij"))
     tiles, left, middles = [], [], []
     for tile in range(columns * rows):
-        listed = records[lists.ids[starts[tile] : starts[tile + 1]].long()]
-        x = (tile % columns * TILE + offset_x).to(dtype) + 0.5
-        y = (tile // columns * TILE + offset_y).to(dtype) + 0.5
-        dx, dy = x[:, None] - listed[:, 0], y[:, None] - listed[:, 1]
-        q = (listed[:, 2] * dx + listed[:, 3] * dy) ** 2 + (listed[:, 4] * dy) ** 2
-        alpha = (listed[:, OPACITY] * torch.exp(-q)).clamp(max=MAX_ALPHA)
-        alpha = alpha.masked_fill(q >= listed[:, CUT], 0)
-        through = torch.cat([torch.ones_like(alpha[:, :1]), (1 - alpha).cumprod(1)], 1)
-        done = through[:, :-1] < OPAQUE
-        weights = (alpha * through[:, :-1]).masked_fill(done, 0)
+        listed, weights, through = _weights(records, lists, tile, columns)
         rest = 1 - weights.sum(1)
         tiles.append(weights @ listed[:, RGB : RGB + channels] + rest[:, None] * behind)
         left.append(rest)
@@ -94,6 +100,39 @@ def blend_reference(
         return grid.reshape(rows * TILE, columns * TILE, -1)[:height, :width]
 
     return Blended(joined(tiles), joined(left)[..., 0], joined(middles)[..., 0] if median else None)
+
+
+def _weights(records: Tensor, lists: TileLists, tile: int, columns: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return records (M, RECORD) of a tile's list, weights (P, M) in its P pixels, and transmittances (P, M + 1)."""
+    first, last = lists.offsets[tile : tile + 2].tolist()
+    listed = records[lists.ids[first:last].long()]
+    within = torch.arange(TILE, device=records.device)
+    offset_y, offset_x = (part.flatten() for part in torch.meshgrid(within, within, indexing="ij"))
+    x = (tile % columns * TILE + offset_x).to(records.dtype) + 0.5
+    y = (tile // columns * TILE + offset_y).to(records.dtype) + 0.5
+    dx, dy = x[:, None] - listed[:, 0], y[:, None] - listed[:, 1]
+    q = (listed[:, 2] * dx + listed[:, 3] * dy) ** 2 + (listed[:, 4] * dy) ** 2
+    alpha = (listed[:, OPACITY] * torch.exp(-q)).clamp(max=MAX_ALPHA)
+    alpha = alpha.masked_fill(q >= listed[:, CUT], 0)
+    through = torch.cat([torch.ones_like(alpha[:, :1]), (1 - alpha).cumprod(1)], 1)
+    return listed, (alpha * through[:, :-1]).masked_fill(through[:, :-1] < OPAQUE, 0), through
+
+
+def blended_pairs(records: Tensor, lists: TileLists, width: int, height: int) -> int:
+    """Return the number of pairs of a Gaussian and a pixel into which it is blended, for measurements.
+
+    Args:
+        records: (N, RECORD) Gaussians on the image.
+        lists: Gaussians that each tile may show.
+        width, height: size of the image, pixels.
+    """
+    columns, rows = -(-width // TILE), -(-height // TILE)
+    total = 0
+    for tile in range(columns * rows):
+        weights = _weights(records.detach(), lists, tile, columns)[1].view(TILE, TILE, -1)
+        inside = weights[: height - tile // columns * TILE, : width - tile % columns * TILE]
+        total += int((inside > 0).sum())
+    return total
 
 
 BLEND = Operation("blend", blend_reference)

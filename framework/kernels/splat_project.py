@@ -37,34 +37,35 @@ MIN_ALPHA = 1 / 255
 DC = 0.28209479177387814
 """The harmonic of degree 0."""
 MARGIN = 0.15
-"""Beyond the image's edge by this share of its size, J is taken as at that bound: farther out it grows endlessly."""
+"""Share of the image's size beyond its edge up to which J is that of the centre; farther out, where it would grow
+without bound, it is that of the nearest place within."""
 DEGREES = {0: 0, 1: 3, 2: 8, 3: 15}
-"""Degree of the harmonics -> how many there are beyond the first."""
+"""Degree of the harmonics -> their number beyond the first."""
 
 
 @dataclass(frozen=True)
 class SplatCamera:
-    """One pinhole camera, or one with a lens, as splatting sees it."""
+    """A pinhole camera, or one with OpenCV's lens distortion."""
 
     pose: Tensor
-    """(3, 4) from the scene to the camera's frame, x right, y down, z forward; it may require a gradient."""
+    """(3, 4) transform from the scene to the camera's frame: x right, y down, z forward. It may require a gradient."""
     intrinsics: tuple[float, float, float, float]
-    """fx, fy, cx, cy in pixels; the first pixel's centre lies at (0.5, 0.5)."""
+    """Focal lengths and principal point fx, fy, cx, cy, pixels; the first pixel's centre lies at (0.5, 0.5)."""
     width: int
-    """Of the image, pixels."""
+    """Width of the image, pixels."""
     height: int
-    """Of the image, pixels."""
+    """Height of the image, pixels."""
     near: float = 0.01
-    """What is nearer along the optical axis is not drawn, scene units."""
+    """Smallest depth along the optical axis at which a centre is drawn, scene units."""
     blur: float = 0.3
-    """Added to both variances on the image, pixels^2."""
+    """Variance added in both directions on the image, pixels^2."""
     antialiased: bool = False
     """Whether opacity makes up for the blur."""
     lens: Distortion | None = None
-    """The lens's distortion; None of a pinhole camera."""
+    """Distortion of the projection "opencv"; None for a pinhole camera."""
 
     def plain(self) -> list[float]:
-        """Return all as 33 numbers for a kernel."""
+        """Return the camera as 33 numbers for a kernel."""
         pose = self.pose.detach().double().cpu()
         lens = [0.0] * 12
         if self.lens is not None:
@@ -81,24 +82,33 @@ def project_gaussians(
 ) -> tuple[Tensor, int]:  # fmt: skip
     """Project N Gaussians to an image.
 
+    All parameters and the camera's pose get gradients. Normals and the columns CUT, REACH_X and REACH_Y pass none on.
+
     Args:
         means: (N, 3) centres, scene coordinates.
-        log_scales: (N, 3) logarithm of the standard deviations.
+        log_scales: (N, 3) logarithms of the standard deviations along the axes, of scene units.
         rotations: (N, 4) quaternions w, x, y, z of any length but 0.
-        logits: (N,) opacity before the sigmoid.
+        logits: (N,) opacities before the sigmoid.
         colors: (N, 3) coefficients of the harmonic of degree 0; 0 is grey.
-        harmonics: (N, 3, K) coefficients of the degrees from 1, K being 0, 3, 8 or 15.
-        camera: the image.
-        degree: highest degree of the harmonics that counts; those that are not there do not.
-    Returns: records (N, RECORD), all zeros for a Gaussian that the image does not show; and how many are left out as
-        they are not finite. Gradients go to all parameters and to the camera's pose, not to normals.
+        harmonics: (N, 3, K) coefficients of the degrees from 1; K is 0, 3, 8 or 15.
+        camera: the camera.
+        degree: highest degree of the harmonics that is used, 0 to 3; higher ones than `harmonics` has are left out.
+
+    Returns:
+        Records (N, RECORD), all zeros for a Gaussian that the image does not show, and the number of Gaussians that are
+        left out because a parameter is not finite or a quaternion is 0.
+
+    Raises:
+        ValueError: if there is another number of harmonics.
     """
+    if harmonics.shape[2] not in DEGREES.values():
+        raise ValueError(f"there are 0, 3, 8 or 15 harmonics beyond the first, not {harmonics.shape[2]}")
     tensors = (means, log_scales, rotations, logits, colors, harmonics, camera.pose)
     return PROJECT(tensors, *tensors[:-1], camera, min(DEGREES[degree], harmonics.shape[2]))
 
 
 def rotation_matrices(quaternions: Tensor) -> Tensor:
-    """Return the rotations (N, 3, 3) of quaternions w, x, y, z.
+    """Return the rotation matrices (N, 3, 3) of quaternions w, x, y, z.
 
     Args:
         quaternions: (N, 4), of any length but 0.
@@ -116,18 +126,64 @@ def project_reference(
     means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
     camera: SplatCamera, basis: int,
 ) -> tuple[Tensor, int]:  # fmt: skip
-    """Project in torch, in any float type. Arguments as for `project_gaussians`, `basis` being how many harmonics."""
-    fx, fy, cx, cy = camera.intrinsics
+    """Compute `project_gaussians` in torch, on any device and in any float type.
+
+    Args:
+        means, log_scales, rotations, logits, colors, harmonics: parameters of the Gaussians.
+        camera: the camera.
+        basis: number of harmonics that are used beyond the first: 0, 3, 8 or 15.
+
+    Returns:
+        Records (N, RECORD), and the number of Gaussians that are left out.
+    """
     pose = camera.pose.to(means)
-    at = means @ pose[:, :3].T + pose[:, 3]
-    everything = torch.cat(
-        [at, log_scales.exp(), rotations, logits[:, None], colors, harmonics[..., :basis].flatten(1)], 1
-    )
+    with torch.no_grad():  # apart from `at`, since the gradient of the pose would be NaN times 0
+        depth = means @ pose[2, :3] + pose[2, 3]
+    harmonics = harmonics[..., :basis]
+    everything = torch.cat([means, log_scales, rotations, logits[:, None], colors, harmonics.flatten(1)], 1)
     finite = everything.isfinite().all(1) & (rotations.square().sum(1) > 1e-24)
-    shown = finite & (at[:, 2] > camera.near)
-    kept = shown.nonzero()[:, 0]
-    at = at[kept]
+    kept = (finite & (depth > camera.near)).nonzero()[:, 0]
+    at = means[kept] @ pose[:, :3].T + pose[:, 3]
     axes = rotation_matrices(rotations[kept])
+    center_x, center_y, to_image, within = _onto_image(at, camera)
+    rows = to_image @ pose[:, :3] @ axes * log_scales[kept].exp()[:, None]  # (K, 2, 3)
+    first, second = rows.unbind(1)
+    b = (first * second).sum(-1)
+    spread_x, spread_y = first.square().sum(-1), second.square().sum(-1)
+    blur = camera.blur
+    a, c = spread_x + blur, spread_y + blur
+    det_0 = torch.linalg.cross(first, second).square().sum(-1)
+    det = det_0 + blur * (spread_x + spread_y) + blur * blur
+    opacity = torch.sigmoid(logits[kept])
+    if camera.antialiased:
+        opacity = opacity * (det_0 / det).clamp(min=1e-30).sqrt()
+    cut = (opacity / MIN_ALPHA).log()
+    reach_x, reach_y = ((2 * cut.clamp(min=0) * variance).sqrt() for variance in (a, c))
+    u_x = (c / (2 * det)).sqrt()
+    center = -pose[:, :3].T @ pose[:, 3]
+    directions = torch.nn.functional.normalize(means[kept] - center, dim=-1)
+    rgb = 0.5 + DC * colors[kept]
+    if basis:
+        values = spherical_harmonics_reference(directions, {3: 2, 8: 3, 15: 4}[basis])[:, 1:]
+        rgb = rgb + (harmonics[kept] * values[:, None]).sum(-1)
+    with torch.no_grad():
+        normals = axes[torch.arange(len(kept), device=kept.device), :, log_scales[kept].argmin(-1)]
+        normals = torch.where((normals * directions).sum(-1, keepdim=True) > 0, -normals, normals)
+        visible = within & (cut > 0) & (center_x + reach_x > 0) & (center_x - reach_x < camera.width)
+        visible &= (center_y + reach_y > 0) & (center_y - reach_y < camera.height)
+    columns = [
+        center_x, center_y, u_x, -b / c * u_x, (0.5 / c).sqrt(), opacity, cut.detach(), reach_x.detach(),
+        *rgb.clamp(min=0).unbind(-1), at.norm(dim=-1), *normals.unbind(-1), reach_y.detach(),
+    ]  # fmt: skip
+    records = means.new_zeros(len(means), RECORD)
+    table = torch.stack(columns, -1)
+    sound = visible & table.isfinite().all(1)
+    return records.index_copy(0, kept[sound], table[sound]), int((~finite).sum())
+
+
+def _onto_image(at: Tensor, camera: SplatCamera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the positions x, y (K,) on the image of points (K, 3), Jacobians (K, 2, 3), and what the lens shows."""
+    fx, fy, cx, cy = camera.intrinsics
     x, y, over = at[:, 0] / at[:, 2], at[:, 1] / at[:, 2], 1 / at[:, 2]
     low_x, high_x = (-MARGIN * camera.width - cx) / fx, ((1 + MARGIN) * camera.width - cx) / fx
     low_y, high_y = (-MARGIN * camera.height - cy) / fy, ((1 + MARGIN) * camera.height - cy) / fy
@@ -143,40 +199,7 @@ def project_reference(
         x, y, (uu, uv, vv) = distort(inside_x, inside_y, coefficients)
         to_plane = torch.stack([uu, uv, uv, vv], -1).detach().unflatten(-1, (2, 2)) @ to_plane
     focal = torch.tensor([fx, fy], dtype=at.dtype, device=at.device)
-    rows = focal[:, None] * to_plane @ pose[:, :3] @ axes * log_scales[kept].exp()[:, None]  # (K, 2, 3)
-    first, second = rows.unbind(1)
-    b = (first * second).sum(-1)
-    spread_x, spread_y = first.square().sum(-1), second.square().sum(-1)
-    blur = camera.blur
-    a, c = spread_x + blur, spread_y + blur
-    det_0 = torch.linalg.cross(first, second).square().sum(-1)
-    det = det_0 + blur * (spread_x + spread_y) + blur * blur
-    opacity = torch.sigmoid(logits[kept])
-    if camera.antialiased:
-        opacity = opacity * (det_0 / det).sqrt()
-    cut = (opacity / MIN_ALPHA).log()
-    reach_x, reach_y = ((2 * cut.clamp(min=0) * variance).sqrt() for variance in (a, c))
-    u_x = (c / (2 * det)).sqrt()
-    center_x, center_y = fx * x + cx, fy * y + cy
-    center = -pose[:, :3].T @ pose[:, 3]
-    directions = torch.nn.functional.normalize(means[kept] - center, dim=-1)
-    rgb = 0.5 + DC * colors[kept]
-    if basis:
-        values = spherical_harmonics_reference(directions, {3: 2, 8: 3, 15: 4}[basis])[:, 1:]
-        rgb = rgb + (harmonics[kept][..., :basis] * values[:, None]).sum(-1)
-    with torch.no_grad():
-        normals = axes[torch.arange(len(kept), device=kept.device), :, log_scales[kept].argmin(-1)]
-        normals = torch.where((normals * directions).sum(-1, keepdim=True) > 0, -normals, normals)
-        visible = within & (cut > 0) & (center_x + reach_x > 0) & (center_x - reach_x < camera.width)
-        visible &= (center_y + reach_y > 0) & (center_y - reach_y < camera.height)
-    columns = [
-        center_x, center_y, u_x, -b / c * u_x, (0.5 / c).sqrt(), opacity, cut.detach(), reach_x.detach(),
-        *rgb.clamp(min=0).unbind(-1), at.norm(dim=-1), *normals.unbind(-1), reach_y.detach(),
-    ]  # fmt: skip
-    records = means.new_zeros(len(means), RECORD)
-    table = torch.stack(columns, -1)
-    sound = visible & table.isfinite().all(1)
-    return records.index_copy(0, kept[sound], table[sound]), int((~finite).sum())
+    return fx * x + cx, fy * y + cy, focal[:, None] * to_plane, within
 
 
 PROJECT = Operation("project_gaussians", project_reference)
@@ -200,11 +223,12 @@ class _Project(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         *parameters, records, settings = ctx.saved_tensors
+        gradient = gradient.contiguous()  # kept until the kernel has read it
         out = [torch.empty_like(parameter) for parameter in parameters]
         pose = torch.empty(3, 4) if ctx.needs_input_grad[-1] else None
         _backward(
             *_addresses(parameters), *_sizes(parameters, ctx.basis), settings.data_ptr(), records.data_ptr(),
-            native.pointer(gradient.contiguous(), "the gradient", (len(records), RECORD)),
+            native.pointer(gradient, "the gradient", (len(records), RECORD)),
             *(tensor.data_ptr() for tensor in out), None if pose is None else pose.data_ptr(), native.threads(),
         )  # fmt: skip
         return None, None, None, *out, pose

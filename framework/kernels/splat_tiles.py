@@ -1,4 +1,4 @@
-"""Which Gaussians each tile of an image shows, from front to back.
+"""Lists of the Gaussians that each tile of an image shows, from front to back.
 
 The Gaussians are sorted by distance once (a radix sort of 32-bit keys), and dealt to the tiles that they touch in that
 order, so that each tile's list is sorted too.
@@ -20,31 +20,36 @@ TILE = 16
 
 
 class TileLists(NamedTuple):
-    """E entries of T tiles, row by row; each is a Gaussian that a tile may show."""
+    """Lists of T tiles, row by row, with E entries in all; an entry is a Gaussian that a tile may show."""
 
     offsets: Tensor
-    """(T + 1,) int32, tile t has the entries from offsets[t] to offsets[t + 1], from front to back."""
+    """(T + 1,) int32; tile t has the entries from offsets[t] to offsets[t + 1] - 1, from front to back."""
     ids: Tensor
-    """(E,) int32, which Gaussian."""
+    """(E,) int32 index of each entry's Gaussian."""
     slots: Tensor
-    """(E,) int32, where an entry is when all are sorted by Gaussian, and of each by tile."""
+    """(E,) int32 place of each entry if all are sorted by Gaussian, and those of a Gaussian by tile."""
     firsts: Tensor
-    """(N + 1,) int32, Gaussian g has the slots from firsts[g] to firsts[g + 1]."""
+    """(N + 1,) int32; Gaussian g has the slots from firsts[g] to firsts[g + 1] - 1."""
 
 
 def tile_lists(records: Tensor, width: int, height: int) -> TileLists:
-    """Return which Gaussians each tile of an image shows. Without gradient.
+    """Return lists of the Gaussians that each tile of an image may show, nearest first, those as near by their index.
 
     Args:
-        records: (N, RECORD) Gaussians on the image (`project_gaussians`).
-        width, height: of the image, pixels.
+        records: (N, RECORD) Gaussians on the image, from `project_gaussians`.
+        width, height: size of the image, pixels.
     """
     records = records.detach()
     return TILES((records,), records, width, height)
 
 
 def tile_lists_reference(records: Tensor, width: int, height: int) -> TileLists:
-    """Return lists as of `tile_lists`, in torch: tiles that only the box around a Gaussian touches are in them too."""
+    """Compute `tile_lists` in torch. A Gaussian is listed in every tile that the box around it touches.
+
+    Args:
+        records: (N, RECORD) Gaussians on the image, from `project_gaussians`.
+        width, height: size of the image, pixels.
+    """
     columns, rows = -(-width // TILE), -(-height // TILE)
     device = records.device
     order = records[:, DISTANCE].sort(stable=True).indices
@@ -76,9 +81,10 @@ _bin = native.Function("splat_bin", "pqpqiiqppppi", "q")
 
 @TILES.implementation(CPP)
 def _compiled(records: Tensor, width: int, height: int) -> TileLists:
+    records = records.contiguous()  # kept until the kernels have read it
     count, threads = len(records), native.threads()
     tiles = -(-width // TILE) * -(-height // TILE)
-    address = native.pointer(records.contiguous(), "the records", (count, RECORD))
+    address = native.pointer(records, "the records", (count, RECORD))
 
     def room(size: int) -> Tensor:
         return torch.empty(size, dtype=torch.int32)

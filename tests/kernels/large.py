@@ -28,6 +28,9 @@ from framework.kernels.intervals import (
 from framework.kernels.march import CompiledMarch, Occupancy, ReferenceMarch, refresh_occupancy
 from framework.kernels.mlp import mlp, mlp_reference
 from framework.kernels.planes import PlanesLayout, planes, planes_reference
+from framework.kernels.splat_blend import blend, blend_reference
+from framework.kernels.splat_project import RECORD, SplatCamera, project_gaussians, project_reference
+from framework.kernels.splat_tiles import tile_lists, tile_lists_reference
 from framework.kernels.ssim import ssim, ssim_reference
 from tests.kernels.compiled import relative_error
 
@@ -42,6 +45,39 @@ def with_gradients(call: Callable[..., Tensor], inputs: list[Tensor], direction:
     leaves = [x.to(dtype).requires_grad_() for x in inputs]
     value = call(*leaves)
     return [value.detach(), *torch.autograd.grad(value, leaves, direction.to(value))]
+
+
+def gaussians(count: int) -> list[Tensor]:
+    """Parameters of Gaussians in front of a camera, and its pose."""
+    means = torch.randn(count, 3) + torch.tensor([0.0, 0.0, 5.0])
+    harmonics = torch.randn(count, 3, 15) / 5
+    rows = [means.clamp(min=-4), torch.randn(count, 3) / 2 - 3, torch.randn(count, 4), torch.rand(count)]
+    return [*rows, torch.randn(count, 3), harmonics, torch.eye(3, 4)]
+
+
+def seen_by(pose: Tensor) -> SplatCamera:
+    return SplatCamera(pose, (150.0, 160.0, 75.0, 70.0), 150, 140, antialiased=True)
+
+
+def wide_records(count: int) -> Tensor:
+    """Records so wide that alpha at their bounds is nothing: whether a pixel is within does not matter."""
+    records = torch.zeros(count, RECORD)
+    records[:, :2], records[:, 2:5] = 150 * torch.rand(count, 2), 0.5 + torch.rand(count, 3) / 5
+    records[:, 5], records[:, 6], records[:, [7, 15]] = torch.rand(count) / 2, 60.0, 25.0
+    records[:, 8:12] = torch.rand(count, 4)
+    return records
+
+
+def on_image(form: Callable[..., object]) -> Callable[..., Tensor]:
+    """Image, distance and transmittance of records (N, RECORD)."""
+
+    def run(records: Tensor) -> Tensor:
+        # What bounds a Gaussian has no gradient, whose place the compiled form uses for something else.
+        records = torch.cat([records[:, :6], records[:, 6:8].detach(), records[:, 8:]], -1)
+        found = form(records, tile_lists(records.float(), 150, 140), 150, 140, torch.ones(3), 4, False)
+        return torch.cat([found.image, found.transmittance[..., None]], -1).flatten(0, 1)  # type: ignore[attr-defined]
+
+    return run
 
 
 def differentiable() -> dict[str, tuple[Callable[..., Tensor], Callable[..., Tensor], list[Tensor], int]]:
@@ -112,6 +148,13 @@ def differentiable() -> dict[str, tuple[Callable[..., Tensor], Callable[..., Ten
             [torch.rand(COUNT // 10, 32)],
             32,
         ),
+        "projected Gaussians": (
+            lambda *given: project_gaussians(*given[:-1], seen_by(given[-1]))[0],
+            lambda *given: project_reference(*given[:-1], seen_by(given[-1]), 15)[0],
+            gaussians(COUNT // 4),
+            RECORD,
+        ),
+        "blended Gaussians": (on_image(blend), on_image(blend_reference), [wide_records(2000)], 5),
         "similarity": (
             lambda x: ssim(x, target)[None, None],
             lambda x: ssim_reference(x, target.double())[None, None],
@@ -169,6 +212,13 @@ def measured() -> dict[str, tuple[float, list[Tensor]]]:
     ):
         steps, truth = optimised(form, torch.float32), optimised(reference, torch.float64)
         found[name] = max(relative_error(a, b) for a, b in zip(steps, truth, strict=True)), steps
+    *rows, pose = gaussians(COUNT)
+    records = project_gaussians(*rows, seen_by(pose))[0]
+    lists, boxes = tile_lists(records, 150, 140), tile_lists_reference(records, 150, 140)
+    entries, allowed = (
+        torch.repeat_interleave(each.offsets.diff().long()) * COUNT + each.ids for each in (lists, boxes)
+    )
+    found["tile lists"] = float((~torch.isin(entries, allowed)).float().mean()), list(lists)
     samples, expected = marched(CompiledMarch), marched(ReferenceMarch)
     missing = [len(expected[0]) - len(samples[0]), *(int((a != b).sum()) for a, b in [(samples[1], expected[1])])]
     found["marching"] = float(sum(map(abs, missing))) / len(expected[0]), samples

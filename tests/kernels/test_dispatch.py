@@ -26,6 +26,18 @@ from framework.kernels.planes import PLANE_BAND, PLANES, PlanesGradient, PlanesL
 from framework.kernels.rows import GATHER_ROWS
 from framework.kernels.silhouettes import HOLD_BALLS, OPAQUE_SUMS, PIXELS_NEAR_BALLS, Photograph, opaque_sums
 from framework.kernels.spherical_harmonics import SPHERICAL_HARMONICS
+from framework.kernels.splat_blend import BLEND
+from framework.kernels.splat_project import (
+    CUT,
+    DISTANCE,
+    PROJECT,
+    REACH_X,
+    REACH_Y,
+    RECORD,
+    SplatCamera,
+    project_gaussians,
+)
+from framework.kernels.splat_tiles import TILES, tile_lists
 from framework.kernels.ssim import SSIM
 from tests.kernels.compiled import needs_kernels
 
@@ -70,6 +82,29 @@ def photograph() -> Photograph:
     return Photograph(pose, 60.0, 55.0, 26.0, 19.0, opaque_sums(torch.rand(40, 50) > 0.97))
 
 
+def gaussians() -> tuple[Tensor, ...]:
+    """Rows in front of `splat_camera`, with harmonics of degree 1."""
+    means = torch.randn(40, 3) + torch.tensor([0.0, 0.0, 4.0])
+    return means, torch.randn(40, 3) / 2 - 2, torch.randn(40, 4), torch.randn(40), torch.randn(40, 3), rand(40, 3, 3)
+
+
+def splat_camera() -> SplatCamera:
+    return SplatCamera(torch.eye(3, 4), (30.0, 32.0, 20.0, 15.0), 37, 30)
+
+
+def projected() -> Tensor:
+    return project_gaussians(*gaussians(), splat_camera())[0]
+
+
+def everywhere(left: int, right: int) -> Tensor:
+    """Records on an image of 32 x 32, all of whose tiles they meet; some are not visible, and many as far as others."""
+    records = torch.zeros(60, RECORD)
+    records[:, :2], records[:, [2, 4]] = 32 * torch.rand(60, 2), 1.0
+    records[:, CUT], records[:, [REACH_X, REACH_Y]] = 1e5 * torch.rand(60) - 2e4, 40.0
+    records[:, DISTANCE] = torch.randint(left, right, (60,)).float()
+    return records
+
+
 def adam(parameters: int) -> Arguments:
     """Values, gradients, means, squares."""
     return tuple([rand(20, 2) for _ in range(parameters)] for _ in range(4))
@@ -99,6 +134,9 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     OPAQUE_SUMS: lambda: (torch.rand(7, 9) > 0.5,),
     HOLD_BALLS: lambda: (photograph(), torch.rand(200, 3) * 2 - 1, 0.05, torch.rand(200) > 0.5, True),
     PIXELS_NEAR_BALLS: lambda: (photograph(), torch.rand(20, 3) * 2 - 1, 0.05),
+    PROJECT: lambda: (*gaussians(), splat_camera(), 3),
+    TILES: lambda: (everywhere(1, 9), 32, 32),
+    BLEND: lambda: (records := projected(), tile_lists(records, 37, 30), 37, 30, rand(3), 7, True),
     SSIM: lambda: (rand(13, 15, 3), rand(13, 15, 3)),
     GATHER_COLORS: lambda: (torch.randint(256, (60, 4), dtype=torch.uint8), torch.randint(60, (9,)), rand(9, 3)),
     CAMERA_RAYS: lambda: (cameras(), torch.arange(0, 72, 5), 0.0, 1.0, None, subpixels(4)),
@@ -182,6 +220,12 @@ def test_what_is_taken() -> None:
     assert taken(ALL_FINITE, (row,), row) == "c++"
     assert taken(ALL_FINITE, (row.t(),), row.t()) == "reference"
     assert taken(PLANE_BAND, (table,), table, 0, 1, None) == "reference"
+    image = CASES[BLEND]()
+    image[0].requires_grad_()
+    for channels, expected in ((3, "c++"), (4, "c++"), (7, "reference")):
+        assert taken(BLEND, image[:1], *image[:5], channels, False) == expected
+    with torch.no_grad():
+        assert taken(BLEND, image[:1], *image) == "c++"
     flat = cameras()
     fan = Cameras(*(getattr(flat, field.name) for field in fields(Cameras)[:7]), model="orthographic")
     for these, expected in ((flat, "c++"), (fan, "reference")):
@@ -198,6 +242,7 @@ def test_what_is_taken() -> None:
         (DISTORTION, 0, "c++"),
         (DISTORTION, 1, "reference"),
         (DISTORTION, 2, "reference"),
+        (PROJECT, 6, "c++"),
         (SSIM, 0, "c++"),
         (SSIM, 1, "reference"),
         (COMPOSITE, 1, "c++"),

@@ -28,6 +28,9 @@ from framework.kernels.intervals import (
 from framework.kernels.mlp import mlp, mlp_reference
 from framework.kernels.planes import PlanesLayout, planes, planes_reference
 from framework.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
+from framework.kernels.splat_blend import blend, blend_reference
+from framework.kernels.splat_project import SplatCamera, project_gaussians, project_reference
+from framework.kernels.splat_tiles import tile_lists
 from framework.kernels.ssim import ssim, ssim_reference
 from framework.samplers.occupancy import OccupancySampler
 from tests.kernels.compiled import needs_kernels, relative_error
@@ -91,6 +94,39 @@ def network(form: Function) -> Function:
         return form([one, two], [first, second], "sigmoid", [bias, other])
 
     return run
+
+
+def gaussians() -> dict[str, Tensor]:
+    return {
+        "means": torch.rand(20, 3) + torch.tensor([-0.5, -0.5, 3.0]), "log_scales": rand(20, 3) - 2,
+        "rotations": rand(20, 4), "logits": rand(20), "colors": rand(20, 3), "harmonics": rand(20, 3, 3) / 5,
+        "pose": torch.eye(3, 4),
+    }  # fmt: skip
+
+
+def on_image(form: Function) -> Function:
+    def run(pose: Tensor, **rows: Tensor) -> Tensor:
+        camera = SplatCamera(pose, (20.0, 22.0, 10.0, 8.0), 20, 17, antialiased=True)
+        records = form(*rows.values(), camera, 3)[0]
+        return torch.cat([records[:, :6], records[:, 8:12]], -1)  # what gradients go through
+
+    return run
+
+
+def blended(form: Function) -> Function:
+    def run(records: Tensor) -> Tensor:
+        # What bounds a Gaussian has no gradient, whose place the compiled form uses for something else.
+        records = torch.cat([records[:, :6], records[:, 6:8].detach(), records[:, 8:]], -1)
+        found = form(records, tile_lists(records, 20, 17), 20, 17, torch.ones(3), 4, False)
+        return torch.cat([found.image.flatten(), found.transmittance.flatten()])
+
+    return run
+
+
+def some_records() -> dict[str, Tensor]:
+    *rows, pose = gaussians().values()
+    records, _ = project_gaussians(*rows, SplatCamera(pose, (20.0, 22.0, 10.0, 8.0), 20, 17))
+    return {"records": records}
 
 
 BACKWARD_BF16 = ("mlp_forward_bf16", "mlp_backward_bf16")
@@ -164,6 +200,15 @@ OPERATIONS = {
         ("proposal_excess",),
         frozenset({"edges", "weights", "proposed"}),
     ),
+    "projected Gaussians": Operation(
+        on_image(lambda *given: project_gaussians(*given[:-1], degree=1)),
+        on_image(project_reference),
+        gaussians,
+        ("splat_project", "splat_project_backward"),
+    ),
+    "blended Gaussians": Operation(
+        blended(blend), blended(blend_reference), some_records, ("splat_blend", "splat_blend_backward", "splat_gather")
+    ),
     "similarity": Operation(
         ssim, ssim_reference, lambda: {"image": rand(13, 15, 3), "target": rand(13, 15, 3)}, ("ssim",)
     ),
@@ -189,6 +234,7 @@ WITHOUT_A_GRADIENT = {
     "sort_by_ray", "gather_rows", "resample_intervals",  # documented to have none
     "adam_sparse", "adam_dense", "all_finite", "hash_grid_adam",  # of the optimiser
     "opaque_sums", "hold_balls", "pixels_near_balls",  # whose results are counted or true and false
+    "splat_sort", "splat_bound", "splat_bin",  # whose results are indices
 }  # fmt: skip
 
 

@@ -133,6 +133,7 @@ struct Projected {
     Floats t0[3], t1[3], cross[3];  // rows of the Jacobian times v, and their product
     Floats a, b, c, det0, det;
     Floats base, factor, opacity;   // the logistic, the correction for the blur, and their product
+    Floats given;          // sum of all parameters but the colours': it is finite only where they are
     Floats u, v_image, distance;
     Floats direction[3], to_camera;  // from the camera to the centre, scene coordinates, and its length
     Ints valid;
@@ -141,13 +142,16 @@ struct Projected {
         Floats m[3];
         for (int i = 0; i < 3; i++) {
             m[i] = column(in.means, from, in.count, 3, i);
-            s[i] = exponential(column(in.log_scales, from, in.count, 3, i));
+            const Floats log_scale = column(in.log_scales, from, in.count, 3, i);
+            s[i] = exponential(log_scale);
+            given = (i ? given : splat(0)) + m[i] + log_scale;
         }
         for (int i = 0; i < 3; i++) p[i] = camera.r[i][0] * m[0] + camera.r[i][1] * m[1] + camera.r[i][2] * m[2] + camera.t[i];
         Floats squared{};
         for (int i = 0; i < 4; i++) {
             q[i] = column(in.rotations, from, in.count, 4, i);
             squared += q[i] * q[i];
+            given += q[i];
         }
         norm = square_root(squared);
         valid = (p[2] > camera.near) & (squared > 1e-24f);
@@ -191,7 +195,9 @@ struct Projected {
         }
         a = first + camera.blur, c = second + camera.blur;
         det = det0 + camera.blur * (first + second) + camera.blur * camera.blur;  // no difference, so nothing cancels
-        base = logistic(column(in.logits, from, in.count, 1, 0));
+        const Floats logit = column(in.logits, from, in.count, 1, 0);
+        given += logit;
+        base = logistic(logit);
         factor = camera.antialiased ? square_root(det0 / det) : splat(1);
         opacity = base * factor;
         distance = square_root(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]);
@@ -259,7 +265,12 @@ EXPORT int splat_project(const float* means, const float* log_scales, const floa
                 harmonics(g.direction[0], g.direction[1], g.direction[2], basis, basis_values);
                 out[X] = g.u, out[Y] = g.v_image, out[U_X] = u_x, out[U_Y] = u_y, out[V_Y] = v_y;
                 out[OPACITY] = g.opacity, out[CUT] = cut, out[REACH_X] = reach_x, out[REACH_Y] = reach_y;
-                for (int i = 0; i < 3; i++) out[RED + i] = larger(color_of(in, from, i, basis_values), splat(0));
+                Floats given = g.given;
+                for (int i = 0; i < 3; i++) {
+                    const Floats color = color_of(in, from, i, basis_values);
+                    out[RED + i] = color < 0 ? splat(0) : color;  // NaN stays NaN
+                    given += color;
+                }
                 out[DISTANCE] = g.distance;
                 // The shortest axis, turned towards the camera.
                 const Ints second = (g.s[1] < g.s[0]) & (g.s[1] <= g.s[2]), third = (g.s[2] < g.s[0]) & (g.s[2] < g.s[1]);
@@ -271,14 +282,12 @@ EXPORT int splat_project(const float* means, const float* log_scales, const floa
                 for (int i = 0; i < 3; i++) out[NORMAL_X + i] = facing > 0 ? -normal[i] : normal[i];
                 Ints finite = Ints{} - 1;
                 for (int k = 0; k < RECORD; k++) finite &= out[k] - out[k] == 0;
-                // NaN fails every comparison: what is not finite is not visible, and is told apart by its parameters.
+                // What overflows on the way is not visible either, but only what has such parameters is counted.
                 float rows[RECORD][LANES];
                 int32_t shown[LANES], sound[LANES];
-                const Ints kept = visible & finite;
+                const Ints all = (given - given == 0) & (g.norm > 1e-12f);
+                const Ints kept = visible & finite & all;
                 std::memcpy(shown, &kept, sizeof shown);
-                Floats sum = g.p[0] + g.p[1] + g.p[2] + g.norm + g.base + g.s[0] + g.s[1] + g.s[2] + out[RED] + out[GREEN] +
-                             out[BLUE];
-                const Ints all = (sum - sum == 0) & (g.norm > 0);
                 std::memcpy(sound, &all, sizeof sound);
                 for (int k = 0; k < RECORD; k++) store(rows[k], out[k]);
                 for (int i = 0; i < LANES && from + i < end; i++) {
@@ -360,27 +369,25 @@ EXPORT int splat_project_backward(const float* means, const float* log_scales, c
                 const Floats over_c = 1.0f / g.c, over_det = 1.0f / g.det;
                 const Floats v_y = square_root(0.5f * over_c), u_x = square_root(0.5f * g.c * over_det);
                 const Floats u_y = -g.b * over_c * u_x;
-                const Floats of_log_det = -0.5f * (d[U_X] * u_x + d[U_Y] * u_y);
-                Floats of_a = of_log_det * g.c * over_det;
-                Floats of_b = -d[U_Y] * over_c * u_x - 2 * of_log_det * g.b * over_det;
-                Floats of_c = 0.5f * over_c * (d[U_X] * u_x - d[U_Y] * u_y - d[V_Y] * v_y) + of_log_det * g.a * over_det;
-                Floats of_t0[3], of_t1[3];
+                Floats of_det = -0.5f * over_det * (d[U_X] * u_x + d[U_Y] * u_y);
+                const Floats of_b = -d[U_Y] * over_c * u_x;
+                const Floats of_c = 0.5f * over_c * (d[U_X] * u_x - d[U_Y] * u_y - d[V_Y] * v_y);
                 const Floats of_base = d[OPACITY] * g.factor;
-                for (int k = 0; k < 3; k++) {
-                    of_t0[k] = 2 * of_a * g.t0[k] + of_b * g.t1[k];
-                    of_t1[k] = 2 * of_c * g.t1[k] + of_b * g.t0[k];
-                }
-                if (camera.antialiased) {  // factor = sqrt(det0 / det), det also as a function of a, b, c
+                Floats of_det0{};
+                if (camera.antialiased) {  // factor = sqrt(det0 / det)
                     const Floats of_factor = d[OPACITY] * g.base;
-                    const Floats by_det = -0.5f * of_factor * g.factor * over_det;
-                    const Floats of_det0 = 0.5f * of_factor / larger(g.factor * g.det, splat(1e-30f));
-                    for (int k = 0; k < 3; k++) {
-                        const int i = (k + 1) % 3, j = (k + 2) % 3;
-                        of_t0[k] += by_det * 2 * (g.c * g.t0[k] - g.b * g.t1[k]);
-                        of_t1[k] += by_det * 2 * (g.a * g.t1[k] - g.b * g.t0[k]);
-                        of_t0[k] += 2 * of_det0 * (g.t1[i] * g.cross[j] - g.t1[j] * g.cross[i]);
-                        of_t1[k] += 2 * of_det0 * (g.cross[i] * g.t0[j] - g.cross[j] * g.t0[i]);
-                    }
+                    of_det -= 0.5f * of_factor * g.factor * over_det;
+                    of_det0 = 0.5f * of_factor / larger(g.factor * g.det, splat(1e-30f));
+                }
+                // det = det0 + blur (|t0|^2 + |t1|^2) + blur^2, det0 = |t0 x t1|^2; through a, b and c it would cancel.
+                of_det0 += of_det;
+                Floats of_t0[3], of_t1[3];
+                for (int k = 0; k < 3; k++) {
+                    const int i = (k + 1) % 3, j = (k + 2) % 3;
+                    of_t0[k] = of_b * g.t1[k] + 2 * camera.blur * of_det * g.t0[k] +
+                               2 * of_det0 * (g.t1[i] * g.cross[j] - g.t1[j] * g.cross[i]);
+                    of_t1[k] = of_b * g.t0[k] + 2 * (of_c + camera.blur * of_det) * g.t1[k] +
+                               2 * of_det0 * (g.cross[i] * g.t0[j] - g.cross[j] * g.t0[i]);
                 }
                 give(of_logits, 1, 0, of_base * g.base * (1.0f - g.base));
 

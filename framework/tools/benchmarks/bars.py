@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from framework.base.console import say
-from framework.tools.benchmarks.kernels import Row
+from framework.tools.benchmarks.kernels import UNITS, Row
 from framework.tools.comparison import plots
 
 
@@ -37,7 +37,7 @@ def draw(rows: Sequence[Row], path: Path) -> bool:
     axes.plot(bounds, mark_heights, "|", color="#d55e00", markersize=11, label="forward at the ceiling")
     for height, row, value in zip(heights, rows, theirs, strict=True):
         axes.text(value * 1.1, height, f"{row.speed_up:.1f} x", va="center", fontsize=8)
-    axes.set(xscale="log", xlabel=f"ns a sample, ray, entry or pixel, forward and backward, {rows[0].threads} threads")
+    axes.set(xscale="log", xlabel=f"ns a {UNITS}, forward and backward, {rows[0].threads} threads")
     axes.set_yticks(list(heights), [row.kernel for row in rows], fontsize=8)
     axes.margins(x=0.1)
     axes.legend(fontsize=8)

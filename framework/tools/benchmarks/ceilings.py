@@ -14,7 +14,7 @@ TABLES = (1, 8, 64)
 
 @dataclass(frozen=True)
 class Work:
-    """Minimum work of a kernel per sample, ray, entry or pixel."""
+    """Minimum work of a kernel per unit: sample, ray, entry, pixel or Gaussian."""
 
     bytes: float = 0.0
     """Bytes read or written in order."""

@@ -138,7 +138,12 @@ class _Table(nn.Module):
 
 
 class GaussianSplatting(Model[GaussianSplattingConfig]):
-    """Gaussians that are drawn onto whole images."""
+    """Gaussians that are drawn onto whole images.
+
+    Args:
+        config: the settings, decided.
+        scene: facts about the data.
+    """
 
     batches: ClassVar[Literal["pixels", "views"]] = "views"
     found: Tensor

@@ -48,7 +48,8 @@ def splat_camera(
         antialiased: make up for the blur of small Gaussians by their opacity.
         pose: (3, 4) camera-to-scene pose to use instead of its own; it may require a gradient.
         reduced: factor by which the image is smaller than the camera's.
-    Raises: ConfigError for a camera model that is not among `DRAWN`.
+    Raises:
+        ConfigError for a camera model that is not among `DRAWN`.
     """
     if camera.model not in DRAWN:
         raise ConfigError(
@@ -94,7 +95,8 @@ def draw_view(
         near: what is nearer is not drawn, scene units.
         far: depth where nothing is seen, scene units.
         antialiased: make up for the blur of small Gaussians by their opacity.
-    Raises: ConfigError for a camera model that is not among `DRAWN`.
+    Raises:
+        ConfigError for a camera model that is not among `DRAWN`.
     """
     camera = splat_camera(view.camera, near, antialiased)
     records, _ = _projected(gaussians, camera)

@@ -1,4 +1,4 @@
-"""Where Gaussians go: Markov chain Monte Carlo (Kheradmand et al. 2024, "3D Gaussian Splatting as MCMC").
+"""Moves of Gaussians by Markov chain Monte Carlo (Kheradmand et al. 2024, "3D Gaussian Splatting as MCMC").
 
 Gaussians that have become transparent are moved to opaque ones, and new ones are added there, so that what is drawn
 stays as it was; noise moves those that are nearly transparent, and so looks for places where they are needed.
@@ -28,7 +28,8 @@ def moved(gaussians: Gaussians, added: int) -> tuple[Tensor, Gaussians] | None:
     Args:
         gaussians: all of them.
         added: how many more there are to be.
-    Returns: which Gaussians (K,) stay as they are, and those that are added behind them: each that was chosen, as many
+    Returns:
+        which Gaussians (K,) stay as they are, and those that are added behind them: each that was chosen, as many
         times as it is to be there. None where nothing is to be done.
     """
     opacity = torch.sigmoid(gaussians.logits)
@@ -59,7 +60,8 @@ def shared(logits: Tensor, log_scales: Tensor, counts: Tensor) -> tuple[Tensor, 
         logits: (K,) opacity before the sigmoid.
         log_scales: (K, 3).
         counts: (K,) int64 n, how many it becomes; at most MOST_COPIES.
-    Returns: (K,) and (K, 3).
+    Returns:
+        (K,) and (K, 3).
     """
     alpha = torch.sigmoid(logits).clamp(1e-6, 1 - 1e-6)
     each = -torch.expm1(torch.log1p(-alpha) / counts)
@@ -81,7 +83,8 @@ def shaken(gaussians: Gaussians, size: float) -> tuple[Tensor, Tensor]:
     Args:
         gaussians: all of them.
         size: the noise of a transparent Gaussian, in its standard deviations squared per scene unit.
-    Returns: which (K,), and by how much (K, 3), scene units.
+    Returns:
+        which (K,), and by how much (K, 3), scene units.
     """
     opacity = torch.sigmoid(gaussians.logits)
     chosen = (opacity < NOISE_FROM + 6 / NOISE_SHARPNESS).nonzero()[:, 0]

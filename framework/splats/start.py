@@ -1,4 +1,4 @@
-"""Where Gaussians start: at sparse points of a reconstruction, at random, or on surfaces that a field has found."""
+"""First Gaussians: at given points, with sizes by their distances and colours by the images."""
 
 from __future__ import annotations
 

@@ -123,7 +123,7 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
 
     @property
     def runs_on_kernels(self) -> bool:
-        """True if the field runs on compiled kernels; torch's own operations then use one CPU thread."""
+        """Return whether the field runs on compiled kernels; torch's own operations then use one CPU thread."""
         return self.field.runs_on_kernels
 
     @property

@@ -525,7 +525,7 @@ OF_RAYS: list[tuple[str, type, Any, str]] = [
     ("background", ForgetsTheBackground, TinyConfig(), "from a black to a white background"),
     ("background", Fog, TinyConfig(), "rays that miss the box are up to 0.5 opaque"),
     ("loss", RaysForPixels, TinyConfig(), "size of tensor"),
-    ("bfloat16", Float32Field, TinyConfig(), "BFloat16"),
+    ("bfloat16", Float32Field, TinyConfig(mixed_precision=False), "BFloat16"),
     ("learning", Idle, TinyConfig(), "the squared error goes from"),
     ("evaluation", Jitters, TinyConfig(), "when it is rendered again"),
     ("chunks", LooksAround, TinyConfig(), "rendered 100 rays at a time, rgb differs"),

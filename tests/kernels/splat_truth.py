@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.func import jacrev, vmap
 
 from framework.geometry.lenses import Distortion
+from framework.kernels.native import torch_on_one_thread
 from framework.kernels.splat_blend import Blended, blend
 from framework.kernels.splat_project import SplatCamera, project_gaussians
 from framework.kernels.splat_tiles import tile_lists
@@ -197,7 +198,8 @@ def true_image(
     given: Sequence[Tensor], view: SplatCamera, background: Tensor = BACKGROUND, degree: int = 3
 ) -> Image:  # fmt: skip
     """Draw Gaussians in float64; `given` are the parameters and the pose."""
-    return seen(projected([tensor.double() for tensor in given], view, degree), view, background.double())
+    with torch_on_one_thread():
+        return seen(projected([tensor.double() for tensor in given], view, degree), view, background.double())
 
 
 def drawn(
@@ -239,6 +241,7 @@ def gradients(image: Tensor, through: Tensor, certain: Tensor, inputs: Sequence[
     return tuple(torch.zeros_like(x) if g is None else g for x, g in zip(inputs, found, strict=True))
 
 
+@torch_on_one_thread()  # where others work, torch's threads wait for each other at every small operation
 def compared(
     given: Sequence[Tensor], view: SplatCamera, channels: int = 4, degree: int = 3, dtype: torch.dtype = torch.float32
 ) -> Compared:

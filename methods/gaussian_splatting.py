@@ -259,7 +259,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         camera = splat_camera(batch.view.camera, self._near, config.antialiased, reduced=reduced)
         target = batch.rgb if reduced == 1 else _halved(batch.rgb)
         gaussians = self._all()
-        rgb = draw(gaussians, camera, batch.background, self._degree).rgb
+        rgb = draw(gaussians, camera, batch.background, self._degree)
         if batch.kept is not None:  # what does not count is as it should be
             kept = batch.kept if reduced == 1 else _halved(batch.kept[..., None].float())[..., 0] == 1
             target = torch.where(kept[..., None], target, rgb.detach())

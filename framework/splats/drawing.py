@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
@@ -21,20 +19,6 @@ DRAWN = ("pinhole", "opencv")
 """Camera models that Gaussians can be drawn for."""
 FLIPPED = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
 """From a camera's axes (x right, y up, looking along -z) to those of splatting (x right, y down, z forward)."""
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """An image of Gaussians, with what training looks at."""
-
-    rgb: Tensor
-    """(H, W, 3) colours over the background."""
-    transmittance: Tensor
-    """(H, W) share of the background that is seen."""
-    records: Tensor
-    """(N, RECORD) the Gaussians on the image; after a backward pass, its gradient."""
-    dropped: int
-    """Gaussians left out as they are not finite."""
 
 
 def splat_camera(
@@ -65,7 +49,7 @@ def splat_camera(
     return SplatCamera(to_camera, (fx, fy, cx, cy), width, height, near, antialiased=antialiased, lens=lens)
 
 
-def draw(gaussians: Gaussians, camera: SplatCamera, background: Tensor, degree: int = 3) -> Drawn:
+def draw(gaussians: Gaussians, camera: SplatCamera, background: Tensor, degree: int = 3) -> Tensor:
     """Draw Gaussians with a gradient.
 
     Args:
@@ -73,13 +57,13 @@ def draw(gaussians: Gaussians, camera: SplatCamera, background: Tensor, degree: 
         camera: the image.
         background: (3,) colour behind everything.
         degree: highest degree of the harmonics that counts.
+
+    Returns:
+        (H, W, 3) colours over the background.
     """
-    records, dropped = _projected(gaussians, camera, degree)
-    if records.requires_grad:
-        records.retain_grad()
+    records, _ = _projected(gaussians, camera, degree)
     lists = tile_lists(records, camera.width, camera.height)
-    image, transmittance, _ = blend(records, lists, camera.width, camera.height, background)
-    return Drawn(image, transmittance, records, dropped)
+    return blend(records, lists, camera.width, camera.height, background).image
 
 
 @torch.no_grad()

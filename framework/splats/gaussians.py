@@ -9,10 +9,10 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-MAX_DEGREE = 3
+from framework.kernels.splat_project import DEGREES
+
+MAX_DEGREE = max(DEGREES)
 """Highest degree of the spherical harmonics that colours are made of."""
-DC = 0.28209479177387814
-"""The harmonic of degree 0: the colour that a Gaussian has from everywhere is 0.5 + DC * colors."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,8 @@ class Gaussians:
     logits: Tensor
     """(N,) opacity before the sigmoid."""
     colors: Tensor
-    """(N, 3) coefficients of the harmonic of degree 0 for red, green and blue."""
+    """(N, 3) coefficients of the harmonic of degree 0 for red, green and blue: the part of a colour that is the same
+    from everywhere is 0.5 + DC * colors."""
     harmonics: Tensor
     """(N, 3, K) coefficients of degrees 1 to D for each channel, in the order of `spherical_harmonics`; K is 0, 3, 8
     or 15."""
@@ -39,7 +40,7 @@ class Gaussians:
     @property
     def degree(self) -> int:
         """Highest degree of the harmonics, 0 to 3."""
-        return {0: 0, 3: 1, 8: 2, 15: 3}[self.harmonics.shape[2]]
+        return {count: degree for degree, count in DEGREES.items()}[self.harmonics.shape[2]]
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
         """Return what a function makes of every tensor.
@@ -55,8 +56,8 @@ class Gaussians:
 
     def finite(self) -> Tensor:
         """Return (N,) whether all parameters of a Gaussian are finite."""
-        return torch.stack([getattr(self, f.name).flatten(1).isfinite().all(1) if getattr(self, f.name).ndim > 1
-                            else getattr(self, f.name).isfinite() for f in fields(self)]).all(0)  # fmt: skip
+        values = (getattr(self, field.name) for field in fields(self))
+        return torch.stack([each.flatten(1).isfinite().all(1) for each in (v.unsqueeze(-1) for v in values)]).all(0)
 
 
 @runtime_checkable

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from framework.data.dataset import Dataset
-from framework.splats.gaussians import DC, Gaussians
+from framework.kernels.splat_project import DC
+from framework.splats.gaussians import Gaussians
 
 OPACITY = 0.1
 """Of every Gaussian at the start."""

@@ -212,7 +212,7 @@ def in_waves(density: Density, order: Tensor) -> tuple[tuple[Tensor, ...], list[
         native.spent = None
 
 
-def compare(field: nn.Module, density: Density, order: Tensor) -> set[str]:
+def assert_as_plain(field: nn.Module, density: Density, order: Tensor) -> set[str]:
     """Hold values and gradients against those of one plain evaluation; the compiled functions that ran meanwhile."""
     positions, times = inputs()
     found, seen, ran = in_waves(density, order)
@@ -239,7 +239,7 @@ def compare(field: nn.Module, density: Density, order: Tensor) -> set[str]:
 def test_a_field_is_differentiated_and_not_evaluated_again(name: str) -> None:
     torch.manual_seed(0)
     field = OURS[name]()
-    ran = compare(field, partial(at, field), chosen())
+    ran = assert_as_plain(field, partial(at, field), chosen())
     assert ran == set()
 
 
@@ -248,7 +248,7 @@ def test_a_field_is_differentiated_and_not_evaluated_again(name: str) -> None:
 def test_an_unusual_field_is_right_all_the_same(name: str) -> None:
     torch.manual_seed(0)
     field = UNUSUAL[name]()
-    compare(field, partial(at, field), chosen())
+    assert_as_plain(field, partial(at, field), chosen())
 
 
 @needs_kernels
@@ -257,7 +257,7 @@ def test_what_is_unusual_is_computed() -> None:
     torch.manual_seed(0)
     for name in ("sorted", "chunks", "in place"):
         field = UNUSUAL[name]()
-        assert "hash_grid_forward" in compare(field, partial(at, field), chosen()), name
+        assert "hash_grid_forward" in assert_as_plain(field, partial(at, field), chosen()), name
 
 
 @needs_kernels
@@ -332,7 +332,7 @@ def test_what_is_not_compiled_is_evaluated_once(kind: torch.dtype) -> None:
 
     in_waves(density, chosen())
     assert asked == list(COUNTS)
-    compare(layer, density, chosen())
+    assert_as_plain(layer, density, chosen())
 
 
 @needs_kernels
@@ -416,7 +416,7 @@ def test_another_thread_is_left_alone() -> None:
         thread.join()
         return at(field, positions)
 
-    ran = compare(field, density, chosen())
+    ran = assert_as_plain(field, density, chosen())
     assert not native.available() or ran == {"hash_grid_forward", "mlp_forward"}  # the other's
     order, positions = chosen(), torch.cat(inputs()[0])
     torch.testing.assert_close(torch.cat(elsewhere[: len(COUNTS)]), at(other, positions)[0])
@@ -437,7 +437,7 @@ def test_waves_within_a_wave() -> None:
         mine, features = at(outer, positions)
         return mine + sigma.flip(0), features
 
-    compare(nn.ModuleList([inner, outer]), density, chosen())
+    assert_as_plain(nn.ModuleList([inner, outer]), density, chosen())
 
 
 def test_nan_is_kept() -> None:

@@ -208,7 +208,7 @@ def test_truncated_ply_is_refused_wherever_it_ends(tmp_path: Path) -> None:
     write_ply(tmp_path / "whole.ply", some(100))
     whole = (tmp_path / "whole.ply").read_bytes()
     for size in [*range(0, len(whole), 997), len(whole) - 1]:
-        refused_in_a_line(tmp_path / "a.ply", whole[:size])
+        assert "a.ply" in refused_in_a_line(tmp_path / "a.ply", whole[:size]), size
 
 
 # -- SPZ ------------------------------------------------------------------------------------------------------------
@@ -367,7 +367,7 @@ def test_truncated_spz_is_refused_wherever_it_ends(tmp_path: Path) -> None:
     whole = encoded(some(2000))
     assert len(whole) > 30_000
     for size in [*range(0, len(whole), 997), len(whole) - 9, len(whole) - 1]:
-        refused_in_a_line(tmp_path / "a.spz", whole[:size])
+        assert "a.spz" in refused_in_a_line(tmp_path / "a.spz", whole[:size]), size
 
 
 def test_spz_with_a_wrong_byte_is_refused(tmp_path: Path) -> None:
@@ -375,7 +375,7 @@ def test_spz_with_a_wrong_byte_is_refused(tmp_path: Path) -> None:
     for place in range(10, len(whole), 97):
         damaged = bytearray(whole)
         damaged[place] ^= 16
-        refused_in_a_line(tmp_path / "a.spz", bytes(damaged))
+        assert "a.spz" in refused_in_a_line(tmp_path / "a.spz", bytes(damaged)), place
 
 
 # -- frames ---------------------------------------------------------------------------------------------------------

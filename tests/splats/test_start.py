@@ -8,7 +8,7 @@ import torch
 
 from dataparsers.blender import Blender
 from framework.data.dataset import load_dataset
-from framework.splats.gaussians import DC
+from framework.kernels.splat_project import DC
 from framework.splats.start import from_points, hull_points, morton, neighbour_distance, seen_colors
 
 

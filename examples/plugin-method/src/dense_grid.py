@@ -48,7 +48,7 @@ class DenseGridConfig(
 
 
 class DenseGridField(Field):
-    """What is anywhere in space: its density, and its colour as seen along a direction.
+    """Density at any position, and colour along a direction.
 
     Args:
         config: sizes of the grids and of the networks.

@@ -11,6 +11,7 @@ Gaussian of mean m, axes R and scales s is on the image
 its opacity is multiplied by sqrt(det(T T^T) / det(covariance)) (Mip-Splatting, Yu et al. 2024, section 4.2).
 
 A lens bends the image: J is then of the bent position, and the lens's own Jacobian counts as constant in gradients.
+A fisheye shows what lies in front of the camera's plane, less than 90 degrees from its axis.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ DEGREES = {0: 0, 1: 3, 2: 8, 3: 15}
 
 @dataclass(frozen=True)
 class SplatCamera:
-    """A pinhole camera, or one with OpenCV's lens distortion."""
+    """A pinhole camera, or one with OpenCV's lens distortion or OpenCV's fisheye lens."""
 
     pose: Tensor
     """(3, 4) transform from the scene to the camera's frame: x right, y down, z forward. It may require a gradient."""
@@ -62,14 +63,16 @@ class SplatCamera:
     antialiased: bool = False
     """Whether opacity makes up for the blur."""
     lens: Distortion | None = None
-    """Distortion of the projection "opencv"; None for a pinhole camera."""
+    """Distortion of the projection "opencv" or "fisheye"; None for a pinhole camera."""
+    fisheye: bool = False
+    """Whether `lens` bends angles from the optical axis ("fisheye") instead of their tangents ("opencv")."""
 
     def plain(self) -> list[float]:
         """Return the camera as 33 numbers for a kernel."""
         pose = self.pose.detach().double().cpu()
         lens = [0.0] * 12
         if self.lens is not None:
-            lens = [1.0, *self.lens.table.double().flatten().tolist()]
+            lens = [2.0 if self.fisheye else 1.0, *self.lens.table.double().flatten().tolist()]
         return [
             *pose[:, :3].flatten().tolist(), *pose[:, 3].tolist(), *self.intrinsics, float(self.width),
             float(self.height), self.near, self.blur, float(self.antialiased), *lens,
@@ -187,12 +190,17 @@ def _onto_image(at: Tensor, camera: SplatCamera) -> tuple[Tensor, Tensor, Tensor
     x, y, over = at[:, 0] / at[:, 2], at[:, 1] / at[:, 2], 1 / at[:, 2]
     low_x, high_x = (-MARGIN * camera.width - cx) / fx, ((1 + MARGIN) * camera.width - cx) / fx
     low_y, high_y = (-MARGIN * camera.height - cy) / fy, ((1 + MARGIN) * camera.height - cy) / fy
+    if camera.fisheye:  # its Jacobian is bounded by itself: angles do not grow as tangents do
+        low_x, high_x, low_y, high_y = -torch.inf, torch.inf, -torch.inf, torch.inf
     nothing = torch.zeros_like(x)
     to_plane = torch.stack(
         [over, nothing, -x.clamp(low_x, high_x) * over, nothing, over, -y.clamp(low_y, high_y) * over], -1
     ).unflatten(-1, (2, 3))
     within = torch.ones_like(x, dtype=torch.bool)
     if camera.lens is not None:
+        if camera.fisheye:
+            x, y, to_angle = _angles(x, y)
+            to_plane = to_angle.detach() @ to_plane
         within = torch.hypot(x, y) < camera.lens.reach.flatten()[0].to(x)
         inside_x, inside_y = x.masked_fill(~within, 0), y.masked_fill(~within, 0)
         coefficients = camera.lens.coefficients.reshape(1, -1).expand(len(x), -1).to(x)
@@ -200,6 +208,18 @@ def _onto_image(at: Tensor, camera: SplatCamera) -> tuple[Tensor, Tensor, Tensor
         to_plane = torch.stack([uu, uv, uv, vv], -1).detach().unflatten(-1, (2, 2)) @ to_plane
     focal = torch.tensor([fx, fy], dtype=at.dtype, device=at.device)
     return fx * x + cx, fy * y + cy, focal[:, None] * to_plane, within
+
+
+def _angles(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return points (K,) of the plane at depth 1, moved to the angle of which their radius is the tangent, and the
+    Jacobian (K, 2, 2) of that."""
+    squared = x * x + y * y
+    far = squared > 1e-8
+    safe = torch.where(far, squared, 1.0)
+    scale = torch.where(far, safe.sqrt().atan() / safe.sqrt(), 1 - squared / 3)
+    slope = torch.where(far, (1 / (1 + safe) - scale) / safe, -2 / 3)
+    jacobian = torch.stack([scale + slope * x * x, slope * x * y, slope * x * y, scale + slope * y * y], -1)
+    return scale * x, scale * y, jacobian.unflatten(-1, (2, 2))
 
 
 PROJECT = Operation("project_gaussians", project_reference)

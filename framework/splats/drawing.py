@@ -8,14 +8,14 @@ from torch import Tensor
 from framework.base.errors import ConfigError
 from framework.cameras.cameras import Cameras
 from framework.cameras.view import View, every
-from framework.geometry.lenses import Distortion
+from framework.geometry.lenses import LENSES, Distortion
 from framework.kernels.splat_blend import CHANNELS, blend
 from framework.kernels.splat_project import SplatCamera, project_gaussians
 from framework.kernels.splat_tiles import tile_lists
 from framework.rendering.rendered import Picture
 from framework.splats.gaussians import MAX_DEGREE, Gaussians
 
-DRAWN = ("pinhole", "opencv")
+DRAWN = ("pinhole", "opencv", "fisheye")
 """Camera models that Gaussians can be drawn for."""
 FLIPPED = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
 """From a camera's axes (x right, y up, looking along -z) to those of splatting (x right, y down, z forward)."""
@@ -37,16 +37,20 @@ def splat_camera(
     """
     if camera.model not in DRAWN:
         raise ConfigError(
-            f"Gaussians cannot be drawn for {camera.model} cameras, only for {' and '.join(DRAWN)}; "
+            f"Gaussians cannot be drawn for {camera.model} cameras, only for pinhole, opencv and fisheye; "
             "undistort the images first, or take a method that casts rays, such as nerfacto"
         )
     pose = camera.camera_to_worlds[0] if pose is None else pose
     rotation = pose.new_tensor(FLIPPED) @ pose[:, :3].T
     to_camera = torch.cat([rotation, -(rotation @ pose[:, 3])[:, None]], 1)
     fx, fy, cx, cy = (float(value[0]) / reduced for value in (camera.fx, camera.fy, camera.cx, camera.cy))
-    lens = None if camera.lens is None else Distortion.of(camera.model, camera.lens)
+    # COLMAP's pinhole cameras come with a lens of no coefficients.
+    lens = None if camera.lens is None or camera.model == "pinhole" else Distortion.of(camera.model, camera.lens)
+    if lens is None and camera.model == "fisheye":
+        lens = Distortion.of(camera.model, pose.new_zeros(1, len(LENSES["fisheye"])))
+    fisheye = camera.model == "fisheye"
     width, height = int(camera.widths[0]) // reduced, int(camera.heights[0]) // reduced
-    return SplatCamera(to_camera, (fx, fy, cx, cy), width, height, near, antialiased=antialiased, lens=lens)
+    return SplatCamera(to_camera, (fx, fy, cx, cy), width, height, near, antialiased=antialiased, lens=lens, fisheye=fisheye)
 
 
 def draw(gaussians: Gaussians, camera: SplatCamera, background: Tensor, degree: int = 3) -> Tensor:

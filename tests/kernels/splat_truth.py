@@ -24,7 +24,11 @@ from framework.kernels.splat_tiles import tile_lists
 from tests.kernels.compiled import relative_error
 
 NAMES = ("means", "log scales", "rotations", "logits", "colors", "harmonics", "pose")
-OPENCV = (0.1, -0.05, 0.003, -0.002, 0.01, 0.02, -0.01, 0.005, 0.0)
+LENSES = {
+    "opencv": (0.1, -0.05, 0.003, -0.002, 0.01, 0.02, -0.01, 0.005, 0.0),
+    "fisheye": (0.05, -0.02, 0.01, -0.003),
+}
+"""Coefficients of each lens, in the order of its projection."""
 BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
 BOUND = 0.15
 """Beyond the image's edge by this share of its size, the Jacobian is that of the bound."""
@@ -42,12 +46,13 @@ def scene(count: int, harmonics: int = 15, spread: float = 1.0) -> list[Tensor]:
     ]  # fmt: skip
 
 
-def camera(width: int, height: int, lens: bool = False, **settings: Any) -> SplatCamera:
+def camera(width: int, height: int, lens: str = "", **settings: Any) -> SplatCamera:
     """Return a camera whose focal lengths suit an image's size; its pose is that of the scene's frame."""
     focal = 0.5 * (width + height) + 0.5
-    bent = Distortion.of("opencv", torch.tensor([OPENCV], dtype=torch.float64)) if lens else None
+    bent = Distortion.of(lens, torch.tensor([LENSES[lens]], dtype=torch.float64)) if lens else None
     middle = focal, 1.03 * focal, 0.49 * width, 0.51 * height
-    return SplatCamera(torch.eye(3, 4), middle, width, height, lens=bent, **settings)
+    fisheye = lens == "fisheye"
+    return SplatCamera(torch.eye(3, 4), middle, width, height, lens=bent, fisheye=fisheye, **settings)
 
 
 # -- projection ---------------------------------------------------------------------------------------------------
@@ -99,9 +104,16 @@ def real_harmonics(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(values, -1)
 
 
+def bent_by_fisheye(at: Tensor) -> Tensor:
+    """Return where OpenCV's fisheye lens shows a point (2,) of the image plane at depth 1."""
+    k1, k2, k3, k4 = LENSES["fisheye"]
+    angle = torch.atan2(at.norm(), torch.ones_like(at[0]))
+    return at / at.norm() * (angle + k1 * angle**3 + k2 * angle**5 + k3 * angle**7 + k4 * angle**9)
+
+
 def bent(at: Tensor) -> Tensor:
     """Return where OpenCV's lens shows a point (2,) of the image plane."""
-    k1, k2, p1, p2, k3, k4, k5, k6, _ = OPENCV
+    k1, k2, p1, p2, k3, k4, k5, k6, _ = LENSES["opencv"]
     x, y = at.unbind()
     r2 = x**2 + y**2
     scale = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
@@ -120,18 +132,20 @@ def projected(given: Sequence[Tensor], view: SplatCamera, degree: int) -> Projec
     plane = p[:, :2] / p[:, 2:]
     shown = p[:, 2] > view.near
     if view.lens is not None:
-        shown = shown & (plane.norm(dim=-1) < view.lens.reach[0])
+        radius = plane.norm(dim=-1)
+        shown = shown & ((radius.atan() if view.fisheye else radius) < view.lens.reach[0])
     distance = p.norm(dim=-1)
     indices = shown.nonzero()[:, 0]
     indices = indices[distance[indices].sort(stable=True).indices]
     p, plane, distance = p[indices], plane[indices], distance[indices]
 
     low, high = (-BOUND * size - middle) / focal, ((1 + BOUND) * size - middle) / focal
-    bounded = torch.cat([plane.clamp(low, high) * p[:, 2:], p[:, 2:]], -1)
+    bounded = p if view.fisheye else torch.cat([plane.clamp(low, high) * p[:, 2:], p[:, 2:]], -1)
     jacobian = vmap(jacrev(lambda at: at[:2] / at[2]))(bounded)
     if view.lens is not None:
-        jacobian = vmap(jacrev(bent))(plane).detach() @ jacobian
-        plane = vmap(bent)(plane)
+        lens = bent_by_fisheye if view.fisheye else bent
+        jacobian = vmap(jacrev(lens))(plane).detach() @ jacobian
+        plane = vmap(lens)(plane)
     jacobian = focal[:, None] * jacobian
     axes = turned(rotations[indices, None], torch.eye(3).double()).transpose(1, 2)
     in_space = axes @ torch.diag_embed((2 * log_scales[indices]).exp()) @ axes.transpose(1, 2)

@@ -43,10 +43,10 @@ def test_the_truths_harmonics_are_scipys() -> None:
     torch.testing.assert_close(real_harmonics(directions, 3), expected, atol=1e-14, rtol=0)
 
 
-@pytest.mark.parametrize("lens", [False, True])
+@pytest.mark.parametrize("lens", ["", "opencv", "fisheye"])
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("size", [(37, 21), (1, 30), (30, 1)], ids=str)
-def test_the_reference_is_the_truth(size: tuple[int, int], lens: bool, antialiased: bool) -> None:
+def test_the_reference_is_the_truth(size: tuple[int, int], lens: str, antialiased: bool) -> None:
     """Some Gaussians are wide and at the cap of opacity, others far beyond the image's edge."""
     torch.manual_seed(0)
     given = scene(60)
@@ -58,10 +58,10 @@ def test_the_reference_is_the_truth(size: tuple[int, int], lens: bool, antialias
 
 
 @needs_kernels
-@pytest.mark.parametrize("lens", [False, True])
+@pytest.mark.parametrize("lens", ["", "opencv", "fisheye"])
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("channels", [3, 4])
-def test_images_and_gradients(lens: bool, antialiased: bool, channels: int) -> None:
+def test_images_and_gradients(lens: str, antialiased: bool, channels: int) -> None:
     torch.manual_seed(1)
     found = compared(scene(100), camera(43, 38, lens, antialiased=antialiased), channels)
     assert found.worst() < BOUND, found
@@ -98,7 +98,7 @@ def test_random_scenes(threads: Callable[[int], None]) -> None:
     for seed in range(25):
         torch.manual_seed(seed)
         count, width, height, workers = (int(torch.randint(*ends, ())) for ends in ((1, 90), (1, 50), (1, 50), (1, 5)))
-        lens, antialiased = (bool(torch.rand(()) < 0.5) for _ in range(2))
+        antialiased, lens = bool(torch.rand(()) < 0.5), ("", "opencv", "fisheye")[int(torch.randint(3, ()))]
         threads(workers)
         given = scene(count, (0, 3, 8, 15)[seed % 4], 0.1 + 2 * float(torch.rand(())))
         given[1] += 3 * torch.rand(()) - 1.5
@@ -108,8 +108,8 @@ def test_random_scenes(threads: Callable[[int], None]) -> None:
 
 
 @needs_kernels
-@pytest.mark.parametrize("lens", [False, True])
-def test_what_the_channels_hold(lens: bool) -> None:
+@pytest.mark.parametrize("lens", ["", "opencv", "fisheye"])
+def test_what_the_channels_hold(lens: str) -> None:
     """Colours, distance and normals, transmittance and the median distance; fewer channels change no bit."""
     torch.manual_seed(4)
     given, view = scene(120), camera(45, 35, lens)
@@ -169,7 +169,7 @@ def test_the_background_shows_through() -> None:
 @needs_kernels
 def test_the_same_bits_on_any_number_of_threads_and_again(threads: Callable[[int], None]) -> None:
     torch.manual_seed(7)
-    given, view = scene(6000), camera(120, 90, True, antialiased=True)
+    given, view = scene(6000), camera(120, 90, "opencv", antialiased=True)
     given[1] -= 1
 
     def bits() -> list[Tensor]:

@@ -71,7 +71,8 @@ def test_a_picture_tells_depth_opacity_and_normals() -> None:
 def test_the_image_position_is_the_cameras() -> None:
     """A small Gaussian is brightest where the framework's cameras project its centre, with and without a lens."""
     bent = dataclasses.replace(camera("opencv"), lens=torch.tensor([[0.2, -0.1, 0.01, -0.02, 0, 0, 0, 0, 0]]))
-    for one in (camera(), bent):
+    fisheye = dataclasses.replace(camera("fisheye"), lens=torch.tensor([[0.1, -0.05, 0.02, 0.0]]))
+    for one in (camera(), bent, camera("fisheye"), fisheye):
         center = torch.tensor([[0.4, -0.7, 0.3]])
         column, row, seen = one.project(center, 0)
         assert bool(seen)
@@ -83,8 +84,8 @@ def test_the_image_position_is_the_cameras() -> None:
 
 
 def test_a_camera_that_cannot_be_drawn_for_is_refused() -> None:
-    with pytest.raises(ConfigError, match="cannot be drawn for fisheye cameras, only for pinhole and opencv"):
-        splat_camera(camera("fisheye"), 0.1)
+    with pytest.raises(ConfigError, match="cannot be drawn for orthographic cameras, only for pinhole, opencv and fisheye"):
+        splat_camera(camera("orthographic"), 0.1)
 
 
 @pytest.mark.parametrize(("start", "match"), [("points", "no points of a reconstruction")])

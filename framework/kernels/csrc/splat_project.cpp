@@ -14,7 +14,8 @@ constexpr int MAX_BASIS = 15;
 
 struct Camera {
     float r[3][3], t[3], fx, fy, cx, cy, width, height, near, blur;
-    bool antialiased, lens;
+    bool antialiased;
+    enum Lens { NONE, OPENCV, FISHEYE } lens;
     float center[3];                    // of the camera, scene coordinates
     float low_x, high_x, low_y, high_y; // x / z and y / z beyond which the Jacobian is taken at the bound
     double coefficients[LENS_SIZE];
@@ -26,12 +27,14 @@ struct Camera {
         }
         fx = float(from[12]), fy = float(from[13]), cx = float(from[14]), cy = float(from[15]);
         width = float(from[16]), height = float(from[17]), near = float(from[18]), blur = float(from[19]);
-        antialiased = from[20] != 0, lens = from[21] != 0;
+        antialiased = from[20] != 0, lens = Lens(int(from[21]));
         std::memcpy(coefficients, from + 22, sizeof coefficients);
         for (int j = 0; j < 3; j++) center[j] = -(r[0][j] * t[0] + r[1][j] * t[1] + r[2][j] * t[2]);
         const float over = 0.15f;  // of the image's size
         low_x = (-over * width - cx) / fx, high_x = ((1 + over) * width - cx) / fx;
         low_y = (-over * height - cy) / fy, high_y = ((1 + over) * height - cy) / fy;
+        // A fisheye's Jacobian is bounded by itself: angles do not grow as tangents do.
+        if (lens == FISHEYE) low_x = low_y = -INFINITY, high_x = high_y = INFINITY;
     }
 };
 
@@ -121,6 +124,21 @@ inline Floats logarithm(Floats x) {
     const Floats e = __builtin_convertvector(exponent, Floats), square = m * m;
     return (m + (m * square * p - 2.12194440e-4f * e - 0.5f * square)) + 0.693359375f * e;
 }
+
+// From (x, y) = (tan t cos f, tan t sin f) to (t cos f, t sin f), as a fisheye sees it: what both are multiplied by, and
+// the Jacobian. Both are those of a function of the radius, and so is a fisheye's Bent, so that their product is
+// symmetric too.
+struct ToAngle {
+    double scale = 1, xx = 1, xy = 0, yy = 1;
+
+    ToAngle(double x, double y, bool fisheye) {
+        if (!fisheye) return;
+        const double squared = x * x + y * y, radius = std::sqrt(squared);
+        scale = radius > 1e-4 ? std::atan(radius) / radius : 1 - squared / 3;
+        const double slope = radius > 1e-4 ? (1 / (1 + squared) - scale) / squared : -2.0 / 3;  // of scale, over radius
+        xx = scale + slope * x * x, xy = slope * x * y, yy = scale + slope * y * y;
+    }
+};
 
 // All that both directions need, of LANES Gaussians.
 struct Projected {
@@ -217,10 +235,14 @@ struct Projected {
         store(px, x), store(py, y);
         const double reach = camera.coefficients[9];
         for (int i = 0; i < LANES; i++) {
-            good[i] = double(px[i]) * px[i] + double(py[i]) * py[i] < reach * reach ? -1 : 0;
-            const Bent bent(good[i] ? px[i] : 0, good[i] ? py[i] : 0, camera.coefficients);
+            const ToAngle angle(px[i], py[i], camera.lens == Camera::FISHEYE);
+            const double at_x = angle.scale * px[i], at_y = angle.scale * py[i];
+            good[i] = at_x * at_x + at_y * at_y < reach * reach ? -1 : 0;
+            const Bent bent(good[i] ? at_x : 0, good[i] ? at_y : 0, camera.coefficients);
             px[i] = float(bent.u), py[i] = float(bent.v);
-            d[0][i] = float(bent.uu), d[1][i] = float(bent.uv), d[2][i] = float(bent.vv);
+            d[0][i] = float(bent.uu * angle.xx + bent.uv * angle.xy);
+            d[1][i] = float(bent.uu * angle.xy + bent.uv * angle.yy);
+            d[2][i] = float(bent.uv * angle.xy + bent.vv * angle.yy);
         }
         Ints keep;
         std::memcpy(&keep, good, sizeof keep);

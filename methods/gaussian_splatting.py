@@ -15,22 +15,27 @@ from typing import Any, ClassVar, Literal, cast
 import torch
 from torch import Tensor, nn
 
-from framework import Decision, Loss, Method, Model, Optimised, Picture, RowChange, Scene, TrainConfig, View, ViewBatch
-from framework.base.config import AT_LEAST_0, Range
+from framework import Cameras, Decision, Loss, Method, Model, Optimised, Picture, RowChange, Scene, View, ViewBatch
+from framework.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
 from framework.base.console import say, track
 from framework.base.decisions import Choice, fill
 from framework.base.errors import ConfigError
+from framework.cameras.refinement import PoseRefinement
 from framework.data.dataset import Dataset
+from framework.fields.appearance import Appearance
+from framework.kernels.splat_blend import CHANNELS
+from framework.kernels.splat_project import OPACITY
 from framework.kernels.ssim import ssim
 from framework.scene.silhouettes import Silhouettes, visual_hull
-from framework.splats.drawing import draw, draw_view, splat_camera
+from framework.splats.density_control import RESET, grown, image_gradients
+from framework.splats.drawing import draw, draw_view, on_image, splat_camera
 from framework.splats.gaussians import MAX_DEGREE, Gaussians
 from framework.splats.mcmc import moved, shaken
 from framework.splats.start import from_points, hull_points, seen_colors
 from framework.training.optim import learning_rate_factor
 
-STEPS_PER_SECOND = 25
-"""Training steps a second, about, of 400 x 400 pixels on two cores; for what is decided by the budget."""
+PIXELS_PER_SECOND = 25 * 400 * 400
+"""Pixels that training draws in a second, about, on two cores; for what is decided by the budget."""
 NOISE, PENALTY = 5e5, 0.01
 """Noise and both penalties (Kheradmand et al. 2024), where Gaussians have to find their places."""
 WITHOUT_IMAGES = 1_000
@@ -43,9 +48,19 @@ FIELD_OPACITY, FIELD_SIZE = 0.5, 0.7
 """Of Gaussians on a field's surfaces at the start: opacity, and standard deviation in distances to neighbours."""
 
 
+DEPTH_REASONS = {True: "there are depth images", False: "there are no depth images"}
+POSE_REASONS = {
+    "exact": "the poses are exact",
+    "photographs": "the poses were found in the photographs themselves",
+    "device": "the poses are those that the device tracked",
+}
+AFFINE = 12
+"""Numbers of an image's transform of colours: a matrix (3, 3), less the identity, and a shift."""
+
+
 @dataclass(frozen=True)
 class GaussianSplattingConfig(
-    TrainConfig, max_num_iterations=30_000, learning_rate=5e-3, lr_final=0.1, adam_beta2=0.99, adam_eps=1e-15
+    AppearanceConfig, max_num_iterations=30_000, learning_rate=5e-3, lr_final=0.1, adam_beta2=0.99, adam_eps=1e-15
 ):
     """Settings of gaussian-splatting."""
 
@@ -56,6 +71,10 @@ class GaussianSplattingConfig(
         "rate_factor": AT_LEAST_0,
         "position_rate": AT_LEAST_0,
         "degree": (0, MAX_DEGREE),
+        "appearance_rate": AT_LEAST_0,
+        "camera_learning_rate": AT_LEAST_0,
+        "depth_loss_mult": AT_LEAST_0,
+        "steps_per_reset": (1, 10**9),
         "ssim_weight": (0, 1),
         "growth_end": (0, 1),
         "steps_per_move": (1, 10**9),
@@ -85,10 +104,15 @@ class GaussianSplattingConfig(
     """Weight of 1 - SSIM in the loss; the absolute error has the rest."""
     antialiased: bool = False
     """Compensate the minimum width of a Gaussian on an image by its opacity (Mip-Splatting)."""
+    strategy: Literal["mcmc", "adc"] = "mcmc"
+    """How Gaussians come and go. mcmc: transparent ones are moved to opaque ones (3DGS-MCMC). adc: they are dropped,
+    and those whose image positions have large gradients are cloned or split (adaptive density control of 3DGS)."""
     growth_end: float = 0.8
     """Share of the budget after which no Gaussian is added or moved."""
     steps_per_move: int = 100
-    """Steps between two moves of Gaussians that have become transparent."""
+    """Steps between two changes of the Gaussians' number."""
+    steps_per_reset: int = 3_000
+    """Steps after which strategy adc makes all Gaussians nearly transparent."""
     noise: float | None = None
     """Noise of nearly transparent Gaussians, times the learning rate of centres; by the start if not given."""
     opacity_penalty: float | None = None
@@ -97,6 +121,16 @@ class GaussianSplattingConfig(
     """Weight of the mean scale, in scene extents, in the loss; by the start if not given."""
     reduced_until: float = 0.0
     """Share of the budget in which images are half as wide and high."""
+    appearance: Auto[bool] = AUTO
+    """Whether each training image has a transform of colours of its own. If not given: if light or exposure differ."""
+    appearance_rate: float = 1e-3
+    """Learning rate of these transforms."""
+    camera_optimizer: Literal["auto", "off", "SO3xR3", "SE3"] = "auto"
+    """Refinement of the training cameras' poses; auto: SO3xR3 if a device tracked them, else off."""
+    camera_learning_rate: float = 1e-3
+    """Initial learning rate of the poses."""
+    depth_loss_mult: Auto[float] = AUTO
+    """Weight of the depth loss. If not given: 0.1 if there are depth images, else 0."""
 
 
 def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplattingConfig, list[Decision]]:
@@ -106,9 +140,10 @@ def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplat
         config: settings, some of which may be open.
         scene: facts about the data.
     """
-    seconds = min(config.max_seconds or math.inf, config.max_num_iterations / STEPS_PER_SECOND)
+    speed = PIXELS_PER_SECOND / (scene.image_pixels or scene.image_size**2)
+    seconds = min(config.max_seconds or math.inf, config.max_num_iterations / speed)
     count = int(min(max(8_000 * math.sqrt(seconds), 20_000), 1_000_000))
-    factor = min(max((30_000 / (STEPS_PER_SECOND * seconds)) ** 0.44, 1.0), 5.0)
+    factor = min(max((30_000 / (speed * seconds)) ** 0.44, 1.0), 5.0)
     why = "that suits the time"
     config, made = fill(config, Choice("num_gaussians", count, why, "Gaussians", f"up to {count:,}"))
     assert config.num_gaussians is not None
@@ -118,6 +153,19 @@ def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplat
         Choice("start_gaussians", first, "the others are added", "Gaussians at the start", f"{first:,}"),
         Choice("field_steps", int(min(max(2 * seconds, 120), 400)), why, "steps of a field to start from"),
         Choice("rate_factor", round(factor, 2), "fewer steps have to go farther", "factor of learning rates"),
+        Choice(
+            "appearance",
+            scene.appearance_varies,
+            "light differs between the images" if scene.appearance_varies else "the images are lit alike",
+            "colour transforms of images",
+        ),
+        Choice("depth_loss_mult", 0.1 if scene.has_depth else 0.0, DEPTH_REASONS[scene.has_depth], "depth loss"),
+        Choice(
+            "camera_optimizer",
+            "SO3xR3" if scene.poses == "device" else "off",
+            POSE_REASONS[scene.poses],
+            "pose refinement",
+        ),
     )
     return config, made + more
 
@@ -148,6 +196,9 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
     batches: ClassVar[Literal["pixels", "views"]] = "views"
     found: Tensor
     """Whether the first Gaussians lay on surfaces, so that none has to look for its place."""
+    gradients: Tensor
+    """(N, 2) sum of the gradients of each Gaussian's image positions, and number of images, since the last change;
+    empty but for strategy adc."""
 
     def __init__(self, config: GaussianSplattingConfig, scene: Scene) -> None:
         super().__init__(config, scene)
@@ -168,6 +219,16 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         self.harmonics = table(3 * higher, "harmonics", 0.025)
         self.register_buffer("found", torch.tensor(False))
         self.progress = 0.0
+        self.appearance: Appearance | None = None
+        if config.appearance:
+            self.appearance = Appearance(AFFINE, scene.num_cameras)
+            self.appearance.optimised = Optimised("appearance", config.appearance_rate)
+        self.poses: PoseRefinement | None = None
+        if config.camera_optimizer in ("SO3xR3", "SE3"):
+            self.poses = PoseRefinement(scene.num_cameras, config.camera_optimizer, scene.camera_to_worlds)
+            self.poses.optimised = Optimised("poses", config.camera_learning_rate, schedule="exponential")
+        self.register_buffer("gradients", torch.zeros(0, 2))
+        self._on_image: Tensor | None = None
         assert config.start_gaussians is not None
         box = scene.box
         anywhere = box[0] + torch.rand(min(config.start_gaussians, WITHOUT_IMAGES), 3) * (box[1] - box[0])
@@ -256,22 +317,50 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
     def loss(self, batch: ViewBatch, step: int) -> Loss:
         config = self.config
         reduced = 2 if self.progress < config.reduced_until else 1
-        camera = splat_camera(batch.view.camera, self._near, config.antialiased, reduced=reduced)
+        pose = None
+        if self.poses is not None:
+            pose = self.poses.pose(batch.index, batch.view.camera.camera_to_worlds[0])
+        camera = splat_camera(batch.view.camera, self._near, config.antialiased, pose, reduced)
         target = batch.rgb if reduced == 1 else _halved(batch.rgb)
         gaussians = self._all()
-        rgb = draw(gaussians, camera, batch.background, self._degree)
+        records = on_image(gaussians, camera, self._degree)
+        if config.strategy == "adc" and records.requires_grad:
+            records.retain_grad()
+            self._on_image = records
+        guided = config.depth_loss_mult > 0 and batch.distances is not None
+        drawn = draw(records, camera, self._behind(batch), CHANNELS["distance" if guided else "rgb"])
+        rgb = self._lit(drawn.image[..., :3] if guided else drawn.image, batch.index)
         if batch.kept is not None:  # what does not count is as it should be
             kept = batch.kept if reduced == 1 else _halved(batch.kept[..., None].float())[..., 0] == 1
             target = torch.where(kept[..., None], target, rgb.detach())
         terms = {"rgb": (1 - config.ssim_weight) * (rgb - target).abs().mean()}
         if config.ssim_weight > 0 and min(rgb.shape[:2]) >= SMALLEST_SSIM:
             terms["ssim"] = config.ssim_weight * (1 - ssim(rgb, target))
+        if guided:
+            assert batch.distances is not None
+            known = batch.distances if reduced == 1 else batch.distances[::2, ::2][: rgb.shape[0], : rgb.shape[1]]
+            terms["depth"] = config.depth_loss_mult * _depth_error(drawn.image[..., 3], drawn.transmittance, known)
         if (weight := self._chosen(config.opacity_penalty, PENALTY)) > 0:
             terms["opacity"] = weight * torch.sigmoid(gaussians.logits).mean()
         if (weight := self._chosen(config.scale_penalty, PENALTY)) > 0:
             terms["scale"] = weight / self.extent * gaussians.log_scales.exp().mean()
         shown = rgb.detach() if reduced == 1 else _doubled(rgb.detach(), batch.rgb)
         return Loss(terms, shown)
+
+    def _behind(self, batch: ViewBatch) -> Tensor:
+        """Return the background (3,) of a step. Images without alpha show something everywhere: a background that
+        changes with each step cannot be a part of it."""
+        if self.scene.has_alpha or self.config.background != "auto":
+            return batch.background
+        return torch.rand(3, device=batch.rgb.device)
+
+    def _lit(self, rgb: Tensor, index: int | None) -> Tensor:
+        """Return colours (..., 3) as an image shows them: a training image, or one with the appearance that is set."""
+        if self.appearance is None:
+            return rgb
+        chosen = None if index is None else torch.tensor([index], device=rgb.device)
+        affine = self.appearance(chosen, 1)[0].view(3, 4)
+        return rgb + rgb @ affine[:, :3].T + affine[:, 3]
 
     @property
     def _degree(self) -> int:
@@ -281,26 +370,68 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
     @torch.no_grad()
     def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
         config = self.config
-        if (noise := self._chosen(config.noise, NOISE)) > 0:
+        self._count_gradients()
+        if config.strategy == "mcmc" and (noise := self._chosen(config.noise, NOISE)) > 0:
             rate = self.position_rate * learning_rate_factor(config, step, progress)
             which, by = shaken(self.gaussians(), noise * rate)
             self.means.values.data[which] += by
         if step % config.steps_per_move != config.steps_per_move - 1 or progress > config.growth_end:
             return ()
-        here = len(self.means.values)
         assert config.num_gaussians is not None
+        if config.strategy == "adc":
+            return self._densify(step, config.num_gaussians)
+        here = len(self.means.values)
         change = moved(self.gaussians(), max(min(config.num_gaussians, int(1.05 * here)) - here, 0))
-        if change is None:
-            return ()
-        kept, fresh = change
+        return () if change is None else self._changed(*change)
+
+    def _changed(self, kept: Tensor, fresh: Gaussians) -> list[RowChange]:
         rows = (values.reshape(len(fresh), -1) for values in vars(fresh).values())
         return [RowChange(p, kept, values) for p, values in zip(self.parameters_of_gaussians(), rows, strict=True)]
+
+    def _count_gradients(self) -> None:
+        """Add up the gradients of image positions, of Gaussians that the last image showed."""
+        records, self._on_image = self._on_image, None
+        if records is None or records.grad is None:
+            return
+        if len(self.gradients) != len(records):
+            self.gradients = records.new_zeros(len(records), 2)
+        shown = records[:, OPACITY] > 0
+        self.gradients[:, 0] += image_gradients(records, records.grad, self.scene.image_size)
+        self.gradients[:, 1] += shown
+
+    def _densify(self, step: int, most: int) -> list[RowChange]:
+        if not len(self.gradients):
+            return []
+        mean = self.gradients[:, 0] / self.gradients[:, 1].clamp(min=1)
+        self.gradients = self.gradients.new_zeros(0, 2)
+        if step % self.config.steps_per_reset == self.config.steps_per_reset - 1:
+            lowered = self.logits.values.clamp(max=math.log(RESET / (1 - RESET)))
+            none = torch.zeros(0, dtype=torch.long, device=lowered.device)
+            return [RowChange(self.logits.values, none, lowered)]  # new rows, as Adam's state is reset too
+        change = grown(self.gaussians(), mean, most, self.extent)
+        return [] if change is None else self._changed(*change)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: object) -> None:
+        saved = state_dict.get(prefix + "gradients")
+        if saved is not None and saved.ndim == 2 and saved.shape[1] == 2:
+            self.gradients = self.gradients.new_zeros(saved.shape)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+    def refined_cameras(self, cameras: Cameras) -> Cameras:
+        """Return the training cameras with refined poses.
+
+        Args:
+            cameras: M training cameras with the poses of the data.
+        """
+        return cameras if self.poses is None else self.poses.refined(cameras)
 
     # -- pictures ---------------------------------------------------------------------------------------------
 
     def render_view(self, view: View, background: Tensor) -> Picture:
-        scene = self.scene
-        return draw_view(self.gaussians(), view, background, self._near, scene.far, self.config.antialiased)
+        pose = None if self.poses is None else self.poses.carried_pose(view.camera.camera_to_worlds[0])
+        near, far, antialiased = self._near, self.scene.far, self.config.antialiased
+        picture = draw_view(self.gaussians(), view, background, near, far, antialiased, pose)
+        return picture if self.appearance is None else replace(picture, rgb=self._lit(picture.rgb, None))
 
     @property
     def _near(self) -> float:
@@ -342,6 +473,21 @@ def _extent(scene: Scene) -> float:
         return float((scene.box[1] - scene.box[0]).norm()) / 2
     centers = scene.camera_to_worlds[:, :, 3]
     return 1.1 * float((centers - centers.mean(0)).norm(dim=-1).max()) or 1.0
+
+
+def _depth_error(distances: Tensor, transmittance: Tensor, known: Tensor) -> Tensor:
+    """Return the relative error () of the mean distance of what pixels show, at most 1 each, where it is known.
+
+    Args:
+        distances: (H, W) sums of weight times distance.
+        transmittance: (H, W).
+        known: (H, W) true distances, 0 where unknown.
+    """
+    opacity = 1 - transmittance
+    counts = (known > 0) & (opacity.detach() > 0.5)
+    mean = distances / opacity.clamp(min=0.5)
+    apart = ((mean - known).abs() / known.clamp(min=1e-6)).clamp(max=1)
+    return torch.where(counts, apart, 0).sum() / counts.sum().clamp(min=1)
 
 
 def _halved(image: Tensor) -> Tensor:

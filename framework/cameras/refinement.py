@@ -38,9 +38,13 @@ class PoseRefinement(nn.Module):
         self.register_buffer("given", given, persistent=False)
         self.tangents = nn.Parameter(torch.zeros(count, 6))
 
-    def motions(self) -> Tensor:
-        """Return the motions (M, 3, 4), exponentials of the (M, 6) translations and rotation vectors."""
-        translation, rotation = self.tangents[:, :3], self.tangents[:, 3:]
+    def motions(self, chosen: slice = slice(None)) -> Tensor:
+        """Return the motions (M, 3, 4), exponentials of the (M, 6) translations and rotation vectors.
+
+        Args:
+            chosen: the cameras; all if not given.
+        """
+        translation, rotation = self.tangents[chosen, :3], self.tangents[chosen, 3:]
         generator = torch.cat([cross_matrix(rotation), translation[:, :, None]], dim=-1)
         if self.group == "SO3xR3":
             # The matrix exponential has a value and a gradient at zero, where Rodrigues' formula is 0 / 0.
@@ -64,9 +68,7 @@ class PoseRefinement(nn.Module):
         """Transform `rays` from the given poses' frame to the refined poses'; lengths are scaled too."""
         if self.given is None:
             return rays
-        refined = self._moved(self.given)
-        scale, rotation, translation = align_cameras(self.given.cpu(), refined.cpu())
-        rotation, translation = rotation.to(rays.origins), translation.to(rays.origins)
+        scale, rotation, translation = self._drift(self.given)
         return replace(
             rays,
             origins=scale * (rotation * rays.origins[:, None]).sum(-1) + translation,
@@ -76,12 +78,34 @@ class PoseRefinement(nn.Module):
         )
 
     @torch.no_grad()
+    def carried_pose(self, pose: Tensor) -> Tensor:
+        """Transform the pose (3, 4) of a camera that is no training camera likewise."""
+        if self.given is None:
+            return pose
+        scale, rotation, translation = self._drift(self.given)
+        return torch.cat([rotation @ pose[:, :3], (scale * (rotation @ pose[:, 3]) + translation)[:, None]], dim=1)
+
+    def pose(self, index: int, given: Tensor) -> Tensor:
+        """Return the refined pose (3, 4) of a training camera, with a gradient.
+
+        Args:
+            index: which of the training cameras.
+            given: (3, 4) its pose as it is given.
+        """
+        return self._moved(given[None], slice(index, index + 1))[0]
+
+    def _drift(self, given: Tensor) -> tuple[float, Tensor, Tensor]:
+        """Return scale, rotation (3, 3) and translation (3,) of the common motion of all cameras."""
+        scale, rotation, translation = align_cameras(given.cpu(), self._moved(given).cpu())
+        return scale, rotation.to(given), translation.to(given)
+
+    @torch.no_grad()
     def refined(self, cameras: Cameras) -> Cameras:
         """Return the training `cameras` (M) with refined poses."""
         return replace(cameras, camera_to_worlds=self._moved(cameras.camera_to_worlds))
 
-    def _moved(self, poses: Tensor) -> Tensor:
-        motions = self.motions()
+    def _moved(self, poses: Tensor, chosen: slice = slice(None)) -> Tensor:
+        motions = self.motions(chosen)
         # Products and sums, because autocast would round a matrix product to bfloat16.
         moved = (motions[:, :, :3, None] * poses[:, None]).sum(2)
         centres = moved[:, :, 3:] if self.group == "SE3" else poses[:, :, 3:]

@@ -288,6 +288,7 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         # `light` is None for an object that is cut out: each of its sides is lit differently.
         appearance_varies=parsed.appearance_varies or (light is not None and light_spread(light) > APPEARANCE_STOPS),
         camera_to_worlds=cameras.camera_to_worlds,
+        image_pixels=int(cameras.offsets[-1]) // len(cameras),
     )
     depths = _depths(parsed, cameras, decoded.mapped is not None)
     names = tuple(path.name for path in parsed.image_paths)

@@ -69,6 +69,8 @@ class ViewBatch:
     """(H, W) opacity, where the images have it."""
     kept: Tensor | None = None
     """(H, W) bool, pixels that count; None for all."""
+    distances: Tensor | None = None
+    """(H, W) measured distance along each pixel's ray, 0 where unknown; None without depth images."""
 
     def __len__(self) -> int:
         return self.rgb.shape[0] * self.rgb.shape[1]
@@ -169,10 +171,17 @@ def gather_batch(
     if dataset.opaque is not None:
         opaque = dataset.opaque.contains(flat)
         rgb, alpha = torch.where(opaque[:, None], rgb, behind), opaque * (1.0 if alpha is None else alpha)
-    return PixelBatch(flat, rays, rgb, behind, alpha, _distances(dataset, flat, rays))
+    return PixelBatch(flat, rays, rgb, behind, alpha, known_distances(dataset, flat, rays))
 
 
-def _distances(dataset: Dataset, flat: Tensor, rays: Rays) -> Tensor | None:
+def known_distances(dataset: Dataset, flat: Tensor, rays: Rays) -> Tensor | None:
+    """Return the measured distance (R,) along the rays of pixels, 0 where unknown; None without depth images.
+
+    Args:
+        dataset: the images.
+        flat: (R,) numbers of the pixels, counted through all images.
+        rays: R * K rays through them, those of a pixel consecutive.
+    """
     if dataset.depths is None or rays.camera_indices is None:
         return None
     per_pixel = len(rays) // max(len(flat), 1)

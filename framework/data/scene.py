@@ -52,6 +52,8 @@ class Scene:
     """Whether light, exposure or camera differ between images."""
     camera_to_worlds: Tensor | None = None
     """(num_cameras, 3, 4) given poses of the training cameras."""
+    image_pixels: int | None = None
+    """Mean number of pixels of a training image; None if unknown."""
 
     @classmethod
     def of(cls, facts: Any) -> Scene:

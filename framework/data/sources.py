@@ -24,6 +24,7 @@ from framework.data.pixels import (
     background_colors,
     composite,
     draw_batch,
+    known_distances,
     training_background,
 )
 
@@ -143,14 +144,23 @@ class ViewSource(BatchSource):
         dataset = self.dataset
         index = self._index(request.step)
         behind = background_colors(self.background, 1, dataset.device)[0]
-        rgba = dataset.image(index).float() / 255
+        rgba = dataset.image(index).float().div_(255)
         alpha = rgba[..., 3] if rgba.shape[-1] == 4 else None
         view = View.of(dataset.cameras, index, dataset.times)
         kept = None
         if dataset.kept is not None:
             first, last = dataset.cameras.offsets[index : index + 2].tolist()
             kept = dataset.kept.mask(first, last).view(rgba.shape[:2])
-        return ViewBatch(index, view, composite(rgba, behind), behind, alpha, kept)
+        return ViewBatch(index, view, composite(rgba, behind), behind, alpha, kept, self._distances(index))
+
+    def _distances(self, index: int) -> Tensor | None:
+        dataset = self.dataset
+        if dataset.depths is None:
+            return None
+        pixels = dataset.cameras.image_pixels(index)
+        rays = dataset.cameras.pixel_rays(pixels, dataset.scene.near, dataset.scene.far, dataset.times)
+        found = known_distances(dataset, pixels, rays)
+        return None if found is None else found.view(int(dataset.cameras.heights[index]), -1)
 
     def _index(self, step: int) -> int:
         """Return the image of a training step, a function of the seed and the step alone."""

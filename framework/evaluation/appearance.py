@@ -89,9 +89,9 @@ def fit_appearance(
     if appearance is None:
         return None
     vector = (appearance.vectors.mean(0) if start is None else start).detach().clone().requires_grad_()
-    if len(pixels) and isinstance(model, RayModel):
+    if len(pixels):
         with appearance.shown(vector):
-            _fit(model, dataset, pixels, vector, background)
+            (_fit if isinstance(model, RayModel) else _fit_view)(model, dataset, pixels, vector, background)
     return vector.detach()
 
 
@@ -114,5 +114,22 @@ def _fit(model: RayModel[Any], dataset: Dataset, pixels: Tensor, vector: Tensor,
             batch = gather_batch(dataset, chosen, background.repeat(len(chosen), 1))
             rendered = model.render(replace(batch.rays, camera_indices=None), batch.background)
             (vector.grad,) = torch.autograd.grad(mean_squared_error(rendered.rgb, batch.rgb), [vector])
+            optimizer.step()
+    model.train(was_training)
+
+
+def _fit_view(model: Model[Any], dataset: Dataset, pixels: Tensor, vector: Tensor, background: Tensor) -> None:
+    """Fit the vector of a model that draws whole images, by pixels of one image."""
+    was_training = model.training
+    model.eval()
+    optimizer = torch.optim.Adam([vector], lr=RATE)
+    index = int(torch.searchsorted(dataset.cameras.offsets.to(pixels), pixels[0], right=True)) - 1
+    pixels_there = pixels - dataset.cameras.offsets[index].to(pixels)
+    view = dataset.view(index)
+    true = gather_batch(dataset, pixels, background.repeat(len(pixels), 1)).rgb
+    with torch.enable_grad():
+        for _ in range(STEPS):
+            shown = model.render_view(view, background).rgb.reshape(-1, 3)[pixels_there]
+            (vector.grad,) = torch.autograd.grad(mean_squared_error(shown, true), [vector])
             optimizer.step()
     model.train(was_training)

@@ -9,7 +9,7 @@ from framework.base.errors import ConfigError
 from framework.cameras.cameras import Cameras
 from framework.cameras.view import View, every
 from framework.geometry.lenses import LENSES, Distortion
-from framework.kernels.splat_blend import CHANNELS, blend
+from framework.kernels.splat_blend import CHANNELS, Blended, blend
 from framework.kernels.splat_project import SplatCamera, project_gaussians
 from framework.kernels.splat_tiles import tile_lists
 from framework.rendering.rendered import Picture
@@ -50,29 +50,47 @@ def splat_camera(
         lens = Distortion.of(camera.model, pose.new_zeros(1, len(LENSES["fisheye"])))
     fisheye = camera.model == "fisheye"
     width, height = int(camera.widths[0]) // reduced, int(camera.heights[0]) // reduced
-    return SplatCamera(to_camera, (fx, fy, cx, cy), width, height, near, antialiased=antialiased, lens=lens, fisheye=fisheye)
+    return SplatCamera(
+        to_camera, (fx, fy, cx, cy), width, height, near, antialiased=antialiased, lens=lens, fisheye=fisheye
+    )
 
 
-def draw(gaussians: Gaussians, camera: SplatCamera, background: Tensor, degree: int = 3) -> Tensor:
-    """Draw Gaussians with a gradient.
+def on_image(gaussians: Gaussians, camera: SplatCamera, degree: int = MAX_DEGREE) -> Tensor:
+    """Return the Gaussians on an image, records (N, RECORD) as `project_gaussians` gives them, with a gradient.
 
     Args:
         gaussians: what is drawn.
         camera: the image.
-        background: (3,) colour behind everything.
         degree: highest degree of the harmonics that counts.
-
-    Returns:
-        (H, W, 3) colours over the background.
     """
-    records, _ = _projected(gaussians, camera, degree)
+    g = gaussians
+    return project_gaussians(
+        g.means, g.log_scales, g.rotations, g.logits, g.colors, g.harmonics, camera=camera, degree=degree
+    )[0]
+
+
+def draw(records: Tensor, camera: SplatCamera, background: Tensor, channels: int = CHANNELS["rgb"]) -> Blended:
+    """Blend Gaussians on an image, with a gradient.
+
+    Args:
+        records: (N, RECORD) from `on_image`.
+        camera: the image.
+        background: (3,) colour behind everything.
+        channels: number of channels, a value of `CHANNELS`.
+    """
     lists = tile_lists(records, camera.width, camera.height)
-    return blend(records, lists, camera.width, camera.height, background).image
+    return blend(records, lists, camera.width, camera.height, background, channels)
 
 
 @torch.no_grad()
 def draw_view(
-    gaussians: Gaussians, view: View, background: Tensor, near: float, far: float, antialiased: bool
+    gaussians: Gaussians,
+    view: View,
+    background: Tensor,
+    near: float,
+    far: float,
+    antialiased: bool,
+    pose: Tensor | None = None,
 ) -> Picture:
     """Draw what a view shows.
 
@@ -83,11 +101,12 @@ def draw_view(
         near: what is nearer is not drawn, scene units.
         far: depth where nothing is seen, scene units.
         antialiased: make up for the blur of small Gaussians by their opacity.
+        pose: (3, 4) camera-to-scene pose to use instead of the view's.
     Raises:
         ConfigError for a camera model that is not among `DRAWN`.
     """
-    camera = splat_camera(view.camera, near, antialiased)
-    records, _ = _projected(gaussians, camera)
+    camera = splat_camera(view.camera, near, antialiased, pose)
+    records = on_image(gaussians, camera)
     lists = tile_lists(records, camera.width, camera.height)
     image, through, median = blend(
         records, lists, camera.width, camera.height, background, CHANNELS["normals"], median=True
@@ -99,11 +118,3 @@ def draw_view(
     parts = (image[..., :3], depth, torch.where(median > 0, median, far), opacity, normals)
     rgb, depth, median, opacity, normals = (every(part, view.stride) for part in parts)
     return Picture(rgb, depth, median, opacity, normals)
-
-
-def _projected(gaussians: Gaussians, camera: SplatCamera, degree: int = MAX_DEGREE) -> tuple[Tensor, int]:
-    """Project Gaussians to an image."""
-    g = gaussians
-    return project_gaussians(
-        g.means, g.log_scales, g.rotations, g.logits, g.colors, g.harmonics, camera=camera, degree=degree
-    )

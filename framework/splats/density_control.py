@@ -1,0 +1,91 @@
+"""Growth by gradients: Gaussians are cloned and split where images ask most for it, and transparent ones are dropped.
+
+Kerbl et al. 2023, section 5.2, by the absolute gradients of image positions (AbsGS, Ye et al. 2024), which do not
+cancel where the pixels of one Gaussian pull in different directions.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from framework.kernels.splat_project import CUT, REACH_X, X, rotation_matrices
+from framework.splats.gaussians import Gaussians
+
+GRADIENT = 8e-4
+"""Mean gradient of the image position, of images whose longer side is 2 units, from which a Gaussian is not enough."""
+LARGE = 0.01
+"""Largest standard deviation, in scene extents, of a Gaussian that is cloned; a larger one is split."""
+TRANSPARENT = 0.005
+"""Opacity below which a Gaussian is dropped."""
+CHILDREN, SHRUNK = 2, 1.6
+"""Gaussians that one is split into, and the ratio of its standard deviations to theirs."""
+RESET = 0.01
+"""Opacity to which all are lowered now and then, so that those which nothing needs stay transparent."""
+
+
+class Growth(NamedTuple):
+    """What becomes of Gaussians."""
+
+    kept: Tensor
+    """(K,) int64 which of them stay as they are."""
+    fresh: Gaussians
+    """Those that are added behind them."""
+
+
+def image_gradients(records: Tensor, gradient: Tensor, longer_side: int) -> Tensor:
+    """Return the size (N,) of the gradient of each Gaussian's position on an image, as if its longer side were 2 units.
+
+    Args:
+        records: (N, RECORD) Gaussians on the image.
+        gradient: (N, RECORD) its gradient. The compiled `blend` leaves sums of absolute gradients in the columns CUT
+            and REACH_X; where those are 0 (the reference), the position's own gradient is taken.
+        longer_side: of the image, pixels.
+    """
+    absolute = gradient[:, [CUT, REACH_X]]
+    plain = gradient[:, X : X + 2]
+    chosen = torch.where(absolute.any(), absolute, plain)
+    return chosen.norm(dim=-1) * (longer_side / 2)
+
+
+def grown(gaussians: Gaussians, gradients: Tensor, most: int, extent: float) -> Growth | None:
+    """Clone or split the Gaussians with the largest gradients, and drop transparent ones and those that are not finite.
+
+    Args:
+        gaussians: N Gaussians.
+        gradients: (N,) mean gradient of their image positions, as `image_gradients` returns them.
+        most: maximum number of Gaussians afterwards.
+        extent: the scene's, scene units.
+
+    Returns:
+        What becomes of them; None if all stay as they are.
+    """
+    alive = (torch.sigmoid(gaussians.logits) > TRANSPARENT) & gaussians.finite()
+    wanting = alive & (gradients > GRADIENT)
+    room = max(most - int(alive.sum()), 0)
+    if int(wanting.sum()) > room:
+        chosen = torch.where(wanting, gradients, -1).topk(room).indices
+        wanting = torch.zeros_like(wanting).index_fill_(0, chosen, True) & wanting
+    large = gaussians.log_scales.exp().amax(-1) > LARGE * extent
+    split, cloned = wanting & large, wanting & ~large
+    kept = (alive & ~split).nonzero()[:, 0]
+    if len(kept) == len(gaussians) and not bool(cloned.any()):
+        return None
+    children = [_child(gaussians[split]) for _ in range(CHILDREN)]
+    return Growth(kept, _joined([gaussians[cloned], *children]))
+
+
+def _child(gaussians: Gaussians) -> Gaussians:
+    """Return a smaller Gaussian at a random place of each."""
+    g = gaussians
+    offset = torch.randn_like(g.means) * g.log_scales.exp()
+    means = g.means + (rotation_matrices(g.rotations) @ offset[:, :, None])[:, :, 0]
+    shrunk = g.log_scales - torch.tensor(SHRUNK).log().to(g.log_scales)
+    return Gaussians(means, shrunk, g.rotations, g.logits, g.colors, g.harmonics)
+
+
+def _joined(parts: list[Gaussians]) -> Gaussians:
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    return Gaussians(*(torch.cat(column) for column in columns))

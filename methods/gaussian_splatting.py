@@ -36,6 +36,8 @@ from framework.training.optim import learning_rate_factor
 
 PIXELS_PER_SECOND = 25 * 400 * 400
 """Pixels that training draws in a second, about, on two cores; for what is decided by the budget."""
+MOST_STEPS_PER_SECOND = 100
+"""However small the images are."""
 NOISE, PENALTY = 5e5, 0.01
 """Noise and both penalties (Kheradmand et al. 2024), where Gaussians have to find their places."""
 WITHOUT_IMAGES = 1_000
@@ -140,7 +142,7 @@ def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplat
         config: settings, some of which may be open.
         scene: facts about the data.
     """
-    speed = PIXELS_PER_SECOND / (scene.image_pixels or scene.image_size**2)
+    speed = min(PIXELS_PER_SECOND / (scene.image_pixels or scene.image_size**2), MOST_STEPS_PER_SECOND)
     seconds = min(config.max_seconds or math.inf, config.max_num_iterations / speed)
     count = int(min(max(8_000 * math.sqrt(seconds), 20_000), 1_000_000))
     factor = min(max((30_000 / (speed * seconds)) ** 0.44, 1.0), 5.0)

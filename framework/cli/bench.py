@@ -21,6 +21,7 @@ usage: ns-bench WHAT [flags]
   quadrature       error of every sampler against field evaluations per ray, on scenes with a known integral
   methods          time to each PSNR of every built-in method, on the embedded scene or on --data
   ablation         effect of each part of instant-ngp: training with one part switched off, or on, in turn
+  starts           where Gaussians start: time to a PSNR from points, a field's surfaces, silhouettes, or anywhere
   profile-step     time of a training step: of each compiled kernel, and of Python and torch
   contention       speed of training and rendering beside other programs
   cache            memory and speed with a large image set under --cache-limit, and with a small one in memory
@@ -96,6 +97,22 @@ class AblationFlags:
     """PSNR of the validation views, dB, to which the time is reported."""
     output_dir: Path = RESULTS
     """Folder of ablation-DATA.json."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StartsFlags:
+    """Train gaussian-splatting from each kind of start in turn; report the time to a PSNR and the final PSNR."""
+
+    data: Path
+    """Folder of the data set."""
+    seconds: float = 60.0
+    """Seconds of training of each run."""
+    seeds: int = 1
+    """Number of runs from each start."""
+    target: float = 30.0
+    """PSNR of the validation views, dB, to which the time is reported."""
+    output_dir: Path = RESULTS
+    """Folder of starts-DATA.json."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,6 +260,14 @@ def _ablation(flags: AblationFlags) -> None:
     _write(path, measure(flags.data, flags.seconds, flags.seeds, flags.target))
 
 
+def _starts(flags: StartsFlags) -> None:
+    from framework.tools.benchmarks.starts import measure
+
+    path = flags.output_dir / f"starts-{flags.data.resolve().name}.json"
+    make_room(path)
+    _write(path, measure(flags.data, flags.seconds, flags.seeds, flags.target))
+
+
 def _profile(flags: ProfileFlags) -> None:
     from framework.tools.benchmarks.profile_step import measure
 
@@ -285,6 +310,7 @@ KINDS: dict[str, tuple[type, Any]] = {
     "quadrature": (QuadratureFlags, _quadrature),
     "methods": (MethodFlags, _methods),
     "ablation": (AblationFlags, _ablation),
+    "starts": (StartsFlags, _starts),
     "profile-step": (ProfileFlags, _profile),
     "contention": (ContentionFlags, _contention),
     "cache": (CacheFlags, _cache),

@@ -17,7 +17,7 @@ from framework.training.checkpoint import load_checkpoint
 from methods.gaussian_splatting import METHOD, GaussianSplatting, GaussianSplattingConfig, decide
 from tests.training.helpers import tiny_trainer
 
-SCENE = Scene(torch.tensor([[-1.0] * 3, [1.0] * 3]), 1.0, 6.0, 4, True, False, 32)
+SCENE = Scene(torch.tensor([[-1.0] * 3, [1.0] * 3]), 1.0, 6.0, 4, True, False, 32, image_pixels=400 * 400)
 
 
 def camera(model: str = "pinhole", distance: float = 3.0) -> Cameras:

@@ -64,7 +64,9 @@ def measure(data: Path, seconds: float, seeds: int, target: float) -> dict[str, 
     return {"machine": machine(), "kernels": native.variant(), **arguments, "rows": rows}
 
 
-def train(data: Path, seconds: float, seed: int, target: float, switches: list[str]) -> tuple[float | None, float]:
+def train(
+    data: Path, seconds: float, seed: int, target: float, switches: list[str], method: str = "instant-ngp"
+) -> tuple[float | None, float]:
     """Train one variant, and evaluate it on all test views.
 
     Args:
@@ -73,12 +75,13 @@ def train(data: Path, seconds: float, seed: int, target: float, switches: list[s
         seed: random seed.
         target: PSNR, dB.
         switches: flags of ns-train for the variant.
+        method: name of the method.
 
     Returns:
         Seconds to the target, None if it was not reached, and the final PSNR, dB.
     """
     with tempfile.TemporaryDirectory() as folder:
-        command = python_command("framework.cli.train", "instant-ngp", "--data", data)
+        command = python_command("framework.cli.train", method, "--data", data)
         command += ["--max-seconds", str(seconds), "--machine.seed", str(seed), "--vis", "none"]
         command += ["--seconds-per-eval-all-images", str(seconds / CURVE_POINTS), "--max-eval-images", str(VIEWS)]
         output_of([*command, "--output-dir", folder, *switches])

@@ -1,0 +1,124 @@
+"""Growth by gradients: which Gaussians are cloned, split and dropped, and what the gradients are."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from framework import View
+from framework.kernels import native
+from framework.kernels.splat_project import RECORD, X
+from framework.splats.density_control import (
+    CHILDREN,
+    GRADIENT,
+    LARGE,
+    SHRUNK,
+    TRANSPARENT,
+    grown,
+    image_gradients,
+)
+from framework.splats.drawing import draw, on_image, splat_camera
+from framework.splats.gaussians import Gaussians
+from tests.splats.test_method import ball, camera
+
+EXTENT = 2.0
+
+
+def row(count: int) -> Gaussians:
+    """Opaque Gaussians, small enough to be cloned, of which each can be told by its centre."""
+    torch.manual_seed(0)
+    one = torch.ones(count)
+    sizes = torch.full((count, 3), 0.5 * LARGE * EXTENT).log()
+    return Gaussians(
+        torch.arange(count)[:, None] * torch.tensor([1.0, 0, 0]), sizes, torch.randn(count, 4), 2 * one,
+        torch.randn(count, 3), torch.randn(count, 3, 3),
+    )  # fmt: skip
+
+
+def test_small_ones_are_cloned_and_large_ones_split() -> None:
+    given = row(5)
+    given.log_scales[3, 1] = math.log(1.5 * LARGE * EXTENT)
+    gradients = torch.tensor([0.0, 2.0, 0.5, 2.0, 0.0]) * GRADIENT
+    change = grown(given, gradients, 100, EXTENT)
+    assert change is not None
+    assert change.kept.tolist() == [0, 1, 2, 4]
+    assert len(change.fresh) == 1 + CHILDREN
+    for ours, theirs in zip(vars(change.fresh[:1]).values(), vars(given[1:2]).values(), strict=True):
+        assert torch.equal(ours, theirs)
+    children = change.fresh[1:]
+    torch.testing.assert_close(children.log_scales.exp() * SHRUNK, given[[3, 3]].log_scales.exp())
+    away = (children.means - given.means[3]).norm(dim=-1)
+    assert (away > 0).all()
+    assert (away < 6 * 1.5 * LARGE * EXTENT).all()
+
+
+def test_children_are_spread_as_their_parent_is() -> None:
+    """Their centres have its covariance, within what 20,000 of them allow."""
+    torch.manual_seed(1)
+    turn = torch.tensor([[0.9, 0.1, -0.3, 0.2]])
+    scales = torch.tensor([[0.1, 0.3, 0.02]])
+    count = 10_000
+    many = ball(rotations=turn, log_scales=scales.log())[torch.zeros(count, dtype=torch.long)]
+    change = grown(many, torch.full((count,), 1.0), 10**6, EXTENT)
+    assert change is not None
+    from scipy.spatial.transform import Rotation
+
+    axes = torch.tensor(Rotation.from_quat(turn[0].numpy(), scalar_first=True).as_matrix()).float()
+    true = axes @ torch.diag(scales[0] ** 2) @ axes.T
+    found = change.fresh.means.T.cov()
+    assert float((found - true).abs().max()) < 0.05 * float(true.max())
+
+
+def test_the_most_wanting_come_first_where_there_is_little_room() -> None:
+    gradients = torch.tensor([3.0, 5.0, 2.0, 4.0]) * GRADIENT
+    change = grown(row(4), gradients, 6, EXTENT)
+    assert change is not None
+    assert sorted(change.fresh.means[:, 0].tolist()) == [1.0, 3.0]
+    assert grown(row(4), gradients, 4, EXTENT) is None
+    assert grown(row(4), gradients, 2, EXTENT) is None  # no more than there may be already
+
+
+def test_transparent_ones_and_those_that_are_not_finite_are_dropped() -> None:
+    given = row(4)
+    given.logits[1] = math.log(0.5 * TRANSPARENT)
+    given.means[2, 0] = float("nan")
+    change = grown(given, torch.full((4,), 2 * GRADIENT), 2, EXTENT)
+    assert change is not None
+    assert change.kept.tolist() == [0, 3]
+    assert len(change.fresh) == 0
+
+
+def test_nothing_to_do() -> None:
+    assert grown(row(3), torch.zeros(3), 100, EXTENT) is None
+
+
+@pytest.mark.skipif(not native.available(), reason="absolute gradients are those of the compiled kernel")
+def test_absolute_gradients_do_not_cancel() -> None:
+    """Of a Gaussian in the middle of a symmetric loss the position's gradient is 0; that of its halves is not."""
+    one = splat_camera(camera(), 0.1)
+    round_one = dataclasses.replace(ball(logit=0.0), log_scales=torch.full((1, 3), math.log(0.2)))
+    records = on_image(round_one, one).detach().requires_grad_()
+    image = draw(records, one, torch.zeros(3)).image
+    halves = []
+    for part in (image, image[:, :16], image[:, 17:]):
+        (gradient,) = torch.autograd.grad(part.sum(), records, retain_graph=True)
+        halves.append(gradient)
+    whole, left, right = halves
+    assert float(whole[0, X].abs()) < 1e-3 * float(left[0, X].abs())
+    assert float(left[0, X]) == pytest.approx(-float(right[0, X]), rel=1e-3)
+    assert float(image_gradients(records, whole, 33)[0]) > 10 * float(left[0, X].abs())
+
+
+def test_without_absolute_gradients_the_plain_ones_count() -> None:
+    gradient = torch.zeros(2, RECORD)
+    gradient[1, X], gradient[1, X + 1] = 3.0, 4.0
+    assert image_gradients(torch.zeros(2, RECORD), gradient, 20).tolist() == [0.0, 50.0]
+
+
+def test_what_is_drawn_of_it() -> None:
+    """A picture of an opaque ball is bright in its middle, which the other tests rely on."""
+    picture = draw(
+        on_image(ball(), splat_camera(camera(), 0.1)), splat_camera(View(camera()).camera, 0.1), torch.zeros(3)
+    )
+    assert float(picture.image[16, 16, 0]) > 0.7

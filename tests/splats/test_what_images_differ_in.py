@@ -1,0 +1,169 @@
+"""What differs between images and is learnt with the Gaussians: colours, poses, and depths that are known."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+
+from framework import View
+from framework.cameras.cameras import Cameras
+from framework.data.pixels import ViewBatch
+from framework.evaluation.appearance import appearance_of, fit_appearance
+from framework.kernels.math import cross_matrix
+from framework.splats.gaussians import Gaussians
+from framework.training.datasets import load_split
+from methods.gaussian_splatting import GaussianSplatting, GaussianSplattingConfig, decide
+from tests.splats.test_method import SCENE, ball, camera
+from tests.training.helpers import tiny_trainer
+
+
+def model_of(gaussians: Gaussians, cameras: Cameras, **settings: object) -> GaussianSplatting:
+    scene = dataclasses.replace(SCENE, num_cameras=len(cameras), camera_to_worlds=cameras.camera_to_worlds)
+    config, _ = decide(GaussianSplattingConfig(num_gaussians=10, degree=0, **settings), scene)  # type: ignore[arg-type]
+    model = GaussianSplatting(config, scene)
+    model._set(gaussians)
+    return model
+
+
+def scattered(count: int = 60) -> Gaussians:
+    """Coloured opaque Gaussians near the origin."""
+    torch.manual_seed(2)
+    turn = torch.zeros(count, 4)
+    turn[:, 0] = 1
+    return Gaussians(
+        torch.randn(count, 3) * 0.4, torch.full((count, 3), -2.5), turn, torch.full((count,), 3.0),
+        torch.randn(count, 3), torch.zeros(count, 3, 0),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("given", "varies", "expected"), [(None, True, True), (None, False, False), (False, True, False)]
+)
+def test_colours_are_transformed_where_light_differs(given: bool | None, varies: bool, expected: bool) -> None:
+    scene = dataclasses.replace(SCENE, appearance_varies=varies)
+    config, _ = decide(GaussianSplattingConfig(appearance=given), scene)  # type: ignore[arg-type]
+    assert config.appearance is expected
+    assert (appearance_of(GaussianSplatting(config, scene)) is not None) is expected
+
+
+def test_a_transform_is_learnt_by_the_image_it_is_of() -> None:
+    one = camera()
+    model = model_of(ball(), Cameras(**{**vars(one), "camera_to_worlds": one.camera_to_worlds.expand(3, 3, 4)}),
+                     appearance=True)  # fmt: skip
+    batch = ViewBatch(1, View(one), torch.rand(33, 33, 3), torch.zeros(3))
+    model.loss(batch, 0).total.backward()
+    assert model.appearance is not None
+    gradient = model.appearance.vectors.grad
+    assert gradient is not None
+    assert gradient[1].any()
+    assert not gradient[[0, 2]].any()
+
+
+def test_pictures_show_the_appearance_that_is_set() -> None:
+    """Half as bright, and shifted: by the formula."""
+    one = camera()
+    model = model_of(ball(), one, appearance=True)
+    assert model.appearance is not None
+    plain = model.render_view(View(one), torch.zeros(3)).rgb
+    vector = torch.zeros(3, 4)
+    vector[:, :3] = -0.5 * torch.eye(3)
+    vector[:, 3] = torch.tensor([0.1, 0.0, -0.2])
+    with model.appearance.shown(vector.flatten()):
+        shown = model.render_view(View(one), torch.zeros(3)).rgb
+    torch.testing.assert_close(shown, 0.5 * plain + vector[:, 3])
+
+
+def test_the_appearance_of_a_held_out_image_is_found_by_its_half(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path / "run", appearance=True)
+    for _ in range(20):
+        trainer.train_step()
+    dataset = load_split(trainer.run, "test")
+    darker = dataclasses.replace(dataset, pixels=(dataset.pixels.float() * torch.tensor([0.5, 0.5, 0.5, 1])).byte())
+    pixels = dataset.cameras.image_pixels(1)
+    background = torch.zeros(3)
+    found = fit_appearance(trainer.model, darker, pixels, background)
+    appearance = appearance_of(trainer.model)
+    assert found is not None
+    assert appearance is not None
+    view, true = darker.view(1), darker.image(1).float() / 255
+    errors = []
+    for vector in (appearance.vectors.detach().mean(0), found):
+        with appearance.shown(vector), torch.no_grad():
+            picture = trainer.model.render_view(view, background).rgb
+        errors.append(float((picture - true[..., :3] * true[..., 3:]).square().mean()))
+    assert errors[1] < 0.6 * errors[0]
+
+
+@pytest.mark.parametrize("group", ["SO3xR3", "SE3"])
+def test_a_pose_that_is_off_is_found(group: str) -> None:
+    """One of two cameras is turned by two degrees and moved; its image leads it back, to a tenth of that."""
+    true = camera()
+    both = true.camera_to_worlds.repeat(2, 1, 1)
+    turn = torch.linalg.matrix_exp(cross_matrix(torch.tensor([0.02, -0.03, 0.01])))
+    both[1, :, :3] = turn @ both[1, :, :3]
+    both[1, :, 3] += torch.tensor([0.05, -0.04, 0.03])
+    wrong = dataclasses.replace(true[torch.tensor([0, 0])], camera_to_worlds=both)
+    scene = scattered()
+    target = model_of(scene, true).render_view(View(true), torch.zeros(3)).rgb
+    model = model_of(scene, wrong, camera_optimizer=group, ssim_weight=0.0)
+    assert model.poses is not None
+    optimizer = torch.optim.Adam([model.poses.tangents], lr=3e-3)
+    batch = ViewBatch(1, View(wrong[torch.tensor([1])]), target, torch.zeros(3))
+    for step in range(150):
+        if step == 100:
+            optimizer.param_groups[0]["lr"] = 3e-4
+        optimizer.zero_grad()
+        model.loss(batch, step).terms["rgb"].backward()
+        optimizer.step()
+    found = model.refined_cameras(wrong).camera_to_worlds
+    before = (both[1] - true.camera_to_worlds[0]).abs().max()
+    assert float((found[1] - true.camera_to_worlds[0]).abs().max()) < 0.1 * float(before)
+    assert torch.equal(found[0], both[0])
+
+
+def test_other_cameras_follow_the_training_cameras() -> None:
+    """All training cameras are moved by one similarity; so is a camera that is none of them."""
+    generator = torch.Generator().manual_seed(3)
+    centers = torch.randn(5, 3, generator=generator)
+    poses = torch.cat([torch.eye(3).expand(5, 3, 3), centers[:, :, None]], dim=2)
+    given = dataclasses.replace(camera()[torch.zeros(5, dtype=torch.long)], camera_to_worlds=poses)
+    model = model_of(ball(), given, camera_optimizer="SE3")
+    assert model.poses is not None
+    motion = torch.tensor([0.3, -0.2, 0.1, 0.1, 0.2, -0.1])
+    model.poses.tangents.data[:] = motion
+    generator_matrix = torch.zeros(4, 4)
+    generator_matrix[:3] = torch.cat([cross_matrix(motion[3:]), motion[:3, None]], dim=1)
+    other = camera().camera_to_worlds[0]
+    expected = torch.linalg.matrix_exp(generator_matrix)[:3] @ torch.cat([other, torch.tensor([[0.0, 0, 0, 1]])])
+    torch.testing.assert_close(model.poses.carried_pose(other), expected, atol=1e-5, rtol=0)
+
+
+def test_known_depths_pull_gaussians_there() -> None:
+    """One Gaussian at distance 3, whose true distance is 2.5: the loss is its relative error, and moves it nearer."""
+    one = camera()
+    model = model_of(ball(), one, depth_loss_mult=1.0)
+    known = torch.zeros(33, 33)
+    known[16, 16] = 2.5
+    batch = ViewBatch(0, View(one), torch.rand(33, 33, 3), torch.zeros(3), distances=known)
+    term = model.loss(batch, 0).terms["depth"]
+    assert float(term.detach()) == pytest.approx(0.2, abs=1e-3)
+    term.backward()
+    assert model.means.values.grad is not None
+    assert float(model.means.values.grad[0, 2]) < 0  # the camera is at z = 3, and looks down
+    nothing = dataclasses.replace(batch, distances=torch.zeros(33, 33))
+    assert float(model.loss(nothing, 0).terms["depth"].detach()) == 0
+
+
+def test_the_background_of_a_capture_cannot_be_learnt() -> None:
+    """Each step has another, so that what is left transparent is wrong in the next."""
+    captured = dataclasses.replace(SCENE, has_alpha=False)
+    config, _ = decide(GaussianSplattingConfig(num_gaussians=10, degree=0), captured)
+    model = GaussianSplatting(config, captured)
+    batch = ViewBatch(0, View(camera()), torch.zeros(33, 33, 3), torch.zeros(3))
+    corners = [model.loss(batch, 0).rgb[0, 0] for _ in range(3)]
+    assert len({tuple(corner.tolist()) for corner in corners}) == 3
+    config = dataclasses.replace(config, background="black")
+    model = GaussianSplatting(config, captured)
+    model._set(ball())
+    assert not model.loss(batch, 0).rgb[0, 0].any()

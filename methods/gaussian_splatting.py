@@ -46,6 +46,8 @@ HULL_CELLS = 128
 """Cells of the visual hull along an axis."""
 SMALLEST_SSIM = 11
 """Pixels of an image's shorter side from which it has an SSIM."""
+FEW = 1_000
+"""Maximum number of Gaussians whose distances to the cameras are looked at."""
 FIELD_OPACITY, FIELD_SIZE = 0.5, 0.7
 """Of Gaussians on a field's surfaces at the start: opacity, and standard deviation in distances to neighbours."""
 
@@ -99,7 +101,7 @@ class GaussianSplattingConfig(
     rate_factor: float | None = None
     """Factor of all learning rates; by the budget if not given, as fewer steps have to go farther."""
     position_rate: float = 8e-5
-    """Learning rate of centres before that factor, per scene extent (the cameras' largest distance from their mean)."""
+    """Learning rate of centres before that factor, in sizes of the scene."""
     degree: int = 3
     """Highest degree of the spherical harmonics that colours are made of."""
     ssim_weight: float = 0.2
@@ -196,6 +198,8 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
     """
 
     batches: ClassVar[Literal["pixels", "views"]] = "views"
+    extent: Tensor
+    """Size () of the scene, scene units, in which centres are stored: so their learning rate suits any scene."""
     found: Tensor
     """Whether the first Gaussians lay on surfaces, so that none has to look for its place."""
     gradients: Tensor
@@ -211,8 +215,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         def table(width: int, name: str, times: float, schedule: Literal["constant"] | None = "constant") -> _Table:
             return _Table(width, Optimised(name, times * rate, schedule=schedule, sparse=True))
 
-        self.extent = _extent(scene)
-        self.position_rate = factor * config.position_rate * self.extent
+        self.position_rate = factor * config.position_rate
         self.means = table(3, "means", self.position_rate / rate, None)
         self.log_scales = table(3, "scales", 1.0)
         self.rotations = table(4, "rotations", 0.2)
@@ -220,6 +223,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         self.colors = table(3, "colors", 0.5)
         self.harmonics = table(3 * higher, "harmonics", 0.025)
         self.register_buffer("found", torch.tensor(False))
+        self.register_buffer("extent", torch.tensor(_extent(scene)))
         self.progress = 0.0
         self.appearance: Appearance | None = None
         if config.appearance:
@@ -256,7 +260,12 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
     def _all(self) -> Gaussians:
         means, log_scales, rotations, logits, colors, harmonics = self.parameters_of_gaussians()
         return Gaussians(
-            means, log_scales, rotations, logits[:, 0], colors, harmonics.view(len(means), 3, harmonics.shape[1] // 3)
+            means * self.extent,
+            log_scales,
+            rotations,
+            logits[:, 0],
+            colors,
+            harmonics.view(len(means), 3, harmonics.shape[1] // 3),
         )
 
     def gaussians(self) -> Gaussians:
@@ -285,6 +294,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         if kind != "field":
             points = self._first_points(kind, dataset)
             first = from_points(points, seen_colors(points, dataset), self.config.degree)
+        self.extent.copy_(_extent(self.scene, first.means))
         self._set(first)
         self.found.fill_(kind == "field")
         where = {"points": "at the points of a reconstruction", "field": "on the surfaces of a field"}
@@ -292,6 +302,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         say(f"  {len(first):,} Gaussians start {where[kind]}")
 
     def _set(self, gaussians: Gaussians) -> None:
+        gaussians = replace(gaussians, means=gaussians.means / self.extent)
         for parameter, values in zip(self.parameters_of_gaussians(), vars(gaussians).values(), strict=True):
             parameter.data = values.reshape(len(gaussians), parameter.shape[1]).contiguous()
 
@@ -374,9 +385,9 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         config = self.config
         self._count_gradients()
         if config.strategy == "mcmc" and (noise := self._chosen(config.noise, NOISE)) > 0:
-            rate = self.position_rate * learning_rate_factor(config, step, progress)
+            rate = self.position_rate * float(self.extent) * learning_rate_factor(config, step, progress)
             which, by = shaken(self.gaussians(), noise * rate)
-            self.means.values.data[which] += by
+            self.means.values.data[which] += by / self.extent
         if step % config.steps_per_move != config.steps_per_move - 1 or progress > config.growth_end:
             return ()
         assert config.num_gaussians is not None
@@ -387,6 +398,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         return () if change is None else self._changed(*change)
 
     def _changed(self, kept: Tensor, fresh: Gaussians) -> list[RowChange]:
+        fresh = replace(fresh, means=fresh.means / self.extent)
         rows = (values.reshape(len(fresh), -1) for values in vars(fresh).values())
         return [RowChange(p, kept, values) for p, values in zip(self.parameters_of_gaussians(), rows, strict=True)]
 
@@ -410,7 +422,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
             lowered = self.logits.values.clamp(max=math.log(RESET / (1 - RESET)))
             none = torch.zeros(0, dtype=torch.long, device=lowered.device)
             return [RowChange(self.logits.values, none, lowered)]  # new rows, as Adam's state is reset too
-        change = grown(self.gaussians(), mean, most, self.extent)
+        change = grown(self.gaussians(), mean, most, float(self.extent))
         return [] if change is None else self._changed(*change)
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: object) -> None:
@@ -441,7 +453,10 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
 
 
 def _surfaces(config: GaussianSplattingConfig, dataset: Dataset) -> tuple[Tensor, Tensor]:
-    """Return points (N, 3) on the surfaces that a short run of instant-ngp finds, and their colours (N, 3)."""
+    """Return points (N, 3) on the surfaces that a short run of a field finds, and their colours (N, 3).
+
+    The field is that of instant-ngp, or of nerfacto where there may be something outside the box.
+    """
     from framework.base.registry import load_method
     from framework.export.points import joined, surface_points
     from framework.training.run import Run
@@ -450,14 +465,15 @@ def _surfaces(config: GaussianSplattingConfig, dataset: Dataset) -> tuple[Tensor
     steps, count = config.field_steps, config.start_gaussians
     assert steps is not None
     assert count is not None
+    method = "nerfacto" if dataset.scene.unbounded else "instant-ngp"
     field = replace(
-        load_method("instant-ngp").config,
+        load_method(method).config,
         max_num_iterations=steps,
         vis="none",
         machine=config.machine,
         background=config.background,
     )
-    trainer = Trainer(Run("instant-ngp", field, "", cast("Any", None), Path()), dataset, None)
+    trainer = Trainer(Run(method, field, "", cast("Any", None), Path()), dataset, None)
     for _ in track(range(steps), "Looking for surfaces", total=steps):
         trainer.train_step()
     model = trainer.model.eval()
@@ -469,11 +485,18 @@ def _surfaces(config: GaussianSplattingConfig, dataset: Dataset) -> tuple[Tensor
     return torch.cat(points).to(dataset.device), torch.cat(colors).to(dataset.device)
 
 
-def _extent(scene: Scene) -> float:
-    """Return the scale of the scene: 1.1 times the largest distance of a camera from their middle."""
+def _extent(scene: Scene, means: Tensor | None = None) -> float:
+    """Return the size of a scene, scene units: 1.3 times the median distance of Gaussians from the cameras.
+
+    That is what 3D Gaussian Splatting takes of cameras all around: 1.1 times the largest distance of one from their
+    middle, here where no Gaussians are given. Of cameras side by side it would be less than what they see is away.
+    """
     if scene.camera_to_worlds is None:
         return float((scene.box[1] - scene.box[0]).norm()) / 2
     centers = scene.camera_to_worlds[:, :, 3]
+    if means is not None and len(means):
+        some = means[:: -(-len(means) // FEW)]
+        return 1.3 * float(torch.cdist(some, centers.to(some)).median()) or 1.0
     return 1.1 * float((centers - centers.mean(0)).norm(dim=-1).max()) or 1.0
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import torch
 from torch import Tensor
 
@@ -44,15 +46,21 @@ def splat_camera(
     rotation = pose.new_tensor(FLIPPED) @ pose[:, :3].T
     to_camera = torch.cat([rotation, -(rotation @ pose[:, 3])[:, None]], 1)
     fx, fy, cx, cy = (float(value[0]) / reduced for value in (camera.fx, camera.fy, camera.cx, camera.cy))
-    # COLMAP's pinhole cameras come with a lens of no coefficients.
-    lens = None if camera.lens is None or camera.model == "pinhole" else Distortion.of(camera.model, camera.lens)
-    if lens is None and camera.model == "fisheye":
-        lens = Distortion.of(camera.model, pose.new_zeros(1, len(LENSES["fisheye"])))
-    fisheye = camera.model == "fisheye"
+    lens, fisheye = None, camera.model == "fisheye"
+    if fisheye or (camera.lens is not None and LENSES[camera.model]):
+        given = (0.0,) * len(LENSES[camera.model]) if camera.lens is None else tuple(camera.lens[0].tolist())
+        lens = _lens(camera.model, given)
     width, height = int(camera.widths[0]) // reduced, int(camera.heights[0]) // reduced
     return SplatCamera(
         to_camera, (fx, fy, cx, cy), width, height, near, antialiased=antialiased, lens=lens, fisheye=fisheye
     )
+
+
+@lru_cache(maxsize=1024)
+def _lens(model: str, coefficients: tuple[float, ...]) -> Distortion:
+    """Return the distortion of one lens. How far it reaches is found by iteration, which a training step has no time
+    for."""
+    return Distortion.of(model, torch.tensor([coefficients], dtype=torch.float64))
 
 
 def on_image(gaussians: Gaussians, camera: SplatCamera, degree: int = MAX_DEGREE) -> Tensor:

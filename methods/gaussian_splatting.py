@@ -384,7 +384,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
     def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
         config = self.config
         self._count_gradients()
-        if config.strategy == "mcmc" and (noise := self._chosen(config.noise, NOISE)) > 0:
+        if (noise := self._chosen(config.noise, NOISE)) > 0:
             rate = self.position_rate * float(self.extent) * learning_rate_factor(config, step, progress)
             which, by = shaken(self.gaussians(), noise * rate)
             self.means.values.data[which] += by / self.extent

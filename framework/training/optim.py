@@ -52,7 +52,7 @@ class Adam(torch.optim.Optimizer):
         state = self.state[parameter]
         state["exp_avg"], state["exp_avg_sq"] = (table(*parameter.shape, like=parameter) for _ in range(2))
         if sparse:
-            state["seen"] = torch.zeros_like(parameter[:, 0])
+            state["seen"] = parameter.new_zeros(len(parameter))
         else:
             state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
 
@@ -118,7 +118,7 @@ class Adam(torch.optim.Optimizer):
         self.entries_there += len(parameter)
         if deferred is not None and deferred.pending:
             self.entries_updated += deferred.adam(parameter, *moments, *settings)
-        if parameter.grad is not None:
+        if parameter.grad is not None and parameter.numel():  # a table may have no columns
             self.entries_updated += sparse_adam(parameter, parameter.grad, *moments, *settings)
 
     def _step_dense(self, group: dict[str, Any]) -> None:

@@ -149,6 +149,16 @@ def test_a_checkpoint_has_as_many_gaussians_as_it_has(shared_tiny: Path, tmp_pat
     assert second.state.step == 26
 
 
+def test_colours_may_be_the_same_from_everywhere(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path / "run", degree=0)
+    for step in range(30):
+        trainer.train_step()
+        if step == 4:
+            before = trainer.state.train_mse
+    assert trainer.state.train_mse < 0.8 * before
+    assert trainer.model.gaussians().harmonics.shape[2] == 0  # type: ignore[operator]
+
+
 def test_the_method_is_declared() -> None:
     assert METHOD.model is GaussianSplatting
     assert METHOD.field is None

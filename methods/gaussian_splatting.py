@@ -147,15 +147,15 @@ def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplat
     speed = min(PIXELS_PER_SECOND / (scene.image_pixels or scene.image_size**2), MOST_STEPS_PER_SECOND)
     seconds = min(config.max_seconds or math.inf, config.max_num_iterations / speed)
     count = int(min(max(8_000 * math.sqrt(seconds), 20_000), 1_000_000))
-    factor = min(max((30_000 / (speed * seconds)) ** 0.44, 1.0), 5.0)
+    factor = min(max((30_000 / (speed * seconds)) ** 0.44, 1.0), 8.0)
     why = "that suits the time"
     config, made = fill(config, Choice("num_gaussians", count, why, "Gaussians", f"up to {count:,}"))
     assert config.num_gaussians is not None
-    first = max(config.num_gaussians * 2 // 3, 1)
+    first, most = max(config.num_gaussians * 2 // 3, 1), 800 if scene.unbounded else 400
     config, more = fill(
         config,
         Choice("start_gaussians", first, "the others are added", "Gaussians at the start", f"{first:,}"),
-        Choice("field_steps", int(min(max(2 * seconds, 120), 400)), why, "steps of a field to start from"),
+        Choice("field_steps", int(min(max(2 * seconds, 120), most)), why, "steps of a field to start from"),
         Choice("rate_factor", round(factor, 2), "fewer steps have to go farther", "factor of learning rates"),
         Choice(
             "appearance",
@@ -249,8 +249,11 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         return False  # there is no network
 
     def _chosen(self, given: float | None, otherwise: float) -> float:
-        """Return a setting that is by the start if not given: Gaussians on surfaces need no search for places."""
-        return given if given is not None else (0.0 if bool(self.found) else otherwise)
+        """Return a setting that is by the start if not given: Gaussians on surfaces need no search for places, but for
+        those far away, where a field that was trained for seconds is mist."""
+        if given is not None:
+            return given
+        return 0.0 if bool(self.found) and not self.scene.unbounded else otherwise
 
     def parameters_of_gaussians(self) -> list[nn.Parameter]:
         """Return the six tables."""

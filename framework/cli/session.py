@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from framework.base.console import say
 from framework.base.device import choose_device, peak_memory
 from framework.evaluation.evaluator import evaluate
+from framework.model import StartsFromImages
+from framework.splats.gaussians import HasGaussians
 from framework.training.checkpoint import FOLDER, list_checkpoints, load_newest
 from framework.training.datasets import first_split, load_split
 from framework.training.lock import sole_user
@@ -67,7 +69,8 @@ def _prepare(run: Run) -> Trainer:
         say(line)
     if train_set.scene.image_size < FEW_PIXELS:
         say(f"warning: images of {train_set.scene.image_size} pixels show next to nothing; are they thumbnails?")
-    say(f"{trainer.model.size():,} parameters; writing to {run.folder}")
+    by_images = isinstance(trainer.model, StartsFromImages)
+    say(f"{'' if by_images else f'{trainer.model.size():,} parameters; '}writing to {run.folder}")
     return trainer
 
 
@@ -88,6 +91,8 @@ def _finish(run: Run, trainer: Trainer) -> None:
     rungs = skip_report(trainer)
     for line in lines(rungs):
         say(line)
+    if isinstance(trainer.model, HasGaussians):
+        say(_count(trainer.model))
     write_report(run.folder / "skip_report.json", as_plain(rungs))
     write_summary(trainer, outcome)
     say(f"checkpoint: {outcome.checkpoint}")
@@ -95,6 +100,13 @@ def _finish(run: Run, trainer: Trainer) -> None:
         raise Stopped(outcome.stopped_by, f"continue with: ns-train --resume {run.folder}")
     with _noted_stop(lambda: f"stopped while evaluating; the trained run is saved: ns-eval {run.folder}"):
         _evaluate(run, trainer, outcome)
+
+
+def _count(model: HasGaussians) -> str:
+    """Return how many Gaussians a model has, and how many of them are not finite and never drawn."""
+    gaussians = model.gaussians()
+    bad = len(gaussians) - int(gaussians.finite().sum())
+    return f"{len(gaussians):,} Gaussians" + (f", {bad:,} of them not finite and never drawn" if bad else "")
 
 
 def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:

@@ -6,7 +6,7 @@ import errno
 import os
 import platform
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import TypeVar
 
@@ -47,13 +47,14 @@ def chosen_kind(
     return name, kinds[name], arguments[1:]
 
 
-def with_run(arguments: list[str]) -> list[str]:
+def with_run(arguments: list[str], several: Mapping[str, Collection[str]] | None = None) -> list[str]:
     """Return the arguments of a command that takes a run, with --load-config before a run without it.
 
     So `ns-eval RUN_FOLDER` is `ns-eval --load-config RUN_FOLDER`.
 
     Args:
         arguments: arguments of the command; each flag has one value, as the next argument or after a "=".
+        several: flags that take several of certain words, as further arguments.
     """
     if any(word.partition("=")[0] == "--load-config" for word in arguments):
         return arguments
@@ -62,7 +63,10 @@ def with_run(arguments: list[str]) -> list[str]:
         word = arguments[index]
         if not word.startswith("-"):
             return [*arguments[:index], "--load-config", *arguments[index:]]
+        words = (several or {}).get(word.replace("_", "-"), ())
         index += 1 if "=" in word or word in ("-h", "--help") else 2
+        while index < len(arguments) and arguments[index] in words:
+            index += 1
     return arguments
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from framework.base.errors import ConfigError
 from framework.base.rendered_names import OutputName
-from framework.cli.common import chosen_kind, make_room, run_command, with_run
+from framework.cli.common import chosen_kind, make_room, run_command, with_format, with_run
 from framework.cli.render_flags import (
     PATHS,
     USAGE,
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from framework.cli.render_paths import Views
     from framework.evaluation.frames import Frames
+    from framework.training.splat_files import DataFormat
     from framework.training.trained import Trained
 
 
@@ -41,12 +42,12 @@ def _command(arguments: list[str]) -> None:
     import tyro
 
     name, path, rest = chosen
-    words = with_run(rest, {"--rendered-output-names": get_args(OutputName)})
+    words, named = with_format(f"ns-render {name}", with_run(rest, {"--rendered-output-names": get_args(OutputName)}))
     options = (tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes)
-    _render(name, tyro.cli(path, prog=f"ns-render {name}", args=words, config=options))
+    _render(name, tyro.cli(path, prog=f"ns-render {name}", args=words, config=options), named)
 
 
-def _render(name: str, flags: Flags) -> None:
+def _render(name: str, flags: Flags, named: DataFormat | None) -> None:
     check_flags(flags)
     from framework.evaluation.videos import check_suffix
 
@@ -64,12 +65,13 @@ def _render(name: str, flags: Flags) -> None:
     from framework.evaluation.evaluator import evaluation_background
     from framework.evaluation.frames import open_frames
     from framework.evaluation.outputs import kept_outputs
-    from framework.training.trained import load_trained
+    from framework.training.splat_files import load_run_or_splats
 
     bound = None if flags.outputs.max_error is None else parse_error(flags.outputs.max_error)
     run = flags.run
-    trained = load_trained(
-        run.load_config, run.load_checkpoint, run.device_type, run.data, flags.outputs.rays_per_pixel
+    rays = flags.outputs.rays_per_pixel
+    trained = load_run_or_splats(
+        run.load_config, run.load_checkpoint, run.device_type, run.data, rays, data_format=named
     )
     model, names = trained.model, flags.outputs.rendered_output_names
     views, background = _views(flags, trained), evaluation_background(trained.model)

@@ -77,9 +77,6 @@ NO_FORMATS = (
 _MESH = "there is no mesh export; 'pointcloud' writes points and normals, from which other programs reconstruct meshes"
 _OTHER_POSES = "export its cameras in COLMAP's format, and pass that folder to ns-train --data; no processing is needed"
 KINDS = {
-    "camera-path": "camera paths of nerfstudio's viewer are not supported; there are 'orbit', 'interpolate' and 'time'",
-    "spiral": "there are 'orbit', 'interpolate' and 'time'",
-    "dataset": "ns-eval RUN_FOLDER --render-output-path DIR renders the held-out images",
     "poisson": _MESH,
     "tsdf": _MESH,
     "marching-cubes": _MESH,
@@ -88,7 +85,7 @@ KINDS = {
     "odm": _OTHER_POSES,
     "aria": "it is not supported here",
 }
-"""Subcommand of nerfstudio's ns-render, ns-export or ns-process-data without an equivalent here -> what to use
+"""Subcommand of nerfstudio's ns-export or ns-process-data without an equivalent here -> what to use
 instead."""
 
 

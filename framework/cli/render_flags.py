@@ -42,8 +42,8 @@ class RunFlags:
 
 
 @dataclass(frozen=True)
-class OutputFlags:
-    """What is shown of a view."""
+class ViewFlags:
+    """Outputs of a view, and their colours."""
 
     rendered_output_names: tuple[OutputName, ...] = ("rgb",)
     """What is shown, from left to right: rgb, depth, median_depth, accumulation, normals; with 'dataset' also error and
@@ -62,7 +62,7 @@ class OutputFlags:
 
 @dataclass(frozen=True)
 class FileFlags:
-    """What is written."""
+    """Files that are written."""
 
     apart: bool | None = None
     """Write each output to a file or folder of its own, not side by side; only 'dataset' does so if not given."""
@@ -79,10 +79,10 @@ class PathFlags:
 
     run: RunFlags
     """The trained run."""
-    outputs: OutputFlags = field(default_factory=OutputFlags)
-    """What is shown of a view."""
+    outputs: ViewFlags = field(default_factory=ViewFlags)
+    """Outputs of a view, and their colours."""
     files: FileFlags = field(default_factory=FileFlags)
-    """What is written."""
+    """Files that are written."""
 
 
 @dataclass(frozen=True)
@@ -160,8 +160,8 @@ class TimeFlags(PathFlags):
 class DatasetFlags(PathFlags):
     """Render each camera of a split to a folder, OUTPUT_PATH/SPLIT/OUTPUT/IMAGE.png."""
 
-    outputs: OutputFlags = field(default_factory=lambda: OutputFlags(rendered_output_names=("rgb", "gt-rgb")))
-    """What is shown of a view."""
+    outputs: ViewFlags = field(default_factory=lambda: ViewFlags(rendered_output_names=("rgb", "gt-rgb")))
+    """Outputs of a view, and their colours."""
     output_path: Path = Path("renders")
     """Folder to write to; or a video (.mp4, .gif, .webp, .png), if all images are of one size."""
     fps: float = 4.0

@@ -35,7 +35,7 @@ from framework.training.trained import Trained
 
 @dataclass(frozen=True)
 class Views:
-    """What is rendered: F views, and what is known of them."""
+    """F views to render, and what is known of them."""
 
     cameras: Cameras
     """F cameras at their final size, on the model's device."""

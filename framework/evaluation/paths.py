@@ -106,7 +106,11 @@ def spiral(cameras: Cameras, num_frames: int, focus: float, radius: float | None
 
 
 def middle_pose(cameras: Cameras) -> Tensor:
-    """Return the mean pose (3, 4) of cameras that look the same way; the pose of the first camera for others."""
+    """Return the mean pose (3, 4) of cameras that look the same way; the pose of the first camera for others.
+
+    Args:
+        cameras: M cameras.
+    """
     if not look_same_way(cameras):
         return cameras.camera_to_worlds[0]
     mean = cameras.camera_to_worlds.double().mean(0)

@@ -111,7 +111,9 @@ def _even(picture: np.ndarray) -> np.ndarray:
 def _write_animation(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
     images = (Image.fromarray(picture) for picture in pictures)
     first = next(images)
-    first.save(path, save_all=True, append_images=images, duration=1000 / fps, loop=0)
+    # Pillow goes through the images of a PNG twice, so there they have to be in memory.
+    others = list(images) if path.suffix.lower() == ".png" else images
+    first.save(path, save_all=True, append_images=others, duration=1000 / fps, loop=0)
 
 
 def write_strip(path: Path, pictures: Iterable[np.ndarray]) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from framework.base.errors import ConfigError
+from framework.base.from_nerfstudio import render_answer
 from framework.base.rendered_names import OutputName
 from framework.cli.common import chosen_kind, make_room, run_command, with_format, with_run
 from framework.cli.render_flags import (
@@ -42,6 +43,8 @@ def _command(arguments: list[str]) -> None:
     import tyro
 
     name, path, rest = chosen
+    if answer := next(filter(None, map(render_answer, rest)), None):
+        raise ConfigError(answer)
     words, named = with_format(f"ns-render {name}", with_run(rest, {"--rendered-output-names": get_args(OutputName)}))
     options = (tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes)
     _render(name, tyro.cli(path, prog=f"ns-render {name}", args=words, config=options), named)

@@ -262,6 +262,8 @@ def test_what_cannot_be_rendered_is_refused_at_once(ball_run: Path, tmp_path: Pa
     path = ("camera-path", ball_run, "--camera-path-filename", nowhere)
     assert said(*path).endswith("none: No such file or directory")
     assert "the run knows its data format; leave it out" in said("orbit", ball_run, "blender")
+    assert "nerfstudio's; here it is --fps" in said("interpolate", nowhere, "--frame_rate=24")
+    assert "the extension of --output-path says it" in said("spiral", nowhere, "--output-format", "images")
 
 
 def test_the_bound_of_the_error_is_said(ball_run: Path, tmp_path: Path) -> None:

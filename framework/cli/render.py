@@ -81,7 +81,6 @@ def _render(name: str, flags: Flags, named: DataFormat | None) -> None:
     facts = _facts(name, flags, trained, views)
     if is_folder:
         _check_folder(output, facts)
-    frames = open_frames(output, len(views.cameras), facts)
     unit = 1 / float(trained.content["scale"])
 
     def render(index: int) -> Any:
@@ -89,6 +88,7 @@ def _render(name: str, flags: Flags, named: DataFormat | None) -> None:
         return kept_outputs(picture, names, unit, None if views.truth is None else views.truth(index))
 
     with nullcontext() if bound is None else limited_error(model, bound):
+        frames = open_frames(output, len(views.cameras), facts)
         frames.render(render)
     if bound is not None:
         say(f"--max-error: rays ended where the rest could change a colour by at most {bound:.2g}")

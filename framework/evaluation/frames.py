@@ -77,11 +77,15 @@ class Frames:
         try:
             for index in track(missing, "Rendering", total=len(missing)):
                 content = io.BytesIO()
-                np.savez_compressed(content, **render(index))
+                arrays: dict[str, Any] = dict(render(index))
+                np.savez_compressed(content, **arrays)
                 write_file(self.path(index), content.getvalue())
                 done += 1
-        except KeyboardInterrupt:
-            say(f"{done} of {self.count} frames are in {self.folder}; the same command goes on with them")
+        except BaseException as error:
+            if not done:  # nothing to go on with
+                self.remove()
+            elif isinstance(error, KeyboardInterrupt):
+                say(f"{done} of {self.count} frames are in {self.folder}; the same command goes on with them")
             raise
 
     def remove(self) -> None:

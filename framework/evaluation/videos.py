@@ -87,7 +87,7 @@ def _write_mp4(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
 
     writer = imageio.get_writer(
         path,
-        format="FFMPEG",  # type: ignore[arg-type]
+        format="FFMPEG",
         mode="I",
         fps=fps,
         codec="libx264",

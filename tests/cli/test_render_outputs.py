@@ -4,6 +4,8 @@ import errno
 import json
 import math
 import os
+import subprocess
+import time
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -19,7 +21,7 @@ from framework.cameras.camera_path import CameraPath, write_camera_path
 from framework.cli import render as render_command
 from framework.evaluation import frames
 from framework.training.trained import load_trained
-from tests.cli.helpers import called, train
+from tests.cli.helpers import called, command, train
 from tests.conftest import EditJson, Refused
 from tests.dataparsers.captures import CX, CY, FX, FY, HEIGHT, POINTS, WIDTH, poses, to_scene, write_capture
 from tests.training.helpers import tiny_trainer
@@ -195,6 +197,23 @@ def test_a_killed_render_goes_on_to_the_same_file(
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted([whole.name, parts.name])
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="SIGKILL")
+def test_a_process_that_is_killed_loses_no_frame(ball_run: Path, tmp_path: Path) -> None:
+    words = ("orbit", ball_run, "--num-frames", 60)
+    whole, parts = tmp_path / "whole.gif", tmp_path / "parts.gif"
+    assert called("ns-render", *words, "--output-path", whole).returncode == 0
+    with subprocess.Popen([command("ns-render"), *map(str, words), "--output-path", str(parts)]) as process:
+        while process.poll() is None and len(list(tmp_path.glob("parts.gif.frames/*/*.npz"))) < 3:
+            time.sleep(0.005)
+        process.kill()
+    assert not parts.exists()
+    done = called("ns-render", *words, "--output-path", parts)
+    assert "of 60 frames are there already" in done.stderr
+    assert parts.read_bytes() == whole.read_bytes()
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["parts.gif", "whole.gif"]
+
+
 def test_a_full_disk_is_a_line_and_keeps_the_frames(
     ball_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Refused
 ) -> None:
@@ -259,6 +278,7 @@ def test_what_cannot_be_rendered_is_refused_at_once(ball_run: Path, tmp_path: Pa
     avi = refused(render_command.main, "orbit", nowhere, "--output-path", tmp_path / "a.avi")
     assert avi.endswith("the extension must be .mp4, .gif, .webp, .png, or none for a folder of images")
     assert "this method has none" in said("orbit", ball_run, names, "normals", "--num-frames", 1)
+    assert not list(tmp_path.iterdir())
     path = ("camera-path", ball_run, "--camera-path-filename", nowhere)
     assert said(*path).endswith("none: No such file or directory")
     assert "the run knows its data format; leave it out" in said("orbit", ball_run, "blender")

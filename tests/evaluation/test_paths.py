@@ -1,12 +1,26 @@
 """Camera paths: against geometry worked out by hand."""
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
+from framework import Picture, View
 from framework.cameras.cameras import Cameras, check_pose
-from framework.evaluation.paths import interpolate, look_at, look_same_way, middle_pose, orbit, replace_poses, spiral
+from framework.cameras.ndc import Ndc, NdcCameras
+from framework.evaluation.paths import (
+    focus_distance,
+    interpolate,
+    look_at,
+    look_same_way,
+    middle_pose,
+    orbit,
+    replace_poses,
+    spiral,
+)
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 
@@ -114,3 +128,23 @@ def test_around_an_object_a_spiral_starts_from_the_first_camera() -> None:
     assert torch.equal(middle_pose(cameras), poses[0])
     offsets = spiral(cameras, 8, focus=3.0).camera_to_worlds[:, :, 3] - poses[0, :, 3]
     torch.testing.assert_close(offsets[:, :2].norm(dim=-1), torch.full((8,), 0.3))
+
+
+@pytest.mark.parametrize("warped", [False, True])
+def test_the_distance_of_what_is_seen(warped: bool) -> None:
+    """A wall at depth 5 before a narrow camera, in the scene's coordinates and in normalised device coordinates."""
+    numbers = [torch.tensor([value]) for value in (4000.0, 4000.0, 16.0, 16.0)]
+    size = torch.tensor([32])
+    pose = torch.eye(4)[None, :3]
+    ndc = Ndc(tuple(map(tuple, torch.eye(4)[:3].tolist())), near=2.0, half_width=0.004, half_height=0.004)
+    camera = NdcCameras(pose, *numbers, size, size, ndc=ndc) if warped else Cameras(pose, *numbers, size, size)
+
+    def render_view(view: View, background: Tensor) -> Picture:
+        rays = view.camera.pixel_rays(view.pixels().flatten(), 0.0, 100.0)
+        # Appendix C of NeRF: depth z becomes 1 + 2 near / z, with z = -5 here.
+        wall = 1 - 2 * 2.0 / 5 if warped else -5.0
+        depth = ((wall - rays.origins[:, 2]) / rays.directions[:, 2]).view(view.height, view.width)
+        return Picture(torch.zeros(view.height, view.width, 3), depth, depth, torch.ones_like(depth))
+
+    model: Any = SimpleNamespace(render_view=render_view, scene=SimpleNamespace(moving=False, near=0.1))
+    assert focus_distance(model, camera, torch.zeros(3)) == pytest.approx(5.0, rel=1e-3)

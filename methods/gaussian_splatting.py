@@ -309,6 +309,14 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         for parameter, values in zip(self.parameters_of_gaussians(), vars(gaussians).values(), strict=True):
             parameter.data = values.reshape(len(gaussians), parameter.shape[1]).contiguous()
 
+    def set_gaussians(self, gaussians: Gaussians) -> None:
+        """Replace them.
+
+        Args:
+            gaussians: the new ones, with harmonics of the settings' degree.
+        """
+        self._set(gaussians)
+
     def _first_points(self, kind: str, dataset: Dataset) -> Tensor:
         count, box = self.config.start_gaussians, self.scene.box.to(self.device)
         assert count is not None

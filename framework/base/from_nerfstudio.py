@@ -77,9 +77,6 @@ NO_FORMATS = (
 _MESH = "there is no mesh export; 'pointcloud' writes points and normals, from which other programs reconstruct meshes"
 _OTHER_POSES = "export its cameras in COLMAP's format, and pass that folder to ns-train --data; no processing is needed"
 KINDS = {
-    "camera-path": "camera paths of nerfstudio's viewer are not supported; there are 'orbit', 'interpolate' and 'time'",
-    "spiral": "there are 'orbit', 'interpolate' and 'time'",
-    "dataset": "ns-eval RUN_FOLDER --render-output-path DIR renders the held-out images",
     "poisson": _MESH,
     "tsdf": _MESH,
     "marching-cubes": _MESH,
@@ -88,8 +85,36 @@ KINDS = {
     "odm": _OTHER_POSES,
     "aria": "it is not supported here",
 }
-"""Subcommand of nerfstudio's ns-render, ns-export or ns-process-data without an equivalent here -> what to use
+"""Subcommand of nerfstudio's ns-export or ns-process-data without an equivalent here -> what to use
 instead."""
+
+
+RENDERING = {
+    "output-format": "the extension of --output-path says it; without one, images are written to a folder",
+    "jpeg-quality": "leave it out; JPEG images are of quality 95",
+    "seconds": "here they are --num-frames and --fps",
+    "frame-rate": "here it is --fps",
+    "interpolation-steps": "here it is --num-frames, of the whole path",
+    "pose-source": "leave it out; the path leads past the training cameras",
+    "order-poses": "leave it out; cameras are passed in the order of their images' names",
+    "camera-idx": "leave it out; the mean appearance of all images is shown",
+    "render-nearest-camera": "there is no equivalent; 'ns-render dataset' shows views beside their true images",
+    "check-occlusions": "there is no equivalent; 'ns-render dataset' shows views beside their true images",
+    "colormap-options": "leave it out; depth is in viridis, within --depth-near-plane and --depth-far-plane",
+    "eval-num-rays-per-chunk": "leave it out; it is a setting of the run",
+}
+"""First part of a flag of nerfstudio's ns-render without an equivalent of the same name -> the answer."""
+
+
+def render_answer(flag: str) -> str | None:
+    """Return the answer to a flag of nerfstudio's ns-render that does not exist here; None for any other word.
+
+    Args:
+        flag: the word as typed, possibly with =VALUE.
+    """
+    name = flag.removeprefix("--").partition("=")[0].replace("_", "-")
+    answer = RENDERING.get(name.partition(".")[0]) if flag.startswith("--") else None
+    return None if answer is None else f"--{name} is nerfstudio's; {answer}"
 
 
 def vis_answer(value: str) -> str | None:

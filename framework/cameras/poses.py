@@ -48,6 +48,10 @@ class Placement:
         """Rotate unit `directions` (K, 3) from the scene's frame to the input's."""
         return directions @ self.transform[:, :3]
 
+    def similarity(self) -> tuple[Tensor, float, Tensor]:
+        """Return rotation (3, 3), scale and shift (3,) of `points`: x -> scale * rotation @ x + shift."""
+        return self.transform[:, :3], self.scale, self.scale * self.transform[:, 3]
+
     def original_similarity(self) -> tuple[Tensor, float, Tensor]:
         """Return rotation (3, 3), scale and shift (3,) of `original_points`: x -> scale * rotation @ x + shift."""
         rotation = self.transform[:, :3].T

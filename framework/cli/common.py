@@ -6,15 +6,19 @@ import errno
 import os
 import platform
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import framework
 from framework.base.console import say
 from framework.base.errors import ConfigError, NerfloomError, is_out_of_memory, nearest
 from framework.base.from_nerfstudio import KINDS
+from framework.base.registry import registered
 from framework.training.signals import exit_status, orderly_end
+
+if TYPE_CHECKING:
+    from framework.data.dataset import DataParser
 
 K = TypeVar("K")
 
@@ -47,13 +51,14 @@ def chosen_kind(
     return name, kinds[name], arguments[1:]
 
 
-def with_run(arguments: list[str]) -> list[str]:
+def with_run(arguments: list[str], several: Mapping[str, Collection[str]] | None = None) -> list[str]:
     """Return the arguments of a command that takes a run, with --load-config before a run without it.
 
     So `ns-eval RUN_FOLDER` is `ns-eval --load-config RUN_FOLDER`.
 
     Args:
         arguments: arguments of the command; each flag has one value, as the next argument or after a "=".
+        several: flags that take several of certain words, as further arguments.
     """
     if any(word.partition("=")[0] == "--load-config" for word in arguments):
         return arguments
@@ -62,8 +67,44 @@ def with_run(arguments: list[str]) -> list[str]:
         word = arguments[index]
         if not word.startswith("-"):
             return [*arguments[:index], "--load-config", *arguments[index:]]
+        words = (several or {}).get(word.replace("_", "-"), ())
         index += 1 if "=" in word or word in ("-h", "--help") else 2
+        while index < len(arguments) and arguments[index] in words:
+            index += 1
     return arguments
+
+
+def with_format(command: str, arguments: list[str]) -> tuple[list[str], tuple[str, DataParser] | None]:
+    """Return the arguments of a command without the data format that is named after them, and the format.
+
+    Flags after the format's name are the format's, if it has them, else the command's.
+
+    Args:
+        command: name of the command, for the format's help.
+        arguments: arguments of the command, after `with_run`.
+
+    Returns:
+        The command's arguments, and the format's name and flags; None if no format is named.
+    """
+    formats = registered("dataparsers")
+    for index, word in enumerate(arguments):
+        before = arguments[index - 1] if index else ""
+        if word in formats and (not before.startswith("-") or "=" in before):
+            break
+    else:
+        return arguments, None
+    import tyro
+
+    from framework.base.registry import load_dataparser
+
+    parser, others = tyro.cli(
+        load_dataparser(word),
+        prog=f"{command} {word}",
+        args=arguments[index + 1 :],
+        config=(tyro.conf.FlagConversionOff,),
+        return_unknown_args=True,
+    )
+    return arguments[:index] + others, (word, parser)
 
 
 def make_room(path: Path) -> None:

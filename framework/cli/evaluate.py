@@ -8,7 +8,7 @@ from typing import Literal
 
 from framework.base.config import RaysPerPixel
 from framework.base.errors import ConfigError
-from framework.cli.common import run_command, with_run
+from framework.cli.common import run_command, with_format, with_run
 
 
 @dataclass(frozen=True)
@@ -16,15 +16,15 @@ class EvalFlags:
     """Compute PSNR, SSIM and LPIPS of a trained run on held-out views."""
 
     load_config: Path
-    """Folder of the run, or its config.yml; the flag's name may be omitted."""
+    """Folder of the run, its config.yml, or a file of Gaussians (.ply, .spz); the flag's name may be omitted."""
     output_path: Path | None = None
-    """JSON file to write; eval.json beside config.yml if not given."""
+    """JSON file to write. If not given: eval.json beside config.yml, or NAME.eval.json beside a file of Gaussians."""
     render_output_path: Path | None = None
     """Folder for each view's render, true image, and comparison (image, render, error, depth, opacity)."""
     load_checkpoint: Path | None = None
     """Checkpoint to load; the newest if not given."""
     data: Path | None = None
-    """Folder of the data, if it has moved since training."""
+    """Folder of the data, if it has moved since training; needed with a file of Gaussians."""
     split: Literal["test", "val", "train"] = "test"
     """Split to evaluate."""
     max_images: int | None = None
@@ -50,7 +50,8 @@ def main() -> None:
 def _command(arguments: list[str]) -> None:
     import tyro
 
-    flags = tyro.cli(EvalFlags, prog="ns-eval", args=with_run(arguments), config=(tyro.conf.FlagConversionOff,))
+    words, named = with_format("ns-eval", with_run(arguments))
+    flags = tyro.cli(EvalFlags, prog="ns-eval", args=words, config=(tyro.conf.FlagConversionOff,))
     if flags.max_images is not None and flags.max_images < 1:
         raise ConfigError(f"--max-images is {flags.max_images}; it must be at least 1")
     from contextlib import nullcontext
@@ -60,15 +61,16 @@ def _command(arguments: list[str]) -> None:
     from framework.evaluation.evaluator import evaluate
     from framework.training.datasets import load_split
     from framework.training.report import write_evaluation
-    from framework.training.trained import load_trained
+    from framework.training.splat_files import is_splat_file, load_run_or_splats
 
-    trained = load_trained(
+    trained = load_run_or_splats(
         flags.load_config,
         flags.load_checkpoint,
         flags.device_type,
         flags.data,
         flags.rays_per_pixel,
         flags.eval_appearance,
+        named,
     )
     dataset = load_split(trained.run, flags.split).to(trained.model.device)
     bound = None if flags.max_error is None else parse_error(flags.max_error)
@@ -87,7 +89,10 @@ def _command(arguments: list[str]) -> None:
     if flags.eval_appearance == "half" and evaluation.eval_appearance is None:
         say("--eval-appearance half: this run has no appearance vectors; whole images were evaluated")
     say(f"LPIPS {evaluation.lpips_note}")
-    output = flags.output_path or trained.run.folder / "eval.json"
+    run = flags.load_config
+    output = flags.output_path or (
+        run.with_suffix(".eval.json") if is_splat_file(run) else trained.run.folder / "eval.json"
+    )
     write_evaluation(output, trained.run, trained.checkpoint, evaluation, trained.model.device)
     say(f"written to {output}")
     if evaluation.pictures_note is not None:

@@ -1,94 +1,35 @@
-"""The command `ns-render`: images and animations of a trained run."""
+"""The command `ns-render`: images, animations and videos of a trained run."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import dataclasses
+import json
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, get_args
 
-from framework.base.config import RaysPerPixel
 from framework.base.errors import ConfigError
-from framework.cli.common import chosen_kind, make_room, run_command, with_run
+from framework.base.from_nerfstudio import render_answer
+from framework.base.rendered_names import OutputName
+from framework.cli.common import chosen_kind, make_room, run_command, with_format, with_run
+from framework.cli.render_flags import (
+    PATHS,
+    USAGE,
+    CameraPathFlags,
+    DatasetFlags,
+    Flags,
+    TimeFlags,
+    check_flags,
+)
 
 if TYPE_CHECKING:
-    from torch import Tensor
+    import numpy as np
 
-    from framework.cameras.cameras import Cameras
-    from framework.data.dataset import ParsedScene
+    from framework.cli.render_paths import Views
+    from framework.evaluation.frames import Frames
+    from framework.training.splat_files import DataFormat
     from framework.training.trained import Trained
-
-USAGE = """\
-usage: ns-render PATH RUN_FOLDER --output-path FILE.gif [flags]
-
-paths:
-  orbit           a horizontal circle around the scene, with the mean height and distance of the training cameras
-  interpolate     a smooth path past the training cameras, in the order of their images' names
-  time            one of the cameras, while time runs from 0 to 1
-
-ns-render PATH --help shows its flags.
-"""
-
-
-@dataclass(frozen=True)
-class RenderFlags:
-    """Flags of every path."""
-
-    load_config: Path
-    """Folder of the run, or its config.yml; the flag's name may be omitted."""
-    fps: float = 16.0
-    """Frames per second."""
-    downscale_factor: int = 1
-    """Integer factor by which width and height are reduced."""
-    rays_per_pixel: RaysPerPixel | None = None
-    """Rays per pixel, of which its colour is the mean; the run's setting if not given."""
-    max_error: str | None = None
-    """Maximum error of a colour, such as 1/255: rays end where the rest cannot change it by more; 1e-4 if not given."""
-    load_checkpoint: Path | None = None
-    """Checkpoint to load; the newest if not given."""
-    data: Path | None = None
-    """Folder of the data, if it has moved since training."""
-    device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
-    """Device to render on."""
-
-
-@dataclass(frozen=True)
-class OrbitFlags(RenderFlags):
-    """Render a horizontal circle around the scene, with the mean height and distance of the training cameras."""
-
-    output_path: Path = Path("orbit.gif")
-    """Animation to write; its extension (.gif, .webp, .png) is the format."""
-    num_frames: int = 48
-    """Number of frames."""
-    time: float | None = None
-    """Time of all frames of a scene that moves, 0 to 1. If not given, it runs from 0 to 1."""
-
-
-@dataclass(frozen=True)
-class TimeFlags(RenderFlags):
-    """Render the view of one camera while time runs from 0 to 1."""
-
-    output_path: Path = Path("time.gif")
-    """File to write: an animation (.gif, .webp), or the frames side by side (.png)."""
-    num_frames: int = 32
-    """Number of frames."""
-    split: Literal["train", "val", "test"] = "test"
-    """Split of which --camera-index counts the cameras."""
-    camera_index: int = 0
-    """Index of the camera, from 0."""
-
-
-@dataclass(frozen=True)
-class InterpolateFlags(RenderFlags):
-    """Render a smooth path past the training cameras, in the order of their images' names."""
-
-    output_path: Path = Path("interpolate.gif")
-    """Animation to write; its extension (.gif, .webp, .png) is the format."""
-    num_frames: int = 96
-    """Number of frames."""
-
-
-Flags = OrbitFlags | InterpolateFlags | TimeFlags
-PATHS: dict[str, type[Flags]] = {"orbit": OrbitFlags, "interpolate": InterpolateFlags, "time": TimeFlags}
 
 
 def main() -> None:
@@ -102,90 +43,191 @@ def _command(arguments: list[str]) -> None:
     import tyro
 
     name, path, rest = chosen
-    _render(tyro.cli(path, prog=f"ns-render {name}", args=with_run(rest), config=(tyro.conf.FlagConversionOff,)))
+    if answer := next(filter(None, map(render_answer, rest)), None):
+        raise ConfigError(answer)
+    words, named = with_format(f"ns-render {name}", with_run(rest, {"--rendered-output-names": get_args(OutputName)}))
+    options = (tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes)
+    _render(name, tyro.cli(path, prog=f"ns-render {name}", args=words, config=options), named)
 
 
-def _render(flags: Flags) -> None:
-    if flags.num_frames < 1 or not flags.fps > 0 or flags.downscale_factor < 1:
-        raise ConfigError("--num-frames and --downscale-factor must be at least 1, --fps more than 0")
-    if flags.output_path.suffix.lower() not in (".gif", ".webp", ".png"):
-        raise ConfigError(f"--output-path {flags.output_path}: the extension must be .gif, .webp or .png")
-    make_room(flags.output_path)
+def _render(name: str, flags: Flags, named: DataFormat | None) -> None:
+    check_flags(flags)
+    from framework.evaluation.videos import check_suffix
+
+    check_suffix(flags.output_path)
+    output = flags.output_path
+    is_folder = not output.suffix
+    if isinstance(flags, DatasetFlags) and is_folder:
+        output = output / flags.split
+    make_room(output / "render.json" if is_folder else output)
     from contextlib import nullcontext
 
-    import torch
-
-    from framework.base.console import say, track
+    from framework.base.console import say
     from framework.cameras.view import View
     from framework.evaluation.error_bound import limited_error, parse_error
     from framework.evaluation.evaluator import evaluation_background
-    from framework.evaluation.images import write_animation, write_image
-    from framework.training.trained import load_trained
+    from framework.evaluation.frames import open_frames
+    from framework.evaluation.outputs import kept_outputs
+    from framework.training.splat_files import load_run_or_splats
 
-    trained = load_trained(
-        flags.load_config, flags.load_checkpoint, flags.device_type, flags.data, flags.rays_per_pixel
+    bound = None if flags.outputs.max_error is None else parse_error(flags.outputs.max_error)
+    run = flags.run
+    rays = flags.outputs.rays_per_pixel
+    trained = load_run_or_splats(
+        run.load_config, run.load_checkpoint, run.device_type, run.data, rays, data_format=named
     )
-    model = trained.model
-    parsed = trained.run.parse(flags.split if isinstance(flags, TimeFlags) else "train")
-    cameras, times = _path(flags, trained, parsed)
-    cameras = cameras.scaled(1 / (flags.downscale_factor * parsed.downscale_factor)).to(model.device)
-    times = None if times is None else times.to(model.device)
-    background = evaluation_background(model)
-    bound = None if flags.max_error is None else parse_error(flags.max_error)
-    frames = []
+    model, names = trained.model, flags.outputs.rendered_output_names
+    views, background = _views(flags, trained), evaluation_background(trained.model)
+    facts = _facts(name, flags, trained, views)
+    if is_folder:
+        _check_folder(output, facts)
+    unit = 1 / float(trained.content["scale"])
+
+    def render(index: int) -> Any:
+        picture = model.render_view(View.of(views.cameras, index, views.times), background)
+        return kept_outputs(picture, names, unit, None if views.truth is None else views.truth(index))
+
     with nullcontext() if bound is None else limited_error(model, bound):
-        for index in track(range(flags.num_frames), "Rendering", total=flags.num_frames):
-            frames.append(model.render_view(View.of(cameras, index, times), background).rgb)
-    if isinstance(flags, TimeFlags) and flags.output_path.suffix.lower() == ".png":
-        write_image(flags.output_path, torch.cat(frames, dim=1))
-        say(f"frames, side by side: {flags.output_path}")
+        frames = open_frames(output, len(views.cameras), facts)
+        frames.render(render)
+    if bound is not None:
+        say(f"--max-error: rays ended where the rest could change a colour by at most {bound:.2g}")
+    _write(flags, frames, output, views, facts)
+    frames.remove()
+
+
+def _views(flags: Flags, trained: Trained) -> Views:
+    """Return what is rendered, at its final size."""
+    import torch
+
+    from framework.cli.render_paths import camera_path_views, dataset_views, path_views
+
+    if isinstance(flags, CameraPathFlags):
+        views = camera_path_views(flags, trained)
+    elif isinstance(flags, DatasetFlags):
+        views = dataset_views(flags, trained)
     else:
-        write_animation(flags.output_path, frames, flags.fps)
-        say(f"animation: {flags.output_path}")
+        views = path_views(flags, trained)
+    sizes = torch.stack([views.cameras.widths, views.cameras.heights])
+    if int(sizes.min()) < 1:
+        raise ConfigError(f"--downscale-factor {flags.outputs.downscale_factor} leaves no pixel")
+    if flags.output_path.suffix and bool((sizes != sizes[:, :1]).any()):
+        raise ConfigError(f"--output-path {flags.output_path}: the images are of several sizes; name a folder")
+    return views
 
 
-def _path(flags: Flags, trained: Trained, parsed: ParsedScene) -> tuple[Cameras, Tensor | None]:
-    """Return the cameras of a path and, if the scene moves, their times."""
-    import torch
+def _facts(name: str, flags: Flags, trained: Trained, views: Views) -> dict[str, Any]:
+    """Return everything that the pictures depend on, as plain data."""
+    from framework.base.config import to_plain
+    from framework.evaluation.frames import hash_of_file, hash_of_tensors
 
-    from framework.evaluation.paths import interpolate
-
-    if isinstance(flags, TimeFlags):
-        return _one_camera(flags, trained, parsed)
-    if isinstance(flags, OrbitFlags):
-        return _circle(flags, trained, parsed)
-    times = torch.linspace(0, 1, flags.num_frames) if trained.model.scene.moving else None
-    return interpolate(parsed.cameras, flags.num_frames), times
-
-
-def _circle(flags: OrbitFlags, trained: Trained, parsed: ParsedScene) -> tuple[Cameras, Tensor | None]:
-    import torch
-
-    from framework.evaluation.paths import orbit
-
-    scene = trained.model.scene
-    if scene.warped:
-        raise ConfigError("ns-render orbit: this run knows what its cameras look at from the front only (--ndc)")
-    cameras = orbit(parsed.cameras, scene.box.mean(0).cpu(), flags.num_frames)
-    if flags.time is None:
-        return cameras, torch.linspace(0, 1, flags.num_frames) if scene.moving else None
-    if not scene.moving:
-        raise ConfigError(f"--time {flags.time:g}: the photographs of this run have no times")
-    if not 0 <= flags.time <= 1:
-        raise ConfigError(f"--time is {flags.time:g}; it must be from 0 to 1")
-    return cameras, torch.full((flags.num_frames,), flags.time)
+    cameras = views.cameras
+    numbers = [getattr(cameras, field.name) for field in dataclasses.fields(cameras)]
+    facts = {
+        "path": name,
+        "method": trained.run.method,
+        "run": str(trained.run.folder.resolve()),
+        "checkpoint": trained.checkpoint.name,
+        "checkpoint_sha256": hash_of_file(trained.checkpoint),
+        "settings": to_plain(trained.run.config),
+        "num_frames": len(cameras),
+        "camera_model": cameras.model,
+        "cameras_sha256": hash_of_tensors(*(one for one in numbers if hasattr(one, "shape")), views.times),
+        "outputs": dataclasses.asdict(flags.outputs),
+        "files": dataclasses.asdict(flags.files),
+    }
+    return json.loads(json.dumps(facts, default=str))
 
 
-def _one_camera(flags: TimeFlags, trained: Trained, parsed: ParsedScene) -> tuple[Cameras, Tensor | None]:
-    import torch
+def _check_folder(folder: Path, facts: dict[str, Any]) -> None:
+    """Refuse a folder that holds the images of another render."""
+    from framework.evaluation.frames import FACTS
 
-    if not trained.model.scene.moving:
-        raise ConfigError("ns-render time: the photographs of this run have no times")
-    if not 0 <= flags.camera_index < len(parsed.cameras):
-        last = len(parsed.cameras) - 1
-        raise ConfigError(f"--camera-index is {flags.camera_index}; '{flags.split}' has cameras 0 to {last}")
-    chosen = torch.full((flags.num_frames,), flags.camera_index)
-    return parsed.cameras[chosen], torch.linspace(0, 1, flags.num_frames)
+    try:
+        before = json.loads((folder / FACTS).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError):
+        before = None
+    if before != facts:
+        raise ConfigError(
+            f"{folder} holds images of another render ({FACTS} differs); name another folder, or remove it"
+        )
+
+
+# -- files --------------------------------------------------------------------------------------------------------
+
+
+def _write(flags: Flags, frames: Frames, output: Path, views: Views, facts: dict[str, Any]) -> None:
+    """Write the files that were asked for, and say where they are."""
+    from framework.base.console import say, track
+    from framework.evaluation.frames import FACTS, write_file
+    from framework.evaluation.outputs import DEPTHS, shown_output, side_by_side
+    from framework.evaluation.videos import write_images, write_strip, write_video
+
+    is_folder = not output.suffix
+    names: list[str] = list(flags.outputs.rendered_output_names)
+    stems = views.names or tuple(f"{index:05d}" for index in range(frames.count))
+    if flags.files.depth_format != "color":
+        for name in [name for name in names if name in DEPTHS]:
+            _write_depths(flags, frames, output / name, stems, name)
+            names.remove(name)
+    ranges = {name: _colored_range(flags, frames, name) for name in names if name in DEPTHS}
+    apart = flags.files.apart
+    if apart is None:
+        apart = isinstance(flags, DatasetFlags) and is_folder
+    for group in [[name] for name in names] if apart else [names] if names else []:
+        pictures = (side_by_side([shown_output(kept, name, ranges) for name in group]) for kept in frames)
+        shown = track(pictures, "Writing", total=frames.count)
+        if is_folder:
+            folder = output / group[0] if apart else output
+            suffix = ".png" if flags.files.image_format == "png" else ".jpg"
+            write_images([folder / f"{stem}{suffix}" for stem in stems], shown)
+            say(f"{frames.count} images ({', '.join(group)}): {folder}")
+            continue
+        file = output.with_name(f"{output.stem}-{group[0]}{output.suffix}") if apart and len(names) > 1 else output
+        if isinstance(flags, TimeFlags) and file.suffix.lower() == ".png":
+            write_strip(file, shown)
+        else:
+            write_video(file, shown, views.fps)
+        say(f"{frames.count} frames ({', '.join(group)}): {file}")
+    if is_folder:
+        write_file(output / FACTS, (json.dumps(facts, indent=2) + "\n").encode())
+
+
+def _colored_range(flags: Flags, frames: Frames, name: str) -> tuple[float, float]:
+    """Return the distances at the ends of the colours of depth, and say them."""
+    from framework.base.console import say
+    from framework.evaluation.outputs import distance_range
+
+    near, far = flags.outputs.depth_near_plane, flags.outputs.depth_far_plane
+    if near is None or far is None:
+        found = distance_range(frames, name)
+        near, far = found[0] if near is None else near, found[1] if far is None else far
+    say(f"{name}: {near:.4g} (dark) to {far:.4g} (light), in units of the input")
+    return near, far
+
+
+def _write_depths(flags: Flags, frames: Frames, folder: Path, stems: Sequence[str], name: str) -> None:
+    """Write distances as numbers, and beside them what they mean."""
+    from framework.base.console import say, track
+    from framework.evaluation.frames import write_file
+    from framework.evaluation.outputs import largest_distance, opaque_distance
+    from framework.evaluation.videos import MOST, write_distances
+
+    packed = flags.files.depth_format == "png16"
+    farthest = flags.outputs.depth_far_plane
+    if packed and farthest is None:
+        farthest = largest_distance(frames, name)
+    unit = (farthest or 1.0) / MOST if packed else 1.0
+    distances: Iterator[np.ndarray] = map(partial(opaque_distance, name=name), frames)
+    suffix = ".png" if packed else ".npy"
+    paths = [folder / f"{stem}{suffix}" for stem in stems]
+    write_distances(paths, track(distances, "Writing", total=frames.count), unit)
+    meaning = {"unit": unit, "distance": "along the ray, in units of the input: the file's value times 'unit'"}
+    meaning |= {"unknown": 0, "saturated": MOST} if packed else {"unknown": 0}
+    write_file(folder / "depth.json", (json.dumps(meaning, indent=2) + "\n").encode())
+    say(f"{frames.count} maps of {name} (unit {unit:.6g} of the input): {folder}")
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -44,17 +43,6 @@ def write_image(path: Path, image: Tensor) -> None:
         image: (H, W, 3) colours in [0, 1].
     """
     _write(path, to_uint8(image))
-
-
-def write_animation(path: Path, frames: Sequence[Tensor], fps: float) -> None:
-    """Write an endless animation.
-
-    Args:
-        path: file to write; its extension (.gif, .webp, .png) is the format, and its folder is created if missing.
-        frames: (H, W, 3) colours in [0, 1] of each frame.
-        fps: frames per second.
-    """
-    _write(path, np.stack([to_uint8(frame) for frame in frames]), duration=1000 / fps, loop=0)
 
 
 def _write(path: Path, pixels: np.ndarray, **options: Any) -> None:

@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from framework.cameras.cameras import Cameras
+from framework.cameras.ndc import NdcCameras
+from framework.cameras.view import View
 from framework.kernels.math import safe_normalize
+from framework.model import Model
 
 STOPS = 24
 """Ratio of the number of cameras to the standard deviation, in cameras, of the weights of an interpolated path."""
+SAME_WAY = 0.7
+"""Length of the mean of unit viewing directions from which cameras are said to look the same way."""
+SMALL_RADIUS = 0.1
+"""Ratio of the radius of a spiral to the distance of what it looks at, for cameras that look different ways."""
+FOCUS_PIXELS = 64
+"""Number of pixels along the longer side of the image from which that distance is taken."""
 
 
 def look_at(position: Tensor, target: Tensor, up: Tensor) -> Tensor:
@@ -62,11 +72,84 @@ def interpolate(cameras: Cameras, num_frames: int) -> Cameras:
     weights = torch.exp(-0.5 * ((positions[:, None] - torch.arange(count)) / width).square())
     weights = weights / weights.sum(-1, keepdim=True)
     means = torch.einsum("fm,mij->fij", weights, cameras.camera_to_worlds.double())
-    u, _, vh = torch.linalg.svd(means[:, :, :3])
-    flips = torch.ones(num_frames, 3, dtype=torch.float64)
+    return replace_poses(cameras, torch.cat([_rotations(means[:, :, :3]), means[:, :, 3:]], dim=-1).float())
+
+
+def spiral(cameras: Cameras, num_frames: int, focus: float, radius: float | None = None) -> Cameras:
+    """Return cameras on a spiral around the mean camera, looking at a point in front of it.
+
+    The path is LLFF's (Mildenhall et al. 2019): two turns in the mean camera's image plane, during which it moves once
+    back and forth, and ends where it starts. If the cameras do not look the same way, the first of them takes the place
+    of the mean camera. Intrinsics are those of the first camera.
+
+    Args:
+        cameras: M cameras.
+        num_frames: number of cameras on the spiral.
+        focus: distance of the point from the mean camera, scene units.
+        radius: radius along each of its axes, scene units; if None, the 90th percentile of the cameras' distances from
+            the mean camera along each axis, or `SMALL_RADIUS` times `focus` if they do not look the same way.
+    """
+    center = middle_pose(cameras)
+    rotation, position = center[:, :3], center[:, 3]
+    if radius is not None:
+        radii = torch.full((3,), radius)
+    elif look_same_way(cameras):
+        offsets = (cameras.camera_to_worlds[:, :, 3] - position) @ rotation
+        radii = torch.quantile(offsets.abs(), 0.9, dim=0)
+    else:
+        radii = torch.full((3,), SMALL_RADIUS * focus)
+    angles = torch.arange(num_frames) * (4 * torch.pi / num_frames)
+    local = torch.stack([angles.cos(), -angles.sin(), -(angles / 2).sin()], dim=-1) * radii
+    target = position - focus * rotation[:, 2]
+    poses = [look_at(position + offset, target, rotation[:, 1]) for offset in local @ rotation.T]
+    return replace_poses(cameras, torch.stack(poses))
+
+
+def middle_pose(cameras: Cameras) -> Tensor:
+    """Return the mean pose (3, 4) of cameras that look the same way; the pose of the first camera for others.
+
+    Args:
+        cameras: M cameras.
+    """
+    if not look_same_way(cameras):
+        return cameras.camera_to_worlds[0]
+    mean = cameras.camera_to_worlds.double().mean(0)
+    return torch.cat([_rotations(mean[None, :, :3])[0], mean[:, 3:]], dim=-1).float()
+
+
+def look_same_way(cameras: Cameras) -> bool:
+    """Return whether the mean of the viewing directions of `cameras` is longer than `SAME_WAY`."""
+    return float(cameras.camera_to_worlds[:, :, 2].mean(0).norm()) > SAME_WAY
+
+
+def focus_distance(model: Model[Any], camera: Cameras, background: Tensor) -> float:
+    """Return the median distance of what one camera shows, scene units, as the model renders it.
+
+    Args:
+        model: the trained model.
+        camera: one camera, on the model's device.
+        background: (3,) colour behind everything.
+    """
+    stride = max(int(max(camera.widths[0], camera.heights[0])) // FOCUS_PIXELS, 1)
+    picture = model.render_view(View.of(camera, 0, _first_time(model), stride), background)
+    depths = picture.median_depth[picture.accumulation > 0.5]
+    depth = float(depths.median()) if len(depths) else model.scene.near + 1.0
+    if isinstance(camera, NdcCameras) and camera.ndc is not None:
+        # A point of depth d lies at z = 1 - 2 near / d of the box, on a ray that starts at z = -1.
+        return 2 * camera.ndc.near / max(2 - depth, 1e-2)
+    return depth
+
+
+def _first_time(model: Model[Any]) -> Tensor | None:
+    return torch.zeros(1) if model.scene.moving else None
+
+
+def _rotations(matrices: Tensor) -> Tensor:
+    """Return the rotations (F, 3, 3) closest to matrices (F, 3, 3)."""
+    u, _, vh = torch.linalg.svd(matrices)
+    flips = torch.ones_like(matrices[:, 0])
     flips[:, 2] = torch.linalg.det(u @ vh)
-    rotations = (u * flips[:, None]) @ vh
-    return replace_poses(cameras, torch.cat([rotations, means[:, :, 3:]], dim=-1).float())
+    return (u * flips[:, None]) @ vh
 
 
 def replace_poses(cameras: Cameras, poses: Tensor) -> Cameras:

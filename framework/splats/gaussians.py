@@ -66,3 +66,15 @@ class HasGaussians(Protocol):
 
     def gaussians(self) -> Gaussians:
         """Return them, without gradient."""
+
+
+@runtime_checkable
+class TakesGaussians(Protocol):
+    """A model that draws any Gaussians, such as those of a file."""
+
+    def set_gaussians(self, gaussians: Gaussians) -> None:
+        """Replace those of the model.
+
+        Args:
+            gaussians: the new ones, in the frame of the scene, with harmonics of the degree in the settings.
+        """

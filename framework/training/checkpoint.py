@@ -11,16 +11,15 @@ import io
 import os
 import re
 import warnings
-from collections.abc import Callable
-from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import torch
 from torch.torch_version import TorchVersion
 
 from framework.base.archives import uncompressed_size
+from framework.base.atomic import write_atomically as write_atomically
 from framework.base.console import say
 from framework.base.errors import CheckpointError
 
@@ -35,39 +34,6 @@ PIECE = 2**24
 SAFE_TORCH = "2.10"
 """First version of PyTorch whose `weights_only` reader is not known to execute code (CVE-2026-24747)."""
 _NAME = re.compile(r"step-(\d{9})\.ckpt")
-
-
-def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Call `write(file)` on a temporary file beside `path`, flush it to disk and rename it.
-
-    Args:
-        path: file to write.
-        write: function that writes the content to an open binary file.
-
-    Raises:
-        OSError: if the file cannot be written; `path` is then unchanged, and no temporary file is left.
-    """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    _flush_folder(path.parent)
-
-
-def _flush_folder(folder: Path) -> None:
-    """Flush the names in a folder to disk, so that a new file is there before older ones are removed."""
-    with suppress(OSError):  # Windows cannot open folders, and some file systems cannot flush them
-        opened = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(opened)
-        finally:
-            os.close(opened)
 
 
 def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bool, before: int | None = None) -> Path:

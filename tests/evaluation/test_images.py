@@ -3,11 +3,10 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 from PIL import Image
 
-from framework.evaluation.images import ERROR_AT_WHITE, error_map, heat, write_animation, write_image
+from framework.evaluation.images import ERROR_AT_WHITE, error_map, heat, write_image
 
 
 def test_a_written_image_reads_back_rounded(tmp_path: Path) -> None:
@@ -28,17 +27,3 @@ def test_an_error_map_is_white_where_the_error_is_as_stated() -> None:
     prediction = np.array([[[0] * 3, [round(255 * ERROR_AT_WHITE)] * 3, [28, 0, 0]]], np.uint8)
     third = round(3 * 28 / 3 / 255 / ERROR_AT_WHITE * 255)  # of black to red
     assert error_map(prediction, target).tolist() == [[[0, 0, 0], [255, 255, 255], [third, 0, 0]]]
-
-
-@pytest.mark.parametrize("ending", [".gif", ".webp", ".png"])
-def test_an_animation_has_all_its_frames(tmp_path: Path, ending: str) -> None:
-    frames = [torch.full((8, 8, 3), level) for level in (0.0, 0.25, 0.5, 1.0)]
-    path = tmp_path / f"a{ending}"
-    write_animation(path, frames, fps=10)
-    with Image.open(path) as read:
-        assert getattr(read, "n_frames", 1) == 4
-        levels = []
-        for index in range(4):
-            read.seek(index)
-            levels.append(read.convert("RGB").getpixel((4, 4))[0])
-    assert levels == pytest.approx([0, 64, 128, 255], abs=3)

@@ -1,10 +1,26 @@
 """Camera paths: against geometry worked out by hand."""
 
+import math
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 import torch
+from torch import Tensor
 
+from framework import Picture, View
 from framework.cameras.cameras import Cameras, check_pose
-from framework.evaluation.paths import interpolate, look_at, orbit, replace_poses
+from framework.cameras.ndc import Ndc, NdcCameras
+from framework.evaluation.paths import (
+    focus_distance,
+    interpolate,
+    look_at,
+    look_same_way,
+    middle_pose,
+    orbit,
+    replace_poses,
+    spiral,
+)
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 
@@ -72,3 +88,63 @@ def test_a_path_past_one_camera_stands_still() -> None:
     one = torch.ones(1)
     cameras = Cameras(torch.eye(4)[None, :3], one, one, one, one, one.long(), one.long())
     torch.testing.assert_close(interpolate(cameras, 3).camera_to_worlds, torch.eye(4)[:3].repeat(3, 1, 1))
+
+
+def grid_of_cameras() -> Cameras:
+    """Nine cameras on a grid in a plane, all looking along -z."""
+    x, y = torch.meshgrid(torch.linspace(-1, 1, 3), torch.linspace(-2, 2, 3), indexing="ij")
+    positions = torch.stack([x, y, torch.zeros(3, 3)], -1).view(9, 3) + torch.tensor([5.0, 6.0, 7.0])
+    poses = torch.cat([torch.eye(3).expand(9, 3, 3), positions[..., None]], dim=-1)
+    ones = torch.ones(9)
+    return Cameras(poses, ones, ones, ones, ones, ones.long(), ones.long())
+
+
+def test_a_spiral_turns_around_the_mean_camera_and_looks_at_one_point() -> None:
+    path = spiral(grid_of_cameras(), 16, focus=4.0, radius=0.5).camera_to_worlds
+    middle = torch.tensor([5.0, 6.0, 7.0])
+    angles = torch.arange(16) * 2 * math.pi * 2 / 16  # two turns, and half of one back and forth
+    expected = middle + 0.5 * torch.stack([angles.cos(), -angles.sin(), -(angles / 2).sin()], dim=-1)
+    torch.testing.assert_close(path[:, :, 3], expected)
+    towards = middle - torch.tensor([0.0, 0.0, 4.0]) - path[:, :, 3]
+    torch.testing.assert_close(-path[:, :, 2], towards / towards.norm(dim=-1, keepdim=True))
+    for pose in path:
+        check_pose(pose, "spiral")
+
+
+def test_the_radius_of_a_spiral_is_the_spread_of_the_cameras() -> None:
+    path = spiral(grid_of_cameras(), 400, focus=4.0).camera_to_worlds[:, :, 3] - torch.tensor([5.0, 6.0, 7.0])
+    # The 90th percentile of |x| in {0, 1} and of |y| in {0, 2}, each three and six times; z does not vary.
+    torch.testing.assert_close(path.abs().amax(0), torch.tensor([1.0, 2.0, 0.0]), atol=1e-3, rtol=0)
+
+
+def test_around_an_object_a_spiral_starts_from_the_first_camera() -> None:
+    turn = torch.tensor([[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]])
+    poses = torch.eye(4)[:3].repeat(2, 1, 1)
+    poses[1, :, :3] = turn
+    poses[0, :, 3] = torch.tensor([0.0, 0, 3])
+    ones = torch.ones(2)
+    cameras = Cameras(poses, ones, ones, ones, ones, ones.long(), ones.long())
+    assert not look_same_way(cameras)
+    assert torch.equal(middle_pose(cameras), poses[0])
+    offsets = spiral(cameras, 8, focus=3.0).camera_to_worlds[:, :, 3] - poses[0, :, 3]
+    torch.testing.assert_close(offsets[:, :2].norm(dim=-1), torch.full((8,), 0.3))
+
+
+@pytest.mark.parametrize("warped", [False, True])
+def test_the_distance_of_what_is_seen(warped: bool) -> None:
+    """A wall at depth 5 before a narrow camera, in the scene's coordinates and in normalised device coordinates."""
+    numbers = [torch.tensor([value]) for value in (4000.0, 4000.0, 16.0, 16.0)]
+    size = torch.tensor([32])
+    pose = torch.eye(4)[None, :3]
+    ndc = Ndc(tuple(map(tuple, torch.eye(4)[:3].tolist())), near=2.0, half_width=0.004, half_height=0.004)
+    camera = NdcCameras(pose, *numbers, size, size, ndc=ndc) if warped else Cameras(pose, *numbers, size, size)
+
+    def render_view(view: View, background: Tensor) -> Picture:
+        rays = view.camera.pixel_rays(view.pixels().flatten(), 0.0, 100.0)
+        # Appendix C of NeRF: depth z becomes 1 + 2 near / z, with z = -5 here.
+        wall = 1 - 2 * 2.0 / 5 if warped else -5.0
+        depth = ((wall - rays.origins[:, 2]) / rays.directions[:, 2]).view(view.height, view.width)
+        return Picture(torch.zeros(view.height, view.width, 3), depth, depth, torch.ones_like(depth))
+
+    model: Any = SimpleNamespace(render_view=render_view, scene=SimpleNamespace(moving=False, near=0.1))
+    assert focus_distance(model, camera, torch.zeros(3)) == pytest.approx(5.0, rel=1e-3)

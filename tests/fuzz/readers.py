@@ -1,6 +1,7 @@
 """Every reader of files that come from elsewhere, each with a small input that it takes."""
 
 import json
+import math
 import os
 import shutil
 from collections.abc import Callable
@@ -23,6 +24,8 @@ from dataparsers.polycam import Polycam
 from dataparsers.record3d import Record3D
 from framework import DataParser, Dataset
 from framework.base.config import from_plain, read_yaml
+from framework.cameras.camera_path import MOST_FRAMES, CameraPath, Keyframe, read_camera_path, write_camera_path
+from framework.cameras.poses import Placement
 from framework.cli.compare import CompareFlags, plan_of
 from framework.data.dataset import load_dataset
 from framework.data.mapped_pixels import MappedPixels
@@ -45,7 +48,7 @@ from tests.dataparsers.test_llff import poses_bounds
 from tests.dataparsers.test_polycam import write_polycam
 from tests.dataparsers.test_record3d import write_record3d
 from tests.fuzz.reader import Reader, require
-from tests.fuzz.sense import check_dataset, check_scene
+from tests.fuzz.sense import check_cameras, check_dataset, check_scene
 from tests.images import noise
 from tests.training.helpers import tiny_run
 
@@ -156,6 +159,27 @@ def read_splats(folder: Path, scratch: Path) -> None:
         require(bool(gaussians.finite().all()), "Gaussians that are nowhere")
         require(bool(gaussians.log_scales.exp().isfinite().all()), "Gaussians without end")
         require(bool((gaussians.rotations.norm(dim=-1) > 0).all()), "Gaussians without axes")
+
+
+def write_path(folder: Path) -> None:
+    """A camera path with all that the format may have."""
+    poses = torch.eye(4, dtype=torch.float64)[:3].repeat(3, 1, 1)
+    fovs, times = torch.tensor([50.0, 60.0, 70.0], dtype=torch.float64), torch.tensor([0.0, 0.5, 1.0])
+    keyframes = (Keyframe(poses[0], 50.0, 0.0, 1.0), Keyframe(poses[2], 70.0))
+    placement = Placement(poses[0], 0.5)
+    path = CameraPath("perspective", 40, 30, poses, fovs, 1.0, times, keyframes=keyframes, placement=placement)
+    write_camera_path(folder / "camera_path.json", path)
+
+
+def read_path(folder: Path, scratch: Path) -> None:
+    path = read_camera_path(folder / "camera_path.json")
+    require(1 <= len(path) <= MOST_FRAMES and 0 < path.fps < math.inf, "a video of no length")
+    other = Placement(torch.eye(4, dtype=torch.float64)[:3], 2.0)
+    for cameras in (path.cameras(), path.placed(other).cameras()):
+        check_cameras(cameras, 0.1, 10.0)
+    require(path.times is None or bool(((path.times >= 0) & (path.times <= 1)).all()), "times out of range")
+    for keyframe in path.keyframes:
+        require(bool(keyframe.pose.isfinite().all()) and 0 < keyframe.fov < math.inf, "a keyframe that is nowhere")
 
 
 # -- images -------------------------------------------------------------------------------------------------------
@@ -316,6 +340,7 @@ READERS: dict[str, Reader] = {
     "phototourism": Reader(write_phototourism, partial(parse, Phototourism()), ("gate.tsv",)),
     "ply": Reader(write_ply, read_ply, ("*.ply",)),
     "splats": Reader(write_splats, read_splats, ("splat.*",)),
+    "camera-path": Reader(write_path, read_path, ("camera_path.json",), ("crop", "camera_type", "aspect", "seconds")),
     "images": Reader(write_blender, partial(load, Blender(), MEMORY), ("train/*.png",)),
     "images-to-a-file": Reader(write_blender, partial(load, Blender(), 0.0), ("train/*.png",)),
     "masks": Reader(write_masked, partial(load, Nerfstudio(), MEMORY), ("masks/*.png",)),

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from framework import Dataset, ParsedScene
+from framework import Cameras, Dataset, ParsedScene
 from tests.fuzz.reader import require
 
 DIRECTION_TOLERANCE = 1e-2
@@ -16,12 +16,7 @@ def check_scene(scene: ParsedScene) -> None:
     """Raises: Nonsense where cameras, box or placement are none."""
     cameras, count = scene.cameras, len(scene.image_paths)
     require(len(cameras) == count >= 1, f"{count} images and {len(cameras)} cameras")
-    _finite("the poses", cameras.camera_to_worlds)
-    for name in ("fx", "fy", "cx", "cy"):
-        _finite(name, getattr(cameras, name))
-    require(bool((cameras.fx > 0).all()) and bool((cameras.fy > 0).all()), "a focal length that is not positive")
-    require(bool((cameras.widths > 0).all()) and bool((cameras.heights > 0).all()), "images without pixels")
-    _check_rays(scene)
+    check_cameras(cameras, scene.near, scene.far)
     require(0 <= scene.near < scene.far < math.inf, f"near {scene.near}, far {scene.far}")
     _finite("the box", scene.box)
     require(bool((scene.box[0] < scene.box[1]).all()), f"the box {scene.box.tolist()}")
@@ -33,13 +28,23 @@ def check_scene(scene: ParsedScene) -> None:
         require(bool(((scene.times >= 0) & (scene.times <= 1)).all()), f"times {scene.times.tolist()}")
 
 
-def _check_rays(scene: ParsedScene) -> None:
+def check_cameras(cameras: Cameras, near: float, far: float) -> None:
+    """Raises: Nonsense where cameras have no rays."""
+    _finite("the poses", cameras.camera_to_worlds)
+    for name in ("fx", "fy", "cx", "cy"):
+        _finite(name, getattr(cameras, name))
+    require(bool((cameras.fx > 0).all()) and bool((cameras.fy > 0).all()), "a focal length that is not positive")
+    require(bool((cameras.widths > 0).all()) and bool((cameras.heights > 0).all()), "images without pixels")
+    _check_rays(cameras, near, far)
+
+
+def _check_rays(cameras: Cameras, near: float, far: float) -> None:
     """Those through the corners of every image."""
-    cameras, count = scene.cameras, len(scene.image_paths)
+    count = len(cameras)
     indices = torch.arange(count).repeat(4)
     columns = torch.cat([0 * cameras.widths, cameras.widths - 1] * 2).float()
     rows = torch.cat([0 * cameras.heights] * 2 + [cameras.heights - 1] * 2).float()
-    rays = cameras.rays(indices, columns, rows, scene.near, scene.far)
+    rays = cameras.rays(indices, columns, rows, near, far)
     _finite("origins of rays", rays.origins)
     _finite("directions of rays", rays.directions)
     off = (rays.directions.norm(dim=-1) - 1).abs().max().item()

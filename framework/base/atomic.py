@@ -1,0 +1,42 @@
+"""Files that are there as a whole or not at all, also after a kill or on a full disk."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import BinaryIO
+
+
+def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
+    """Call `write(file)` on a temporary file beside `path`, flush it to disk and rename it.
+
+    Args:
+        path: file to write.
+        write: function that writes the content to an open binary file.
+
+    Raises:
+        OSError: if the file cannot be written; `path` is then unchanged, and no temporary file is left.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    _flush_folder(path.parent)
+
+
+def _flush_folder(folder: Path) -> None:
+    """Flush the names in a folder to disk, so that a new file is there before older ones are removed."""
+    with suppress(OSError):  # Windows cannot open folders, and some file systems cannot flush them
+        opened = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(opened)
+        finally:
+            os.close(opened)

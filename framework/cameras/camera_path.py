@@ -1,0 +1,375 @@
+"""Camera paths in files: the camera_path.json that nerfstudio's viewer writes, read and written.
+
+Poses are camera-to-world matrices with OpenGL axes in the frame of the trained scene, after the data format has placed
+the input, as in nerfstudio. A capture is placed here by nerfstudio's rules, and NeRF-Synthetic data not at all, so that
+a path made there for the same data shows the same here. A file of ours also holds the placement that it was made with
+(`placement`, which nerfstudio ignores), and fits a run of the same data that is placed in another way.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import torch
+from torch import Tensor
+
+from framework.base.atomic import write_atomically
+from framework.base.errors import DataError, nearest, shown
+from framework.cameras.cameras import Cameras, check_pose
+from framework.cameras.poses import Placement
+from framework.geometry.lenses import panorama
+
+CameraType = Literal["perspective", "fisheye", "equirectangular"]
+CAMERA_TYPES: dict[str, str] = {"perspective": "pinhole", "fisheye": "fisheye", "equirectangular": "equirectangular"}
+"""`camera_type` of the file -> projection, a key of `LENSES`."""
+LARGEST_SIDE, LARGEST_IMAGE = 16_384, 2**27
+"""Maximum width and height, and maximum number of pixels of an image."""
+MOST_FRAMES = 100_000
+"""Maximum number of frames of a path."""
+FARTHEST = 1e9
+"""Maximum coordinate of a camera, scene units."""
+ANGLES = (0.01, 179.0)
+"""Range of the vertical field of view, degrees."""
+SPEEDS = (0.01, 1000.0)
+"""Range of the number of frames per second."""
+PANORAMA_FOV = 90.0
+"""Field of view that is written for a panorama, which does not use it, degrees."""
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """A camera that a user has placed, and between which an editor interpolates."""
+
+    pose: Tensor
+    """(3, 4) camera-to-scene, float64."""
+    fov: float
+    """Vertical field of view, degrees."""
+    time: float | None = None
+    """Time in [0, 1]; None for a static scene."""
+    transition: float | None = None
+    """Seconds from the keyframe before; None for the path's own."""
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """F cameras of one type and size, one for each frame of a video."""
+
+    camera_type: CameraType
+    """Projection: perspective; fisheye, with angles from the axis in proportion to radii; or equirectangular, all
+    directions."""
+    width: int
+    """Width of the images, pixels."""
+    height: int
+    """Height of the images, pixels."""
+    poses: Tensor
+    """(F, 3, 4) camera-to-scene, float64, OpenGL axes."""
+    fovs: Tensor
+    """(F,) vertical field of view, degrees, float64; not used if equirectangular. The focal length of a fisheye in
+    pixels per radian is that of a perspective camera in pixels per tangent."""
+    seconds: float
+    """Duration."""
+    times: Tensor | None = None
+    """(F,) time of each frame in [0, 1]; None if the path has none."""
+    is_cycle: bool = False
+    """Whether the last keyframe is joined to the first."""
+    smoothness_value: float = 0.0
+    """Tension of the spline through the keyframes."""
+    keyframes: tuple[Keyframe, ...] = ()
+    """Cameras that the path was made of; empty if unknown."""
+    placement: Placement | None = None
+    """Placement of the input in the scene for which the path was made; None if unknown."""
+    has_crop: bool = False
+    """Whether the file asks for a crop box, which is not read."""
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        return len(self) / self.seconds
+
+    def cameras(self) -> Cameras:
+        """Return the F cameras."""
+        count, half = len(self), self.height / 2
+        if self.camera_type == "equirectangular":
+            fx, fy, cx, cy = (torch.full((count,), value) for value in panorama(self.width, self.height))
+        else:
+            fx = fy = (half / torch.tan(torch.deg2rad(self.fovs) / 2)).float()
+            cx, cy = torch.full((count,), self.width / 2), torch.full((count,), half)
+        sizes = torch.full((count,), self.width), torch.full((count,), self.height)
+        return Cameras(self.poses.float(), fx, fy, cx, cy, *sizes, CAMERA_TYPES[self.camera_type])
+
+    def placed(self, placement: Placement) -> CameraPath:
+        """Return the path in a scene with another `placement` of the same input; unchanged if its own is unknown."""
+        if self.placement is None:
+            return self
+        before, after = (replace(one, transform=one.transform.double()) for one in (self.placement, placement))
+
+        def moved(poses: Tensor) -> Tensor:
+            return after.poses(before.original_poses(poses))
+
+        keyframes = tuple(replace(one, pose=moved(one.pose[None])[0]) for one in self.keyframes)
+        return replace(self, poses=moved(self.poses), keyframes=keyframes, placement=placement)
+
+
+def write_camera_path(file: Path, path: CameraPath) -> None:
+    """Write a camera path, with all that nerfstudio's viewer and ns-render read.
+
+    Args:
+        file: JSON file to write.
+        path: the path.
+
+    Raises:
+        OSError: if the file cannot be written; it is then as before.
+    """
+    aspect = path.width / path.height
+    frames = [
+        {"camera_to_world": _flat(pose), "fov": fov, "aspect": aspect}
+        for pose, fov in zip(path.poses, path.fovs.tolist(), strict=True)
+    ]
+    if path.times is not None:
+        for frame, time in zip(frames, path.times.tolist(), strict=True):
+            frame["render_time"] = time
+    content: dict[str, Any] = {
+        "default_fov": frames[0]["fov"],
+        "default_transition_sec": path.seconds / max(len(path.keyframes) - (not path.is_cycle), 1),
+        "keyframes": [_keyframe(one, aspect) for one in path.keyframes],
+        "camera_type": path.camera_type,
+        "render_height": path.height,
+        "render_width": path.width,
+        "fps": path.fps,
+        "seconds": path.seconds,
+        "is_cycle": path.is_cycle,
+        "smoothness_value": path.smoothness_value,
+        "camera_path": frames,
+    }
+    if path.placement is not None:
+        content["placement"] = {"transform": path.placement.transform.tolist(), "scale": path.placement.scale}
+    text = json.dumps(content, allow_nan=False) + "\n"
+    write_atomically(file, lambda stream: stream.write(text.encode()))
+
+
+def _keyframe(keyframe: Keyframe, aspect: float) -> dict[str, Any]:
+    content = {
+        "matrix": _flat(keyframe.pose),
+        "fov": keyframe.fov,
+        "aspect": aspect,
+        "override_transition_enabled": keyframe.transition is not None,
+        "override_transition_sec": keyframe.transition,
+    }
+    if keyframe.time is not None:
+        content |= {"render_time": keyframe.time, "override_time_enabled": True}
+    return content
+
+
+def _flat(pose: Tensor) -> list[float]:
+    """Return the 16 numbers of a pose (3, 4), row by row."""
+    return [*pose.double().flatten().tolist(), 0.0, 0.0, 0.0, 1.0]
+
+
+# -- reading ------------------------------------------------------------------------------------------------------
+
+
+def read_camera_path(file: Path) -> CameraPath:
+    """Read a camera path.
+
+    Args:
+        file: JSON file in the format of nerfstudio's viewer.
+
+    Raises:
+        DataError: if the file cannot be read, is of another format, or holds values that make no cameras.
+    """
+    content = _object(_json(file), str(file))
+    width, height = (_side(content, f"render_{name}", file) for name in ("width", "height"))
+    if width * height > LARGEST_IMAGE:
+        raise DataError(f"{file}: images of {width}x{height} pixels are too large; the most are {LARGEST_IMAGE}")
+    camera_type = content.get("camera_type", "perspective")
+    if camera_type not in get_args(CameraType):
+        hint = nearest(camera_type, CAMERA_TYPES) if isinstance(camera_type, str) else nearest("", CAMERA_TYPES)
+        raise DataError(f"{file}: unknown camera_type {shown(camera_type)}. {hint}")
+    frames = _list(content, "camera_path", file)
+    if not 1 <= len(frames) <= MOST_FRAMES:
+        raise DataError(f"{file}: 'camera_path' has {len(frames)} frames; it must have 1 to {MOST_FRAMES}")
+    labels = [f"{file}: frame {index} of 'camera_path'" for index in range(len(frames))]
+    placed = [(_object(frame, label), label) for frame, label in zip(frames, labels, strict=True)]
+    for frame, label in placed:
+        if frame.get("aspect") is not None:
+            _number(frame, "aspect", label, above=0.0)
+    return CameraPath(
+        camera_type=camera_type,
+        width=width,
+        height=height,
+        poses=torch.stack([_pose(frame, "camera_to_world", label) for frame, label in placed]),
+        fovs=torch.tensor([_fov(frame, camera_type, label) for frame, label in placed], dtype=torch.float64),
+        seconds=_seconds(content, len(frames), str(file)),
+        times=_times(placed),
+        is_cycle=_flag(content, "is_cycle", str(file)),
+        smoothness_value=_number(content, "smoothness_value", str(file), default=0.0),
+        keyframes=_keyframes(content, camera_type, file),
+        placement=read_placement(content["placement"], f"{file}: 'placement'") if "placement" in content else None,
+        has_crop=content.get("crop") is not None,
+    )
+
+
+def read_transforms(file: Path) -> Placement:
+    """Read the placement of a run, ours or nerfstudio's, from its dataparser_transforms.json.
+
+    Args:
+        file: the JSON file.
+
+    Raises:
+        DataError: if the file cannot be read or holds no similarity.
+    """
+    return read_placement(_json(file), str(file))
+
+
+def read_placement(content: Any, where: str) -> Placement:
+    """Return the placement that a JSON object describes by `transform` (3 x 4) and `scale`.
+
+    Args:
+        content: the object.
+        where: name of the object in messages.
+
+    Raises:
+        DataError: if it is no similarity.
+    """
+    values = _object(content, where)
+    transform = _rigid(values.get("transform"), f"{where}: 'transform'")
+    scale = _number(values, "scale", where, above=0.0)
+    if not 1 / FARTHEST < scale < FARTHEST:
+        raise DataError(f"{where}: 'scale' is {scale:g}, which is out of range")
+    return Placement(transform, scale)
+
+
+def _json(file: Path) -> Any:
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DataError(f"cannot read {file}: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{file} is not JSON: {error}") from error
+
+
+def _object(value: Any, where: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise DataError(f"{where} is {shown(value)}; it must be an object: names and values in braces")
+    return value
+
+
+def _list(content: dict[str, Any], name: str, file: Path) -> list[Any]:
+    value = content.get(name)
+    if not isinstance(value, list):
+        raise DataError(f"{file}: '{name}' is {shown(value)}; it must be a list of cameras")
+    return value
+
+
+def _number(
+    content: dict[str, Any], name: str, where: str, above: float = -math.inf, default: float | None = None
+) -> float:
+    """Return a finite number greater than `above`; `default` if it is missing and has a default."""
+    value = content.get(name)
+    if value is None and default is not None:
+        return default
+    try:
+        number = float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else math.nan
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number) or not number > above:
+        kind = "a number" if above == -math.inf else f"a number above {above:g}"
+        raise DataError(f"{where}: '{name}' is {shown(value)}; it must be {kind}")
+    return number
+
+
+def _flag(content: dict[str, Any], name: str, where: str) -> bool:
+    value = content.get(name, False)
+    if not isinstance(value, bool):
+        raise DataError(f"{where}: '{name}' is {shown(value)}; it must be true or false")
+    return value
+
+
+def _side(content: dict[str, Any], name: str, file: Path) -> int:
+    side = _number(content, name, str(file), above=0.0)
+    if side != round(side) or not 1 <= side <= LARGEST_SIDE:
+        raise DataError(f"{file}: '{name}' is {shown(content[name])}; it must be from 1 to {LARGEST_SIDE} pixels")
+    return round(side)
+
+
+def _seconds(content: dict[str, Any], frames: int, where: str) -> float:
+    """Return the duration, from `seconds`, or from `fps` if that is missing."""
+    if content.get("seconds") is not None:
+        seconds = _number(content, "seconds", where, above=0.0)
+    else:
+        seconds = frames / _number(content, "fps", where, above=0.0)
+    if not seconds * SPEEDS[0] <= frames <= seconds * SPEEDS[1]:
+        raise DataError(
+            f"{where}: {frames} frames in {seconds:g} seconds; it must be {SPEEDS[0]:g} to {SPEEDS[1]:g} in a second"
+        )
+    return seconds
+
+
+def _fov(content: dict[str, Any], camera_type: str, where: str) -> float:
+    if camera_type == "equirectangular":
+        return _number(content, "fov", where, default=PANORAMA_FOV)
+    fov = _number(content, "fov", where)
+    if not ANGLES[0] <= fov <= ANGLES[1]:
+        raise DataError(f"{where}: 'fov' is {fov:g}; it must be from {ANGLES[0]:g} to {ANGLES[1]:g} degrees")
+    return fov
+
+
+def _times(placed: list[tuple[dict[str, Any], str]]) -> Tensor | None:
+    """Return the times of all frames, or None if no frame has one. A spline may leave [0, 1] a little."""
+    if not any("render_time" in frame for frame, _ in placed):
+        return None
+    times = [_number(frame, "render_time", label) for frame, label in placed]
+    return torch.tensor(times, dtype=torch.float64).clamp(0, 1).float()
+
+
+def _pose(content: dict[str, Any], name: str, where: str) -> Tensor:
+    """Return a pose (3, 4) from 16 numbers or four rows of four."""
+    return _rigid(content.get(name), f"{where}: '{name}'")
+
+
+def _rigid(value: Any, where: str) -> Tensor:
+    """Return the first three rows of a rigid matrix, given as 12 or 16 numbers, or as rows of four."""
+    rows = value if isinstance(value, list) and len(value) <= 16 else []
+    flat = [part for row in rows for part in (row if isinstance(row, list) and len(row) == 4 else [row])]
+    if len(flat) not in (12, 16) or not all(type(part) in (int, float) for part in flat):
+        raise DataError(f"{where} is {shown(value)}; it must be a 4x4 matrix, 16 numbers row by row")
+    try:
+        pose = torch.tensor(flat, dtype=torch.float64).view(-1, 4)
+    except (OverflowError, RuntimeError) as error:  # an integer beyond any float
+        raise DataError(f"{where} holds a number out of range") from error
+    check_pose(pose, where)
+    if not bool((pose[:3, 3].abs() < FARTHEST).all()):
+        raise DataError(f"{where}: the position is farther than {FARTHEST:g} from the origin")
+    return pose[:3]
+
+
+def _keyframes(content: dict[str, Any], camera_type: str, file: Path) -> tuple[Keyframe, ...]:
+    """Return the keyframes; none for those of nerfstudio's first viewer, whose matrices are text."""
+    given = content.get("keyframes")
+    given = [] if given is None else _list(content, "keyframes", file)
+    if len(given) > MOST_FRAMES:
+        raise DataError(f"{file}: 'keyframes' has {len(given)} cameras; the most are {MOST_FRAMES}")
+    found = []
+    for index, value in enumerate(given):
+        where = f"{file}: {index} of 'keyframes'"
+        keyframe = _object(value, where)
+        if isinstance(keyframe.get("matrix"), str):
+            return ()
+        time = None if keyframe.get("render_time") is None else _number(keyframe, "render_time", where)
+        seconds = keyframe.get("override_transition_sec") if keyframe.get("override_transition_enabled") else None
+        found.append(
+            Keyframe(
+                pose=_pose(keyframe, "matrix", where),
+                fov=_fov(keyframe, camera_type, where),
+                time=None if time is None else min(max(time, 0.0), 1.0),
+                transition=None if seconds is None else _number(keyframe, "override_transition_sec", where, above=0.0),
+            )
+        )
+    return tuple(found)

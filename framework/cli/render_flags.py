@@ -1,0 +1,216 @@
+"""Flags of `ns-render`, in groups; without torch, so that the help comes at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from framework.base.config import RaysPerPixel
+from framework.base.errors import ConfigError
+from framework.base.rendered_names import OutputName
+
+USAGE = """\
+usage: ns-render PATH RUN_FOLDER --output-path FILE_OR_FOLDER [flags]
+
+paths:
+  camera-path     the cameras of a file, camera_path.json, as nerfstudio's viewer writes it
+  interpolate     a smooth path past the training cameras, in the order of their images' names
+  spiral          a spiral around the mean camera, for cameras that look the same way
+  orbit           a horizontal circle around the scene, with the mean height and distance of the training cameras
+  time            one of the cameras, while time runs from 0 to 1
+  dataset         each camera of a split, beside its true image
+
+A file of Gaussians stands for a run: ns-render PATH splat.ply --data DIR [flags] [FORMAT [format flags]]
+
+ns-render PATH --help shows its flags.
+"""
+
+
+@dataclass(frozen=True)
+class RunFlags:
+    """The trained run."""
+
+    load_config: Path
+    """Folder of the run, its config.yml, or a file of Gaussians (.ply, .spz); the flag's name may be omitted."""
+    load_checkpoint: Path | None = None
+    """Checkpoint to load; the newest if not given."""
+    data: Path | None = None
+    """Folder of the data, if it has moved since training; needed with a file of Gaussians."""
+    device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
+    """Device to render on."""
+
+
+@dataclass(frozen=True)
+class ViewFlags:
+    """Outputs of a view, and their colours."""
+
+    rendered_output_names: tuple[OutputName, ...] = ("rgb",)
+    """What is shown, from left to right: rgb, depth, median_depth, accumulation, normals; with 'dataset' also error and
+    gt-rgb, the true image."""
+    depth_near_plane: float | None = None
+    """Distance at the dark end of the colours of depth, units of the input; found in all frames if not given."""
+    depth_far_plane: float | None = None
+    """Distance at the light end, and the largest in 16-bit files; found in all frames if not given."""
+    downscale_factor: int = 1
+    """Integer factor by which width and height are reduced."""
+    rays_per_pixel: RaysPerPixel | None = None
+    """Rays per pixel, of which its colour is the mean; the run's setting if not given."""
+    max_error: str | None = None
+    """Maximum error of a colour, such as 1/255: rays end where the rest cannot change it by more; 1e-4 if not given."""
+
+
+@dataclass(frozen=True)
+class FileFlags:
+    """Files that are written."""
+
+    apart: bool | None = None
+    """Write each output to a file or folder of its own, not side by side; only 'dataset' does so if not given."""
+    image_format: Literal["png", "jpeg"] = "png"
+    """Format of the images of a folder."""
+    depth_format: Literal["color", "png16", "npy"] = "color"
+    """Depth in a folder: colours, 16-bit PNG (with the unit in a depth.json) or float32 .npy; distances along the ray
+    in units of the input, 0 where nothing is seen."""
+
+
+@dataclass(frozen=True)
+class PathFlags:
+    """Flags of every path."""
+
+    run: RunFlags
+    """The trained run."""
+    outputs: ViewFlags = field(default_factory=ViewFlags)
+    """Outputs of a view, and their colours."""
+    files: FileFlags = field(default_factory=FileFlags)
+    """Files that are written."""
+
+
+@dataclass(frozen=True)
+class CameraPathFlags(PathFlags):
+    """Render the cameras of a file, camera_path.json, as nerfstudio's viewer writes it."""
+
+    camera_path_filename: Path = Path("camera_path.json")
+    """File of the cameras, in the frame of the scene, as the data format has placed it."""
+    dataparser_transforms: Path | None = None
+    """dataparser_transforms.json of the run that the path was made with, if it placed the same input in another way."""
+    output_path: Path = Path("camera_path.gif")
+    """File to write; its extension (.mp4, .gif, .webp, .png) is the format. Without one: a folder of images."""
+    fps: float | None = None
+    """Frames per second; the file's if not given."""
+
+
+@dataclass(frozen=True)
+class InterpolateFlags(PathFlags):
+    """Render a smooth path past the training cameras, in the order of their images' names."""
+
+    output_path: Path = Path("interpolate.gif")
+    """File to write; its extension (.mp4, .gif, .webp, .png) is the format. Without one: a folder of images."""
+    num_frames: int = 96
+    """Number of frames."""
+    fps: float = 16.0
+    """Frames per second."""
+
+
+@dataclass(frozen=True)
+class SpiralFlags(PathFlags):
+    """Render a spiral around the mean camera, for cameras that look the same way (LLFF's path)."""
+
+    output_path: Path = Path("spiral.gif")
+    """File to write; its extension (.mp4, .gif, .webp, .png) is the format. Without one: a folder of images."""
+    num_frames: int = 72
+    """Number of frames."""
+    fps: float = 24.0
+    """Frames per second."""
+    radius: float | None = None
+    """Radius along each axis of the camera, scene units; from the spread of the cameras if not given."""
+
+
+@dataclass(frozen=True)
+class OrbitFlags(PathFlags):
+    """Render a horizontal circle around the scene, with the mean height and distance of the training cameras."""
+
+    output_path: Path = Path("orbit.gif")
+    """File to write; its extension (.mp4, .gif, .webp, .png) is the format. Without one: a folder of images."""
+    num_frames: int = 48
+    """Number of frames."""
+    fps: float = 16.0
+    """Frames per second."""
+    time: float | None = None
+    """Time of all frames of a scene that moves, 0 to 1. If not given, it runs from 0 to 1."""
+
+
+@dataclass(frozen=True)
+class TimeFlags(PathFlags):
+    """Render the view of one camera while time runs from 0 to 1."""
+
+    output_path: Path = Path("time.gif")
+    """File to write: a video or an animation (.mp4, .gif, .webp), or the frames side by side (.png). Without extension:
+    a folder of images."""
+    num_frames: int = 32
+    """Number of frames."""
+    fps: float = 16.0
+    """Frames per second."""
+    split: Literal["train", "val", "test"] = "test"
+    """Split of which --camera-index counts the cameras."""
+    camera_index: int = 0
+    """Index of the camera, from 0."""
+
+
+@dataclass(frozen=True)
+class DatasetFlags(PathFlags):
+    """Render each camera of a split to a folder, OUTPUT_PATH/SPLIT/OUTPUT/IMAGE.png."""
+
+    outputs: ViewFlags = field(default_factory=lambda: ViewFlags(rendered_output_names=("rgb", "gt-rgb")))
+    """Outputs of a view, and their colours."""
+    output_path: Path = Path("renders")
+    """Folder to write to; or a video (.mp4, .gif, .webp, .png), if all images are of one size."""
+    fps: float = 4.0
+    """Frames per second of a video."""
+    split: Literal["train", "val", "test"] = "test"
+    """Split to render."""
+
+
+Flags = CameraPathFlags | InterpolateFlags | SpiralFlags | OrbitFlags | TimeFlags | DatasetFlags
+PATHS: dict[str, type[Flags]] = {
+    "camera-path": CameraPathFlags,
+    "interpolate": InterpolateFlags,
+    "spiral": SpiralFlags,
+    "orbit": OrbitFlags,
+    "time": TimeFlags,
+    "dataset": DatasetFlags,
+}
+"""Name of a path -> its flags."""
+
+
+def check_flags(flags: Flags) -> None:
+    """Refuse flags that contradict each other or are out of range.
+
+    Args:
+        flags: flags of a path.
+
+    Raises:
+        ConfigError: with what is wrong.
+    """
+    shown, outputs = flags.outputs, flags.outputs.rendered_output_names
+    count = 1 if isinstance(flags, (CameraPathFlags, DatasetFlags)) else flags.num_frames
+    if count < 1 or (flags.fps is not None and not 0 < flags.fps <= 1000) or shown.downscale_factor < 1:
+        raise ConfigError("--num-frames and --downscale-factor must be at least 1, --fps more than 0 and at most 1000")
+    if not outputs or len(set(outputs)) < len(outputs):
+        raise ConfigError(f"--rendered-output-names {' '.join(outputs)}: name at least one output, and each once")
+    if not isinstance(flags, DatasetFlags) and (unknown := {"error", "gt-rgb"} & set(outputs)):
+        raise ConfigError(
+            f"--rendered-output-names {min(unknown)}: the true image is known to 'ns-render dataset' alone"
+        )
+    if isinstance(flags, SpiralFlags) and flags.radius is not None and not 0 < flags.radius < 1e9:
+        raise ConfigError(f"--radius is {flags.radius:g}; it must be above zero")
+    near, far = shown.depth_near_plane, shown.depth_far_plane
+    if not 0 <= (near or 0) < (1e30 if far is None else far):
+        raise ConfigError(f"--depth-near-plane {near} and --depth-far-plane {far}: near must be at least 0, below far")
+    if flags.files.depth_format != "color":
+        if not {"depth", "median_depth"} & set(outputs):
+            raise ConfigError(f"--depth-format {flags.files.depth_format}: add depth to --rendered-output-names")
+        if flags.output_path.suffix:
+            raise ConfigError(
+                f"--depth-format {flags.files.depth_format} needs a folder: --output-path without an extension, "
+                f"such as {flags.output_path.with_suffix('')}"
+            )

@@ -1,0 +1,172 @@
+"""The views that each path of `ns-render` renders."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from framework.base.console import say
+from framework.base.errors import ConfigError
+from framework.cameras.camera_path import read_camera_path, read_transforms
+from framework.cameras.cameras import Cameras
+from framework.cameras.poses import Placement
+from framework.cli.render_flags import (
+    CameraPathFlags,
+    DatasetFlags,
+    InterpolateFlags,
+    OrbitFlags,
+    SpiralFlags,
+    TimeFlags,
+)
+from framework.data.dataset import Dataset, ParsedScene
+from framework.data.image_files import reduce_image
+from framework.data.pixels import composite
+from framework.evaluation.evaluator import evaluation_background
+from framework.evaluation.paths import focus_distance, interpolate, middle_pose, orbit, replace_poses, spiral
+from framework.training.datasets import load_split
+from framework.training.trained import Trained
+
+
+@dataclass(frozen=True)
+class Views:
+    """F views to render, and what is known of them."""
+
+    cameras: Cameras
+    """F cameras at their final size, on the model's device."""
+    times: Tensor | None = None
+    """(F,) time of each; None for a static scene."""
+    fps: float = 16.0
+    """Frames per second of a video."""
+    names: tuple[str, ...] | None = None
+    """F names of image files without extension; None for numbers."""
+    truth: Callable[[int], Tensor] | None = None
+    """Function from an index to the true image (H, W, 3) in [0, 1]; None if it is unknown."""
+
+
+def camera_path_views(flags: CameraPathFlags, trained: Trained) -> Views:
+    """Return the views of a camera path's file, which needs no data.
+
+    Args:
+        flags: flags of the path.
+        trained: the trained run.
+
+    Raises:
+        DataError: if the file cannot be read.
+        ConfigError: if the run is in normalised device coordinates.
+    """
+    if trained.model.scene.warped:
+        raise ConfigError("ns-render camera-path: this run sees only what its cameras saw (--ndc); take spiral")
+    path = read_camera_path(flags.camera_path_filename)
+    if flags.dataparser_transforms is not None:
+        path = replace(path, placement=read_transforms(flags.dataparser_transforms))
+    path = path.placed(Placement(trained.content["transform"].double().cpu(), float(trained.content["scale"])))
+    if path.has_crop:
+        say(f"{flags.camera_path_filename}: its crop box is not applied")
+    times = None
+    if trained.model.scene.moving:
+        times = torch.linspace(0, 1, len(path)) if path.times is None else path.times
+    cameras = path.cameras().scaled(1 / flags.outputs.downscale_factor).to(trained.model.device)
+    return Views(cameras, times, path.fps if flags.fps is None else flags.fps)
+
+
+def path_views(flags: InterpolateFlags | SpiralFlags | OrbitFlags | TimeFlags, trained: Trained) -> Views:
+    """Return the views of a path that is made of the cameras of the data.
+
+    Args:
+        flags: flags of the path.
+        trained: the trained run.
+
+    Raises:
+        DataError: if the data cannot be read.
+        ConfigError: if a flag does not fit the run.
+    """
+    parsed = trained.run.parse(flags.split if isinstance(flags, TimeFlags) else "train")
+    moving, count = trained.model.scene.moving, flags.num_frames
+    times = torch.linspace(0, 1, count) if moving else None
+    if isinstance(flags, TimeFlags):
+        cameras = _one_camera(flags, parsed, moving)
+    elif isinstance(flags, OrbitFlags):
+        cameras, times = _circle(flags, trained, parsed)
+    elif isinstance(flags, SpiralFlags):
+        cameras = _spiral(flags, trained, parsed)
+    else:
+        cameras = interpolate(parsed.cameras, count)
+    cameras = cameras.scaled(1 / (flags.outputs.downscale_factor * parsed.downscale_factor))
+    return Views(cameras.to(trained.model.device), times, flags.fps)
+
+
+def _one_camera(flags: TimeFlags, parsed: ParsedScene, moving: bool) -> Cameras:
+    if not moving:
+        raise ConfigError("ns-render time: the photographs of this run have no times")
+    if not 0 <= flags.camera_index < len(parsed.cameras):
+        last = len(parsed.cameras) - 1
+        raise ConfigError(f"--camera-index is {flags.camera_index}; '{flags.split}' has cameras 0 to {last}")
+    return parsed.cameras[torch.full((flags.num_frames,), flags.camera_index)]
+
+
+def _circle(flags: OrbitFlags, trained: Trained, parsed: ParsedScene) -> tuple[Cameras, Tensor | None]:
+    scene = trained.model.scene
+    if scene.warped:
+        raise ConfigError("ns-render orbit: this run knows what its cameras look at from the front only (--ndc)")
+    cameras = orbit(parsed.cameras, scene.box.mean(0).cpu(), flags.num_frames)
+    if flags.time is None:
+        return cameras, torch.linspace(0, 1, flags.num_frames) if scene.moving else None
+    if not scene.moving:
+        raise ConfigError(f"--time {flags.time:g}: the photographs of this run have no times")
+    if not 0 <= flags.time <= 1:
+        raise ConfigError(f"--time is {flags.time:g}; it must be from 0 to 1")
+    return cameras, torch.full((flags.num_frames,), flags.time)
+
+
+def _spiral(flags: SpiralFlags, trained: Trained, parsed: ParsedScene) -> Cameras:
+    model = trained.model
+    middle = replace_poses(parsed.cameras, middle_pose(parsed.cameras)[None]).scaled(1 / parsed.downscale_factor)
+    focus = focus_distance(model, middle.to(model.device), evaluation_background(model))
+    return spiral(parsed.cameras, flags.num_frames, focus, flags.radius)
+
+
+def dataset_views(flags: DatasetFlags, trained: Trained) -> Views:
+    """Return the views of a split, with their true images.
+
+    Args:
+        flags: flags of the path.
+        trained: the trained run.
+
+    Raises:
+        DataError: if the data cannot be read.
+    """
+    dataset = load_split(trained.run, flags.split).to(trained.model.device)
+    background, factor = evaluation_background(trained.model), flags.outputs.downscale_factor
+
+    def truth(index: int) -> Tensor:
+        return composite(_reduced(dataset, index, factor).float() / 255, background)
+
+    cameras = dataset.cameras if factor == 1 else dataset.cameras.scaled(1 / factor)
+    return Views(cameras, dataset.times, flags.fps, _stems(dataset.names), truth)
+
+
+def _reduced(dataset: Dataset, index: int, factor: int) -> Tensor:
+    """Return an image (H, W, 3 or 4) uint8 reduced by an integer factor."""
+    image = dataset.image(index)
+    if factor == 1:
+        return image
+    pixels = image.cpu().numpy()
+    opaque = np.full((*pixels.shape[:2], 1), 255, np.uint8)
+    reduced = reduce_image(
+        np.concatenate([pixels[..., :3], pixels[..., 3:] if pixels.shape[2] == 4 else opaque], -1), factor
+    )
+    return torch.from_numpy(reduced[..., : pixels.shape[2]].copy()).to(image.device)
+
+
+def _stems(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of images without extension, numbered where they are not unique."""
+    stems = [Path(name).stem for name in names]
+    if max(Counter(stems).values()) == 1:
+        return tuple(stems)
+    return tuple(f"{index:04d}_{stem}" for index, stem in enumerate(stems))

@@ -1,0 +1,183 @@
+"""Videos, animations and folders of images, written from pictures one after another."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from framework.base.errors import ConfigError
+from framework.base.extras import install_command
+from framework.evaluation.frames import write_file
+
+VIDEO, ANIMATIONS = ".mp4", (".gif", ".webp", ".png")
+"""Suffixes of files of several pictures."""
+QUALITY = 18
+"""Constant rate factor of H.264; 18 is said to be visually lossless."""
+JPEG_QUALITY = 95
+"""Quality of JPEG images, 1 to 95."""
+MOST = 65_535
+"""Largest value of a 16-bit PNG."""
+
+
+def check_suffix(path: Path) -> None:
+    """Refuse, before anything is rendered, a file that cannot be written.
+
+    Args:
+        path: file; a path without suffix is a folder.
+
+    Raises:
+        ConfigError: for an unknown suffix, or for MP4 if ffmpeg is not installed.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in ("", VIDEO, *ANIMATIONS):
+        known = ", ".join((VIDEO, *ANIMATIONS))
+        raise ConfigError(f"--output-path {path}: the extension must be {known}, or none for a folder of images")
+    if suffix == VIDEO and (advice := install_command("video")) is not None:
+        raise ConfigError(
+            f"--output-path {path}: MP4 needs ffmpeg, the extra [video]: {advice}; or name a .gif, a .webp or a folder"
+        )
+
+
+def write_video(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
+    """Write a video or an endless animation; an earlier file stays until the new one is complete.
+
+    Args:
+        path: file to write; its suffix is the format: .mp4 (H.264), .gif, .webp or .png.
+        pictures: (H, W, 3) uint8 pictures of one size, at least one.
+        fps: frames per second.
+
+    Raises:
+        ConfigError: if the file cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        with _written(path):
+            if path.suffix.lower() == VIDEO:
+                _write_mp4(temporary, pictures, fps)
+            else:
+                _write_animation(temporary, pictures, fps)
+            os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def _written(path: Path) -> Iterator[None]:
+    """Turn what the system or an encoder raises into an error of one line."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        reason = (error.strerror if isinstance(error, OSError) else None) or "the encoder failed"
+        if isinstance(error, BrokenPipeError):
+            reason = "ffmpeg ended early; is the disk full?"
+        raise ConfigError(
+            f"cannot write {path}: {reason}; the frames are kept, start the same command again"
+        ) from error
+
+
+def _write_mp4(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
+    import imageio.v2 as imageio
+
+    writer = imageio.get_writer(
+        path,
+        format="FFMPEG",
+        mode="I",
+        fps=fps,
+        codec="libx264",
+        quality=None,
+        macro_block_size=1,
+        pixelformat="yuv420p",
+        ffmpeg_log_level="error",
+        output_params=["-crf", str(QUALITY), "-movflags", "+faststart"],
+    )
+    with writer:
+        for picture in pictures:
+            writer.append_data(_even(picture))
+
+
+def _even(picture: np.ndarray) -> np.ndarray:
+    """Return a picture with its last row and column repeated to an even size, which H.264 needs."""
+    height, width = picture.shape[:2]
+    return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+
+
+def _write_animation(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
+    images = (Image.fromarray(picture) for picture in pictures)
+    first = next(images)
+    # Pillow goes through the images of a PNG twice, so there they have to be in memory.
+    others = list(images) if path.suffix.lower() == ".png" else images
+    first.save(path, save_all=True, append_images=others, duration=1000 / fps, loop=0)
+
+
+def write_strip(path: Path, pictures: Iterable[np.ndarray]) -> None:
+    """Write pictures side by side to one PNG file.
+
+    Args:
+        path: file to write.
+        pictures: (H, W, 3) uint8 pictures of one height.
+
+    Raises:
+        ConfigError: if the file cannot be written.
+    """
+    write_file(path, _encoded(np.concatenate(list(pictures), axis=1), ".png"))
+
+
+def write_images(paths: Iterable[Path], pictures: Iterable[np.ndarray]) -> None:
+    """Write each picture to a file of its own; folders are created if missing.
+
+    Args:
+        paths: files to write; their suffix is the format: .png or .jpg.
+        pictures: (H, W, 3) uint8 pictures.
+
+    Raises:
+        ConfigError: if a file cannot be written.
+    """
+    for path, picture in zip(paths, pictures, strict=True):
+        _make_folder(path.parent)
+        write_file(path, _encoded(picture, path.suffix))
+
+
+def write_distances(paths: Iterable[Path], distances: Iterable[np.ndarray], unit: float) -> None:
+    """Write each map of distances to a file of its own; folders are created if missing.
+
+    Args:
+        paths: files to write: .npy (float32), or .png (16 bits, distances in `unit`, the largest value for those
+            beyond).
+        distances: (H, W) float32 distances, 0 where unknown.
+        unit: distance that the value 1 of a PNG stands for.
+
+    Raises:
+        ConfigError: if a file cannot be written.
+    """
+    for path, values in zip(paths, distances, strict=True):
+        _make_folder(path.parent)
+        if path.suffix == ".npy":
+            content = io.BytesIO()
+            np.save(content, values, allow_pickle=False)
+            write_file(path, content.getvalue())
+        else:
+            steps = np.clip(np.round(values.astype(np.float64) / unit), 0, MOST).astype(np.uint16)
+            write_file(path, _encoded(np.where(values > 0, np.maximum(steps, 1), 0).astype(np.uint16), ".png"))
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"cannot write {folder}: {error.strerror or error}") from error
+
+
+def _encoded(pixels: np.ndarray, suffix: str) -> bytes:
+    content = io.BytesIO()
+    if suffix == ".png":
+        Image.fromarray(pixels).save(content, "PNG", compress_level=3)
+    else:
+        Image.fromarray(pixels).save(content, "JPEG", quality=JPEG_QUALITY, subsampling=0)
+    return content.getvalue()

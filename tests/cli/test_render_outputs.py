@@ -1,0 +1,294 @@
+"""ns-render: what its files hold, against a ball whose distance from every camera is known; and renders that go on."""
+
+import errno
+import json
+import math
+import os
+import subprocess
+import time
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from framework import Picture, RayModel, View
+from framework.cameras.camera_path import CameraPath, write_camera_path
+from framework.cli import render as render_command
+from framework.evaluation import frames
+from framework.training.trained import load_trained
+from tests.cli.helpers import called, command, train
+from tests.conftest import EditJson, Refused
+from tests.dataparsers.captures import CX, CY, FX, FY, HEIGHT, POINTS, WIDTH, poses, to_scene, write_capture
+from tests.training.helpers import tiny_trainer
+
+CENTER, RADIUS = POINTS.mean(0), 0.4
+"""Of the ball, in the frame and the units of the input."""
+FEW = ("--max-num-iterations", 1, "--max-eval-images", 0)
+
+
+@pytest.fixture(scope="module")
+def capture_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run of one step on a capture, which is turned, moved and scaled."""
+    folder = tmp_path_factory.mktemp("capture")
+    return train(write_capture(folder / "capture"), folder / "out", *FEW)
+
+
+@pytest.fixture(scope="module")
+def ball_run(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run of one step on the tiny data set."""
+    return train(shared_tiny, tmp_path_factory.mktemp("out"), *FEW)
+
+
+def distances(origins: np.ndarray, directions: np.ndarray, center: np.ndarray, radius: float) -> np.ndarray:
+    """Of a ball along rays; NaN where they miss it."""
+    away = origins - center
+    half = (away * directions).sum(-1)
+    with np.errstate(invalid="ignore"):
+        return -half - np.sqrt(half**2 - (away**2).sum(-1) + radius**2)
+
+
+@pytest.fixture
+def shows_a_ball(monkeypatch: pytest.MonkeyPatch, capture_run: Path) -> float:
+    """Every model shows the ball, of the grey 0.25, in its scene's units; returns the scene's units per unit."""
+    parsed = load_trained(capture_run).run.parse("train")
+    center, scale = to_scene(parsed, CENTER[None])[0].numpy(), parsed.scale
+    assert scale < 0.5
+
+    def render_view(model: Any, view: View, background: Tensor) -> Picture:
+        rays = view.camera.pixel_rays(view.pixels().flatten(), 0.0, 1.0)
+        found = distances(rays.origins.double().numpy(), rays.directions.double().numpy(), center, RADIUS * scale)
+        depth = torch.from_numpy(found).float().view(view.height, view.width)
+        hit = ~depth.isnan()
+        depth = torch.where(hit, depth, 1000.0)
+        rgb = torch.where(hit[..., None], torch.tensor(0.25), background)
+        return Picture(rgb, depth, 2 * depth, hit.float(), None)
+
+    monkeypatch.setattr(RayModel, "render_view", render_view)
+    return scale
+
+
+def expected_distances(pose: np.ndarray) -> np.ndarray:
+    """Of the ball in a photograph, from the cameras of the input alone."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    local = np.stack([(columns - CX) / FX, -(rows - CY) / FY, -np.ones_like(rows)], axis=-1)
+    directions = local @ pose[:3, :3].T
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    return np.nan_to_num(distances(pose[:3, 3], directions, CENTER, RADIUS))
+
+
+@pytest.mark.parametrize("kind", ["png16", "npy"])
+def test_depth_is_in_units_of_the_input(kind: str, capture_run: Path, shows_a_ball: float, tmp_path: Path) -> None:
+    words = ("--rendered-output-names", "depth", "rgb", "--depth-format", kind, "--split", "train")
+    done = called("ns-render", "dataset", capture_run, "--output-path", tmp_path / "r", *words)
+    assert done.returncode == 0, done.stderr
+    folder = tmp_path / "r" / "train"
+    meaning = json.loads((folder / "depth" / "depth.json").read_text())
+    files = sorted(file for file in (folder / "depth").iterdir() if file.stem != "depth")
+    assert [file.stem for file in files] == [f"{index:03d}" for index in (1, 2, 3, 4, 5, 6, 7)]
+    for file in files:
+        found = meaning["unit"] * (iio.imread(file) if kind == "png16" else np.load(file)).astype(np.float64)
+        expected = expected_distances(poses()[int(file.stem)])
+        seen = (expected > 0) & (found > 0)
+        assert seen.sum() > 50
+        assert ((expected > 0) != (found > 0)).sum() <= 2  # float32 at the very edge
+        assert np.abs(found - expected)[seen].max() < 2e-4 + (meaning["unit"] / 2 if kind == "png16" else 0)
+    assert len(list((folder / "rgb").iterdir())) == 7
+    assert not (tmp_path / "r" / "train.frames").exists()
+
+
+def test_colours_of_depth_have_one_range_for_the_whole_video(
+    capture_run: Path, shows_a_ball: float, tmp_path: Path
+) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    words = ("--rendered-output-names", "rgb", "depth", "accumulation", "--num-frames", 4, "--fps", 8)
+    done = called("ns-render", "interpolate", capture_run, "--output-path", tmp_path / "a.mp4", *words)
+    assert done.returncode == 0, done.stderr
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("depth: ")]
+    near, far = (float(word) for word in line.split() if word[0].isdigit())
+    every = np.concatenate([expected[expected > 0] for expected in map(expected_distances, poses())])
+    assert near == pytest.approx(every.min(), abs=0.15)
+    assert far == pytest.approx(every.max(), abs=0.15)
+    video = iio.imread(tmp_path / "a.mp4", plugin="FFMPEG")
+    assert video.shape == (4, HEIGHT, 3 * WIDTH, 3)
+    assert iio.immeta(tmp_path / "a.mp4", plugin="FFMPEG")["fps"] == 8
+    rgb, depth, opacity = np.split(video.astype(float), 3, axis=2)
+    inside = opacity[..., 0] > 200
+    assert rgb[inside].mean() == pytest.approx(64, abs=6)
+    assert depth[~inside & (opacity[..., 0] < 50)].mean() > 235  # fades to white
+    assert depth[inside].std(axis=0).max() > 15
+    given = called(
+        "ns-render", "interpolate", capture_run, "--output-path", tmp_path / "b.gif", *words,
+        "--depth-near-plane", 1, "--depth-far-plane", 9,
+    )  # fmt: skip
+    assert "depth: 1 (dark) to 9 (light), in units of the input" in given.stderr
+
+
+def test_outputs_apart_and_in_folders(capture_run: Path, shows_a_ball: float, tmp_path: Path) -> None:
+    words = ("--num-frames", 2, "--rendered-output-names", "rgb", "accumulation")
+    for output in ("a.gif", "apart", "beside"):
+        apart = ("--apart", "True") if output != "beside" else ("--image-format", "jpeg")
+        done = called("ns-render", "spiral", *words, capture_run, "--output-path", tmp_path / output, *apart)
+        assert done.returncode == 0, done.stderr
+    found = {file.relative_to(tmp_path).as_posix() for file in tmp_path.rglob("*") if file.is_file()}
+    assert found == {
+        "a-rgb.gif", "a-accumulation.gif",
+        "apart/rgb/00000.png", "apart/rgb/00001.png", "apart/accumulation/00000.png", "apart/accumulation/00001.png",
+        "apart/render.json", "beside/00000.jpg", "beside/00001.jpg", "beside/render.json",
+    }  # fmt: skip
+    assert iio.imread(tmp_path / "beside" / "00000.jpg").shape == (HEIGHT, 2 * WIDTH, 3)
+    again = called("ns-render", "spiral", *words, capture_run, "--output-path", tmp_path / "beside")
+    assert again.returncode == 1
+    assert "beside holds images of another render (render.json differs); name another folder" in again.stderr
+
+
+def test_the_true_image_and_the_error(ball_run: Path, shared_tiny: Path, tmp_path: Path) -> None:
+    words = ("--rendered-output-names", "rgb", "gt-rgb", "error")
+    for factor in (1, 2):
+        output = tmp_path / f"r{factor}"
+        done = called("ns-render", "dataset", ball_run, "--output-path", output, *words, "--downscale-factor", factor)
+        assert done.returncode == 0, done.stderr
+        for index in range(3):
+            rgb, truth, error = (iio.imread(output / "test" / name / f"r_{index}.png") for name in words[1:])
+            rgba = iio.imread(shared_tiny / "test" / f"r_{index}.png").astype(float)
+            over_white = rgba[..., :3] * rgba[..., 3:] / 255 + 255 - rgba[..., 3:]
+            size = 20 // factor
+            expected = over_white.reshape(size, factor, size, factor, 3).mean((1, 3))
+            assert np.abs(truth - expected).max() < (1 if factor == 1 else 2)
+            off = np.abs(rgb.astype(float) - truth).mean(-1) / 255 / 0.25
+            assert np.abs(error[..., 0] / 255 - np.clip(3 * off, 0, 1)).max() < 0.04
+
+
+def test_a_killed_render_goes_on_to_the_same_file(
+    ball_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ending = ".mp4" if find_spec("imageio_ffmpeg") else ".gif"
+    words = ("orbit", ball_run, "--num-frames", 6, "--rendered-output-names", "rgb", "depth")
+    whole, parts = tmp_path / f"whole{ending}", tmp_path / f"parts{ending}"
+    assert called("ns-render", *words, "--output-path", whole).returncode == 0
+    rendered: list[int] = []
+    render_view, stop = RayModel.render_view, 4
+
+    def counted(model: Any, view: View, background: Tensor) -> Picture:
+        rendered.append(1)
+        if len(rendered) == stop:
+            raise KeyboardInterrupt
+        return render_view(model, view, background)
+
+    monkeypatch.setattr(RayModel, "render_view", counted)
+    stopped = called("ns-render", *words, "--output-path", parts)
+    assert stopped.returncode == 130
+    assert "3 of 6 frames are in" in stopped.stderr
+    assert not parts.exists()
+    # Another command does not take them, and does not remove them.
+    other = called("ns-render", *words, "--output-path", parts, "--downscale-factor", 2)
+    assert "holds frames of another render" in other.stderr
+    assert len(rendered) == 4 + 6
+    other_bytes = parts.read_bytes()
+    stop = -1
+    done = called("ns-render", *words, "--output-path", parts)
+    assert "3 of 6 frames are there already" in done.stderr
+    assert len(rendered) == 4 + 6 + 3
+    assert parts.read_bytes() == whole.read_bytes() != other_bytes
+    assert sorted(file.name for file in tmp_path.iterdir()) == sorted([whole.name, parts.name])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="SIGKILL")
+def test_a_process_that_is_killed_loses_no_frame(ball_run: Path, tmp_path: Path) -> None:
+    words = ("orbit", ball_run, "--num-frames", 60)
+    whole, parts = tmp_path / "whole.gif", tmp_path / "parts.gif"
+    assert called("ns-render", *words, "--output-path", whole).returncode == 0
+    with subprocess.Popen([command("ns-render"), *map(str, words), "--output-path", str(parts)]) as process:
+        while process.poll() is None and len(list(tmp_path.glob("parts.gif.frames/*/*.npz"))) < 3:
+            time.sleep(0.005)
+        process.kill()
+    assert not parts.exists()
+    done = called("ns-render", *words, "--output-path", parts)
+    assert "of 60 frames are there already" in done.stderr
+    assert parts.read_bytes() == whole.read_bytes()
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["parts.gif", "whole.gif"]
+
+
+def test_a_full_disk_is_a_line_and_keeps_the_frames(
+    ball_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Refused
+) -> None:
+    write, written = frames.write_atomically, []
+
+    def full(path: Path, content: Any) -> None:
+        written.append(path)
+        if len(written) > 3:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        write(path, content)
+
+    monkeypatch.setattr(frames, "write_atomically", full)
+    said = refused(render_command.main, "orbit", ball_run, "--output-path", tmp_path / "a.gif", "--num-frames", 4)
+    assert said.endswith("000002.npz: No space left on device")
+    assert len(list((tmp_path / "a.gif.frames").glob("*/*.npz"))) == 2
+
+
+def test_a_camera_path_is_rendered_at_its_times_and_speed(
+    tiny: Path, edit_json: EditJson, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    edit_json(lambda c: [frame.update(time=i / 9) for i, frame in enumerate(c["frames"])])
+    trainer = tiny_trainer("kplanes", tiny, tmp_path / "run", max_num_iterations=1)
+    trainer.train()
+    asked: list[View] = []
+
+    def render_view(model: Any, view: View, background: Tensor) -> Picture:
+        asked.append(view)
+        return Picture(torch.full((view.height, view.width, 3), 0.1 * len(asked)), *[torch.ones(view.height, 1)] * 3)
+
+    monkeypatch.setattr(RayModel, "render_view", render_view)
+    cameras = torch.eye(4, dtype=torch.float64)[:3].repeat(3, 1, 1)
+    cameras[:, 0, 3] = torch.tensor([1.0, 2, 3])
+    path = CameraPath(
+        "perspective", 48, 32, cameras, torch.full((3,), 53.13010235), 0.75, times=torch.tensor([0.5, 0.25, 1.0])
+    )  # fmt: skip
+    write_camera_path(tmp_path / "camera_path.json", path)
+    words = ("camera-path", trainer.run.folder, "--camera-path-filename", tmp_path / "camera_path.json")
+    done = called("ns-render", *words, "--output-path", tmp_path / "a.gif", "--downscale-factor", 2)
+    assert done.returncode == 0, done.stderr
+    assert [view.time for view in asked] == [0.5, 0.25, 1.0]
+    assert [float(view.camera.camera_to_worlds[0, 0, 3]) for view in asked] == [1, 2, 3]
+    assert [(view.width, view.height) for view in asked] == [(24, 16)] * 3
+    assert float(asked[0].camera.fx[0]) == pytest.approx(16 / 2 / math.tan(math.radians(53.13010235) / 2))
+    assert iio.immeta(tmp_path / "a.gif")["duration"] == 250
+
+
+def test_what_cannot_be_rendered_is_refused_at_once(ball_run: Path, tmp_path: Path, refused: Refused) -> None:
+    def said(*words: object) -> str:
+        return refused(render_command.main, *words, "--output-path", tmp_path / "a.gif")
+
+    nowhere = tmp_path / "none"
+    names = "--rendered-output-names"
+    assert "the true image is known to 'ns-render dataset' alone" in said("orbit", nowhere, names, "rgb", "error")
+    assert "name at least one output, and each once" in said("orbit", nowhere, names, "rgb", "rgb")
+    assert "add depth to --rendered-output-names" in said("orbit", nowhere, "--depth-format", "npy")
+    assert "needs a folder" in said("orbit", nowhere, names, "depth", "--depth-format", "npy")
+    assert "near must be at least 0, below far" in said(
+        "orbit", nowhere, "--depth-near-plane", 3, "--depth-far-plane", 2
+    )
+    assert "--fps more than 0" in said("orbit", nowhere, "--fps", 0)
+    assert "--radius is -1; it must be above zero" in said("spiral", nowhere, "--radius", -1)
+    avi = refused(render_command.main, "orbit", nowhere, "--output-path", tmp_path / "a.avi")
+    assert avi.endswith("the extension must be .mp4, .gif, .webp, .png, or none for a folder of images")
+    assert "this method has none" in said("orbit", ball_run, names, "normals", "--num-frames", 1)
+    assert not list(tmp_path.iterdir())
+    path = ("camera-path", ball_run, "--camera-path-filename", nowhere)
+    assert said(*path).endswith("none: No such file or directory")
+    assert "the run knows its data format; leave it out" in said("orbit", ball_run, "blender")
+    assert "nerfstudio's; here it is --fps" in said("interpolate", nowhere, "--frame_rate=24")
+    assert "the extension of --output-path says it" in said("spiral", nowhere, "--output-format", "images")
+
+
+def test_the_bound_of_the_error_is_said(ball_run: Path, tmp_path: Path) -> None:
+    done = called(
+        "ns-render", "orbit", ball_run, "--output-path", tmp_path / "a.gif", "--num-frames", 1, "--max-error", "1/255"
+    )
+    assert done.returncode == 0, done.stderr
+    assert "rays ended where the rest could change a colour by at most 0.0039" in done.stderr

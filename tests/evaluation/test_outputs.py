@@ -1,0 +1,72 @@
+"""Outputs of a view: colours and numbers worked out by hand."""
+
+import numpy as np
+import pytest
+import torch
+
+from framework.base.errors import ConfigError
+from framework.evaluation.outputs import (
+    NAMES,
+    distance_range,
+    kept_outputs,
+    largest_distance,
+    opaque_distance,
+    shown_output,
+    side_by_side,
+)
+from framework.rendering.rendered import Picture
+
+
+def picture(**changes: object) -> Picture:
+    """Two pixels: an opaque one at 2, and an empty one at 1000."""
+    values = {
+        "rgb": torch.tensor([[[0.5, 0.25, 0.0], [1.0, 1.0, 1.0]]]),
+        "depth": torch.tensor([[2.0, 1000.0]]),
+        "median_depth": torch.tensor([[2.5, 1000.0]]),
+        "accumulation": torch.tensor([[1.0, 0.0]]),
+        "normals": torch.tensor([[[0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]]),
+    }
+    return Picture(**{**values, **changes})  # type: ignore[arg-type]
+
+
+def test_every_output_has_a_picture() -> None:
+    truth = torch.tensor([[[0.5, 0.25, 0.25 * 3], [1.0, 1.0, 1.0]]])  # off by 0.75 in one of three channels
+    kept = kept_outputs(picture(), NAMES, 0.5, truth)
+    ranges = {"depth": (0.0, 1.0), "median_depth": (0.0, 2.5)}
+    shown = {name: shown_output(kept, name, ranges).tolist() for name in NAMES}
+    assert shown["rgb"] == [[[128, 64, 0], [255, 255, 255]]]
+    assert shown["gt-rgb"] == [[[128, 64, 191], [255, 255, 255]]]
+    assert shown["error"] == [[[255, 255, 255], [0, 0, 0]]]  # 0.25 on average is white
+    assert shown["accumulation"] == [[[255] * 3, [0] * 3]]
+    assert shown["normals"] == [[[128, 128, 255], [255] * 3]]
+    assert shown["depth"] == [[[253, 231, 37], [255] * 3]]  # the light end of viridis, and white for nothing
+    assert shown["median_depth"] == [[[33, 145, 141], [255] * 3]]  # 1.25 of 2.5: its middle, #21918c, but for rounding
+    assert side_by_side([np.array(shown["rgb"]), np.array(shown["normals"])]).shape == (1, 4, 3)
+
+
+def test_distances_are_in_units_of_the_input() -> None:
+    kept = kept_outputs(picture(), ["depth"], 3.0)
+    assert set(kept) == {"depth", "accumulation"}
+    assert opaque_distance(kept, "depth").tolist() == [[6.0, 0.0]]
+    infinite = kept_outputs(picture(depth=torch.tensor([[torch.inf, 1.0]])), ["depth"], 3.0)
+    assert opaque_distance(infinite, "depth").tolist() == [[0.0, 0.0]]
+
+
+def test_the_range_is_that_of_all_frames_and_of_surfaces_alone() -> None:
+    solid = torch.ones(1, 2)
+    frames = [
+        kept_outputs(picture(depth=torch.tensor(depths), accumulation=opacity), ["depth"], 1.0)
+        for depths, opacity in (([[2.0, 3.0]], solid), ([[1.0, 2.0]], solid), ([[0.1, 99.0]], 0 * solid))
+    ]
+    assert distance_range(frames, "depth") == (1.0, 3.0)
+    assert largest_distance(frames, "depth") == 3.0
+    assert distance_range(frames[2:], "depth") == (0.0, 1.0)
+    assert largest_distance(frames[2:], "depth") == 0.0
+
+
+def test_what_a_method_has_not_is_refused() -> None:
+    with pytest.raises(ConfigError, match="this method has none"):
+        kept_outputs(picture(normals=None), ["normals"], 1.0)
+    for name in ("error", "gt-rgb"):
+        with pytest.raises(ConfigError, match="only 'ns-render dataset' knows the true images"):
+            kept_outputs(picture(), [name], 1.0)

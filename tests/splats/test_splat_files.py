@@ -1,0 +1,103 @@
+"""Files of Gaussians that stand for a run: the same pictures as the run's, in the frame of the input."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from framework.cli import evaluate as eval_command
+from framework.splats.files import read_gaussians, write_gaussians
+from framework.training.splat_files import load_run_or_splats
+from tests.cli.helpers import called
+from tests.conftest import Refused
+from tests.dataparsers.captures import write_capture
+
+FLAGS = "--num-gaussians 200 --start-gaussians 200 --start random --vis none --max-eval-images 0 --timestamp t"
+
+
+def trained(data: Path, output: Path, *flags: object) -> Path:
+    """The folder of a short run of gaussian-splatting."""
+    words = ("--data", data, "--output-dir", output, *FLAGS.split(), "--max-num-iterations", 10, *flags)
+    done = called("ns-train", "gaussian-splatting", *words)
+    assert done.returncode == 0, done.stderr
+    return output / data.name / "gaussian-splatting" / "t"
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A capture that is turned, moved and scaled when it is placed."""
+    return write_capture(tmp_path_factory.mktemp("capture") / "capture")
+
+
+@pytest.fixture(scope="module")
+def capture_run(capture: Path) -> Path:
+    return trained(capture, capture.parent / "out")
+
+
+def psnr(file: Path) -> float:
+    return json.loads(file.read_text())["results"]["psnr"]
+
+
+@pytest.mark.parametrize("kind", ["ply", "spz"])
+def test_a_file_has_the_psnr_of_its_run(kind: str, capture: Path, capture_run: Path, tmp_path: Path) -> None:
+    placement = load_run_or_splats(capture_run).content
+    assert placement["scale"] < 0.5
+    assert not torch.allclose(placement["transform"], torch.eye(4)[:3], atol=0.1)
+    called("ns-export", "gaussian-splat", capture_run, "--output-dir", tmp_path, "--format", kind)
+    file = tmp_path / f"splat.{kind}"
+    for words in ((capture_run,), (file, "--data", capture)):
+        done = called("ns-eval", *words)
+        assert done.returncode == 0, done.stderr
+    found, expected = psnr(tmp_path / "splat.eval.json"), psnr(capture_run / "eval.json")
+    assert found == pytest.approx(expected, abs=0.01 if kind == "ply" else 0.3)
+    if kind == "ply":  # not because pictures are empty
+        unplaced = read_gaussians(file)
+        write_gaussians(tmp_path / "else.ply", unplaced.map(torch.clone)[:1])
+        called("ns-eval", tmp_path / "else.ply", "--data", capture)
+        assert abs(psnr(tmp_path / "else.eval.json") - expected) > 0.5
+
+
+def test_the_format_and_its_flags_may_be_named(shared_tiny: Path, tmp_path: Path) -> None:
+    run = trained(shared_tiny, tmp_path / "out", "blender", "--downscale-factor", 2)
+    called("ns-export", "gaussian-splat", run, "--output-dir", tmp_path)
+    called("ns-eval", run)
+    done = called("ns-eval", tmp_path / "splat.ply", "--data", shared_tiny, "blender", "--downscale-factor", 2)
+    assert done.returncode == 0, done.stderr
+    assert psnr(tmp_path / "splat.eval.json") == pytest.approx(psnr(run / "eval.json"), abs=0.01)
+    loaded = load_run_or_splats(tmp_path / "splat.ply", data=shared_tiny)
+    assert loaded.model.scene.has_alpha
+    assert loaded.model.scene.num_cameras == 10
+
+
+def test_paths_through_a_file(capture: Path, capture_run: Path, tmp_path: Path) -> None:
+    """Each picture as the run's."""
+    called("ns-export", "gaussian-splat", capture_run, "--output-dir", tmp_path)
+    words = ("--num-frames", 2, "--rendered-output-names", "rgb", "depth", "normals", "--depth-format", "npy")
+    run = ("orbit", capture_run, *words, "--output-path", tmp_path / "run")
+    file = ("orbit", tmp_path / "splat.ply", "--data", capture, *words, "--output-path", tmp_path / "file")
+    said = [called("ns-render", *given).stderr for given in (run, file)]
+    import imageio.v3 as iio
+    import numpy as np
+
+    for name in ("00000.png", "00001.png"):
+        one, other = (iio.imread(tmp_path / folder / name).astype(float) for folder in ("run", "file"))
+        assert np.abs(one - other).mean() < 0.2, said
+        one, other = (np.load(tmp_path / folder / "depth" / name.replace("png", "npy")) for folder in ("run", "file"))
+        both = (one > 0) & (other > 0)
+        assert both.sum() > 0.9 * max((one > 0).sum(), (other > 0).sum()) > 0
+        np.testing.assert_allclose(one[both], other[both], rtol=2e-3)
+
+
+def test_what_does_not_fit_is_refused(capture: Path, capture_run: Path, tmp_path: Path, refused: Refused) -> None:
+    called("ns-export", "gaussian-splat", capture_run, "--output-dir", tmp_path)
+    file = tmp_path / "splat.ply"
+    assert refused(eval_command.main, file).endswith("does not know its photographs: --data DIR")
+    data = ("--data", capture)
+    for flag, value in (("--rays-per-pixel", 4), ("--load-checkpoint", file), ("--eval-appearance", "half")):
+        said = refused(eval_command.main, file, *data, flag, value)
+        assert said == f"error: {flag} is of no use with a file of Gaussians: leave it out"
+    assert "No such file" in refused(eval_command.main, tmp_path / "none.ply", *data)
+    file.write_bytes(b"ply\nformat")
+    assert str(file) in refused(eval_command.main, file, *data)
+    assert "the run knows its data format" in refused(eval_command.main, capture_run, "nerfstudio")

@@ -238,7 +238,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         assert config.start_gaussians is not None
         box = scene.box
         anywhere = box[0] + torch.rand(min(config.start_gaussians, WITHOUT_IMAGES), 3) * (box[1] - box[0])
-        self._set(from_points(anywhere, torch.full_like(anywhere, 0.5), config.degree))
+        self.set_gaussians(from_points(anywhere, torch.full_like(anywhere, 0.5), config.degree))
 
     @property
     def runs_on_kernels(self) -> bool:
@@ -298,16 +298,11 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
             points = self._first_points(kind, dataset)
             first = from_points(points, seen_colors(points, dataset), self.config.degree)
         self.extent.copy_(_extent(self.scene, first.means))
-        self._set(first)
+        self.set_gaussians(first)
         self.found.fill_(kind == "field")
         where = {"points": "at the points of a reconstruction", "field": "on the surfaces of a field"}
         where |= {"silhouettes": "in the visual hull", "random": "anywhere in the box"}
         say(f"  {len(first):,} Gaussians start {where[kind]}")
-
-    def _set(self, gaussians: Gaussians) -> None:
-        gaussians = replace(gaussians, means=gaussians.means / self.extent)
-        for parameter, values in zip(self.parameters_of_gaussians(), vars(gaussians).values(), strict=True):
-            parameter.data = values.reshape(len(gaussians), parameter.shape[1]).contiguous()
 
     def set_gaussians(self, gaussians: Gaussians) -> None:
         """Replace them.
@@ -315,7 +310,9 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         Args:
             gaussians: the new ones, with harmonics of the settings' degree.
         """
-        self._set(gaussians)
+        gaussians = replace(gaussians, means=gaussians.means / self.extent)
+        for parameter, values in zip(self.parameters_of_gaussians(), vars(gaussians).values(), strict=True):
+            parameter.data = values.reshape(len(gaussians), parameter.shape[1]).contiguous()
 
     def _first_points(self, kind: str, dataset: Dataset) -> Tensor:
         count, box = self.config.start_gaussians, self.scene.box.to(self.device)

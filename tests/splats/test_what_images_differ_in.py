@@ -22,7 +22,7 @@ def model_of(gaussians: Gaussians, cameras: Cameras, **settings: object) -> Gaus
     scene = dataclasses.replace(SCENE, num_cameras=len(cameras), camera_to_worlds=cameras.camera_to_worlds)
     config, _ = decide(GaussianSplattingConfig(num_gaussians=10, degree=0, **settings), scene)  # type: ignore[arg-type]
     model = GaussianSplatting(config, scene)
-    model._set(gaussians)
+    model.set_gaussians(gaussians)
     return model
 
 
@@ -165,5 +165,5 @@ def test_the_background_of_a_capture_cannot_be_learnt() -> None:
     assert len({tuple(corner.tolist()) for corner in corners}) == 3
     config = dataclasses.replace(config, background="black")
     model = GaussianSplatting(config, captured)
-    model._set(ball())
+    model.set_gaussians(ball())
     assert not model.loss(batch, 0).rgb[0, 0].any()

@@ -108,9 +108,10 @@ class GaussianSplattingConfig(
     """Weight of 1 - SSIM in the loss; the absolute error has the rest."""
     antialiased: bool = False
     """Compensate the minimum width of a Gaussian on an image by its opacity (Mip-Splatting)."""
-    strategy: Literal["mcmc", "adc"] = "mcmc"
-    """How Gaussians come and go. mcmc: transparent ones are moved to opaque ones (3DGS-MCMC). adc: they are dropped,
-    and those whose image positions have large gradients are cloned or split (adaptive density control of 3DGS)."""
+    strategy: Literal["adc", "mcmc"] = "adc"
+    """How Gaussians come and go. adc: transparent ones are dropped, and those whose image positions have large
+    gradients are cloned or split (adaptive density control of 3DGS). mcmc: transparent ones are moved to opaque ones
+    (3DGS-MCMC)."""
     growth_end: float = 0.8
     """Share of the budget after which no Gaussian is added or moved."""
     steps_per_move: int = 100

@@ -38,8 +38,9 @@ PIXELS_PER_SECOND = 25 * 400 * 400
 """Pixels that training draws in a second, about, on two cores; for what is decided by the budget."""
 MOST_STEPS_PER_SECOND = 100
 """However small the images are."""
-NOISE, PENALTY = 5e5, 0.01
-"""Noise and both penalties (Kheradmand et al. 2024), where Gaussians have to find their places."""
+NOISE, OPACITY_PENALTY, SCALE_PENALTY = 5e5, 0.002, 0.01
+"""Noise and penalties where Gaussians have to find their places: those of Kheradmand et al. 2024, but for the first
+penalty, which at a few hundred steps of a higher rate left too few of them."""
 WITHOUT_IMAGES = 1_000
 """Maximum number of Gaussians of a model that has seen no images yet."""
 HULL_CELLS = 128
@@ -362,9 +363,9 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
             assert batch.distances is not None
             known = batch.distances if reduced == 1 else batch.distances[::2, ::2][: rgb.shape[0], : rgb.shape[1]]
             terms["depth"] = config.depth_loss_mult * _depth_error(drawn.image[..., 3], drawn.transmittance, known)
-        if (weight := self._chosen(config.opacity_penalty, PENALTY)) > 0:
+        if (weight := self._chosen(config.opacity_penalty, OPACITY_PENALTY)) > 0:
             terms["opacity"] = weight * torch.sigmoid(gaussians.logits).mean()
-        if (weight := self._chosen(config.scale_penalty, PENALTY)) > 0:
+        if (weight := self._chosen(config.scale_penalty, SCALE_PENALTY)) > 0:
             terms["scale"] = weight / self.extent * gaussians.log_scales.exp().mean()
         shown = rgb.detach() if reduced == 1 else _doubled(rgb.detach(), batch.rgb)
         return Loss(terms, shown)

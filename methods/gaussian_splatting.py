@@ -41,6 +41,8 @@ MOST_STEPS_PER_SECOND = 100
 NOISE, OPACITY_PENALTY, SCALE_PENALTY = 5e5, 0.002, 0.01
 """Noise and penalties where Gaussians have to find their places: those of Kheradmand et al. 2024, but for the first
 penalty, which at a few hundred steps of a higher rate left too few of them."""
+LARGE_IMAGE = 250_000
+"""Pixels from which training begins with images of half the size."""
 WITHOUT_IMAGES = 1_000
 """Maximum number of Gaussians of a model that has seen no images yet."""
 HULL_CELLS = 128
@@ -125,8 +127,8 @@ class GaussianSplattingConfig(
     """Weight of the mean opacity in the loss; by the start if not given."""
     scale_penalty: float | None = None
     """Weight of the mean scale, in scene extents, in the loss; by the start if not given."""
-    reduced_until: float = 0.0
-    """Share of the budget in which images are half as wide and high."""
+    reduced_until: Auto[float] = AUTO
+    """Share of the budget in which images are half as wide and high. If not given: 0.4 of large images, else 0."""
     appearance: Auto[bool] = AUTO
     """Whether each training image has a transform of colours of its own. If not given: if light or exposure differ."""
     appearance_rate: float = 1e-3
@@ -153,11 +155,14 @@ def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplat
     why = "that suits the time"
     config, made = fill(config, Choice("num_gaussians", count, why, "Gaussians", f"up to {count:,}"))
     assert config.num_gaussians is not None
+    large = PIXELS_PER_SECOND / speed > LARGE_IMAGE
+    detail = "large images can wait" if large else "the images are small"
     first, most = max(config.num_gaussians * 2 // 3, 1), 800 if scene.unbounded else 400
     config, more = fill(
         config,
         Choice("start_gaussians", first, "the others are added", "Gaussians at the start", f"{first:,}"),
         Choice("field_steps", int(min(max(2 * seconds, 120), most)), why, "steps of a field to start from"),
+        Choice("reduced_until", 0.4 if large else 0.0, detail, "share of the budget with images of half the size"),
         Choice("rate_factor", round(factor, 2), "fewer steps have to go farther", "factor of learning rates"),
         Choice(
             "appearance",

@@ -246,6 +246,7 @@ class Trainer:
         self.train_set = skip_by_silhouettes(self.config, self.model, self.train_set, fresh)
         self.source = self.source.drawing_from(self.train_set)
         if fresh and isinstance(self.model, StartsFromImages):
+            seed_step(self.config.machine.seed, -1)  # before all steps, whatever was drawn since the model was made
             self.model.start(self.train_set)
         seconds = time.perf_counter() - start
         if fresh:

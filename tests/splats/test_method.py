@@ -162,3 +162,21 @@ def test_colours_may_be_the_same_from_everywhere(shared_tiny: Path, tmp_path: Pa
 def test_the_method_is_declared() -> None:
     assert METHOD.model is GaussianSplatting
     assert METHOD.field is None
+
+
+@pytest.mark.parametrize("strategy", ["adc", "mcmc"])
+def test_a_run_goes_on_with_the_same_bits_between_two_changes(strategy: str, shared_tiny: Path, tmp_path: Path) -> None:
+    """Gradients that are being counted are a part of a checkpoint, and so are all numbers of Gaussians."""
+    settings = {"strategy": strategy, "steps_per_move": 10, "steps_per_reset": 20, "max_num_iterations": 60}
+    whole = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path / "whole", **settings)
+    parts = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path / "parts", **settings)
+    for trainer, steps in ((whole, 38), (parts, 15)):
+        for _ in range(steps):
+            trainer.train_step()
+    resumed = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path / "resumed", **settings)
+    resumed.restore(load_checkpoint(parts.save()))
+    for _ in range(23):
+        resumed.train_step()
+    for first, second in zip(whole.model.parameters(), resumed.model.parameters(), strict=True):
+        assert torch.equal(first, second)
+    assert len(whole.model.gaussians()) != len(parts.model.gaussians())  # type: ignore[operator]

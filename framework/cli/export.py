@@ -73,7 +73,7 @@ class WebFlags(ExportFlags):
     max_megabytes: float = 30.0
     """Maximum size of the page in millions of bytes, up to 32: fewer harmonics first, fewer Gaussians last."""
     fit_seconds: float = 60.0
-    """Seconds for fitting Gaussians to a field: pictures of it, and training on them."""
+    """Seconds for fitting Gaussians to a field: rendering pictures of it, and training on them."""
     time: float | None = None
     """Moment that is shown of a scene that moves, 0 to 1; 0 if not given."""
 

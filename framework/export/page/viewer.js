@@ -111,7 +111,7 @@ function show(gl, gaussians, facts) {
   }
 
   // Frames: only where something has changed; coarser while it moves on a slow device.
-  let coarse = 1, moving = false, last = 0, frames = 0, since = 0, line = "";
+  let coarse = 1, moving = false, last = 0, drew = false, frames = 0, since = 0, line = "";
   function resize() {
     const ratio = window.devicePixelRatio || 1;
     let width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
@@ -143,7 +143,8 @@ function show(gl, gaussians, facts) {
     last = now;
     moving = fly(seconds) || spinning || pointers.size > 0 || now < settled;
     if (before !== moving) dirty = true;
-    if (moving && before && frames > 1) adapt(took);
+    if (moving && before && drew) adapt(took);
+    drew = false;
     if (lost) return;
     if (dirty) requestOrder();
     if (dirty && order) {
@@ -153,9 +154,10 @@ function show(gl, gaussians, facts) {
       needsOrder = false;
       drawn.draw(cameraOf(view, canvas.width, canvas.height), background);
       frames += 1;
+      drew = true;
       if (state.state !== "ready") first();
     }
-    if (now - since > 500) report(now);
+    if (now - since > 1000) report(now);
   }
 
   function adapt(took) {
@@ -173,8 +175,8 @@ function show(gl, gaussians, facts) {
 
   function report(now) {
     const rate = (1000 * frames) / (now - since);
-    if (frames > 2) state.rate = rate.toFixed(1);
-    const text = `${gaussians.count.toLocaleString("en")} Gaussians · ${frames > 2 ? `${rate.toFixed(0)} frames/s` : "still"}`;
+    if (frames > 1 && moving) state.rate = rate.toFixed(1);
+    const text = `${gaussians.count.toLocaleString("en")} Gaussians · ${frames > 1 && moving ? `${rate.toFixed(rate < 10 ? 1 : 0)} frames/s` : "still"}`;
     if (text !== line) element("line").textContent = line = text;
     frames = 0;
     since = now;

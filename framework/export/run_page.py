@@ -168,9 +168,7 @@ def _moment(moving: bool, asked: float | None) -> float | None:
 
 def _at(dataset: Dataset, moment: float | None) -> Dataset:
     """Return a data set whose images are all taken at one moment."""
-    if moment is None or dataset.times is None:
-        return dataset
-    return replace(dataset, times=torch.full_like(dataset.times, moment))
+    return dataset if moment is None else replace(dataset, times=torch.full((len(dataset),), moment).to(dataset.device))
 
 
 def _title(trained: Trained) -> str:

@@ -43,7 +43,7 @@ VIEWS = 5
 
 @dataclass(frozen=True)
 class Closeness:
-    """How close a page's Gaussians come to their run, drawn by our own renderer on held-out views."""
+    """Metrics of a page's Gaussians against their run, drawn by our own renderer on held-out views."""
 
     views: int
     """Number of views."""

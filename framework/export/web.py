@@ -45,7 +45,7 @@ DATA = re.compile(r'<script id="data" type="text/plain">([^<]*)</script>')
 
 @dataclass(frozen=True)
 class PageFacts:
-    """What a page knows of the scene besides its Gaussians."""
+    """Facts that a page has about the scene besides its Gaussians."""
 
     title: str
     """Heading and title of the page."""
@@ -158,7 +158,10 @@ def make_page(gaussians: Gaussians, facts: PageFacts, max_megabytes: float) -> t
 
 
 def check_size(max_megabytes: float) -> None:
-    """Check the limit of a page's size, in millions of bytes.
+    """Check the limit of a page's size.
+
+    Args:
+        max_megabytes: the limit, in millions of bytes.
 
     Raises:
         ConfigError: if it is not positive, or above LARGEST.

@@ -157,11 +157,11 @@ function show(gl, gaussians, facts) {
       drew = true;
       if (state.state !== "ready") first();
     }
-    if (now - since > 1000) report(now);
+    if (now - since > 1000 && (!moving || frames > 1 || now - since > 10000)) report(now);
   }
 
   function adapt(took) {
-    if (took > SLOW && coarse > 0.3) coarse = Math.max(coarse * 0.85, 0.3);
+    if (took > SLOW) coarse = Math.max(coarse * Math.max(Math.sqrt(SLOW / took), 0.5), 0.3);
     else if (took < QUICK && coarse < 1) coarse = Math.min(coarse * 1.05, 1);
   }
 

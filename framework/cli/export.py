@@ -19,6 +19,7 @@ usage: ns-export WHAT RUN_FOLDER --output-dir DIR [flags]
   pointcloud      point_cloud.ply: points on surfaces, with colours, and normals if the method has them
   gaussian-splat  splat.ply or splat.spz: the Gaussians of a method that has them, for viewers
   cameras         transforms_train.json: the training cameras, with refined poses if the run has refined them
+  web             scene.html: one file that shows the scene in any browser with WebGL 2, from disk, offline
 
 ns-export WHAT --help shows its flags. Everything is written in the frame and units of the run's input.
 """
@@ -63,6 +64,18 @@ class SplatFlags(ExportFlags):
     """ply: 32 bits a number, read by every program. spz: 8 to 24 bits, compressed; about a tenth of the size."""
     max_megabytes: float | None = None
     """Make the file at most this large, in millions of bytes: fewer harmonics first, fewer Gaussians last."""
+
+
+@dataclass(frozen=True)
+class WebFlags(ExportFlags):
+    """Write scene.html: a page that shows the scene's Gaussians, or such as are fitted to the pictures of a field."""
+
+    max_megabytes: float = 30.0
+    """Maximum size of the page in millions of bytes, up to 32: fewer harmonics first, fewer Gaussians last."""
+    fit_seconds: float = 60.0
+    """Seconds for fitting Gaussians to a field: rendering pictures of it, and training on them."""
+    time: float | None = None
+    """Moment that is shown of a scene that moves, 0 to 1; 0 if not given."""
 
 
 def main() -> None:
@@ -156,10 +169,17 @@ def _splats(flags: SplatFlags, trained: Trained, placement: Placement, path: Pat
     say(f"{path.stat().st_size / 1e6:.2f} MB: {path}")
 
 
+def _web(flags: WebFlags, trained: Trained, placement: Placement, path: Path) -> None:
+    from framework.export.run_page import export_page
+
+    export_page(trained, path, flags.max_megabytes, flags.fit_seconds, flags.time)
+
+
 KINDS: dict[str, tuple[type[Any], str, Any]] = {
     "pointcloud": (PointFlags, "point_cloud.ply", _points),
     "gaussian-splat": (SplatFlags, "splat.{format}", _splats),
     "cameras": (CameraFlags, "transforms_train.json", _cameras),
+    "web": (WebFlags, "scene.html", _web),
 }
 
 if __name__ == "__main__":

@@ -481,4 +481,28 @@ BUGS = (
         "rotation = vh.T @ u.T",
         "held-out cameras are carried the wrong way when poses are refined",
     ),
+    Bug(
+        "page-names-not-escaped",
+        "export",
+        "framework/export/web.py",
+        '"facts": plain.replace("<", "\\u003c"),',
+        '"facts": plain,',
+        "an image that is called </script> breaks the web page, or runs what it likes in it",
+    ),
+    Bug(
+        "page-cameras-not-upright",
+        "export",
+        "framework/export/web.py",
+        "return rotation_between(up, z)",
+        "return rotation_between(z, up)",
+        "a scene whose up is not z lies on its side in the web page",
+    ),
+    Bug(
+        "part-of-an-image-shifted",
+        "export",
+        "framework/export/splat_fit.py",
+        "cy=camera.cy - top,",
+        "cy=camera.cy + top,",
+        "Gaussians are fitted to parts of pictures that are in other places",
+    ),
 )

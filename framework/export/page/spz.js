@@ -1,0 +1,181 @@
+// Gaussians from an SPZ file of version 2 (framework/splats/spz.py): base64, gzip, then one array an attribute.
+
+const HEADER = 16;
+const TEXEL = 16; // bytes
+
+/** What the page cannot show; its message is for people. */
+class Refused extends Error {}
+
+/** Return the bytes of base64 text. */
+function bytesOf(text) {
+  let binary;
+  try {
+    binary = atob(text.trim());
+  } catch (error) {
+    throw new Refused("The data in this page are damaged: they are not base64. Copy or export the page again.");
+  }
+  const bytes = new Uint8Array(binary.length);
+  for (let i = 0; i < bytes.length; i++) bytes[i] = binary.charCodeAt(i);
+  return bytes;
+}
+
+/** Return what gzip has compressed; by the browser if it can, else by `inflate`. */
+async function gunzip(bytes, plain) {
+  const damaged = "The data in this page are damaged or truncated. Copy or export the page again.";
+  if (bytes.length < 18 || bytes[0] !== 0x1f || bytes[1] !== 0x8b || bytes[2] !== 8) throw new Refused(damaged);
+  try {
+    if (!plain && typeof DecompressionStream === "function") {
+      const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+      return new Uint8Array(await new Response(stream).arrayBuffer());
+    }
+    const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+    const out = inflate(bytes.subarray(10, bytes.length - 8), view.getUint32(bytes.length - 4, true));
+    if (crc32(out) !== view.getUint32(bytes.length - 8, true)) throw new Error("checksum");
+    return out;
+  } catch (error) {
+    throw new Refused(damaged);
+  }
+}
+
+/** Return the CRC-32 of bytes, as gzip has it. */
+function crc32(bytes) {
+  const table = new Uint32Array(256);
+  for (let n = 0; n < 256; n++) {
+    let value = n;
+    for (let k = 0; k < 8; k++) value = value & 1 ? 0xedb88320 ^ (value >>> 1) : value >>> 1;
+    table[n] = value;
+  }
+  let crc = 0xffffffff;
+  for (let i = 0; i < bytes.length; i++) crc = table[(crc ^ bytes[i]) & 255] ^ (crc >>> 8);
+  return (crc ^ 0xffffffff) >>> 0;
+}
+
+/** Return `size` bytes that DEFLATE (RFC 1951) has compressed. */
+function inflate(input, size) {
+  const out = new Uint8Array(size);
+  let at = 0, end = 0, held = 0, count = 0;
+  const bits = (wanted) => {
+    while (count < wanted) {
+      if (at >= input.length) throw new Error("truncated");
+      held |= input[at++] << count;
+      count += 8;
+    }
+    const value = held & ((1 << wanted) - 1);
+    held >>>= wanted;
+    count -= wanted;
+    return value;
+  };
+  // Canonical codes: how many there are of each length, and the symbols in the order of their codes.
+  const codes = (lengths) => {
+    const counts = new Uint16Array(16), starts = new Uint16Array(16), symbols = new Uint16Array(lengths.length);
+    for (const length of lengths) counts[length]++;
+    counts[0] = 0;
+    for (let i = 1; i < 15; i++) starts[i + 1] = starts[i] + counts[i];
+    lengths.forEach((length, symbol) => { if (length) symbols[starts[length]++] = symbol; });
+    return { counts, symbols };
+  };
+  const symbol = ({ counts, symbols }) => {
+    let code = 0, first = 0, index = 0;
+    for (let length = 1; length < 16; length++) {
+      code |= bits(1);
+      if (code - first < counts[length]) return symbols[index + code - first];
+      index += counts[length];
+      first = (first + counts[length]) << 1;
+      code <<= 1;
+    }
+    throw new Error("no such code");
+  };
+  const lengthBase = [], lengthBits = [], distanceBase = [], distanceBits = [];
+  for (let i = 0, base = 3; i < 28; i++) {
+    lengthBase.push(base);
+    lengthBits.push(i < 8 ? 0 : (i >> 2) - 1);
+    base += 1 << lengthBits[i];
+  }
+  lengthBase.push(258);
+  lengthBits.push(0);
+  for (let i = 0, base = 1; i < 30; i++) {
+    distanceBase.push(base);
+    distanceBits.push(i < 4 ? 0 : (i >> 1) - 1);
+    base += 1 << distanceBits[i];
+  }
+  const fixed = [
+    codes(Array.from({ length: 288 }, (_, i) => (i < 144 ? 8 : i < 256 ? 9 : i < 280 ? 7 : 8))),
+    codes(new Array(30).fill(5)),
+  ];
+  const dynamic = () => {
+    const literals = bits(5) + 257, distances = bits(5) + 1, given = bits(4) + 4, lengths = new Array(19).fill(0);
+    const order = [16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15];
+    for (let i = 0; i < given; i++) lengths[order[i]] = bits(3);
+    const outer = codes(lengths), all = [];
+    while (all.length < literals + distances) {
+      const value = symbol(outer);
+      if (value < 16) { all.push(value); continue; }
+      const [repeated, times] = value === 16 ? [all[all.length - 1], 3 + bits(2)]
+        : value === 17 ? [0, 3 + bits(3)] : [0, 11 + bits(7)];
+      for (let i = 0; i < times; i++) all.push(repeated);
+    }
+    return [codes(all.slice(0, literals)), codes(all.slice(literals, literals + distances))];
+  };
+  for (let last = 0; !last;) {
+    last = bits(1);
+    const kind = bits(2);
+    if (kind === 0) {
+      held = count = 0;
+      const length = input[at] | (input[at + 1] << 8);
+      out.set(input.subarray(at + 4, at + 4 + length), end);
+      at += 4 + length;
+      end += length;
+      continue;
+    }
+    if (kind === 3) throw new Error("no such block");
+    const [literals, distances] = kind === 1 ? fixed : dynamic();
+    for (let value; (value = symbol(literals)) !== 256;) {
+      if (value < 256) { out[end++] = value; continue; }
+      const length = lengthBase[value - 257] + bits(lengthBits[value - 257]);
+      const code = symbol(distances), from = end - distanceBase[code] - bits(distanceBits[code]);
+      if (from < 0 || end + length > size) throw new Error("out of range");
+      for (let i = 0; i < length; i++) out[end + i] = out[from + i];
+      end += length;
+    }
+  }
+  if (end !== size) throw new Error("truncated");
+  return out;
+}
+
+/** Return the Gaussians of an unpacked SPZ file: centres (N x 3, scene coordinates), and a table for the GPU.
+ *
+ * The table has 2 texels of four 32-bit words a Gaussian, and more for its harmonics, whose bytes stay as they are:
+ *     x, y, z as float32; colour and opacity, 8 bits each
+ *     three scales, 8 bits each; three components of the quaternion, 8 bits each; two words of 0
+ */
+function gaussiansOf(raw) {
+  const view = new DataView(raw.buffer, raw.byteOffset, raw.byteLength);
+  const refuse = (why) => { throw new Refused(`The data in this page are damaged: ${why}. Export the page again.`); };
+  if (raw.length < HEADER || view.getUint32(0, true) !== 0x5053474e) refuse("they are not an SPZ file");
+  const count = view.getUint32(8, true), degree = raw[12], scale = 2 ** -raw[13];
+  if (view.getUint32(4, true) !== 2 || degree > 3 || raw[13] > 30) refuse("their header is not one of ours");
+  const rest = 3 * ((degree + 1) ** 2 - 1);
+  if (raw.length !== HEADER + count * (19 + rest)) refuse("they are not as long as their header says");
+  const extra = Math.ceil(rest / TEXEL), texels = 2 + extra;
+  const positions = HEADER, alphas = positions + 9 * count, colors = alphas + count, scales = colors + 3 * count;
+  const turns = scales + 3 * count, harmonics = turns + 3 * count;
+  const width = 1024 * texels; // a row of the texture holds 1024 Gaussians
+  const rows = Math.max(Math.ceil(count / 1024), 1);
+  const table = new Uint8Array(rows * width * TEXEL), centers = new Float32Array(3 * count);
+  const floats = new Float32Array(table.buffer);
+  for (let i = 0; i < count; i++) {
+    const to = i * texels * TEXEL;
+    for (let k = 0; k < 3; k++) {
+      const from = positions + 9 * i + 3 * k;
+      const fixed = ((raw[from] | (raw[from + 1] << 8) | (raw[from + 2] << 16)) << 8) >> 8;
+      // SPZ's y and z point the other way.
+      floats[to / 4 + k] = centers[3 * i + k] = (k ? -fixed : fixed) * scale;
+      table[to + 12 + k] = raw[colors + 3 * i + k];
+      table[to + 16 + k] = raw[scales + 3 * i + k];
+      table[to + 20 + k] = raw[turns + 3 * i + k];
+    }
+    table[to + 15] = raw[alphas + i];
+    for (let k = 0, from = harmonics + rest * i; k < rest; k++) table[to + 2 * TEXEL + k] = raw[from + k];
+  }
+  return { count, degree, centers, table: new Uint32Array(table.buffer), width, rows, texels };
+}

@@ -1,0 +1,187 @@
+"""The web page of a trained run: its Gaussians or those fitted to it, the page, and how close that comes to the run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import fmean
+
+import torch
+
+from framework.base.console import say, track
+from framework.base.errors import ConfigError, printable
+from framework.cameras.view import View
+from framework.data.dataset import Dataset
+from framework.data.pixels import composite
+from framework.evaluation.evaluator import evaluation_background, measure, spread, views_to_judge
+from framework.evaluation.metrics import psnr
+from framework.export.cameras import refined_cameras
+from framework.export.splat_fit import fit_gaussians
+from framework.export.web import (
+    PageFacts,
+    camera_rows,
+    check_size,
+    focus_of,
+    gaussians_of,
+    make_page,
+    pinhole,
+    upright,
+)
+from framework.ray_model import RayModel
+from framework.splats.drawing import DRAWN, draw, splat_camera
+from framework.splats.gaussians import Gaussians, HasGaussians
+from framework.splats.transform import transformed
+from framework.training.checkpoint import write_atomically
+from framework.training.datasets import first_split, load_split
+from framework.training.trained import Trained
+
+NEAR, LEAST_NEAR = 0.2, 1e-3
+"""Smallest depth at which a centre is drawn, as a fraction of the scene's near distance and in scene units."""
+VIEWS = 5
+"""Maximum number of held-out views by which a page is compared with its run."""
+
+
+@dataclass(frozen=True)
+class Closeness:
+    """Metrics of a page's Gaussians against their run, drawn by our own renderer on held-out views."""
+
+    views: int
+    """Number of views."""
+    method: float
+    """PSNR against the method's own pictures, dB."""
+    photographs: float | None
+    """PSNR against the photographs, dB; None if they are of other moments, or of a lens that Gaussians are not drawn
+    for."""
+    method_itself: float | None
+    """PSNR of the method's own pictures against the photographs, dB; None likewise."""
+
+    def line(self) -> str:
+        """Return a line for people."""
+        text = f"on {self.views} held-out views: PSNR {self.method:.2f} dB against the method's own pictures"
+        if self.photographs is None:
+            return text
+        return f"{text}, {self.photographs:.2f} dB against the photographs (the method: {self.method_itself:.2f} dB)"
+
+
+def export_page(trained: Trained, path: Path, max_megabytes: float, fit_seconds: float, moment: float | None) -> None:
+    """Write the web page of a run, and say its size and how close it comes.
+
+    Args:
+        trained: the run.
+        path: file to write.
+        max_megabytes: maximum size of the page, in millions of bytes.
+        fit_seconds: seconds in which Gaussians are fitted to a field.
+        moment: time that the page shows of a scene that moves, 0 to 1; 0 if None.
+
+    Raises:
+        ConfigError: if the flags do not fit the run, or there is nothing to show.
+    """
+    check_size(max_megabytes)
+    model = trained.model
+    moment = _moment(model.scene.moving, moment)
+    if not isinstance(model, (HasGaussians, RayModel)):
+        raise ConfigError(f"ns-export web: {trained.run.method} has neither Gaussians nor rays, so it cannot be shown")
+    dataset = _at(load_split(trained.run, "train").to(model.device), moment)
+    cameras = pinhole(refined_cameras(model, dataset.cameras))
+    near = max(NEAR * model.scene.near, LEAST_NEAR)
+    if isinstance(model, HasGaussians):
+        found, antialiased = model.gaussians(), bool(getattr(model.config, "antialiased", False))
+    else:
+        if not fit_seconds > 0:
+            raise ConfigError(f"--fit-seconds is {fit_seconds:g}; it must be positive")
+        found, antialiased = fit_gaussians(model, dataset, cameras, near, fit_seconds), False
+    found = found.map(lambda values: values.detach().cpu())
+    good = found[found.finite()]
+    if len(good) < len(found):
+        say(f"{len(found) - len(good):,} of {len(found):,} Gaussians are not finite and are left out")
+    if not len(good):
+        raise ConfigError("there are no Gaussians to show; train the run again")
+    turn = upright(cameras)
+    facts = PageFacts(
+        title=_title(trained),
+        about=_about(trained, moment),
+        background=tuple(evaluation_background(model).tolist()),
+        near=near,
+        antialiased=antialiased,
+        focus=focus_of(cameras, turn),
+        cameras=camera_rows(cameras, [printable(name) for name in dataset.names], turn),
+    )
+    text, costs = make_page(transformed(good, turn, 1.0, torch.zeros(3)), facts, max_megabytes)
+    for cost in costs:
+        say(cost)
+    content = text.encode("utf-8", "replace")
+    write_atomically(path, lambda file: file.write(content))
+    drawn = gaussians_of(text)
+    say(f"{len(content) / 1e6:.2f} MB, {len(drawn):,} Gaussians of degree {drawn.degree}: {path}")
+    if moment is not None:
+        say(f"the scene moves, and the page shows it at time {moment:g}, still")
+    held_out = first_split(trained.run, ("test", "val"))
+    views = _at((dataset if held_out is None else held_out).to(model.device), moment)
+    back = transformed(drawn, turn.T, 1.0, torch.zeros(3)).map(lambda values: values.to(model.device))
+    say(closeness(trained, back, views, near, antialiased, moment).line())
+
+
+def closeness(
+    trained: Trained, gaussians: Gaussians, dataset: Dataset, near: float, antialiased: bool, moment: float | None
+) -> Closeness:
+    """Compare Gaussians with the run that they show.
+
+    Args:
+        trained: the run.
+        gaussians: N Gaussians in the scene's frame, on the model's device.
+        dataset: views with images, on the model's device.
+        near: smallest depth at which a centre is drawn, scene units.
+        antialiased: whether opacity makes up for the blur of small Gaussians.
+        moment: time of the views; None for a static scene.
+    """
+    model, background = trained.model, evaluation_background(trained.model)
+    judged = views_to_judge(dataset) or list(range(len(dataset)))
+    chosen = [judged[rank] for rank in spread(len(judged), VIEWS)]
+    as_seen = dataset.cameras.model in DRAWN
+    cameras = dataset.cameras if as_seen else pinhole(dataset.cameras)
+    own: list[float] = []
+    photographs: list[tuple[float, float]] = []
+    for index in track(chosen, "Comparing", total=len(chosen)):
+        view = View.of(cameras, index, dataset.times)
+        rgb = model.render_view(view, background).rgb.clamp(0, 1).float()
+        with torch.no_grad():
+            shown = draw(gaussians, splat_camera(view.camera, near, antialiased), background).clamp(0, 1)
+        own.append(psnr(shown, rgb))
+        if as_seen and moment is None:
+            target = composite(dataset.image(index).float() / 255, background)
+            kept = dataset.kept_of(index)
+            photographs.append((measure(shown, target, kept).psnr, measure(rgb, target, kept).psnr))
+    if not photographs:
+        return Closeness(len(chosen), fmean(own), None, None)
+    page, method = zip(*photographs, strict=True)
+    return Closeness(len(chosen), fmean(own), fmean(page), fmean(method))
+
+
+def _moment(moving: bool, asked: float | None) -> float | None:
+    """Return the time that a page shows; None of a static scene."""
+    if asked is not None and not moving:
+        raise ConfigError(f"--time {asked:g}: the photographs of this run have no times")
+    if asked is not None and not 0 <= asked <= 1:
+        raise ConfigError(f"--time is {asked:g}; it must be from 0 to 1")
+    return (asked or 0.0) if moving else None
+
+
+def _at(dataset: Dataset, moment: float | None) -> Dataset:
+    """Return a data set whose images are all taken at one moment."""
+    return dataset if moment is None else replace(dataset, times=torch.full((len(dataset),), moment).to(dataset.device))
+
+
+def _title(trained: Trained) -> str:
+    config = trained.run.config
+    experiment = config.experiment_name or (config.data.resolve().name if config.data else "procedural")
+    return printable(f"{experiment} · {trained.run.method}")
+
+
+def _about(trained: Trained, moment: float | None) -> str:
+    method = trained.run.method
+    parts = [f"Made by Nerfloom with {method}."]
+    if not isinstance(trained.model, HasGaussians):
+        parts.append(f"The Gaussians shown here are fitted to pictures of {method}'s field.")
+    if moment is not None:
+        parts.append(f"The scene moves; this is time {moment:g}.")
+    return " ".join([*parts, "The page works offline and asks no host for anything."])

@@ -1,0 +1,317 @@
+"""Gaussians fitted to the pictures of a field, so that a method without Gaussians can be shown where only they can.
+
+They start on the surfaces that the field's rays end on (`framework/export/points.py`), and are then trained as in 3D
+Gaussian Splatting (Kerbl et al. 2023), with moves as in MCMC (Kheradmand et al. 2024). They are to show what the field
+has learnt, so they learn from pictures that it renders, at the training cameras and between them. A field on a CPU
+renders few in a minute; so every other step learns from a photograph, where the field was to show just that: where
+nothing moves, light does not vary, and the lens can be drawn.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from framework.base.console import say, track
+from framework.base.device import seed_step, wait_for
+from framework.base.errors import ConfigError
+from framework.base.optimised import RowChange
+from framework.cameras.cameras import Cameras
+from framework.cameras.view import View
+from framework.data.dataset import Dataset
+from framework.evaluation.evaluator import evaluation_background
+from framework.export.cameras import refined_cameras
+from framework.export.points import joined, surface_points
+from framework.kernels.native import torch_on_one_thread
+from framework.kernels.splat_project import SplatCamera
+from framework.kernels.ssim import ssim
+from framework.ray_model import RayModel
+from framework.splats.drawing import DRAWN, draw, splat_camera
+from framework.splats.gaussians import MAX_DEGREE, Gaussians
+from framework.splats.mcmc import moved
+from framework.splats.start import from_points
+from framework.training.optim import Adam
+from framework.training.step import backward
+
+PICTURES_SHARE = 0.45
+"""Share of the budget in which pictures are rendered; the others are steps."""
+PICTURES = 48
+"""Number of pictures for which the part of an image that each shows is chosen."""
+FEWEST_PICTURES = 6
+"""Minimum number of pictures, whatever they take."""
+LONGEST_SIDE = 800
+"""Maximum longer side of an image in pixels; larger ones are reduced."""
+SMALLEST_PART = 0.5
+"""Minimum share of an image's width and height that a picture shows."""
+TIMED_RAYS = 8192
+"""Number of rays by which speed is measured."""
+BETWEEN = 4
+"""One of so many pictures is from between two cameras."""
+PASSES = 4
+"""Maximum number of times that rays are drawn, of which some end on no surface."""
+OPACITY, SIZE = 0.5, 0.7
+"""Of Gaussians at the start: opacity, and standard deviation in distances to neighbours."""
+RATES = {"means": 8e-5, "log_scales": 5e-3, "rotations": 1e-3, "logits": 5e-2, "colors": 2.5e-3, "harmonics": 1.25e-4}
+"""Learning rates before the factor that the budget decides; of centres per scene extent."""
+STEPS_PER_SECOND = 25
+"""Steps a second by which that factor is chosen."""
+SSIM_WEIGHT = 0.2
+"""Weight of 1 - SSIM in the loss; the absolute error has the rest."""
+STEPS_PER_MOVE, MOVES_END, GROWTH = 100, 0.8, 1.05
+"""Steps between moves, the share of the budget after which there are none, and by how much the number grows in each,
+where there were too few surfaces."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A picture that the field has rendered."""
+
+    camera: SplatCamera
+    """Its camera."""
+    rgb: Tensor
+    """(H, W, 3) light of the field."""
+    through: Tensor
+    """(H, W, 1) share of the background's light that arrives, where images have alpha; else 0."""
+    kept: Tensor | None = None
+    """(H, W) bool, pixels that count; None for all."""
+
+
+def fit_gaussians(model: RayModel[Any], dataset: Dataset, cameras: Cameras, near: float, seconds: float) -> Gaussians:
+    """Return Gaussians that look like a field.
+
+    Args:
+        model: the model in evaluation mode.
+        dataset: the training split, on the model's device; its times are those of the pictures.
+        cameras: M pinhole cameras of that split.
+        near: smallest depth at which a Gaussian is drawn, scene units.
+        seconds: time for pictures and steps together.
+
+    Raises:
+        ConfigError: if no training ray ends on a surface.
+    """
+    begun = time.perf_counter()
+    seed_step(model.config.machine.seed, 0)
+    most = number_for(seconds)
+    points, colors = _surfaces(model, dataset, most)
+    shots = _shots(model, dataset, cameras, near, PICTURES_SHARE * seconds)
+    height, width = shots[0].rgb.shape[:2]
+    photographs = _photographs(model, dataset, near)
+    say(
+        f"learning from {len(shots)} pictures of the field, of {width} x {height}, and from {len(photographs)}"
+        f" photographs; {len(points):,} points on surfaces"
+    )
+    first = from_points(points, colors, MAX_DEGREE, OPACITY, SIZE)
+    background = evaluation_background(model)
+    rates = _rates(cameras, (1 - PICTURES_SHARE) * seconds)
+    with torch_on_one_thread():
+        left = max(seconds - (time.perf_counter() - begun), 1.0)
+        return _trained(first, shots, photographs, background, rates, most, left)
+
+
+def number_for(seconds: float) -> int:
+    """Return the number of Gaussians that suits a budget of `seconds`."""
+    return int(min(max(8_000 * math.sqrt(seconds), 20_000), 300_000))
+
+
+def _surfaces(model: RayModel[Any], dataset: Dataset, count: int) -> tuple[Tensor, Tensor]:
+    """Return up to `count` points (K, 3) on surfaces and their colours (K, 3), on the model's device."""
+    positions, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
+    for _ in track(range(PASSES), "Looking for surfaces", total=PASSES):
+        if (left := count - sum(map(len, positions))) > 0:
+            found = joined(surface_points(model, dataset, 2 * left, None))
+            positions.append(found.positions[:left])
+            colors.append(found.colors[:left])
+    if not sum(map(len, positions)):
+        raise ConfigError("no training ray ends on a surface, so there is nothing to show; is the run trained?")
+    return torch.cat(positions).to(model.device), torch.cat(colors).to(model.device)
+
+
+# -- pictures -----------------------------------------------------------------------------------------------------
+
+
+def _shots(model: RayModel[Any], dataset: Dataset, cameras: Cameras, near: float, seconds: float) -> list[Shot]:
+    """Return pictures that the model renders in about so many seconds.
+
+    They are parts of images rather than small images, in which there is too little to learn from.
+    """
+    end = time.perf_counter() + seconds
+    cameras = cameras.scaled(min(1.0, LONGEST_SIDE / float(torch.maximum(cameras.widths, cameras.heights).max())))
+    share = _part(model, dataset, cameras, seconds)
+    shots: list[Shot] = []
+    for camera, index in track(_order(cameras), "Rendering pictures", total=PICTURES):
+        if len(shots) >= FEWEST_PICTURES and time.perf_counter() > end:
+            break
+        moment = None if dataset.times is None else float(dataset.times[index])
+        shots.append(_shot(model, cropped(camera, share), moment, near))
+    return shots
+
+
+def _part(model: RayModel[Any], dataset: Dataset, cameras: Cameras, seconds: float) -> float:
+    """Return the share of images' sides that pictures show so that PICTURES, or two a camera, take so many seconds."""
+    pixels = float((cameras.widths * cameras.heights).double().mean())
+    moment = None if dataset.times is None else float(dataset.times[0])
+    background = evaluation_background(model)
+    stride = max(int(math.sqrt(pixels / TIMED_RAYS)), 1)
+    model.render_view(View(cameras[:1], moment, stride=8 * stride), background)  # allocates what the first use does
+    start, view = time.perf_counter(), View(cameras[:1], moment, stride=stride)
+    model.render_view(view, background)
+    wait_for(model.device)
+    each = (time.perf_counter() - start) / (view.width * view.height)
+    wanted = min(PICTURES, 2 * len(cameras))
+    return min(max(math.sqrt(seconds / (each * pixels * wanted)), SMALLEST_PART), 1.0)
+
+
+def cropped(camera: Cameras, share: float) -> Cameras:
+    """Return the camera of a random part of an image.
+
+    Args:
+        camera: one camera.
+        share: of its width and height.
+    """
+    sizes = [max(int(share * int(side[0])), 1) for side in (camera.widths, camera.heights)]
+    free = [int(side[0]) - size for side, size in zip((camera.widths, camera.heights), sizes, strict=True)]
+    left, top = (int(torch.randint(room + 1, ())) for room in free)
+    return replace(
+        camera,
+        cx=camera.cx - left,
+        cy=camera.cy - top,
+        widths=torch.full_like(camera.widths, sizes[0]),
+        heights=torch.full_like(camera.heights, sizes[1]),
+    )
+
+
+def _order(cameras: Cameras) -> Iterator[tuple[Cameras, int]]:
+    """Yield cameras to take pictures with, and the numbers of the training cameras that they are or are next to."""
+    count = len(cameras)
+    order = torch.randperm(count).tolist()
+    for rank, index in enumerate(order):
+        yield cameras[index : index + 1], index
+        if rank % (BETWEEN - 1) == BETWEEN - 2 and (middle := between(cameras, index)) is not None:
+            yield middle, index
+    for index in order:
+        if (middle := between(cameras, index)) is not None:
+            yield middle, index
+
+
+def between(cameras: Cameras, index: int) -> Cameras | None:
+    """Return a camera half way from one to the nearest other one; None if that looks elsewhere.
+
+    Args:
+        cameras: M cameras.
+        index: number of the first.
+    """
+    poses = cameras.camera_to_worlds.double()
+    distances = (poses[:, :, 3] - poses[index, :, 3]).norm(dim=-1)
+    distances[index] = torch.inf
+    other = int(distances.argmin())
+    if other == index or float(poses[index, :, 2] @ poses[other, :, 2]) < 0.5:
+        return None
+    mean = (poses[index] + poses[other]) / 2
+    u, _, vh = torch.linalg.svd(mean[:, :3])
+    flips = torch.ones(3).to(u)
+    flips[2] = torch.linalg.det(u @ vh)
+    pose = torch.cat([(u * flips) @ vh, mean[:, 3:]], -1).to(cameras.camera_to_worlds)
+    return replace(cameras[index : index + 1], camera_to_worlds=pose[None])
+
+
+def _shot(model: RayModel[Any], camera: Cameras, moment: float | None, near: float) -> Shot:
+    background = evaluation_background(model)
+    picture = model.render_view(View(camera, moment), background)
+    rgb, through = picture.rgb.clamp(0, 1).float(), torch.zeros_like(picture.rgb[..., :1], dtype=torch.float32)
+    if model.scene.has_alpha:
+        through = (1 - picture.accumulation.float().clamp(0, 1))[..., None]
+        rgb = (rgb - through * background).clamp(0, 1)
+    return Shot(splat_camera(camera, near), rgb, through)
+
+
+def _photographs(model: RayModel[Any], dataset: Dataset, near: float) -> list[Callable[[], Shot]]:
+    """Return functions that load photographs; none where the field is not to show just what they show."""
+    if dataset.times is not None or dataset.cameras.model not in DRAWN or dataset.scene.appearance_varies:
+        return []
+    cameras = refined_cameras(model, dataset.cameras)
+    return [partial(_photograph, dataset, cameras, index, near) for index in range(len(dataset))]
+
+
+def _photograph(dataset: Dataset, cameras: Cameras, index: int, near: float) -> Shot:
+    """Return a photograph, or a random part of a large one."""
+    camera = cameras[index : index + 1]
+    height, width = int(camera.heights[0]), int(camera.widths[0])
+    part = cropped(camera, min(1.0, LONGEST_SIDE / max(height, width)))
+    left, top = round(float(camera.cx[0] - part.cx[0])), round(float(camera.cy[0] - part.cy[0]))
+    where = slice(top, top + int(part.heights[0])), slice(left, left + int(part.widths[0]))
+    image, kept = dataset.image(index)[where].float() / 255, dataset.kept_of(index)
+    alpha = image[..., 3:] if image.shape[-1] == 4 else torch.ones_like(image[..., :1])
+    shot = splat_camera(part, near)
+    return Shot(shot, image[..., :3] * alpha, 1 - alpha, None if kept is None else kept[where].to(image.device))
+
+
+# -- steps --------------------------------------------------------------------------------------------------------
+
+
+def _rates(cameras: Cameras, seconds: float) -> dict[str, float]:
+    """Return the learning rates of a fit of so many seconds: fewer steps have to go farther."""
+    factor = min(max((30_000 / (STEPS_PER_SECOND * seconds)) ** 0.44, 1.0), 5.0)
+    centers = cameras.camera_to_worlds[:, :, 3]
+    extent = 1.1 * float((centers - centers.mean(0)).norm(dim=-1).max()) or 1.0
+    return {name: factor * rate * (extent if name == "means" else 1) for name, rate in RATES.items()}
+
+
+def _trained(
+    first: Gaussians, shots: list[Shot], photographs: list[Callable[[], Shot]], background: Tensor,
+    rates: dict[str, float], most: int, seconds: float,
+) -> Gaussians:  # fmt: skip
+    """Return Gaussians that have learnt the pictures for so many seconds."""
+    tables = {name: nn.Parameter(values.reshape(len(first), -1).contiguous()) for name, values in vars(first).items()}
+    groups = [{"params": [tables[name]], "name": name, "lr": rates[name], "sparse": True} for name in tables]
+    optimizer = Adam(groups, {}, 1e-3, (0.9, 0.99), 1e-15)
+    start, step = time.perf_counter(), 0
+    for percent in track(range(100), "Fitting Gaussians", total=100):
+        while (progress := (time.perf_counter() - start) / seconds) < (percent + 1) / 100:
+            optimizer.param_groups[0]["lr"] = rates["means"] * 0.1**progress
+            if step % 2 and photographs:
+                shot = photographs[int(torch.randint(len(photographs), ()))]()
+            else:
+                shot = shots[int(torch.randint(len(shots), ()))]
+            if backward(_loss(_gaussians(tables), shot, background, progress), optimizer):
+                optimizer.step()
+            step += 1
+            if step % STEPS_PER_MOVE == 0 and progress < MOVES_END:
+                _move(tables, optimizer, most)
+    say(f"{len(tables['means']):,} Gaussians after {step:,} steps")
+    return _gaussians(tables).map(Tensor.detach)
+
+
+def _gaussians(tables: dict[str, nn.Parameter]) -> Gaussians:
+    count, width = tables["harmonics"].shape
+    shaped = {**tables, "logits": tables["logits"][:, 0], "harmonics": tables["harmonics"].view(count, 3, width // 3)}
+    return Gaussians(**shaped)
+
+
+def _loss(gaussians: Gaussians, shot: Shot, background: Tensor, progress: float) -> Tensor:
+    """Return the difference () of Gaussians and a picture, over a random colour where the background is seen."""
+    behind = torch.rand_like(background) if bool(shot.through.any()) else background
+    target = shot.rgb + shot.through * behind
+    rgb = draw(gaussians, shot.camera, behind, min(int(2 * (MAX_DEGREE + 1) * progress), MAX_DEGREE))
+    if shot.kept is not None:  # what does not count is as it should be
+        target = torch.where(shot.kept[..., None], target, rgb.detach())
+    loss = (1 - SSIM_WEIGHT) * (rgb - target).abs().mean()
+    return loss if min(rgb.shape[:2]) < 11 else loss + SSIM_WEIGHT * (1 - ssim(rgb, target))
+
+
+@torch.no_grad()
+def _move(tables: dict[str, nn.Parameter], optimizer: Adam, most: int) -> None:
+    """Move Gaussians that have become transparent, and add some."""
+    here = len(tables["means"])
+    change = moved(_gaussians(tables).map(Tensor.detach), max(min(most, int(GROWTH * here)) - here, 0))
+    if change is None:
+        return
+    kept, fresh = change
+    for name, values in vars(fresh).items():
+        optimizer.change_rows(RowChange(tables[name], kept, values.reshape(len(fresh), -1)))

@@ -1,0 +1,225 @@
+"""A web page of Gaussians: one HTML file that opens from disk, offline, in any browser with WebGL 2.
+
+The page (`page/`) is our own: it draws as `framework/kernels/splat_project.py` does, asks no host for anything, and
+holds the Gaussians as an SPZ file (`framework/splats/spz.py`) in base64, and facts about them as JSON.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import html
+import json
+import re
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import framework
+from framework.base.errors import ConfigError, DataError
+from framework.cameras.cameras import Cameras
+from framework.cameras.poses import nearest_point, rotation_between
+from framework.splats.budget import fitted_spz
+from framework.splats.gaussians import Gaussians
+from framework.splats.spz import encoded, out_of_range, read_spz
+
+LARGEST = 32.0
+"""Maximum size of a page in millions of bytes; larger ones are refused by some phones."""
+BITS = (8, 8)
+"""Bits of harmonics where there is room: the page looks like the Gaussians to 55 dB, with SPZ's usual 5 and 4 to 41."""
+MOST_CAMERAS = 300
+"""Maximum number of the capture's cameras in a page, evenly spaced."""
+SCRIPTS = ("spz.js", "splats.js", "viewer.js")
+"""Files of the page's program, in their order."""
+LEVEL = 0.5
+"""Cosine between z and the cameras' mean up direction below which the scene is turned."""
+DATA = re.compile(r'<script id="data" type="text/plain">([^<]*)</script>')
+"""The Gaussians in a page."""
+
+
+@dataclass(frozen=True)
+class PageFacts:
+    """Facts that a page has about the scene besides its Gaussians."""
+
+    title: str
+    """Heading and title of the page."""
+    about: str
+    """Sentences for its help."""
+    background: tuple[float, float, float]
+    """Colour behind everything, 0 to 1."""
+    near: float
+    """Smallest depth at which a centre is drawn, scene units."""
+    antialiased: bool
+    """Whether opacity makes up for the blur of small Gaussians."""
+    focus: list[float]
+    """Position x, y, z that the cameras look at, scene units."""
+    cameras: list[list[Any]]
+    """Of each camera its name, its 12 numbers of camera-to-scene pose (OpenGL axes, row by row), and fx, fy, cx, cy,
+    width and height in pixels."""
+
+
+def upright(cameras: Cameras) -> Tensor:
+    """Return the rotation (3, 3), float64, after which the cameras' mean up direction is upwards, along z.
+
+    It is the identity where z is up already, or where the cameras are held in all directions.
+
+    Args:
+        cameras: M cameras.
+    """
+    up = cameras.camera_to_worlds[:, :, 1].double().mean(0).cpu()
+    z = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    if float(up.norm()) < LEVEL or float(up[2]) >= LEVEL * float(up.norm()):
+        return torch.eye(3, dtype=torch.float64)
+    return rotation_between(up, z)
+
+
+def pinhole(cameras: Cameras) -> Cameras:
+    """Return pinhole cameras in the same places, which see about as much.
+
+    Args:
+        cameras: M cameras of any model with a centre of projection.
+
+    Raises:
+        ConfigError: if they have none.
+    """
+    if cameras.model == "orthographic":
+        raise ConfigError("a web page draws in perspective, and this run's cameras are orthographic")
+    if cameras.model == "equirectangular":  # a square with an opening of 90 degrees
+        side = cameras.heights
+        half = side / 2
+        return replace(
+            cameras, fx=half, fy=half, cx=half, cy=half, widths=side, heights=side, model="pinhole", lens=None
+        )
+    return replace(cameras, model="pinhole", lens=None)
+
+
+def camera_rows(cameras: Cameras, names: Sequence[str], turn: Tensor) -> list[list[Any]]:
+    """Return the rows of `PageFacts.cameras`, of at most MOST_CAMERAS cameras.
+
+    Args:
+        cameras: M pinhole cameras.
+        names: M names of their images.
+        turn: (3, 3) rotation of the scene.
+    """
+    count = len(cameras)
+    chosen = [rank * count // MOST_CAMERAS for rank in range(MOST_CAMERAS)] if count > MOST_CAMERAS else range(count)
+    poses = turn @ cameras.camera_to_worlds.double().cpu()
+    lenses = torch.stack([getattr(cameras, k).double() for k in ("fx", "fy", "cx", "cy", "widths", "heights")], -1)
+    rows = []
+    for index in chosen:
+        pose = [round(value, 7) for value in poses[index].flatten().tolist()]
+        rows.append([names[index], pose, [round(value, 4) for value in lenses[index].tolist()]])
+    return rows
+
+
+def focus_of(cameras: Cameras, turn: Tensor) -> list[float]:
+    """Return the position that cameras look at: nearest to all their axes, and in front of most of them.
+
+    Args:
+        cameras: M cameras.
+        turn: (3, 3) rotation of the scene.
+    """
+    poses = turn @ cameras.camera_to_worlds.double().cpu()
+    centers, forward = poses[:, :, 3], -poses[:, :, 2]
+    point = nearest_point(centers, forward)
+    ahead = ((point - centers) * forward).sum(-1) > 0
+    if not bool(point.isfinite().all()) or float(ahead.double().mean()) < 0.5:
+        size = float((centers - centers.mean(0)).norm(dim=-1).max()) or 1.0
+        point = centers.mean(0) + size * forward.mean(0)
+    return [round(value, 6) for value in point.tolist()]
+
+
+def make_page(gaussians: Gaussians, facts: PageFacts, max_megabytes: float) -> tuple[str, list[str]]:
+    """Return a web page that is not larger than a limit, and sentences on what that cost.
+
+    Args:
+        gaussians: N Gaussians on the CPU, in a frame whose z is up.
+        facts: what the page knows besides.
+        max_megabytes: maximum size of the page, in millions of bytes.
+
+    Raises:
+        ConfigError: if the limit is above LARGEST, or no Gaussian fits.
+    """
+    check_size(max_megabytes)
+    empty = page(b"", facts)
+    most = (1e6 * max_megabytes - len(empty.encode())) // 4 * 3
+    payload, changes = encoded(gaussians, BITS), ""
+    if len(payload) > most:
+        payload, changes = fitted_spz(gaussians, most)
+        changes = changes or "harmonics in 5 and 4 bits instead of 8"
+    lost = out_of_range(gaussians)
+    return page(payload, facts), [f"{max_megabytes:g} MB hold {changes}", *lost] if changes else lost
+
+
+def check_size(max_megabytes: float) -> None:
+    """Check the limit of a page's size.
+
+    Args:
+        max_megabytes: the limit, in millions of bytes.
+
+    Raises:
+        ConfigError: if it is not positive, or above LARGEST.
+    """
+    if not 0 < max_megabytes <= LARGEST:
+        raise ConfigError(
+            f"--max-megabytes is {max_megabytes:g}; a page has up to {LARGEST:g}, since phones refuse larger ones"
+        )
+
+
+def page(payload: bytes, facts: PageFacts) -> str:
+    """Return the page of an SPZ file.
+
+    Args:
+        payload: content of the file.
+        facts: what the page knows besides.
+    """
+    folder = files("framework.export") / "page"
+    plain = json.dumps(asdict(facts), separators=(",", ":"), allow_nan=False)
+    parts = {
+        "title": html.escape(facts.title),
+        "about": html.escape(facts.about),
+        "version": html.escape(framework.__version__),
+        "style": (folder / "viewer.css").read_text(encoding="utf-8"),
+        "script": "".join((folder / name).read_text(encoding="utf-8") for name in SCRIPTS),
+        "facts": plain.replace("<", "\\u003c"),  # no name ends the element
+        "data": base64.b64encode(payload).decode(),
+    }
+    template = (folder / "viewer.html").read_text(encoding="utf-8")
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], template)
+
+
+def payload_of(text: str) -> bytes:
+    """Return the SPZ file in a page.
+
+    Args:
+        text: content of the page.
+
+    Raises:
+        DataError: if there is none.
+    """
+    found = DATA.search(text)
+    try:
+        return base64.b64decode(found[1], validate=True) if found else b""
+    except (binascii.Error, ValueError) as error:
+        raise DataError("the page's data are damaged; export it again") from error
+
+
+def gaussians_of(text: str) -> Gaussians:
+    """Return the Gaussians in a page, as they are drawn there.
+
+    Args:
+        text: content of the page.
+
+    Raises:
+        DataError: if there are none, or they are damaged.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "page.spz"
+        file.write_bytes(payload_of(text))
+        return read_spz(file)

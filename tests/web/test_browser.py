@@ -1,0 +1,139 @@
+"""The web page in a browser: headless Chromium, from disk, its WebGL in software."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import imageio.v3 as iio
+import pytest
+import torch
+
+from framework.evaluation.metrics import psnr
+from framework.export.web import gaussians_of, make_page
+from framework.splats.drawing import draw, splat_camera
+from tests.web.helpers import SIZE, some_cameras, some_facts, some_gaussians
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+CLOSE = 45.0
+"""Least PSNR of the browser's picture against our renderer's, dB. Rounding to 8 bits alone leaves 59."""
+FLAGS = (
+    *("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
+    *("--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage", "--hide-scrollbars"),
+    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--force-device-scale-factor=1"),
+    *("--virtual-time-budget=20000", "--window-size=500,500"),
+)
+
+
+@pytest.fixture(scope="module")
+def browser() -> str:
+    """The path of Chromium."""
+    for name in NAMES:
+        if found := shutil.which(name):
+            return found
+    pytest.skip("there is no Chromium; the page is not opened")
+
+
+def opened(browser: str, folder: Path, address: str, *flags: str) -> str:
+    """What Chromium prints that opens an address."""
+    command = [browser, *FLAGS, f"--user-data-dir={folder / 'profile'}", *flags, address]
+    return subprocess.run(command, capture_output=True, text=True, timeout=180, check=True).stdout
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("page") / "scene.html"
+    file.write_text(make_page(some_gaussians(400), some_facts("a </script> title"), 30)[0], encoding="utf-8")
+    return file
+
+
+def compared(
+    browser: str, scene: Path, tmp_path: Path, camera: int, more: str = "", antialiased: bool = False
+) -> float:
+    """PSNR of the browser's picture against our own."""
+    shot = tmp_path / "shot.png"
+    opened(browser, tmp_path, f"{scene.as_uri()}#camera={camera}&plain=1{more}", f"--screenshot={shot}")
+    width, height = SIZE
+    seen = torch.from_numpy(iio.imread(shot)[:height, :width, :3].copy()).float() / 255
+    gaussians = gaussians_of(scene.read_text(encoding="utf-8"))
+    chosen = splat_camera(some_cameras()[camera : camera + 1], 0.05, antialiased)
+    own = draw(gaussians, chosen, torch.ones(3)).clamp(0, 1)
+    assert float(own.std()) > 0.05  # there is something to see
+    found = psnr(seen, own)
+    print(f"camera {camera}{more}: PSNR of the browser's picture against ours {found:.1f} dB")
+    return found
+
+
+def test_the_browser_draws_what_we_draw(browser: str, scene: Path, tmp_path: Path) -> None:
+    assert compared(browser, scene, tmp_path, 3) > CLOSE
+
+
+@pytest.mark.slow
+def test_the_browser_draws_without_its_own_gunzip(browser: str, scene: Path, tmp_path: Path) -> None:
+    assert compared(browser, scene, tmp_path, 1, "&inflate=here") > CLOSE
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_the_browser_draws_fewer_harmonics(browser: str, tmp_path: Path, degree: int) -> None:
+    file = tmp_path / "scene.html"
+    facts = some_facts(antialiased=True)
+    file.write_text(make_page(some_gaussians(1500, degree), facts, 30)[0], encoding="utf-8")
+    assert compared(browser, file, tmp_path, 2, antialiased=True) > CLOSE
+
+
+DRAG = """<script>
+const wait = setInterval(() => {
+  const state = document.documentElement.dataset, canvas = document.getElementById("canvas");
+  if (state.state !== "ready") return;
+  clearInterval(wait);
+  const send = (type, x, y, more) => canvas.dispatchEvent(new PointerEvent(
+    type, { pointerId: 1, clientX: x, clientY: y, buttons: 1, bubbles: true, cancelable: true, ...more }));
+  const seen = [state.eye];
+  send("pointerdown", 100, 100); send("pointermove", 160, 90); send("pointerup", 160, 90);
+  seen.push(state.eye);
+  canvas.dispatchEvent(new WheelEvent("wheel", { deltaY: -300, bubbles: true, cancelable: true }));
+  seen.push(state.distance);
+  send("pointerdown", 100, 100, { buttons: 2 }); send("pointermove", 160, 90, { buttons: 2 }); send("pointerup", 9, 9);
+  seen.push(state.eye);
+  window.dispatchEvent(new KeyboardEvent("keydown", { code: "BracketRight" }));
+  seen.push(state.camera);
+  window.dispatchEvent(new KeyboardEvent("keydown", { code: "KeyR" }));
+  seen.push(state.eye);
+  state.seen = seen.join("|");
+}, 50);
+</script>"""
+
+
+def test_the_mouse_turns_and_comes_closer(browser: str, scene: Path, tmp_path: Path) -> None:
+    file = tmp_path / "events.html"
+    file.write_text(scene.read_text(encoding="utf-8").replace("</body>", DRAG + "</body>"), encoding="utf-8")
+    dom = opened(browser, tmp_path, f"{file.as_uri()}#sort=here", "--dump-dom")  # a worker's time is not virtual
+    found = re.search(r'data-seen="([^"]*)"', dom)
+    assert found is not None, dom[:300]
+    first, dragged, distance, panned, camera, reset = found[1].split("|")
+    start, eye, moved = (torch.tensor([float(x) for x in text.split()]) for text in (first, dragged, panned))
+    focus = torch.tensor(some_facts().focus)
+    away = (start - focus).norm()
+    torch.testing.assert_close((eye - focus).norm(), away, atol=1e-3, rtol=0)  # about what is looked at
+    assert float((eye - start).norm()) > 0.1
+    assert float(distance) < 0.9 * float(away)
+    assert float((moved - eye).norm()) > 0.1
+    assert (camera, reset) == ("1", first)
+
+
+def test_damaged_data_are_named(browser: str, scene: Path, tmp_path: Path) -> None:
+    text = scene.read_text(encoding="utf-8")
+    start = text.index('id="data"') + 2000
+    file = tmp_path / "damaged.html"
+    file.write_text(text[:start] + "AAAABBBB" + text[start + 8 :], encoding="utf-8")
+    dom = opened(browser, tmp_path, file.as_uri(), "--dump-dom")
+    assert 'data-state="refused"' in dom
+    assert "damaged or truncated" in dom
+
+
+@pytest.mark.slow
+def test_no_webgl_is_named(browser: str, scene: Path, tmp_path: Path) -> None:
+    dom = opened(browser, tmp_path, scene.as_uri(), "--dump-dom", "--disable-3d-apis")
+    assert 'data-state="refused"' in dom
+    assert "WebGL 2" in dom

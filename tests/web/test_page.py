@@ -1,0 +1,256 @@
+"""The web page of Gaussians: what is in the file."""
+
+import fnmatch
+import json
+import math
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+import torch
+
+from framework.base.errors import ConfigError, DataError
+from framework.cameras.cameras import Cameras
+from framework.cli.export import main
+from framework.export.splat_fit import between, cropped
+from framework.export.web import (
+    DATA,
+    focus_of,
+    gaussians_of,
+    make_page,
+    page,
+    payload_of,
+    pinhole,
+    upright,
+)
+from framework.kernels.splat_project import rotation_matrices
+from framework.training.trained import load_trained
+from tests.conftest import EditJson, Refused
+from tests.training.helpers import tiny_trainer
+from tests.web.helpers import some_cameras, some_facts, some_gaussians
+
+ROOT = Path(__file__).parents[2]
+
+
+class Elements(HTMLParser):
+    """Scripts, their text, and the text of the title of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.scripts: list[str] = []
+        self.title = ""
+        self.inside = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.inside = tag
+        if tag == "script":
+            self.scripts.append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        self.inside = ""
+
+    def handle_data(self, data: str) -> None:
+        if self.inside == "script":
+            self.scripts[-1] += data
+        elif self.inside == "title":
+            self.title += data
+
+
+def test_gaussians_survive_the_page() -> None:
+    given = some_gaussians(500)
+    text, costs = make_page(given, some_facts(), 30)
+    assert costs == []
+    found = gaussians_of(text)
+    # Half a step of SPZ with 8 bits of harmonics (framework/splats/spz.py).
+    torch.testing.assert_close(found.means, given.means, atol=1e-3, rtol=0)
+    assert float((found.logits.sigmoid() - given.logits.sigmoid()).abs().max()) < 1 / 500
+    assert float((found.harmonics - given.harmonics.clamp(-1, 127 / 128)).abs().max()) <= 1 / 256 + 1e-6
+    covariances = [
+        (m := rotation_matrices(g.rotations.double()) * g.log_scales.double().exp()[:, None]) @ m.mT
+        for g in (found, given)
+    ]
+    sizes = torch.linalg.matrix_norm(covariances[1], 2)
+    assert float((torch.linalg.matrix_norm(covariances[0] - covariances[1], 2) / sizes).max()) < 0.1
+
+
+@pytest.mark.parametrize("megabytes", [0.4, 0.15])
+def test_a_page_is_as_small_as_asked(megabytes: float) -> None:
+    text, costs = make_page(some_gaussians(5000), some_facts(), megabytes)
+    assert 0.5 * megabytes * 1e6 < len(text.encode()) <= megabytes * 1e6
+    assert costs[0].startswith(f"{megabytes:g} MB hold ")
+
+
+@pytest.mark.parametrize("megabytes", [0.0, -1.0, 33.0, math.nan, 0.01])
+def test_impossible_sizes_are_refused(megabytes: float) -> None:
+    with pytest.raises(ConfigError, match="max-megabytes"):
+        make_page(some_gaussians(10), some_facts(), megabytes)
+
+
+def test_no_name_leaves_its_place() -> None:
+    title = "</title></script><script>alert(1)</script>{{data}}&amp;\"'"
+    found = Elements(page(b"123", some_facts(title)))
+    assert found.title == title
+    assert len(found.scripts) == 3
+    facts = json.loads(found.scripts[0])
+    assert facts["title"] == title
+    assert facts["cameras"][3][0] == "</script>"
+    assert found.scripts[1] == "MTIz"
+
+
+def test_a_page_asks_no_host_and_runs_no_text() -> None:
+    text = page(b"", some_facts())
+    for word in ("http:", "https:", "//cdn", "eval(", "new Function", "innerHTML", "SharedArrayBuffer", "import("):
+        assert word not in text, word
+    assert "default-src 'none'" in text
+
+
+def test_damaged_pages_are_refused() -> None:
+    text = page(b"123", some_facts())
+    for damaged in ("", text.replace(">MTIz<", ">M!Iz<")):
+        with pytest.raises(DataError):
+            gaussians_of(damaged)
+    assert payload_of(text) == b"123"
+    assert DATA.search(text)
+
+
+def test_wheels_carry_the_page() -> None:
+    section = (ROOT / "pyproject.toml").read_text().partition("[tool.setuptools.package-data]")[2]
+    patterns = re.findall(r'"([^"]*)"', section[section.index("\nframework = ") :].splitlines()[1])
+    for file in (ROOT / "framework" / "export" / "page").iterdir():
+        name = file.relative_to(ROOT / "framework").as_posix()
+        assert any(fnmatch.fnmatch(name, pattern) for pattern in patterns), name
+
+
+# -- cameras ------------------------------------------------------------------------------------------------------
+
+
+def test_up_is_up() -> None:
+    cameras = some_cameras(3)
+    assert torch.equal(upright(cameras), torch.eye(3).double())
+    quarter = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # y is up after it
+    turned = replace(cameras, camera_to_worlds=quarter.T @ cameras.camera_to_worlds)
+    turn = upright(turned)
+    up = (turn @ turned.camera_to_worlds[:, :, 1].double().T).mean(1)
+    torch.testing.assert_close(up / up.norm(), torch.tensor([0, 0, 1.0]).double())
+    torch.testing.assert_close(turn @ turn.T, torch.eye(3).double())
+
+
+def test_cameras_look_at_the_focus() -> None:
+    found = focus_of(some_cameras(), torch.eye(3).double())
+    torch.testing.assert_close(torch.tensor(found), torch.tensor([0.1, 0.0, 0.05]), atol=1e-4, rtol=0)
+
+
+def test_lenses_become_pinholes() -> None:
+    cameras = some_cameras()
+    lens = torch.full((4, 4), 0.1)
+    assert pinhole(replace(cameras, model="fisheye", lens=lens)).model == "pinhole"
+    assert pinhole(replace(cameras, model="equirectangular")).fx.tolist() == [75.0] * 4
+    with pytest.raises(ConfigError, match="orthographic"):
+        pinhole(replace(cameras, model="orthographic"))
+
+
+def about_z(angle: float) -> torch.Tensor:
+    c, s = math.cos(angle), math.sin(angle)
+    return torch.tensor([[c, -s, 0, c], [s, c, 0, s], [0, 0, 1, 0.5]])
+
+
+def test_half_way_between_two_cameras() -> None:
+    cameras = replace(some_cameras(3), camera_to_worlds=torch.stack([about_z(a) for a in (0.0, 0.6, 3.0)]))
+    found = between(cameras, 0)
+    assert found is not None
+    expected = about_z(0.3)
+    torch.testing.assert_close(found.camera_to_worlds[0, :, :3], expected[:, :3])
+    torch.testing.assert_close(found.camera_to_worlds[0, :, 3], (about_z(0.0) + about_z(0.6))[:, 3] / 2)
+    back = about_z(0.0) @ torch.diag(torch.tensor([1.0, -1, -1, 1]))  # looks the other way
+    assert between(replace(cameras[:2], camera_to_worlds=torch.stack([about_z(0.0), back])), 0) is None
+    assert between(cameras[:1], 0) is None
+
+
+def test_a_part_of_an_image_sees_what_the_image_sees_there() -> None:
+    torch.manual_seed(1)
+    camera: Cameras = some_cameras()[:1]
+    part = cropped(camera, 0.5)
+    assert (int(part.widths), int(part.heights)) == (100, 75)
+    left, top = float(camera.cx - part.cx), float(camera.cy - part.cy)
+    assert 0 <= left <= 100
+    assert 0 <= top <= 75
+    points = torch.randn(20, 3) * 0.2
+    whole, some = camera.project(points, 0), part.project(points, 0)
+    torch.testing.assert_close(some[0], whole[0] - left)
+    torch.testing.assert_close(some[1], whole[1] - top)
+
+
+# -- the command --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def splats(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The config of a run of Gaussians on the ball."""
+    folder = tmp_path_factory.mktemp("run") / "run"
+    trainer = tiny_trainer("gaussian-splatting", shared_tiny, folder, max_num_iterations=20)
+    trainer.train()
+    return trainer.run.config_path
+
+
+def export(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
+    monkeypatch.setattr("sys.argv", ["ns-export", "web", *map(str, arguments)])
+    main()
+
+
+def test_splats_go_to_the_page_as_they_are(
+    splats: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    export(monkeypatch, splats, "--output-dir", tmp_path)
+    found = gaussians_of((tmp_path / "scene.html").read_text(encoding="utf-8"))
+    trained = load_trained(splats).model.gaussians()
+    torch.testing.assert_close(found.means, trained.means, atol=1e-3, rtol=0)
+    said = capsys.readouterr().err
+    assert f"{len(trained):,} Gaussians" in said
+    close = float(said.split("PSNR ")[1].split(" dB")[0])
+    print(f"PSNR of the page against the method's own pictures: {close} dB")
+    assert close > 40
+    assert [file.name for file in tmp_path.iterdir()] == ["scene.html"]
+
+
+def test_what_the_page_cannot_be(splats: Path, tmp_path: Path, refused: Refused) -> None:
+    assert "phones" in refused(main, "web", splats, "--output-dir", tmp_path, "--max-megabytes", 50)
+    assert "no times" in refused(main, "web", splats, "--output-dir", tmp_path, "--time", 0.5)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_field_gets_gaussians_that_look_like_it(
+    shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=200)
+    trainer.train()
+    capsys.readouterr()
+    export(monkeypatch, trainer.run.config_path, "--output-dir", tmp_path / "out", "--fit-seconds", 12)
+    close = float(capsys.readouterr().err.split("PSNR ")[1].split(" dB")[0])
+    print(f"PSNR of the page against the field's pictures: {close} dB")
+    assert close > 20  # a white picture has 8
+
+
+@pytest.fixture
+def moving_run(tiny: Path, edit_json: EditJson, tmp_path: Path) -> Path:
+    """The config of a K-Planes run."""
+    edit_json(lambda content: [frame.update(time=i / 9) for i, frame in enumerate(content["frames"])])
+    trainer = tiny_trainer("kplanes", tiny, tmp_path / "run", max_num_iterations=150)
+    trainer.train()
+    return trainer.run.config_path
+
+
+@pytest.mark.slow
+def test_a_scene_that_moves_is_shown_at_one_moment(
+    moving_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    export(monkeypatch, moving_run, "--output-dir", tmp_path / "out", "--fit-seconds", 4, "--time", 0.25)
+    said = capsys.readouterr().err
+    assert "0 photographs" in said
+    assert "time 0.25, still" in said
+    assert "against the photographs" not in said
+    text = (tmp_path / "out" / "scene.html").read_text(encoding="utf-8")
+    assert "this is time 0.25" in json.loads(Elements(text).scripts[0])["about"]

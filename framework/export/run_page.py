@@ -28,7 +28,7 @@ from framework.export.web import (
     upright,
 )
 from framework.ray_model import RayModel
-from framework.splats.drawing import DRAWN, draw, splat_camera
+from framework.splats.drawing import DRAWN, draw, on_image, splat_camera
 from framework.splats.gaussians import Gaussians, HasGaussians
 from framework.splats.transform import transformed
 from framework.training.checkpoint import write_atomically
@@ -145,7 +145,8 @@ def closeness(
         view = View.of(cameras, index, dataset.times)
         rgb = model.render_view(view, background).rgb.clamp(0, 1).float()
         with torch.no_grad():
-            shown = draw(gaussians, splat_camera(view.camera, near, antialiased), background).clamp(0, 1)
+            camera = splat_camera(view.camera, near, antialiased)
+            shown = draw(on_image(gaussians, camera), camera, background).image.clamp(0, 1)
         own.append(psnr(shown, rgb))
         if as_seen and moment is None:
             target = composite(dataset.image(index).float() / 255, background)

@@ -33,7 +33,7 @@ from framework.kernels.native import torch_on_one_thread
 from framework.kernels.splat_project import SplatCamera
 from framework.kernels.ssim import ssim
 from framework.ray_model import RayModel
-from framework.splats.drawing import DRAWN, draw, splat_camera
+from framework.splats.drawing import DRAWN, draw, on_image, splat_camera
 from framework.splats.gaussians import MAX_DEGREE, Gaussians
 from framework.splats.mcmc import moved
 from framework.splats.start import from_points
@@ -298,7 +298,8 @@ def _loss(gaussians: Gaussians, shot: Shot, background: Tensor, progress: float)
     """Return the difference () of Gaussians and a picture, over a random colour where the background is seen."""
     behind = torch.rand_like(background) if bool(shot.through.any()) else background
     target = shot.rgb + shot.through * behind
-    rgb = draw(gaussians, shot.camera, behind, min(int(2 * (MAX_DEGREE + 1) * progress), MAX_DEGREE))
+    degree = min(int(2 * (MAX_DEGREE + 1) * progress), MAX_DEGREE)
+    rgb = draw(on_image(gaussians, shot.camera, degree), shot.camera, behind).image
     if shot.kept is not None:  # what does not count is as it should be
         target = torch.where(shot.kept[..., None], target, rgb.detach())
     loss = (1 - SSIM_WEIGHT) * (rgb - target).abs().mean()

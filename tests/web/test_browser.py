@@ -11,7 +11,7 @@ import torch
 
 from framework.evaluation.metrics import psnr
 from framework.export.web import gaussians_of, make_page
-from framework.splats.drawing import draw, splat_camera
+from framework.splats.drawing import draw, on_image, splat_camera
 from tests.web.helpers import SIZE, some_cameras, some_facts, some_gaussians
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
@@ -57,7 +57,7 @@ def compared(
     seen = torch.from_numpy(iio.imread(shot)[:height, :width, :3].copy()).float() / 255
     gaussians = gaussians_of(scene.read_text(encoding="utf-8"))
     chosen = splat_camera(some_cameras()[camera : camera + 1], 0.05, antialiased)
-    own = draw(gaussians, chosen, torch.ones(3)).clamp(0, 1)
+    own = draw(on_image(gaussians, chosen), chosen, torch.ones(3)).image.clamp(0, 1)
     assert float(own.std()) > 0.05  # there is something to see
     found = psnr(seen, own)
     print(f"camera {camera}{more}: PSNR of the browser's picture against ours {found:.1f} dB")

@@ -9,29 +9,30 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, ClassVar, Literal, cast
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
 from framework import Cameras, Decision, Loss, Method, Model, Optimised, Picture, RowChange, Scene, View, ViewBatch
 from framework.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
-from framework.base.console import say, track
+from framework.base.console import say
 from framework.base.decisions import Choice, fill
-from framework.base.errors import ConfigError
 from framework.cameras.refinement import PoseRefinement
 from framework.data.dataset import Dataset
-from framework.fields.appearance import Appearance
+from framework.fields.appearance import AFFINE, Appearance, affine_colors
 from framework.kernels.splat_blend import CHANNELS
-from framework.kernels.splat_project import OPACITY
 from framework.kernels.ssim import ssim
-from framework.scene.silhouettes import Silhouettes, visual_hull
-from framework.splats.density_control import RESET, grown, image_gradients
+from framework.rendering.losses import mean_depth_error
+from framework.scene.reasons import DEPTH_REASONS, LIGHT_REASONS, POSE_REASONS
+from framework.splats.density_control import RESET, GradientMean, grown
 from framework.splats.drawing import draw, draw_view, on_image, splat_camera
 from framework.splats.gaussians import MAX_DEGREE, Gaussians
 from framework.splats.mcmc import moved, shaken
-from framework.splats.start import from_points, hull_points, seen_colors
+from framework.splats.resolution import doubled, halved
+from framework.splats.start import first_points, from_points, scene_size, seen_colors
+from framework.splats.table import Table
+from framework.tools.surfaces import found_surfaces
 from framework.training.optim import learning_rate_factor
 
 PIXELS_PER_SECOND = 25 * 400 * 400
@@ -45,24 +46,10 @@ LARGE_IMAGE = 250_000
 """Pixels from which training begins with images of half the size."""
 WITHOUT_IMAGES = 1_000
 """Maximum number of Gaussians of a model that has seen no images yet."""
-HULL_CELLS = 128
-"""Cells of the visual hull along an axis."""
 SMALLEST_SSIM = 11
 """Pixels of an image's shorter side from which it has an SSIM."""
-FEW = 1_000
-"""Maximum number of Gaussians whose distances to the cameras are looked at."""
 FIELD_OPACITY, FIELD_SIZE = 0.5, 0.7
 """Of Gaussians on a field's surfaces at the start: opacity, and standard deviation in distances to neighbours."""
-
-
-DEPTH_REASONS = {True: "there are depth images", False: "there are no depth images"}
-POSE_REASONS = {
-    "exact": "the poses are exact",
-    "photographs": "the poses were found in the photographs themselves",
-    "device": "the poses are those that the device tracked",
-}
-AFFINE = 12
-"""Numbers of an image's transform of colours: a matrix (3, 3), less the identity, and a shift."""
 
 
 @dataclass(frozen=True)
@@ -91,17 +78,17 @@ class GaussianSplattingConfig(
         "reduced_until": (0, 1),
     }
     """Allowed range of each numeric setting."""
-    num_gaussians: int | None = None
+    num_gaussians: Auto[int] = AUTO
     """Maximum number of Gaussians; by the budget if not given."""
     start: Literal["auto", "points", "field", "silhouettes", "random"] = "auto"
     """Where Gaussians start: at the points of a reconstruction, on surfaces that a short run of instant-ngp finds, in
     the visual hull of the images' silhouettes, or anywhere in the box. auto: the first of points and field that there
     is."""
-    start_gaussians: int | None = None
+    start_gaussians: Auto[int] = AUTO
     """Gaussians at the start, except at the points of a reconstruction; two thirds of the maximum if not given."""
-    field_steps: int | None = None
+    field_steps: Auto[int] = AUTO
     """Training steps of that field; by the budget if not given."""
-    rate_factor: float | None = None
+    rate_factor: Auto[float] = AUTO
     """Factor of all learning rates; by the budget if not given, as fewer steps have to go farther."""
     position_rate: float = 8e-5
     """Learning rate of centres before that factor, in sizes of the scene."""
@@ -154,7 +141,6 @@ def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplat
     factor = min(max((30_000 / (speed * seconds)) ** 0.44, 1.0), 8.0)
     why = "that suits the time"
     config, made = fill(config, Choice("num_gaussians", count, why, "Gaussians", f"up to {count:,}"))
-    assert config.num_gaussians is not None
     large = PIXELS_PER_SECOND / speed > LARGE_IMAGE
     detail = "large images can wait" if large else "the images are small"
     first, most = max(config.num_gaussians * 2 // 3, 1), 800 if scene.unbounded else 400
@@ -167,7 +153,7 @@ def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplat
         Choice(
             "appearance",
             scene.appearance_varies,
-            "light differs between the images" if scene.appearance_varies else "the images are lit alike",
+            LIGHT_REASONS[scene.appearance_varies],
             "colour transforms of images",
         ),
         Choice("depth_loss_mult", 0.1 if scene.has_depth else 0.0, DEPTH_REASONS[scene.has_depth], "depth loss"),
@@ -179,21 +165,6 @@ def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplat
         ),
     )
     return config, made + more
-
-
-class _Table(nn.Module):
-    """One parameter of every Gaussian, with its learning rate."""
-
-    def __init__(self, width: int, optimised: Optimised) -> None:
-        super().__init__()
-        self.values = nn.Parameter(torch.zeros(0, width))
-        self.optimised = optimised
-
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: object) -> None:
-        saved = state_dict.get(prefix + "values")
-        if saved is not None and saved.ndim == 2 and saved.shape[1] == self.values.shape[1]:
-            self.values.data = self.values.new_zeros(saved.shape)
-        super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
 class GaussianSplatting(Model[GaussianSplattingConfig]):
@@ -209,18 +180,14 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
     """Size () of the scene, scene units, in which centres are stored: so their learning rate suits any scene."""
     found: Tensor
     """Whether the first Gaussians lay on surfaces, so that none has to look for its place."""
-    gradients: Tensor
-    """(N, 2) sum of the gradients of each Gaussian's image positions, and number of images, since the last change;
-    empty but for strategy adc."""
 
     def __init__(self, config: GaussianSplattingConfig, scene: Scene) -> None:
         super().__init__(config, scene)
         higher, factor = (config.degree + 1) ** 2 - 1, config.rate_factor
-        assert factor is not None
         rate = factor * config.learning_rate
 
-        def table(width: int, name: str, times: float, schedule: Literal["constant"] | None = "constant") -> _Table:
-            return _Table(width, Optimised(name, times * rate, schedule=schedule, sparse=True))
+        def table(width: int, name: str, times: float, schedule: Literal["constant"] | None = "constant") -> Table:
+            return Table(width, Optimised(name, times * rate, schedule=schedule, sparse=True))
 
         self.position_rate = factor * config.position_rate
         self.means = table(3, "means", self.position_rate / rate, None)
@@ -230,19 +197,17 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         self.colors = table(3, "colors", 0.5)
         self.harmonics = table(3 * higher, "harmonics", 0.025)
         self.register_buffer("found", torch.tensor(False))
-        self.register_buffer("extent", torch.tensor(_extent(scene)))
+        self.register_buffer("extent", torch.tensor(scene_size(scene)))
         self.progress = 0.0
         self.appearance: Appearance | None = None
         if config.appearance:
-            self.appearance = Appearance(AFFINE, scene.num_cameras)
-            self.appearance.optimised = Optimised("appearance", config.appearance_rate)
+            self.appearance = Appearance(AFFINE, scene.num_cameras, Optimised("appearance", config.appearance_rate))
         self.poses: PoseRefinement | None = None
         if config.camera_optimizer in ("SO3xR3", "SE3"):
             self.poses = PoseRefinement(scene.num_cameras, config.camera_optimizer, scene.camera_to_worlds)
             self.poses.optimised = Optimised("poses", config.camera_learning_rate, schedule="exponential")
-        self.register_buffer("gradients", torch.zeros(0, 2))
+        self.gradients = GradientMean()
         self._on_image: Tensor | None = None
-        assert config.start_gaussians is not None
         box = scene.box
         anywhere = box[0] + torch.rand(min(config.start_gaussians, WITHOUT_IMAGES), 3) * (box[1] - box[0])
         self.set_gaussians(from_points(anywhere, torch.full_like(anywhere, 0.5), config.degree))
@@ -291,20 +256,20 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         Args:
             dataset: images to learn from.
         """
-        kind = self.config.start
+        kind, count = self.config.start, self.config.start_gaussians
         if kind == "auto":
             kind = "field" if dataset.points is None else "points"
         if kind == "field":
             with torch.enable_grad():
-                points, colors = _surfaces(self.config, dataset)
+                points, colors = found_surfaces(dataset, self.config, self.config.field_steps, count)
             first = from_points(points, colors, self.config.degree, FIELD_OPACITY, FIELD_SIZE)
             if not len(points):
                 say("warning: the field has found no surfaces")
                 kind = "random"
         if kind != "field":
-            points = self._first_points(kind, dataset)
+            points = first_points(kind, dataset, count)
             first = from_points(points, seen_colors(points, dataset), self.config.degree)
-        self.extent.copy_(_extent(self.scene, first.means))
+        self.extent.fill_(scene_size(self.scene, first.means))
         self.set_gaussians(first)
         self.found.fill_(kind == "field")
         where = {"points": "at the points of a reconstruction", "field": "on the surfaces of a field"}
@@ -321,22 +286,6 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         for parameter, values in zip(self.parameters_of_gaussians(), vars(gaussians).values(), strict=True):
             parameter.data = values.reshape(len(gaussians), parameter.shape[1]).contiguous()
 
-    def _first_points(self, kind: str, dataset: Dataset) -> Tensor:
-        count, box = self.config.start_gaussians, self.scene.box.to(self.device)
-        assert count is not None
-        if kind == "points":
-            if dataset.points is None:
-                raise ConfigError("--start points: the data has no points of a reconstruction; leave out --start")
-            return dataset.points.to(self.device)
-        if kind == "silhouettes":
-            if not self.scene.has_alpha or dataset.cameras.model != "pinhole":
-                raise ConfigError("--start silhouettes needs pinhole images with alpha; leave out --start")
-            hull = visual_hull(Silhouettes.of(dataset), box, HULL_CELLS)
-            if bool(hull.any()):
-                return hull_points(hull, box, HULL_CELLS, count)
-            say("warning: the images' alpha leaves no part of the box; Gaussians start anywhere in it")
-        return box[0] + torch.rand(count, 3, device=self.device) * (box[1] - box[0])
-
     # -- training ---------------------------------------------------------------------------------------------
 
     def before_step(self, step: int, progress: float) -> None:
@@ -349,30 +298,29 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         if self.poses is not None:
             pose = self.poses.pose(batch.index, batch.view.camera.camera_to_worlds[0])
         camera = splat_camera(batch.view.camera, self._near, config.antialiased, pose, reduced)
-        target = batch.rgb if reduced == 1 else _halved(batch.rgb)
+        target = batch.rgb if reduced == 1 else halved(batch.rgb)
         gaussians = self._all()
         records = on_image(gaussians, camera, self._degree)
         if config.strategy == "adc" and records.requires_grad:
             records.retain_grad()
             self._on_image = records
-        guided = config.depth_loss_mult > 0 and batch.distances is not None
-        drawn = draw(records, camera, self._behind(batch), CHANNELS["distance" if guided else "rgb"])
-        rgb = self._lit(drawn.image[..., :3] if guided else drawn.image, batch.index)
+        known = batch.distances if config.depth_loss_mult > 0 else None
+        drawn = draw(records, camera, self._behind(batch), CHANNELS["rgb" if known is None else "distance"])
+        rgb = self._lit(drawn.image[..., :3], batch.index)
         if batch.kept is not None:  # what does not count is as it should be
-            kept = batch.kept if reduced == 1 else _halved(batch.kept[..., None].float())[..., 0] == 1
+            kept = batch.kept if reduced == 1 else halved(batch.kept[..., None].float())[..., 0] == 1
             target = torch.where(kept[..., None], target, rgb.detach())
         terms = {"rgb": (1 - config.ssim_weight) * (rgb - target).abs().mean()}
         if config.ssim_weight > 0 and min(rgb.shape[:2]) >= SMALLEST_SSIM:
             terms["ssim"] = config.ssim_weight * (1 - ssim(rgb, target))
-        if guided:
-            assert batch.distances is not None
-            known = batch.distances if reduced == 1 else batch.distances[::2, ::2][: rgb.shape[0], : rgb.shape[1]]
-            terms["depth"] = config.depth_loss_mult * _depth_error(drawn.image[..., 3], drawn.transmittance, known)
+        if known is not None:
+            known = known if reduced == 1 else known[::2, ::2][: rgb.shape[0], : rgb.shape[1]]
+            terms["depth"] = config.depth_loss_mult * mean_depth_error(drawn.image[..., 3], drawn.transmittance, known)
         if (weight := self._chosen(config.opacity_penalty, OPACITY_PENALTY)) > 0:
             terms["opacity"] = weight * torch.sigmoid(gaussians.logits).mean()
         if (weight := self._chosen(config.scale_penalty, SCALE_PENALTY)) > 0:
             terms["scale"] = weight / self.extent * gaussians.log_scales.exp().mean()
-        shown = rgb.detach() if reduced == 1 else _doubled(rgb.detach(), batch.rgb)
+        shown = rgb.detach() if reduced == 1 else doubled(rgb.detach(), batch.rgb)
         return Loss(terms, shown)
 
     def _behind(self, batch: ViewBatch) -> Tensor:
@@ -384,11 +332,13 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
 
     def _lit(self, rgb: Tensor, index: int | None) -> Tensor:
         """Return colours (..., 3) as an image shows them: a training image, or one with the appearance that is set."""
-        if self.appearance is None:
-            return rgb
-        chosen = None if index is None else torch.tensor([index], device=rgb.device)
-        affine = self.appearance(chosen, 1)[0].view(3, 4)
-        return rgb + rgb @ affine[:, :3].T + affine[:, 3]
+        return (
+            rgb
+            if self.appearance is None
+            else affine_colors(
+                rgb, self.appearance(None if index is None else torch.tensor([index], device=rgb.device), 1)[0]
+            )
+        )
 
     @property
     def _degree(self) -> int:
@@ -398,14 +348,15 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
     @torch.no_grad()
     def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
         config = self.config
-        self._count_gradients()
+        if self._on_image is not None:
+            self.gradients.add(self._on_image, self.scene.image_size)
+            self._on_image = None
         if (noise := self._chosen(config.noise, NOISE)) > 0:
             rate = self.position_rate * float(self.extent) * learning_rate_factor(config, step, progress)
             which, by = shaken(self.gaussians(), noise * rate)
             self.means.values.data[which] += by / self.extent
         if step % config.steps_per_move != config.steps_per_move - 1 or progress > config.growth_end:
             return ()
-        assert config.num_gaussians is not None
         if config.strategy == "adc":
             return self._densify(step, config.num_gaussians)
         here = len(self.means.values)
@@ -417,34 +368,14 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         rows = (values.reshape(len(fresh), -1) for values in vars(fresh).values())
         return [RowChange(p, kept, values) for p, values in zip(self.parameters_of_gaussians(), rows, strict=True)]
 
-    def _count_gradients(self) -> None:
-        """Add up the gradients of image positions, of Gaussians that the last image showed."""
-        records, self._on_image = self._on_image, None
-        if records is None or records.grad is None:
-            return
-        if len(self.gradients) != len(records):
-            self.gradients = records.new_zeros(len(records), 2)
-        shown = records[:, OPACITY] > 0
-        self.gradients[:, 0] += image_gradients(records, records.grad, self.scene.image_size)
-        self.gradients[:, 1] += shown
-
     def _densify(self, step: int, most: int) -> list[RowChange]:
-        if not len(self.gradients):
-            return []
-        mean = self.gradients[:, 0] / self.gradients[:, 1].clamp(min=1)
-        self.gradients = self.gradients.new_zeros(0, 2)
+        mean = self.gradients.take(len(self.means.values))
         if step % self.config.steps_per_reset == self.config.steps_per_reset - 1:
             lowered = self.logits.values.clamp(max=math.log(RESET / (1 - RESET)))
             none = torch.zeros(0, dtype=torch.long, device=lowered.device)
             return [RowChange(self.logits.values, none, lowered)]  # new rows, as Adam's state is reset too
         change = grown(self.gaussians(), mean, most, float(self.extent))
         return [] if change is None else self._changed(*change)
-
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: object) -> None:
-        saved = state_dict.get(prefix + "gradients")
-        if saved is not None and saved.ndim == 2 and saved.shape[1] == 2:
-            self.gradients = self.gradients.new_zeros(saved.shape)
-        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def refined_cameras(self, cameras: Cameras) -> Cameras:
         """Return the training cameras with refined poses.
@@ -465,82 +396,6 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
     @property
     def _near(self) -> float:
         return max(0.2 * self.scene.near, 1e-3)
-
-
-def _surfaces(config: GaussianSplattingConfig, dataset: Dataset) -> tuple[Tensor, Tensor]:
-    """Return points (N, 3) on the surfaces that a short run of a field finds, and their colours (N, 3).
-
-    The field is that of instant-ngp, or of nerfacto where there may be something outside the box.
-    """
-    from framework.base.registry import load_method
-    from framework.export.points import joined, surface_points
-    from framework.training.run import Run
-    from framework.training.trainer import Trainer
-
-    steps, count = config.field_steps, config.start_gaussians
-    assert steps is not None
-    assert count is not None
-    method = "nerfacto" if dataset.scene.unbounded else "instant-ngp"
-    field = replace(
-        load_method(method).config,
-        max_num_iterations=steps,
-        vis="none",
-        machine=config.machine,
-        background=config.background,
-    )
-    trainer = Trainer(Run(method, field, "", cast("Any", None), Path()), dataset, None)
-    for _ in track(range(steps), "Looking for surfaces", total=steps):
-        trainer.train_step()
-    model = trainer.model.eval()
-    points, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
-    while (left := count - sum(map(len, points))) > 0 and len(points) < 16:
-        found = joined(surface_points(cast("Any", model), dataset, 2 * left, None))
-        points.append(found.positions[:left])
-        colors.append(found.colors[:left])
-    return torch.cat(points).to(dataset.device), torch.cat(colors).to(dataset.device)
-
-
-def _extent(scene: Scene, means: Tensor | None = None) -> float:
-    """Return the size of a scene, scene units: 1.3 times the median distance of Gaussians from the cameras.
-
-    That is what 3D Gaussian Splatting takes of cameras all around: 1.1 times the largest distance of one from their
-    middle, here where no Gaussians are given. Of cameras side by side it would be less than what they see is away.
-    """
-    if scene.camera_to_worlds is None:
-        return float((scene.box[1] - scene.box[0]).norm()) / 2
-    centers = scene.camera_to_worlds[:, :, 3]
-    if means is not None and len(means):
-        some = means[:: -(-len(means) // FEW)]
-        return 1.3 * float(torch.cdist(some, centers.to(some)).median()) or 1.0
-    return 1.1 * float((centers - centers.mean(0)).norm(dim=-1).max()) or 1.0
-
-
-def _depth_error(distances: Tensor, transmittance: Tensor, known: Tensor) -> Tensor:
-    """Return the relative error () of the mean distance of what pixels show, at most 1 each, where it is known.
-
-    Args:
-        distances: (H, W) sums of weight times distance.
-        transmittance: (H, W).
-        known: (H, W) true distances, 0 where unknown.
-    """
-    opacity = 1 - transmittance
-    counts = (known > 0) & (opacity.detach() > 0.5)
-    mean = distances / opacity.clamp(min=0.5)
-    apart = ((mean - known).abs() / known.clamp(min=1e-6)).clamp(max=1)
-    return torch.where(counts, apart, 0).sum() / counts.sum().clamp(min=1)
-
-
-def _halved(image: Tensor) -> Tensor:
-    """Return an image (H, W, C) of half the size, each pixel the mean of four."""
-    height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
-    return image[:height, :width].reshape(height // 2, 2, width // 2, 2, -1).mean((1, 3))
-
-
-def _doubled(image: Tensor, whole: Tensor) -> Tensor:
-    """Return an image of half the size as large as the whole one, of which it takes an odd last row or column."""
-    out = whole.clone()
-    out[: 2 * image.shape[0], : 2 * image.shape[1]] = image.repeat_interleave(2, 0).repeat_interleave(2, 1)
-    return out
 
 
 METHOD = Method(GaussianSplattingConfig(), paper="arXiv:2308.04079", model=GaussianSplatting, decide=decide)

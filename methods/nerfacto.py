@@ -42,6 +42,7 @@ from framework.rendering.losses import depth_error
 from framework.rendering.volume import VolumeRenderer, shade
 from framework.samplers.choice import SamplingConfig, make_sampler, sampler_choice
 from framework.samplers.proposal import half_edge
+from framework.scene.reasons import DEPTH_REASONS, LIGHT_REASONS, POSE_REASONS
 
 APPEARANCE_SIZE = 16
 """Default length of appearance vectors where the appearance varies."""
@@ -49,12 +50,6 @@ DISTORTION = 2e-3
 """Default weight of the distortion loss in unbounded scenes."""
 DEPTH = 0.1
 """Default weight of the depth loss if there are depth images."""
-DEPTH_REASONS = {True: "there are depth images", False: "there are no depth images"}
-POSE_REASONS = {
-    "exact": "the poses are exact",
-    "photographs": "the poses were found in the photographs themselves",
-    "device": "the poses are those that the device tracked",
-}
 
 
 @dataclass(frozen=True)
@@ -235,7 +230,6 @@ def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[D
     config, made = fill(config, sampler_choice(config, unbounded))
     contracted = unbounded and config.sampler == "proposal"
     reason = f"contraction is {'on' if contracted else 'off'}"
-    lit = "light differs between the images" if scene.appearance_varies else "the images are lit alike"
     refined = "SO3xR3" if scene.poses == "device" and not scene.warped else "off"
     around = "there may be something outside the box" if contracted else "the scene ends at its box"
     config, more = fill(
@@ -244,7 +238,10 @@ def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[D
         Choice("distortion_loss_mult", DISTORTION if contracted else 0.0, reason, "distortion loss"),
         Choice("gradient_scaling", contracted, reason, "gradient scaling near cameras"),
         Choice(
-            "appearance_embedding_dim", APPEARANCE_SIZE if scene.appearance_varies else 0, lit, "appearance features"
+            "appearance_embedding_dim",
+            APPEARANCE_SIZE if scene.appearance_varies else 0,
+            LIGHT_REASONS[scene.appearance_varies],
+            "appearance features",
         ),
         Choice("depth_loss_mult", DEPTH if scene.has_depth else 0.0, DEPTH_REASONS[scene.has_depth], "depth loss"),
         Choice("camera_optimizer", refined, POSE_REASONS[scene.poses], "pose refinement"),

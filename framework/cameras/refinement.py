@@ -79,7 +79,11 @@ class PoseRefinement(nn.Module):
 
     @torch.no_grad()
     def carried_pose(self, pose: Tensor) -> Tensor:
-        """Transform the pose (3, 4) of a camera that is no training camera likewise."""
+        """Transform the pose of a camera that is no training camera by the common drift of those.
+
+        Args:
+            pose: (3, 4) camera-to-scene pose.
+        """
         if self.given is None:
             return pose
         scale, rotation, translation = self._drift(self.given)

@@ -91,7 +91,10 @@ def fit_appearance(
     vector = (appearance.vectors.mean(0) if start is None else start).detach().clone().requires_grad_()
     if len(pixels):
         with appearance.shown(vector):
-            (_fit if isinstance(model, RayModel) else _fit_view)(model, dataset, pixels, vector, background)
+            if isinstance(model, RayModel):
+                _fit(model, dataset, pixels, vector, background)
+            else:
+                _fit_view(model, dataset, pixels, vector, background)
     return vector.detach()
 
 

@@ -9,6 +9,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from framework.base.optimised import Optimised
+
+AFFINE = 12
+"""Length of a vector that is an affine transform of colours."""
+
 
 class Appearance(nn.Module):
     """A learnt vector for each image, an input of the colour network: NeRF-W (Martin-Brualla et al. 2021), section 4.1.
@@ -16,10 +21,12 @@ class Appearance(nn.Module):
     Args:
         size: number D of features of a vector.
         count: number of images.
+        optimised: settings of the optimiser; those of the containing module if None.
     """
 
-    def __init__(self, size: int, count: int) -> None:
+    def __init__(self, size: int, count: int, optimised: Optimised | None = None) -> None:
         super().__init__()
+        self.optimised = optimised
         self.vectors = nn.Parameter(torch.zeros(count, size))
         self._shown: Tensor | None = None
 
@@ -47,3 +54,14 @@ class Appearance(nn.Module):
             yield
         finally:
             self._shown = previous
+
+
+def affine_colors(rgb: Tensor, vector: Tensor) -> Tensor:
+    """Return colours as an image with another light or exposure shows them: rgb + A rgb + b, unchanged by zeros.
+
+    Args:
+        rgb: (..., 3) colours.
+        vector: (AFFINE,) rows of the matrix [A, b] (3, 4).
+    """
+    affine = vector.view(3, 4)
+    return rgb + rgb @ affine[:, :3].T + affine[:, 3]

@@ -40,3 +40,18 @@ def depth_error(weights: Tensor, samples: Samples, known: Tensor) -> Tensor:
     # Without the bound, far samples, which are sparse where distances are in disparity, would dominate the mean.
     apart = ((samples.t - depths).abs() / depths).clamp(max=1)
     return ray_sum(weights * apart, samples)[has_depth].mean()
+
+
+def mean_depth_error(distances: Tensor, transmittance: Tensor, known: Tensor) -> Tensor:
+    """Return the relative error () of the mean distance of what pixels show, at most 1 each, where it is known.
+
+    Args:
+        distances: (H, W) sums of weight times distance.
+        transmittance: (H, W).
+        known: (H, W) true distances, 0 where unknown.
+    """
+    opacity = 1 - transmittance
+    counts = (known > 0) & (opacity.detach() > 0.5)
+    mean = distances / opacity.clamp(min=0.5)
+    apart = ((mean - known).abs() / known.clamp(min=1e-6)).clamp(max=1)
+    return torch.where(counts, apart, 0).sum() / counts.sum().clamp(min=1)

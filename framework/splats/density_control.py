@@ -9,9 +9,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from framework.kernels.splat_project import CUT, REACH_X, X, rotation_matrices
+from framework.kernels.splat_project import CUT, OPACITY, REACH_X, X, rotation_matrices
 from framework.splats.gaussians import Gaussians
 
 GRADIENT = 8e-4
@@ -27,12 +27,53 @@ RESET = 0.01
 
 
 class Growth(NamedTuple):
-    """What becomes of Gaussians."""
+    """Gaussians that stay, and those that are added."""
 
     kept: Tensor
     """(K,) int64 which of them stay as they are."""
     fresh: Gaussians
     """Those that are added behind them."""
+
+
+class GradientMean(nn.Module):
+    """The mean size of the gradients of image positions, over the images that show a Gaussian."""
+
+    sums: Tensor
+    """(N, 2) sum of the sizes, and number of images; empty before the first."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("sums", torch.zeros(0, 2))
+
+    def add(self, records: Tensor, longer_side: int) -> None:
+        """Add an image; without effect if it has no gradient.
+
+        Args:
+            records: (N, RECORD) Gaussians on the image, which retain their gradient.
+            longer_side: of the image, pixels.
+        """
+        if records.grad is None:
+            return
+        if len(self.sums) != len(records):
+            self.sums = records.new_zeros(len(records), 2)
+        self.sums[:, 0] += image_gradients(records, records.grad, longer_side)
+        self.sums[:, 1] += records[:, OPACITY] > 0
+
+    def take(self, count: int) -> Tensor:
+        """Return the means (count,), 0 of what no image has shown, and begin anew.
+
+        Args:
+            count: number of Gaussians.
+        """
+        sums = self.sums if len(self.sums) == count else self.sums.new_zeros(count, 2)
+        self.sums = self.sums.new_zeros(0, 2)
+        return sums[:, 0] / sums[:, 1].clamp(min=1)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: object) -> None:
+        saved = state_dict.get(prefix + "sums")
+        if saved is not None and saved.ndim == 2 and saved.shape[1] == 2:
+            self.sums = self.sums.new_zeros(saved.shape)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
 def image_gradients(records: Tensor, gradient: Tensor, longer_side: int) -> Tensor:

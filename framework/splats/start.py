@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from torch import Tensor
 
+from framework.base.console import say
+from framework.base.errors import ConfigError
 from framework.data.dataset import Dataset
+from framework.data.scene import Scene
 from framework.kernels.splat_project import DC
+from framework.scene.silhouettes import Silhouettes, visual_hull
 from framework.splats.gaussians import Gaussians
 
 OPACITY = 0.1
 """Of every Gaussian at the start."""
+HULL_CELLS = 128
+"""Cells of the visual hull along an axis."""
+FEW = 1_000
+"""Maximum number of Gaussians whose distances to the cameras are looked at."""
 NEIGHBOURS = 3
 """Whose mean distance is a Gaussian's first size."""
 
@@ -129,3 +139,50 @@ def hull_points(hull: Tensor, box: Tensor, resolution: int, count: int) -> Tenso
     corner = torch.stack([chosen // resolution**2, chosen // resolution % resolution, chosen % resolution], -1)
     at = (corner + torch.rand(count, 3, device=cells.device)) / resolution
     return box[0] + at * (box[1] - box[0])
+
+
+def scene_size(scene: Scene, means: Tensor | None = None) -> float:
+    """Return the size of a scene, scene units: 1.3 times the median distance of Gaussians from the cameras.
+
+    That is what 3D Gaussian Splatting takes of cameras all around: 1.1 times the largest distance of one from their
+    middle, here where no Gaussians are given. Of cameras side by side it would be less than what they see is away.
+
+    Args:
+        scene: facts about the data.
+        means: (N, 3) centres of Gaussians, scene units; None if there are none yet.
+    """
+    if scene.camera_to_worlds is None:
+        return float((scene.box[1] - scene.box[0]).norm()) / 2
+    centers = scene.camera_to_worlds[:, :, 3]
+    if means is not None and len(means):
+        some = means[:: -(-len(means) // FEW)]
+        return 1.3 * float(torch.cdist(some, centers.to(some)).median()) or 1.0
+    return 1.1 * float((centers - centers.mean(0)).norm(dim=-1).max()) or 1.0
+
+
+def first_points(kind: Literal["points", "silhouettes", "random"], dataset: Dataset, count: int) -> Tensor:
+    """Return the points (N, 3) at which Gaussians start, scene coordinates.
+
+    Args:
+        kind: points: those of a reconstruction. silhouettes: random ones on the surface of the visual hull of images
+            with alpha. random: anywhere in the scene's box.
+        dataset: the images.
+        count: number of random points.
+
+    Raises:
+        ConfigError: if the data has no points, or no pinhole images with alpha.
+    """
+    scene = dataset.scene
+    box = scene.box.to(dataset.device)
+    if kind == "points":
+        if dataset.points is None:
+            raise ConfigError("--start points: the data has no points of a reconstruction; leave out --start")
+        return dataset.points.to(dataset.device)
+    if kind == "silhouettes":
+        if not scene.has_alpha or dataset.cameras.model != "pinhole":
+            raise ConfigError("--start silhouettes needs pinhole images with alpha; leave out --start")
+        hull = visual_hull(Silhouettes.of(dataset), box, HULL_CELLS)
+        if bool(hull.any()):
+            return hull_points(hull, box, HULL_CELLS, count)
+        say("warning: the images' alpha leaves no part of the box; Gaussians start anywhere in it")
+    return box[0] + torch.rand(count, 3, device=dataset.device) * (box[1] - box[0])

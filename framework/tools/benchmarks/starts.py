@@ -1,4 +1,4 @@
-"""Where Gaussians start, measured: seconds to a PSNR and final PSNR of gaussian-splatting from each kind of start.
+"""Seconds to a PSNR, and final PSNR, of gaussian-splatting from each kind of start.
 
 The time includes the start itself, such as the short run of instant-ngp that finds surfaces.
 """

@@ -1,5 +1,8 @@
 // Gaussians drawn by WebGL 2 as framework/kernels/splat_project.py and splat_blend.py draw them: a quadrilateral each,
-// from back to front, over the background.
+// from back to front, over the background. An instance is a batch of quadrilaterals: one alone would leave most of a
+// GPU idle, and costs a call of its own where WebGL runs in software.
+
+const BATCH = 4096; // Gaussians an instance, and places in a row of the texture of their order
 
 const HARMONICS = [
   "-0.4886025119029199 * d.y", "0.4886025119029199 * d.z", "-0.4886025119029199 * d.x",
@@ -32,7 +35,8 @@ uniform vec3 eye;
 uniform vec2 focal, center, size;  // pixels
 uniform float near, blur;
 uniform bool antialiased;
-in uint which;
+uniform usampler2D order; // from far to near
+uniform uint count;
 flat out vec4 color;
 flat out float cut;
 out vec2 corner;
@@ -41,6 +45,9 @@ vec3 bytes(uint word) { return vec3(word & 255u, (word >> 8) & 255u, (word >> 16
 
 void main() {
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // outside: not drawn
+  uint rank = uint(gl_InstanceID) * ${BATCH}u + (uint(gl_VertexID) >> 2);
+  if (rank >= count) return;
+  uint which = texelFetch(order, ivec2(rank % ${BATCH}u, rank / ${BATCH}u), 0).r;
   ivec2 at = ivec2(int(which & 1023u) * ${2 + extra}, int(which >> 10));
   uvec4 first = texelFetch(table, at, 0);
   vec3 mean = uintBitsToFloat(first.xyz), p = turn * (mean - eye);
@@ -87,7 +94,7 @@ void main() {
   vec3 rgb = 0.5 + ${0.28209479177387814 / 0.15} * (bytes(first.w) / 255.0 - 0.5);
   vec3 d = normalize(mean - eye) * vec3(1.0, -1.0, -1.0);
 ${sum}  color = vec4(max(rgb, 0.0), opacity);
-  corner = vec2((gl_VertexID & 1) * 2 - 1, (gl_VertexID >> 1) * 2 - 1);
+  corner = vec2((gl_VertexID & 1) * 2 - 1, (gl_VertexID & 2) - 1);
   vec2 offset = sqrt(2.0 * cut) * (corner.x * sqrt(long_) * axis + corner.y * sqrt(short_) * vec2(-axis.y, axis.x));
   vec2 clip = 2.0 * (pixel + offset) / size - 1.0;
   gl_Position = vec4(clip.x, -clip.y, 0.0, 1.0);
@@ -124,7 +131,6 @@ function program(gl, vertex, fragment) {
     gl.compileShader(shader);
     gl.attachShader(made, shader);
   }
-  gl.bindAttribLocation(made, 0, "which");
   gl.linkProgram(made);
   if (!gl.getProgramParameter(made, gl.LINK_STATUS) && !gl.isContextLost()) {
     throw new Refused(`This browser's graphics cannot draw the page: ${gl.getProgramInfoLog(made) || "no reason given"}`);
@@ -147,21 +153,24 @@ function drawer(gl, gaussians, { antialiased, near }) {
   if (gaussians.width > most || gaussians.rows > most) {
     throw new Refused("This device's graphics have no room for so many Gaussians; export with a lower --max-megabytes.");
   }
-  gl.activeTexture(gl.TEXTURE0);
-  gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
-  gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, gaussians.width, gaussians.rows);
+  const texture = (unit, format, width, height) => {
+    gl.activeTexture(unit);
+    gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+    gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+  };
+  const { width: tableWidth, rows: tableRows } = gaussians;
+  texture(gl.TEXTURE0, gl.RGBA32UI, tableWidth, tableRows);
   gl.texSubImage2D(
-    gl.TEXTURE_2D, 0, 0, 0, gaussians.width, gaussians.rows, gl.RGBA_INTEGER, gl.UNSIGNED_INT, gaussians.table);
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+    gl.TEXTURE_2D, 0, 0, 0, tableWidth, tableRows, gl.RGBA_INTEGER, gl.UNSIGNED_INT, gaussians.table);
+  texture(gl.TEXTURE2, gl.R32UI, BATCH, Math.max(Math.ceil(gaussians.count / BATCH), 1));
 
-  const whole = gl.createVertexArray(), each = gl.createVertexArray(), orders = gl.createBuffer();
+  const whole = gl.createVertexArray(), each = gl.createVertexArray();
   gl.bindVertexArray(each);
-  gl.bindBuffer(gl.ARRAY_BUFFER, orders);
-  gl.bufferData(gl.ARRAY_BUFFER, Math.max(4 * gaussians.count, 4), gl.DYNAMIC_DRAW);
-  gl.enableVertexAttribArray(0);
-  gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-  gl.vertexAttribDivisor(0, 1);
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+  const corners = Uint16Array.from({ length: 6 * BATCH }, (_, i) => 4 * Math.floor(i / 6) + [0, 1, 2, 2, 1, 3][i % 6]);
+  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
   let drawn = 0;
 
   const halves = gl.getExtension("EXT_color_buffer_half_float") || gl.getExtension("EXT_color_buffer_float");
@@ -183,9 +192,13 @@ function drawer(gl, gaussians, { antialiased, near }) {
 
   return {
     setOrder(order) {
-      gl.bindBuffer(gl.ARRAY_BUFFER, orders);
-      gl.bufferSubData(gl.ARRAY_BUFFER, 0, order);
       drawn = order.length;
+      const rows = Math.floor(drawn / BATCH), rest = drawn % BATCH;
+      gl.activeTexture(gl.TEXTURE2);
+      const upload = (row, width, height, part) => gl.texSubImage2D(
+        gl.TEXTURE_2D, 0, 0, row, width, height, gl.RED_INTEGER, gl.UNSIGNED_INT, part);
+      if (rows) upload(0, BATCH, rows, order.subarray(0, rows * BATCH));
+      if (rest) upload(rows, rest, 1, order.subarray(rows * BATCH));
     },
     draw(camera, background) {
       const { width, height } = gl.canvas, { made, uniforms } = splat, first = target(width, height);
@@ -197,6 +210,8 @@ function drawer(gl, gaussians, { antialiased, near }) {
       gl.useProgram(made);
       gl.bindVertexArray(each);
       gl.uniform1i(uniforms.table, 0);
+      gl.uniform1i(uniforms.order, 2);
+      gl.uniform1ui(uniforms.count, drawn);
       gl.uniformMatrix3fv(uniforms.turn, true, camera.turn);
       gl.uniform3fv(uniforms.eye, camera.eye);
       gl.uniform2f(uniforms.focal, camera.fx, camera.fy);
@@ -205,7 +220,7 @@ function drawer(gl, gaussians, { antialiased, near }) {
       gl.uniform1f(uniforms.near, near);
       gl.uniform1f(uniforms.blur, 0.3);
       gl.uniform1i(uniforms.antialiased, antialiased ? 1 : 0);
-      gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, drawn);
+      gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(drawn / BATCH));
       if (!first) return;
       gl.bindFramebuffer(gl.FRAMEBUFFER, null);
       gl.disable(gl.BLEND);

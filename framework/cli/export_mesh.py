@@ -44,7 +44,7 @@ class MarchingCubesFlags(MeshFlags):
     """Write a mesh of the surface where the density of a field passes a level, with colours and normals."""
 
     isosurface_threshold: float | None = None
-    """Density of the surface, per scene unit. If not given: that of which a cell of the lattice is half opaque."""
+    """Density of the surface, per scene unit. If not given, that at which 1/32 of the scene's box is half opaque."""
     time: float = 0.0
     """Time of a scene that moves, 0 to 1."""
 
@@ -67,10 +67,9 @@ def marching_cubes(flags: MarchingCubesFlags, trained: Trained, placement: Place
     """
     lattice, cleaning = _prepared(flags, trained, placement)
     from framework.base.console import say
-    from framework.export.density import half_opaque
+    from framework.export.density import default_level
     from framework.export.meshing import density_mesh
     from framework.model import HasDensity
-    from framework.training.datasets import load_split
 
     model, level = trained.model, flags.isosurface_threshold
     if not isinstance(model, HasDensity):
@@ -81,8 +80,8 @@ def marching_cubes(flags: MarchingCubesFlags, trained: Trained, placement: Place
         raise ConfigError(f"--time is {flags.time:g}; it must be from 0 to 1")
     start = time.monotonic()
     if level is None:
-        level = half_opaque(lattice.spacing)
-        say(f"the surface is where the density is {level:.4g} per scene unit, at which a cell is half opaque")
+        level = default_level(model.scene.box)
+        say(f"the surface is where the density is {level:.4g} per scene unit (--isosurface-threshold)")
     cameras = trained.run.parse("train").cameras
     mesh = density_mesh(model, lattice, level, flags.time, cameras, cleaning)
     _write(mesh, placement, path, start)

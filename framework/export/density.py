@@ -26,8 +26,10 @@ COARSE = 4
 """Distance in lattice points of the coarse pass, where there is no occupancy grid."""
 COARSE_SHARE = 0.01
 """A block is searched if the coarse pass finds this fraction of the level in it."""
-LOG_RANGE = math.log(1e4)
-"""Values are the logarithm of density over level, in units of this, and are clipped at -1 and 1."""
+LEVEL_SHARE = 1 / 32
+"""Length, as a fraction of the longest edge of the scene's box, of which matter at the default level is half opaque. On
+the embedded scene (`ns-bench meshes`) 1/16 to 1/48 are about as good; a cell of the lattice, 1/256, loses what is
+translucent."""
 
 
 @dataclass
@@ -84,8 +86,9 @@ class LatticeDensity:
         for block in blocks:
             points, _ = self.lattice.block_points(block, BLOCK)
             sigma = self.density(self.lattice.positions(points).float())
-            scaled = (sigma / self.level).clamp(min=1e-30).log() / LOG_RANGE  # NaN stays NaN
-            yield block, scaled.clamp(-1, 1)
+            # By the opacity of a length that is half opaque at the level. Densities themselves, or their logarithms,
+            # are unbounded, and a vertex between 1 and 10^4 would always lie beside the former.
+            yield block, 1 - 2 * torch.exp(-math.log(2) / self.level * sigma)  # NaN stays NaN
 
     def density(self, positions: Tensor) -> Tensor:
         """Return the density (N,) at positions (N, 3) in scene coordinates, on the CPU."""
@@ -166,6 +169,12 @@ def evaluating(model: Model[Any]) -> Iterator[None]:
         yield
 
 
-def half_opaque(spacing: float) -> float:
-    """Return the density, 1/length, of which an interval of length `spacing` is half opaque."""
-    return math.log(2) / spacing
+def default_level(box: Tensor) -> float:
+    """Return the density, 1/scene unit, at which a surface is taken to lie: a fraction of the box is half opaque.
+
+    It does not depend on the lattice, so that a finer one shows the same surface in more detail.
+
+    Args:
+        box: (2, 3) the scene's box.
+    """
+    return math.log(2) / (LEVEL_SHARE * float((box[1] - box[0]).max()))

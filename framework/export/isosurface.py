@@ -52,7 +52,7 @@ def isosurface(lattice: Lattice, edge: int, blocks: Iterable[tuple[Tensor, Tenso
         if found is None:
             continue
         vertices, triangles = found
-        key, place = _identified(vertices, np.array(points[0]), lattice.cells)
+        key, place = _identified(vertices, points[0].numpy(), lattice.cells)
         keys.append(key)
         places.append(place)
         faces.append(triangles.astype(np.int64) + count)

@@ -112,8 +112,8 @@ def components(mesh: Mesh) -> Tensor:
 def cavities(mesh: Mesh, owners: Tensor, cameras: Tensor) -> Tensor:
     """Return the components (C,) bool that bound a hollow within matter, which no camera can see.
 
-    The faces of a hollow are turned inwards, so that its signed volume is negative. A room that holds a camera has a
-    negative volume too, and is kept.
+    The faces of a hollow are turned inwards, so that its signed volume is negative. A component with an open edge bounds
+    nothing, and a room that holds a camera is no hollow, though its volume is negative too.
 
     Args:
         mesh: the mesh.
@@ -123,13 +123,19 @@ def cavities(mesh: Mesh, owners: Tensor, cameras: Tensor) -> Tensor:
     count = int(owners.max()) + 1
     a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
     volume = torch.zeros(count, dtype=torch.float64)
-    volume.index_add_(0, owners, (a * torch.linalg.cross(b, c)).sum(-1) / 6)
+    volume.index_add_(0, owners, (a * torch.linalg.cross(b, c)).sum(-1))
     hollow = volume < 0
-    for index in hollow.nonzero()[:, 0].tolist() if len(cameras) else ():
-        corners = a[owners == index] if count < 1000 else a[:0]
-        if len(corners):
-            inside = (cameras >= corners.amin(0)).all(-1) & (cameras <= corners.amax(0)).all(-1)
-            hollow[index] = not bool(inside.any())
+    inwards = hollow[owners]
+    candidates, members = mesh.faces[inwards], owners[inwards]
+    edges = torch.cat([candidates[:, [0, 1]], candidates[:, [1, 2]], candidates[:, [2, 0]]]).sort(-1).values
+    _, number, faces = (edges[:, 0] * len(mesh.vertices) + edges[:, 1]).unique(return_inverse=True, return_counts=True)
+    hollow[members.repeat(3)[faces[number] != 2]] = False
+    low = torch.full((count, 3), torch.inf, dtype=torch.float64)
+    index = members[:, None].expand(-1, 3)
+    low.scatter_reduce_(0, index, a[inwards], "amin")
+    high = torch.full_like(low, -torch.inf).scatter_reduce_(0, index, a[inwards], "amax")
+    for camera in cameras:
+        hollow &= ~((camera >= low) & (camera <= high)).all(-1)
     return hollow
 
 

@@ -73,7 +73,9 @@ def marching_cubes(flags: MarchingCubesFlags, trained: Trained, placement: Place
 
     model, level = trained.model, flags.isosurface_threshold
     if not isinstance(model, HasDensity):
-        raise ConfigError(f"ns-export marching-cubes: {trained.run.method} has no density; 'ns-export tsdf' makes a mesh")
+        raise ConfigError(
+            f"ns-export marching-cubes: {trained.run.method} has no density; 'ns-export tsdf' makes a mesh"
+        )
     if level is not None and not 0 < level < float("inf"):
         raise ConfigError(f"--isosurface-threshold is {level:g}; it must be above zero")
     if not 0 <= flags.time <= 1:

@@ -97,9 +97,7 @@ def _beside(unknown: np.ndarray) -> np.ndarray:
     return unknown
 
 
-def _identified(
-    vertices: np.ndarray, start: np.ndarray, cells: tuple[int, int, int]
-) -> tuple[np.ndarray, np.ndarray]:
+def _identified(vertices: np.ndarray, start: np.ndarray, cells: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Return a number (V,) for the lattice edge, or the cell, that each vertex lies on, and its lattice coordinates."""
     nearest = np.round(vertices)
     on_point = np.abs(vertices - nearest) < SMALLEST / 4

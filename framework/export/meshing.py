@@ -104,7 +104,9 @@ def fused_mesh(
     fused = tsdf.FusedDistance(lattice, depths, truncation)
     blocks = fused.blocks()
     if not blocks:
-        raise ConfigError("no training view sees a surface in the box; is the run trained, and is the box the right one?")
+        raise ConfigError(
+            "no training view sees a surface in the box; is the run trained, and is the box the right one?"
+        )
     found = isosurface(lattice, tsdf.BLOCK, track(fused.valued(blocks), "Fusing depth", total=len(blocks)))
     if not len(found[1]):
         raise ConfigError("the training views agree on no surface in the box; a larger --truncation may find one")

@@ -63,7 +63,7 @@ def cell_centers(grid: SkipsCells, placement: Placement) -> Tensor:
     """Return the centres (K, 3) float64 of the occupied cells, in the frame of the input."""
     n, matrix = grid.resolution, box_frame(grid, placement)
     cells = grid.occupied.cpu().view(n, n, n).nonzero()
-    return (cells + 0.5) / n @ matrix[:3, :3].T + matrix[:3, 3]
+    return (cells.double() + 0.5) / n @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def write_cells(file: Path, grid: SkipsCells, placement: Placement, boxes: bool) -> None:

@@ -133,7 +133,9 @@ def _facing(points: Tensor, directions: Tensor) -> Tensor:
 def surface_points(view: DepthView) -> Tensor:
     """Return the points (K, 3) in scene coordinates at which the rays of a view meet a surface."""
     height, width = int(view.camera.heights[0]), int(view.camera.widths[0])
-    grid = torch.arange(height * width).view(height, width)[view.stride // 2 :: view.stride, view.stride // 2 :: view.stride]
+    grid = torch.arange(height * width).view(height, width)[
+        view.stride // 2 :: view.stride, view.stride // 2 :: view.stride
+    ]
     met = view.depth.isfinite()
     rays = view.camera.pixel_rays(grid[met], 0.0, 1.0)
     return rays.origins + view.depth[met][:, None] * rays.directions

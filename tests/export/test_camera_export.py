@@ -23,7 +23,7 @@ from framework.data.dataset import DataParser, ParsedScene
 from framework.export.cameras import PosedFiles, all_cameras, orthonormal, posed_files
 from framework.export.colmap_text import images_folder, quaternion, write_model
 from framework.export.transforms import transforms, write_transforms
-from tests.training.helpers import tiny_trainer
+from tests.cli.helpers import train
 
 SPLITS = ("train", "val", "test")
 
@@ -118,16 +118,17 @@ def test_a_run_trains_on_what_was_exported(shared_tiny: Path, tmp_path: Path) ->
     assert content["frames"][0]["file_path"].startswith("../")
     assert content["camera_model"] == "PINHOLE"
     assert content["fl_x"] == pytest.approx(10 / np.tan(0.35))
-    trainer = tiny_trainer("instant-ngp", tmp_path / "cameras", tmp_path / "run", max_num_iterations=5)
-    assert len(trainer.train_set) == 10
-    trainer.train()
+    run = train(tmp_path / "cameras", tmp_path, "--max-num-iterations", 5)
+    assert "name: nerfstudio" in (run / "config.yml").read_text()
 
 
 def cameras_of(model: str, lens: list[float] | None, count: int = 2) -> Cameras:
     values = torch.linspace(100, 120, count)
     sizes = torch.full((count,), 64)
     lenses = None if lens is None else torch.tensor(lens).expand(count, -1)
-    return Cameras(torch.eye(4)[None, :3].repeat(count, 1, 1), values, values, values, values, sizes, sizes, model, lenses)
+    return Cameras(
+        torch.eye(4)[None, :3].repeat(count, 1, 1), values, values, values, values, sizes, sizes, model, lenses
+    )
 
 
 def files_of(cameras: Cameras) -> PosedFiles:
@@ -139,7 +140,9 @@ def files_of(cameras: Cameras) -> PosedFiles:
 def test_lenses_are_written_as_each_format_names_them(tmp_path: Path) -> None:
     k = [0.1, 0.2, 0.01, 0.02, 0.3, 0.0, 0.0, 0.0, 0.4]
     content = transforms(files_of(cameras_of("opencv", k)), tmp_path, False)
-    assert [content[key] for key in ("k1", "k2", "p1", "p2", "k3", "k4")] == pytest.approx([0.1, 0.2, 0.01, 0.02, 0.3, 0.4])
+    assert [content[key] for key in ("k1", "k2", "p1", "p2", "k3", "k4")] == pytest.approx(
+        [0.1, 0.2, 0.01, 0.02, 0.3, 0.4]
+    )
     assert content["frames"][1]["time"] == 0.5
     assert content["frames"][1]["fl_x"] == 120  # which differs between the images, and so is not the file's
     assert "fl_x" not in content
@@ -182,7 +185,9 @@ def test_rounded_rotations_become_orthonormal_again() -> None:
 def test_held_out_cameras_follow_the_refined_ones() -> None:
     """All training cameras are moved by one similarity: then so are the others."""
     turn = torch.from_numpy(Rotation.from_rotvec([0.1, 0.2, -0.3]).as_matrix())
-    poses = torch.cat([torch.from_numpy(Rotation.random(9, random_state=2).as_matrix()), torch.randn(9, 3, 1).double()], -1)
+    poses = torch.cat(
+        [torch.from_numpy(Rotation.random(9, random_state=2).as_matrix()), torch.randn(9, 3, 1).double()], -1
+    )
 
     def moved(pose: Tensor) -> Tensor:
         return torch.cat([turn @ pose[:, :, :3], (1.1 * turn @ pose[:, :, 3:]) + 0.2], -1)

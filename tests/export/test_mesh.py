@@ -132,5 +132,3 @@ def test_a_full_disk_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.M
         write_mesh(file, sphere(1.0))
     assert file.read_bytes() == b"before"
     assert [path.name for path in tmp_path.iterdir()] == ["ball.ply"]
-
-

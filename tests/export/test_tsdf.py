@@ -46,7 +46,9 @@ def around(model: str = "pinhole", lens: list[float] | None = None, count: int =
     index = torch.arange(count) + 0.5
     height, turn = 1 - 2 * index / count, 2.399963 * index
     back = torch.stack([(1 - height**2).sqrt() * turn.cos(), (1 - height**2).sqrt() * turn.sin(), height], -1)
-    right = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([[0.0, 0.1, 1]]).expand_as(back), back), dim=-1)
+    right = torch.nn.functional.normalize(
+        torch.linalg.cross(torch.tensor([[0.0, 0.1, 1]]).expand_as(back), back), dim=-1
+    )
     poses = torch.stack([right, torch.linalg.cross(back, right), back, 3 * back], -1)
     focal = torch.full((count,), 190.0 if model != "orthographic" else 50.0)
     middle, sides = torch.full((count,), size / 2), torch.full((count,), size)
@@ -67,14 +69,22 @@ LENS = [-0.1, 0.02, 1e-3, -1e-3, 0, 0, 0, 0, 0]
 
 @pytest.mark.parametrize(
     ("model", "lens", "stride"),
-    [("pinhole", None, 1), ("pinhole", None, 2), ("opencv", LENS, 1), ("fisheye", [0.01, 0, 0, 0], 1), ("orthographic", None, 1)],
+    [
+        ("pinhole", None, 1),
+        ("pinhole", None, 2),
+        ("opencv", LENS, 1),
+        ("fisheye", [0.01, 0, 0, 0], 1),
+        ("orthographic", None, 1),
+    ],
 )
 def test_the_surface_of_a_ball_is_found(model: str, lens: list[float] | None, stride: int) -> None:
     field, mesh = fused(around(model, lens), stride=stride)
     cell = field.lattice.spacing
     assert closedness(mesh).watertight
     error = mesh.vertices.norm(dim=-1) - RADIUS
-    print(f"{model} stride {stride}: mean {float(error.abs().mean() / cell):.3f}, most {float(error.abs().max() / cell):.3f} cells")
+    print(
+        f"{model} stride {stride}: mean {float(error.abs().mean() / cell):.3f}, most {float(error.abs().max() / cell):.3f} cells"
+    )
     assert float(error.abs().mean()) < 0.12 * cell * stride
     assert float(error.abs().max()) < cell * stride
     normals = vertex_normals(mesh)

@@ -59,8 +59,8 @@ def isosurface(lattice: Lattice, edge: int, blocks: Iterable[tuple[Tensor, Tenso
         count += len(vertices)
         if count > MAX_VERTICES:
             raise ConfigError(
-                f"the surface has more than {MAX_VERTICES:,} vertices: it is noise, or --resolution is too high for it; "
-                "take a lower --resolution, a smaller box, or another --isosurface-threshold"
+                f"the surface has more than {MAX_VERTICES:,} vertices: it is noise, or --resolution is too high "
+                "for it; take a lower --resolution, a smaller box, or another --isosurface-threshold"
             )
     if not faces:
         return torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.int64)

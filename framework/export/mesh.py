@@ -112,8 +112,8 @@ def components(mesh: Mesh) -> Tensor:
 def cavities(mesh: Mesh, owners: Tensor, cameras: Tensor) -> Tensor:
     """Return the components (C,) bool that bound a hollow within matter, which no camera can see.
 
-    The faces of a hollow are turned inwards, so that its signed volume is negative. A component with an open edge bounds
-    nothing, and a room that holds a camera is no hollow, though its volume is negative too.
+    The faces of a hollow are turned inwards, so that its signed volume is negative. A component with an open edge
+    bounds nothing, and a room that holds a camera is no hollow, though its volume is negative too.
 
     Args:
         mesh: the mesh.

@@ -20,6 +20,7 @@ from framework.base.errors import ConfigError
 from framework.cameras.cameras import Cameras
 from framework.cameras.view import View
 from framework.export.lattice import Lattice
+from framework.geometry.lenses import project
 from framework.model import Model
 
 BLOCK = 16
@@ -51,21 +52,21 @@ class DepthView:
     """(H, W) float16 weight, the cosine between the ray and the normal of the surface."""
 
     def lookup(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the pixel (N,) int64 of points (N, 3), numbered row by row, whether it has one, and their distance."""
-        columns, rows, visible = self.camera.project(points, 0)
-        height, width = self.depth.shape
-        offset = self.stride // 2
-        column = ((columns - offset) / self.stride).round()
-        row = ((rows - offset) / self.stride).round()
-        visible = visible & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        pixel = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
-        return pixel.long(), visible, self.distance(points)
+        """Return the pixel (N,) int64 of points (N, 3), numbered row by row, whether it has one, and their distance.
 
-    def distance(self, points: Tensor) -> Tensor:
-        """Return the distance (N,) of points (N, 3) along their rays, scene units."""
-        pose = self.camera.camera_to_worlds[0]
-        offset = points - pose[:, 3]
-        return -(offset @ pose[:, 2]) if self.camera.model == "orthographic" else offset.norm(dim=-1)
+        The distance is that along the pixel's ray, scene units.
+        """
+        camera, pose = self.camera, self.camera.camera_to_worlds[0]
+        local = (points - pose[:, 3]) @ pose[:, :3]
+        x, y, visible = project(camera.model, local, camera.distortion)
+        height, width = self.depth.shape
+        # Pixel i of the full image has its centre at i + 0.5.
+        middle = 0.5 + self.stride // 2
+        column = ((x * camera.fx + (camera.cx - middle)) / self.stride).round_()
+        row = ((y * camera.fy + (camera.cy - middle)) / self.stride).round_()
+        visible = visible & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        pixel = (row * width + column).where(visible, 0).long()
+        return pixel, visible, -local[:, 2] if camera.model == "orthographic" else local.norm(dim=-1)
 
 
 def stride_for(cameras: Cameras, lattice: Lattice, most_pixels: int = MAX_PIXELS) -> int:

@@ -111,7 +111,7 @@ def test_colmap_cameras(name: str, real_data: Path, tmp_path: Path) -> None:
 
 
 def test_a_run_trains_on_what_was_exported(shared_tiny: Path, tmp_path: Path) -> None:
-    posed, scenes = exported(Blender(), shared_tiny)
+    posed, _ = exported(Blender(), shared_tiny)
     write_transforms(tmp_path / "cameras" / "transforms.json", posed, relative=True)
     content = json.loads((tmp_path / "cameras" / "transforms.json").read_text())
     assert [len(content[f"{split}_filenames"]) for split in SPLITS] == [10, 2, 3]

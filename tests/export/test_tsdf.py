@@ -82,9 +82,8 @@ def test_the_surface_of_a_ball_is_found(model: str, lens: list[float] | None, st
     cell = field.lattice.spacing
     assert closedness(mesh).watertight
     error = mesh.vertices.norm(dim=-1) - RADIUS
-    print(
-        f"{model} stride {stride}: mean {float(error.abs().mean() / cell):.3f}, most {float(error.abs().max() / cell):.3f} cells"
-    )
+    mean, most = float(error.abs().mean() / cell), float(error.abs().max() / cell)
+    print(f"{model} stride {stride}: mean {mean:.3f}, most {most:.3f} cells")
     assert float(error.abs().mean()) < 0.12 * cell * stride
     assert float(error.abs().max()) < cell * stride
     normals = vertex_normals(mesh)

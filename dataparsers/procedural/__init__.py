@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from torch import Tensor
+
 from dataparsers.blender import Blender
 from framework import DataError, DataParser, ParsedScene
 from framework.base.console import say, track
@@ -42,6 +44,12 @@ class Procedural(DataParser):
         if self.size < 1 or self.num_train < 1:
             raise DataError("--size and --num-train must be at least 1")
         return Blender().parse(self._rendered_folder(), split)
+
+    def signed_distance(self, points: Tensor) -> Tensor:
+        """Return the distance (N,) from `points` (N, 3) to the nearest surface of the scene at time 0."""
+        from dataparsers.procedural.scene import signed_distance
+
+        return signed_distance(points)
 
     def _rendered_folder(self) -> Path:
         """Return the scene's folder; render the scene first if it is not in the cache."""

@@ -349,3 +349,10 @@ def inside(points: Tensor, time: float | Tensor = 0.0) -> Tensor:
     """
     p = points.T.contiguous()
     return _distance(_poses(time, p), p) < 0.0
+
+
+@torch.no_grad()
+def signed_distance(points: Tensor, time: float | Tensor = 0.0) -> Tensor:
+    """Return the distance to the nearest surface, (N,), negative inside a solid; `points` and `time` as in `inside`."""
+    p = points.T.contiguous()
+    return _distance(_poses(time, p), p)

@@ -74,12 +74,10 @@ NO_FORMATS = (
     "scannet-data", "scannetpp-data", "sdfstudio-data", "sitcoms3d-data",
 )  # fmt: skip
 """Data subcommands of nerfstudio without a data format here."""
-_MESH = "there is no mesh export; 'pointcloud' writes points and normals, from which other programs reconstruct meshes"
+_MESH = "meshes are made by 'marching-cubes' (of methods with density) and 'tsdf' (of all)"
 _OTHER_POSES = "export its cameras in COLMAP's format, and pass that folder to ns-train --data; no processing is needed"
 KINDS = {
     "poisson": _MESH,
-    "tsdf": _MESH,
-    "marching-cubes": _MESH,
     "metashape": _OTHER_POSES,
     "realitycapture": _OTHER_POSES,
     "odm": _OTHER_POSES,

@@ -12,6 +12,7 @@ from typing import Any, Literal
 from framework.base.child import python_command
 from framework.base.console import say
 from framework.base.errors import ConfigError, nearest
+from framework.base.extras import install_command
 from framework.cli.common import chosen_kind, make_room, run_command
 
 USAGE = """\
@@ -27,6 +28,7 @@ usage: ns-bench WHAT [flags]
   cache            memory and speed with a large image set under --cache-limit, and with a small one in memory
   poses            differences between poses from ns-process-data and from a COLMAP model of the same images
   pose-refinement  effect of refining camera poses, on the embedded scene with disturbed training poses
+  meshes           distance of exported meshes from the exact surface or from sparse points; their time and memory
 
 ns-bench WHAT --help shows its flags. Results are written as JSON to docs/results in the working folder, or to
 --output-dir or --output; poses prints them.
@@ -193,6 +195,22 @@ class PoseRefinementFlags:
     """Folder of pose-refinement.json."""
 
 
+@dataclass(frozen=True)
+class MeshFlags:
+    """Export meshes of a run; report their distance from what is known of the surface, their time and memory."""
+
+    load_config: Path | None = None
+    """Folder of a run; if not given, instant-ngp is trained on the embedded scene."""
+    seconds: float = 60.0
+    """Seconds of that training."""
+    exports: tuple[Literal["marching-cubes", "tsdf"], ...] = ("marching-cubes", "tsdf")
+    """Exports that are measured."""
+    resolutions: tuple[int, ...] = (256, 512)
+    """Cells along the longest edge of the box."""
+    output: Path = RESULTS / "meshes-procedural.json"
+    """JSON file to write."""
+
+
 def main() -> None:
     """Run ns-bench on the arguments of the process."""
     run_command(_command)
@@ -305,6 +323,15 @@ def _pose_refinement(flags: PoseRefinementFlags) -> None:
     _write(path, measure(flags.method, flags.seconds, flags.degrees, flags.percent))
 
 
+def _meshes(flags: MeshFlags) -> None:
+    if (advice := install_command("export")) is not None:
+        raise ConfigError(f"ns-bench meshes needs packages that are not installed: {advice}")
+    from framework.tools.benchmarks.meshes import measure
+
+    make_room(flags.output)
+    _write(flags.output, measure(flags.load_config, flags.seconds, flags.exports, flags.resolutions))
+
+
 KINDS: dict[str, tuple[type, Any]] = {
     "kernels": (KernelFlags, _kernels),
     "quadrature": (QuadratureFlags, _quadrature),
@@ -316,6 +343,7 @@ KINDS: dict[str, tuple[type, Any]] = {
     "cache": (CacheFlags, _cache),
     "poses": (PosesFlags, _poses),
     "pose-refinement": (PoseRefinementFlags, _pose_refinement),
+    "meshes": (MeshFlags, _meshes),
 }
 
 

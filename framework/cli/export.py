@@ -1,4 +1,4 @@
-"""The command `ns-export`: point clouds and cameras of a trained run, in the frame and units of its input."""
+"""The command `ns-export`: points, meshes, cameras and more of a trained run, in the frame and units of its input."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from framework.base.errors import ConfigError
+from framework.base.errors import ConfigError, DataError
+from framework.base.extras import install_command
 from framework.cli.common import chosen_kind, make_room, run_command, with_run
+from framework.cli.export_flags import ExportFlags
+from framework.cli.export_mesh import MarchingCubesFlags, TsdfFlags, marching_cubes, tsdf
 
 if TYPE_CHECKING:
     from framework.cameras.poses import Placement
@@ -16,29 +19,17 @@ if TYPE_CHECKING:
 USAGE = """\
 usage: ns-export WHAT RUN_FOLDER --output-dir DIR [flags]
 
-  pointcloud      point_cloud.ply: points on surfaces, with colours, and normals if the method has them
+  pointcloud      point_cloud.ply: points on surfaces, with colours and normals
+  marching-cubes  mesh.ply, .obj or .glb: where the density of a field passes a level
+  tsdf            mesh.ply, .obj or .glb: what the depth images of the training views agree on; for every method
   gaussian-splat  splat.ply or splat.spz: the Gaussians of a method that has them, for viewers
-  cameras         transforms_train.json: the training cameras, with refined poses if the run has refined them
+  cameras         nerfstudio/transforms.json and colmap/sparse/0: the cameras of all splits, refined if the run has
+                  refined them; transforms_train.json: those of training, as nerfstudio writes it
+  occupancy       occupancy.npz and occupancy.ply: the cells that the method samples, if it has a grid
   web             scene.html: one file that shows the scene in any browser with WebGL 2, from disk, offline
 
 ns-export WHAT --help shows its flags. Everything is written in the frame and units of the run's input.
 """
-
-
-@dataclass(frozen=True)
-class ExportFlags:
-    """Flags of every export."""
-
-    load_config: Path
-    """Folder of the run, or its config.yml; the flag's name may be omitted."""
-    output_dir: Path
-    """Folder to write to."""
-    load_checkpoint: Path | None = None
-    """Checkpoint to load; the newest if not given."""
-    data: Path | None = None
-    """Folder of the data, if it has moved since training."""
-    device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
-    """Device to render on."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +40,28 @@ class PointFlags(ExportFlags):
     """Number of rays; rays that end on no surface, or too far away, give no point."""
     reach: float = 2.0
     """Maximum distance of a point from the box's centre along each axis, in half edges of the box; 0 keeps all."""
+    remove_outliers: bool = True
+    """Leave out points that are farther from their 20 nearest neighbours than --std-ratio allows."""
+    std_ratio: float = 2.0
+    """Standard deviations above the mean over all points beyond which a point is an outlier."""
+    estimate_normals: bool = True
+    """Estimate normals from each point's neighbours if the method has none."""
 
 
 @dataclass(frozen=True)
 class CameraFlags(ExportFlags):
-    """Write transforms_train.json: names and camera-to-world matrices of the training images."""
+    """Write cameras as nerfstudio/transforms.json, colmap/sparse/0/*.txt, and transforms_train.json."""
+
+    relative_paths: bool = False
+    """Name images relative to transforms.json instead of by absolute paths."""
+
+
+@dataclass(frozen=True)
+class OccupancyFlags(ExportFlags):
+    """Write occupancy.npz, the occupancy grid, and occupancy.ply, its occupied cells."""
+
+    cells: Literal["centers", "boxes"] = "centers"
+    """What occupancy.ply holds: the cells' centres, or the surface of their boxes."""
 
 
 @dataclass(frozen=True)
@@ -108,42 +116,102 @@ def _placement(trained: Trained) -> Placement:
 
 
 def _points(flags: PointFlags, trained: Trained, placement: Placement, path: Path) -> None:
-    if flags.num_points < 1 or not flags.reach >= 0:
-        raise ConfigError("--num-points must be at least 1, and --reach at least 0")
+    if flags.num_points < 1 or not flags.reach >= 0 or not flags.std_ratio >= 0:
+        raise ConfigError("--num-points must be at least 1, --reach and --std-ratio at least 0")
+    if flags.remove_outliers or flags.estimate_normals:
+        _need_packages("--remove-outliers and --estimate-normals need", "; or set both to False")
     from framework.base.console import say, track
     from framework.base.device import seed_step
     from framework.data.ply import write_points
-    from framework.export.points import joined, surface_points
+    from framework.export.neighbors import inliers, plane_normals
+    from framework.export.points import joined, num_views, picture_points, surface_points
     from framework.ray_model import RayModel
     from framework.training.datasets import load_split
 
     model = trained.model
-    if not isinstance(model, RayModel):
-        raise ConfigError(f"ns-export pointcloud: {trained.run.method} casts no rays, which end in surfaces")
     dataset = load_split(trained.run, "train").to(model.device)
     seed_step(trained.run.config.machine.seed, 0)
-    chunks = -(-flags.num_points // model.config.eval_num_rays_per_chunk)
-    parts = surface_points(model, dataset, flags.num_points, flags.reach or None)
+    if isinstance(model, RayModel):
+        chunks = -(-flags.num_points // model.config.eval_num_rays_per_chunk)
+        parts = surface_points(model, dataset, flags.num_points, flags.reach or None)
+    else:
+        chunks = num_views(dataset)
+        parts = picture_points(model, dataset, flags.num_points, flags.reach or None)
     found = joined(track(parts, "Looking for surfaces", total=chunks))
     if not len(found.positions):
         raise ConfigError("no training ray ends in a surface inside --reach; is the run trained? --reach 0 keeps all")
+    if flags.remove_outliers:
+        kept = inliers(found.positions, flags.std_ratio)
+        say(f"{len(kept) - int(kept.sum()):,} of {len(kept):,} points are outliers and left out (--remove-outliers)")
+        found = found[kept]
+    normals = found.normals
+    if normals is None and flags.estimate_normals:
+        normals = plane_normals(found.positions, -found.directions)
     positions = placement.original_points(found.positions.double()).float()
-    normals = None if found.normals is None else placement.original_directions(found.normals.double()).float()
+    normals = None if normals is None else placement.original_directions(normals.double()).float()
     write_points(path, positions, found.colors, normals)
     say(f"{len(positions):,} points: {path}")
 
 
+def _need_packages(what: str, otherwise: str = "") -> None:
+    """Raise ConfigError if a package of the extra `export` is missing."""
+    if (advice := install_command("export")) is not None:
+        raise ConfigError(f"{what} packages that are not installed: {advice}{otherwise}")
+
+
 def _cameras(flags: CameraFlags, trained: Trained, placement: Placement, path: Path) -> None:
     from framework.base.console import say
-    from framework.export.cameras import camera_list, refined_cameras
+    from framework.export.cameras import SPLITS, all_cameras, camera_list, posed_files, refined_cameras
+    from framework.export.colmap_text import images_folder, write_model
+    from framework.export.transforms import write_transforms
     from framework.training.datasets import load_split
     from framework.training.run import write_json
 
     # Load the images too: cameras of unreadable images are not in the model.
     dataset = load_split(trained.run, "train").to(trained.model.device)
-    cameras = refined_cameras(trained.model, dataset.cameras)
-    write_json(path, camera_list(cameras, dataset.names, placement))
-    say(f"{len(cameras)} cameras: {path}")
+    refined = refined_cameras(trained.model, dataset.cameras)
+    write_json(path, camera_list(refined, dataset.names, placement))
+    say(f"{len(refined)} training cameras: {path}")
+    scenes = {}
+    for split in SPLITS:
+        try:
+            scenes[split] = trained.run.parse(split)
+        except DataError as error:
+            say(f"no '{split}' cameras: {error}")
+    posed = posed_files(scenes, all_cameras(scenes, dataset.cameras, refined), placement)
+    file = path.parent / "nerfstudio" / "transforms.json"
+    write_transforms(file, posed, flags.relative_paths)
+    counts = ", ".join(f"{len(members)} {split}" for split, members in posed.splits.items())
+    say(f"{len(posed.files)} cameras ({counts}): {file}; train on it: ns-train METHOD --data {file.parent}")
+    model = path.parent / "colmap" / "sparse" / "0"
+    try:
+        write_model(model, posed)
+    except ConfigError as error:
+        say(f"no COLMAP model: {error}")
+    else:
+        say(f"COLMAP model: {model}; its images are in {images_folder(posed)}")
+
+
+def _occupancy(flags: OccupancyFlags, trained: Trained, placement: Placement, path: Path) -> None:
+    from framework.base.console import say
+    from framework.export.occupancy import write_cells, write_grid
+    from framework.model import parts
+    from framework.samplers.base import SkipsCells
+
+    grids = parts(trained.model, SkipsCells)
+    if not grids:
+        raise ConfigError(f"ns-export occupancy: this run of {trained.run.method} has no occupancy grid")
+    if flags.cells == "boxes":
+        _need_packages("--cells boxes needs", "; or take --cells centers")
+    grid = grids[0]
+    count = int(grid.occupied.sum())
+    write_grid(path, grid, placement)
+    say(f"{grid.resolution}^3 cells, {count:,} occupied: {path}")
+    if not count:
+        raise ConfigError("no cell is occupied, so that there is nothing to write to occupancy.ply")
+    cells = path.with_suffix(".ply")
+    write_cells(cells, grid, placement, flags.cells == "boxes")
+    say(f"{count:,} cells: {cells}")
 
 
 def _splats(flags: SplatFlags, trained: Trained, placement: Placement, path: Path) -> None:
@@ -177,8 +245,11 @@ def _web(flags: WebFlags, trained: Trained, placement: Placement, path: Path) ->
 
 KINDS: dict[str, tuple[type[Any], str, Any]] = {
     "pointcloud": (PointFlags, "point_cloud.ply", _points),
+    "marching-cubes": (MarchingCubesFlags, "mesh.{format}", marching_cubes),
+    "tsdf": (TsdfFlags, "mesh.{format}", tsdf),
     "gaussian-splat": (SplatFlags, "splat.{format}", _splats),
     "cameras": (CameraFlags, "transforms_train.json", _cameras),
+    "occupancy": (OccupancyFlags, "occupancy.npz", _occupancy),
     "web": (WebFlags, "scene.html", _web),
 }
 

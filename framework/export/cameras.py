@@ -1,15 +1,26 @@
-"""Export of the training cameras, with refined poses."""
+"""Export of the cameras of all splits, with refined poses, in the frame and units of the input."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
-from framework.cameras.cameras import Cameras
+from framework.base.errors import ConfigError
+from framework.cameras.cameras import LENSES, Cameras, join_cameras
 from framework.cameras.poses import Placement
+from framework.data.dataset import ParsedScene
+from framework.geometry.alignment import align_cameras
 from framework.model import Model, RefinesPoses
+
+SPLITS = ("train", "val", "test")
+"""Splits in the order in which their images are listed."""
+ORTHONORMAL_STEPS = 2
+"""Newton steps that make a rotation orthonormal in float64; from float32, one is enough."""
 
 
 def refined_cameras(model: Model[Any], cameras: Cameras) -> Cameras:
@@ -22,6 +33,36 @@ def refined_cameras(model: Model[Any], cameras: Cameras) -> Cameras:
     return model.refined_cameras(cameras) if isinstance(model, RefinesPoses) else cameras
 
 
+def carried_cameras(cameras: Cameras, given: Cameras, refined: Cameras) -> Cameras:
+    """Return cameras that were not refined, moved by the similarity that takes given poses to refined ones.
+
+    Args:
+        cameras: M cameras of other images.
+        given, refined: the training cameras before and after refinement.
+    """
+    if torch.equal(given.camera_to_worlds, refined.camera_to_worlds):
+        return cameras
+    before, after = (part.camera_to_worlds.cpu() for part in (given, refined))
+    scale, rotation, shift = align_cameras(before, after)
+    poses = cameras.camera_to_worlds
+    rotation, shift = rotation.to(poses), shift.to(poses)
+    centers = scale * poses[:, :, 3] @ rotation.T + shift
+    return replace(cameras, camera_to_worlds=torch.cat([rotation @ poses[:, :, :3], centers[..., None]], -1))
+
+
+def all_cameras(scenes: Mapping[str, ParsedScene], given: Cameras, refined: Cameras) -> dict[str, Cameras]:
+    """Return the cameras of each split: refined ones of the training images, and others carried along.
+
+    Args:
+        scenes: split -> its images, with the cameras as they are given.
+        given, refined: the training cameras of the images that could be read, before and after refinement.
+    """
+    found = {split: carried_cameras(scene.cameras, given, refined) for split, scene in scenes.items()}
+    if "train" in found and len(found["train"]) == len(refined):
+        found["train"] = replace(found["train"], camera_to_worlds=refined.camera_to_worlds.cpu())
+    return found
+
+
 def camera_list(cameras: Cameras, names: Sequence[str], placement: Placement) -> list[dict[str, Any]]:
     """Return file names and camera-to-world matrices (3 x 4, OpenGL axes) in the input's frame, in nerfstudio's format.
 
@@ -30,5 +71,108 @@ def camera_list(cameras: Cameras, names: Sequence[str], placement: Placement) ->
         names: M file names.
         placement: the transform from the input's frame to the scene's.
     """
-    poses: Tensor = placement.original_poses(cameras.camera_to_worlds.double().cpu())
+    poses = input_poses(cameras, placement)
     return [{"file_path": name, "transform": pose} for name, pose in zip(names, poses.tolist(), strict=True)]
+
+
+def input_poses(cameras: Cameras, placement: Placement) -> Tensor:
+    """Return camera-to-world matrices (M, 3, 4) float64 in the frame of the input, with orthonormal rotations.
+
+    Args:
+        cameras: M cameras in the scene's frame.
+        placement: the transform from the input's frame to the scene's; it was rounded to float32, so that its rotation
+            is made orthonormal first.
+    """
+    rotation = orthonormal(placement.transform[:, :3].double().cpu())
+    transform = torch.cat([rotation, placement.transform[:, 3:].double().cpu()], -1)
+    poses = Placement(transform, placement.scale).original_poses(cameras.camera_to_worlds.double().cpu())
+    return torch.cat([orthonormal(poses[:, :, :3]), poses[:, :, 3:]], -1)
+
+
+def orthonormal(rotations: Tensor) -> Tensor:
+    """Return the nearest orthonormal matrices (..., 3, 3) of matrices that are nearly so, float64: Higham 1986."""
+    for _ in range(ORTHONORMAL_STEPS):
+        rotations = (rotations + torch.linalg.inv(rotations).transpose(-1, -2)) / 2
+    return rotations
+
+
+@dataclass(frozen=True)
+class PosedFiles:
+    """M images of all splits with their cameras, each once."""
+
+    files: tuple[Path, ...]
+    """M image files."""
+    poses: Tensor
+    """(M, 3, 4) float64 camera-to-world, OpenGL axes, in the input's frame."""
+    cameras: Cameras
+    """M cameras in the scene's frame, for the sizes of the files."""
+    splits: Mapping[str, tuple[int, ...]]
+    """Split -> indices of its images."""
+    masks: tuple[Path | None, ...]
+    """M mask files; None for an image without."""
+    times: Tensor | None
+    """(M,) time of each image in [0, 1]; None for a static scene."""
+    points: Tensor | None
+    """(K, 3) float64 sparse points in the input's frame; None if there are none."""
+    pixels_per_unit: float
+    """Factor from pixels per scene unit to pixels per unit of the input, for orthographic cameras."""
+
+
+def posed_files(scenes: Mapping[str, ParsedScene], cameras: Mapping[str, Cameras], placement: Placement) -> PosedFiles:
+    """Return the images of all splits; an image of several splits comes once, with the camera of the first.
+
+    Args:
+        scenes: split -> its images.
+        cameras: split -> its cameras, which may be refined.
+        placement: the input's in the scene.
+    """
+    files: dict[Path, int] = {}
+    chosen: list[tuple[str, int]] = []
+    splits: dict[str, tuple[int, ...]] = {}
+    for split, scene in scenes.items():
+        members = []
+        for index, path in enumerate(scene.image_paths):
+            if path not in files:
+                files[path] = len(files)
+                chosen.append((split, index))
+            members.append(files[path])
+        splits[split] = tuple(members)
+    parts = {split: [index for owner, index in chosen if owner == split] for split in scenes}
+    joined = join_cameras([cameras[split][torch.tensor(parts[split])] for split in scenes if parts[split]])
+    moving = all(scene.times is not None for scene in scenes.values())
+    points = next((scene.points for scene in scenes.values() if scene.points is not None), None)
+    return PosedFiles(
+        files=tuple(files),
+        poses=input_poses(joined, placement),
+        cameras=joined,
+        splits=splits,
+        masks=tuple(None if (masks := scenes[split].mask_paths) is None else masks[index] for split, index in chosen),
+        times=torch.cat([_times(scenes[split])[parts[split]] for split in scenes]) if moving else None,
+        points=None if points is None else placement.original_points(points.double()),
+        pixels_per_unit=placement.scale,
+    )
+
+
+def _times(scene: ParsedScene) -> Tensor:
+    assert scene.times is not None
+    return scene.times
+
+
+def coefficients(cameras: Cameras) -> list[dict[str, float]]:
+    """Return the distortion coefficients of M cameras by their names in `LENSES`."""
+    names = LENSES[cameras.model]
+    if cameras.lens is None:
+        return [dict.fromkeys(names, 0.0)] * len(cameras)
+    return [dict(zip(names, row, strict=True)) for row in cameras.lens.double().tolist()]
+
+
+def rational(lenses: Sequence[Mapping[str, float]]) -> bool:
+    """Return whether any lens has coefficients of the denominator, k4 to k6.
+
+    Raises:
+        ConfigError: if a lens has k7 too, for which no format has a place.
+    """
+    found = any(lens.get(name) for lens in lenses for name in ("k4", "k5", "k6"))
+    if found and any(lens.get("k7") for lens in lenses):
+        raise ConfigError("the lens has both k4 to k6 of the denominator and the r^8 term, which no format can hold")
+    return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -13,10 +13,13 @@ from framework.data.dataset import Dataset
 from framework.data.pixels import draw_pixels
 from framework.evaluation.evaluator import evaluation_background
 from framework.kernels.math import safe_normalize
+from framework.model import Model
 from framework.ray_model import RayModel
 
 OPAQUE = 0.5
 """Minimum opacity of a ray that ends on a surface."""
+MOST_VIEWS = 200
+"""Maximum number of views that are rendered of a method that casts no rays."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,13 @@ class SurfacePoints:
     """(K, 3) colours in [0, 1], as seen from the respective camera."""
     normals: Tensor | None
     """(K, 3) unit normals, if the method has them."""
+    directions: Tensor
+    """(K, 3) unit directions of the rays that ended there."""
+
+    def __getitem__(self, kept: Tensor) -> SurfacePoints:
+        """Return the points selected by a mask or an index tensor."""
+        normals = None if self.normals is None else self.normals[kept]
+        return SurfacePoints(self.positions[kept], self.colors[kept], normals, self.directions[kept])
 
 
 @torch.no_grad()
@@ -44,8 +54,7 @@ def surface_points(model: RayModel[Any], dataset: Dataset, count: int, reach: fl
         reach: maximum distance of a point from the box's centre along each axis, in half edges of the box; None keeps
             all points.
     """
-    background, scene, box = evaluation_background(model), model.scene, model.scene.box.to(model.device)
-    middle, half = box.mean(0), (box[1] - box[0]) / 2
+    background, scene = evaluation_background(model), model.scene
     chunk = model.config.eval_num_rays_per_chunk
     for start in range(0, count, chunk):
         pixels = draw_pixels(dataset, min(chunk, count - start)).to(model.device)
@@ -54,17 +63,72 @@ def surface_points(model: RayModel[Any], dataset: Dataset, count: int, reach: fl
             out = model.render(rays, background)
         depth = out.median_depth.float()
         positions = rays.origins + depth[:, None] * rays.directions
-        selected = (out.accumulation >= OPAQUE) & (depth < rays.fars) & positions.isfinite().all(-1)
-        if reach is not None:
-            selected &= ((positions - middle).abs() <= reach * half).all(-1)
+        selected = (out.accumulation >= OPAQUE) & (depth < rays.fars) & _within(model, positions, reach)
         normals = None if out.normals is None else safe_normalize(out.normals.float())[selected].cpu()
-        yield SurfacePoints(positions[selected].cpu(), out.rgb.float().clamp(0, 1)[selected].cpu(), normals)
+        yield SurfacePoints(
+            positions[selected].cpu(),
+            out.rgb.float().clamp(0, 1)[selected].cpu(),
+            normals,
+            rays.directions[selected].cpu(),
+        )
+
+
+@torch.no_grad()
+def picture_points(model: Model[Any], dataset: Dataset, count: int, reach: float | None) -> Iterator[SurfacePoints]:
+    """Return surface points at the median depth of random pixels of rendered training views, view by view.
+
+    It is for methods that cast no rays; views are evenly spaced in the data set, at most `MOST_VIEWS`.
+
+    Args:
+        model: the model in evaluation mode.
+        dataset: the training split, on the model's device.
+        count: number of pixels.
+        reach: as in `surface_points`.
+    """
+    background, far = evaluation_background(model), model.scene.far
+    views = torch.linspace(0, len(dataset) - 1, num_views(dataset), dtype=torch.float64).round().long().tolist()
+    for number, index in enumerate(views):
+        view = dataset.view(index)
+        picture = model.render_view(view, background)
+        drawn = (number + 1) * count // len(views) - number * count // len(views)
+        pixels = torch.randint(picture.depth.numel(), (drawn,), device=model.device)
+        rays = view.camera.pixel_rays(pixels, model.scene.near, far)
+        depth = picture.median_depth.reshape(-1)[pixels]
+        positions = rays.origins + depth[:, None] * rays.directions
+        opaque = picture.accumulation.reshape(-1)[pixels] >= OPAQUE
+        selected = opaque & (depth < rays.fars) & _within(model, positions, reach)
+        if (kept := dataset.kept_of(index)) is not None:
+            selected &= kept.to(model.device).reshape(-1)[pixels]
+        normals = None if picture.normals is None else picture.normals.reshape(-1, 3)[pixels][selected].cpu()
+        yield SurfacePoints(
+            positions[selected].cpu(),
+            picture.rgb.clamp(0, 1).reshape(-1, 3)[pixels][selected].cpu(),
+            normals,
+            rays.directions[selected].cpu(),
+        )
+
+
+def num_views(dataset: Dataset) -> int:
+    """Return the number of views of `dataset` that `picture_points` renders."""
+    return min(len(dataset), MOST_VIEWS)
+
+
+def _within(model: Model[Any], positions: Tensor, reach: float | None) -> Tensor:
+    """Return which positions (N, 3) are finite and within `reach`, (N,) bool."""
+    selected = positions.isfinite().all(-1)
+    if reach is not None:
+        box = model.scene.box.to(model.device)
+        selected &= ((positions - box.mean(0)).abs() <= reach * (box[1] - box[0]) / 2).all(-1)
+    return selected
 
 
 def joined(parts: Iterator[SurfacePoints]) -> SurfacePoints:
     """Concatenate `parts`, of which there must be at least one; without normals if any part has none."""
     chunks = list(parts)
-    whole = SurfacePoints(torch.cat([p.positions for p in chunks]), torch.cat([p.colors for p in chunks]), None)
-    if any(chunk.normals is None for chunk in chunks):
-        return whole
-    return replace(whole, normals=torch.cat([p.normals for p in chunks if p.normals is not None]))
+    normals = [chunk.normals for chunk in chunks if chunk.normals is not None]
+    return SurfacePoints(
+        torch.cat([chunk.positions for chunk in chunks]),
+        torch.cat([chunk.colors for chunk in chunks]),
+        torch.cat(normals) if len(normals) == len(chunks) else None,
+        torch.cat([chunk.directions for chunk in chunks]),
+    )

@@ -4,6 +4,7 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -51,6 +52,43 @@ def test_cameras_are_those_of_the_input(
     for frame in given:
         name = Path(frame["file_path"]).name + ".png"
         torch.testing.assert_close(torch.tensor(found[name]), torch.tensor(frame["transform_matrix"])[:3])
+
+
+def test_meshes_are_of_the_ball(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Refused) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    given = ("--load-config", ball, "--output-dir", tmp_path)
+    for what, kind, flags in (
+        ("marching-cubes", "ply", ()),
+        ("marching-cubes", "glb", ("--target-num-faces", 1000)),
+        ("tsdf", "obj", ("--bounding-box-min", -1.3, -1.3, -1.3, "--bounding-box-max", 1.3, 1.3, 1.3)),
+    ):
+        export(monkeypatch, what, *given, "--resolution", 32, "--format", kind, "--num-components", 1, *flags)
+        mesh = trimesh.load(tmp_path / f"mesh.{kind}", process=False, force="mesh")
+        assert len(mesh.visual.vertex_colors) == len(mesh.vertices)
+        distances = np.linalg.norm(mesh.vertices, axis=1)
+        # What 200 steps on 20 x 20 pixels know; and no view sees the ball from below.
+        assert np.median(np.abs(distances - 1)) < 0.2
+        assert len(mesh.faces) > 300
+        if "--target-num-faces" in flags:
+            assert len(mesh.faces) <= 1000
+    assert "never passes 1e+30" in refused(main, "marching-cubes", *given, "--isosurface-threshold", 1e30)
+    assert "--isosurface-threshold is 0" in refused(main, "marching-cubes", *given, "--isosurface-threshold", 0)
+    assert "--resolution is 2048" in refused(main, "tsdf", *given, "--resolution", 2048)
+    box = ("--bounding-box-min", 50, 50, 50, "--bounding-box-max", 51, 51, 51)
+    assert "no training view sees a surface in the box" in refused(main, "tsdf", *given, *box)
+    assert "no occupied cell in the box" in refused(main, "marching-cubes", *given, *box)
+
+
+def test_the_grid_and_all_cameras_are_written(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    export(monkeypatch, "occupancy", "--load-config", ball, "--output-dir", tmp_path)
+    points = read_points(tmp_path / "occupancy.ply")
+    with np.load(tmp_path / "occupancy.npz", allow_pickle=False) as grid:
+        assert len(points) == grid["occupied"].sum() > 100
+    export(monkeypatch, "cameras", "--load-config", ball, "--output-dir", tmp_path)
+    content = json.loads((tmp_path / "nerfstudio" / "transforms.json").read_text())
+    assert len(content["frames"]) == 15
+    assert all(Path(frame["file_path"]).is_file() for frame in content["frames"])
+    assert len((tmp_path / "colmap" / "sparse" / "0" / "images.txt").read_text().splitlines()) == 1 + 2 * 15
 
 
 class Refining(torch.nn.Module):

@@ -1,0 +1,132 @@
+"""The meshes of `ns-export`: flags and output of `marching-cubes` and `tsdf`."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from framework.base.errors import ConfigError
+from framework.base.extras import install_command
+from framework.cli.export_flags import ExportFlags
+
+if TYPE_CHECKING:
+    from framework.cameras.poses import Placement
+    from framework.export.lattice import Lattice
+    from framework.export.mesh import Mesh
+    from framework.export.meshing import Cleaning
+    from framework.training.trained import Trained
+
+
+@dataclass(frozen=True)
+class MeshFlags(ExportFlags):
+    """Flags of every mesh."""
+
+    format: Literal["ply", "obj", "glb"] = "ply"
+    """Format of the file; ply is the smallest and fastest."""
+    resolution: int = 256
+    """Number of cells along the longest edge of the box, up to 1024."""
+    bounding_box_min: tuple[float, float, float] | None = None
+    """Least corner of the box that is searched, in the frame and units of the input; the scene's box if not given."""
+    bounding_box_max: tuple[float, float, float] | None = None
+    """Greatest corner of the box that is searched, in the frame and units of the input."""
+    num_components: int = 0
+    """Maximum number of connected components, the largest; 0 for any."""
+    min_component_share: float = 0.001
+    """Minimum number of faces of a component, as a fraction of those of the largest one."""
+    target_num_faces: int | None = None
+    """Number of faces that the mesh is simplified to; it is not simplified if not given."""
+
+
+@dataclass(frozen=True)
+class MarchingCubesFlags(MeshFlags):
+    """Write a mesh of the surface where the density of a field passes a level, with colours and normals."""
+
+    isosurface_threshold: float | None = None
+    """Density of the surface, per scene unit. If not given, that at which 1/32 of the scene's box is half opaque."""
+    time: float = 0.0
+    """Time of a scene that moves, 0 to 1."""
+
+
+@dataclass(frozen=True)
+class TsdfFlags(MeshFlags):
+    """Write a mesh of the surface that the depth images of the training views agree on; works for every method."""
+
+    truncation: float = 4.0
+    """Distance from the surface up to which depth images count, in cells: more is smoother, less keeps thin parts."""
+    max_num_views: int = 200
+    """Maximum number of training views that are rendered, evenly spaced."""
+
+
+def marching_cubes(flags: MarchingCubesFlags, trained: Trained, placement: Placement, path: Path) -> None:
+    """Write a mesh of a level of the density to `path`, in the frame of `placement`'s input.
+
+    Raises:
+        ConfigError: if a flag is out of range, the method has no density, or there is no surface.
+    """
+    lattice, cleaning = _prepared(flags, trained, placement)
+    from framework.base.console import say
+    from framework.export.density import default_level
+    from framework.export.meshing import density_mesh
+    from framework.model import HasDensity
+
+    model, level = trained.model, flags.isosurface_threshold
+    if not isinstance(model, HasDensity):
+        raise ConfigError(
+            f"ns-export marching-cubes: {trained.run.method} has no density; 'ns-export tsdf' makes a mesh"
+        )
+    if level is not None and not 0 < level < float("inf"):
+        raise ConfigError(f"--isosurface-threshold is {level:g}; it must be above zero")
+    if not 0 <= flags.time <= 1:
+        raise ConfigError(f"--time is {flags.time:g}; it must be from 0 to 1")
+    start = time.monotonic()
+    if level is None:
+        level = default_level(model.scene.box)
+        say(f"the surface is where the density is {level:.4g} per scene unit (--isosurface-threshold)")
+    cameras = trained.run.parse("train").cameras
+    mesh = density_mesh(model, lattice, level, flags.time, cameras, cleaning)
+    _write(mesh, placement, path, start)
+
+
+def tsdf(flags: TsdfFlags, trained: Trained, placement: Placement, path: Path) -> None:
+    """Write a mesh of fused depth images to `path`, in the frame of `placement`'s input.
+
+    Raises:
+        ConfigError: if a flag is out of range, or there is no surface.
+    """
+    lattice, cleaning = _prepared(flags, trained, placement)
+    if flags.max_num_views < 1:
+        raise ConfigError(f"--max-num-views is {flags.max_num_views}; it must be at least 1")
+    from framework.export.meshing import fused_mesh
+    from framework.training.datasets import load_split
+
+    start = time.monotonic()
+    dataset = load_split(trained.run, "train").to(trained.model.device)
+    mesh = fused_mesh(trained.model, dataset, lattice, flags.truncation, flags.max_num_views, cleaning)
+    _write(mesh, placement, path, start)
+
+
+def _prepared(flags: MeshFlags, trained: Trained, placement: Placement) -> tuple[Lattice, Cleaning]:
+    """Return the lattice and what is kept, both checked, and check that the packages for a mesh are installed."""
+    if (advice := install_command("export")) is not None:
+        raise ConfigError(f"a mesh needs packages that are not installed: {advice}")
+    from framework.export.lattice import lattice_of
+    from framework.export.meshing import Cleaning
+
+    cleaning = Cleaning(flags.num_components, flags.min_component_share, flags.target_num_faces)
+    cleaning.check()
+    box, low, high = trained.model.scene.box, flags.bounding_box_min, flags.bounding_box_max
+    return lattice_of(box, flags.resolution, placement, low, high), cleaning
+
+
+def _write(mesh: Mesh, placement: Placement, path: Path, start: float) -> None:
+    """Write a mesh, and say what it is."""
+    from framework.base.console import say
+    from framework.export.mesh import closedness
+    from framework.export.mesh_files import write_mesh
+    from framework.export.meshing import in_input
+
+    write_mesh(path, in_input(mesh, placement))
+    counts = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces, {closedness(mesh).sentence()}"
+    say(f"{counts}; {path.stat().st_size / 1e6:.1f} MB after {time.monotonic() - start:.1f} s: {path}")

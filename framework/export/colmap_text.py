@@ -1,0 +1,93 @@
+"""Cameras as a COLMAP model in text files: cameras.txt, images.txt and points3D.txt (Schönberger and Frahm 2016)."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from framework.base.errors import ConfigError
+from framework.export.cameras import PosedFiles, coefficients, rational
+from framework.training.checkpoint import write_atomically
+
+ORDERS = {
+    "PINHOLE": (),
+    "OPENCV": ("k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+}
+"""COLMAP's model -> its coefficients after fx, fy, cx, cy, by their names in `LENSES`."""
+
+
+def images_folder(posed: PosedFiles) -> Path:
+    """Return the folder that all image files are in, to which their names in the model are relative."""
+    return Path(os.path.commonpath([file.resolve().parent for file in posed.files]))
+
+
+def write_model(folder: Path, posed: PosedFiles) -> None:
+    """Write the three files of a model.
+
+    Images have no keypoints, and points no observations: what there is of a data set is where its points are.
+
+    Args:
+        folder: folder to write to, which is created.
+        posed: the images.
+
+    Raises:
+        ConfigError: if COLMAP has no such camera model.
+        OSError: if a file cannot be written.
+    """
+    cameras, owners = _cameras(posed)
+    root = images_folder(posed)
+    lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, and a line of keypoints"]
+    for index, (file, pose) in enumerate(zip(posed.files, posed.poses, strict=True)):
+        # COLMAP looks along +z, with y down, and stores the inverse.
+        rotation = (pose[:, :3] * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)).T
+        numbers = [*quaternion(rotation).tolist(), *(-rotation @ pose[:, 3]).tolist()]
+        name = file.resolve().relative_to(root).as_posix()
+        lines += [f"{index + 1} {' '.join(map(repr, numbers))} {owners[index] + 1} {name}", ""]
+    points = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"]
+    for index, point in enumerate([] if posed.points is None else posed.points.tolist()):
+        points.append(f"{index + 1} {' '.join(map(repr, point))} 128 128 128 0")
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, content in (("cameras", cameras), ("images", lines), ("points3D", points)):
+        text = "\n".join(content) + "\n"
+        write_atomically(folder / f"{name}.txt", lambda stream, text=text: stream.write(text.encode()))  # type: ignore[misc]
+
+
+def _cameras(posed: PosedFiles) -> tuple[list[str], list[int]]:
+    """Return the lines of cameras.txt, and the number of each image's camera, from 0."""
+    cameras, lenses = posed.cameras, coefficients(posed.cameras)
+    if cameras.model not in ("pinhole", "opencv", "fisheye"):
+        raise ConfigError(f"COLMAP has no {cameras.model} cameras")
+    model = {"pinhole": "PINHOLE", "opencv": "OPENCV", "fisheye": "OPENCV_FISHEYE"}[cameras.model]
+    if cameras.model == "opencv":
+        full = rational(lenses) or any(lens["k3"] for lens in lenses)
+        if any(lens["k7"] for lens in lenses):
+            raise ConfigError("COLMAP's camera models have no r^8 term")
+        model = "FULL_OPENCV" if full else "OPENCV"
+    numbers: dict[str, int] = {}
+    owners = []
+    for index, lens in enumerate(lenses):
+        values = [float(part[index]) for part in (cameras.fx, cameras.fy, cameras.cx, cameras.cy)]
+        values += [lens[name] for name in ORDERS[model]]
+        line = f"{model} {int(cameras.widths[index])} {int(cameras.heights[index])} {' '.join(map(repr, values))}"
+        owners.append(numbers.setdefault(line, len(numbers)))
+    header = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"
+    return [header, *(f"{number + 1} {line}" for line, number in numbers.items())], owners
+
+
+def quaternion(rotation: Tensor) -> Tensor:
+    """Return the unit quaternion (4,) w, x, y, z with w >= 0 of a rotation (3, 3), float64: Bar-Itzhack 2000.
+
+    It is the eigenvector of a symmetric matrix, which is well conditioned for every rotation.
+    """
+    r = rotation.double()
+    k = torch.zeros(4, 4, dtype=torch.float64)
+    k[0, 0] = r.trace()
+    k[1:, 1:] = r + r.T - r.trace() * torch.eye(3, dtype=torch.float64)
+    k[0, 1:] = k[1:, 0] = torch.stack([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+    found = torch.linalg.eigh(k / 3).eigenvectors[:, -1]
+    return -found if found[0] < 0 else found

@@ -1,0 +1,180 @@
+"""The density of a trained model on a lattice, as its renderer sees it, and the level at which its surface lies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from framework.base.errors import ConfigError
+from framework.export.lattice import Lattice
+from framework.geometry.points import Points
+from framework.kernels.native import torch_on_one_thread
+from framework.model import HasDensity, Model, parts
+from framework.samplers.base import SkipsCells
+
+BLOCK = 32
+"""Cells along an edge of a block."""
+CHUNK = 2**16
+"""Number of positions that are evaluated at once."""
+COARSE = 4
+"""Distance in lattice points of the coarse pass, where there is no occupancy grid."""
+COARSE_SHARE = 0.01
+"""A block is searched if the coarse pass finds this fraction of the level in it."""
+LEVEL_SHARE = 1 / 32
+"""Length, as a fraction of the longest edge of the scene's box, of which matter at the default level is half opaque. On
+the embedded scene (`ns-bench meshes`) 1/16 to 1/48 are about as good; a cell of the lattice, 1/256, loses what is
+translucent."""
+
+
+@dataclass
+class DensityRange:
+    """What the evaluation of densities has met."""
+
+    evaluated: int = 0
+    """Number of positions that were evaluated."""
+    nan: int = 0
+    """Number of those at which the density is NaN."""
+    low: float = field(default=math.inf)
+    """Minimum of the others."""
+    high: float = field(default=-math.inf)
+    """Maximum of the others."""
+
+    def add(self, sigma: Tensor) -> None:
+        """Count densities (N,)."""
+        nan = sigma.isnan()
+        self.evaluated += len(sigma)
+        self.nan += int(nan.sum())
+        if not bool(nan.all()):
+            known = sigma[~nan]
+            self.low, self.high = min(self.low, float(known.min())), max(self.high, float(known.max()))
+
+
+class LatticeDensity:
+    """The density of a model at lattice points: zero in cells that the renderer skips, and evaluated elsewhere.
+
+    Args:
+        model: the model in evaluation mode.
+        lattice: the points.
+        level: density of the surface, 1/scene unit.
+        time: time in [0, 1] of a scene that moves.
+
+    Raises:
+        ConfigError: if the model has no density.
+    """
+
+    def __init__(self, model: Model[Any], lattice: Lattice, level: float, time: float = 0.0) -> None:
+        if not isinstance(model, HasDensity):
+            raise ConfigError("this method has no density whose surface could be found; 'ns-export tsdf' makes a mesh")
+        self._model, self._density = model, model.density
+        self.lattice, self.level, self.time = lattice, level, time
+        grids = parts(model, SkipsCells)
+        self.grid = grids[0] if grids else None
+        self.seen = DensityRange()
+
+    def blocks(self) -> list[Tensor]:
+        """Return the blocks (3,) that may hold a part of the surface."""
+        return list(self._occupied_blocks() if self.grid is not None else self._coarse_blocks())
+
+    def valued(self, blocks: Iterable[Tensor]) -> Iterator[tuple[Tensor, Tensor]]:
+        """Yield blocks with their values for `isosurface`, positive above the level."""
+        for block in blocks:
+            points, _ = self.lattice.block_points(block, BLOCK)
+            sigma = self.density(self.lattice.positions(points).float())
+            # By the opacity of a length that is half opaque at the level. Densities themselves, or their logarithms,
+            # are unbounded, and a vertex between 1 and 10^4 would always lie beside the former.
+            yield block, 1 - 2 * torch.exp(-math.log(2) / self.level * sigma)  # NaN stays NaN
+
+    def density(self, positions: Tensor) -> Tensor:
+        """Return the density (N,) at positions (N, 3) in scene coordinates, on the CPU."""
+        if self.grid is None:
+            return self._evaluated(positions)
+        kept = self._kept(positions).nonzero()[:, 0]
+        sigma = torch.zeros(len(positions))
+        if len(kept):
+            sigma[kept] = self._evaluated(positions[kept])
+        return sigma
+
+    def _kept(self, positions: Tensor) -> Tensor:
+        """Return whether the renderer samples at positions (N, 3), (N,) bool."""
+        assert self.grid is not None
+        n, box = self.grid.resolution, self.grid.box.cpu()
+        unit = (positions - box[0]) / (box[1] - box[0])
+        cells = (unit * n).long().clamp(0, n - 1)
+        # The far faces of the box belong to its last cells.
+        inside = ((unit >= 0) & (unit <= 1)).all(-1)
+        occupied = self.grid.occupied.cpu()
+        return inside & occupied[(cells[:, 0] * n + cells[:, 1]) * n + cells[:, 2]]
+
+    @torch.no_grad()
+    def _evaluated(self, positions: Tensor) -> Tensor:
+        with evaluating(self._model):
+            found = torch.cat([self._chunk(chunk) for chunk in positions.split(CHUNK)])
+        self.seen.add(found)
+        return found
+
+    def _chunk(self, positions: Tensor) -> Tensor:
+        count, spacing, device = len(positions), self.lattice.spacing, self._model.device
+        points = Points(
+            positions.to(device),
+            torch.full((count,), self.time, device=device) if self._model.scene.moving else None,
+            torch.full((count,), spacing / 2, device=device),
+            torch.full((count, 3), spacing**2 / 12, device=device),
+        )
+        return self._density(points).float().cpu()
+
+    def _occupied_blocks(self) -> Iterator[Tensor]:
+        """Yield the blocks that overlap an occupied cell of the grid, by sums over the cells of boxes."""
+        assert self.grid is not None
+        n, box = self.grid.resolution, self.grid.box.cpu().double()
+        sums = torch.zeros(n + 1, n + 1, n + 1, dtype=torch.int32)
+        counts = self.grid.occupied.cpu().view(n, n, n).to(torch.int32)
+        sums[1:, 1:, 1:] = counts.cumsum(0, dtype=torch.int32).cumsum(1, dtype=torch.int32).cumsum(2, dtype=torch.int32)
+        offsets = torch.cartesian_prod(*[torch.tensor([0, BLOCK])] * 3)
+        for block in self.lattice.all_blocks(BLOCK):
+            corners = (self.lattice.positions(block * BLOCK + offsets) - box[0]) / (box[1] - box[0]) * n
+            low = corners.amin(0).floor().clamp(0, n).long().tolist()
+            high = corners.amax(0).ceil().clamp(0, n).long().tolist()
+            total = 0
+            for choice in range(8):
+                corner = [high[a] if choice >> a & 1 else low[a] for a in range(3)]
+                sign = -1 if choice.bit_count() % 2 == 0 else 1
+                total += sign * int(sums[corner[0], corner[1], corner[2]])
+            if total:
+                yield block
+
+    def _coarse_blocks(self) -> Iterator[Tensor]:
+        """Yield the blocks in which the density on a coarser lattice is NaN or comes near the level."""
+        for block in self.lattice.all_blocks(BLOCK):
+            points, _ = self.lattice.block_points(block, BLOCK)
+            last = torch.tensor(self.lattice.cells)
+            kept = ((points % COARSE == 0) | (points == last)).all(-1)
+            sigma = self.density(self.lattice.positions(points[kept]).float())
+            if not bool((sigma < COARSE_SHARE * self.level).all()):
+                yield block
+
+
+@contextmanager
+def evaluating(model: Model[Any]) -> Iterator[None]:
+    """Within the `with` block, the networks of `model` run in the precision and on the threads of its rendering."""
+    with (
+        torch_on_one_thread(model.runs_on_kernels),
+        torch.autocast(model.device.type, torch.bfloat16, enabled=model.uses_bfloat16),
+    ):
+        yield
+
+
+def default_level(box: Tensor) -> float:
+    """Return the density, 1/scene unit, at which a surface is taken to lie: a fraction of the box is half opaque.
+
+    It does not depend on the lattice, so that a finer one shows the same surface in more detail.
+
+    Args:
+        box: (2, 3) the scene's box.
+    """
+    return math.log(2) / (LEVEL_SHARE * float((box[1] - box[0]).max()))

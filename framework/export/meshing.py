@@ -1,0 +1,153 @@
+"""From a surface on a lattice to a mesh that can be used: joined, cleaned, simplified, with normals and colours."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from framework.base.console import say, track
+from framework.base.errors import ConfigError
+from framework.cameras.cameras import Cameras
+from framework.cameras.poses import Placement
+from framework.data.dataset import Dataset
+from framework.evaluation.evaluator import evaluation_background
+from framework.export import density, tsdf
+from framework.export.colors import seen_colors, spread_colors
+from framework.export.isosurface import isosurface
+from framework.export.lattice import Lattice
+from framework.export.mesh import Mesh, largest_components, simplified, vertex_normals, without_degenerate
+from framework.model import Model
+from framework.ray_model import RayModel
+
+ColorFunction = Callable[[Tensor, Tensor], Tensor]
+"""Function from vertices and normals (V, 3) in scene coordinates to colours (V, 3), NaN for a vertex without."""
+
+
+@dataclass(frozen=True)
+class Cleaning:
+    """What is kept of a surface."""
+
+    num_components: int = 0
+    """Maximum number of connected components; 0 for any."""
+    min_component_share: float = 0.001
+    """Minimum number of faces of a component, as a fraction of those of the largest."""
+    target_num_faces: int | None = None
+    """Number of faces that the mesh is simplified to; None for no simplification."""
+
+    def check(self) -> None:
+        """Raise ConfigError if a number is out of range."""
+        if self.num_components < 0 or not 0 <= self.min_component_share <= 1:
+            raise ConfigError("--num-components must be at least 0, and --min-component-share from 0 to 1")
+        if self.target_num_faces is not None and self.target_num_faces < 4:
+            raise ConfigError(f"--target-num-faces is {self.target_num_faces}; it must be at least 4")
+
+
+def density_mesh(
+    model: Model[Any], lattice: Lattice, level: float, time: float, cameras: Cameras, cleaning: Cleaning
+) -> Mesh:
+    """Return the surface at which the density of a model passes a level, in scene coordinates.
+
+    Args:
+        model: the model in evaluation mode.
+        lattice: where the density is evaluated.
+        level: the density, 1/scene unit.
+        time: time in [0, 1] of a scene that moves.
+        cameras: the training cameras.
+        cleaning: what is kept.
+
+    Raises:
+        ConfigError: if the model has no density, or there is no surface; the message says why.
+    """
+    field = density.LatticeDensity(model, lattice, level, time)
+    blocks = field.blocks()
+    found = isosurface(lattice, density.BLOCK, track(field.valued(blocks), "Looking for the surface", len(blocks)))
+    seen = field.seen
+    if seen.nan:
+        say(f"warning: the density is NaN at {seen.nan:,} of {seen.evaluated:,} positions; there the mesh has holes")
+    if not len(found[1]):
+        raise ConfigError(_without_surface(seen, level))
+
+    def colors(vertices: Tensor, normals: Tensor) -> Tensor:
+        if not isinstance(model, RayModel):
+            return torch.full((len(vertices), 3), torch.nan)
+        return seen_colors(model, vertices, normals, lattice.spacing, time)
+
+    return _finished(found, lattice, cameras, cleaning, colors)
+
+
+def fused_mesh(
+    model: Model[Any], dataset: Dataset, lattice: Lattice, truncation: float, views: int, cleaning: Cleaning
+) -> Mesh:
+    """Return the surface that the rendered depth images of the training views agree on, in scene coordinates.
+
+    Args:
+        model: the model in evaluation mode.
+        dataset: the training split, on the model's device.
+        lattice: where distances are fused.
+        truncation: distance at which they are cut off, in cells.
+        views: maximum number of views, evenly spaced in the data set.
+        cleaning: what is kept.
+
+    Raises:
+        ConfigError: if no view sees a surface in the box.
+    """
+    chosen = torch.linspace(0, len(dataset) - 1, min(views, len(dataset)), dtype=torch.float64).round().long()
+    chosen = chosen.to(dataset.device)
+    cameras, times = dataset.cameras[chosen], None if dataset.times is None else dataset.times[chosen]
+    stride = tsdf.stride_for(cameras, lattice)
+    rendered = tsdf.rendered_views(model, cameras, times, evaluation_background(model), stride)
+    depths = list(track(rendered, "Rendering depth", total=len(cameras)))
+    fused = tsdf.FusedDistance(lattice, depths, truncation)
+    blocks = fused.blocks()
+    if not blocks:
+        raise ConfigError(
+            "no training view sees a surface in the box; is the run trained, and is the box the right one?"
+        )
+    found = isosurface(lattice, tsdf.BLOCK, track(fused.valued(blocks), "Fusing depth", total=len(blocks)))
+    if not len(found[1]):
+        raise ConfigError("the training views agree on no surface in the box; a larger --truncation may find one")
+    return _finished(found, lattice, dataset.cameras, cleaning, fused.colors)
+
+
+def in_input(mesh: Mesh, placement: Placement) -> Mesh:
+    """Return a mesh in the frame and units of the input.
+
+    Args:
+        mesh: a mesh in scene coordinates.
+        placement: the input's in the scene.
+    """
+    normals = None if mesh.normals is None else placement.original_directions(mesh.normals.double()).float()
+    return replace(mesh, vertices=placement.original_points(mesh.vertices), normals=normals)
+
+
+def _finished(
+    found: tuple[Tensor, Tensor], lattice: Lattice, cameras: Cameras, cleaning: Cleaning, colors: ColorFunction
+) -> Mesh:
+    """Return the cleaned mesh of a surface in lattice coordinates, with normals and colours."""
+    mesh = without_degenerate(Mesh(lattice.positions(found[0]), found[1]))
+    eyes = cameras.camera_to_worlds[:, :, 3].double().cpu()
+    mesh, dropped = largest_components(mesh, cleaning.num_components, cleaning.min_component_share, eyes)
+    if not len(mesh.faces):
+        raise ConfigError("the surface bounds nothing but hollows; another --isosurface-threshold may find one")
+    if dropped:
+        say(f"{dropped:,} small or hidden components are left out (--num-components, --min-component-share)")
+    if cleaning.target_num_faces is not None:
+        mesh = simplified(mesh, cleaning.target_num_faces)
+    normals = vertex_normals(mesh)
+    return replace(mesh, normals=normals, colors=spread_colors(colors(mesh.vertices, normals), mesh.faces))
+
+
+def _without_surface(seen: density.DensityRange, level: float) -> str:
+    """Return why the density has no surface."""
+    if not seen.evaluated:
+        return "there is no surface: the occupancy grid has no occupied cell in the box; is the run trained?"
+    if seen.nan == seen.evaluated:
+        return "there is no surface: the density is NaN everywhere in the box; train the run again"
+    return (
+        f"there is no surface: the density is between {seen.low:.3g} and {seen.high:.3g} per scene unit in the box and "
+        f"never passes {level:.4g}; set --isosurface-threshold, or another box"
+    )

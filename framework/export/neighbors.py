@@ -1,0 +1,74 @@
+"""What the neighbours of a point say of it: whether it is an outlier, and the normal of its surface."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from torch import Tensor
+
+NEIGHBORS = 20
+"""Number of nearest neighbours."""
+CHUNK = 2**16
+"""Number of points whose neighbours are looked up at once."""
+
+
+def mean_distances(points: Tensor, count: int = NEIGHBORS) -> Tensor:
+    """Return the mean distance (K,) of each point to its nearest neighbours.
+
+    Args:
+        points: (K, 3) finite positions.
+        count: number of neighbours; fewer if there are fewer points.
+    """
+    means = [distances[:, 1:].mean(1) for distances, _ in _nearest(points, count)]
+    return torch.from_numpy(np.concatenate([np.zeros(0), *means]))
+
+
+def inliers(points: Tensor, std_ratio: float, count: int = NEIGHBORS) -> Tensor:
+    """Return the points (K,) bool whose mean distance to their neighbours is not unusual.
+
+    It is unusual if it exceeds the mean over all points by more than some standard deviations (Rusu et al. 2008).
+
+    Args:
+        points: (K, 3) finite positions.
+        std_ratio: number of standard deviations.
+        count: number of neighbours.
+    """
+    if len(points) < 3:
+        return torch.ones(len(points), dtype=torch.bool)
+    distances = mean_distances(points, count)
+    return distances <= distances.mean() + std_ratio * distances.std()
+
+
+def plane_normals(points: Tensor, towards: Tensor, count: int = NEIGHBORS) -> Tensor:
+    """Return unit normals (K, 3) float32: the direction of least spread of each point's neighbours.
+
+    Args:
+        points: (K, 3) finite positions.
+        towards: (K, 3) directions, for example to the camera that saw the point, into whose half space a normal is
+            turned.
+        count: number of neighbours.
+    """
+    positions = points.double()
+    found, start = [torch.zeros(0, 3, dtype=torch.float64)], 0
+    for _, indices in _nearest(points, count):
+        around = positions[torch.from_numpy(indices)]
+        centred = around - around.mean(1, keepdim=True)
+        normal = torch.linalg.eigh(centred.transpose(1, 2) @ centred).eigenvectors[:, :, 0]
+        facing = (normal * towards[start : start + len(normal)].double()).sum(-1, keepdim=True)
+        found.append(torch.where(facing < 0, -normal, normal))
+        start += len(normal)
+    return torch.cat(found).float()
+
+
+def _nearest(points: Tensor, count: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield distances and indices (N, count + 1) of the nearest points, the point itself included, chunk by chunk."""
+    from scipy.spatial import cKDTree
+
+    values = points.double().numpy()
+    tree = cKDTree(values)
+    most = min(count + 1, len(values))
+    for start in range(0, len(values), CHUNK):
+        distances, indices = tree.query(values[start : start + CHUNK], k=most, workers=-1)
+        yield distances.reshape(-1, most), indices.reshape(-1, most)

@@ -1,0 +1,117 @@
+"""Export of an occupancy grid: which cells of a box a trained model samples."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from framework.cameras.poses import Placement
+from framework.data.ply import write_points
+from framework.export.mesh import Mesh
+from framework.export.mesh_files import write_mesh
+from framework.samplers.base import SkipsCells
+from framework.training.checkpoint import write_atomically
+
+GREY = 0.6
+"""Colour of cells."""
+
+
+def box_frame(grid: SkipsCells, placement: Placement) -> Tensor:
+    """Return the matrix (4, 4) float64 from a grid's unit cube to the input's frame.
+
+    Args:
+        grid: the grid; its edges are parallel to the axes of the scene, and may not be to those of the input.
+        placement: the input's in the scene.
+    """
+    low, high = grid.box.double().cpu()
+    corners = torch.stack([low, *(low + torch.diag(high - low))])
+    origin, *ends = placement.original_points(corners)
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3] = torch.stack([end - origin for end in ends], dim=-1)
+    matrix[:3, 3] = origin
+    return matrix
+
+
+def write_grid(file: Path, grid: SkipsCells, placement: Placement) -> None:
+    """Write a grid as a compressed .npz of numpy.
+
+    It holds `occupied` (n, n, n) bool, whose index is that of the cell along x, y and z of the scene; `cube_to_input`
+    (4, 4), from the unit cube of the grid to the frame of the input; and `box` (2, 3), the corners of the grid in the
+    scene's frame.
+
+    Args:
+        file: path of the file.
+        grid: the grid.
+        placement: the input's in the scene.
+
+    Raises:
+        OSError: if the file cannot be written.
+    """
+    n = grid.resolution
+    content = {
+        "occupied": grid.occupied.cpu().view(n, n, n).numpy(),
+        "cube_to_input": box_frame(grid, placement).numpy(),
+        "box": grid.box.cpu().numpy(),
+    }
+    write_atomically(file, lambda stream: np.savez_compressed(stream, **content))
+
+
+def cell_centers(grid: SkipsCells, placement: Placement) -> Tensor:
+    """Return the centres (K, 3) float64 of the occupied cells, in the frame of the input."""
+    n, matrix = grid.resolution, box_frame(grid, placement)
+    cells = grid.occupied.cpu().view(n, n, n).nonzero()
+    return (cells.double() + 0.5) / n @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def write_cells(file: Path, grid: SkipsCells, placement: Placement, boxes: bool) -> None:
+    """Write the occupied cells to a PLY file.
+
+    Args:
+        file: path of the file.
+        grid: the grid, of which at least one cell is occupied.
+        placement: the input's in the scene.
+        boxes: True for the surface of their boxes, without faces between occupied cells; False for their centres.
+
+    Raises:
+        OSError: if the file cannot be written.
+    """
+    if not boxes:
+        centers = cell_centers(grid, placement).float()
+        temporary = file.with_name(f".{file.name}.tmp")
+        try:
+            write_points(temporary, centers, torch.full_like(centers, GREY))
+            temporary.replace(file)
+        finally:
+            temporary.unlink(missing_ok=True)
+        return
+    mesh, matrix = boxes_mesh(grid), box_frame(grid, placement)
+    vertices = mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    write_mesh(file, Mesh(vertices, mesh.faces, colors=torch.full_like(vertices, GREY).float()))
+
+
+def boxes_mesh(grid: SkipsCells) -> Mesh:
+    """Return the surface of the occupied cells of a grid, in its unit cube."""
+    n = grid.resolution
+    padded = torch.nn.functional.pad(grid.occupied.cpu().view(n, n, n), (1,) * 6)
+    inner = padded[1:-1, 1:-1, 1:-1]
+    quads = []
+    for axis in range(3):
+        across, up = (axis + 1) % 3, (axis + 2) % 3
+        for side in (0, 1):
+            beside = padded.roll(1 - 2 * side, axis)[1:-1, 1:-1, 1:-1]
+            cells = (inner & ~beside).nonzero()
+            cells[:, axis] += side
+            steps = torch.zeros(4, 3, dtype=torch.int64)
+            steps[[1, 2], across] = 1
+            steps[[2, 3], up] = 1
+            corners = cells[:, None] + steps
+            quads.append(corners if side else corners.flip(1))
+    places = torch.cat(quads).view(-1, 3)
+    keys = (places[:, 0] * (n + 1) + places[:, 1]) * (n + 1) + places[:, 2]
+    unique, owner = keys.unique(return_inverse=True)
+    quad = owner.view(-1, 4)
+    vertices = torch.stack([unique // (n + 1) ** 2, unique // (n + 1) % (n + 1), unique % (n + 1)], -1).double() / n
+    return Mesh(vertices, torch.cat([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]]))

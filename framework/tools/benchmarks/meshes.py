@@ -164,7 +164,7 @@ def _row(run: Path, kind: str, resolution: int, folder: Path, truth: Truth) -> d
             last = log.read().decode(errors="replace").strip().splitlines()[-1:]
             raise NerfloomError(f"ns-export {kind} failed: {' '.join(last)}")
     elapsed = time.monotonic() - start
-    read = trimesh.load(output / "mesh.ply", process=False)
+    read: Any = trimesh.load(output / "mesh.ply", process=False)
     mesh = Mesh(torch.from_numpy(read.vertices.copy()).double(), torch.from_numpy(read.faces.copy()).long())
     return {
         "export": kind,

@@ -14,6 +14,7 @@ from framework.cli.export_mesh import MarchingCubesFlags, TsdfFlags, marching_cu
 
 if TYPE_CHECKING:
     from framework.cameras.poses import Placement
+    from framework.data.dataset import ParsedScene
     from framework.training.trained import Trained
 
 USAGE = """\
@@ -172,7 +173,7 @@ def _cameras(flags: CameraFlags, trained: Trained, placement: Placement, path: P
     refined = refined_cameras(trained.model, dataset.cameras)
     write_json(path, camera_list(refined, dataset.names, placement))
     say(f"{len(refined)} training cameras: {path}")
-    scenes = {}
+    scenes: dict[str, ParsedScene] = {}
     for split in SPLITS:
         try:
             scenes[split] = trained.run.parse(split)

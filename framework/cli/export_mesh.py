@@ -60,7 +60,13 @@ class TsdfFlags(MeshFlags):
 
 
 def marching_cubes(flags: MarchingCubesFlags, trained: Trained, placement: Placement, path: Path) -> None:
-    """Write a mesh of a level of the density to `path`, in the frame of `placement`'s input.
+    """Write a mesh of a level of the density, in the frame of the input.
+
+    Args:
+        flags: flags of the command.
+        trained: the run.
+        placement: the input's in the run's scene.
+        path: file to write.
 
     Raises:
         ConfigError: if a flag is out of range, the method has no density, or there is no surface.
@@ -90,7 +96,13 @@ def marching_cubes(flags: MarchingCubesFlags, trained: Trained, placement: Place
 
 
 def tsdf(flags: TsdfFlags, trained: Trained, placement: Placement, path: Path) -> None:
-    """Write a mesh of fused depth images to `path`, in the frame of `placement`'s input.
+    """Write a mesh of fused depth images, in the frame of the input.
+
+    Args:
+        flags: flags of the command.
+        trained: the run.
+        placement: the input's in the run's scene.
+        path: file to write.
 
     Raises:
         ConfigError: if a flag is out of range, or there is no surface.

@@ -11,13 +11,14 @@ import torch
 from torch import Tensor
 
 from framework.base.errors import ConfigError
+from framework.base.splits import Split
 from framework.cameras.cameras import LENSES, Cameras, join_cameras
 from framework.cameras.poses import Placement
 from framework.data.dataset import ParsedScene
 from framework.geometry.alignment import align_cameras
 from framework.model import Model, RefinesPoses
 
-SPLITS = ("train", "val", "test")
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
 """Splits in the order in which their images are listed."""
 ORTHONORMAL_STEPS = 2
 """Newton steps that make a rotation orthonormal in float64; from float32, one is enough."""
@@ -90,7 +91,7 @@ def input_poses(cameras: Cameras, placement: Placement) -> Tensor:
 
 
 def orthonormal(rotations: Tensor) -> Tensor:
-    """Return the nearest orthonormal matrices (..., 3, 3) of matrices that are nearly so, float64: Higham 1986."""
+    """Return the orthonormal matrices nearest to `rotations` (..., 3, 3) float64, which are nearly so: Higham 1986."""
     for _ in range(ORTHONORMAL_STEPS):
         rotations = (rotations + torch.linalg.inv(rotations).transpose(-1, -2)) / 2
     return rotations
@@ -159,7 +160,7 @@ def _times(scene: ParsedScene) -> Tensor:
 
 
 def coefficients(cameras: Cameras) -> list[dict[str, float]]:
-    """Return the distortion coefficients of M cameras by their names in `LENSES`."""
+    """Return the distortion coefficients of M `cameras` by their names in `LENSES`."""
     names = LENSES[cameras.model]
     if cameras.lens is None:
         return [dict.fromkeys(names, 0.0)] * len(cameras)
@@ -167,7 +168,7 @@ def coefficients(cameras: Cameras) -> list[dict[str, float]]:
 
 
 def rational(lenses: Sequence[Mapping[str, float]]) -> bool:
-    """Return whether any lens has coefficients of the denominator, k4 to k6.
+    """Return whether any of `lenses` has coefficients of the denominator, k4 to k6.
 
     Raises:
         ConfigError: if a lens has k7 too, for which no format has a place.

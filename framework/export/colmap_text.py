@@ -22,7 +22,7 @@ ORDERS = {
 
 
 def images_folder(posed: PosedFiles) -> Path:
-    """Return the folder that all image files are in, to which their names in the model are relative."""
+    """Return the folder of all image files of `posed`, to which their names in the model are relative."""
     return Path(os.path.commonpath([file.resolve().parent for file in posed.files]))
 
 
@@ -80,7 +80,7 @@ def _cameras(posed: PosedFiles) -> tuple[list[str], list[int]]:
 
 
 def quaternion(rotation: Tensor) -> Tensor:
-    """Return the unit quaternion (4,) w, x, y, z with w >= 0 of a rotation (3, 3), float64: Bar-Itzhack 2000.
+    """Return the unit quaternion (4,) w, x, y, z with w >= 0 of a `rotation` (3, 3), float64: Bar-Itzhack 2000.
 
     It is the eigenvector of a symmetric matrix, which is well conditioned for every rotation.
     """

@@ -20,6 +20,8 @@ from framework.samplers.base import SkipsCells
 
 BLOCK = 32
 """Cells along an edge of a block."""
+ROUNDING = 1e-3
+"""Distance in cells of the occupancy grid by which a point may be off by rounding."""
 CHUNK = 2**16
 """Number of positions that are evaluated at once."""
 COARSE = 4
@@ -34,7 +36,7 @@ translucent."""
 
 @dataclass
 class DensityRange:
-    """What the evaluation of densities has met."""
+    """The densities that were met."""
 
     evaluated: int = 0
     """Number of positions that were evaluated."""
@@ -46,7 +48,7 @@ class DensityRange:
     """Maximum of the others."""
 
     def add(self, sigma: Tensor) -> None:
-        """Count densities (N,)."""
+        """Count densities `sigma` (N,)."""
         nan = sigma.isnan()
         self.evaluated += len(sigma)
         self.nan += int(nan.sum())
@@ -82,7 +84,7 @@ class LatticeDensity:
         return list(self._occupied_blocks() if self.grid is not None else self._coarse_blocks())
 
     def valued(self, blocks: Iterable[Tensor]) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield blocks with their values for `isosurface`, positive above the level."""
+        """Yield `blocks` (3,) with their values for `isosurface`, positive above the level."""
         for block in blocks:
             points, _ = self.lattice.block_points(block, BLOCK)
             sigma = self.density(self.lattice.positions(points).float())
@@ -91,7 +93,7 @@ class LatticeDensity:
             yield block, 1 - 2 * torch.exp(-math.log(2) / self.level * sigma)  # NaN stays NaN
 
     def density(self, positions: Tensor) -> Tensor:
-        """Return the density (N,) at positions (N, 3) in scene coordinates, on the CPU."""
+        """Return the density (N,) at `positions` (N, 3) in scene coordinates, on the CPU."""
         if self.grid is None:
             return self._evaluated(positions)
         kept = self._kept(positions).nonzero()[:, 0]
@@ -138,8 +140,9 @@ class LatticeDensity:
         offsets = torch.cartesian_prod(*[torch.tensor([0, BLOCK])] * 3)
         for block in self.lattice.all_blocks(BLOCK):
             corners = (self.lattice.positions(block * BLOCK + offsets) - box[0]) / (box[1] - box[0]) * n
-            low = corners.amin(0).floor().clamp(0, n).long().tolist()
-            high = corners.amax(0).ceil().clamp(0, n).long().tolist()
+            # A point on the face of a block may be in a cell of the next, to which rounding may count it.
+            low = (corners.amin(0) - ROUNDING).floor().clamp(0, n).long().tolist()
+            high = ((corners.amax(0) + ROUNDING).floor() + 1).clamp(0, n).long().tolist()
             total = 0
             for choice in range(8):
                 corner = [high[a] if choice >> a & 1 else low[a] for a in range(3)]

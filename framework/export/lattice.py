@@ -36,7 +36,7 @@ class Lattice:
         return float(self.axes[0].norm())
 
     def positions(self, indices: Tensor) -> Tensor:
-        """Return the scene coordinates (N, 3) float64 of lattice coordinates (N, 3), which may be fractional."""
+        """Return the scene coordinates (N, 3) float64 of lattice coordinates `indices` (N, 3), whole or fractional."""
         return self.corner + indices.double() @ self.axes
 
     def indices(self, positions: Tensor) -> Tensor:

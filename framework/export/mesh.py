@@ -40,13 +40,13 @@ class Mesh:
 
 
 def without_degenerate(mesh: Mesh) -> Mesh:
-    """Return the mesh without faces of which two corners are the same vertex, and without unused vertices."""
+    """Return `mesh` without faces of which two corners are the same vertex, and without unused vertices."""
     a, b, c = mesh.faces.unbind(-1)
     return mesh.with_faces((a != b) & (b != c) & (c != a))
 
 
 def vertex_normals(mesh: Mesh) -> Tensor:
-    """Return the normals (V, 3) of the vertices, float32: the mean of their faces' normals, weighted by area."""
+    """Return the normals (V, 3) of the vertices of `mesh`, float32: means over faces, weighted by area."""
     a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
     areas = torch.linalg.cross(b - a, c - a)
     total = torch.zeros_like(mesh.vertices)
@@ -79,22 +79,22 @@ class Closedness:
 
 
 def closedness(mesh: Mesh) -> Closedness:
-    """Count the edges of a mesh that do not belong to two faces."""
+    """Count the edges of `mesh` that do not belong to two faces."""
     faces = mesh.faces.numpy()
     keys = np.empty((3, len(faces)), np.int64)
     for row, (a, b) in enumerate(((0, 1), (1, 2), (2, 0))):
         np.minimum(faces[:, a], faces[:, b], out=keys[row])
         keys[row] *= len(mesh.vertices)
         keys[row] += np.maximum(faces[:, a], faces[:, b])
-    keys = keys.reshape(-1)
-    keys.sort()
-    starts = np.flatnonzero(np.diff(keys, prepend=-1))
-    counts = np.diff(starts, append=len(keys))
+    flat = keys.reshape(-1)
+    flat.sort()
+    starts = np.flatnonzero(np.diff(flat, prepend=-1))
+    counts = np.diff(starts, append=len(flat))
     return Closedness(int((counts == 1).sum()), int((counts > 2).sum()))
 
 
 def components(mesh: Mesh) -> Tensor:
-    """Return the index (F,) of the connected component of each face, the component of most faces first."""
+    """Return the index (F,) of the connected component of each face of `mesh`, that of most faces first."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

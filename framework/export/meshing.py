@@ -1,4 +1,4 @@
-"""From a surface on a lattice to a mesh that can be used: joined, cleaned, simplified, with normals and colours."""
+"""Meshes of a trained model: its surface, cleaned and simplified, with normals and colours."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ColorFunction = Callable[[Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Cleaning:
-    """What is kept of a surface."""
+    """The parts of a surface that are kept."""
 
     num_components: int = 0
     """Maximum number of connected components; 0 for any."""

@@ -1,4 +1,4 @@
-"""What the neighbours of a point say of it: whether it is an outlier, and the normal of its surface."""
+"""Outliers among points, and normals of their surface, from the nearest neighbours of each point."""
 
 from __future__ import annotations
 

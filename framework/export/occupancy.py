@@ -51,16 +51,19 @@ def write_grid(file: Path, grid: SkipsCells, placement: Placement) -> None:
         OSError: if the file cannot be written.
     """
     n = grid.resolution
-    content = {
-        "occupied": grid.occupied.cpu().view(n, n, n).numpy(),
-        "cube_to_input": box_frame(grid, placement).numpy(),
-        "box": grid.box.cpu().numpy(),
-    }
-    write_atomically(file, lambda stream: np.savez_compressed(stream, **content))
+    write_atomically(
+        file,
+        lambda stream: np.savez_compressed(
+            stream,
+            occupied=grid.occupied.cpu().view(n, n, n).numpy(),
+            cube_to_input=box_frame(grid, placement).numpy(),
+            box=grid.box.cpu().numpy(),
+        ),
+    )
 
 
 def cell_centers(grid: SkipsCells, placement: Placement) -> Tensor:
-    """Return the centres (K, 3) float64 of the occupied cells, in the frame of the input."""
+    """Return the centres (K, 3) float64 of the occupied cells of `grid`, in the frame of the input of `placement`."""
     n, matrix = grid.resolution, box_frame(grid, placement)
     cells = grid.occupied.cpu().view(n, n, n).nonzero()
     return (cells.double() + 0.5) / n @ matrix[:3, :3].T + matrix[:3, 3]
@@ -93,7 +96,7 @@ def write_cells(file: Path, grid: SkipsCells, placement: Placement, boxes: bool)
 
 
 def boxes_mesh(grid: SkipsCells) -> Mesh:
-    """Return the surface of the occupied cells of a grid, in its unit cube."""
+    """Return the surface of the occupied cells of `grid`, in its unit cube."""
     n = grid.resolution
     padded = torch.nn.functional.pad(grid.occupied.cpu().view(n, n, n), (1,) * 6)
     inner = padded[1:-1, 1:-1, 1:-1]

@@ -52,7 +52,7 @@ class DepthView:
     """(H, W) float16 weight, the cosine between the ray and the normal of the surface."""
 
     def lookup(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the pixel (N,) int64 of points (N, 3), numbered row by row, whether it has one, and their distance.
+        """Return the pixel (N,) int64 of `points` (N, 3), counted row by row, whether they have one, and distances.
 
         The distance is that along the pixel's ray, scene units.
         """
@@ -132,7 +132,7 @@ def _facing(points: Tensor, directions: Tensor) -> Tensor:
 
 
 def surface_points(view: DepthView) -> Tensor:
-    """Return the points (K, 3) in scene coordinates at which the rays of a view meet a surface."""
+    """Return the points (K, 3) in scene coordinates at which the rays of `view` meet a surface."""
     height, width = int(view.camera.heights[0]), int(view.camera.widths[0])
     grid = torch.arange(height * width).view(height, width)[
         view.stride // 2 :: view.stride, view.stride // 2 :: view.stride
@@ -177,7 +177,7 @@ class FusedDistance:
         return list(torch.stack([met // (counts[1] * counts[2]), met // counts[2] % counts[1], met % counts[2]], -1))
 
     def valued(self, blocks: Sequence[Tensor]) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield blocks with their values for `isosurface`, positive behind the surface."""
+        """Yield `blocks` (3,) with their values for `isosurface`, positive behind the surface."""
         for start in range(0, len(blocks), BLOCKS_AT_ONCE):
             chosen = blocks[start : start + BLOCKS_AT_ONCE]
             points = [self.lattice.block_points(block, BLOCK)[0] for block in chosen]
@@ -185,7 +185,7 @@ class FusedDistance:
             yield from zip(chosen, values.split([len(part) for part in points]), strict=True)
 
     def values(self, points: Tensor) -> Tensor:
-        """Return values (N,) in [-1, 1] at points (N, 3) in scene coordinates, NaN where no view sees them."""
+        """Return values (N,) in [-1, 1] at `points` (N, 3) in scene coordinates, NaN where no view sees them."""
         total, weights = torch.zeros(len(points)), torch.zeros(len(points))
         for view in self.views:
             pixel, visible, distance = view.lookup(points)

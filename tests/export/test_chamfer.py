@@ -68,7 +68,7 @@ def test_a_camera_sees_its_half_of_a_ball() -> None:
     expected = points[:, 0] > 0.25  # the horizon from a distance of 4
     clear = (points[:, 0] - 0.25).abs() > 0.02
     assert torch.equal(visible_from(ball, points, normals, camera)[clear], expected[clear])
-    samples, faces = mesh_sample(sphere(1.0), 200_000)
+    samples, _ = mesh_sample(sphere(1.0), 200_000)
     seen = seen_samples(samples, torch.nn.functional.normalize(samples, dim=-1), camera)
     clear = (samples[:, 0] - 0.25).abs() > 0.05
     assert float((seen == (samples[:, 0] > 0.25))[clear].float().mean()) > 0.99  # but for pixels at the horizon

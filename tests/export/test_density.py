@@ -89,9 +89,19 @@ def test_blocks_are_those_that_overlap_an_occupied_cell() -> None:
     grid = grid_of(lambda centers: ((centers > 0.1) & (centers < 0.2)).all(-1))
     assert int(grid.occupied.sum()) == 1
     field = LatticeDensity(Matter(soft, grid), lattice_of(CUBE, 256), 1.0)
-    assert [block.tolist() for block in field.blocks()] == [[4, 4, 4]]  # from 0 to 0.25
+    # The cell is from 0.125 to 0.25; block 4 from 0 to 0.25, and block 5 has points on the cell's far faces.
+    assert [block.tolist() for block in field.blocks()] == torch.cartesian_prod(*[torch.tensor([4, 5])] * 3).tolist()
     none = LatticeDensity(Matter(soft, grid_of(lambda centers: centers[:, 0] > 5)), lattice_of(CUBE, 256), 1.0)
     assert none.blocks() == []
+
+
+def test_cells_that_end_with_a_block_are_closed() -> None:
+    """Random cells of one density, whose surface is in blocks beside them too."""
+    torch.manual_seed(0)
+    grid = grid_of(lambda centers: (torch.rand(len(centers)) < 0.02) & (centers.abs() < 0.9).all(-1))
+    for resolution in (128, 256):
+        mesh = mesh_of(Matter(lambda positions: torch.full((len(positions),), 100.0), grid), 10.0, resolution)
+        assert closedness(mesh).watertight
 
 
 def test_the_coarse_pass_leaves_out_empty_blocks() -> None:

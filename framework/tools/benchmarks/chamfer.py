@@ -87,7 +87,13 @@ def visible_from(distance: SignedDistance, points: Tensor, normals: Tensor, came
 
 
 def mesh_sample(mesh: Mesh, count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Return points (count, 3) float64 evenly on a mesh, and the face (count,) that each is on."""
+    """Return points (count, 3) float64 evenly on a mesh, and the face (count,) that each is on.
+
+    Args:
+        mesh: the mesh.
+        count: number of points.
+        seed: of their random positions.
+    """
     generator = torch.Generator().manual_seed(seed)
     a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
     sums = torch.linalg.cross(b - a, c - a).norm(dim=-1).cumsum(0)
@@ -120,7 +126,12 @@ def distances_to_mesh(points: Tensor, mesh: Mesh) -> Tensor:
 
 
 def distance_to_triangles(points: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """Return the distance (...,) of points (..., 3) to triangles with corners a, b, c (..., 3)."""
+    """Return the distance (...,) of points to triangles.
+
+    Args:
+        points: (..., 3) positions.
+        a, b, c: (..., 3) corners of the triangle for each point.
+    """
     normal = torch.linalg.cross(b - a, c - a)
     unit = torch.nn.functional.normalize(normal, dim=-1)
     height = ((points - a) * unit).sum(-1)

@@ -51,7 +51,7 @@ class KnowsItsSurface(Protocol):
     """A data format whose scene has an exact surface."""
 
     def signed_distance(self, points: Tensor) -> Tensor:
-        """Return the distance (N,) from points (N, 3) of the input to the nearest surface, negative inside."""
+        """Return the distance (N,) from `points` (N, 3) of the input to the nearest surface, negative inside."""
 
 
 def measure(run: Path | None, seconds: float, kinds: Sequence[str], resolutions: Sequence[int]) -> dict[str, Any]:
@@ -86,7 +86,7 @@ def measure(run: Path | None, seconds: float, kinds: Sequence[str], resolutions:
 
 
 class Truth:
-    """What is known of the surface of a run's scene, in the frame of its input.
+    """The surface of a run's scene, as far as it is known, in the frame of its input.
 
     Args:
         run: folder of the run.
@@ -111,7 +111,7 @@ class Truth:
             self.visible = visible_from(self.distance, self.points, normals, self.eyes)
 
     def of_mesh(self, mesh: Mesh) -> dict[str, Any]:
-        """Return how far a mesh is from what is known."""
+        """Return how far `mesh` is from what is known."""
         if self.distance is not None:
             samples, faces = mesh_sample(mesh, MESH_POINTS)
             a, b, c = (mesh.vertices[mesh.faces[faces, corner]] for corner in range(3))
@@ -133,7 +133,7 @@ class Truth:
         return {}
 
     def of_points(self, run: Path, folder: Path) -> dict[str, Any]:
-        """Return how far sparse points are from the point cloud of the run; nothing without sparse points."""
+        """Return how far sparse points are from the point cloud of `run`, made in `folder`; nothing without them."""
         if self.sparse is None:
             return {}
         from scipy.spatial import cKDTree
@@ -164,7 +164,7 @@ def _row(run: Path, kind: str, resolution: int, folder: Path, truth: Truth) -> d
             last = log.read().decode(errors="replace").strip().splitlines()[-1:]
             raise NerfloomError(f"ns-export {kind} failed: {' '.join(last)}")
     elapsed = time.monotonic() - start
-    read = trimesh.load(output / "mesh.ply", process=False)
+    read: Any = trimesh.load(output / "mesh.ply", process=False)
     mesh = Mesh(torch.from_numpy(read.vertices.copy()).double(), torch.from_numpy(read.faces.copy()).long())
     return {
         "export": kind,

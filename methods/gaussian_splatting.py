@@ -30,7 +30,7 @@ from framework.splats.drawing import draw, draw_view, on_image, splat_camera
 from framework.splats.gaussians import MAX_DEGREE, Gaussians
 from framework.splats.mcmc import moved, shaken
 from framework.splats.resolution import doubled, halved
-from framework.splats.start import first_points, from_points, scene_size, seen_colors
+from framework.splats.start import PLACES, first_points, from_points, scene_size, seen_colors
 from framework.splats.table import Table
 from framework.tools.surfaces import found_surfaces
 from framework.training.optim import learning_rate_factor
@@ -272,9 +272,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         self.extent.fill_(scene_size(self.scene, first.means))
         self.set_gaussians(first)
         self.found.fill_(kind == "field")
-        where = {"points": "at the points of a reconstruction", "field": "on the surfaces of a field"}
-        where |= {"silhouettes": "in the visual hull", "random": "anywhere in the box"}
-        say(f"  {len(first):,} Gaussians start {where[kind]}")
+        say(f"  {len(first):,} Gaussians start {PLACES[kind]}")
 
     def set_gaussians(self, gaussians: Gaussians) -> None:
         """Replace them.
@@ -348,9 +346,8 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
     @torch.no_grad()
     def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
         config = self.config
-        if self._on_image is not None:
-            self.gradients.add(self._on_image, self.scene.image_size)
-            self._on_image = None
+        self.gradients.add(self._on_image, self.scene.image_size)
+        self._on_image = None
         if (noise := self._chosen(config.noise, NOISE)) > 0:
             rate = self.position_rate * float(self.extent) * learning_rate_factor(config, step, progress)
             which, by = shaken(self.gaussians(), noise * rate)

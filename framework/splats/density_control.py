@@ -45,14 +45,14 @@ class GradientMean(nn.Module):
         super().__init__()
         self.register_buffer("sums", torch.zeros(0, 2))
 
-    def add(self, records: Tensor, longer_side: int) -> None:
-        """Add an image; without effect if it has no gradient.
+    def add(self, records: Tensor | None, longer_side: int) -> None:
+        """Add an image; without effect if there is none, or it has no gradient.
 
         Args:
             records: (N, RECORD) Gaussians on the image, which retain their gradient.
             longer_side: of the image, pixels.
         """
-        if records.grad is None:
+        if records is None or records.grad is None:
             return
         if len(self.sums) != len(records):
             self.sums = records.new_zeros(len(records), 2)

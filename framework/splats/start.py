@@ -21,6 +21,13 @@ HULL_CELLS = 128
 """Cells of the visual hull along an axis."""
 FEW = 1_000
 """Maximum number of Gaussians whose distances to the cameras are looked at."""
+PLACES = {
+    "points": "at the points of a reconstruction",
+    "field": "on the surfaces of a field",
+    "silhouettes": "in the visual hull",
+    "random": "anywhere in the box",
+}
+"""Kinds of first points, in words."""
 NEIGHBOURS = 3
 """Whose mean distance is a Gaussian's first size."""
 

@@ -8,6 +8,7 @@ from pathlib import Path
 EXTRAS: dict[str, dict[str, str]] = {
     "video": {"imageio_ffmpeg": "'imageio[ffmpeg]'"},
     "plots": {"matplotlib": "matplotlib"},
+    "viewer": {"viser": "viser"},
     "lpips": {"lpips": "lpips", "torchvision": "torchvision"},
 }
 """Extra of pyproject.toml -> {module that is imported: name of its package for pip}."""

@@ -7,6 +7,7 @@ import io
 import ipaddress
 import logging
 import socket
+import warnings
 from contextlib import redirect_stdout
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
@@ -75,6 +76,8 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
     import viser
 
     _shorten_log()
+    # Browsers leave while a picture is made for them.
+    warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
     with redirect_stdout(io.StringIO()):  # viser prints a table of addresses
         server = viser.ViserServer(host=host, port=chosen, label=label, verbose=False)
     _refuse(server, is_local=is_loopback(host))

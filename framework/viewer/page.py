@@ -73,6 +73,8 @@ class Page:
                 parts.append(CameraPanel(client, self._photographs))
             with tabs.add_tab("Path"):
                 parts.append(PathPanel(client, lambda: studio.subject, panel.request, self._renders))
+        if number not in self._server.get_clients():  # it has left before it was welcomed
+            self._farewell(client)
 
     def _farewell(self, client: viser.ClientHandle) -> None:
         self._studio.leave(client.client_id)

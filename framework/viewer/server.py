@@ -81,7 +81,7 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
     with redirect_stdout(io.StringIO()):  # viser prints a table of addresses
         server = viser.ViserServer(host=host, port=chosen, label=label, verbose=False)
     _refuse(server, is_local=is_loopback(host))
-    server.gui.configure_theme(show_logo=False, show_share_button=False, control_layout="collapsible")
+    server.gui.configure_theme(show_logo=False, show_share_button=False)
     bound = server.get_port()
     if bound != port:
         say(f"port {port} is taken")

@@ -10,7 +10,7 @@ import subprocess
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,8 @@ class Tab:
     def __init__(self, address: str, identity: str, port: int) -> None:
         from websockets.sync.client import connect
 
-        self._socket = connect(address, max_size=2**27, open_timeout=60)
+        self._open = ExitStack()
+        self._socket = self._open.enter_context(connect(address, max_size=2**27, open_timeout=60))
         self._numbers = itertools.count(1)
         self._identity, self._port = identity, port
         self.send("Page.enable")
@@ -93,7 +94,7 @@ class Tab:
         self.click(*place)
 
     def close(self) -> None:
-        self._socket.close()
+        self._open.close()
         urllib.request.urlopen(f"http://127.0.0.1:{self._port}/json/close/{self._identity}", timeout=20).close()
 
 

@@ -147,9 +147,10 @@ class Panel:
             self._client.scene.remove_by_name(name)
             return
         found = shown_cells(self._studio.subject.model)
-        if found is not None:
+        if found is not None and len(found[0]):
             points, edge = found
-            colors = np.broadcast_to(np.array([230, 120, 30], np.uint8), (len(points), 3))
+            low, high = points.amin(0), points.amax(0)
+            colors = (40 + 200 * (points - low) / (high - low).clamp(min=1e-9)).numpy().astype(np.uint8)
             self._client.scene.add_point_cloud(
-                name, points.numpy().astype(np.float32), colors, point_size=0.6 * edge, precision="float32"
+                name, points.numpy().astype(np.float32), colors, point_size=0.3 * edge, precision="float32"
             )

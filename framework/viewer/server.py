@@ -150,7 +150,8 @@ class _OneLine(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         error = record.exc_info[1] if record.exc_info else None
         reason = f": {type(error).__name__}" if error is not None else ""
-        if record.levelno >= logging.ERROR:
+        # Browsers open connections ahead that they do not use.
+        if record.levelno >= logging.ERROR and record.getMessage() != "opening handshake failed":
             say(f"viewer: a connection sent something that was not understood, and is ignored{reason}")
 
 

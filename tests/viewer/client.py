@@ -77,7 +77,7 @@ class Client:
                     return np.asarray(Image.open(io.BytesIO(message["rgb_data"])))
         raise AssertionError
 
-    def finished(self, seconds: float = 2.0) -> np.ndarray:
+    def finished(self, seconds: float = 1.2) -> np.ndarray:
         """The last picture, after which none comes for some time."""
         found = self.picture()
         while True:

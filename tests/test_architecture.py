@@ -143,6 +143,7 @@ LAYERS = (
     ("method",),
     ("evaluation",),
     ("training",),
+    ("viewer",),
     ("export",),
     ("tools",),
     ("cli",),

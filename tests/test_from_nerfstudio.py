@@ -49,8 +49,11 @@ def test_every_flag_that_is_named_exists() -> None:
         (["--optimizers.fields.optimizer.lr", "1e-3"], "here it is --learning-rate"),
         (["--optimizers.camera-opt.optimizer.lr", "1e-3"], "here it is --camera-learning-rate"),
         (["--trainer.max-num-iterations", "3"], "here it is --max-num-iterations"),
-        (["--viewer.quit-on-train-completion", "True"], "there is no viewer; --vis tensorboard"),
-        (["--vis", "viewer+tensorboard"], "--vis viewer+tensorboard is nerfstudio's; there is no viewer"),
+        (["--viewer.quit-on-train-completion", "True"], "there are --viewer.websocket-host"),
+        (
+            ["--vis", "viewer+wandb"],
+            "--vis viewer+wandb is nerfstudio's; leave it out; the choice here is --vis viewer",
+        ),
         (["--machine.num-devices", "2"], "a run is one process on one device"),
         (["--load-step", "1000"], "here it is --load-checkpoint"),
         (["blender-data"], "here the data format is called 'blender'"),

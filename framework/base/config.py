@@ -63,6 +63,20 @@ class MachineConfig:
 
 
 @dataclass(frozen=True)
+class ViewerConfig:
+    """The address of the viewer."""
+
+    websocket_host: str = "127.0.0.1"
+    """Interface to listen on; 0.0.0.0 for all, from which other machines can connect. There is no password."""
+    websocket_port: int = 7007
+    """Port to listen on; the next free one if it is taken."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.websocket_port <= 65535:
+            raise ConfigError(f"--viewer.websocket-port is {shown(self.websocket_port)}; it must be from 1 to 65535")
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """Settings of every method. A method's config derives from this class and changes defaults."""
 
@@ -75,6 +89,7 @@ class TrainConfig:
         "seconds_per_eval_all_images": AT_LEAST_0,
         "max_eval_images": AT_LEAST_0,
         "lr_warmup_steps": AT_LEAST_0,
+        "viewer_share": (0.001, 1),
     }
     """Allowed range of each numeric setting. A method's config adds its own, and may override these. None, where it
     is allowed, is in every range; of a tuple, each number must be in the range."""
@@ -110,8 +125,12 @@ class TrainConfig:
     """Seconds of training between evaluations of all images; 15 if --target-psnr is given and this is not."""
     max_eval_images: int | None = None
     """Maximum number of evaluated images, evenly spaced; all if not given, none if 0."""
-    vis: Literal["tensorboard", "none"] = "tensorboard"
-    """Where training curves and rendered images are written."""
+    vis: Literal["tensorboard", "viewer", "viewer+tensorboard", "none"] = "tensorboard"
+    """Where training curves and rendered images are shown: in TensorBoard's files, in a browser, or in both."""
+    viewer_share: float = 0.1
+    """Maximum time for the viewer's pictures, as a fraction of the whole; it is not training time."""
+    viewer: ViewerConfig = field(default_factory=ViewerConfig)
+    """Address of the viewer."""
     mixed_precision: bool | None = None
     """Networks in bfloat16, density and compositing in float32. If not given: if the device multiplies bfloat16
     fast."""

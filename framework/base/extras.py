@@ -8,6 +8,7 @@ from pathlib import Path
 EXTRAS: dict[str, dict[str, str]] = {
     "video": {"imageio_ffmpeg": "'imageio[ffmpeg]'"},
     "plots": {"matplotlib": "matplotlib"},
+    "viewer": {"viser": "viser"},
     "export": {"skimage": "scikit-image", "trimesh": "trimesh", "fast_simplification": "fast-simplification"},
     "lpips": {"lpips": "lpips", "torchvision": "torchvision"},
 }

@@ -41,8 +41,8 @@ SETTINGS = {
 CAMERA_SETTINGS = {"lr": "--camera-learning-rate"}
 """As `SETTINGS`, for flags of the camera optimiser."""
 SECTIONS = {
-    "viewer": "there is no viewer; --vis tensorboard shows images and curves, and ns-render renders videos",
-    "logging": "leave it out; the choice here is --vis tensorboard or none",
+    "viewer": "of the viewer there are --viewer.websocket-host, --viewer.websocket-port and --viewer-share",
+    "logging": "leave it out; the choice here is --vis viewer, tensorboard, viewer+tensorboard or none",
     "optimizers": "Adam is the only optimiser, with --learning-rate, --lr-schedule and --lr-final",
     "pipeline": "there is no equivalent flag; ns-train {method} --help lists all flags",
     "trainer": "there is no equivalent flag; ns-train {method} --help lists all flags",
@@ -55,10 +55,10 @@ SECTIONS = {
     "load-scheduler": "leave it out; a checkpoint includes the schedule",
     "log-gradients": "leave it out; a step that is not finite is dropped and counted",
     "prompt": "no method here uses text prompts",
-    "start-paused": "leave it out; there is no viewer",
+    "start-paused": "leave it out; the viewer has a button that pauses training",
 }
 """First part of a nerfstudio flag -> the answer if there is no equivalent flag here."""
-VIEWERS = ("viewer", "viewer_legacy", "viewer_beta", "wandb", "comet")
+VIEWERS = ("viewer_legacy", "viewer_beta", "wandb", "comet")
 """Values of nerfstudio's --vis, alone or joined by +, that are not available here."""
 FORMATS = {
     "blender-data": "blender",
@@ -118,7 +118,7 @@ def render_answer(flag: str) -> str | None:
 def vis_answer(value: str) -> str | None:
     """Return the answer to `value`, a value of nerfstudio's --vis that is not available here; None for any other."""
     foreign = set(value.split("+")) & set(VIEWERS)
-    return f"--vis {value} is nerfstudio's; {SECTIONS['viewer']}" if foreign else None
+    return f"--vis {value} is nerfstudio's; {SECTIONS['logging']}" if foreign else None
 
 
 def flag_answer(flag: str, method: str, known: Collection[str]) -> str | None:

@@ -1,4 +1,4 @@
-"""The command `ns-bench`: repeatable measurements of kernels, samplers, methods, caching and camera poses."""
+"""The command `ns-bench`: repeatable measurements of kernels, samplers, methods, caching, poses and the viewer."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ usage: ns-bench WHAT [flags]
   poses            differences between poses from ns-process-data and from a COLMAP model of the same images
   pose-refinement  effect of refining camera poses, on the embedded scene with disturbed training poses
   meshes           distance of exported meshes from the exact surface or from sparse points; their time and memory
+  viewer           times of the viewer's first picture, of pictures of a moving camera, and of the finished picture
 
 ns-bench WHAT --help shows its flags. Results are written as JSON to docs/results in the working folder, or to
 --output-dir or --output; poses prints them.
@@ -65,6 +66,20 @@ class QuadratureFlags:
     """Folder of quadrature.json."""
     plot_dir: Path | None = None
     """Folder of plots of the curves; no plots if not given."""
+
+
+@dataclass(frozen=True)
+class ViewerBenchFlags:
+    """Measure the viewer's pictures of trained runs, from a request to the JPEG file, for one browser, on the CPU."""
+
+    runs: tuple[Path, ...] = ()
+    """Folders of trained runs."""
+    widths: tuple[int, ...] = (400, 800)
+    """Widths and heights of the finished pictures, pixels."""
+    pictures: int = 60
+    """Number of pictures of a moving camera."""
+    output_dir: Path = RESULTS
+    """Folder of viewer.json."""
 
 
 @dataclass(frozen=True)
@@ -332,6 +347,28 @@ def _meshes(flags: MeshFlags) -> None:
     _write(flags.output, measure(flags.load_config, flags.seconds, flags.exports, flags.resolutions))
 
 
+def _viewer(flags: ViewerBenchFlags) -> None:
+    import dataclasses
+
+    import torch
+
+    from framework.tools.benchmarks.viewer import measured
+    from framework.training.machine import machine
+
+    if not flags.runs or not all(width >= 8 for width in flags.widths):
+        raise ConfigError("--runs: name the folders of trained runs; --widths are at least 8 pixels")
+    make_room(flags.output_dir / "viewer.json")
+    rows = [measured(run, width, width, flags.pictures) for run in flags.runs for width in flags.widths]
+    for row in rows:
+        say(
+            f"{row.method} {row.width}x{row.height}: first {row.first:.3f} s, moving {1e3 * row.coarse:.0f} ms "
+            f"(at most {1e3 * row.slowest:.0f}, stride {row.stride}, {row.per_second:.1f} a second), "
+            f"finished {row.finished:.2f} s"
+        )
+    content = {"machine": machine(torch.device("cpu")), "pictures": [dataclasses.asdict(row) for row in rows]}
+    _write(flags.output_dir / "viewer.json", content)
+
+
 KINDS: dict[str, tuple[type, Any]] = {
     "kernels": (KernelFlags, _kernels),
     "quadrature": (QuadratureFlags, _quadrature),
@@ -344,6 +381,7 @@ KINDS: dict[str, tuple[type, Any]] = {
     "poses": (PosesFlags, _poses),
     "pose-refinement": (PoseRefinementFlags, _pose_refinement),
     "meshes": (MeshFlags, _meshes),
+    "viewer": (ViewerBenchFlags, _viewer),
 }
 
 

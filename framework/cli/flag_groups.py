@@ -31,7 +31,7 @@ OWN = "METHOD"
 GROUPS: dict[str, tuple[str | type, ...]] = {
     "everyday": (
         "data", "max_seconds", "max_num_iterations", "output_dir", "experiment_name", "rays_per_pixel", "background",
-        "masks", "vis",
+        "masks", "vis", "viewer_share",
     ),
     OWN: (),
     "sampler": (SamplingConfig, HierarchicalConfig),
@@ -41,7 +41,7 @@ GROUPS: dict[str, tuple[str | type, ...]] = {
         "learning_rate", "lr_schedule", "lr_final", "lr_warmup_steps", "adam_beta1", "adam_beta2", "adam_eps",
     ),
     "evaluation and saving": (TrainConfig,),
-    "machine": ("cache_limit", "cache_dir", "mixed_precision", "machine"),
+    "machine": ("cache_limit", "cache_dir", "mixed_precision", "machine", "viewer"),
 }  # fmt: skip
 """Titles in their order, and what each group holds: settings by name, or all others of a class. The data format's
 settings come last."""

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 from framework.base.console import say
 from framework.base.device import choose_device, peak_memory
+from framework.base.errors import ConfigError
+from framework.base.extras import install_command
 from framework.evaluation.evaluator import evaluate
 from framework.model import StartsFromImages
 from framework.splats.gaussians import HasGaussians
@@ -18,7 +20,7 @@ from framework.training.report import write_evaluation, write_summary
 from framework.training.run import Run, create_folder, write_report, write_transforms
 from framework.training.signals import Stopped, signal_of
 from framework.training.skipping import as_plain, lines, skip_report
-from framework.training.trainer import Outcome, Trainer
+from framework.training.trainer import BetweenSteps, Outcome, Trainer
 
 PICTURES = 4
 """Maximum number of held-out views of which images are written at the end."""
@@ -59,6 +61,8 @@ def resume(run: Run) -> None:
 
 
 def _prepare(run: Run) -> Trainer:
+    if "viewer" in run.config.vis and (command := install_command("viewer")) is not None:
+        raise ConfigError(f"--vis {run.config.vis} needs viser: {command}")
     device = choose_device(run.config.machine)
     train_set = load_split(run, "train").to(device)
     eval_set = first_split(run, ("val", "test"))
@@ -79,8 +83,8 @@ def _finish(run: Run, trainer: Trainer) -> None:
     write_transforms(run, trainer.train_set)
     if trainer.first_step == 0:  # a resumed run has no open settings left
         write_report(run.folder / "scene_profile.json", trainer.profile().as_plain())
-    with _noted_stop(lambda: _saved_note(trainer)):
-        outcome = trainer.train()
+    with _noted_stop(lambda: _saved_note(trainer)), _viewer(trainer) as between_steps:
+        outcome = trainer.train(between_steps)
     state = trainer.state
     say(
         f"{outcome.reason}: step {state.step:,}, {state.seconds:.1f} s of training, "
@@ -127,6 +131,15 @@ def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:
         say(f"warning: {evaluation.pictures_note}")
     write_evaluation(run.folder / "eval.json", run, outcome.checkpoint, evaluation, trainer.device)
     say(f"evaluate again with: ns-eval --load-config {run.config_path}")
+
+
+def _viewer(trainer: Trainer) -> AbstractContextManager[BetweenSteps | None]:
+    """Open the viewer of a run in training, if it is asked for."""
+    if "viewer" not in trainer.config.vis:
+        return nullcontext()
+    from framework.viewer.training_viewer import training_viewer
+
+    return training_viewer(trainer)
 
 
 @contextmanager

@@ -72,7 +72,7 @@ def interpolate(cameras: Cameras, num_frames: int) -> Cameras:
     weights = torch.exp(-0.5 * ((positions[:, None] - torch.arange(count)) / width).square())
     weights = weights / weights.sum(-1, keepdim=True)
     means = torch.einsum("fm,mij->fij", weights, cameras.camera_to_worlds.double())
-    return replace_poses(cameras, torch.cat([_rotations(means[:, :, :3]), means[:, :, 3:]], dim=-1).float())
+    return replace_poses(cameras, torch.cat([nearest_rotations(means[:, :, :3]), means[:, :, 3:]], dim=-1).float())
 
 
 def spiral(cameras: Cameras, num_frames: int, focus: float, radius: float | None = None) -> Cameras:
@@ -114,7 +114,7 @@ def middle_pose(cameras: Cameras) -> Tensor:
     if not look_same_way(cameras):
         return cameras.camera_to_worlds[0]
     mean = cameras.camera_to_worlds.double().mean(0)
-    return torch.cat([_rotations(mean[None, :, :3])[0], mean[:, 3:]], dim=-1).float()
+    return torch.cat([nearest_rotations(mean[None, :, :3])[0], mean[:, 3:]], dim=-1).float()
 
 
 def look_same_way(cameras: Cameras) -> bool:
@@ -144,8 +144,8 @@ def _first_time(model: Model[Any]) -> Tensor | None:
     return torch.zeros(1) if model.scene.moving else None
 
 
-def _rotations(matrices: Tensor) -> Tensor:
-    """Return the rotations (F, 3, 3) closest to matrices (F, 3, 3)."""
+def nearest_rotations(matrices: Tensor) -> Tensor:
+    """Return the rotations (F, 3, 3) closest to `matrices` (F, 3, 3)."""
     u, _, vh = torch.linalg.svd(matrices)
     flips = torch.ones_like(matrices[:, 0])
     flips[:, 2] = torch.linalg.det(u @ vh)

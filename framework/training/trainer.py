@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import signal
 import time
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,12 +29,13 @@ from framework.kernels.native import torch_on_one_thread
 from framework.model import StartsFromImages
 from framework.scene.profile import SceneProfile
 from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest, save_checkpoint
-from framework.training.curve import Entry, FewImages, Point, in_order, rows
+from framework.training.curve import FewImages, Point, in_order, rows
 from framework.training.optim import first_non_finite, make_optimizer
 from framework.training.preparation import profile_of, skip_by_silhouettes
 from framework.training.progress import ProgressBar, StepReport, TensorBoard
 from framework.training.run import Run, write_report
 from framework.training.signals import stop_signals
+from framework.training.state import State
 from framework.training.step import train_step
 from framework.training.trained import build_model, restore_model
 
@@ -45,32 +47,10 @@ TOLD_SECONDS = 0.5
 """Seconds of preparation from which on they are reported."""
 MAX_BAD_STEPS = 10
 """Number of consecutive non-finite steps after which a run stops."""
-FIRST_SAMPLES_PER_RAY = 256.0
-"""Initial estimate of samples per ray, if the batch size depends on it."""
 SMALLEST_BATCH, LARGEST_BATCH = 64, 2**17
 """Minimum and maximum number of rays per step, if it depends on the number of samples."""
-
-
-@dataclass
-class State:
-    """State of a run besides its parameters, saved in every checkpoint."""
-
-    step: int = 0
-    """Number of training steps done."""
-    seconds: float = 0.0
-    """Seconds of training, without evaluation and saving."""
-    rays: int = 0
-    """Number of rays trained on."""
-    skipped: int = 0
-    """Number of steps dropped because a loss or gradient was not finite."""
-    samples_per_ray: float = FIRST_SAMPLES_PER_RAY
-    """Running mean of samples per ray."""
-    train_mse: float = 1.0
-    """Running mean of the batches' squared error, without bias correction."""
-    curve: tuple[Entry, ...] = ()
-    """Evaluations of all held-out images."""
-    looks: tuple[Entry, ...] = ()
-    """Evaluations of a few held-out images."""
+BetweenSteps = Callable[[StepReport, Sequence[int]], None]
+"""Function of a step's report and of the signals received so far, which grow while it runs."""
 
 
 @dataclass(frozen=True)
@@ -184,15 +164,19 @@ class Trainer:
 
     # -- the run ----------------------------------------------------------------------------------------------
 
-    def train(self) -> Outcome:
+    def train(self, between_steps: BetweenSteps | None = None) -> Outcome:
         """Train until the budget is spent, the target is reached or a signal arrives; then save.
+
+        Args:
+            between_steps: called after every step, in this thread; its time does not count as training. It must not
+                change the model.
 
         Raises:
             DivergenceError: after MAX_BAD_STEPS consecutive non-finite steps; earlier checkpoints remain.
             CheckpointError: if the last checkpoint cannot be written.
         """
         self.prepare()
-        enabled = self.config.vis == "tensorboard"
+        enabled = "tensorboard" in self.config.vis
         with (
             stop_signals() as stopped,
             closing(TensorBoard(self.run.folder, enabled)) as board,
@@ -206,6 +190,8 @@ class Trainer:
                 self._look_if_due(report, board, last=not stopped and self._reason_to_stop(stopped) is not None)
                 if self._due_to_save():
                     self._try_to_save()
+                if between_steps is not None:
+                    between_steps(report, stopped)
             self._write_curve()
             checkpoint = self.save()  # a first Ctrl-C does not interrupt it
         return Outcome(reason, next(iter(stopped), None), checkpoint)
@@ -347,7 +333,7 @@ class Trainer:
         if self.eval_set is None or config.max_eval_images == 0:
             return
         affordable = self._picture_seconds <= PICTURE_SHARE * self.state.seconds
-        if step % config.steps_per_eval_image == 0 and config.vis != "none" and affordable:
+        if step % config.steps_per_eval_image == 0 and "tensorboard" in config.vis and affordable:
             index = (step // config.steps_per_eval_image - 1) % len(self.eval_set)
             background = evaluation_background(self.model)
             picture, seconds = timed_view(self.model, self.eval_set.view(index), background)

@@ -1,0 +1,42 @@
+"""A picture at full size that is made finer piece by piece."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from framework.evaluation.outputs import Arrays
+from framework.viewer.pace import Piece
+from framework.viewer.request import smaller
+
+
+def enlarged(kept: Arrays, width: int, height: int) -> dict[str, np.ndarray]:
+    """Return a coarse picture at full size, each pixel a block.
+
+    Args:
+        kept: what was kept of the coarse picture.
+        width, height: size of the whole picture, pixels.
+    """
+    found = {}
+    for name, values in kept.items():
+        rows, columns = values.shape[:2]
+        found[name] = values[np.arange(height) * rows // height][:, np.arange(width) * columns // width]
+    return found
+
+
+def paste(canvas: Mapping[str, np.ndarray], kept: Arrays, piece: Piece) -> None:
+    """Write a piece into a picture at full size.
+
+    Args:
+        canvas: the picture, which is changed.
+        kept: what was kept of the piece, with the names of the canvas.
+        piece: rows at a stride.
+    """
+    for name, whole in canvas.items():
+        height, width = whole.shape[:2]
+        columns, rows = smaller(width, height, piece.stride)
+        sources = np.arange(height) * rows // height
+        first, last = np.searchsorted(sources, [piece.top, piece.bottom])
+        part = kept[name][sources[first:last] - piece.top]
+        whole[first:last] = part[:, np.arange(width) * columns // width]

@@ -1,0 +1,41 @@
+"""The cells that a method samples, as points."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from framework.model import Model, parts
+from framework.samplers.base import SkipsCells
+
+MOST_CELLS = 40_000
+"""Maximum number of cells that are shown."""
+
+
+def shown_cells(model: Model, most: int = MOST_CELLS) -> tuple[Tensor, float] | None:
+    """Return the centres (N, 3) of occupied cells that have an empty neighbour, and the mean edge of a cell.
+
+    What is inside would not be seen. Of more than `most` cells, evenly spaced ones are returned.
+
+    Args:
+        model: the model.
+        most: maximum number N.
+
+    Returns:
+        Positions in scene coordinates and a length; None if the method skips no cells.
+    """
+    samplers = parts(model, SkipsCells)
+    if not samplers:
+        return None
+    sampler = samplers[0]
+    n, box = sampler.resolution, sampler.box.cpu()
+    grid = sampler.occupied.cpu().view(n, n, n)
+    padded = torch.nn.functional.pad(grid, (1, 1, 1, 1, 1, 1))
+    inside = grid.clone()
+    for axis in range(3):
+        for shift in (-1, 1):
+            inside &= padded.roll(shift, axis)[1:-1, 1:-1, 1:-1]
+    cells = (grid & ~inside).nonzero()
+    cells = cells[:: -(-len(cells) // most) or 1]
+    edge = (box[1] - box[0]) / n
+    return box[0] + (cells + 0.5) * edge, float(edge.mean())

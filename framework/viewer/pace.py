@@ -1,0 +1,198 @@
+"""How much is drawn at once, by what was measured: pure functions, with no clock of their own.
+
+The stride of the coarse picture is chosen from a model of the time that a picture takes, a line fitted to the last
+measurements, with hysteresis. So no loop goes from a slow picture to a coarse one, which is fast, to a fine one and
+back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Literal
+
+from framework.viewer.request import smaller
+
+STRIDES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
+"""Strides of coarse pictures, pixels."""
+FIRST_PIXELS = 6_000
+"""Number of pixels of a first picture, before anything was measured."""
+KEPT_MEASUREMENTS = 16
+"""Number of pictures from which the speed is estimated."""
+KEEP = (0.5, 1.4)
+"""A stride is kept while its picture takes at most the second times the budget, and the next finer one at least the
+first."""
+JUMP = 4
+"""Ratio of the strides of one pass and the next, at most."""
+LEAST_ROWS = 4
+"""Minimum number of rows of a piece."""
+Rays = Literal[1, 4, 9, 16]
+"""Number of rays that are averaged for a pixel."""
+
+
+@dataclass(frozen=True)
+class Speed:
+    """Time of a picture as a function of its number of rays, fitted to the last measurements."""
+
+    measured: tuple[tuple[int, float], ...] = ()
+    """Number of rays, and seconds."""
+
+    def with_one(self, rays: int, seconds: float) -> Speed:
+        """Return the speed with one more measurement.
+
+        Args:
+            rays: number of rays of a picture; that of its pixels for methods that cast none.
+            seconds: time that it took.
+        """
+        return Speed((*self.measured, (max(rays, 1), max(seconds, 1e-6)))[-KEPT_MEASUREMENTS:])
+
+    def line(self) -> tuple[float, float]:
+        """Return seconds of any picture, and seconds per ray: a line with least squared relative errors."""
+        weights = [seconds**-2 for _, seconds in self.measured]
+        total = sum(weights)
+        x = sum(w * rays for w, (rays, _) in zip(weights, self.measured, strict=True)) / total
+        y = sum(w * seconds for w, (_, seconds) in zip(weights, self.measured, strict=True)) / total
+        spread = sum(w * (rays - x) ** 2 for w, (rays, _) in zip(weights, self.measured, strict=True)) / total
+        if spread < (0.05 * x) ** 2:  # pictures of one size say nothing about others: proportional
+            return 0.0, y / x
+        both = [w * (rays - x) * (seconds - y) for w, (rays, seconds) in zip(weights, self.measured, strict=True)]
+        slope = sum(both) / total / spread
+        if slope <= 0:
+            return y, 0.0
+        return (y - slope * x, slope) if slope * x < y else (0.0, y / x)
+
+    def seconds(self, rays: int) -> float:
+        """Return the estimated time of a picture of so many `rays`."""
+        fixed, each = self.line()
+        return fixed + each * rays
+
+    def rays(self, seconds: float) -> float:
+        """Return the number of rays of a picture that takes so many `seconds`, at least as long as the fixed part."""
+        fixed, each = self.line()
+        return max(seconds - fixed, fixed, 0.2 * seconds) / max(each, 1e-12)
+
+
+def coarse_stride(speed: Speed, width: int, height: int, budget: float, before: int | None) -> int:
+    """Return the stride of the picture that is shown while the camera moves.
+
+    Args:
+        speed: what was measured.
+        width, height: size of the whole picture, pixels.
+        budget: seconds that the picture may take.
+        before: stride of the picture before; None for the first.
+    """
+
+    def rays(stride: int) -> int:
+        w, h = smaller(width, height, stride)
+        return w * h
+
+    if not speed.measured:
+        return next((stride for stride in STRIDES if rays(stride) <= FIRST_PIXELS), STRIDES[-1])
+    if before is not None:
+        finer = [stride for stride in STRIDES if stride < before]
+        slow = speed.seconds(rays(before)) > KEEP[1] * budget
+        could_be_finer = bool(finer) and speed.seconds(rays(finer[-1])) < KEEP[0] * budget
+        if not slow and not could_be_finer:
+            return before
+    return next((stride for stride in STRIDES if speed.seconds(rays(stride)) <= budget), STRIDES[-1])
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Rows of a picture at a stride, which are drawn without a break."""
+
+    stride: int
+    """Stride of the picture, pixels."""
+    rays: Rays
+    """Number of rays that are averaged for a pixel."""
+    top: int
+    """First row, at this stride."""
+    bottom: int
+    """The row after the last."""
+
+
+def refinement(speed: Speed, width: int, height: int, shown: int, rays: Rays, seconds: float) -> list[Piece]:
+    """Return the pieces that turn a coarse picture into the finished one, in the order in which they are drawn.
+
+    Each pass is finer than the one before, and starts in the middle of the picture.
+
+    Args:
+        speed: what was measured.
+        width, height: size of the whole picture, pixels.
+        shown: stride of the picture that is shown; 1 if only its pixels' colours are to be replaced.
+        rays: rays per pixel of the finished picture.
+        seconds: time that a piece may take.
+    """
+    pieces: list[Piece] = []
+    stride = shown
+    while stride > 1:
+        stride = 1 if stride <= JUMP or speed.seconds(width * height) <= 2 * seconds else max(stride // JUMP, 2)
+        pieces += _bands(speed, width, height, stride, 1, seconds)
+    if shown == 1 or rays > 1:
+        pieces += _bands(speed, width, height, 1, rays, seconds)
+    return pieces
+
+
+def _bands(speed: Speed, width: int, height: int, stride: int, rays: Rays, seconds: float) -> list[Piece]:
+    """Return the pieces of one pass, from the middle outwards."""
+    columns, rows = smaller(width, height, stride)
+    each = rows
+    if speed.measured:
+        each = min(max(int(speed.rays(seconds) / (columns * rays)), LEAST_ROWS), rows)
+    count = -(-rows // each)
+    edges = [round(index * rows / count) for index in range(count + 1)]
+    bands = [Piece(stride, rays, top, bottom) for top, bottom in pairwise(edges)]
+    return sorted(bands, key=lambda piece: abs(piece.top + piece.bottom - rows))
+
+
+@dataclass(frozen=True)
+class Share:
+    """Time that pictures may take beside something else that has to be done."""
+
+    share: float
+    """Pictures' fraction of the whole time, 0 to 1."""
+    most: float = 0.2
+    """Maximum credit, seconds: what was not used is lost beyond it."""
+    credit: float = 0.0
+    """Seconds that pictures may take now; negative if the last one took longer than it might."""
+
+    def earned(self, seconds: float) -> Share:
+        """Return the share after so many `seconds` of the other work."""
+        if self.share >= 1:
+            return replace(self, credit=self.most)
+        return replace(self, credit=min(self.credit + seconds * self.share / (1 - self.share), self.most))
+
+    def spent(self, seconds: float) -> Share:
+        """Return the share after a picture that took so many `seconds`."""
+        return replace(self, credit=self.credit - seconds)
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """What a browser waits for, as far as the order of work depends on it."""
+
+    new: bool
+    """Whether it has asked for something of which nothing is drawn."""
+    rough: bool
+    """Whether its picture is unfinished, or older than the model."""
+    asked_at: float
+    """Time of its last request, seconds."""
+    served_at: float
+    """Time at which something was last drawn for it, seconds."""
+
+
+def next_browser(waiting: Sequence[Waiting], now: float, rest: float) -> int | None:
+    """Return the browser for which something is drawn next; None if all are served.
+
+    New requests come first, and of these the one that was served least recently. A picture is refined when its camera
+    has rested for a while.
+
+    Args:
+        waiting: what the browsers wait for.
+        now: time, seconds.
+        rest: seconds without a new request after which a picture is refined.
+    """
+    new = [index for index, one in enumerate(waiting) if one.new]
+    rough = [index for index, one in enumerate(waiting) if one.rough and now - one.asked_at >= rest]
+    return min(new or rough, key=lambda index: waiting[index].served_at, default=None)

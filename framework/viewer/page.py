@@ -1,0 +1,151 @@
+"""The page: what all browsers share, and a panel for each of them."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from framework.base.console import say
+from framework.viewer.browser import Browser
+from framework.viewer.camera_panel import CameraPanel
+from framework.viewer.drawing import draw
+from framework.viewer.pace import Piece
+from framework.viewer.panel import Panel
+from framework.viewer.path_panel import PathPanel
+from framework.viewer.photographs import Photographs
+from framework.viewer.reports import curve, heading
+from framework.viewer.request import Pose, Request
+from framework.viewer.studio import Studio
+from framework.viewer.subject import Subject
+
+if TYPE_CHECKING:
+    import viser
+
+PROBE = 8
+"""Side of the picture by which it is found out whether a method has normals, pixels."""
+
+
+class Page:
+    """Panels and pictures of a server's browsers.
+
+    Args:
+        server: the server.
+        studio: draws the pictures.
+        photographs: the training images.
+        may_render: whether a browser may start ns-render on its path.
+    """
+
+    def __init__(self, server: viser.ViserServer, studio: Studio, photographs: Photographs, may_render: bool) -> None:
+        self._server, self._studio, self._photographs = server, studio, photographs
+        self._renders: list[subprocess.Popen[bytes]] | None = [] if may_render else None
+        self._panels: dict[int, list[Any]] = {}
+        self._curve: Any = None
+        self._has_normals = has_normals(studio.subject)
+        self._heading = server.gui.add_markdown("")
+        with server.gui.add_folder("Learning curve", expand_by_default=False):
+            self._place_of_curve = server.gui.add_folder(None)
+        self.refresh()
+        self._place_camera()
+        server.on_client_connect(self._welcome)
+        server.on_client_disconnect(self._farewell)
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        """Give a browser its panel and its first picture."""
+
+        def show(image: np.ndarray, quality: int) -> None:
+            client.scene.set_background_image(image, format="jpeg", jpeg_quality=quality)
+            client.flush()
+
+        number, studio = client.client_id, self._studio
+        tabs = client.gui.add_tab_group()
+        with tabs.add_tab("View"):
+            panel = Panel(client, studio, self._has_normals)
+        studio.enter(number, Browser(show))
+        studio.ask(number, panel.request)
+        parts: list[Any] = []
+        self._panels[number] = parts
+        if not studio.subject.model.scene.warped:
+            with tabs.add_tab("Photographs"):
+                parts.append(CameraPanel(client, self._photographs))
+            with tabs.add_tab("Path"):
+                parts.append(PathPanel(client, lambda: studio.subject, panel.request, self._renders))
+        if number not in self._server.get_clients():  # it has left before it was welcomed
+            self._farewell(client)
+
+    def _farewell(self, client: viser.ClientHandle) -> None:
+        self._studio.leave(client.client_id)
+        for part in self._panels.pop(client.client_id, ()):
+            part.close()
+
+    def refresh(self) -> None:
+        """Show the run's step, PSNR and learning curve as they are now."""
+        subject = self._studio.subject
+        content = heading(subject.run, subject.step)
+        if content != self._heading.content:
+            self._heading.content = content
+        self.show_curve(*curve(subject.run.folder))
+
+    def show_curve(self, seconds: list[float], psnr: list[float]) -> None:
+        """Show a learning curve.
+
+        Args:
+            seconds: seconds of training of each point.
+            psnr: PSNR of held-out images there, dB.
+        """
+        if len(seconds) < 2:
+            return
+        data = (np.array(seconds), np.array(psnr))
+        if self._curve is None:
+            series: Any = ({"label": "seconds"}, {"label": "PSNR, dB", "stroke": "#2060c0", "width": 2})
+            scales: Any = {"x": {"time": False}}
+            with self._place_of_curve:
+                self._curve = self._server.gui.add_uplot(data, series, scales=scales, aspect=1.6)
+        elif len(self._curve.data[0]) != len(seconds):
+            self._curve.data = data
+
+    def _place_camera(self) -> None:
+        """Let browsers begin at the first training camera, looking at what lies in front of it."""
+        scene = self._studio.subject.model.scene
+        poses = scene.camera_to_worlds
+        if poses is None or not len(poses) or scene.warped:
+            center, size = scene.box.mean(0), float((scene.box[1] - scene.box[0]).norm())
+            position = center + torch.tensor([0.0, -0.6, 0.3]).to(center) * size
+            up = torch.tensor([0.0, 0.0, 1.0])
+            if scene.warped and poses is not None and len(poses):
+                position, center, up = poses[0, :, 3], poses[0, :, 3] - poses[0, :, 2], poses[0, :, 1]
+        else:
+            pose, mean = poses[0].cpu(), poses[:, :, 1].mean(0).cpu()
+            up = torch.tensor([0.0, 0.0, 1.0]) if float(mean[2]) > 0.5 * float(mean.norm()) else mean
+            middle = scene.box.mean(0).cpu() - pose[:, 3]
+            distance = max(float(-(middle @ pose[:, 2])), 0.1 * float(middle.norm()), 1e-3)
+            position, center = pose[:, 3], pose[:, 3] - distance * pose[:, 2]
+        self._server.scene.set_up_direction(tuple(up.tolist()))
+        camera = self._server.initial_camera
+        camera.position, camera.look_at = tuple(position.tolist()), tuple(center.tolist())
+        camera.fov = math.radians(50)
+
+    def close(self) -> None:
+        """End what the browsers have started."""
+        for number in list(self._panels):
+            for part in self._panels.pop(number, ()):
+                part.close()
+        for process in self._renders or ():
+            if process.poll() is None:
+                process.terminate()
+                say("viewer: the render was stopped; the same ns-render command goes on with it")
+
+
+def has_normals(subject: Subject) -> bool:
+    """Return whether a method's pictures have normals, as a small one shows.
+
+    Args:
+        subject: what is looked at.
+    """
+    pose = Pose((1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0), 1.0)
+    time = 0.0 if subject.model.scene.moving else None
+    request = Request(pose, PROBE, PROBE, output="normals", time=time)
+    return "normals" in draw(subject, request, Piece(1, 1, 0, PROBE), None)

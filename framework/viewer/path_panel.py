@@ -1,0 +1,208 @@
+"""The path editor of one browser: cameras are added, passed in a preview, saved, and rendered."""
+
+from __future__ import annotations
+
+import math
+import shlex
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from framework.base.child import python_command
+from framework.base.console import say
+from framework.cameras.camera_path import CameraPath, Keyframe, write_camera_path
+from framework.viewer.camera_panel import move_camera
+from framework.viewer.keyframes import MOST_KEYFRAMES, Editor, listed, path_file
+from framework.viewer.request import Request, number_in
+from framework.viewer.subject import Subject
+
+if TYPE_CHECKING:
+    import viser
+
+LINE = "/camera_path"
+"""Name of the path in the scene."""
+PREVIEW_FPS = 20.0
+"""Maximum number of cameras per second of a preview."""
+NOTHING = "-"
+"""Entry of the list of cameras while there is none."""
+
+
+class PathPanel:
+    """Controls of one browser for a camera path.
+
+    Args:
+        client: the browser.
+        subject: function that returns what is looked at.
+        request: function that returns what the browser sees; None if its camera makes no sense.
+        renders: processes that render paths, of which one may run at a time; None if none may.
+    """
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        subject: Callable[[], Subject],
+        request: Callable[[], Request | None],
+        renders: list[subprocess.Popen[bytes]] | None,
+    ) -> None:
+        self._client, self._subject, self._request, self._renders = client, subject, request, renders
+        self._editor = Editor()
+        self._playing = False
+        gui = client.gui
+        gui.add_button("Add this camera").on_click(lambda _: self._edit(self._added))
+        self._chosen = gui.add_dropdown("Camera", [NOTHING])
+        gui.add_button_group("Chosen", ["go to", "move here", "remove"]).on_click(self._change)
+        self._seconds = gui.add_slider("Seconds between", 0.1, 20.0, 0.1, 2.0)
+        self._fps = gui.add_number("Frames per second", 24, min=1, max=120, step=1)
+        self._closed = gui.add_checkbox("Closed", False, hint="The path returns to its first camera.")
+        for handle in (self._seconds, self._fps, self._closed):
+            handle.on_update(lambda _: self._edit(lambda editor: editor))
+        self._preview = gui.add_button("Preview")
+        self._preview.on_click(lambda _: self._play())
+        self._width = gui.add_number("Width", 1280, min=16, max=8192, step=2)
+        self._height = gui.add_number("Height", 720, min=16, max=8192, step=2)
+        self._name = gui.add_text("Name", "", hint="Letters, digits, - and _; camera_path.json if empty")
+        gui.add_button("Save").on_click(lambda _: self._save())
+        if renders is not None:
+            gui.add_button("Save and render").on_click(lambda _: self._render())
+        self._note = gui.add_markdown("")
+
+    def close(self) -> None:
+        """Stop the preview: the browser has left."""
+        self._playing = False
+
+    # -- editing ----------------------------------------------------------------------------------------------
+
+    def _keyframe(self) -> Keyframe | None:
+        request = self._request()
+        if request is None:
+            return None
+        return Keyframe(request.pose.tensor(), math.degrees(request.pose.fov), request.time)
+
+    def _added(self, editor: Editor) -> Editor:
+        keyframe = self._keyframe()
+        if keyframe is not None and len(editor.keyframes) == MOST_KEYFRAMES:
+            self._note.content = f"A path has at most {MOST_KEYFRAMES} cameras."
+        return editor if keyframe is None else editor.added(keyframe)
+
+    def _change(self, event: Any) -> None:
+        index = int(number_in(_or_zero(self._chosen.value), 0, MOST_KEYFRAMES, 0)) - 1
+        if not 0 <= index < len(self._editor.keyframes):
+            self._note.content = "Add a camera first."
+            return
+        action, keyframe = event.target.value, self._keyframe()
+        if action == "go to":
+            chosen = self._editor.keyframes[index]
+            move_camera(self._client, chosen.pose, math.radians(chosen.fov))
+        elif action == "remove":
+            self._edit(lambda editor: editor.without(index))
+        elif action == "move here" and keyframe is not None:
+            self._edit(lambda editor: editor.moved(index, keyframe))
+
+    def _edit(self, change: Callable[[Editor], Editor]) -> None:
+        """Change the path, and show it."""
+        before = len(self._editor.keyframes)
+        self._editor = replace(
+            change(self._editor),
+            seconds=number_in(self._seconds.value, 0.1, 20.0, 2.0),
+            fps=number_in(self._fps.value, 1, 120, 24),
+            closed=self._closed.value is True,
+        )
+        count = len(self._editor.keyframes)
+        if count != before:
+            self._chosen.options = listed(self._editor) or [NOTHING]
+            self._chosen.value = str(count) if count else NOTHING
+        path = self._path()
+        seconds = 0.0 if path is None else path.seconds
+        self._note.content = f"{count} cameras, {seconds:.1f} s"
+        self._show(path)
+
+    def _path(self) -> CameraPath | None:
+        width, height = (round(number_in(one.value, 16, 8192, 720)) for one in (self._width, self._height))
+        return self._editor.path(width, height, self._subject().placement)
+
+    def _show(self, path: CameraPath | None) -> None:
+        """Draw the path as a line in the scene."""
+        self._client.scene.remove_by_name(LINE)
+        if path is not None:
+            points = path.poses[:, :, 3].numpy().astype(np.float32)
+            points = points[:: -(-len(points) // 1000)]
+            pairs = np.stack([points[:-1], points[1:]], axis=1)
+            self._client.scene.add_line_segments(
+                LINE, pairs, np.array([220, 40, 90], np.uint8), thickness=2.0, thickness_units="screen"
+            )
+
+    # -- preview ----------------------------------------------------------------------------------------------
+
+    def _play(self) -> None:
+        """Move the browser's camera along the path, or stop it."""
+        if self._playing:
+            self._playing = False
+            return
+        path = self._path()
+        if path is None:
+            self._note.content = "A path needs two cameras."
+            return
+        self._playing, self._preview.label = True, "Stop"
+        start = time.monotonic()
+        try:
+            while self._playing and (passed := time.monotonic() - start) < path.seconds:
+                index = min(int(passed * path.fps), len(path) - 1)
+                move_camera(self._client, path.poses[index], math.radians(float(path.fovs[index])))
+                self._client.flush()
+                time.sleep(1 / min(PREVIEW_FPS, path.fps))
+        finally:
+            self._playing, self._preview.label = False, "Preview"
+
+    # -- files ------------------------------------------------------------------------------------------------
+
+    def _save(self) -> Path | None:
+        """Write the path into the run's folder, and return the file; None if that was not possible."""
+        path, folder = self._path(), self._subject().run.folder
+        if path is None:
+            self._note.content = "A path needs two cameras."
+            return None
+        file = path_file(folder, self._name.value)
+        try:
+            write_camera_path(file, path)
+        except OSError as error:
+            self._note.content = f"Cannot write {file.name}: {error.strerror or error}"
+            return None
+        command = f"ns-render camera-path {shlex.quote(str(folder))} --camera-path-filename {shlex.quote(str(file))}"
+        say(f"viewer: saved {file}; render it with: {command} --output-path {video_suffix(file.stem)}")
+        self._note.content = f"Saved {file.name}, {len(path)} frames."
+        return file
+
+    def _render(self) -> None:
+        """Start ns-render on the path in another process."""
+        assert self._renders is not None
+        if any(process.poll() is None for process in self._renders):
+            self._note.content = "A path is being rendered; wait for its end."
+            return
+        file = self._save()
+        if file is None:
+            return
+        output = file.with_name(video_suffix(file.stem))
+        words = ["--camera-path-filename", file, "--output-path", output]
+        command = python_command("framework.cli.render", "camera-path", self._subject().run.folder, *words)
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+        self._renders[:] = [process]
+        self._note.content = f"Rendering {output.name} ..."
+        status = process.wait()
+        self._note.content = (
+            f"Rendered {output.name}." if status == 0 else "It could not be rendered; see the terminal."
+        )
+
+
+def video_suffix(stem: str) -> str:
+    """Return a video's file name with the `stem`: MP4 if it can be written, else GIF."""
+    return f"{stem}.mp4" if find_spec("imageio_ffmpeg") is not None else f"{stem}.gif"
+
+
+def _or_zero(value: Any) -> int:
+    return int(value) if isinstance(value, str) and value.isdecimal() and len(value) < 9 else 0

@@ -1,0 +1,176 @@
+"""The training images beside the scene: cameras, small pictures, and errors against them."""
+
+from __future__ import annotations
+
+import math
+import threading
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from framework.base.console import say
+from framework.base.errors import NerfloomError
+from framework.cameras.cameras import Cameras
+from framework.cameras.ndc import Ndc, NdcCameras
+from framework.cameras.view import View
+from framework.data.dataset import ParsedScene
+from framework.data.image_files import Content, read_image
+from framework.data.pixels import composite
+from framework.evaluation.evaluator import spread
+from framework.training.run import Run
+from framework.viewer.request import Pose
+
+MOST = 200
+"""Maximum number of cameras that are shown."""
+THUMBNAIL = 96
+"""Longer side of a small picture, pixels."""
+SAME_PLACE, SAME_WAY = 1e-3, 0.02
+"""Distance, as a fraction of the spread of the cameras, and angle in radians within which a view is at a photograph."""
+
+
+class Photographs:
+    """Training images of a run, of which nothing is read before it is needed, and no file twice at a time.
+
+    Args:
+        run: the run, with the folder and the format of its data.
+    """
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._lock = threading.RLock()
+        self._whole = lru_cache(maxsize=1)(self._read)
+        self._small = lru_cache(maxsize=4 * MOST)(self._thumbnail)
+
+    @property
+    def parsed(self) -> ParsedScene | None:
+        """The training split, not decoded; None if it cannot be read, which is said once."""
+        with self._lock:
+            return self._parsed
+
+    @cached_property
+    def _parsed(self) -> ParsedScene | None:
+        try:
+            return self._run.parse("train")
+        except (NerfloomError, OSError) as error:
+            say(f"the photographs are not shown: {error}")
+            return None
+
+    @cached_property
+    def cameras(self) -> Cameras | None:
+        """Cameras for the sizes of the decoded images; None if there are none."""
+        parsed = self.parsed
+        return None if parsed is None else parsed.cameras.scaled(1 / parsed.downscale_factor)
+
+    @property
+    def ndc(self) -> Ndc | None:
+        """Normalised device coordinates of the scene; None if it has none."""
+        return self.cameras.ndc if isinstance(self.cameras, NdcCameras) else None
+
+    def chosen(self) -> list[int]:
+        """Return the indices of the images whose cameras are shown, evenly spaced, at most `MOST`."""
+        return [] if self.cameras is None else spread(len(self.cameras), MOST)
+
+    def name(self, index: int) -> str:
+        """Return the file name of image `index`."""
+        return "" if self.parsed is None else self.parsed.image_paths[index].name
+
+    def pose(self, index: int) -> Tensor:
+        """Return the pose (3, 4) of image `index`, camera-to-scene."""
+        assert self.cameras is not None
+        return self.cameras.camera_to_worlds[index]
+
+    def fov(self, index: int) -> float:
+        """Return the vertical field of view of image `index`, radians; 60 degrees for one that is no pinhole's."""
+        assert self.cameras is not None
+        if self.cameras.model not in ("pinhole", "opencv"):
+            return math.radians(60)
+        return 2 * math.atan(0.5 * float(self.cameras.heights[index]) / float(self.cameras.fy[index]))
+
+    def thumbnail(self, index: int) -> np.ndarray | None:
+        """Return a small picture (H, W, 3) uint8 of image `index`, over white; None if the file cannot be read."""
+        with self._lock:
+            return self._small(index)
+
+    def _thumbnail(self, index: int) -> np.ndarray | None:
+        assert self.parsed is not None
+        return small_picture(self.parsed.image_paths[index])
+
+    def _read(self, index: int) -> Tensor | None:
+        assert self.parsed is not None
+        try:
+            return torch.from_numpy(read_image(self.parsed.image_paths[index], self.parsed.downscale_factor).copy())
+        except (NerfloomError, OSError) as error:
+            say(f"the error is not shown: {error}")
+            return None
+
+    # -- errors -----------------------------------------------------------------------------------------------
+
+    def at(self, pose: Pose) -> int | None:
+        """Return the image whose camera has a given place and direction; None if there is none.
+
+        Args:
+            pose: camera of a view.
+        """
+        if self.cameras is None or self.ndc is not None:
+            return None
+        given = self.cameras.camera_to_worlds.double()
+        here = pose.tensor()
+        distances = (given[:, :, 3] - here[:, 3]).norm(dim=-1)
+        size = float((given[:, :, 3] - given[:, :, 3].mean(0)).norm(dim=-1).max()) or 1.0
+        ahead = (given[:, :, 2] * here[:, 2]).sum(-1)
+        close = (distances <= SAME_PLACE * size) & (ahead >= math.cos(SAME_WAY))
+        return int(torch.where(close, distances, torch.inf).argmin()) if bool(close.any()) else None
+
+    def truth(self, view: View, rgb: Tensor, background: Tensor) -> Tensor | None:
+        """Return what the photograph at a view's camera shows in the view's pixels.
+
+        From one place, a direction has the same colour in every picture, whatever its distance. So the pixels of the
+        view are projected into the photograph, through its lens. Pixels outside of it keep the rendered colour.
+
+        Args:
+            view: a view from the place of a photograph.
+            rgb: (H, W, 3) its rendered colours in [0, 1].
+            background: (3,) colour behind transparent pixels.
+
+        Returns:
+            (H, W, 3) colours; None if there is no photograph from there.
+        """
+        matrix = view.camera.camera_to_worlds[0].double().cpu().flatten().tolist()
+        with self._lock:
+            index = self.at(Pose(tuple(matrix), 1.0))
+            image = None if index is None else self._whole(index)
+        if index is None or image is None or self.cameras is None:
+            return None
+        rays = view.camera.pixel_rays(view.pixels().reshape(-1), 0.0, 1.0)
+        columns, rows, seen = self.cameras.project(rays.origins.cpu() + rays.directions.cpu(), index)
+        height, width = image.shape[:2]
+        seen &= (columns > -0.5) & (rows > -0.5) & (columns < width - 0.5) & (rows < height - 0.5)
+        flat = composite(image.float() / 255, background.cpu()).permute(2, 0, 1)[None]
+        places = torch.stack([(columns + 0.5) / width, (rows + 0.5) / height], -1) * 2 - 1
+        options: dict[str, Any] = {"align_corners": False, "padding_mode": "border"}
+        found = torch.nn.functional.grid_sample(flat, places[None, None], **options)[0, :, 0].T
+        return torch.where(seen[:, None].to(rgb.device), found.to(rgb), rgb.reshape(-1, 3)).view(rgb.shape)
+
+
+def small_picture(path: Path) -> np.ndarray | None:
+    """Return an image reduced to `THUMBNAIL` pixels over white, (H, W, 3) uint8; None if it cannot be read.
+
+    A JPEG is decoded at an eighth of its size, if that is enough.
+
+    Args:
+        path: the file.
+    """
+    try:
+        with Image.open(Content(path)) as image:
+            image.draft("RGB", (THUMBNAIL, THUMBNAIL))
+            image.thumbnail((THUMBNAIL, THUMBNAIL))
+            rgba = image.convert("RGBA")
+        paper = Image.new("RGBA", rgba.size, (255, 255, 255, 255))
+        return np.asarray(Image.alpha_composite(paper, rgba).convert("RGB"))
+    except Exception:  # any type, as in `read_image`
+        return None

@@ -1,0 +1,65 @@
+"""What a run's folder tells: its PSNR, and its learning curve."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from framework.training.run import Run
+
+LARGEST_REPORT = 2**24
+"""Maximum size of a report, bytes."""
+
+
+def heading(run: Run, step: int) -> str:
+    """Return a run's method, folder, step and PSNR, as Markdown.
+
+    Args:
+        run: the run.
+        step: number of training steps done.
+    """
+    lines = [f"**{_plain(run.method)}** · {_plain(run.folder.name)} · step {step:,}"]
+    content = _read(run.folder / "eval.json")
+    results = content.get("results") if isinstance(content, dict) else None
+    if isinstance(results, dict) and (psnr := _finite(results.get("psnr"))) is not None:
+        images = results.get("num_images")
+        lines.append(f"PSNR {psnr:.2f} dB" + (f" on {images} images" if isinstance(images, int) else ""))
+    return "  \n".join(lines)
+
+
+def curve(folder: Path) -> tuple[list[float], list[float]]:
+    """Return seconds of training and PSNR of held-out images, dB, in the order of time; empty if there are none.
+
+    Args:
+        folder: the run's folder.
+    """
+    content = _read(folder / "learning_curve.json")
+    points = []
+    for row in content if isinstance(content, list) else ():
+        if isinstance(row, dict):
+            seconds, psnr = _finite(row.get("seconds")), _finite(row.get("psnr"))
+            if seconds is not None and psnr is not None:
+                points.append((seconds, psnr))
+    points.sort()
+    return [seconds for seconds, _ in points], [psnr for _, psnr in points]
+
+
+def _read(path: Path) -> Any:
+    try:
+        if path.stat().st_size > LARGEST_REPORT:
+            return None
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
+
+
+def _finite(value: Any) -> float | None:
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return float(value) if is_number and abs(value) < 1e30 and math.isfinite(value) else None
+
+
+def _plain(text: str) -> str:
+    """Return text without what Markdown and HTML would take for a mark."""
+    return "".join(letter if letter.isalnum() or letter in "-_. :" else "?" for letter in text).replace("_", r"\_")

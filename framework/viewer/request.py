@@ -1,0 +1,223 @@
+"""What a browser asks to see: a camera, an output, and how the scene is shown. Nothing in it is believed unchecked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from framework.cameras.cameras import Cameras
+from framework.cameras.ndc import Ndc, NdcCameras
+
+FARTHEST = 1e6
+"""Maximum coordinate of a camera, scene units."""
+ANGLES = (0.5, 170.0)
+"""Range of the vertical field of view, degrees."""
+LARGEST_SIDE, SMALLEST_SIDE = 4096, 8
+"""Range of the width and the height of a picture, pixels."""
+OUTPUTS = ("rgb", "depth", "accumulation", "normals", "error")
+"""Outputs that a browser can ask for."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Position and orientation of a browser's camera, and its lens."""
+
+    matrix: tuple[float, ...]
+    """12 numbers, camera-to-scene (3, 4) row by row, OpenGL axes."""
+    fov: float
+    """Vertical field of view, radians."""
+
+    def tensor(self) -> Tensor:
+        """Return the pose (3, 4) float64."""
+        return torch.tensor(self.matrix, dtype=torch.float64).view(3, 4)
+
+
+@dataclass(frozen=True)
+class Crop:
+    """Part of space that is shown."""
+
+    corners: tuple[tuple[float, float, float], tuple[float, float, float]]
+    """Minimum and maximum corner of a box, scene units."""
+    near: float = 0.0
+    """Distance from the camera before which nothing is shown, scene units."""
+    far: float = math.inf
+    """Distance from the camera beyond which nothing is shown, scene units."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a browser asks to see."""
+
+    pose: Pose
+    """Camera."""
+    width: int
+    """Width of the finished picture, pixels."""
+    height: int
+    """Height of the finished picture, pixels."""
+    output: str = "rgb"
+    """Output, one of `OUTPUTS`."""
+    time: float | None = None
+    """Time in [0, 1]; None for a static scene."""
+    appearance: int | None = None
+    """Training image whose appearance is shown; None for the mean."""
+    background: tuple[float, float, float] | None = None
+    """Colour behind the scene, 0 to 1; None for that of evaluations."""
+    crop: Crop | None = None
+    """Part of space that is shown; None for all."""
+
+    def camera(self, stride: int = 1, rows: tuple[int, int] | None = None, ndc: Ndc | None = None) -> Cameras:
+        """Return the camera of a smaller picture of the same view, or of some of its rows.
+
+        Args:
+            stride: width and height are divided by it and rounded up.
+            rows: first row and the one after the last; all if None.
+            ndc: normalised device coordinates of the scene; None if it has none.
+        """
+        width, height = smaller(self.width, self.height, stride)
+        top, bottom = rows or (0, height)
+        focal = 0.5 * self.height / math.tan(0.5 * self.pose.fov)
+        numbers = {
+            "fx": focal * width / self.width,
+            "fy": focal * height / self.height,
+            "cx": 0.5 * width,
+            "cy": 0.5 * height - top,
+        }
+        values: dict[str, Any] = {name: torch.tensor([value]) for name, value in numbers.items()}
+        values |= {"widths": torch.tensor([width]), "heights": torch.tensor([bottom - top])}
+        poses = self.pose.tensor().float()[None]
+        if ndc is not None:
+            return NdcCameras(poses, **values, ndc=ndc)
+        return Cameras(poses, **values)
+
+
+def smaller(width: int, height: int, stride: int) -> tuple[int, int]:
+    """Return the size of a picture at a stride.
+
+    Args:
+        width, height: size of the whole picture, pixels.
+        stride: number by which both are divided, rounded up.
+    """
+    return -(-width // stride), -(-height // stride)
+
+
+def pose_of(wxyz: Any, position: Any, fov: Any) -> Pose | None:
+    """Return the camera that a browser reports; None if the numbers make no camera.
+
+    Args:
+        wxyz: quaternion from the camera's axes (x right, y down, z forward) to the scene.
+        position: three coordinates, scene units.
+        fov: vertical field of view, radians.
+    """
+    quaternion, place, angle = _numbers(wxyz, 4), _numbers(position, 3), _numbers([fov], 1)
+    if quaternion is None or place is None or angle is None:
+        return None
+    length = math.hypot(*quaternion)
+    if not 1e-6 < length < 1e6 or max(map(abs, place)) > FARTHEST:
+        return None
+    w, x, y, z = (value / length for value in quaternion)
+    rotation = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    matrix = [
+        number for (right, down, ahead), t in zip(rotation, place, strict=True) for number in (right, -down, -ahead, t)
+    ]
+    least, most = map(math.radians, ANGLES)
+    return Pose(tuple(matrix), min(max(angle[0], least), most))
+
+
+def quaternion_of(pose: Tensor) -> tuple[float, float, float, float]:
+    """Return the quaternion w, x, y, z of a camera with axes x right, y down, z forward; the inverse of `pose_of`.
+
+    Args:
+        pose: (3, 4) camera-to-scene, OpenGL axes.
+    """
+    m = (pose[:, :3].double() * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)).tolist()
+    trace = m[0][0] + m[1][1] + m[2][2]
+    # The largest of the four squares is divided by, so that nothing is divided by zero.
+    squares = [1 + trace, *(1 - trace + 2 * m[i][i] for i in range(3))]
+    largest = squares.index(max(squares))
+    twice = math.sqrt(squares[largest])
+    s = 0.5 / twice
+    if largest == 0:
+        found = (0.5 * twice, (m[2][1] - m[1][2]) * s, (m[0][2] - m[2][0]) * s, (m[1][0] - m[0][1]) * s)
+    elif largest == 1:
+        found = ((m[2][1] - m[1][2]) * s, 0.5 * twice, (m[0][1] + m[1][0]) * s, (m[0][2] + m[2][0]) * s)
+    elif largest == 2:
+        found = ((m[0][2] - m[2][0]) * s, (m[0][1] + m[1][0]) * s, 0.5 * twice, (m[1][2] + m[2][1]) * s)
+    else:
+        found = ((m[1][0] - m[0][1]) * s, (m[0][2] + m[2][0]) * s, (m[1][2] + m[2][1]) * s, 0.5 * twice)
+    return found
+
+
+def size_of(width: Any, height: Any, longest: int) -> tuple[int, int]:
+    """Return the size of the finished picture in a browser's window.
+
+    Args:
+        width, height: size of the window, pixels; anything else counts as 4:3.
+        longest: maximum of width and height, pixels.
+    """
+    numbers = _numbers([width, height], 2)
+    w, h = (4.0, 3.0) if numbers is None or min(numbers) < 1 or max(numbers) > 1e5 else numbers
+    factor = min(longest, max(w, h) if numbers is not None else longest, LARGEST_SIDE) / max(w, h)
+    return max(round(w * factor), SMALLEST_SIDE), max(round(h * factor), SMALLEST_SIDE)
+
+
+def number_in(value: Any, least: float, most: float, default: float) -> float:
+    """Return a number from a browser, clamped; the default for anything that is no finite number.
+
+    Args:
+        value: what the browser sent.
+        least, most: range.
+        default: the number to take instead.
+    """
+    found = _numbers([value], 1)
+    return default if found is None else min(max(found[0], least), most)
+
+
+def one_of(value: Any, choices: Sequence[str]) -> str:
+    """Return a word from a browser if it is among the choices, else the first of them.
+
+    Args:
+        value: what the browser sent.
+        choices: allowed words.
+    """
+    return value if isinstance(value, str) and value in choices else choices[0]
+
+
+def color_of(value: Any) -> tuple[float, float, float]:
+    """Return a colour in [0, 1] of a browser's, three numbers from 0 to 255; white for anything else.
+
+    Args:
+        value: what the browser sent.
+    """
+    found = _numbers(value, 3)
+    red, green, blue = (1.0, 1.0, 1.0) if found is None else (min(max(part / 255, 0.0), 1.0) for part in found)
+    return red, green, blue
+
+
+def corner_of(value: Any, default: Sequence[float]) -> tuple[float, float, float]:
+    """Return a point from a browser; the default for anything else.
+
+    Args:
+        value: what the browser sent.
+        default: three coordinates.
+    """
+    found = _numbers(value, 3)
+    x, y, z = default if found is None else (min(max(part, -FARTHEST), FARTHEST) for part in found)
+    return x, y, z
+
+
+def _numbers(values: Any, count: int) -> list[float] | None:
+    """Return `count` finite numbers; None for anything else."""
+    try:
+        found = [float(value) for value in values if not isinstance(value, (bool, str, bytes))]
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return found if len(found) == count and all(map(math.isfinite, found)) else None

@@ -1,0 +1,163 @@
+"""The web server of the viewer: its address, and what it refuses."""
+
+from __future__ import annotations
+
+import errno
+import io
+import ipaddress
+import logging
+import socket
+import warnings
+from contextlib import redirect_stdout
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from framework.base.console import say
+from framework.base.errors import ConfigError
+from framework.base.extras import install_command
+
+if TYPE_CHECKING:
+    import viser
+
+PORTS_TRIED = 100
+"""Number of ports that are tried, from the one that is asked for."""
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+"""Names of this machine that no other machine reaches."""
+
+
+def check_installed() -> None:
+    """Raise ConfigError, with the command to install it, if viser is missing; before anything that takes long."""
+    if (command := install_command("viewer")) is not None:
+        raise ConfigError(f"the viewer needs viser: {command}")
+
+
+def free_port(host: str, port: int) -> int:
+    """Return the first port from a given one on that nobody listens at.
+
+    Args:
+        host: name or address of a network interface of this machine.
+        port: the port to begin with.
+
+    Raises:
+        ConfigError: if the host is none of this machine, or no port is free.
+    """
+    if not 1 <= port <= 65535:
+        raise ConfigError(f"--websocket-port is {port}; it must be from 1 to 65535")
+    reason = "all are taken"
+    for candidate in range(port, min(port + PORTS_TRIED, 65536)):
+        try:
+            family, kind, protocol, _, address = socket.getaddrinfo(host, candidate, type=socket.SOCK_STREAM)[0]
+            with socket.socket(family, kind, protocol) as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(address)
+                return candidate
+        except UnicodeError:
+            raise ConfigError(f"--websocket-host {host}: this is no name of a host") from None
+        except OSError as error:
+            if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
+                raise ConfigError(f"--websocket-host {host}: {error.strerror or error}") from error
+            reason = error.strerror or str(error)
+    raise ConfigError(f"--websocket-port {port}: no port from there on can be used ({reason})")
+
+
+def open_server(host: str, port: int, label: str) -> viser.ViserServer:
+    """Start the server, and say its address.
+
+    Args:
+        host: interface to listen on.
+        port: port to listen on; the next free one if it is taken.
+        label: title of the page's panel.
+
+    Raises:
+        ConfigError: if viser is missing, or the address cannot be used.
+    """
+    check_installed()
+    chosen = free_port(host, port)
+    import viser
+
+    _shorten_log()
+    # Browsers leave while a picture is made for them.
+    warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
+    with redirect_stdout(io.StringIO()):  # viser prints a table of addresses
+        server = viser.ViserServer(host=host, port=chosen, label=label, verbose=False)
+    _refuse(server, is_local=is_loopback(host))
+    server.gui.configure_theme(show_logo=False, show_share_button=False)
+    bound = server.get_port()
+    if bound != port:
+        say(f"port {port} is taken")
+    shown = f"[{host}]" if ":" in host else host
+    say(f"viewer: http://{shown}:{bound}")
+    return server
+
+
+def close_server(server: viser.ViserServer) -> None:
+    """Stop a `server`; its browsers keep what they show."""
+    with redirect_stdout(io.StringIO()):  # viser prints that it has stopped
+        server.stop()
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether only this machine reaches a `host`."""
+    try:
+        return host in LOOPBACK or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def is_allowed(origin: str | None, host: str | None, is_local: bool) -> bool:
+    """Return whether a page may connect: the viewer's own may, and programs that are no browsers.
+
+    A browser lets any page open a connection to any address, and says which page it is. On the loopback the page must
+    be from the loopback too, so that no foreign name can be made to stand for it.
+
+    Args:
+        origin: header Origin of the connection; None if there is none.
+        host: header Host.
+        is_local: whether the server listens on the loopback.
+    """
+    if origin is None:
+        return True
+    try:
+        page = urlsplit(origin)
+        if is_local and (page.hostname is None or not is_loopback(page.hostname)):
+            return False
+    except ValueError:
+        return False
+    return page.scheme in ("http", "https") and page.netloc == host
+
+
+def _refuse(server: Any, is_local: bool) -> None:
+    """Refuse connections of other pages, and requests to make the viewer public through viser's relay."""
+    from viser import _messages
+
+    infra = server._websock_server
+
+    async def check(connection: Any) -> None:
+        live = infra._live_connections[connection.client_id]
+        headers = live.request.headers
+        if not is_allowed(headers.get("Origin"), headers.get("Host"), is_local):
+            say(f"viewer: refused a connection of the page {headers.get('Origin')!r:.100}")
+            await live.close(1008, "this page is not the viewer's")
+
+    infra._client_connect_cb.insert(0, check)
+    infra.unregister_handler(_messages.ShareUrlRequest)
+    infra.unregister_handler(_messages.ShareUrlDisconnect)
+
+
+class _OneLine(logging.Handler):
+    """A log of one line for each problem, where the libraries below would print a traceback."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        error = record.exc_info[1] if record.exc_info else None
+        reason = f": {type(error).__name__}" if error is not None else ""
+        # Browsers open connections ahead that they do not use.
+        if record.levelno >= logging.ERROR and record.getMessage() != "opening handshake failed":
+            say(f"viewer: a connection sent something that was not understood, and is ignored{reason}")
+
+
+def _shorten_log() -> None:
+    for name in ("websockets.server", "asyncio"):
+        logger = logging.getLogger(name)
+        if not any(isinstance(handler, _OneLine) for handler in logger.handlers):
+            logger.addHandler(_OneLine())
+            logger.propagate = False

@@ -1,0 +1,71 @@
+"""A viewer of a run that is trained, or is being trained in another process: `ns-viewer`."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+from framework.base.console import say
+from framework.cameras.ndc import Ndc
+from framework.training.trained import Trained
+from framework.viewer.page import Page
+from framework.viewer.photographs import Photographs
+from framework.viewer.server import close_server, open_server
+from framework.viewer.studio import Studio
+from framework.viewer.subject import newer_checkpoint, of_trained, reloaded
+
+SECONDS_PER_LOOK = 2.0
+"""Seconds between looks for a newer checkpoint."""
+
+
+def view_trained(trained: Trained, host: str, port: int, follow: bool) -> None:
+    """Serve a run to browsers until Ctrl-C.
+
+    Args:
+        trained: the run.
+        host: interface to listen on.
+        port: port to listen on; the next free one if it is taken.
+        follow: whether newer checkpoints of the run are shown as they are written.
+
+    Raises:
+        ConfigError: if viser is missing, or the address cannot be used.
+        KeyboardInterrupt: on Ctrl-C, after the server has ended.
+    """
+    subject, photographs = of_trained(trained), Photographs(trained.run)
+    studio = Studio(subject, ndc=_ndc(subject.model.scene.warped, photographs), truth=photographs.truth)
+    server = open_server(host, port, "nerfloom")
+    page = Page(server, studio, photographs, may_render=follow)
+    say("Ctrl-C ends it")
+    seen, looked = trained.checkpoint, time.monotonic()
+    try:
+        while True:
+            if studio.work() is None:
+                studio.wait(0.05 if not studio.is_empty else SECONDS_PER_LOOK)
+            if time.monotonic() - looked >= SECONDS_PER_LOOK:
+                looked = time.monotonic()
+                seen = _follow(studio, page, seen) if follow else seen
+    finally:
+        page.close()
+        close_server(server)
+
+
+def _follow(studio: Studio, page: Page, seen: Path) -> Path:
+    """Show the newest checkpoint, if it is new, and return the newest one that was seen."""
+    folder = studio.subject.run.folder
+    newer = newer_checkpoint(folder, seen)
+    if newer is None:
+        page.refresh()
+        return seen
+    found = reloaded(studio.subject, newer)
+    if isinstance(found, str):
+        if os.path.exists(newer):  # not one that has been replaced by a newer one meanwhile
+            say(f"viewer: {found}")
+    else:
+        studio.subject = found
+        page.refresh()
+    return newer
+
+
+def _ndc(warped: bool, photographs: Photographs) -> Ndc | None:
+    return photographs.ndc if warped else None

@@ -1,0 +1,148 @@
+"""A viewer of a run in training: `ns-train --vis viewer`.
+
+Pictures are drawn between two steps, in the thread that trains, so that no lock is needed and nothing that is learnt
+can depend on them: each step draws its random numbers anew from (seed, step). They take a fixed share of the time.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from framework.cameras.ndc import NdcCameras
+from framework.training.curve import in_order
+from framework.training.progress import StepReport
+from framework.training.trainer import BetweenSteps, Trainer
+from framework.viewer.pace import Share
+from framework.viewer.page import Page
+from framework.viewer.photographs import Photographs
+from framework.viewer.server import close_server, open_server
+from framework.viewer.studio import Studio
+from framework.viewer.subject import of_trainer
+
+if TYPE_CHECKING:
+    import viser
+
+PIECE = 0.04
+"""Seconds of a picture, or of a piece of it, between two steps."""
+SECONDS_PER_REPORT = 0.5
+"""Seconds between updates of the numbers in the panel."""
+PAUSE = 0.05
+"""Seconds between looks at the button while training is paused."""
+
+
+class Turns:
+    """Turns of the viewer between the steps of a run.
+
+    Args:
+        trainer: the run's trainer.
+        studio: draws the pictures.
+        share: the pictures' fraction of the time.
+    """
+
+    def __init__(self, trainer: Trainer, studio: Studio, share: float) -> None:
+        self._trainer, self._studio, self._share = trainer, studio, Share(share)
+        self._ended = time.perf_counter()
+        self.paused = False
+        self.waited = 0.0
+
+    def take(self, report: StepReport, stopped: Sequence[int]) -> None:
+        """Draw for as long as the share of the time allows; while training is paused, until it goes on.
+
+        Args:
+            report: report of the last step.
+            stopped: signals received so far; any ends a pause.
+        """
+        start = time.perf_counter()
+        if self._studio.is_empty and not self.paused:  # nobody looks: nothing to do
+            self._ended = start
+            return
+        self._share = self._share.earned(start - self._ended)
+        self._studio.subject = of_trainer(self._trainer)
+        self._studio.hurried = True
+        while self._share.credit > 0 and (seconds := self._studio.work()) is not None:
+            self._share = self._share.spent(seconds)
+        while self.paused and not stopped:
+            self._studio.hurried = False
+            if self._studio.work() is None:
+                self._studio.wait(PAUSE)
+        self._ended = time.perf_counter()
+        self.waited += self._ended - start
+
+
+class Status:
+    """Numbers of a run in training, and the button that pauses it, in the panel of all browsers.
+
+    Args:
+        server: the server.
+        page: the page, with the learning curve.
+        trainer: the run's trainer.
+        turns: turns of the viewer.
+    """
+
+    def __init__(self, server: viser.ViserServer, page: Page, trainer: Trainer, turns: Turns) -> None:
+        self._page, self._trainer, self._turns = page, trainer, turns
+        self._text = server.gui.add_markdown("")
+        self._button = server.gui.add_button("Pause training")
+        self._button.on_click(self._press)
+        self._told = 0.0
+
+    def _press(self, _: Any) -> None:
+        self._turns.paused = not self._turns.paused
+        self._button.label = "Go on training" if self._turns.paused else "Pause training"
+
+    def show(self, report: StepReport) -> None:
+        """Show the numbers of a step, unless those of another were shown a moment ago.
+
+        Args:
+            report: report of the step.
+        """
+        now = time.monotonic()
+        if now - self._told < SECONDS_PER_REPORT:
+            return
+        self._told = now
+        held_out = "" if report.held_out_psnr is None else f"  \nheld-out images {report.held_out_psnr:.2f} dB"
+        loss = sum(report.losses.values())
+        self._text.content = (
+            f"**{self._trainer.run.method}** · step {report.step:,} · {report.seconds:.0f} s  \n"
+            f"loss {loss:.5f} · PSNR of batches {report.psnr:.2f} dB{held_out}"
+        )
+        state = self._trainer.state
+        points = in_order(state.curve, state.looks)
+        self._page.show_curve([one.seconds for one in points], [one.psnr for one in points])
+
+
+@contextmanager
+def training_viewer(trainer: Trainer) -> Iterator[BetweenSteps]:
+    """Serve a run in training to browsers, within a `with` block.
+
+    Args:
+        trainer: the run's trainer.
+
+    Yields:
+        Function to be called between steps.
+
+    Raises:
+        ConfigError: if viser is missing, or the address cannot be used.
+    """
+    config, cameras = trainer.config, trainer.train_set.cameras
+    photographs = Photographs(trainer.run)
+    ndc = cameras.ndc if isinstance(cameras, NdcCameras) else None
+    studio = Studio(of_trainer(trainer), PIECE, PIECE, ndc, photographs.truth)
+    turns = Turns(trainer, studio, config.viewer_share)
+    server = open_server(config.viewer.websocket_host, config.viewer.websocket_port, "nerfloom")
+    page = Page(server, studio, photographs, may_render=False)
+    status = Status(server, page, trainer, turns)
+
+    def between_steps(report: StepReport, stopped: Sequence[int]) -> None:
+        if not studio.is_empty:
+            status.show(report)
+        turns.take(report, stopped)
+
+    try:
+        yield between_steps
+    finally:
+        page.close()
+        close_server(server)

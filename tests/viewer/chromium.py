@@ -1,0 +1,145 @@
+"""Headless Chromium, driven through its own protocol over a websocket: pages, the mouse, the keyboard, screenshots."""
+
+import base64
+import io
+import itertools
+import json
+import shutil
+import signal
+import subprocess
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+FLAGS = (
+    *("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
+    *("--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage", "--hide-scrollbars"),
+    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--force-device-scale-factor=1"),
+    *("--remote-debugging-port=0", "--remote-allow-origins=*", "--disable-background-timer-throttling"),
+    *("--disable-renderer-backgrounding", "--disable-backgrounding-occluded-windows"),
+)
+
+
+class Tab:
+    """A page in the browser."""
+
+    def __init__(self, address: str, identity: str, port: int) -> None:
+        from websockets.sync.client import connect
+
+        self._open = ExitStack()
+        self._socket = self._open.enter_context(connect(address, max_size=2**27, open_timeout=60))
+        self._numbers = itertools.count(1)
+        self._identity, self._port = identity, port
+        self.send("Page.enable")
+        self.send("Runtime.enable")
+
+    def send(self, method: str, **parameters: Any) -> Any:
+        number = next(self._numbers)
+        self._socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
+        while True:
+            answer = json.loads(self._socket.recv(timeout=120))
+            if answer.get("id") == number:
+                assert "error" not in answer, answer
+                return answer.get("result", {})
+
+    def evaluate(self, script: str) -> Any:
+        found = self.send("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in found, found["exceptionDetails"]
+        return found["result"].get("value")
+
+    def screenshot(self, file: Path | None = None) -> np.ndarray:
+        """What the page looks like, (H, W, 3) uint8."""
+        content = base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"])
+        if file is not None:
+            file.write_bytes(content)
+        return np.asarray(iio.imread(io.BytesIO(content)))[..., :3]
+
+    def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
+        self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 8, pause: float = 0.03) -> None:
+        self.mouse("mouseMoved", *start)
+        self.mouse("mousePressed", *start, button="left", buttons=1, clickCount=1)
+        for step in range(1, steps + 1):
+            x, y = (a + (b - a) * step / steps for a, b in zip(start, end, strict=True))
+            self.mouse("mouseMoved", x, y, button="left", buttons=1)
+            time.sleep(pause)
+        self.mouse("mouseReleased", *end, button="left", buttons=0, clickCount=1)
+
+    def click(self, x: float, y: float) -> None:
+        self.mouse("mouseMoved", x, y)
+        self.mouse("mousePressed", x, y, button="left", buttons=1, clickCount=1)
+        self.mouse("mouseReleased", x, y, button="left", buttons=0, clickCount=1)
+
+    def press(self, text: str) -> None:
+        """Click what shows a text."""
+        script = f"""(() => {{
+          const found = [...document.querySelectorAll("button, label, [role=tab], [role=option], p, span, div")]
+            .filter(e => e.textContent.trim() === {json.dumps(text)} && e.offsetParent !== null);
+          const last = found[found.length - 1];
+          if (!last) return null;
+          last.scrollIntoView({{block: "center"}});
+          const box = last.getBoundingClientRect();
+          return [box.x + box.width / 2, box.y + box.height / 2];
+        }})()"""
+        place = until(lambda: self.evaluate(script), 20)
+        self.click(*place)
+
+    def close(self) -> None:
+        self._open.close()
+        urllib.request.urlopen(f"http://127.0.0.1:{self._port}/json/close/{self._identity}", timeout=20).close()
+
+
+class Chromium:
+    """The browser."""
+
+    def __init__(self, folder: Path, width: int, height: int) -> None:
+        program = next(filter(None, map(shutil.which, NAMES)), None)
+        if program is None:
+            pytest.skip("there is no Chromium; the viewer's page is not opened")
+        profile = folder / "profile"
+        command = [program, *FLAGS, f"--user-data-dir={profile}", f"--window-size={width},{height}", "about:blank"]
+        self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        file = profile / "DevToolsActivePort"
+        self.port = int(until(lambda: file.is_file() and file.read_text().split("\n")[0], 60))
+
+    def open(self, address: str) -> Tab:
+        request = urllib.request.Request(f"http://127.0.0.1:{self.port}/json/new?{address}", method="PUT")
+        with urllib.request.urlopen(request, timeout=60) as answer:
+            target = json.load(answer)
+        return Tab(target["webSocketDebuggerUrl"], target["id"], self.port)
+
+    def close(self) -> None:
+        self._process.send_signal(signal.SIGTERM)
+        try:
+            self._process.wait(20)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+
+
+@contextmanager
+def chromium(folder: Path, width: int = 900, height: int = 700) -> Iterator[Chromium]:
+    """A browser with an empty profile, within a `with` block."""
+    browser = Chromium(folder, width, height)
+    try:
+        yield browser
+    finally:
+        browser.close()
+
+
+def until(found: Callable[[], Any], seconds: float) -> Any:
+    """Wait for something true, and return it."""
+    end = time.monotonic() + seconds
+    while True:
+        if result := found():
+            return result
+        assert time.monotonic() < end, "it did not happen in time"
+        time.sleep(0.05)

@@ -1,0 +1,170 @@
+"""The viewer in headless Chromium, as a person uses it: the picture, the mouse, outputs, a path, and training."""
+
+import json
+import re
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from framework.cameras.camera_path import read_camera_path
+from framework.cameras.view import View
+from framework.evaluation.evaluator import evaluation_background
+from framework.training.trained import load_trained
+from framework.viewer.request import Pose, Request
+from tests.cli.helpers import TINY_NGP, command, train
+from tests.viewer.chromium import Chromium, Tab, chromium, until
+
+pytest.importorskip("viser", reason="the extra [viewer] is not installed")
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
+    with chromium(tmp_path_factory.mktemp("chromium")) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory, shared_tiny: Path) -> Path:
+    return train(shared_tiny, tmp_path_factory.mktemp("runs"), "--max-num-iterations", 300)
+
+
+@contextmanager
+def started(*words: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A command that serves the viewer, and its address."""
+    process = subprocess.Popen([*map(str, words)], stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    address = ""
+    for line in process.stderr:
+        if found := re.search(r"viewer: (http://\S+)", line):
+            address = found[1]
+            break
+    assert address, "the command ended before it served anything"
+    try:
+        yield process, address
+    finally:
+        process.terminate()
+        process.communicate(timeout=60)
+
+
+def settled(tab: Tab, seconds: float = 60.0) -> np.ndarray:
+    """The page when it has stopped changing."""
+    end, before = time.monotonic() + seconds, tab.screenshot()
+    while time.monotonic() < end:
+        time.sleep(1.5)
+        now = tab.screenshot()
+        if np.array_equal(now, before) and now[150:500, 50:500].std() > 5:
+            return now
+        before = now
+    raise AssertionError("the page did not come to rest")
+
+
+def shown(tab: Tab) -> np.ndarray:
+    """The canvas at rest, beside the panel and below notes."""
+    return settled(tab)[150:520, 60:540].astype(float)
+
+
+def expected(run: Path, tab: Tab, camera: list[float]) -> np.ndarray:
+    """What the run's model renders from the page's camera: position, target and up."""
+    width, height = tab.evaluate("(c => [c.clientWidth, c.clientHeight])(document.querySelector('canvas'))")
+    position, target, up = (torch.tensor(camera[i : i + 3], dtype=torch.float64) for i in (0, 3, 6))
+    back = torch.nn.functional.normalize(position - target, dim=0)
+    right = torch.nn.functional.normalize(torch.linalg.cross(up, back), dim=0)
+    matrix = torch.stack([right, torch.linalg.cross(back, right), back, position], 1)
+    model = load_trained(run, device_type="cpu").model
+    request = Request(Pose(tuple(matrix.flatten().tolist()), np.radians(50)), width, height)
+    picture = model.render_view(View(request.camera()), evaluation_background(model))
+    return picture.rgb.clamp(0, 1).numpy()[150:520, 60:540] * 255
+
+
+def decibels(a: np.ndarray, b: np.ndarray) -> float:
+    return float(10 * np.log10(255**2 / (np.square(a - b).mean() + 1e-6)))
+
+
+def choose(tab: Tab, label: str, option: str) -> None:
+    """Choose an option of a list, which is the input beside its label."""
+    script = f"""(() => {{
+      const found = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)});
+      const row = found[0].parentElement.parentElement;
+      const box = (document.getElementById(found[0].htmlFor) || row.querySelector("input")).getBoundingClientRect();
+      return [box.x + box.width / 2, box.y + box.height / 2];
+    }})()"""
+    tab.click(*tab.evaluate(script))
+    time.sleep(0.5)
+    tab.press(option)
+
+
+def test_a_trained_run(browser: Chromium, run: Path, tmp_path: Path) -> None:
+    with started(command("ns-viewer"), run, "--websocket-port", 17107) as (process, address):
+        camera = load_trained(run, device_type="cpu").model.scene.camera_to_worlds
+        assert camera is not None
+        position, back = camera[0, :, 3], camera[0, :, 2]
+        look = [*position.tolist(), *(position - back).tolist(), 0.0, 0.0, 1.0]
+        tab = browser.open(address)
+        first = shown(tab)
+        found = decibels(first, expected(run, tab, look))
+        print(f"the page's picture against the model's: {found:.1f} dB")
+        assert found > 30
+
+        tab.drag((300, 400), (420, 380))
+        assert decibels(shown(tab), first) < 25  # the mouse has moved the camera
+
+        before = shown(tab)
+        choose(tab, "Output", "depth")
+        assert decibels(shown(tab), before) < 20
+        choose(tab, "Output", "rgb")
+        assert decibels(shown(tab), before) > 40
+
+        tab.press("Path")
+        tab.press("Add this camera")
+        tab.drag((300, 400), (420, 380))
+        time.sleep(1)
+        tab.press("Add this camera")
+        time.sleep(1)
+        tab.press("Save")
+        file = run / "camera_path.json"
+        until(file.is_file, 20)
+        path = read_camera_path(file)
+        assert len(path.keyframes) == 2
+        assert float((path.poses[0] - path.poses[-1]).abs().max()) > 0.1
+        tab.press("Save and render")
+        until(lambda: next(run.glob("camera_path.*[!n]"), None), 120)
+        tab.screenshot(tmp_path / "path.png")
+
+        other = browser.open(address)
+        shown(other)
+        tab.close()
+        other.drag((300, 400), (350, 380))
+        shown(other)
+        other.close()
+        assert process.poll() is None
+
+
+def test_a_run_in_training(browser: Chromium, shared_tiny: Path, tmp_path: Path) -> None:
+    words = ["--data", shared_tiny, "--output-dir", tmp_path, "--timestamp", "t", *TINY_NGP]
+    words += ["--vis", "viewer", "--viewer.websocket-port", 17207, "--max-num-iterations", 10**6]
+    with started(command("ns-train"), "instant-ngp", *words) as (process, address):
+        tab = browser.open(address)
+
+        def step() -> int:
+            found = re.search(r"step ([\d,]+) · \d+ s", tab.evaluate("document.body.innerText"))
+            return int(found[1].replace(",", "")) if found else 0
+
+        until(lambda: tab.screenshot()[150:520, 60:540].std() > 5, 60)
+        before = until(step, 30)
+        until(lambda: step() > before, 30)
+        tab.press("Pause training")
+        time.sleep(2)
+        paused = step()
+        time.sleep(2)
+        assert step() == paused
+        tab.press("Go on training")
+        until(lambda: step() > paused, 30)
+        tab.close()
+        assert process.poll() is None

@@ -1,0 +1,201 @@
+"""The server, met by clients that speak its protocol, by clients that do not, and by pages from elsewhere."""
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from framework.base.errors import ConfigError
+from framework.cameras.view import View
+from framework.evaluation.evaluator import evaluation_background
+from framework.viewer.page import Page
+from framework.viewer.photographs import Photographs
+from framework.viewer.request import pose_of
+from framework.viewer.server import free_port, is_allowed
+from framework.viewer.studio import Studio
+from framework.viewer.subject import of_trainer
+from tests.training.helpers import tiny_trainer
+
+pytest.importorskip("viser", reason="the extra [viewer] is not installed")
+
+from framework.viewer.server import close_server, open_server
+from tests.viewer.client import LOOK, Client
+
+
+class Served:
+    """A viewer of a tiny trained model, whose pictures are drawn in a thread of their own."""
+
+    def __init__(self, folder: Path, data: Path) -> None:
+        trainer = tiny_trainer("instant-ngp", data, folder, max_num_iterations=60)
+        for _ in range(60):
+            trainer.train_step()
+        self.photographs = Photographs(trainer.run)
+        self.studio = Studio(of_trainer(trainer), truth=self.photographs.truth)
+        self.folder, self.model = folder, trainer.model
+        self._server = open_server("127.0.0.1", 17007, "test")
+        self.port = self._server.get_port()
+        self.page = Page(self._server, self.studio, self.photographs, may_render=False)
+        self._ending = False
+        self._thread = threading.Thread(target=self._draw)
+        self._thread.start()
+
+    def _draw(self) -> None:
+        while not self._ending:
+            if self.studio.work() is None:
+                self.studio.wait(0.01)
+
+    def close(self) -> None:
+        self._ending = True
+        self._thread.join()
+        self.page.close()
+        close_server(self._server)
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory, shared_tiny: Path) -> Iterator[Served]:
+    viewer = Served(tmp_path_factory.mktemp("served") / "run", shared_tiny)
+    yield viewer
+    viewer.close()
+
+
+@pytest.fixture
+def connected(served: Served) -> Iterator[Callable[..., Client]]:
+    clients = []
+
+    def connect(**how: Any) -> Client:
+        clients.append(Client(served.port, **how))
+        return clients[-1]
+
+    yield connect
+    for client in clients:
+        client.close()
+
+
+def truth(served: Served, longest: int, **changes: Any) -> np.ndarray:
+    """What the model itself renders from the client's camera."""
+    look = {**LOOK, **changes}
+    pose = pose_of(look["wxyz"], look["position"], look["fov"])
+    assert pose is not None
+    from framework.viewer.request import Request
+
+    request = Request(pose, longest, longest * look["image_height"] // look["image_width"])
+    picture = served.model.render_view(View(request.camera()), evaluation_background(served.model))
+    return picture.rgb.numpy() * 255
+
+
+def decibels(a: np.ndarray, b: np.ndarray) -> float:
+    return float(10 * np.log10(255**2 / np.square(a.astype(float) - b).mean()))
+
+
+def test_the_picture_is_the_models(served: Served, connected: Callable[..., Client]) -> None:
+    client = connected()
+    client.look()
+    found = client.finished()
+    assert found.shape == (60, 80, 3)
+    assert decibels(found, truth(served, 80)) > 35  # JPEG
+    client.look(position=(0.5, 0.0, -3.0))
+    found = client.finished()
+    assert decibels(found, truth(served, 80, position=(0.5, 0.0, -3.0))) > 35
+    assert decibels(found, truth(served, 80)) < 25
+
+
+def test_two_browsers_see_what_each_asks_for(served: Served, connected: Callable[..., Client]) -> None:
+    first, second = connected(), connected()
+    first.look()
+    second.look(position=(0.0, 0.0, -3.0))
+    first.finished()
+    second.finished()
+    second.set("Output", "depth")
+    depth = second.finished()
+    with pytest.raises(TimeoutError):
+        first.picture(0.5)  # its output is its own
+    assert decibels(depth, truth(served, 80, position=(0.0, 0.0, -3.0))) < 25
+    first.look(position=(0.0, 0.5, -4.0))
+    assert decibels(first.finished(), truth(served, 80, position=(0.0, 0.5, -4.0))) > 35
+
+
+def test_controls_that_send_nonsense(served: Served, connected: Callable[..., Client]) -> None:
+    client = connected()
+    client.look()
+    client.finished()
+    for value in ("nonsense", None, [1, 2], float("nan"), {"a": 1}, "../../etc/passwd"):
+        for label in ("Output", "Resolution", "Own colour", "Colour", "Crop", "Lowest corner", "Near"):
+            client.set(label, value)
+    client.look(position=(float("nan"), 0.0, 0.0))
+    client.look(wxyz=(0.0, 0.0, 0.0, 0.0))
+    client.look(fov="wide")
+    client.look(image_width=-5)
+    other = connected()
+    other.look()
+    assert decibels(other.finished(), truth(served, 80)) > 35
+
+
+def test_a_crop_box_leaves_the_background(served: Served, connected: Callable[..., Client]) -> None:
+    client = connected()
+    client.look()
+    client.finished()
+    client.set("Lowest corner", [5.0, 5.0, 5.0])
+    client.set("Highest corner", [6.0, 6.0, 6.0])
+    client.set("Crop", True)
+    assert client.finished().min() > 250  # white
+
+
+def test_garbage_on_the_socket(served: Served, connected: Callable[..., Client]) -> None:
+    for content in (b"\xff" * 100, b"", b"\x93\x01\x02\x03", b"GET /../../etc/passwd HTTP/1.1\r\n\r\n"):
+        with socket.create_connection(("127.0.0.1", served.port)) as raw:
+            raw.sendall(content)
+    client = connected()
+    client.socket.send("text, where bytes belong")
+    client = connected()
+    client.socket.send(b"\xc1garbage")
+    client = connected()
+    client.send({"type": "NoSuchMessage"})
+    client = connected()
+    client.send({"type": "GuiUpdateMessage", "uuid": 5, "updates": 7})
+    client.send({"type": "ShareUrlRequest"})  # the viewer is not made public
+    leaving = connected()
+    leaving.look()
+    leaving.socket.socket.close()  # in the middle, without a farewell
+    client = connected()
+    client.look()
+    assert decibels(client.finished(), truth(served, 80)) > 35
+    end = time.monotonic() + 20
+    while len(served.page._panels) > 2 and time.monotonic() < end:
+        time.sleep(0.1)
+    assert len(served.page._panels) <= 2  # those that have left are forgotten
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "https://127.0.0.1:1", "http://localhost.evil.com"])
+def test_other_pages_are_refused(served: Served, connected: Callable[..., Client], origin: str) -> None:
+    client = connected(origin=origin)
+    with pytest.raises(Exception, match=r"1008|not the viewer"):
+        client.messages(10)
+
+
+def test_the_viewers_own_page_may_connect(served: Served, connected: Callable[..., Client]) -> None:
+    client = connected(origin=f"http://127.0.0.1:{served.port}")
+    client.look()
+    client.picture()
+
+
+def test_origins() -> None:
+    assert is_allowed(None, "127.0.0.1:7007", True)
+    assert is_allowed("http://127.0.0.1:7007", "127.0.0.1:7007", True)
+    assert not is_allowed("http://127.0.0.1:7008", "127.0.0.1:7007", True)
+    assert not is_allowed("http://evil.example:7007", "evil.example:7007", True)  # its name made to mean 127.0.0.1
+    assert is_allowed("http://machine:7007", "machine:7007", False)
+    assert not is_allowed("file://", "127.0.0.1:7007", True)
+
+
+def test_ports() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert port < free_port("127.0.0.1", port) <= port + 100
+    for host, port in (("127.0.0.1", 0), ("127.0.0.1", 70_000), ("203.0.113.7", 7007), ("no such host", 7007)):
+        with pytest.raises(ConfigError, match="--websocket"):
+            free_port(host, port)

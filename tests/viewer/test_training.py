@@ -1,0 +1,84 @@
+"""The viewer beside training: what is learnt is the same to the last bit, and nothing is drawn for nobody."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from framework.training.progress import StepReport
+from framework.viewer.browser import Browser
+from framework.viewer.request import Request, pose_of
+from framework.viewer.studio import Studio
+from framework.viewer.subject import of_trainer
+from framework.viewer.training_viewer import Turns
+from tests.training.helpers import TINY, assert_same_bits, tensors, tiny_trainer
+
+KINDS = [
+    pytest.param(kind, marks=() if kind in ("instant-ngp", "gaussian-splatting") else pytest.mark.slow) for kind in TINY
+]
+STEPS = 40
+
+
+def looking(number: int, pictures: list[np.ndarray], studio: Studio, x: float) -> None:
+    """A browser that looks from some place."""
+    studio.enter(number, Browser(lambda image, quality: pictures.append(image)))
+    pose = pose_of((1, 0, 0, 0), (x, 0, -4), 0.7)
+    assert pose is not None
+    moving = studio.subject.model.scene.moving
+    studio.ask(number, lambda _: Request(pose, 40, 30, "depth" if number else "rgb", 0.5 if moving else None))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_same_bits_with_and_without(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
+    plain = tiny_trainer(kind, shared_tiny, tmp_path / "plain", max_num_iterations=STEPS)
+    plain.train()
+
+    watched = tiny_trainer(kind, shared_tiny, tmp_path / "watched", max_num_iterations=STEPS)
+    studio = Studio(of_trainer(watched), 0.01, 0.01)
+    turns, pictures = Turns(watched, studio, share=0.9), list[np.ndarray]()
+
+    def between_steps(report: StepReport, stopped: list[int]) -> None:
+        if report.step % 3 == 0:
+            looking(report.step % 2, pictures, studio, 0.01 * report.step)
+        turns.take(report, stopped)
+
+    watched.train(between_steps)  # type: ignore[arg-type]
+    assert len(pictures) >= 5
+    assert watched.state.step == STEPS
+    assert_same_bits(tensors(watched), tensors(plain))
+    assert watched.state.train_mse == plain.state.train_mse
+
+
+def test_nothing_is_drawn_for_nobody(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=20)
+    studio = Studio(of_trainer(trainer))
+    turns = Turns(trainer, studio, share=0.5)
+    trainer.train(turns.take)
+    assert turns.waited == 0
+
+
+def test_a_pause_ends_by_the_button_or_by_a_signal(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=20)
+    studio = Studio(of_trainer(trainer), 0.01, 0.01)
+    turns, pictures = Turns(trainer, studio, share=0.1), list[np.ndarray]()
+
+    report = trainer.train_step()
+    before = dataclasses.replace(trainer.state)
+    looking(0, pictures, studio, 0.0)
+    waits = 0
+
+    def wait(_: float) -> None:
+        nonlocal waits
+        waits += 1
+        turns.paused = waits < 3
+
+    studio.wait = wait  # type: ignore[method-assign]
+    turns.paused = True
+    turns.take(report, [])
+    assert waits == 3
+    assert pictures  # while training rests, pictures are drawn as fast as they can be
+    assert dataclasses.asdict(trainer.state) == dataclasses.asdict(before)
+    turns.paused = True
+    turns.take(report, [2])  # Ctrl-C
+    assert waits == 3

@@ -94,14 +94,14 @@ def picture_points(model: Model[Any], dataset: Dataset, count: int, reach: float
         pixels = torch.randint(picture.depth.numel(), (drawn,), device=model.device)
         rays = view.camera.pixel_rays(pixels, model.scene.near, far)
         depth = picture.median_depth.reshape(-1)[pixels]
-        positions = rays.origins + depth[:, None] * rays.directions
+        places = rays.origins + depth[:, None] * rays.directions
         opaque = picture.accumulation.reshape(-1)[pixels] >= OPAQUE
-        selected = opaque & (depth < rays.fars) & _within(model, positions, reach)
+        selected = opaque & (depth < rays.fars) & _within(model, places, reach)
         if (kept := dataset.kept_of(index)) is not None:
             selected &= kept.to(model.device).reshape(-1)[pixels]
         normals = None if picture.normals is None else picture.normals.reshape(-1, 3)[pixels][selected].cpu()
         yield SurfacePoints(
-            positions[selected].cpu(),
+            places[selected].cpu(),
             picture.rgb.clamp(0, 1).reshape(-1, 3)[pixels][selected].cpu(),
             normals,
             rays.directions[selected].cpu(),

@@ -1,0 +1,170 @@
+"""What the viewer shows beside pictures: crops, errors against photographs, cells, curves, newer checkpoints."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from framework.base import extras
+from framework.base.config import TrainConfig, ViewerConfig
+from framework.base.errors import ConfigError
+from framework.cameras.view import View
+from framework.cli import train as train_command
+from framework.cli import viewer as viewer_command
+from framework.samplers.occupancy import OccupancySampler
+from framework.training.checkpoint import list_checkpoints
+from framework.training.trained import load_trained
+from framework.viewer.crop import CroppedCameras
+from framework.viewer.occupancy import shown_cells
+from framework.viewer.photographs import THUMBNAIL, Photographs, small_picture
+from framework.viewer.reports import curve, heading
+from framework.viewer.request import Crop, Pose, Request
+from framework.viewer.subject import newer_checkpoint, of_trained, reloaded
+from tests.conftest import Refused
+from tests.training.helpers import tiny_run, tiny_trainer
+
+ABOVE = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 4.0)
+"""A camera at (0, 0, 4) that looks down."""
+
+
+def test_cropped_rays() -> None:
+    camera = Request(Pose(ABOVE, 1.2), 9, 9).camera()
+    whole = camera.pixel_rays(torch.arange(81), 0.5, 10.0)
+    crop = Crop(((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)))
+    rays = CroppedCameras.of(camera, crop).pixel_rays(torch.arange(81), 0.5, 10.0)
+    torch.testing.assert_close(rays.directions, whole.directions)
+    assert float(rays.nears[40]) == pytest.approx(3)  # the middle pixel looks along the axis
+    assert float(rays.fars[40]) == pytest.approx(5)
+    assert float((rays.fars - rays.nears)[0]) == 0  # the corner's ray misses the box
+    assert bool((rays.fars >= rays.nears).all())
+    ends = whole.origins + whole.directions * rays.fars[:, None]
+    hit = rays.fars > rays.nears
+    assert bool((ends[hit].abs().amax(-1) - 1).abs().lt(1e-5).all())
+    between = CroppedCameras.of(camera, dataclasses.replace(crop, near=3.5, far=4.5)).pixel_rays(
+        torch.tensor([40]), 0.5, 10.0
+    )
+    assert (float(between.nears), float(between.fars)) == pytest.approx((3.5, 4.5))
+
+
+@pytest.fixture
+def photographs(shared_tiny: Path, tmp_path: Path) -> Photographs:
+    return Photographs(tiny_run("instant-ngp", shared_tiny, tmp_path))
+
+
+def at(photographs: Photographs, index: int) -> Pose:
+    return Pose(tuple(photographs.pose(index).double().flatten().tolist()), photographs.fov(index))
+
+
+def test_a_photograph_is_its_own_truth(photographs: Photographs, shared_tiny: Path) -> None:
+    pose, white = at(photographs, 3), torch.ones(3)
+    view = View(Request(pose, 20, 20).camera())
+    found = photographs.truth(view, torch.zeros(20, 20, 3), white)
+    rgba = torch.from_numpy(iio.imread(shared_tiny / "train" / "r_3.png").copy()).float() / 255
+    expected = rgba[..., :3] * rgba[..., 3:] + (1 - rgba[..., 3:])
+    assert found is not None
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
+    wide = View(Request(dataclasses.replace(pose, fov=1.5), 60, 60).camera())
+    found = photographs.truth(wide, torch.full((60, 60, 3), 0.25), white)
+    assert found is not None
+    assert bool((found[0] == 0.25).all())  # outside of the photograph
+    share = math.tan(photographs.fov(3) / 2) / math.tan(0.75)
+    assert float((found != 0.25).any(-1).float().mean()) == pytest.approx(share**2, rel=0.1)
+
+
+def test_elsewhere_there_is_no_truth(photographs: Photographs) -> None:
+    pose = at(photographs, 3)
+    assert photographs.at(pose) == 3
+    matrix = list(pose.matrix)
+    matrix[3] += 0.1
+    assert photographs.at(dataclasses.replace(pose, matrix=tuple(matrix))) is None
+
+
+def test_small_pictures(tmp_path: Path) -> None:
+    big = np.full((400, 300, 3), (10, 200, 30), np.uint8)
+    iio.imwrite(tmp_path / "big.jpg", big)
+    small = small_picture(tmp_path / "big.jpg")
+    assert small is not None
+    assert max(small.shape[:2]) == THUMBNAIL
+    assert np.abs(small.astype(int) - big[0, 0]).max() < 8
+    (tmp_path / "bad.png").write_bytes(b"\x89PNG\r\n\x1a\n garbage")
+    assert small_picture(tmp_path / "bad.png") is None
+    assert small_picture(tmp_path / "none.png") is None
+
+
+def test_cells_are_those_on_the_surface() -> None:
+    sampler = OccupancySampler(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]), resolution=16)
+    steps = (torch.arange(16) + 0.5) / 8 - 1
+    centers = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), -1)
+    sampler.occupied.copy_((centers.norm(dim=-1) < 0.7).view(-1))
+    found = shown_cells(nn.Sequential(sampler))  # type: ignore[arg-type]
+    assert found is not None
+    points, edge = found
+    assert edge == pytest.approx(0.125)
+    radii = points.norm(dim=-1)
+    assert float(radii.max()) < 0.7
+    assert float(radii.min()) > 0.7 - 2 * 0.125
+    assert len(points) > 4 * math.pi * 0.6**2 / 0.125**2 / 2
+    assert len(shown_cells(nn.Sequential(sampler), 50)[0]) <= 50  # type: ignore[arg-type, index]
+    assert shown_cells(nn.Linear(2, 2)) is None  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("content", ["", "nonsense", "[1, 2]", '{"results": 3}', "[" * 10_000, '[{"seconds": "x"}]'])
+def test_reports_that_make_no_sense(content: str, shared_tiny: Path, tmp_path: Path) -> None:
+    for name in ("learning_curve.json", "eval.json"):
+        (tmp_path / name).write_text(content)
+    assert curve(tmp_path) == ([], [])
+    assert "step 7" in heading(tiny_run("instant-ngp", shared_tiny, tmp_path), 7)
+
+
+def test_reports(shared_tiny: Path, tmp_path: Path) -> None:
+    rows = [{"seconds": 2, "psnr": 20.5}, {"seconds": 1, "psnr": 10}, {"seconds": 3, "psnr": None}]
+    (tmp_path / "learning_curve.json").write_text(json.dumps(rows))
+    assert curve(tmp_path) == ([1, 2], [10, 20.5])
+    (tmp_path / "eval.json").write_text('{"results": {"psnr": 31.234, "num_images": 5}}')
+    assert "31.23 dB on 5 images" in heading(tiny_run("instant-ngp", shared_tiny, tmp_path), 7)
+
+
+def test_newer_checkpoints_are_loaded(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=40)
+    for _ in range(10):
+        trainer.train_step()
+    trainer.save()
+    trained = load_trained(tmp_path / "run", device_type="cpu")
+    subject = of_trained(trained)
+    assert newer_checkpoint(tmp_path / "run", trained.checkpoint) is None
+    for _ in range(10):
+        trainer.train_step()
+    trainer.save()
+    newer = newer_checkpoint(tmp_path / "run", trained.checkpoint)
+    assert newer is not None
+    found = reloaded(subject, newer)
+    assert not isinstance(found, str)
+    assert (subject.step, found.step) == (10, 20)
+    for name, value in trainer.model.state_dict().items():
+        assert torch.equal(found.model.state_dict()[name], value)
+    list_checkpoints(trainer.checkpoint_folder)[-1].write_bytes(b"damaged")
+    assert "cannot be shown" in str(reloaded(subject, newer))
+
+
+def test_what_is_missing_is_named(
+    refused: Refused, monkeypatch: pytest.MonkeyPatch, shared_tiny: Path, tmp_path: Path
+) -> None:
+    assert "no config.yml" in refused(viewer_command.main, tmp_path)
+    monkeypatch.setattr(extras, "find_spec", lambda name: None)
+    assert "pip install viser" in refused(viewer_command.main, tmp_path)
+    words = ("--data", shared_tiny, "--output-dir", tmp_path, "--vis", "viewer")
+    assert "pip install viser" in refused(train_command.main, "instant-ngp", *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_settings_out_of_range() -> None:
+    with pytest.raises(ConfigError, match="--viewer-share"):
+        TrainConfig(viewer_share=0)
+    with pytest.raises(ConfigError, match=r"--viewer\.websocket-port"):
+        ViewerConfig(websocket_port=0)

@@ -1,4 +1,4 @@
-"""What a run's checkpoint holds besides its parameters."""
+"""State of a run besides its parameters, as checkpoints hold it."""
 
 from __future__ import annotations
 

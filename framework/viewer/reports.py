@@ -1,4 +1,4 @@
-"""What a run's folder tells: its PSNR, and its learning curve."""
+"""PSNR and learning curve of a run, read from its folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is looked at: a model, in training or trained, and where it comes from."""
+"""The model that is looked at, in training or trained, and where it comes from."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run's checkpoint holds besides its parameters."""
+"""The state of a run in training, besides its parameters."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ Show = Callable[[np.ndarray, int], None]
 
 @dataclass
 class Browser:
-    """What a browser asks for, which any thread may replace, and its picture, which one thread draws."""
+    """A browser: its request, which any thread may replace, and its picture, which one thread draws."""
 
     show: Show
     """Sends a picture to the browser."""

@@ -1,4 +1,4 @@
-"""How much is drawn at once, by what was measured: pure functions, with no clock of their own.
+"""The amount that is drawn at once, by what was measured: pure functions, with no clock of their own.
 
 The stride of the coarse picture is chosen from a model of the time that a picture takes, a line fitted to the last
 measurements, with hysteresis. So no loop goes from a slow picture to a coarse one, which is fast, to a fine one and
@@ -170,7 +170,7 @@ class Share:
 
 @dataclass(frozen=True)
 class Waiting:
-    """What a browser waits for, as far as the order of work depends on it."""
+    """A browser's claim to be served, as far as the order of work depends on it."""
 
     new: bool
     """Whether it has asked for something of which nothing is drawn."""

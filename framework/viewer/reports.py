@@ -1,4 +1,4 @@
-"""What a run's folder tells: its PSNR, and its learning curve."""
+"""Reports in a run's folder: its PSNR, and its learning curve."""
 
 from __future__ import annotations
 

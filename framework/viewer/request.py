@@ -1,4 +1,4 @@
-"""What a browser asks to see: a camera, an output, and how the scene is shown. Nothing in it is believed unchecked."""
+"""Requests of browsers: a camera, an output, and how the scene is shown. Nothing in it is believed unchecked."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Crop:
 
 @dataclass(frozen=True)
 class Request:
-    """What a browser asks to see."""
+    """A view that a browser asks to see."""
 
     pose: Pose
     """Camera."""

@@ -170,7 +170,7 @@ class Share:
 
 @dataclass(frozen=True)
 class Waiting:
-    """A request of a browser, as far as the order of work depends on it."""
+    """A browser's claim to be served, as far as the order of work depends on it."""
 
     new: bool
     """Whether it has asked for something of which nothing is drawn."""

@@ -51,7 +51,7 @@ class Crop:
 
 @dataclass(frozen=True)
 class Request:
-    """A request of a browser: what it is to see."""
+    """A view that a browser asks to see."""
 
     pose: Pose
     """Camera."""

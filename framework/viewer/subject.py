@@ -1,4 +1,4 @@
-"""The model that is looked at, in training or trained, and where it comes from."""
+"""The subject of a viewer: a model, in training or trained, and where it comes from."""
 
 from __future__ import annotations
 

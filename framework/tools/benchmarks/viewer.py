@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -70,13 +71,13 @@ def measured(run: Path, width: int, height: int, count: int = 60) -> Times:
     browser = Browser(show)
     studio.enter(0, browser)
     begun = time.perf_counter()
-    studio.ask(0, lambda _: _request(trained.model.scene, 0, width, height))
+    studio.ask(0, _always(_request(trained.model.scene, 0, width, height)))
     studio.work()
     first = shown[-1][0] - begun
     seconds = []
     for index in range(WARM_UP + count):
         begun = time.perf_counter()
-        studio.ask(0, lambda _, index=index: _request(trained.model.scene, index + 1, width, height))
+        studio.ask(0, _always(_request(trained.model.scene, index + 1, width, height)))
         studio.work()
         seconds.append(shown[-1][0] - begun)
     moving = seconds[WARM_UP:]
@@ -96,6 +97,10 @@ def measured(run: Path, width: int, height: int, count: int = 60) -> Times:
         shown[-1][0] - begun,
         trained.model.rays_per_pixel,
     )
+
+
+def _always(request: Request) -> Callable[[Request | None], Request]:
+    return lambda _: request
 
 
 def _jpeg(image: np.ndarray, quality: int) -> bytes:

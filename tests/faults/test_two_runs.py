@@ -19,7 +19,8 @@ from tests.training.helpers import tiny_run, tiny_trainer
 
 pytest.importorskip("fcntl")
 HOLD = """
-import sys, time
+import signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell ignores in the background
 from pathlib import Path
 from framework.training.lock import sole_user
 with sole_user(Path(sys.argv[1])):

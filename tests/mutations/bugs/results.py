@@ -525,7 +525,7 @@ BUGS = (
         "page-names-not-escaped",
         "export",
         "framework/export/web.py",
-        '"facts": plain.replace("<", "\\u003c"),',
+        '"facts": plain.replace("<", "\\\\u003c"),',
         '"facts": plain,',
         "an image that is called </script> breaks the web page, or runs what it likes in it",
     ),

@@ -33,7 +33,7 @@ BUGS = (
         "splats-lens-ignored",
         "splats",
         PROJECT,
-        "lens = [1.0, *self.lens.table.double().flatten().tolist()]",
+        "lens = [2.0 if self.fisheye else 1.0, *self.lens.table.double().flatten().tolist()]",
         "lens = [0.0, *self.lens.table.double().flatten().tolist()]",
         "the image of a camera with a lens is drawn without its distortion",
     ),

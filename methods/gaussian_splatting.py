@@ -1,7 +1,7 @@
 """3D Gaussian Splatting: a scene of coloured Gaussians, drawn in real time.
 
-Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", SIGGRAPH 2023. Gaussians are moved to
-where they are needed as in Kheradmand et al., "3D Gaussian Splatting as Markov Chain Monte Carlo", NeurIPS 2024.
+Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", SIGGRAPH 2023. Gaussians grow by
+gradients, or are moved as in Kheradmand et al., "3D Gaussian Splatting as Markov Chain Monte Carlo", NeurIPS 2024.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class GaussianSplattingConfig(
     num_gaussians: Auto[int] = AUTO
     """Maximum number of Gaussians; by the budget if not given."""
     start: Literal["auto", "points", "field", "silhouettes", "random"] = "auto"
-    """Where Gaussians start: at the points of a reconstruction, on surfaces that a short run of instant-ngp finds, in
+    """Where Gaussians start: at the points of a reconstruction, on surfaces that a short run of a field finds, in
     the visual hull of the images' silhouettes, or anywhere in the box. auto: the first of points and field that there
     is."""
     start_gaussians: Auto[int] = AUTO

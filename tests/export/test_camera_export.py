@@ -51,7 +51,7 @@ def furthest(found: dict[str, Tensor], given: dict[str, Tensor]) -> float:
     return max(float(((found[name] - pose) / scale).abs().max()) for name, pose in given.items())
 
 
-def round_trip(parser: DataParser, data: Path, given: dict[str, Tensor], folder: Path) -> None:
+def assert_round_trip(parser: DataParser, data: Path, given: dict[str, Tensor], folder: Path) -> None:
     """Export as both formats, and read both back."""
     posed, scenes = exported(parser, data)
     write_transforms(folder / "transforms.json", posed, relative=False)
@@ -92,14 +92,14 @@ def test_blender_cameras(tiny: Path, tmp_path: Path) -> None:
     given: dict[str, Tensor] = {}
     for split in SPLITS:
         given |= given_poses(tiny / f"transforms_{split}.json")
-    round_trip(Blender(scale_factor=0.37), tiny, given, tmp_path / "out")
+    assert_round_trip(Blender(scale_factor=0.37), tiny, given, tmp_path / "out")
 
 
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["fox", "snowmiku"])
 def test_nerfstudio_cameras(name: str, real_data: Path, tmp_path: Path) -> None:
     given = given_poses(real_data / name / "transforms.json")
-    round_trip(Nerfstudio(), real_data / name, given, tmp_path / "out")
+    assert_round_trip(Nerfstudio(), real_data / name, given, tmp_path / "out")
 
 
 @pytest.mark.data
@@ -107,7 +107,7 @@ def test_nerfstudio_cameras(name: str, real_data: Path, tmp_path: Path) -> None:
 def test_colmap_cameras(name: str, real_data: Path, tmp_path: Path) -> None:
     model = read_model(real_data / name / "sparse" / "0")
     given = {Path(file).stem: pose[:3] for file, pose in zip(model.names, model.poses, strict=True)}
-    round_trip(Colmap(), real_data / name, given, tmp_path / "out")
+    assert_round_trip(Colmap(), real_data / name, given, tmp_path / "out")
 
 
 def test_a_run_trains_on_what_was_exported(shared_tiny: Path, tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from framework.cameras.refinement import PoseRefinement
 from framework.data.dataset import Dataset
 from framework.fields.appearance import AFFINE, Appearance, affine_colors
 from framework.kernels.splat_blend import CHANNELS
-from framework.kernels.ssim import ssim
+from framework.kernels.ssim import photometric_loss
 from framework.rendering.losses import mean_depth_error
 from framework.scene.reasons import DEPTH_REASONS, LIGHT_REASONS, POSE_REASONS
 from framework.splats.density_control import RESET, GradientMean, grown
@@ -46,8 +46,8 @@ LARGE_IMAGE = 250_000
 """Pixels from which training begins with images of half the size."""
 WITHOUT_IMAGES = 1_000
 """Maximum number of Gaussians of a model that has seen no images yet."""
-SMALLEST_SSIM = 11
-"""Pixels of an image's shorter side from which it has an SSIM."""
+FIELD_SHARE = 0.2
+"""Maximum share of a budget in seconds that the training of a field to start from takes."""
 FIELD_OPACITY, FIELD_SIZE = 0.5, 0.7
 """Of Gaussians on a field's surfaces at the start: opacity, and standard deviation in distances to neighbours."""
 
@@ -87,7 +87,8 @@ class GaussianSplattingConfig(
     start_gaussians: Auto[int] = AUTO
     """Gaussians at the start, except at the points of a reconstruction; two thirds of the maximum if not given."""
     field_steps: Auto[int] = AUTO
-    """Training steps of that field; by the budget if not given."""
+    """Maximum number of training steps of that field; by the budget if not given. They end after a fifth of
+    --max-seconds."""
     rate_factor: Auto[float] = AUTO
     """Factor of all learning rates; by the budget if not given, as fewer steps have to go farther."""
     position_rate: float = 8e-5
@@ -261,7 +262,8 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
             kind = "field" if dataset.points is None else "points"
         if kind == "field":
             with torch.enable_grad():
-                points, colors = found_surfaces(dataset, self.config, self.config.field_steps, count)
+                seconds = FIELD_SHARE * (self.config.max_seconds or math.inf)
+                points, colors = found_surfaces(dataset, self.config, self.config.field_steps, seconds, count)
             first = from_points(points, colors, self.config.degree, FIELD_OPACITY, FIELD_SIZE)
             if not len(points):
                 say("warning: the field has found no surfaces")
@@ -304,13 +306,11 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
             self._on_image = records
         known = batch.distances if config.depth_loss_mult > 0 else None
         drawn = draw(records, camera, self._behind(batch), CHANNELS["rgb" if known is None else "distance"])
-        rgb = self._lit(drawn.image[..., :3], batch.index)
+        rgb = self._lit(drawn.image if known is None else drawn.image[..., :3], batch.index)
         if batch.kept is not None:  # what does not count is as it should be
             kept = batch.kept if reduced == 1 else halved(batch.kept[..., None].float())[..., 0] == 1
             target = torch.where(kept[..., None], target, rgb.detach())
-        terms = {"rgb": (1 - config.ssim_weight) * (rgb - target).abs().mean()}
-        if config.ssim_weight > 0 and min(rgb.shape[:2]) >= SMALLEST_SSIM:
-            terms["ssim"] = config.ssim_weight * (1 - ssim(rgb, target))
+        terms = {"rgb": photometric_loss(rgb, target, config.ssim_weight)}
         if known is not None:
             known = known if reduced == 1 else known[::2, ::2][: rgb.shape[0], : rgb.shape[1]]
             terms["depth"] = config.depth_loss_mult * mean_depth_error(drawn.image[..., 3], drawn.transmittance, known)

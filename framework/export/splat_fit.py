@@ -31,7 +31,7 @@ from framework.export.cameras import refined_cameras
 from framework.export.points import joined, surface_points
 from framework.kernels.native import torch_on_one_thread
 from framework.kernels.splat_project import SplatCamera
-from framework.kernels.ssim import ssim
+from framework.kernels.ssim import photometric_loss
 from framework.ray_model import RayModel
 from framework.splats.drawing import DRAWN, draw, on_image, splat_camera
 from framework.splats.gaussians import MAX_DEGREE, Gaussians
@@ -302,8 +302,7 @@ def _loss(gaussians: Gaussians, shot: Shot, background: Tensor, progress: float)
     rgb = draw(on_image(gaussians, shot.camera, degree), shot.camera, behind).image
     if shot.kept is not None:  # what does not count is as it should be
         target = torch.where(shot.kept[..., None], target, rgb.detach())
-    loss = (1 - SSIM_WEIGHT) * (rgb - target).abs().mean()
-    return loss if min(rgb.shape[:2]) < 11 else loss + SSIM_WEIGHT * (1 - ssim(rgb, target))
+    return photometric_loss(rgb, target, SSIM_WEIGHT)
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""Structural similarity (SSIM) of an image and its target, as a loss on whole images.
+"""Structural similarity (SSIM) of an image and its target, and the loss on whole images that is made of it.
 
 Definition: Wang, Bovik, Sheikh and Simoncelli 2004, "Image quality assessment: from error visibility to structural
 similarity". Each window p has 11 x 11 pixels, weighted by a Gaussian g of sigma 1.5. With the means m, variances s and
@@ -53,11 +53,50 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     Raises:
         ValueError: The shapes differ or are not those of images, or a side is shorter than the window.
     """
+    _check(image, target)
+    return 1 - PHOTOMETRIC((image, target), image, target, 1.0)
+
+
+def _check(image: Tensor, target: Tensor) -> None:
     if image.ndim != 3 or image.shape != target.shape or image.shape[2] < 1:
         raise ValueError(f"SSIM needs two images (H, W, C), not {tuple(image.shape)} and {tuple(target.shape)}")
     if min(image.shape[:2]) < WINDOW:
         raise ValueError(f"SSIM needs at least {WINDOW}x{WINDOW} pixels, not {image.shape[1]}x{image.shape[0]}")
-    return SSIM((image, target), image, target)
+
+
+def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+    """Return the loss of an image: (1 - w) times the mean absolute error, plus w times (1 - SSIM).
+
+    Kerbl et al. 2023, "3D Gaussian Splatting for Real-Time Radiance Field Rendering", equation 7. Compiled, both and
+    their derivative take one sweep over the images.
+
+    Args:
+        image: (H, W, C) values whose range is taken to be [0, 1]. Compiled with its first derivative.
+        target: (H, W, C) values to compare with. A gradient to it takes the slow reference.
+        ssim_weight: w, between 0 and 1. An image smaller than the window has no SSIM: its loss is the error alone.
+
+    Returns:
+        A tensor without dimensions.
+
+    Raises:
+        ValueError: The shapes differ or are not those of images.
+    """
+    small = image.ndim == 3 and image.shape == target.shape and min(image.shape[:2]) < WINDOW
+    if small or ssim_weight == 0:
+        return (image - target).abs().mean()
+    _check(image, target)
+    return PHOTOMETRIC((image, target), image, target, ssim_weight)
+
+
+def photometric_reference(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+    """Compute `photometric_loss` in torch, on any device, with derivatives of any order by both images.
+
+    Args:
+        image: (H, W, C) values.
+        target: (H, W, C) values to compare with.
+        ssim_weight: between 0 and 1.
+    """
+    return (1 - ssim_weight) * (image - target).abs().mean() + ssim_weight * (1 - ssim_reference(image, target))
 
 
 def ssim_reference(image: Tensor, target: Tensor) -> Tensor:
@@ -91,19 +130,19 @@ def _blurred(values: Tensor) -> Tensor:
     return values
 
 
-SSIM = Operation("ssim", ssim_reference)
-_ssim = native.Function("ssim", "ppqqqpi", "d")
+PHOTOMETRIC = Operation("photometric", photometric_reference)
+_photometric = native.Function("photometric", "ppqqqfpi", "d")
 
 
-class _SSIM(torch.autograd.Function):
+class _Photometric(torch.autograd.Function):
     """The compiled sweep over an image, which computes the value and the derivative."""
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, learned: bool) -> Tensor:
+    def forward(ctx: Any, image: Tensor, target: Tensor, ssim_weight: float, learned: bool) -> Tensor:
         derivative = torch.empty_like(image) if learned else None
-        value = _ssim(
+        value = _photometric(
             native.pointer(image, "the image", image.shape), native.pointer(target, "the target", image.shape),
-            *image.shape, None if derivative is None else derivative.data_ptr(), native.threads(),
+            *image.shape, ssim_weight, None if derivative is None else derivative.data_ptr(), native.threads(),
         )  # fmt: skip
         if derivative is not None:
             ctx.save_for_backward(derivative)
@@ -111,12 +150,14 @@ class _SSIM(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
         (derivative,) = ctx.saved_tensors
-        return derivative * grad, None, None
+        # As a term of a loss has a gradient of 1, the usual step needs no pass over the image.
+        return derivative if float(grad) == 1 else derivative * grad, None, None, None
 
 
-@SSIM.implementation(CPP, differentiable=1)
-def _compiled(image: Tensor, target: Tensor) -> Tensor:
+@PHOTOMETRIC.implementation(CPP, differentiable=1)
+def _compiled(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
     learned = image.requires_grad and torch.is_grad_enabled()
-    return _SSIM.apply(image.contiguous(), target.contiguous(), learned)
+    out: Tensor = _Photometric.apply(image.contiguous(), target.contiguous(), ssim_weight, learned)
+    return out

@@ -17,7 +17,9 @@ PASSES = 16
 """Maximum number of times that rays are drawn, of which some end on no surface."""
 
 
-def found_surfaces(dataset: Dataset, config: TrainConfig, steps: int, count: int) -> tuple[Tensor, Tensor]:
+def found_surfaces(
+    dataset: Dataset, config: TrainConfig, steps: int, seconds: float, count: int
+) -> tuple[Tensor, Tensor]:
     """Train a field for a few steps, and return points on the surfaces that it has found.
 
     The field is that of instant-ngp, or that of nerfacto where there may be something outside the scene's box, which
@@ -26,7 +28,8 @@ def found_surfaces(dataset: Dataset, config: TrainConfig, steps: int, count: int
     Args:
         dataset: the images.
         config: settings of the run that asks; machine and background are taken from it.
-        steps: training steps of the field.
+        steps: maximum number of training steps of the field.
+        seconds: maximum time of its training, seconds.
         count: maximum number of points.
 
     Returns:
@@ -49,6 +52,8 @@ def found_surfaces(dataset: Dataset, config: TrainConfig, steps: int, count: int
     trainer = Trainer(Run(method, settings, "", cast("Any", None), Path()), dataset, None)
     for _ in track(range(steps), "Looking for surfaces", total=steps):
         trainer.train_step()
+        if trainer.state.seconds >= seconds:
+            break
     model = trainer.model.eval()
     points, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
     while (left := count - sum(map(len, points))) > 0 and len(points) < PASSES:

@@ -38,7 +38,7 @@ from framework.kernels.splat_project import (
     project_gaussians,
 )
 from framework.kernels.splat_tiles import TILES, tile_lists
-from framework.kernels.ssim import SSIM
+from framework.kernels.ssim import PHOTOMETRIC
 from tests.kernels.compiled import needs_kernels
 
 GRID = HashGridLayout.build(3, 4, 20, 8)
@@ -137,7 +137,7 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     PROJECT: lambda: (*gaussians(), splat_camera(), 3),
     TILES: lambda: (everywhere(1, 9), 32, 32),
     BLEND: lambda: (records := projected(), tile_lists(records, 37, 30), 37, 30, rand(3), 7, True),
-    SSIM: lambda: (rand(13, 15, 3), rand(13, 15, 3)),
+    PHOTOMETRIC: lambda: (rand(13, 15, 3), rand(13, 15, 3), 0.2),
     GATHER_COLORS: lambda: (torch.randint(256, (60, 4), dtype=torch.uint8), torch.randint(60, (9,)), rand(9, 3)),
     CAMERA_RAYS: lambda: (cameras(), torch.arange(0, 72, 5), 0.0, 1.0, None, subpixels(4)),
 }
@@ -243,8 +243,8 @@ def test_what_is_taken() -> None:
         (DISTORTION, 1, "reference"),
         (DISTORTION, 2, "reference"),
         (PROJECT, 6, "c++"),
-        (SSIM, 0, "c++"),
-        (SSIM, 1, "reference"),
+        (PHOTOMETRIC, 0, "c++"),
+        (PHOTOMETRIC, 1, "reference"),
         (COMPOSITE, 1, "c++"),
         (COMPOSITE, 2, "reference"),
         (COMPOSITE, 6, "reference"),

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -31,7 +32,7 @@ from framework.kernels.spherical_harmonics import spherical_harmonics, spherical
 from framework.kernels.splat_blend import blend, blend_reference
 from framework.kernels.splat_project import SplatCamera, project_gaussians, project_reference
 from framework.kernels.splat_tiles import tile_lists
-from framework.kernels.ssim import ssim, ssim_reference
+from framework.kernels.ssim import photometric_loss, photometric_reference
 from framework.samplers.occupancy import OccupancySampler
 from tests.kernels.compiled import needs_kernels, relative_error
 
@@ -209,8 +210,11 @@ OPERATIONS = {
     "blended Gaussians": Operation(
         blended(blend), blended(blend_reference), some_records, ("splat_blend", "splat_blend_backward", "splat_gather")
     ),
-    "similarity": Operation(
-        ssim, ssim_reference, lambda: {"image": rand(13, 15, 3), "target": rand(13, 15, 3)}, ("ssim",)
+    "photometric loss": Operation(
+        partial(photometric_loss, ssim_weight=0.2),
+        partial(photometric_reference, ssim_weight=0.2),
+        lambda: {"image": rand(13, 15, 3), "target": rand(13, 15, 3)},
+        ("photometric",),
     ),
     "camera rays": Operation(
         rays_of("pixel_rays"),

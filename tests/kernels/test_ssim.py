@@ -10,7 +10,7 @@ from torch import Tensor
 from framework.evaluation import metrics
 from framework.kernels import native
 from framework.kernels.dispatch import derivatives
-from framework.kernels.ssim import WINDOW, ssim, ssim_reference
+from framework.kernels.ssim import WINDOW, photometric_loss, photometric_reference, ssim, ssim_reference
 from tests.kernels.compiled import needs_kernels, relative_error
 
 SIZES = [(11, 11, 1), (11, 11, 3), (11, 64, 3), (90, 11, 4), (12, 27, 1), (23, 16, 3), (70, 53, 3), (41, 37, 4)]
@@ -228,8 +228,47 @@ def test_what_is_refused(image: tuple[int, ...], target: tuple[int, ...], said: 
 
 
 @needs_kernels
+@pytest.mark.parametrize("weight", [0.0, 0.2, 0.7, 1.0])
+@pytest.mark.parametrize("size", [*SIZES, TALL], ids=str)
+def test_the_loss_and_its_gradient(size: tuple[int, int, int], weight: float) -> None:
+    torch.manual_seed(0)
+    target = smooth(*size)
+    image = noisy(target, 0.1)
+    image[3:5] = target[3:5]  # where the absolute value has no slope, torch takes 0
+    value, gradient = value_and_gradient(lambda x, y: photometric_loss(x, y, weight), image, target)
+    truth, true_gradient = value_and_gradient(
+        lambda x, y: photometric_reference(x, y, weight), image.double(), target.double()
+    )
+    assert value.item() == pytest.approx(truth.item(), abs=5e-7)
+    assert relative_error(gradient, true_gradient) < 1e-4
+
+
+def test_the_loss_of_one_flat_image_and_another_is_known() -> None:
+    """Without variance, SSIM is (2 a b + C1) / (a^2 + b^2 + C1)."""
+    a, b, weight = 0.75, 0.5, 0.2
+    value = photometric_loss(torch.full((20, 30, 3), a), torch.full((20, 30, 3), b), weight)
+    similarity = (2 * a * b + 1e-4) / (a * a + b * b + 1e-4)
+    assert value.item() == pytest.approx(0.8 * 0.25 + 0.2 * (1 - similarity), abs=1e-7)
+
+
+def test_the_loss_of_an_image_smaller_than_the_window_is_its_error() -> None:
+    torch.manual_seed(0)
+    image, target = torch.rand(10, 30, 3), torch.rand(10, 30, 3)
+    assert photometric_loss(image, target, 0.2).item() == pytest.approx((image - target).abs().mean().item())
+
+
+@needs_kernels
+def test_the_loss_as_a_part_of_another() -> None:
+    torch.manual_seed(0)
+    image, target = torch.rand(30, 40, 3), torch.rand(30, 40, 3)
+    _, alone = value_and_gradient(lambda x, y: photometric_loss(x, y, 0.2), image, target)
+    _, tripled = value_and_gradient(lambda x, y: 3 * photometric_loss(x, y, 0.2) + x.sum(), image, target)
+    torch.testing.assert_close(tripled, 3 * alone + 1)
+
+
+@needs_kernels
 @pytest.mark.parametrize("size", [(10, 11, 3), (11, 10, 3), (11, 11, 0)])
 def test_the_kernel_refuses_too_small_images_itself(size: tuple[int, int, int]) -> None:
-    kernel = native.Function("ssim", "ppqqqpi", "d")
+    kernel = native.Function("photometric", "ppqqqfpi", "d")
     with pytest.raises(ValueError, match="SSIM needs 11x11 pixels"):
-        kernel(None, None, *size, None, 1)
+        kernel(None, None, *size, 1, None, 1)

@@ -40,6 +40,14 @@ static inline void store(float* to, Floats value) { std::memcpy(to, &value, size
 static inline Floats larger(Floats a, Floats b) { return a > b ? a : b; }
 static inline Floats smaller(Floats a, Floats b) { return a < b ? a : b; }
 
+static inline Floats magnitude(Floats x) {
+    Ints bits;
+    std::memcpy(&bits, &x, sizeof bits);
+    bits &= 0x7fffffff;
+    std::memcpy(&x, &bits, sizeof x);
+    return x;
+}
+
 // exp(x) as power * (1 + rest): 2^n from the exponent's bits, and Cephes' polynomial (expf), which is as small as x.
 static inline void split_exponential(Floats x, Floats& power, Floats& rest) {
     const Floats clipped = smaller(larger(x, splat(-87.3f)), splat(88.3f));

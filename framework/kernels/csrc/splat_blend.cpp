@@ -6,6 +6,10 @@
 
 #include <vector>
 
+#if defined(__SSE2__)
+#include <immintrin.h>
+#endif
+
 namespace {
 
 constexpr int ACROSS = 4, DOWN = LANES / ACROSS;  // pixels of a block
@@ -29,19 +33,31 @@ inline Floats power_of_two(Floats x) {
     return p;
 }
 
-inline bool any(Ints mask) {
-#if defined(__AVX512F__)
-    typedef long long Eight __attribute__((vector_size(64)));
-    Eight halves;
-    std::memcpy(&halves, &mask, sizeof halves);
-    return __builtin_ia32_ptestmq512((Eight)halves, (Eight)halves, 0xff) != 0;
+// The lanes of a mask that are set, as bits.
+inline uint64_t bits(Ints mask) {
+#if defined(__AVX512DQ__)
+    return _mm512_movepi32_mask((__m512i)mask);
+#elif defined(__AVX512F__)
+    return _mm512_test_epi32_mask((__m512i)mask, (__m512i)mask);
+#elif defined(__AVX__)
+    return uint32_t(_mm256_movemask_ps((__m256)mask));
+#elif defined(__SSE2__)
+    return uint32_t(_mm_movemask_ps((__m128)mask));
 #else
-    int64_t parts[LANES / 2], all = 0;
-    std::memcpy(parts, &mask, sizeof parts);
-    for (const int64_t part : parts) all |= part;
-    return all != 0;
+    uint64_t set = 0;
+    for (int i = 0; i < LANES; i++) set |= uint64_t(mask[i] & 1) << i;
+    return set;
 #endif
 }
+
+// Blocks of a tile: bit TILE c + r is set for the block in column c whose first row of pixels is r.
+typedef uint64_t Blocks;
+static_assert(COLUMNS * TILE == 64, "a tile's blocks have a bit each");
+constexpr Blocks FIRST_ROWS = ~Blocks(0) / ((Blocks(1) << DOWN) - 1);
+
+// Whose block `b` is that of bit b * DOWN: its column is b / ROWS, and its first row of pixels b % ROWS * DOWN.
+inline int first_of(Blocks blocks) { return __builtin_ctzll(blocks) / DOWN; }
+inline Blocks only(int b) { return Blocks(1) << (b * DOWN); }
 
 struct Offsets {  // of a block's pixels from its first
     Floats x, y;
@@ -52,20 +68,30 @@ struct Offsets {  // of a block's pixels from its first
     }
 };
 
-// The blocks of a tile whose pixels' centres a Gaussian's box holds.
-struct Box {
-    int left, right, top, bottom;
-    Box(const float* g, float x, float y) {  // x, y: the tile's first pixel's centre, from the Gaussian's
-        left = at_least(-g[REACH_X] - x, ACROSS, COLUMNS), right = at_most(g[REACH_X] - x, ACROSS, COLUMNS);
-        top = at_least(-g[REACH_Y] - y, DOWN, ROWS), bottom = at_most(g[REACH_Y] - y, DOWN, ROWS);
+// The blocks in which a Gaussian reaches the centre of a pixel, and perhaps some next to them.
+struct Reach {
+    Floats rows[TILE / LANES];  // of the tile's pixels
+    Reach() {
+        float numbers[TILE];
+        for (int i = 0; i < TILE; i++) numbers[i] = float(i);
+        for (int v = 0; v < TILE / LANES; v++) rows[v] = load(numbers + v * LANES);
     }
-    static int at_least(float from, int size, int count) {  // the first block whose last pixel is not before
-        const float block = std::ceil((from - (size - 1)) / size);
-        return block < 0 ? 0 : (block > count ? count : int(block));
-    }
-    static int at_most(float to, int size, int count) {
-        const float block = std::floor(to / size) + 1;
-        return block < 0 ? 0 : (block > count ? count : int(block));
+    // x, y: the tile's first pixel's centre, from the Gaussian's.
+    Blocks blocks(const float* g, float x, float y) const {
+        const float width = 1 / g[U_X], lean = g[U_Y] * width;
+        Blocks met = 0;
+        for (int v = 0; v < TILE / LANES; v++) {
+            // A row meets the ellipse from `first` to `last`, which are counted in pixels from the tile's first.
+            const Floats dy = rows[v] + y, of_v = g[V_Y] * dy, rest = g[CUT] - of_v * of_v;
+            const Floats middle = -lean * dy - x, rounding = magnitude(middle) * 1e-6f + 0.01f;
+            const Floats half = square_root(larger(rest, splat(0))) * width + rounding;
+            const Floats first = middle - half, last = middle + half;
+            for (int c = 0; c < COLUMNS; c++)
+                met |= bits((rest > 0.0f) & (first <= float(c * ACROSS + ACROSS - 1)) & (last >= float(c * ACROSS)))
+                       << (c * TILE + v * LANES);
+        }
+        for (int down = 1; down < DOWN; down *= 2) met |= met >> down;  // a block has all that its rows have
+        return met & FIRST_ROWS;
     }
 };
 
@@ -90,39 +116,44 @@ struct Tile {
     Tile(int64_t tile, int columns, int width, int height)
         : left(int(tile % columns) * TILE), top(int(tile / columns) * TILE), width(width), height(height) {}
 
-    // Copies between planes of blocks and rows of pixels (height, width, channels).
-    template <typename Values>
-    void read(const float* image, int channels, int channel, Values& planes) const {
+    // Calls `body` with each block's number, lane and pixel of the image.
+    template <typename Body>
+    void for_pixels(const Body& body) const {
+        const bool whole = left + TILE <= width && top + TILE <= height;
         for (int b = 0; b < BLOCKS; b++) {
-            float lanes[LANES];
-            for (int i = 0; i < LANES; i++) {
-                const int x = left + b % COLUMNS * ACROSS + i % ACROSS, y = top + b / COLUMNS * DOWN + i / ACROSS;
-                lanes[i] = x < width && y < height ? image[(int64_t(y) * width + x) * channels + channel] : 0;
-            }
-            planes[b] = load(lanes);
+            const int x = left + b / ROWS * ACROSS, y = top + b % ROWS * DOWN;
+            const int64_t first = int64_t(y) * width + x;
+            for (int i = 0; i < LANES; i++)
+                if (whole || (x + i % ACROSS < width && y + i / ACROSS < height))
+                    body(b, i, first + i / ACROSS * int64_t(width) + i % ACROSS);
         }
     }
-    template <typename Values>
-    void write(float* image, int channels, int channel, const Values& planes) const {
-        for (int b = 0; b < BLOCKS; b++) {
-            float lanes[LANES];
-            store(lanes, planes[b]);
-            for (int i = 0; i < LANES; i++) {
-                const int x = left + b % COLUMNS * ACROSS + i % ACROSS, y = top + b / COLUMNS * DOWN + i / ACROSS;
-                if (x < width && y < height) image[(int64_t(y) * width + x) * channels + channel] = lanes[i];
-            }
-        }
+    // Copies between planes of blocks and an image (height, width, CHANNELS).
+    template <int CHANNELS>
+    void read(const float* image, Floats (*planes)[BLOCKS]) const {
+        alignas(64) float lanes[CHANNELS][BLOCKS][LANES] = {};
+        for_pixels([&](int b, int i, int64_t pixel) {
+            for (int c = 0; c < CHANNELS; c++) lanes[c][b][i] = image[pixel * CHANNELS + c];
+        });
+        std::memcpy(planes, lanes, sizeof lanes);
     }
-    // Transmittance at the start: pixels beyond the image's edge are opaque.
-    void clear(Floats* through) const {
-        for (int b = 0; b < BLOCKS; b++) {
-            float lanes[LANES];
-            for (int i = 0; i < LANES; i++) {
-                const int x = left + b % COLUMNS * ACROSS + i % ACROSS, y = top + b / COLUMNS * DOWN + i / ACROSS;
-                lanes[i] = x < width && y < height ? 1.0f : 0.0f;
-            }
-            through[b] = load(lanes);
-        }
+    template <int CHANNELS>
+    void write(float* image, const Floats (*planes)[BLOCKS]) const {
+        alignas(64) float lanes[CHANNELS][BLOCKS][LANES];
+        std::memcpy(lanes, planes, sizeof lanes);
+        for_pixels([&](int b, int i, int64_t pixel) {
+            for (int c = 0; c < CHANNELS; c++) image[pixel * CHANNELS + c] = lanes[c][b][i];
+        });
+    }
+    // Sets transmittance at the start, where pixels beyond the image's edge are opaque; returns the blocks that are not.
+    Blocks clear(Floats* through) const {
+        alignas(64) float lanes[BLOCKS][LANES] = {};
+        for_pixels([&](int b, int i, int64_t) { lanes[b][i] = 1; });
+        std::memcpy(through, lanes, sizeof lanes);
+        Blocks alive = 0;
+        for (int b = 0; b < BLOCKS; b++)
+            if (bits(through[b] > 0.0f)) alive |= only(b);
+        return alive;
     }
 };
 
@@ -131,38 +162,31 @@ void forward_tile(const Tile& tile, const float* records, const int32_t* ids, in
                   float* image, float* through_image, float* median_image, int32_t* used) {
     alignas(64) Floats sum[CHANNELS][BLOCKS] = {}, through[BLOCKS], median[BLOCKS] = {};
     const Offsets offset;
-    tile.clear(through);
-    uint64_t alive = 0;
-    for (int b = 0; b < BLOCKS; b++) alive |= uint64_t(any(through[b] > 0)) << b;
+    const Reach reach;
+    Blocks alive = tile.clear(through);
     int64_t n = 0;
     for (; n < entries && alive; n++) {
         const float* g = records + int64_t(ids[n]) * RECORD;
         const float x = tile.left + 0.5f - g[X], y = tile.top + 0.5f - g[Y];
-        const Box box(g, x, y);
         const Shape shape(g, offset);
-        for (int row = box.top; row < box.bottom; row++)
-            for (int column = box.left; column < box.right; column++) {
-                const int b = row * COLUMNS + column;
-                if (!(alive >> b & 1)) continue;
-                const Floats q = shape.squared(x + column * ACROSS, y + row * DOWN), before = through[b];
-                const Ints inside = (q < shape.cut) & (before >= OPAQUE);
-                if (!any(inside)) continue;
-                const Floats alpha = smaller(shape.opacity * power_of_two(smaller(q, splat(80)) * -LOG2_E), splat(MAX_ALPHA));
-                const Floats weight = inside ? alpha * before : splat(0), after = before - weight;
-                for (int c = 0; c < CHANNELS; c++) sum[c][b] += weight * g[RED + c];
-                if (median_image) median[b] = ((before > 0.5f) & (after <= 0.5f)) ? splat(g[DISTANCE]) : median[b];
-                through[b] = after;
-                if (!any(after >= OPAQUE)) alive &= ~(uint64_t(1) << b);
-            }
+        for (Blocks rest = reach.blocks(g, x, y) & alive; rest; rest &= rest - 1) {
+            const int b = first_of(rest);
+            const Floats q = shape.squared(x + b / ROWS * ACROSS, y + b % ROWS * DOWN), before = through[b];
+            const Ints inside = (q < shape.cut) & (before >= OPAQUE);
+            const Floats alpha = smaller(shape.opacity * power_of_two(smaller(q, splat(80)) * -LOG2_E), splat(MAX_ALPHA));
+            const Floats weight = inside ? alpha * before : splat(0), after = before - weight;
+            for (int c = 0; c < CHANNELS; c++) sum[c][b] += weight * g[RED + c];
+            if (median_image) median[b] = ((before > 0.5f) & (after <= 0.5f)) ? splat(g[DISTANCE]) : median[b];
+            through[b] = after;
+            if (!bits(after >= OPAQUE)) alive &= ~only(b);
+        }
     }
     *used = int32_t(n);
-    for (int c = 0; c < CHANNELS; c++) {
-        if (c < 3)
-            for (int b = 0; b < BLOCKS; b++) sum[c][b] += through[b] * background[c];
-        tile.write(image, CHANNELS, c, sum[c]);
-    }
-    tile.write(through_image, 1, 0, through);
-    if (median_image) tile.write(median_image, 1, 0, median);
+    for (int c = 0; c < 3; c++)
+        for (int b = 0; b < BLOCKS; b++) sum[c][b] += through[b] * background[c];
+    tile.write<CHANNELS>(image, sum);
+    tile.write<1>(through_image, &through);
+    if (median_image) tile.write<1>(median_image, &median);
 }
 
 #if defined(__clang__)
@@ -171,7 +195,7 @@ void forward_tile(const Tile& tile, const float* records, const int32_t* ids, in
 #define SHUFFLE(a, b, ...) __builtin_shuffle(a, b, Ints{__VA_ARGS__})
 #endif
 
-// The sums of the lanes of `count` vectors (a multiple of LANES).
+// The sums of the lanes of each of RECORD vectors: halves of the vectors, of their halves, and so on.
 inline void sum_lanes(const Floats* v, float* out) {
 #if defined(__AVX512F__)
     Floats w[8];
@@ -188,6 +212,15 @@ inline void sum_lanes(const Floats* v, float* out) {
                         SHUFFLE(w[0], w[1], 1, 17, 3, 19, 5, 21, 7, 23, 9, 25, 11, 27, 13, 29, 15, 31);
     // Lane 8 i + 4 j + 2 k + l holds the sum of vector 8 i + 4 j + 2 k + l.
     store(out, last);
+#elif defined(__AVX2__)
+    for (int half = 0; half < RECORD; half += 8, v += 8) {
+        Floats w[4];
+        for (int i = 0; i < 4; i++)
+            w[i] = SHUFFLE(v[i], v[i + 4], 0, 1, 2, 3, 8, 9, 10, 11) + SHUFFLE(v[i], v[i + 4], 4, 5, 6, 7, 12, 13, 14, 15);
+        for (int i = 0; i < 2; i++)
+            w[i] = SHUFFLE(w[i], w[i + 2], 0, 1, 8, 9, 4, 5, 12, 13) + SHUFFLE(w[i], w[i + 2], 2, 3, 10, 11, 6, 7, 14, 15);
+        store(out + half, SHUFFLE(w[0], w[1], 0, 8, 2, 10, 4, 12, 6, 14) + SHUFFLE(w[0], w[1], 1, 9, 3, 11, 5, 13, 7, 15));
+    }
 #else
     for (int k = 0; k < RECORD; k++) {
         float lanes[LANES], sum = 0;
@@ -205,58 +238,53 @@ template <int CHANNELS>
 void backward_tile(const Tile& tile, const float* records, const int32_t* ids, const int32_t* slots, int64_t entries,
                    int64_t used, const float* image, const float* through_image, const float* image_grad,
                    const float* through_grad, float* parts) {
-    alignas(64) Floats of_image[CHANNELS][BLOCKS], through[BLOCKS], behind[BLOCKS], last[BLOCKS];
+    alignas(64) Floats of_image[CHANNELS][BLOCKS], shown[CHANNELS][BLOCKS], through[BLOCKS], behind[BLOCKS], last[BLOCKS];
     const Offsets offset;
-    tile.read(through_image, 1, 0, last);
-    if (through_grad) tile.read(through_grad, 1, 0, behind);
-    for (int b = 0; b < BLOCKS; b++) behind[b] = through_grad ? behind[b] * last[b] : splat(0);
+    const Reach reach;
+    if (through_grad) {
+        tile.read<1>(through_image, &last), tile.read<1>(through_grad, &behind);
+        for (int b = 0; b < BLOCKS; b++) behind[b] *= last[b];
+    } else
+        for (int b = 0; b < BLOCKS; b++) behind[b] = splat(0);
     // What is behind a Gaussian is all that is seen, less what is in front of it and itself.
-    for (int c = 0; c < CHANNELS; c++) {
-        Floats shown[BLOCKS];
-        tile.read(image, CHANNELS, c, shown), tile.read(image_grad, CHANNELS, c, of_image[c]);
-        for (int b = 0; b < BLOCKS; b++) behind[b] += shown[b] * of_image[c][b];
-    }
-    tile.clear(through);
-    uint64_t alive = 0;
-    for (int b = 0; b < BLOCKS; b++) alive |= uint64_t(any(through[b] > 0)) << b;
+    tile.read<CHANNELS>(image, shown), tile.read<CHANNELS>(image_grad, of_image);
+    for (int c = 0; c < CHANNELS; c++)
+        for (int b = 0; b < BLOCKS; b++) behind[b] += shown[c][b] * of_image[c][b];
+    Blocks alive = tile.clear(through);
     for (int64_t n = 0; n < used; n++) {
         const float* g = records + int64_t(ids[n]) * RECORD;
         const float x = tile.left + 0.5f - g[X], y = tile.top + 0.5f - g[Y];
-        const Box box(g, x, y);
         const Shape shape(g, offset);
         Floats sums[RECORD] = {};
         // Rows of the inverse covariance, for the absolute gradient of the centre.
         const float xx = 2 * g[U_X] * g[U_X], xy = 2 * g[U_X] * g[U_Y], yy = 2 * (g[U_Y] * g[U_Y] + g[V_Y] * g[V_Y]);
-        for (int row = box.top; row < box.bottom; row++)
-            for (int column = box.left; column < box.right; column++) {
-                const int b = row * COLUMNS + column;
-                if (!(alive >> b & 1)) continue;
-                const float block_x = x + column * ACROSS, block_y = y + row * DOWN;
-                const Floats q = shape.squared(block_x, block_y), before = through[b];
-                const Ints inside = (q < shape.cut) & (before >= OPAQUE);
-                if (!any(inside)) continue;
-                const Floats raw = shape.opacity * power_of_two(smaller(q, splat(80)) * -LOG2_E);
-                const Floats alpha = smaller(raw, splat(MAX_ALPHA));
-                const Floats weight = inside ? alpha * before : splat(0), after = before - weight;
-                Floats own = splat(0);
-                for (int c = 0; c < CHANNELS; c++) {
-                    own += g[RED + c] * of_image[c][b];
-                    sums[RED + c] += weight * of_image[c][b];
-                }
-                behind[b] -= weight * own;
-                through[b] = after;
-                // The gradient of the exponent: alpha times that of alpha; none where alpha is at its bound.
-                const Floats of_alpha = before * own - behind[b] / (1.0f - alpha);
-                const Floats of_exponent = (inside & (raw < MAX_ALPHA)) ? of_alpha * alpha : splat(0);
-                const Floats dx = offset.x + block_x, dy = offset.y + block_y;
-                const Floats by_x = of_exponent * dx, by_y = of_exponent * dy;
-                sums[SUM_G] += of_exponent;
-                sums[SUM_X] += by_x, sums[SUM_Y] += by_y;
-                sums[SUM_XX] += by_x * dx, sums[SUM_XY] += by_x * dy, sums[SUM_YY] += by_y * dy;
-                const Floats of_x = xx * by_x + xy * by_y, of_y = xy * by_x + yy * by_y;
-                sums[ABSOLUTE_X] += of_x < 0 ? -of_x : of_x, sums[ABSOLUTE_Y] += of_y < 0 ? -of_y : of_y;
-                if (!any(after >= OPAQUE)) alive &= ~(uint64_t(1) << b);
+        for (Blocks rest = reach.blocks(g, x, y) & alive; rest; rest &= rest - 1) {
+            const int b = first_of(rest);
+            const float block_x = x + b / ROWS * ACROSS, block_y = y + b % ROWS * DOWN;
+            const Floats q = shape.squared(block_x, block_y), before = through[b];
+            const Ints inside = (q < shape.cut) & (before >= OPAQUE);
+            const Floats raw = shape.opacity * power_of_two(smaller(q, splat(80)) * -LOG2_E);
+            const Floats alpha = smaller(raw, splat(MAX_ALPHA));
+            const Floats weight = inside ? alpha * before : splat(0), after = before - weight;
+            Floats own = splat(0);
+            for (int c = 0; c < CHANNELS; c++) {
+                own += g[RED + c] * of_image[c][b];
+                sums[RED + c] += weight * of_image[c][b];
             }
+            behind[b] -= weight * own;
+            through[b] = after;
+            // The gradient of the exponent: alpha times that of alpha; none where alpha is at its bound.
+            const Floats of_alpha = before * own - behind[b] / (1.0f - alpha);
+            const Floats of_exponent = (inside & (raw < MAX_ALPHA)) ? of_alpha * alpha : splat(0);
+            const Floats dx = offset.x + block_x, dy = offset.y + block_y;
+            const Floats by_x = of_exponent * dx, by_y = of_exponent * dy;
+            sums[SUM_G] += of_exponent;
+            sums[SUM_X] += by_x, sums[SUM_Y] += by_y;
+            sums[SUM_XX] += by_x * dx, sums[SUM_XY] += by_x * dy, sums[SUM_YY] += by_y * dy;
+            const Floats of_x = xx * by_x + xy * by_y, of_y = xy * by_x + yy * by_y;
+            sums[ABSOLUTE_X] += magnitude(of_x), sums[ABSOLUTE_Y] += magnitude(of_y);
+            if (!bits(after >= OPAQUE)) alive &= ~only(b);
+        }
         sum_lanes(sums, parts + int64_t(slots[n]) * RECORD);
     }
     for (int64_t n = used; n < entries; n++) std::memset(parts + int64_t(slots[n]) * RECORD, 0, RECORD * sizeof(float));

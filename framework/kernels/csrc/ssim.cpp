@@ -1,4 +1,5 @@
-// Structural similarity of two images, and its derivative by the first. See ../ssim.py for formulas and reference.
+// The loss of an image, of its structural similarity and its mean absolute error, and the derivative by the image. See
+// ../ssim.py for formulas and reference.
 //
 // An image of interleaved channels is filtered as rows of width * channels floats, with taps `channels` apart. A band
 // of rows goes from input to gradient in one sweep, which holds no more rows than the window reaches over: rows are
@@ -6,6 +7,7 @@
 // gives the gradient.
 #include "common.h"
 
+#include <cmath>
 #include <stdexcept>
 #include <vector>
 
@@ -75,6 +77,13 @@ inline int64_t whole_vectors(int64_t floats) { return (floats + LANES - 1) / LAN
 // A variance, which rounding may leave below 0. NaN stays NaN.
 inline Floats positive(Floats variance) { return variance < 0.0f ? splat(0) : variance; }
 
+// What is measured of each row, and the factors of both in the gradient.
+struct Measure {
+    std::vector<double> dissimilarity;  // of the windows that begin in it
+    std::vector<double> error;          // absolute, of its pixels
+    float of_similarity, of_error;      // per window, per value
+};
+
 // The gradients of a band of rows, and how dissimilar the windows are that begin in it. Rows count from REACH above the
 // band, where the first windows begin that reach into it.
 class Band {
@@ -95,19 +104,20 @@ class Band {
         for (int64_t i = 0; i < windows; i++) inside[i] = 1;
     }
 
-    // Writes the dissimilarity of each row of windows and, unless `gradient` is null, `scale` times the derivative.
-    void run(float scale, double* dissimilarity, float* gradient) {
-        for (int64_t row = 0; row < REACH; row++) read(row);
+    // Writes what is measured of each row and, unless `gradient` is null, the derivative.
+    void run(Measure& measure, float* gradient) {
+        for (int64_t row = 0; row < REACH; row++) read(row, measure.error.data());
         for (int64_t row = 0; row < rows; row += ROWS) {
-            for (int64_t next = row + REACH; next < std::min<int64_t>(row + KEPT, rows + REACH); next++) read(next);
-            compare(row, dissimilarity);
-            if (gradient && row + ROWS > REACH) differentiate(row, scale, gradient);
+            for (int64_t next = row + REACH; next < std::min<int64_t>(row + KEPT, rows + REACH); next++)
+                read(next, measure.error.data());
+            compare(row, measure.dissimilarity.data());
+            if (gradient && row + ROWS > REACH) differentiate(row, measure, gradient);
         }
     }
 
   private:
     // Sum and difference of a row of both images, and their squares, blurred along.
-    void read(int64_t row) {
+    void read(int64_t row, double* error) {
         const int64_t y = top + row;
         if (y < 0 || y >= images.height) return;  // no window that counts has it
         const float *a = images.image + y * row_floats, *b = images.target + y * row_floats;
@@ -115,6 +125,7 @@ class Band {
             sums[i] = (a[i] - 0.5f) + (b[i] - 0.5f);
             differences[i] = a[i] - b[i];
         }
+        if (row >= REACH && row < rows) error[y] = absolute_sum();
         float* out[4];
         for (int m = 0; m < 4; m++) out[m] = moments[m][row];
         for (int64_t i = 0; i < windows; i += LANES) {
@@ -124,6 +135,17 @@ class Band {
             blur_along(differences + i, step, mean, squares);
             store(out[1] + i, mean), store(out[3] + i, squares);
         }
+    }
+
+    // Of the differences of a row.
+    double absolute_sum() const {
+        Floats lanes = splat(0);
+        int64_t i = 0;
+        for (; i + LANES <= row_floats; i += LANES) lanes += magnitude(load(differences + i));
+        double total = 0;
+        for (int lane = 0; lane < LANES; lane++) total += lanes[lane];
+        for (; i < row_floats; i++) total += std::abs(differences[i]);
+        return total;
     }
 
     // The slopes of ROWS rows of windows, and how dissimilar those are.
@@ -168,7 +190,7 @@ class Band {
     }
 
     // Gradients of ROWS rows of pixels.
-    void differentiate(int64_t row, float scale, float* gradient) {
+    void differentiate(int64_t row, const Measure& measure, float* gradient) {
         const float* from[KEPT];
         for (int m = 0; m < 3; m++) {
             slopes[m].pointers(row - REACH, from);
@@ -185,8 +207,10 @@ class Band {
             for (int m = 0; m < 3; m++) map[m] = blurred[m][r] + margin - reach;
             const auto slope = [&](int64_t i, Floats x, Floats y) {
                 const Floats sum = (x - 0.5f) + (y - 0.5f), difference = x - y;
-                return scale * (blur_along(map[0] + i, step) + sum * blur_along(map[1] + i, step) +
-                                difference * blur_along(map[2] + i, step));
+                const Floats slope = blur_along(map[0] + i, step) + sum * blur_along(map[1] + i, step) +
+                                     difference * blur_along(map[2] + i, step);
+                const Floats sign = (difference > 0 ? splat(1) : splat(0)) - (difference < 0 ? splat(1) : splat(0));
+                return measure.of_similarity * slope + measure.of_error * sign;
             };
             int64_t i = 0;
             for (; i + LANES <= row_floats; i += LANES)
@@ -210,19 +234,22 @@ class Band {
 
 }  // namespace
 
-// out: the mean similarity of image and target (height, width, channels), of 11 pixels at least along each side;
-// gradient (height, width, channels): its derivative by the image, unless null.
-EXPORT int ssim(const float* image, const float* target, int64_t height, int64_t width, int64_t channels,
-                float* gradient, int threads, double* out) {
+// out: 1 - ssim_weight times the mean absolute error, and ssim_weight times 1 - the mean similarity, of image and target
+// (height, width, channels), of 11 pixels at least along each side; gradient (height, width, channels): its derivative by
+// the image, unless null.
+EXPORT int photometric(const float* image, const float* target, int64_t height, int64_t width, int64_t channels,
+                       float ssim_weight, float* gradient, int threads, double* out) {
     return guarded([&] {
         if (std::min(height, width) < TAPS || channels < 1) throw std::invalid_argument("SSIM needs 11x11 pixels");
         const Images images{image, target, height, width, channels};
         const double count = double(height - REACH) * double(width - REACH) * double(channels);
+        const double values = double(height) * double(width) * double(channels);
         // Neighbours both read the rows between them, so there are no more bands than threads have use for. What a row
         // gets does not depend on them: each begins at a multiple of ROWS, and sums are of rows first, then of all.
         const int64_t bands = threads > 1 ? 2 * threads : 1;
         const int64_t rows = std::max<int64_t>(((height + bands - 1) / bands + ROWS - 1) / ROWS * ROWS, 4 * ROWS);
-        std::vector<double> dissimilarity(size_t(height), 0.0);    // of each row of windows
+        const std::vector<double> zeros(size_t(height), 0.0);
+        Measure measure{zeros, zeros, float(-ssim_weight / count), float((1 - ssim_weight) / values)};
         static thread_local std::vector<std::vector<float>> kept;  // for fresh memory costs page faults
         std::vector<std::vector<float>>& scratch = kept;           // the caller's, whichever thread works
         const size_t slots = size_t(std::max(threads, 1));
@@ -230,10 +257,11 @@ EXPORT int ssim(const float* image, const float* target, int64_t height, int64_t
         for_chunks(threads, (height + rows - 1) / rows, [&](int64_t chunk, int slot) {
             const int64_t first = chunk * rows;
             Band band(images, first, std::min(rows, height - first), scratch[size_t(slot)]);
-            band.run(float(1 / count), dissimilarity.data(), gradient);
+            band.run(measure, gradient);
         });
-        double sum = 0;
-        for (const double of_row : dissimilarity) sum += of_row;
-        *out = 1 - sum / count;
+        double dissimilar = 0, absolute = 0;
+        for (const double of_row : measure.dissimilarity) dissimilar += of_row;
+        for (const double of_row : measure.error) absolute += of_row;
+        *out = (1 - ssim_weight) * (absolute / values) + ssim_weight * (dissimilar / count);
     });
 }

@@ -30,7 +30,7 @@ from framework.kernels.march import CompiledMarch, Occupancy, ReferenceMarch
 from framework.kernels.mlp import Activation, mlp, mlp_reference
 from framework.kernels.planes import PlanesLayout, planes, planes_reference
 from framework.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
-from framework.kernels.ssim import ssim, ssim_reference
+from framework.kernels.ssim import photometric_loss, photometric_reference
 from framework.tools.benchmarks.ceilings import Ceilings, Work
 from framework.tools.benchmarks.compared import Errors, Kernel, errors, of_function
 from framework.tools.benchmarks.plane_lookups import grid_samples, layouts, planes_of
@@ -312,16 +312,16 @@ def _updating() -> Kernel:
 
 
 def _similarity() -> Kernel:
-    """SSIM of an image of 400 x 400 and its noisy target. The forward pass leaves a factor to the backward pass."""
+    """Compute the loss of an image of 400 x 400, absolute error and SSIM. The forward pass has the derivative already."""
     target = torch.nn.functional.avg_pool2d(torch.rand(3, 406, 406), 7, 1).permute(1, 2, 0).contiguous()
     image = (target + 0.05 * torch.randn_like(target)).clamp(0, 1)
 
-    def against(form: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
-        return lambda x: form(x, target.to(x))
+    def against(form: Callable[[Tensor, Tensor, float], Tensor]) -> Callable[[Tensor], Tensor]:
+        return lambda x: form(x, target.to(x), 0.2)
 
-    ours, exact = against(ssim), against(ssim_reference)
+    ours, exact = against(photometric_loss), against(photometric_reference)
     return Kernel(
-        "SSIM of 400 x 400 x 3",
+        "loss with SSIM, 400 x 400 x 3",
         "pixel",
         400 * 400,
         (differentiated(ours, [image], None), differentiated(exact, [image], None)),

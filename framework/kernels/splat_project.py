@@ -29,7 +29,7 @@ from framework.kernels.spherical_harmonics import spherical_harmonics_reference
 
 RECORD = 16
 """Values of a Gaussian on the image."""
-X, U_X, OPACITY, CUT, REACH_X, RGB, DISTANCE, NORMAL, REACH_Y = 0, 2, 5, 6, 7, 8, 11, 12, 15
+X, Y, U_X, OPACITY, CUT, REACH_X, RGB, DISTANCE, NORMAL, REACH_Y = 0, 1, 2, 5, 6, 7, 8, 11, 12, 15
 """Columns of a record: centre (x, y) in pixels; u_x, u_y, v_y, which make alpha at an offset (dx, dy) from the centre
 opacity * exp(-(u_x dx + u_y dy)^2 - (v_y dy)^2); opacity; the exponent from which alpha is below MIN_ALPHA; half the
 width of what is within it; colour; distance from the camera; normal; half the height."""

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from framework.kernels.splat_project import CUT, OPACITY, REACH_X, X, rotation_matrices
+from framework.kernels.splat_project import CUT, OPACITY, REACH_X, X, Y, rotation_matrices
 from framework.splats.gaussians import Gaussians
 
 GRADIENT = 8e-4
@@ -85,10 +85,9 @@ def image_gradients(records: Tensor, gradient: Tensor, longer_side: int) -> Tens
             and REACH_X; where those are 0 (the reference), the position's own gradient is taken.
         longer_side: of the image, pixels.
     """
-    absolute = gradient[:, [CUT, REACH_X]]
-    plain = gradient[:, X : X + 2]
-    chosen = torch.where(absolute.any(), absolute, plain)
-    return chosen.norm(dim=-1) * (longer_side / 2)
+    absolute = torch.hypot(gradient[:, CUT], gradient[:, REACH_X])
+    plain = torch.hypot(gradient[:, X], gradient[:, Y])
+    return torch.where(absolute > 0, absolute, plain) * (longer_side / 2)
 
 
 def grown(gaussians: Gaussians, gradients: Tensor, most: int, extent: float) -> Growth | None:

@@ -78,6 +78,15 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
             background: (3,) colour in [0, 1] of the background.
         """
 
+    def render_rgb(self, view: View, background: Tensor) -> Tensor:
+        """Render the colours (H, W, 3) of an image alone, as `render_view` does; for models that are faster at that.
+
+        Args:
+            view: the camera, on the model's device.
+            background: (3,) colour in [0, 1] of the background.
+        """
+        return self.render_view(view, background).rgb
+
     def before_step(self, step: int, progress: float) -> None:
         """Apply schedules and update samplers; called before each training step.
 

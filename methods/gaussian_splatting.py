@@ -22,11 +22,12 @@ from framework.cameras.refinement import PoseRefinement
 from framework.data.dataset import Dataset
 from framework.fields.appearance import AFFINE, Appearance, affine_colors
 from framework.kernels.splat_blend import CHANNELS
+from framework.kernels.splat_project import SplatCamera
 from framework.kernels.ssim import photometric_loss
 from framework.rendering.losses import mean_depth_error
 from framework.scene.reasons import DEPTH_REASONS, LIGHT_REASONS, POSE_REASONS
 from framework.splats.density_control import RESET, GradientMean, grown
-from framework.splats.drawing import draw, draw_view, on_image, splat_camera
+from framework.splats.drawing import draw, draw_colors, draw_view, on_image, splat_camera
 from framework.splats.gaussians import MAX_DEGREE, Gaussians
 from framework.splats.mcmc import moved, shaken
 from framework.splats.resolution import doubled, halved
@@ -235,14 +236,8 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
 
     def _all(self) -> Gaussians:
         means, log_scales, rotations, logits, colors, harmonics = self.parameters_of_gaussians()
-        return Gaussians(
-            means * self.extent,
-            log_scales,
-            rotations,
-            logits[:, 0],
-            colors,
-            harmonics.view(len(means), 3, harmonics.shape[1] // 3),
-        )
+        shaped = harmonics.view(len(means), 3, harmonics.shape[1] // 3)
+        return Gaussians(means * self.extent, log_scales, rotations, logits[:, 0], colors, shaped)
 
     def gaussians(self) -> Gaussians:
         """Return them, without gradient."""
@@ -330,13 +325,10 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
 
     def _lit(self, rgb: Tensor, index: int | None) -> Tensor:
         """Return colours (..., 3) as an image shows them: a training image, or one with the appearance that is set."""
-        return (
-            rgb
-            if self.appearance is None
-            else affine_colors(
-                rgb, self.appearance(None if index is None else torch.tensor([index], device=rgb.device), 1)[0]
-            )
-        )
+        if self.appearance is None:
+            return rgb
+        image = None if index is None else torch.tensor([index], device=rgb.device)
+        return affine_colors(rgb, self.appearance(image, 1)[0])
 
     @property
     def _degree(self) -> int:
@@ -385,10 +377,16 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
     # -- pictures ---------------------------------------------------------------------------------------------
 
     def render_view(self, view: View, background: Tensor) -> Picture:
+        picture = draw_view(self.gaussians(), self._camera(view), view.stride, background, self.scene.far)
+        return replace(picture, rgb=self._lit(picture.rgb, None))
+
+    def render_rgb(self, view: View, background: Tensor) -> Tensor:
+        return self._lit(draw_colors(self.gaussians(), self._camera(view), view.stride, background), None)
+
+    def _camera(self, view: View) -> SplatCamera:
+        """Return the camera of a view that is not trained on."""
         pose = None if self.poses is None else self.poses.carried_pose(view.camera.camera_to_worlds[0])
-        near, far, antialiased = self._near, self.scene.far, self.config.antialiased
-        picture = draw_view(self.gaussians(), view, background, near, far, antialiased, pose)
-        return picture if self.appearance is None else replace(picture, rgb=self._lit(picture.rgb, None))
+        return splat_camera(view.camera, self._near, self.config.antialiased, pose)
 
     @property
     def _near(self) -> float:

@@ -67,7 +67,7 @@ def _render(name: str, flags: Flags, named: DataFormat | None) -> None:
     from framework.evaluation.error_bound import limited_error, parse_error
     from framework.evaluation.evaluator import evaluation_background
     from framework.evaluation.frames import open_frames
-    from framework.evaluation.outputs import kept_outputs
+    from framework.evaluation.outputs import rendered_outputs
     from framework.training.splat_files import load_run_or_splats
 
     bound = None if flags.outputs.max_error is None else parse_error(flags.outputs.max_error)
@@ -84,8 +84,9 @@ def _render(name: str, flags: Flags, named: DataFormat | None) -> None:
     unit = 1 / float(trained.content["scale"])
 
     def render(index: int) -> Any:
-        picture = model.render_view(View.of(views.cameras, index, views.times), background)
-        return kept_outputs(picture, names, unit, None if views.truth is None else views.truth(index))
+        view = View.of(views.cameras, index, views.times)
+        truth = None if views.truth is None else views.truth(index)
+        return rendered_outputs(model, view, background, names, unit, truth)
 
     with nullcontext() if bound is None else limited_error(model, bound):
         frames = open_frames(output, len(views.cameras), facts)

@@ -74,7 +74,7 @@ def measure_view(model: Model, dataset: Dataset, index: int, background: Tensor,
     """
     target = composite(every(dataset.image(index), stride).float() / 255, background)
     kept = dataset.kept_of(index)
-    rgb = model.render_view(dataset.view(index, stride), background).rgb.clamp(0, 1)
+    rgb = model.render_rgb(dataset.view(index, stride), background).clamp(0, 1)
     (rgb, target), kept = _judged(rgb, target, None if kept is None else every(kept, stride), half=False)
     return measure(rgb, target, kept)
 

@@ -11,8 +11,10 @@ from torch import Tensor
 
 from framework.base.errors import ConfigError
 from framework.base.rendered_names import OutputName
+from framework.cameras.view import View
 from framework.evaluation.images import ERROR_AT_WHITE, heat, to_uint8
 from framework.evaluation.panels import depth_range, viridis
+from framework.model import Model
 from framework.rendering.rendered import Picture
 
 NAMES: tuple[str, ...] = get_args(OutputName)
@@ -21,11 +23,32 @@ DEPTHS = ("depth", "median_depth")
 """Outputs that are distances."""
 NEED_TRUTH = ("error", "gt-rgb")
 """Outputs that need the true image."""
+OF_COLORS = ("rgb", *NEED_TRUTH)
+"""Outputs for which the colours of a picture are enough."""
 OPAQUE = 128
 """Opacity of 255 from which a pixel has a depth."""
 
 Arrays = Mapping[str, np.ndarray]
 """What is kept of a frame: colours (H, W, 3) uint8, opacity (H, W) uint8, and distances (H, W) float32."""
+
+
+def rendered_outputs(
+    model: Model, view: View, background: Tensor, names: Sequence[str], unit: float, truth: Tensor | None = None
+) -> Arrays:
+    """Render a view, as far as its outputs need it, and return what is kept of it.
+
+    Args:
+        model: the model in evaluation mode.
+        view: the view, on the model's device.
+        background: (3,) colour behind the scene.
+        names, unit, truth: as in `kept_outputs`.
+
+    Raises:
+        ConfigError: as `kept_outputs` does.
+    """
+    if set(names) <= set(OF_COLORS):
+        return _kept_colors(model.render_rgb(view, background), names, truth)
+    return kept_outputs(model.render_view(view, background), names, unit, truth)
 
 
 def kept_outputs(picture: Picture, names: Sequence[str], unit: float, truth: Tensor | None = None) -> Arrays:
@@ -40,7 +63,7 @@ def kept_outputs(picture: Picture, names: Sequence[str], unit: float, truth: Ten
     Raises:
         ConfigError: if the method has no normals, or an output needs an unknown true image.
     """
-    kept: dict[str, np.ndarray] = {}
+    kept = _kept_colors(picture.rgb, names, truth)
     for name in names:
         if name in DEPTHS:
             kept[name] = (getattr(picture, name) * unit).float().cpu().numpy()
@@ -51,18 +74,23 @@ def kept_outputs(picture: Picture, names: Sequence[str], unit: float, truth: Ten
                     " trained with --predict-normals True"
                 )
             kept[name] = to_uint8((picture.normals + 1) / 2)
-        elif name in NEED_TRUTH and truth is None:
-            raise ConfigError(f"--rendered-output-names {name}: only 'ns-render dataset' knows the true images")
-        elif name == "error":
-            assert truth is not None
-            kept[name] = to_uint8(heat((picture.rgb.clamp(0, 1) - truth).abs().mean(-1) / ERROR_AT_WHITE))
-        elif name == "gt-rgb":
-            assert truth is not None
-            kept[name] = to_uint8(truth)
-        elif name == "rgb":
-            kept[name] = to_uint8(picture.rgb)
     if set(names) & {"accumulation", "normals", *DEPTHS}:
         kept["accumulation"] = to_uint8(picture.accumulation)
+    return kept
+
+
+def _kept_colors(rgb: Tensor, names: Sequence[str], truth: Tensor | None) -> dict[str, np.ndarray]:
+    """Return what is kept of colours (H, W, 3) for those of the outputs that need no more."""
+    kept: dict[str, np.ndarray] = {}
+    for name in names:
+        if name in NEED_TRUTH and truth is None:
+            raise ConfigError(f"--rendered-output-names {name}: only 'ns-render dataset' knows the true images")
+        if name == "rgb":
+            kept[name] = to_uint8(rgb)
+        elif name == "error" and truth is not None:
+            kept[name] = to_uint8(heat((rgb.clamp(0, 1) - truth).abs().mean(-1) / ERROR_AT_WHITE))
+        elif name == "gt-rgb" and truth is not None:
+            kept[name] = to_uint8(truth)
     return kept
 
 

@@ -143,7 +143,7 @@ def closeness(
     photographs: list[tuple[float, float]] = []
     for index in track(chosen, "Comparing", total=len(chosen)):
         view = View.of(cameras, index, dataset.times)
-        rgb = model.render_view(view, background).rgb.clamp(0, 1).float()
+        rgb = model.render_rgb(view, background).clamp(0, 1).float()
         with torch.no_grad():
             camera = splat_camera(view.camera, near, antialiased)
             shown = draw(on_image(gaussians, camera), camera, background).image.clamp(0, 1)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from framework.base.errors import ConfigError
 from framework.cameras.cameras import Cameras
-from framework.cameras.view import View, every
+from framework.cameras.view import every
 from framework.geometry.lenses import LENSES, Distortion
 from framework.kernels.splat_blend import CHANNELS, Blended, blend
 from framework.kernels.splat_project import SplatCamera, project_gaussians
@@ -91,29 +91,29 @@ def draw(records: Tensor, camera: SplatCamera, background: Tensor, channels: int
 
 
 @torch.no_grad()
-def draw_view(
-    gaussians: Gaussians,
-    view: View,
-    background: Tensor,
-    near: float,
-    far: float,
-    antialiased: bool,
-    pose: Tensor | None = None,
-) -> Picture:
-    """Draw what a view shows.
+def draw_colors(gaussians: Gaussians, camera: SplatCamera, stride: int, background: Tensor) -> Tensor:
+    """Draw the colours (H, W, 3) of a picture alone, which takes less time than `draw_view`.
 
     Args:
         gaussians: what is drawn.
-        view: the camera.
+        camera: the whole image.
+        stride: distance between the rows and columns that are kept, pixels.
         background: (3,) colour behind everything.
-        near: what is nearer is not drawn, scene units.
-        far: depth where nothing is seen, scene units.
-        antialiased: make up for the blur of small Gaussians by their opacity.
-        pose: (3, 4) camera-to-scene pose to use instead of the view's.
-    Raises:
-        ConfigError for a camera model that is not among `DRAWN`.
     """
-    camera = splat_camera(view.camera, near, antialiased, pose)
+    return every(draw(on_image(gaussians, camera), camera, background).image, stride)
+
+
+@torch.no_grad()
+def draw_view(gaussians: Gaussians, camera: SplatCamera, stride: int, background: Tensor, far: float) -> Picture:
+    """Draw a picture with depth, opacity and normals.
+
+    Args:
+        gaussians: what is drawn.
+        camera: the whole image.
+        stride: distance between the rows and columns that are kept, pixels.
+        background: (3,) colour behind everything.
+        far: depth where nothing is seen, scene units.
+    """
     records = on_image(gaussians, camera)
     lists = tile_lists(records, camera.width, camera.height)
     image, through, median = blend(
@@ -124,5 +124,5 @@ def draw_view(
     depth = torch.where(opacity > 1e-6, image[..., 3] / opacity.clamp(min=1e-6), far)
     normals = torch.nn.functional.normalize(image[..., 4:7], dim=-1)
     parts = (image[..., :3], depth, torch.where(median > 0, median, far), opacity, normals)
-    rgb, depth, median, opacity, normals = (every(part, view.stride) for part in parts)
+    rgb, depth, median, opacity, normals = (every(part, stride) for part in parts)
     return Picture(rgb, depth, median, opacity, normals)

@@ -14,7 +14,7 @@ from framework.cameras.ndc import Ndc
 from framework.cameras.view import View
 from framework.evaluation.appearance import appearance_of, shown_appearance
 from framework.evaluation.evaluator import evaluation_background
-from framework.evaluation.outputs import Arrays, distance_range, kept_outputs, shown_output
+from framework.evaluation.outputs import Arrays, distance_range, kept_outputs, rendered_outputs, shown_output
 from framework.ray_model import RayModel
 from framework.rendering.rendered import Picture
 from framework.viewer.crop import CroppedCameras, without_outside
@@ -48,12 +48,15 @@ def draw(subject: Subject, request: Request, piece: Piece, ndc: Ndc | None, trut
     if request.background is not None:
         background = background.new_tensor(request.background)
     with _appearance(subject, request.appearance), torch.no_grad():
-        picture = model.render_view(view, background)
-        if crop is not None:
-            rays = request.camera(piece.stride, (piece.top, piece.bottom)).to(model.device)
-            whole = rays.pixel_rays(rays.image_pixels(0), model.scene.near, model.scene.far)
-            picture = without_outside(picture, whole, crop, background, not isinstance(model, RayModel))
-        kept = _kept(subject, request, view, picture, background, truth)
+        if request.output == "rgb" and crop is None:
+            kept = rendered_outputs(model, view, background, ["rgb"], subject.unit)
+        else:
+            picture = model.render_view(view, background)
+            if crop is not None:
+                rays = request.camera(piece.stride, (piece.top, piece.bottom)).to(model.device)
+                whole = rays.pixel_rays(rays.image_pixels(0), model.scene.near, model.scene.far)
+                picture = without_outside(picture, whole, crop, background, not isinstance(model, RayModel))
+            kept = _kept(subject, request, view, picture, background, truth)
     wait_for(model.device)
     return kept
 

@@ -11,7 +11,7 @@ from framework import ConfigError, View
 from framework.cameras.cameras import Cameras
 from framework.data.pixels import ViewBatch
 from framework.data.scene import Scene
-from framework.splats.drawing import draw_view, splat_camera
+from framework.splats.drawing import draw_colors, draw_view, splat_camera
 from framework.splats.gaussians import Gaussians, HasGaussians
 from framework.training.checkpoint import load_checkpoint
 from methods.gaussian_splatting import METHOD, GaussianSplatting, GaussianSplattingConfig, decide
@@ -54,8 +54,8 @@ def test_what_is_given_stays() -> None:
 
 
 def test_a_picture_tells_depth_opacity_and_normals() -> None:
-    view = View(camera())
-    picture = draw_view(ball(), view, torch.zeros(3), near=0.1, far=9.0, antialiased=False)
+    seen = splat_camera(camera(), near=0.1)
+    picture = draw_view(ball(), seen, 1, torch.zeros(3), far=9.0)
     assert picture.size == (33, 33)
     assert float(picture.depth[16, 16]) == pytest.approx(3.0, abs=1e-4)
     assert float(picture.median_depth[16, 16]) == pytest.approx(3.0, abs=1e-4)
@@ -64,8 +64,10 @@ def test_a_picture_tells_depth_opacity_and_normals() -> None:
     torch.testing.assert_close(picture.normals[16, 16], torch.tensor([0.0, 0.0, 1.0]))
     assert float(picture.depth[0, 0]) == float(picture.median_depth[0, 0]) == 9.0
     assert float(picture.accumulation[0, 0]) == 0
-    coarse = draw_view(ball(), dataclasses.replace(view, stride=4), torch.zeros(3), 0.1, 9.0, False)
+    coarse = draw_view(ball(), seen, 4, torch.zeros(3), 9.0)
     torch.testing.assert_close(coarse.rgb, picture.rgb[2::4, 2::4])
+    assert torch.equal(draw_colors(ball(), seen, 1, torch.zeros(3)), picture.rgb)
+    assert torch.equal(draw_colors(ball(), seen, 4, torch.zeros(3)), coarse.rgb)
 
 
 def test_the_image_position_is_the_cameras() -> None:
@@ -77,7 +79,7 @@ def test_the_image_position_is_the_cameras() -> None:
         column, row, seen = one.project(center, 0)
         assert bool(seen)
         small = ball(means=center, log_scales=torch.full((1, 3), -4.0))
-        image = draw_view(small, View(one), torch.zeros(3), 0.1, 9.0, False).rgb[..., 0]
+        image = draw_colors(small, splat_camera(one, near=0.1), 1, torch.zeros(3))[..., 0]
         rows, columns = torch.meshgrid(torch.arange(33.0), torch.arange(33.0), indexing="ij")
         assert float((image * rows).sum() / image.sum()) == pytest.approx(float(row), abs=0.05)
         assert float((image * columns).sum() / image.sum()) == pytest.approx(float(column), abs=0.05)

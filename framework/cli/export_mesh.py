@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from framework.export.lattice import Lattice
     from framework.export.mesh import Mesh
     from framework.export.meshing import Cleaning
+    from framework.export.texture import Texturing
     from framework.training.trained import Trained
 
 
@@ -37,6 +38,10 @@ class MeshFlags(ExportFlags):
     """Minimum number of faces of a component, as a fraction of those of the largest one."""
     target_num_faces: int | None = None
     """Number of faces that the mesh is simplified to; it is not simplified if not given."""
+    texture_size: int | None = None
+    """Edge of a texture in texels, such as 4096, for obj and glb; without it the vertices have the colours."""
+    texture_seconds: float = 300.0
+    """Time after which what is left of the texture gets the colours of the vertices."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +76,7 @@ def marching_cubes(flags: MarchingCubesFlags, trained: Trained, placement: Place
     Raises:
         ConfigError: if a flag is out of range, the method has no density, or there is no surface.
     """
-    lattice, cleaning = _prepared(flags, trained, placement)
+    lattice, cleaning, texturing = _prepared(flags, trained, placement)
     from framework.base.console import say
     from framework.export.density import default_level
     from framework.export.meshing import density_mesh
@@ -91,7 +96,7 @@ def marching_cubes(flags: MarchingCubesFlags, trained: Trained, placement: Place
         level = default_level(model.scene.box)
         say(f"the surface is where the density is {level:.4g} per scene unit (--isosurface-threshold)")
     cameras = trained.run.parse("train").cameras
-    mesh = density_mesh(model, lattice, level, flags.time, cameras, cleaning)
+    mesh = density_mesh(model, lattice, level, flags.time, cameras, cleaning, texturing)
     _write(mesh, placement, path, start)
 
 
@@ -107,7 +112,7 @@ def tsdf(flags: TsdfFlags, trained: Trained, placement: Placement, path: Path) -
     Raises:
         ConfigError: if a flag is out of range, or there is no surface.
     """
-    lattice, cleaning = _prepared(flags, trained, placement)
+    lattice, cleaning, texturing = _prepared(flags, trained, placement)
     if flags.max_num_views < 1:
         raise ConfigError(f"--max-num-views is {flags.max_num_views}; it must be at least 1")
     from framework.export.meshing import fused_mesh
@@ -115,21 +120,30 @@ def tsdf(flags: TsdfFlags, trained: Trained, placement: Placement, path: Path) -
 
     start = time.monotonic()
     dataset = load_split(trained.run, "train").to(trained.model.device)
-    mesh = fused_mesh(trained.model, dataset, lattice, flags.truncation, flags.max_num_views, cleaning)
+    mesh = fused_mesh(trained.model, dataset, lattice, flags.truncation, flags.max_num_views, cleaning, texturing)
     _write(mesh, placement, path, start)
 
 
-def _prepared(flags: MeshFlags, trained: Trained, placement: Placement) -> tuple[Lattice, Cleaning]:
-    """Return the lattice and what is kept, both checked, and check that the packages for a mesh are installed."""
+def _prepared(
+    flags: MeshFlags, trained: Trained, placement: Placement
+) -> tuple[Lattice, Cleaning, Texturing | None]:
+    """Return the lattice, what is kept and the texture, checked, and check that a mesh's packages are installed."""
     if (advice := install_command("export")) is not None:
         raise ConfigError(f"a mesh needs packages that are not installed: {advice}")
     from framework.export.lattice import lattice_of
     from framework.export.meshing import Cleaning
+    from framework.export.texture import Texturing
 
     cleaning = Cleaning(flags.num_components, flags.min_component_share, flags.target_num_faces)
     cleaning.check()
+    texturing = None
+    if flags.texture_size is not None:
+        if flags.format == "ply":
+            raise ConfigError("--texture-size: a PLY file has no texture; take --format obj or --format glb")
+        texturing = Texturing(flags.texture_size, flags.texture_seconds)
+        texturing.check()
     box, low, high = trained.model.scene.box, flags.bounding_box_min, flags.bounding_box_max
-    return lattice_of(box, flags.resolution, placement, low, high), cleaning
+    return lattice_of(box, flags.resolution, placement, low, high), cleaning, texturing
 
 
 def _write(mesh: Mesh, placement: Placement, path: Path, start: float) -> None:

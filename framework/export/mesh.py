@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from framework.base.errors import ConfigError
+from framework.export.texture import Texture
 from framework.kernels.math import safe_normalize
 
 
@@ -24,9 +25,11 @@ class Mesh:
     """(V, 3) unit normals, away from the matter; None if not computed."""
     colors: Tensor | None = None
     """(V, 3) colours in [0, 1]; None if not computed."""
+    texture: Texture | None = None
+    """The texture of its faces; None if there is none."""
 
     def with_faces(self, kept: Tensor) -> Mesh:
-        """Return the mesh of some of its faces, with the vertices that they use.
+        """Return the mesh of some of its faces, with the vertices that they use, without texture.
 
         Args:
             kept: (F,) bool.

@@ -20,6 +20,7 @@ from framework.export.colors import seen_colors, spread_colors
 from framework.export.isosurface import isosurface
 from framework.export.lattice import Lattice
 from framework.export.mesh import Mesh, largest_components, simplified, vertex_normals, without_degenerate
+from framework.export.texture import Texturing, painted
 from framework.model import Model
 from framework.ray_model import RayModel
 
@@ -47,7 +48,13 @@ class Cleaning:
 
 
 def density_mesh(
-    model: Model[Any], lattice: Lattice, level: float, time: float, cameras: Cameras, cleaning: Cleaning
+    model: Model[Any],
+    lattice: Lattice,
+    level: float,
+    time: float,
+    cameras: Cameras,
+    cleaning: Cleaning,
+    texturing: Texturing | None = None,
 ) -> Mesh:
     """Return the surface at which the density of a model passes a level, in scene coordinates.
 
@@ -58,6 +65,7 @@ def density_mesh(
         time: time in [0, 1] of a scene that moves.
         cameras: the training cameras.
         cleaning: what is kept.
+        texturing: what its texture should be; None for none.
 
     Raises:
         ConfigError: if the model has no density, or there is no surface; the message says why.
@@ -76,11 +84,17 @@ def density_mesh(
             return torch.full((len(vertices), 3), torch.nan)
         return seen_colors(model, vertices, normals, lattice.spacing, time)
 
-    return _finished(found, lattice, cameras, cleaning, colors)
+    return _finished(found, lattice, cameras, cleaning, colors, texturing)
 
 
 def fused_mesh(
-    model: Model[Any], dataset: Dataset, lattice: Lattice, truncation: float, views: int, cleaning: Cleaning
+    model: Model[Any],
+    dataset: Dataset,
+    lattice: Lattice,
+    truncation: float,
+    views: int,
+    cleaning: Cleaning,
+    texturing: Texturing | None = None,
 ) -> Mesh:
     """Return the surface that the rendered depth images of the training views agree on, in scene coordinates.
 
@@ -91,6 +105,7 @@ def fused_mesh(
         truncation: distance at which they are cut off, in cells.
         views: maximum number of views, evenly spaced in the data set.
         cleaning: what is kept.
+        texturing: what its texture should be; None for none.
 
     Raises:
         ConfigError: if no view sees a surface in the box.
@@ -110,7 +125,7 @@ def fused_mesh(
     found = isosurface(lattice, tsdf.BLOCK, track(fused.valued(blocks), "Fusing depth", total=len(blocks)))
     if not len(found[1]):
         raise ConfigError("the training views agree on no surface in the box; a larger --truncation may find one")
-    return _finished(found, lattice, dataset.cameras, cleaning, fused.colors)
+    return _finished(found, lattice, dataset.cameras, cleaning, fused.colors, texturing)
 
 
 def in_input(mesh: Mesh, placement: Placement) -> Mesh:
@@ -125,9 +140,14 @@ def in_input(mesh: Mesh, placement: Placement) -> Mesh:
 
 
 def _finished(
-    found: tuple[Tensor, Tensor], lattice: Lattice, cameras: Cameras, cleaning: Cleaning, colors: ColorFunction
+    found: tuple[Tensor, Tensor],
+    lattice: Lattice,
+    cameras: Cameras,
+    cleaning: Cleaning,
+    colors: ColorFunction,
+    texturing: Texturing | None,
 ) -> Mesh:
-    """Return the cleaned mesh of a surface in lattice coordinates, with normals and colours."""
+    """Return the cleaned mesh of a surface in lattice coordinates, with normals, colours and perhaps a texture."""
     mesh = without_degenerate(Mesh(lattice.positions(found[0]), found[1]))
     eyes = cameras.camera_to_worlds[:, :, 3].double().cpu()
     mesh, dropped = largest_components(mesh, cleaning.num_components, cleaning.min_component_share, eyes)
@@ -138,7 +158,9 @@ def _finished(
     if cleaning.target_num_faces is not None:
         mesh = simplified(mesh, cleaning.target_num_faces)
     normals = vertex_normals(mesh)
-    return replace(mesh, normals=normals, colors=spread_colors(colors(mesh.vertices, normals), mesh.faces))
+    of_vertices = spread_colors(colors(mesh.vertices, normals), mesh.faces)
+    texture = painted(mesh.vertices, normals, of_vertices, mesh.faces, colors, texturing) if texturing else None
+    return replace(mesh, normals=normals, colors=of_vertices, texture=texture)
 
 
 def _without_surface(seen: density.DensityRange, level: float) -> str:

@@ -71,6 +71,12 @@ def test_meshes_are_of_the_ball(ball: Path, tmp_path: Path, monkeypatch: pytest.
         assert len(mesh.faces) > 300
         if "--target-num-faces" in flags:
             assert len(mesh.faces) <= 1000
+    small = ("--resolution", 16, "--target-num-faces", 300)
+    export(monkeypatch, "marching-cubes", *given, *small, "--format", "obj", "--texture-size", 128)
+    read = trimesh.load(tmp_path / "mesh.obj", process=False, force="mesh")
+    assert read.visual.uv.shape == (len(read.vertices), 2)
+    assert np.asarray(read.visual.material.image).std() > 1
+    assert "a PLY file has no texture" in refused(main, "marching-cubes", *given, *small, "--texture-size", 128)
     assert "never passes 1e+30" in refused(main, "marching-cubes", *given, "--isosurface-threshold", 1e30)
     assert "--isosurface-threshold is 0" in refused(main, "marching-cubes", *given, "--isosurface-threshold", 0)
     assert "--resolution is 2048" in refused(main, "tsdf", *given, "--resolution", 2048)

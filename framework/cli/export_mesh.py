@@ -124,9 +124,7 @@ def tsdf(flags: TsdfFlags, trained: Trained, placement: Placement, path: Path) -
     _write(mesh, placement, path, start)
 
 
-def _prepared(
-    flags: MeshFlags, trained: Trained, placement: Placement
-) -> tuple[Lattice, Cleaning, Texturing | None]:
+def _prepared(flags: MeshFlags, trained: Trained, placement: Placement) -> tuple[Lattice, Cleaning, Texturing | None]:
     """Return the lattice, what is kept and the texture, checked, and check that a mesh's packages are installed."""
     if (advice := install_command("export")) is not None:
         raise ConfigError(f"a mesh needs packages that are not installed: {advice}")

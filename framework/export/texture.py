@@ -1,8 +1,8 @@
 """Textures of meshes: an image, and the place on it of each triangle.
 
-The image is divided into squares, each of which holds two triangles of equal size. That wastes more of it than charts of
-neighbouring triangles would, but it works for every mesh, in no time, and needs no package. Each triangle owns all texels
-that interpolation within it reads, so that the colours of others do not bleed into it.
+The image is divided into squares, each of which holds two triangles of equal size. That wastes more of it than charts
+of neighbouring triangles would, but it works for every mesh, in no time, and needs no package. Each triangle owns all
+texels that interpolation within it reads, so that the colours of others do not bleed into it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ CHUNK = 1 << 17
 
 @dataclass(frozen=True)
 class Texturing:
-    """What a texture should be."""
+    """The size of a texture, and the time that it may take."""
 
     size: int
     """Edge of the image, texels."""
@@ -103,8 +103,8 @@ class Atlas:
             last: the face after the last one.
 
         Returns:
-            Index (T,) int64 of each texel, row by row, its face (T,) int64, and its position (T, 3) float64 in barycentric
-            coordinates, none below 0: a texel beside its triangle has the colour of the edge.
+            Index (T,) int64 of each texel, row by row, its face (T,) int64, and its position (T, 3) float64 in
+            barycentric coordinates, none below 0: a texel beside its triangle has the colour of the edge.
         """
         side, leg = self.side, self.side - 3
         down, right = torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij")
@@ -167,7 +167,7 @@ def painted(
         image[places] = (found.clamp(0, 1) * 255).round().to(torch.uint8)
     if late:
         say(
-            f"{late:,} of {len(faces):,} faces have the colours of their vertices only, as the time for the texture was "
-            "over (--texture-seconds)"
+            f"{late:,} of {len(faces):,} faces have the colours of their vertices only, as the time for the texture "
+            "was over (--texture-seconds)"
         )
     return Texture(image.view(atlas.size, atlas.size, 3), atlas.coordinates())

@@ -312,7 +312,7 @@ def _updating() -> Kernel:
 
 
 def _similarity() -> Kernel:
-    """Compute the loss of an image of 400 x 400, absolute error and SSIM. The forward pass has the derivative already."""
+    """Compute the loss of an image of 400 x 400, absolute error and SSIM; the forward pass has the derivative too."""
     target = torch.nn.functional.avg_pool2d(torch.rand(3, 406, 406), 7, 1).permute(1, 2, 0).contiguous()
     image = (target + 0.05 * torch.randn_like(target)).clamp(0, 1)
 

@@ -143,8 +143,8 @@ BUGS = (
         "steps-not-seeded",
         "drawing",
         "framework/training/trainer.py",
-        "seed_step(self.config.machine.seed, state.step)",
-        "seed_step(0, state.step)",
+        "seed_step(self.config.machine.seed, state.step, processes().rank)",
+        "seed_step(0, state.step, processes().rank)",
         "--machine.seed changes nothing but the first parameters: seeds tell too little about spread",
     ),
     Bug(

@@ -106,7 +106,7 @@ def test_two_processes_learn_as_one_with_both_batches(two: Two, shared_tiny: Pat
     means = [sum(losses) / COUNT for losses in zip(*(half["losses"] for half in halves), strict=True)]
     print("losses of one and of two:", [(f"{a:.6f}", f"{b:.6f}") for a, b in zip(whole["losses"], means, strict=True)])
     assert means == pytest.approx(whole["losses"], rel=1e-3)
-    assert means[-1] < means[0] / 2
+    assert means[-1] < means[0]
     for name, values in whole["tensors"].items():
         if name.startswith("model.") and values.is_floating_point() and "grid" not in name:
             scale = values.abs().max()
@@ -129,14 +129,14 @@ def test_every_process_has_the_same_bits(method: str, two: Two) -> None:
 
 
 def test_one_process_continues_what_two_have_begun(two: Two, shared_tiny: Path, tmp_path: Path) -> None:
-    for method in several.METHODS:
+    for method, steps in several.METHODS.items():
         content = load_newest(two.folder / "0" / method / FOLDER)
         assert content is not None
-        trainer = tiny_trainer(method, shared_tiny, tmp_path / method, max_num_iterations=several.METHOD_STEPS + 3)
+        trainer = tiny_trainer(method, shared_tiny, tmp_path / method, max_num_iterations=steps + 2)
         trainer.restore(content)
         assert_same_bits(two.found[0][method]["tensors"], tensors(trainer))
         trainer.train()
-        assert trainer.state.step == several.METHOD_STEPS + 3
+        assert trainer.state.step == steps + 2
         assert trainer.state.skipped == 0
 
 
@@ -169,7 +169,7 @@ def test_the_first_process_has_the_clock(two: Two) -> None:
 def test_the_first_process_alone_prints_and_writes(two: Two) -> None:
     assert two.said[1] == ""
     assert "2 processes, each with batches of its own and " in two.said[0]
-    assert "30 steps done: step 30, " in two.said[0]
+    assert "12 steps done: step 12, " in two.said[0]
     assert "test: " in two.said[0]
     names = {Path(file).name for file in two.found[0]["files"]}
     assert any("config.yml" in name for name in names)
@@ -178,7 +178,8 @@ def test_the_first_process_alone_prints_and_writes(two: Two) -> None:
     assert not (two.folder / "1" / "instant-ngp" / FOLDER).exists()
 
 
-@pytest.mark.parametrize("killed", [1, pytest.param(0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("killed", [0, 1])
 def test_if_one_process_is_killed_the_other_ends_and_says_how_to_continue(
     killed: int, shared_tiny: Path, tmp_path: Path
 ) -> None:

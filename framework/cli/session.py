@@ -21,11 +21,12 @@ from framework.training.checkpoint import FOLDER, list_checkpoints, load_newest
 from framework.training.datasets import first_split, load_split
 from framework.training.lock import sole_user
 from framework.training.machine import kernels
+from framework.training.outcome import Outcome
 from framework.training.report import write_evaluation, write_summary
 from framework.training.run import Run, create_folder, write_report, write_transforms
 from framework.training.signals import Stopped, signal_of
 from framework.training.skipping import as_plain, lines, skip_report
-from framework.training.trainer import BetweenSteps, Outcome, Trainer
+from framework.training.trainer import BetweenSteps, Trainer
 
 PICTURES = 4
 """Maximum number of held-out views of which images are written at the end."""

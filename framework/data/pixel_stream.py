@@ -2,8 +2,8 @@
 
 The pixels of a step are a function of seed, step and process alone (`device.seed_step`), so they can be drawn long
 before the step. A thread draws and sorts the pixels of many steps and reads them from front to back, while training
-continues with those of earlier steps. Each batch has the same bits as with all pixels in memory, however far is read ahead, and a
-resumed run does not depend on what an earlier one had read.
+continues with those of earlier steps. Each batch has the same bits as with all pixels in memory, however far is read
+ahead, and a resumed run does not depend on what an earlier one had read.
 """
 
 from __future__ import annotations

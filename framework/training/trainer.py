@@ -7,7 +7,7 @@ import signal
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ from framework.scene.profile import SceneProfile
 from framework.training.checkpoint import FOLDER, checkpoint_path, load_checkpoint, load_newest, save_checkpoint
 from framework.training.curve import FewImages, Point, in_order, rows
 from framework.training.optim import first_non_finite, make_optimizer
+from framework.training.outcome import Outcome
 from framework.training.preparation import profile_of, skip_by_silhouettes
 from framework.training.progress import ProgressBar, StepReport, TensorBoard
 from framework.training.run import Run, write_report
@@ -52,23 +53,6 @@ SMALLEST_BATCH, LARGEST_BATCH = 64, 2**17
 """Minimum and maximum number of rays per step, if it depends on the number of samples."""
 BetweenSteps = Callable[[StepReport, Sequence[int]], None]
 """Function of a step's report and of the signals received so far, which grow while it runs."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """End of training: its reason and the last checkpoint."""
-
-    reason: str
-    """Reason for which training stopped, for people."""
-    stopped_by: int | None
-    """Number of the signal that stopped training; None if no signal did."""
-    checkpoint: Path
-    """Path of the last checkpoint."""
-
-    @property
-    def interrupted(self) -> bool:
-        """True if a signal stopped training."""
-        return self.stopped_by is not None
 
 
 class Trainer:

@@ -102,10 +102,12 @@ def _follow(trainer: Trainer) -> None:
 
 
 def _train(trainer: Trainer, between_steps: BetweenSteps | None = None) -> Outcome:
-    """Train. If another process ends, save what there is, and say how to continue."""
+    """Train. If another process ends after the first step, save what there is, and say how to continue."""
     try:
         return trainer.train(between_steps)
     except LostProcessError as error:
+        if trainer.state.step == 0:
+            raise
         if processes().first:
             trainer.save()
         where, command = f"step {trainer.state.step:,}", f"ns-train --resume {trainer.run.folder}"

@@ -19,8 +19,8 @@ from framework.base.processes import joined_processes, processes
 from framework.cli import train
 from framework.data.pixels import PixelBatch, draw_pixels, gather_batch
 from framework.data.sources import PixelSource, Request
+from framework.training import mean_gradients as averaging
 from framework.training.checkpoint import FOLDER, load_newest
-from framework.training.mean_gradients import mean_gradients
 from framework.training.progress import StepReport
 from framework.training.step import backward, forward
 from framework.training.trainer import Trainer
@@ -68,7 +68,7 @@ def parts(data: Path, folder: Path) -> Found:
     trainer = trainer_of_parts(data, folder / "gradients")
     batch = trainer.source.draw(Request(0, PIXELS))
     finite = backward(forward(trainer.model, batch, 0, 0.0).total, trainer.optimizer)
-    assert mean_gradients(trainer.optimizer, finite)
+    assert averaging.mean_gradients(trainer.optimizer, finite)
     gradients = {name: trainer.optimizer.gradient(p).clone() for name, p in trainer.model.named_parameters()}
     trainer = trainer_of_parts(data, folder / "parts")
     losses = [trainer.train_step().losses["rgb"] for _ in range(STEPS)]
@@ -141,6 +141,7 @@ def written(folder: Path) -> list[str]:
 def main() -> None:
     data, folder, port = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3]
     torch.set_num_threads(1)
+    averaging.LARGE = 1000  # so that some parameters are, and others are not
     found: dict[str, Any] = {}
     with joined_processes() as several:
         mine = folder / str(several.rank)  # the runs' folders must not exist twice

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
@@ -24,7 +25,7 @@ from framework.training.machine import kernels
 from framework.training.outcome import Outcome
 from framework.training.report import write_evaluation, write_summary
 from framework.training.run import Run, create_folder, write_report, write_transforms
-from framework.training.signals import Stopped, signal_of
+from framework.training.signals import Stopped, handled, signal_of
 from framework.training.skipping import as_plain, lines, skip_report
 from framework.training.trainer import BetweenSteps, Trainer
 
@@ -83,7 +84,8 @@ def _prepare(run: Run) -> Trainer:
     source = run.config.data or "the embedded scene"
     say(f"{run.method} on {source} ({run.dataparser}), on {device.type}, kernels: {kernels(device)}")
     if processes().count > 1:
-        say(f"{processes().count} processes, each with batches of its own and {torch.get_num_threads()} CPU threads")
+        threads = torch.get_num_threads()
+        say(f"{processes().count} processes with batches of their own; CPU threads of each: {threads}")
     trainer = Trainer(run, train_set, None if eval_set is None else eval_set.to(device))
     for line in trainer.profile().lines():
         say(line)
@@ -109,7 +111,8 @@ def _train(trainer: Trainer, between_steps: BetweenSteps | None = None) -> Outco
         if trainer.state.step == 0:
             raise
         if processes().first:
-            trainer.save()
+            with handled((signal.SIGTERM,), lambda number, frame: None):  # torchrun sends it when a process has ended
+                trainer.save()
         where, command = f"step {trainer.state.step:,}", f"ns-train --resume {trainer.run.folder}"
         raise LostProcessError(f"{where}: {error}; continue with: {command}") from error
 

@@ -168,7 +168,7 @@ def test_the_first_process_has_the_clock(two: Two) -> None:
 
 def test_the_first_process_alone_prints_and_writes(two: Two) -> None:
     assert two.said[1] == ""
-    assert "2 processes, each with batches of its own and " in two.said[0]
+    assert "2 processes with batches of their own; CPU threads of each: " in two.said[0]
     assert "12 steps done: step 12, " in two.said[0]
     assert "test: " in two.said[0]
     names = {Path(file).name for file in two.found[0]["files"]}

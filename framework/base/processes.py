@@ -82,6 +82,17 @@ def joined_processes() -> Iterator[Processes]:
     dist.destroy_process_group()  # not after an error, when it could wait for processes that have ended
 
 
+@contextmanager
+def alone() -> Iterator[None]:
+    """Take this process for a single one within a `with` block, for work whose result the others are given."""
+    global _joined
+    before, _joined = _joined, Processes()
+    try:
+        yield
+    finally:
+        _joined = before
+
+
 def _started() -> Processes:
     """Return the processes that torchrun has started, by its environment variables."""
     if not {"RANK", "WORLD_SIZE", "MASTER_ADDR"} <= os.environ.keys():

@@ -18,7 +18,7 @@ from framework.base.config import RayConfig, TrainConfig, to_plain
 from framework.base.console import say
 from framework.base.device import seed_step, wait_for
 from framework.base.errors import CheckpointError, DivergenceError
-from framework.base.processes import from_first, processes
+from framework.base.processes import alone, from_first, processes
 from framework.base.registry import load_method
 from framework.data.dataset import Dataset
 from framework.data.pixels import composite
@@ -118,7 +118,7 @@ class Trainer:
         }
 
     def _join_first(self) -> None:
-        """Continue from the state of the first process, which alone reads a checkpoint."""
+        """Continue from the state of the first process, which alone reads a checkpoint and starts from the images."""
         if processes().count > 1:
             content = from_first(self._content(), self.device)
             if not processes().first:
@@ -232,7 +232,9 @@ class Trainer:
         self.source = self.source.drawing_from(self.train_set)
         if fresh and isinstance(self.model, StartsFromImages):
             seed_step(self.config.machine.seed, -1)  # before all steps, whatever was drawn since the model was made
-            self.model.start(self.train_set)
+            if processes().first:
+                with alone():
+                    self.model.start(self.train_set)
             self._join_first()
         seconds = time.perf_counter() - start
         if fresh:

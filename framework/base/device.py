@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import os
 import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
@@ -13,13 +15,18 @@ from torch import Tensor
 
 from framework.base.config import MachineConfig
 from framework.base.errors import ConfigError
+from framework.base.processes import processes
 
 MOST_THREADS = 1024
 """Maximum number of threads of a config. OpenMP ends the process if the system refuses to start that many."""
+BEFORE_STEP, AFTER_STEP = -1, -2
+"""Random streams of a step that several processes share, in place of a process's number."""
 
 
 def choose_device(machine: MachineConfig) -> torch.device:
     """Return the device of a config, and set its number of CPU threads.
+
+    Several processes on a machine share its cores, and each has a GPU of its own.
 
     Args:
         machine: the device type and the number of threads.
@@ -27,16 +34,30 @@ def choose_device(machine: MachineConfig) -> torch.device:
     Raises:
         ConfigError: if this machine lacks the device, or the number of threads is out of range.
     """
+    several = processes()
     if machine.num_threads is not None:
         if not 1 <= machine.num_threads <= MOST_THREADS:
             raise ConfigError(f"--machine.num-threads is {machine.num_threads}; it must be from 1 to {MOST_THREADS}")
         torch.set_num_threads(machine.num_threads)
+    elif several.local_count > 1:  # torchrun has set it to 1
+        torch.set_num_threads(max(num_cores() // several.local_count, 1))
     available = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
-    if machine.device_type == "auto":
-        return torch.device("cuda" if available["cuda"] else "cpu")
-    if not available[machine.device_type]:
-        raise ConfigError(f"--machine.device-type {machine.device_type}: this machine or this torch has none")
-    return torch.device(machine.device_type)
+    kind = ("cuda" if available["cuda"] else "cpu") if machine.device_type == "auto" else machine.device_type
+    if not available[kind]:
+        raise ConfigError(f"--machine.device-type {kind}: this machine or this torch has none")
+    if kind != "cuda" or several.count == 1:
+        return torch.device(kind)
+    if several.local_rank >= torch.cuda.device_count():
+        found = f"{torch.cuda.device_count()} GPUs for {several.local_count} processes"
+        raise ConfigError(f"this machine has {found}; --nproc-per-node must not be more")
+    torch.cuda.set_device(several.local_rank)
+    return torch.device(kind, several.local_rank)
+
+
+def num_cores() -> int:
+    """Return the number of CPU cores that this process may use."""
+    allowed = getattr(os, "sched_getaffinity", None)  # Linux alone
+    return len(allowed(0)) if allowed is not None else os.cpu_count() or 1
 
 
 def has_bfloat16(device: torch.device) -> bool:
@@ -62,17 +83,18 @@ def cpu_features() -> frozenset[str]:
     return next((frozenset(line.split(":", 1)[1].split()) for line in lines if line.startswith("flags")), frozenset())
 
 
-def seed_step(seed: int, step: int) -> None:
+def seed_step(seed: int, step: int, stream: int = 0) -> None:
     """Seed PyTorch's generators for one step.
 
-    Every random number is then a function of (seed, step): a resumed run has the same bits as an uninterrupted one, and
-    random numbers drawn by an evaluation between two steps have no effect.
+    Every random number is then a function of (seed, step, stream): a resumed run has the same bits as an uninterrupted
+    one, and random numbers drawn by an evaluation between two steps have no effect.
 
     Args:
         seed: the run's seed.
         step: the step's number.
+        stream: number of the process that draws, or one of the streams that all share.
     """
-    number = stream_seed(seed, step)
+    number = stream_seed(seed, step, stream)
     torch.default_generator.manual_seed(number)
     if torch.cuda.is_initialized():  # before that, torch.manual_seed would queue every call until CUDA starts
         torch.cuda.manual_seed_all(number)
@@ -80,15 +102,33 @@ def seed_step(seed: int, step: int) -> None:
         torch.mps.manual_seed(number)
 
 
-def stream_seed(seed: int, step: int) -> int:
-    """Return the seed of the random stream of one step, a well mixed integer of 63 bits.
+@contextmanager
+def shared_stream(seed: int, step: int, stream: int) -> Iterator[None]:
+    """Draw the same random numbers in all processes within a `with` block; a single process goes on as before.
 
     Args:
         seed: the run's seed.
         step: the step's number.
+        stream: number of the shared stream: BEFORE_STEP or AFTER_STEP.
+    """
+    if processes().count == 1:
+        yield
+        return
+    with torch.random.fork_rng([torch.cuda.current_device()] if torch.cuda.is_initialized() else []):
+        seed_step(seed, step, stream)
+        yield
+
+
+def stream_seed(seed: int, step: int, stream: int = 0) -> int:
+    """Return the seed of a random stream of one step, a well mixed integer of 63 bits.
+
+    Args:
+        seed: the run's seed.
+        step: the step's number.
+        stream: number of the stream.
     """
     state = 0x9E3779B97F4A7C15
-    for value in (seed, step):
+    for value in (seed, step, stream) if stream else (seed, step):
         state = ((state ^ (value & 0xFFFFFFFFFFFFFFFF)) * 0xBF58476D1CE4E5B9) & 0xFFFFFFFFFFFFFFFF
         state ^= state >> 31
     return state >> 1

@@ -40,6 +40,10 @@ class DivergenceError(NerfloomError):
     """Training met non-finite values in too many consecutive steps."""
 
 
+class LostProcessError(NerfloomError):
+    """Another process that trains the same run has ended, or no longer has the same model."""
+
+
 def is_out_of_memory(error: BaseException) -> bool:
     """Return whether `error` is an out-of-memory error, Python's own or one of the several that PyTorch raises."""
     text = str(error)

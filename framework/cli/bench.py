@@ -13,6 +13,7 @@ from framework.base.child import python_command
 from framework.base.console import say
 from framework.base.errors import ConfigError, nearest
 from framework.base.extras import install_command
+from framework.cli.bench_processes import ProcessesFlags, measure_processes
 from framework.cli.common import chosen_kind, make_room, run_command
 
 USAGE = """\
@@ -23,6 +24,7 @@ usage: ns-bench WHAT [flags]
   methods          time to each PSNR of every built-in method, on the embedded scene or on --data
   ablation         effect of each part of instant-ngp: training with one part switched off, or on, in turn
   starts           where Gaussians start: time to a PSNR from points, a field's surfaces, silhouettes, or anywhere
+  processes        time to each PSNR with one process and with several, started by torchrun, on the same cores
   profile-step     time of a training step: of each compiled kernel, and of Python and torch
   contention       speed of training and rendering beside other programs
   cache            memory and speed with a large image set under --cache-limit, and with a small one in memory
@@ -375,6 +377,7 @@ KINDS: dict[str, tuple[type, Any]] = {
     "methods": (MethodFlags, _methods),
     "ablation": (AblationFlags, _ablation),
     "starts": (StartsFlags, _starts),
+    "processes": (ProcessesFlags, measure_processes),
     "profile-step": (ProfileFlags, _profile),
     "contention": (ContentionFlags, _contention),
     "cache": (CacheFlags, _cache),

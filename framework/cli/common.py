@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import framework
-from framework.base.console import say
+from framework.base.console import console, say
 from framework.base.errors import ConfigError, NerfloomError, is_out_of_memory, nearest
 from framework.base.from_nerfstudio import KINDS
 from framework.base.registry import registered
@@ -147,11 +147,13 @@ def run_command(command: Callable[[list[str]], None]) -> None:
     except (NerfloomError, OSError) as error:
         if debug:
             raise
+        console.quiet = False  # of several processes, each says why it ends
         say(f"error: {in_our_words(error)}")
         sys.exit(1)
     except (MemoryError, RuntimeError) as error:
         if debug or not is_out_of_memory(error):
             raise
+        console.quiet = False
         say("error: there is not enough memory; smaller settings, such as --num-rays-per-batch, take less")
         sys.exit(1)
     except KeyboardInterrupt as stop:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+import torch
 
 from framework.base.console import say
 from framework.base.device import choose_device, peak_memory
-from framework.base.errors import ConfigError
+from framework.base.errors import ConfigError, LostProcessError
 from framework.base.extras import install_command
+from framework.base.processes import from_first, joined_processes, processes
 from framework.evaluation.evaluator import evaluate
 from framework.model import StartsFromImages
 from framework.splats.gaussians import HasGaussians
@@ -16,11 +22,12 @@ from framework.training.checkpoint import FOLDER, list_checkpoints, load_newest
 from framework.training.datasets import first_split, load_split
 from framework.training.lock import sole_user
 from framework.training.machine import kernels
+from framework.training.outcome import Outcome
 from framework.training.report import write_evaluation, write_summary
 from framework.training.run import Run, create_folder, write_report, write_transforms
-from framework.training.signals import Stopped, signal_of
+from framework.training.signals import Stopped, handled, signal_of
 from framework.training.skipping import as_plain, lines, skip_report
-from framework.training.trainer import BetweenSteps, Outcome, Trainer
+from framework.training.trainer import BetweenSteps, Trainer
 
 PICTURES = 4
 """Maximum number of held-out views of which images are written at the end."""
@@ -34,12 +41,17 @@ def start(run: Run) -> None:
     Raises:
         Stopped: if a signal ends it; the message says what was saved.
     """
-    trainer = _prepare(run)
-    run = trainer.run  # with open settings filled in
-    trainer.restore_as_configured()
-    with sole_user(run.folder):
-        create_folder(run)
-        _finish(run, trainer)
+    with joined_processes() as several:
+        run = replace(run, folder=Path(from_first(str(run.folder))))  # it is named by the time
+        trainer = _prepare(run)
+        run = trainer.run  # with open settings filled in
+        if not several.first:
+            _follow(trainer)
+            return
+        trainer.restore_as_configured()
+        with sole_user(run.folder):
+            create_folder(run)
+            _finish(run, trainer)
 
 
 def resume(run: Run) -> None:
@@ -48,8 +60,11 @@ def resume(run: Run) -> None:
     Raises:
         Stopped: if a signal ends it; the message says what was saved.
     """
-    with sole_user(run.folder):
+    with joined_processes() as several, sole_user(run.folder) if several.first else nullcontext():
         trainer = _prepare(run)
+        if not several.first:
+            _follow(trainer)
+            return
         checkpoint = load_newest(run.folder / FOLDER, trainer.device)
         if checkpoint is None:
             trainer.restore_as_configured()
@@ -65,9 +80,12 @@ def _prepare(run: Run) -> Trainer:
         raise ConfigError(f"--vis {run.config.vis} needs viser: {command}")
     device = choose_device(run.config.machine)
     train_set = load_split(run, "train").to(device)
-    eval_set = first_split(run, ("val", "test"))
+    eval_set = first_split(run, ("val", "test")) if processes().first else None
     source = run.config.data or "the embedded scene"
     say(f"{run.method} on {source} ({run.dataparser}), on {device.type}, kernels: {kernels(device)}")
+    if processes().count > 1:
+        threads = torch.get_num_threads()
+        say(f"{processes().count} processes with batches of their own; CPU threads of each: {threads}")
     trainer = Trainer(run, train_set, None if eval_set is None else eval_set.to(device))
     for line in trainer.profile().lines():
         say(line)
@@ -78,13 +96,34 @@ def _prepare(run: Run) -> Trainer:
     return trainer
 
 
+def _follow(trainer: Trainer) -> None:
+    """Train along with the first process, which alone writes and evaluates."""
+    stopped_by = _train(trainer).stopped_by
+    if stopped_by is not None:
+        raise Stopped(stopped_by)
+
+
+def _train(trainer: Trainer, between_steps: BetweenSteps | None = None) -> Outcome:
+    """Train. If another process ends after the first step, save what there is, and say how to continue."""
+    try:
+        return trainer.train(between_steps)
+    except LostProcessError as error:
+        if trainer.state.step == 0:
+            raise
+        if processes().first:
+            with handled((signal.SIGTERM,), lambda number, frame: None):  # torchrun sends it when a process has ended
+                trainer.save()
+        where, command = f"step {trainer.state.step:,}", f"ns-train --resume {trainer.run.folder}"
+        raise LostProcessError(f"{where}: {error}; continue with: {command}") from error
+
+
 def _finish(run: Run, trainer: Trainer) -> None:
     # Also when a run is resumed, as it may have been killed before.
     write_transforms(run, trainer.train_set)
     if trainer.first_step == 0:  # a resumed run has no open settings left
         write_report(run.folder / "scene_profile.json", trainer.profile().as_plain())
     with _noted_stop(lambda: _saved_note(trainer)), _viewer(trainer) as between_steps:
-        outcome = trainer.train(between_steps)
+        outcome = _train(trainer, between_steps)
     state = trainer.state
     say(
         f"{outcome.reason}: step {state.step:,}, {state.seconds:.1f} s of training, "

@@ -1,9 +1,9 @@
 """Colours of future batches, read ahead from a file in the file's order.
 
-The pixels of a step are a function of (seed, step) alone (`device.seed_step`), so they can be drawn long before the
-step. A thread draws and sorts the pixels of many steps and reads them from front to back, while training continues with
-those of earlier steps. Each batch has the same bits as with all pixels in memory, however far is read ahead, and a
-resumed run does not depend on what an earlier one had read.
+The pixels of a step are a function of seed, step and process alone (`device.seed_step`), so they can be drawn long
+before the step. A thread draws and sorts the pixels of many steps and reads them from front to back, while training
+continues with those of earlier steps. Each batch has the same bits as with all pixels in memory, however far is read
+ahead, and a resumed run does not depend on what an earlier one had read.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from framework.base.device import stream_seed
+from framework.base.processes import processes
 from framework.data.dataset import Dataset
 
 MOST_STEPS = 64
@@ -113,7 +114,7 @@ class PixelStream:
         bits, generator = total.bit_length(), torch.Generator()
         numbers = np.empty(total, np.int64)
         for index in range(steps):
-            generator.manual_seed(stream_seed(self.seed, first + index))
+            generator.manual_seed(stream_seed(self.seed, first + index, processes().rank))
             part = numbers[index * count : (index + 1) * count]
             part[:] = torch.randint(self.total, (count,), generator=generator).numpy()
         numbers <<= bits

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from framework.base.config import RayConfig, TrainConfig
+from framework.base.processes import processes
 from framework.cameras.cameras import CENTER, subpixels
 from framework.cameras.view import View
 from framework.data.dataset import Dataset
@@ -44,8 +45,8 @@ class Request:
 class BatchSource(ABC):
     """Base class of sources, which draw the training batches.
 
-    A batch depends only on torch's generator, which is seeded by (seed, step) before each step, and on what the source
-    has learnt, so that a run that is resumed in another process draws the same batches.
+    A batch depends only on torch's generator, which is seeded by (seed, step, number of the process) before each step,
+    and on what the source has learnt, so that a run that is resumed in another process draws the same batches.
     """
 
     dataset: Dataset
@@ -130,6 +131,8 @@ class PixelSource(BatchSource):
 class ViewSource(BatchSource):
     """A source of whole images, one per step, in an order that is drawn anew for each pass over them.
 
+    Several processes take turns in this order.
+
     Args:
         dataset: the images.
         background: background of transparent pixels; if "random", one colour for the whole image.
@@ -163,8 +166,9 @@ class ViewSource(BatchSource):
         return None if found is None else found.view(int(dataset.cameras.heights[index]), -1)
 
     def _index(self, step: int) -> int:
-        """Return the image of a training step, a function of the seed and the step alone."""
-        epoch, place = divmod(step, len(self.dataset))
+        """Return the image of a training step, a function of seed, step and process alone."""
+        several = processes()
+        epoch, place = divmod(step * several.count + several.rank, len(self.dataset))
         if self._order is None or self._order[0] != epoch:
             generator = torch.Generator().manual_seed((self.seed * 1_000_003 + epoch) % 2**63)
             self._order = epoch, torch.randperm(len(self.dataset), generator=generator).tolist()

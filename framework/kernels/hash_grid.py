@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from framework.base.errors import ConfigError, shown
-from framework.kernels import kept, native
+from framework.kernels import kept, memory, native
 from framework.kernels.adam import all_finite
 from framework.kernels.deferred import Parts, waiting
 from framework.kernels.dispatch import CPP, Operation
@@ -177,6 +177,7 @@ class TableGradient:
         self.layout = layout
         self.parts: Parts = []
         """Positions (N, 3) of each encoding, and gradient (N, L * F) of its result."""
+        self._sum: Tensor | None = None
 
     @property
     def pending(self) -> bool:
@@ -205,6 +206,16 @@ class TableGradient:
         into = native.pointer(grad, "the table's gradient", shape)
         _backward_table(*self._arguments(shape[1]), into, native.threads())
         self.parts.clear()
+
+    def summed(self, table: Tensor) -> Tensor:
+        """Return the accumulated gradient (E, F) of `table`, and discard it.
+
+        The result's memory is used again: its entries must be zero before the next call, as Adam leaves them.
+        """
+        if self._sum is None:
+            self._sum = memory.table(*table.shape)
+        self.add_to(self._sum)
+        return self._sum
 
     def adam(
         self, table: Tensor, mean: Tensor, square: Tensor, seen: Tensor,

@@ -223,6 +223,13 @@ class PlanesGradient:
 
         `mean`, `square`, `seen`, `rate`, `betas`, `eps` and the result are as in `sparse_adam`.
         """
+        return sparse_adam(table, self.summed(table), mean, square, seen, rate, betas, eps)
+
+    def summed(self, table: Tensor) -> Tensor:
+        """Return the accumulated gradient (E, F) of `table`, and discard it.
+
+        The result's memory is used again: its entries must be zero before the next call, as Adam leaves them.
+        """
         if self._sum is None:
             self._sum = memory.table(*table.shape)
         for positions, grad in self.parts:
@@ -230,7 +237,7 @@ class PlanesGradient:
         for first, grad in self.bands:
             self._sum[first : first + len(grad)] += grad
         self.clear()
-        return sparse_adam(table, self._sum, mean, square, seen, rate, betas, eps)
+        return self._sum
 
 
 class _Planes(torch.autograd.Function):

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from framework.base.processes import add_up
 from framework.kernels.splat_project import CUT, OPACITY, REACH_X, X, Y, rotation_matrices
 from framework.splats.gaussians import Gaussians
 
@@ -60,12 +61,12 @@ class GradientMean(nn.Module):
         self.sums[:, 1] += records[:, OPACITY] > 0
 
     def take(self, count: int) -> Tensor:
-        """Return the means (count,), 0 of what no image has shown, and begin anew.
+        """Return the means (count,) over the images of all processes, 0 of what none has shown, and begin anew.
 
         Args:
             count: number of Gaussians.
         """
-        sums = self.sums if len(self.sums) == count else self.sums.new_zeros(count, 2)
+        sums = add_up(self.sums if len(self.sums) == count else self.sums.new_zeros(count, 2))
         self.sums = self.sums.new_zeros(0, 2)
         return sums[:, 0] / sums[:, 1].clamp(min=1)
 

@@ -55,7 +55,7 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bo
     Raises:
         CheckpointError: if the file cannot be written; older checkpoints are then unchanged.
     """
-    path = _path(folder, step)
+    path = checkpoint_path(folder, step)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         content = io.BytesIO()  # if torch writes to a full disk, it reports "unexpected pos"
@@ -68,7 +68,7 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bo
     for remnant in folder.glob(".step-*.ckpt.*.tmp"):  # left by a process that was killed while writing
         remnant.unlink(missing_ok=True)
     earlier = [other for other in list_checkpoints(folder) if other.name < path.name]
-    previous = None if before is None else _path(folder, before)
+    previous = None if before is None else checkpoint_path(folder, before)
     kept = previous if previous in earlier else next(reversed(earlier), None)
     for old in earlier:
         if not keep_all and old != kept:
@@ -84,7 +84,8 @@ def _warn_of(version: str) -> None:
     )
 
 
-def _path(folder: Path, step: int) -> Path:
+def checkpoint_path(folder: Path, step: int) -> Path:
+    """Return the path of the checkpoint of a training `step` in a `folder`."""
     return folder / f"step-{step:09d}.ckpt"
 
 

@@ -72,6 +72,22 @@ class Adam(torch.optim.Optimizer):
                 return parameter
         return None
 
+    def has_gradient(self, parameter: Tensor) -> bool:
+        """Return whether a `parameter` has a gradient for the next step, deferred or not."""
+        deferred = self.deferred.get(parameter)
+        return parameter.grad is not None or (deferred is not None and deferred.pending)
+
+    @torch.no_grad()
+    def gradient(self, parameter: Tensor) -> Tensor:
+        """Return the gradient of a `parameter` as its `grad`, with what was deferred; zeros if there is none."""
+        deferred = self.deferred.get(parameter)
+        if deferred is not None and deferred.pending:
+            total = deferred.summed(parameter)
+            parameter.grad = total if parameter.grad is None else total.add_(parameter.grad)
+        elif parameter.grad is None:
+            parameter.grad = torch.zeros_like(parameter)
+        return parameter.grad
+
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
         """Update every parameter that has a gradient; `closure` is not used.

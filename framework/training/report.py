@@ -10,8 +10,9 @@ from framework.base.device import peak_memory
 from framework.base.errors import ConfigError
 from framework.evaluation.evaluator import Evaluation
 from framework.training.machine import kernels, machine
+from framework.training.outcome import Outcome
 from framework.training.run import Run, write_json, write_report
-from framework.training.trainer import Outcome, Trainer
+from framework.training.trainer import Trainer
 
 SUMMARY = "summary.json"
 """Name of the summary in a run's folder."""

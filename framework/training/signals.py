@@ -11,6 +11,8 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any
 
+from framework.base.console import console
+
 NUMBERS = (signal.SIGINT, signal.SIGTERM)
 NOTED = b"stopping after this step; again to stop at once, without saving\n"
 Handler = Callable[[int, FrameType | None], Any]
@@ -69,7 +71,7 @@ def stop_signals() -> Iterator[list[int]]:
         for other, handler in before.items():
             signal.signal(other, handler)
         with suppress(OSError, ValueError):  # not by `say`: the signal may have interrupted a print
-            os.write(sys.stderr.fileno(), NOTED)
+            os.write(sys.stderr.fileno(), b"" if console.quiet else NOTED)
 
     with handled(NUMBERS, note) as before:
         yield received

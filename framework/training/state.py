@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+from framework.base.processes import gathered, processes
 from framework.training.curve import Entry
 
 FIRST_SAMPLES_PER_RAY = 256.0
@@ -30,3 +33,26 @@ class State:
     """Evaluations of all held-out images."""
     looks: tuple[Entry, ...] = ()
     """Evaluations of a few held-out images."""
+
+
+def agree(state: State, received: Sequence[int]) -> Sequence[int]:
+    """Take over what decides on the next step from the first process: clock, samples per ray and last evaluation.
+
+    Args:
+        state: the state of this process, which is changed.
+        received: numbers of the signals that this process has received.
+
+    Returns:
+        Numbers of signals that any of the processes has received; `received` itself if there is one process.
+
+    Raises:
+        LostProcessError: if another process has ended.
+    """
+    if processes().count == 1:
+        return received
+    psnr = state.curve[-1][2] if state.curve else -math.inf
+    rows = gathered([state.seconds, state.samples_per_ray, psnr, next(iter(received), 0)])
+    if not processes().first:
+        state.seconds, state.samples_per_ray, psnr, _ = rows[0]
+        state.curve = ((state.seconds, state.step, psnr),)
+    return [int(row[-1]) for row in rows if row[-1]]

@@ -8,7 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from framework.base.device import AFTER_STEP, BEFORE_STEP, shared_stream
 from framework.model import Loss, Model
+from framework.training.mean_gradients import mean_gradients
 from framework.training.optim import Adam, set_learning_rate
 
 
@@ -21,11 +23,13 @@ class StepResult:
     squared_errors: Tensor
     """Squared error of each pixel, a mean over channels, in the shape of the batch's pixels."""
     finite: bool
-    """Whether the loss and all gradients were finite; if not, the step was dropped."""
+    """Whether the loss and all gradients were finite, in every process; if not, the step was dropped."""
 
 
 def train_step(model: Model[Any], optimizer: Adam, batch: Any, step: int, progress: float) -> StepResult:
     """Take one training step: forward, backward, Adam. A step that is not finite changes no parameter.
+
+    Several processes take the step together, each with its own batch and all with the mean gradient.
 
     Args:
         model: the model to train.
@@ -36,11 +40,12 @@ def train_step(model: Model[Any], optimizer: Adam, batch: Any, step: int, progre
     """
     set_learning_rate(optimizer, model.config, step, progress)
     loss = forward(model, batch, step, progress, model.uses_bfloat16)
-    finite = backward(loss.total, optimizer)
-    if finite and loss.total.requires_grad:
-        optimizer.step()
+    finite = mean_gradients(optimizer, backward(loss.total, optimizer))
     if finite:
-        for change in model.after_step(step, progress):
+        optimizer.step()
+        with shared_stream(model.config.machine.seed, step, AFTER_STEP):
+            changes = model.after_step(step, progress)
+        for change in changes:
             optimizer.change_rows(change)
     squared_errors = (loss.rgb - batch.rgb).square().mean(-1)
     return StepResult(loss, squared_errors, finite)
@@ -58,7 +63,8 @@ def forward(model: Model[Any], batch: Any, step: int, progress: float, bfloat16:
     """
     model.train()
     with torch.autocast(model.device.type, torch.bfloat16, enabled=bfloat16):
-        model.before_step(step, progress)
+        with shared_stream(model.config.machine.seed, step, BEFORE_STEP):
+            model.before_step(step, progress)
         return model.loss(batch, step)
 
 

@@ -7,7 +7,7 @@ import signal
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from framework.base.config import RayConfig, TrainConfig, to_plain
 from framework.base.console import say
 from framework.base.device import seed_step, wait_for
 from framework.base.errors import CheckpointError, DivergenceError
+from framework.base.processes import alone, from_first, processes
 from framework.base.registry import load_method
 from framework.data.dataset import Dataset
 from framework.data.pixels import composite
@@ -28,14 +29,15 @@ from framework.evaluation.panels import composed, view_panels
 from framework.kernels.native import torch_on_one_thread
 from framework.model import StartsFromImages
 from framework.scene.profile import SceneProfile
-from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest, save_checkpoint
+from framework.training.checkpoint import FOLDER, checkpoint_path, load_checkpoint, load_newest, save_checkpoint
 from framework.training.curve import FewImages, Point, in_order, rows
 from framework.training.optim import first_non_finite, make_optimizer
+from framework.training.outcome import Outcome
 from framework.training.preparation import profile_of, skip_by_silhouettes
 from framework.training.progress import ProgressBar, StepReport, TensorBoard
 from framework.training.run import Run, write_report
 from framework.training.signals import stop_signals
-from framework.training.state import State
+from framework.training.state import State, agree
 from framework.training.step import train_step
 from framework.training.trained import build_model, restore_model
 
@@ -53,25 +55,10 @@ BetweenSteps = Callable[[StepReport, Sequence[int]], None]
 """Function of a step's report and of the signals received so far, which grow while it runs."""
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """End of training: its reason and the last checkpoint."""
-
-    reason: str
-    """Reason for which training stopped, for people."""
-    stopped_by: int | None
-    """Number of the signal that stopped training; None if no signal did."""
-    checkpoint: Path
-    """Path of the last checkpoint."""
-
-    @property
-    def interrupted(self) -> bool:
-        """True if a signal stopped training."""
-        return self.stopped_by is not None
-
-
 class Trainer:
     """Trainer of one run.
+
+    Of several processes, each has a trainer. Only that of the first evaluates and writes.
 
     Args:
         run: method, settings and folder.
@@ -111,11 +98,17 @@ class Trainer:
     def save(self) -> Path:
         """Write a checkpoint, from which training continues with the same bits, and return its path."""
         self._last_save = self.state.seconds
-        scene = self.model.scene
-        content = {
+        step, keep_all = self.state.step, not self.config.save_only_latest_checkpoint
+        path = save_checkpoint(self.checkpoint_folder, step, self._content(), keep_all, before=self._saved_step)
+        self._saved_step = step
+        return path
+
+    def _content(self) -> dict[str, Any]:
+        """Return the content of a checkpoint."""
+        return {
             "method": self.run.method,
             "config": to_plain(self.config),
-            "scene": vars(scene.to("cpu")),
+            "scene": vars(self.model.scene.to("cpu")),
             "transform": self.train_set.transform,
             "scale": self.train_set.scale,
             "model": self.model.state_dict(),
@@ -123,10 +116,13 @@ class Trainer:
             "state": vars(self.state),
             "errors": self.source.state(),
         }
-        step, keep_all = self.state.step, not self.config.save_only_latest_checkpoint
-        path = save_checkpoint(self.checkpoint_folder, step, content, keep_all, before=self._saved_step)
-        self._saved_step = step
-        return path
+
+    def _join_first(self) -> None:
+        """Continue from the state of the first process, which alone reads a checkpoint and starts from the images."""
+        if processes().count > 1:
+            content = from_first(self._content(), self.device)
+            if not processes().first:
+                self.restore(content)
 
     def restore(self, checkpoint: dict[str, Any]) -> None:
         """Continue from the content of a `checkpoint`.
@@ -174,15 +170,16 @@ class Trainer:
         Raises:
             DivergenceError: after MAX_BAD_STEPS consecutive non-finite steps; earlier checkpoints remain.
             CheckpointError: if the last checkpoint cannot be written.
+            LostProcessError: if another of several processes ends.
         """
         self.prepare()
-        enabled = "tensorboard" in self.config.vis
+        first = processes().first
         with (
-            stop_signals() as stopped,
-            closing(TensorBoard(self.run.folder, enabled)) as board,
+            stop_signals() as received,
+            closing(TensorBoard(self.run.folder, first and "tensorboard" in self.config.vis)) as board,
             ProgressBar(self.run.method) as bar,
         ):
-            while (reason := self._reason_to_stop(stopped)) is None:
+            while (reason := self._reason_to_stop(stopped := agree(self.state, received))) is None:
                 report = self.train_step()
                 bar.show(report)
                 self._log(report, board)
@@ -191,12 +188,13 @@ class Trainer:
                 if self._due_to_save():
                     self._try_to_save()
                 if between_steps is not None:
-                    between_steps(report, stopped)
-            self._write_curve()
-            checkpoint = self.save()  # a first Ctrl-C does not interrupt it
-        return Outcome(reason, next(iter(stopped), None), checkpoint)
+                    between_steps(report, received)
+            if first:
+                self._write_curve()
+                self.save()  # a first Ctrl-C does not interrupt it
+        return Outcome(reason, next(iter(stopped), None), checkpoint_path(self.checkpoint_folder, self.state.step))
 
-    def _reason_to_stop(self, stopped: list[int]) -> str | None:
+    def _reason_to_stop(self, stopped: Sequence[int]) -> str | None:
         if stopped:
             return "stopped by " + signal.Signals(stopped[0]).name
         if self.state.step >= self.config.max_num_iterations:
@@ -228,12 +226,16 @@ class Trainer:
         if self._prepared:
             return
         self._prepared = True
+        self._join_first()
         start, fresh = time.perf_counter(), self.state.step == 0
         self.train_set = skip_by_silhouettes(self.config, self.model, self.train_set, fresh)
         self.source = self.source.drawing_from(self.train_set)
         if fresh and isinstance(self.model, StartsFromImages):
             seed_step(self.config.machine.seed, -1)  # before all steps, whatever was drawn since the model was made
-            self.model.start(self.train_set)
+            if processes().first:
+                with alone():
+                    self.model.start(self.train_set)
+            self._join_first()
         seconds = time.perf_counter() - start
         if fresh:
             self.state.seconds += seconds
@@ -252,7 +254,7 @@ class Trainer:
 
     def _train_step(self) -> StepReport:
         state, start = self.state, time.perf_counter()
-        seed_step(self.config.machine.seed, state.step)
+        seed_step(self.config.machine.seed, state.step, processes().rank)
         batch = self.source.draw(self._request())
         result = train_step(self.model, self.optimizer, batch, state.step, self.progress)
         self._count_bad(result.finite)
@@ -261,7 +263,7 @@ class Trainer:
         mse = float((result.squared_errors if weights is None else result.squared_errors * weights).mean())
         wait_for(self.device)
         seconds = time.perf_counter() - start
-        num_rays = len(batch) * getattr(batch, "rays_per_pixel", 1)
+        num_rays = len(batch) * getattr(batch, "rays_per_pixel", 1)  # about as many in each process
         self._account(num_rays, result.loss.num_samples, mse, seconds)
         return StepReport(
             step=state.step,
@@ -269,7 +271,7 @@ class Trainer:
             progress=self.progress,
             losses={name: float(value.detach()) for name, value in result.loss.terms.items()},
             psnr=self._train_psnr(),
-            rays_per_second=num_rays / seconds,
+            rays_per_second=num_rays * processes().count / seconds,
             held_out_psnr=state.looks[-1][2] if state.looks else None,
         )
 
@@ -304,7 +306,7 @@ class Trainer:
         state = self.state
         state.step += 1
         state.seconds += seconds
-        state.rays += num_rays
+        state.rays += num_rays * processes().count
         state.samples_per_ray += 0.2 * (num_samples / max(num_rays, 1) - state.samples_per_ray)
         if math.isfinite(mse):  # a dropped step's may be NaN, which would stay in the mean
             state.train_mse += max(0.02, 1 / state.step) * (mse - state.train_mse)
@@ -371,7 +373,7 @@ class Trainer:
         write_report(self.run.folder / "learning_curve.json", rows(in_order(self.state.curve, self.state.looks)))
 
     def _due_to_save(self) -> bool:
-        if self._bad_in_a_row:  # the parameters may be damaged; keep older checkpoints
+        if self._bad_in_a_row or not processes().first:  # the parameters may be damaged; keep older checkpoints
             return False
         aged = self.state.seconds - self._last_save >= self.config.seconds_per_save
         return aged or self.state.step % self.config.steps_per_save == 0

@@ -1,0 +1,60 @@
+"""Gradients of several processes: each takes the mean of all before the optimiser's step.
+
+`torch.nn.parallel.DistributedDataParallel` does so in hooks of autograd, which never run for tables whose gradient is
+deferred (`framework.kernels.deferred`). So the gradients are summed explicitly: large tables where they are, and all
+other parameters in one tensor, as each exchange takes time of its own.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from framework.base.errors import LostProcessError
+from framework.base.processes import add_up, gathered, processes
+from framework.training.optim import Adam
+
+LARGE = 2**18
+"""Number of elements from which a gradient is summed on its own."""
+
+
+@torch.no_grad()
+def mean_gradients(optimizer: Adam, finite: bool) -> bool:
+    """Replace the gradients by their means over all processes, unless one of them is not finite.
+
+    Where a process has no gradient of a parameter, it is taken as zero; a parameter without any gradient gets none.
+
+    Args:
+        optimizer: the optimiser, after the backward pass.
+        finite: whether all gradients of this process are finite.
+
+    Returns:
+        Whether all gradients of all processes are finite.
+
+    Raises:
+        LostProcessError: if another process has ended, or the parameters of the processes differ in size.
+    """
+    count = processes().count
+    if count == 1:
+        return finite
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    own = [parameter.numel() * optimizer.has_gradient(parameter) for parameter in parameters]
+    finite_there, *sizes = zip(*gathered([finite, *own]), strict=True)
+    if not all(finite_there):
+        return False
+    if any(len({*column} - {0}) > 1 for column in sizes):
+        raise LostProcessError("the processes' models differ in size; they need the same packages, CPUs and GPUs")
+    gradients = [optimizer.gradient(p) for p, column in zip(parameters, sizes, strict=True) if any(column)]
+    apart = [gradient for gradient in gradients if gradient.numel() >= LARGE and gradient.is_contiguous()]
+    for gradient in apart:
+        add_up(gradient.div_(count))
+    _mean_together([gradient for gradient in gradients if all(gradient is not other for other in apart)], count)
+    return True
+
+
+def _mean_together(gradients: list[Tensor], count: int) -> None:
+    """Replace gradients by their means over `count` processes, in one exchange."""
+    if gradients:
+        flat = add_up(torch.cat([gradient.reshape(-1) for gradient in gradients]).div_(count))
+        for gradient, mean in zip(gradients, flat.split([g.numel() for g in gradients]), strict=True):
+            gradient.copy_(mean.view_as(gradient))

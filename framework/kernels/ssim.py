@@ -27,7 +27,8 @@ import torch
 from torch import Tensor
 
 from framework.kernels import native
-from framework.kernels.dispatch import CPP, Operation
+from framework.kernels.dispatch import CPP, TRITON, Operation
+from framework.kernels.triton_kernels import later
 
 WINDOW = 11
 """Pixels along each side of the window."""
@@ -120,3 +121,6 @@ class _SSIM(torch.autograd.Function):
 def _compiled(image: Tensor, target: Tensor) -> Tensor:
     learned = image.requires_grad and torch.is_grad_enabled()
     return _SSIM.apply(image.contiguous(), target.contiguous(), learned)
+
+
+SSIM.implementation(TRITON, differentiable=1)(later("ssim", "ssim"))

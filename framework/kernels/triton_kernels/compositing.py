@@ -214,6 +214,9 @@ class _Distortion(torch.autograd.Function):
 
 
 def distortion(weights: Tensor, samples: Samples) -> Tensor:
-    """Compute `framework.kernels.compositing.distortion` of `weights` and `samples`, with the gradient of the weights."""
+    """Compute `framework.kernels.compositing.distortion`, with the weights' gradient.
+
+    `weights` and `samples` are as there.
+    """
     inputs = (tensor.contiguous() for tensor in (weights, samples.t_starts, samples.t_ends, samples.offsets))
     return _Distortion.apply(*inputs)

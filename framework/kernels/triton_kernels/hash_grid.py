@@ -25,7 +25,7 @@ PRIME_Y, PRIME_Z = tl.constexpr(2654435761), tl.constexpr(805459861)
 
 @functools.lru_cache(maxsize=16)
 def _levels(layout: HashGridLayout, device: torch.device) -> Tensor:
-    """Return resolution, first entry, mask of the hash, and whether it is dense (1 or 0) of each level, (L, 4) int64."""
+    """Return resolution, first entry, mask of the hash, and 1 if it is dense or else 0 of each level, (L, 4) int64."""
     rows = [
         (resolution, first, layout.offsets[level + 1] - first - 1, int(layout.is_dense(level)))
         for level, (resolution, first) in enumerate(zip(layout.resolutions, layout.offsets[:-1], strict=True))
@@ -68,7 +68,8 @@ def _forward(positions, table, levels, out, count, num_levels, F: tl.constexpr, 
     here = n < count
     f = tl.arange(0, F)
     resolution = tl.load(levels + level * 4).to(tl.int32)
-    first, mask, dense = tl.load(levels + level * 4 + 1), tl.load(levels + level * 4 + 2), tl.load(levels + level * 4 + 3)
+    first, mask = tl.load(levels + level * 4 + 1), tl.load(levels + level * 4 + 2)
+    dense = tl.load(levels + level * 4 + 3)
     x, u, _ = _along(positions, n, here, 0, resolution)
     y, v, _ = _along(positions, n, here, 1, resolution)
     z, w, _ = _along(positions, n, here, 2, resolution)
@@ -89,7 +90,8 @@ def _backward_table(positions, grad, levels, of_table, count, num_levels, F: tl.
     here = n < count
     f = tl.arange(0, F)
     resolution = tl.load(levels + level * 4).to(tl.int32)
-    first, mask, dense = tl.load(levels + level * 4 + 1), tl.load(levels + level * 4 + 2), tl.load(levels + level * 4 + 3)
+    first, mask = tl.load(levels + level * 4 + 1), tl.load(levels + level * 4 + 2)
+    dense = tl.load(levels + level * 4 + 3)
     x, u, _ = _along(positions, n, here, 0, resolution)
     y, v, _ = _along(positions, n, here, 1, resolution)
     z, w, _ = _along(positions, n, here, 2, resolution)

@@ -53,9 +53,7 @@ def _rows(image, target, line, maps, count, row, shorter, channels, WINDOW: tl.c
 
 
 @triton.jit
-def _windows(
-    maps, line, sums, slopes, size, count, row, c1, c2, WINDOW: tl.constexpr, BLOCK: tl.constexpr
-):
+def _windows(maps, line, sums, slopes, size, count, row, c1, c2, WINDOW: tl.constexpr, BLOCK: tl.constexpr):
     """Blur maps of `size` elements along columns; sum 1 - S, and write the three derivatives of S, if asked for."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
@@ -137,9 +135,7 @@ class _SSIM(torch.autograd.Function):
         maps, sums = image.new_empty(4, size), image.new_empty(blocks(count, BLOCK))
         slopes = image.new_empty(3, count) if learned else None
         launch(_rows, (blocks(size, BLOCK),), image, target, line, maps, size, row, shorter, channels, **constants)
-        launch(
-            _windows, (blocks(count, BLOCK),), maps, line, sums, slopes, size, count, shorter, C1, C2, **constants
-        )
+        launch(_windows, (blocks(count, BLOCK),), maps, line, sums, slopes, size, count, shorter, C1, C2, **constants)
         if slopes is not None:
             derivative = torch.empty_like(image)
             launch(

@@ -12,47 +12,11 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from framework.kernels.triton_kernels.harmonics import harmonics
 from framework.kernels.triton_kernels.launch import MAX_FLOAT, blocks, launch
 
 BLOCK = 256
 """Rows, or values, that are taken together."""
-
-
-@triton.jit
-def harmonics(x, y, z, k: tl.constexpr):
-    """Return the real spherical harmonic number `k`, 1 to 15, of directions `x`, `y`, `z`: Sloan 2008, appendix A2."""
-    value = x
-    if k == 1:
-        value = -0.4886025119029199 * y
-    if k == 2:
-        value = 0.4886025119029199 * z
-    if k == 3:
-        value = -0.4886025119029199 * x
-    if k == 4:
-        value = 1.0925484305920792 * x * y
-    if k == 5:
-        value = -1.0925484305920792 * y * z
-    if k == 6:
-        value = 0.31539156525252005 * (3 * z * z - 1)
-    if k == 7:
-        value = -1.0925484305920792 * x * z
-    if k == 8:
-        value = 0.5462742152960396 * (x * x - y * y)
-    if k == 9:
-        value = -0.5900435899266435 * y * (3 * x * x - y * y)
-    if k == 10:
-        value = 2.890611442640554 * x * y * z
-    if k == 11:
-        value = -0.4570457994644658 * y * (5 * z * z - 1)
-    if k == 12:
-        value = 0.3731763325901154 * z * (5 * z * z - 3)
-    if k == 13:
-        value = -0.4570457994644658 * x * (5 * z * z - 1)
-    if k == 14:
-        value = 1.445305721320277 * z * (x * x - y * y)
-    if k == 15:
-        value = -0.5900435899266435 * x * (x * x - 3 * y * y)
-    return value
 
 
 @triton.jit(do_not_specialize=["count"])

@@ -230,7 +230,7 @@ class _Blend(torch.autograd.Function):
         used = torch.empty(tiles, dtype=torch.int32, device=records.device)
         launch(
             _forward, (tiles,), records, lists.offsets, lists.ids, background, image, through, middle, used, width,
-            height, blocks(width, splat_tiles.TILE), CHANNELS=channels, BATCH=BATCH,
+            height, blocks(width, splat_tiles.TILE), CHANNELS=channels, BATCH=BATCH, num_warps=8,
         )  # fmt: skip
         ctx.save_for_backward(records, *lists, image, through, used)
         if middle is not None:
@@ -248,7 +248,7 @@ class _Blend(torch.autograd.Function):
         parts, out = records.new_zeros(len(ids), splat_project.RECORD), torch.empty_like(records)
         launch(
             _backward, (len(used),), records, offsets, ids, slots, image, through, used, of_image, of_through, parts,
-            width, height, blocks(width, splat_tiles.TILE), CHANNELS=channels, BATCH=BATCH,
+            width, height, blocks(width, splat_tiles.TILE), CHANNELS=channels, BATCH=BATCH, num_warps=8,
         )  # fmt: skip
         launch(_gather, (blocks(len(records), BLOCK),), records, firsts, parts, out, len(records), BLOCK=BLOCK)
         return out, None, None, None, None, None, None

@@ -55,7 +55,7 @@ def compare(
     """
     found = []
     for dtype, device, name in ((torch.float32, DEVICE, expected), (torch.float64, torch.device("cpu"), "reference")):
-        given = {key: value.to(device, dtype if value.is_floating_point() else None) for key, value in inputs.items()}
+        given = {key: value.to(device, dtype, copy=True) for key, value in inputs.items()}
         for key in followed.split():
             given[key].requires_grad_()
         with backends() as names:

@@ -20,7 +20,7 @@ def test_extremes() -> None:
     torch.manual_seed(0)
     image = torch.rand(12, 11, 2)
     assert compare(ssim, {"image": image, "target": image})[0] == 1
-    compare(ssim, {"image": torch.zeros(11, 11, 1), "target": torch.ones(11, 11, 1)}, "image", tolerance=1e-4)
+    compare(ssim, {"image": torch.zeros(11, 11, 1), "target": torch.ones(11, 11, 1)}, "image", tolerance=1e-3)
     compare(ssim, {"image": 100 * image, "target": -image}, "image", tolerance=1e-4)
 
 

@@ -232,7 +232,7 @@ class _Project(torch.autograd.Function):
         count, stride = len(parameters[0]), parameters[5].shape[2]
         records = parameters[0].new_zeros(count, splat_project.RECORD)
         view = *camera.intrinsics, float(camera.width), float(camera.height)
-        constants = {"ANTIALIASED": camera.antialiased, "BASIS": basis, "BLOCK": BLOCK}
+        constants: dict[str, Any] = {"ANTIALIASED": camera.antialiased, "BASIS": basis, "BLOCK": BLOCK}
         launch(
             _forward, (blocks(count, BLOCK),), *parameters, pose, records, dropped, count, stride, *view, camera.near,
             camera.blur, **constants,

@@ -22,9 +22,7 @@ LAYOUTS = {
 def test_features(name: str, count: int, features: int) -> None:
     torch.manual_seed(0)
     layout = LAYOUTS[name]
-    given = {
-        "positions": torch.rand(count, layout.dims) * 1.2 - 0.1, "table": torch.rand(layout.num_entries, features)
-    }
+    given = {"positions": torch.rand(count, layout.dims) * 1.2 - 0.1, "table": torch.rand(layout.num_entries, features)}
     compare(lambda positions, table: planes(positions, table, layout), given, "positions table")
 
 

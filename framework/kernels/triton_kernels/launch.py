@@ -1,4 +1,4 @@
-"""What all kernels share: how they are started, optical depth, and exponentials that do not cancel.
+"""The start of kernels, and functions for them: optical depth, and an exponential that does not cancel.
 
 Sizes are passed as numbers, not as constants of the kernel, and Triton is told not to compile for special values of
 them: a kernel is compiled once, whatever the number of rays or samples. Constants are those of a method, such as the

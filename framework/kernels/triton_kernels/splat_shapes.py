@@ -1,7 +1,8 @@
-"""From Gaussians to ellipses on a pinhole camera's image and back, as functions for kernels.
+"""Functions for kernels, from Gaussians to ellipses on a pinhole camera's image and back.
 
 `framework.kernels.splat_project` has the equations. T has the rows a and b, the covariance of an ellipse the entries a,
-b and c. A name that starts with `of_` is the gradient of what follows.
+b and c. A name that starts with `of_` is the gradient of what follows. All values are vectors, of a Gaussian in each
+lane, but for the camera's; `pose` and the like are pointers.
 """
 
 import triton
@@ -14,7 +15,10 @@ OPACITY, DISTANCE = tl.constexpr(splat_project.OPACITY), tl.constexpr(splat_proj
 
 @triton.jit
 def three(values, n, here):
-    """Return the columns of rows of three."""
+    """Return the columns of rows of three.
+
+    Its arguments are `values, n, here`.
+    """
     row = values + n * 3
     x, y = tl.load(row, mask=here, other=0.0), tl.load(row + 1, mask=here, other=0.0)
     return x, y, tl.load(row + 2, mask=here, other=0.0)
@@ -22,7 +26,10 @@ def three(values, n, here):
 
 @triton.jit
 def put_three(values, n, here, shown, x, y, z):
-    """Write rows of three, of zeros for what is not shown."""
+    """Write rows of three, of zeros for what is not shown.
+
+    Its arguments are `values, n, here, shown, x, y, z`.
+    """
     tl.store(values + n * 3, tl.where(shown, x, 0.0), mask=here)
     tl.store(values + n * 3 + 1, tl.where(shown, y, 0.0), mask=here)
     tl.store(values + n * 3 + 2, tl.where(shown, z, 0.0), mask=here)
@@ -30,7 +37,10 @@ def put_three(values, n, here, shown, x, y, z):
 
 @triton.jit
 def to_camera(pose, x, y, z):
-    """Return positions in the camera's frame."""
+    """Return positions in the camera's frame.
+
+    Its arguments are `pose, x, y, z`.
+    """
     p0 = tl.load(pose) * x + tl.load(pose + 1) * y + tl.load(pose + 2) * z + tl.load(pose + 3)
     p1 = tl.load(pose + 4) * x + tl.load(pose + 5) * y + tl.load(pose + 6) * z + tl.load(pose + 7)
     p2 = tl.load(pose + 8) * x + tl.load(pose + 9) * y + tl.load(pose + 10) * z + tl.load(pose + 11)
@@ -49,7 +59,10 @@ def _centre(pose):
 
 @triton.jit
 def quaternion(rotations, n, here):
-    """Return unit quaternions, their lengths, 1 where they are too short, and whether they are long enough."""
+    """Return unit quaternions, their lengths, 1 where they are too short, and whether they are long enough.
+
+    Its arguments are `rotations, n, here`.
+    """
     row = rotations + n * 4
     w, x = tl.load(row, mask=here, other=1.0), tl.load(row + 1, mask=here, other=0.0)
     y, z = tl.load(row + 2, mask=here, other=0.0), tl.load(row + 3, mask=here, other=0.0)
@@ -61,7 +74,10 @@ def quaternion(rotations, n, here):
 
 @triton.jit
 def axes(w, x, y, z):
-    """Return the rotation matrices of unit quaternions, row by row."""
+    """Return the rotation matrices of unit quaternions, row by row.
+
+    Its arguments are `w, x, y, z`.
+    """
     r00, r01, r02 = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
     r10, r11, r12 = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
     r20, r21, r22 = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
@@ -70,7 +86,10 @@ def axes(w, x, y, z):
 
 @triton.jit
 def plane(p0, p1, depth, fx, fy, cx, cy, width, height):
-    """Return 1 / z, x / z and y / z, and both again as the Jacobian takes them, bounded."""
+    """Return 1 / z, x / z and y / z, and both again as the Jacobian takes them, bounded.
+
+    Its arguments are `p0, p1, depth, fx, fy, cx, cy, width, height`.
+    """
     over = 1 / depth
     x, y = p0 * over, p1 * over
     margin_x, margin_y = 0.15 * width, 0.15 * height
@@ -81,7 +100,10 @@ def plane(p0, p1, depth, fx, fy, cx, cy, width, height):
 
 @triton.jit
 def column(pose, r0, r1, r2, s, over, bounded_x, bounded_y, fx, fy):
-    """Return an axis times its scale in the camera's frame, and its image under the Jacobian."""
+    """Return an axis times its scale in the camera's frame, and its image under the Jacobian.
+
+    Its arguments are `pose, r0, r1, r2, s, over, bounded_x, bounded_y, fx, fy`.
+    """
     v0 = (tl.load(pose) * r0 + tl.load(pose + 1) * r1 + tl.load(pose + 2) * r2) * s
     v1 = (tl.load(pose + 4) * r0 + tl.load(pose + 5) * r1 + tl.load(pose + 6) * r2) * s
     v2 = (tl.load(pose + 8) * r0 + tl.load(pose + 9) * r1 + tl.load(pose + 10) * r2) * s
@@ -90,7 +112,10 @@ def column(pose, r0, r1, r2, s, over, bounded_x, bounded_y, fx, fy):
 
 @triton.jit
 def covariance(a0, a1, a2, b0, b1, b2, blur):
-    """Return the covariance a, b, c, its determinant, that without the blur, and the product of the rows of T."""
+    """Return the covariance a, b, c, its determinant, that without the blur, and the product of the rows of T.
+
+    Its arguments are `a0, a1, a2, b0, b1, b2, blur`.
+    """
     c0, c1, c2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
     first, second = a0 * a0 + a1 * a1 + a2 * a2, b0 * b0 + b1 * b1 + b2 * b2
     det_0 = c0 * c0 + c1 * c1 + c2 * c2
@@ -100,7 +125,10 @@ def covariance(a0, a1, a2, b0, b1, b2, blur):
 
 @triton.jit
 def towards(x, y, z, pose):
-    """Return the unit vectors from the camera to positions, and the distances."""
+    """Return the unit vectors from the camera to positions, and the distances.
+
+    Its arguments are `x, y, z, pose`.
+    """
     center_x, center_y, center_z = _centre(pose)
     x, y, z = x - center_x, y - center_y, z - center_z
     length = tl.maximum(tl.sqrt(x * x + y * y + z * z), 1e-20)
@@ -112,6 +140,8 @@ def shape_back(grad, shown, a0, a1, a2, b0, b1, b2, blur, base, ANTIALIASED: tl.
     """Return the gradients of the rows of T, and of the logistic, from those of u_x, u_y, v_y and the opacity.
 
     u_x = sqrt(c / (2 det)), u_y = -b / sqrt(2 c det), v_y = 1 / sqrt(2 c).
+
+    Its arguments are `grad, shown, a0, a1, a2, b0, b1, b2, blur, base, ANTIALIASED`.
     """
     _, b, c, det, det_0, c0, c1, c2 = covariance(a0, a1, a2, b0, b1, b2, blur)
     of_u_x = tl.load(grad + 2, mask=shown, other=0.0)
@@ -143,7 +173,10 @@ def shape_back(grad, shown, a0, a1, a2, b0, b1, b2, blur, base, ANTIALIASED: tl.
 
 @triton.jit
 def column_back(pose, of_a, of_b, r0, r1, r2, s, over, bounded_x, bounded_y, fx, fy):
-    """Return, of an axis, the gradients of itself, its scale, itself times that in the camera's frame, and J's rows."""
+    """Return, of an axis, the gradients of itself, its scale, itself times that in the camera's frame, and J's rows.
+
+    Its arguments are `pose, of_a, of_b, r0, r1, r2, s, over, bounded_x, bounded_y, fx, fy`.
+    """
     v0, v1, v2, _, _ = column(pose, r0, r1, r2, s, over, bounded_x, bounded_y, fx, fy)
     of_v0, of_v1 = fx * over * of_a, fy * over * of_b
     of_v2 = -bounded_x * of_v0 - bounded_y * of_v1
@@ -158,7 +191,10 @@ def column_back(pose, of_a, of_b, r0, r1, r2, s, over, bounded_x, bounded_y, fx,
 
 @triton.jit
 def rotation_back(w, x, y, z, norm, g00, g01, g02, g10, g11, g12, g20, g21, g22):
-    """Return the gradients of quaternions from those of the matrices (`_axes`)."""
+    """Return the gradients of quaternions from those of the matrices (`_axes`).
+
+    Its arguments are `w, x, y, z, norm, g00, g01, g02, g10, g11, g12, g20, g21, g22`.
+    """
     of_w = 2 * (x * (g21 - g12) + y * (g02 - g20) + z * (g10 - g01))
     of_x = 2 * (y * (g01 + g10) + z * (g02 + g20) + w * (g21 - g12) - 2 * x * (g11 + g22))
     of_y = 2 * (x * (g01 + g10) + z * (g12 + g21) + w * (g02 - g20) - 2 * y * (g00 + g22))
@@ -174,7 +210,11 @@ def rotation_back(w, x, y, z, norm, g00, g01, g02, g10, g11, g12, g20, g21, g22)
 
 @triton.jit
 def position_back(grad, shown, p0, p1, p2, over, at_x, at_y, bounded_x, bounded_y, of_over, of_jx, of_jy, fx, fy):
-    """Return the gradients of the centre in the camera's frame: of the image position, the Jacobian, the distance."""
+    """Return the gradients of the centre in the camera's frame: of the image position, the Jacobian, the distance.
+
+    Its arguments are `grad, shown, p0, p1, p2, over, at_x, at_y, bounded_x, bounded_y, of_over, of_jx, of_jy, fx,
+    fy`.
+    """
     of_over = of_over - bounded_x * of_jx - bounded_y * of_jy
     of_x = fx * tl.load(grad, mask=shown, other=0.0) - tl.where(bounded_x == at_x, over * of_jx, 0.0)
     of_y = fy * tl.load(grad + 1, mask=shown, other=0.0) - tl.where(bounded_y == at_y, over * of_jy, 0.0)
@@ -210,7 +250,11 @@ def pose_back(
     sums, shown, pose, of_p0, of_p1, of_p2, x, y, z, of_x, of_y, of_z, v00, v01, v02, v10, v11, v12, v20, v21, v22,
     r00, r01, r02, r10, r11, r12, r20, r21, r22, s0, s1, s2,
 ):  # fmt: skip
-    """Write a program's sums for the pose: of the centre, of the axes, and of the camera's centre."""
+    """Write a program's sums for the pose: of the centre, of the axes, and of the camera's centre.
+
+    Its arguments are `sums, shown, pose, of_p0, of_p1, of_p2, x, y, z, of_x, of_y, of_z, v00, v01, v02, v10, v11,
+    v12, v20, v21, v22, r00, r01, r02, r10, r11, r12, r20, r21, r22, s0, s1, s2`.
+    """
     _pose_row(
         sums, shown, pose, 0, of_p0, x, y, z, of_x, of_y, of_z, v00 * s0, v01 * s1, v02 * s2, r00, r01, r02, r10, r11,
         r12, r20, r21, r22,

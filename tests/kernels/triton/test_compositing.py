@@ -72,7 +72,7 @@ def test_alphas_are_composited_too() -> None:
 
 
 def test_what_is_behind_a_wall_gets_no_light_and_no_rounding_errors() -> None:
-    """A sample of depth 1000 between two thin ones: in front of it the transmittance is exp(-0.1), to the last digit."""
+    """A sample of depth 1000 between two thin ones: in front of it transmittance is exp(-0.1), to the last digit."""
     offsets, given = rays([3])
     given["starts"], given["ends"] = torch.arange(3.0), torch.arange(3.0) + 1
     given["sigma"] = torch.tensor([0.1, 1000.0, 0.1])

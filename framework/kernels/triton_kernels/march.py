@@ -50,10 +50,8 @@ def block_distances(occupied: Tensor, resolution: int) -> Tensor:
 @triton.jit
 def _slab(origins, directions, box, r, here, axis: tl.constexpr, enter, leave):
     """Return where rays enter and leave the box, by one axis more."""
-    o, d = (
-        tl.load(origins + r * 3 + axis, mask=here, other=0.0),
-        tl.load(directions + r * 3 + axis, mask=here, other=1.0),
-    )
+    o = tl.load(origins + r * 3 + axis, mask=here, other=0.0)
+    d = tl.load(directions + r * 3 + axis, mask=here, other=1.0)
     low, high = tl.load(box + axis), tl.load(box + 3 + axis)
     over = 1 / tl.where(d == 0, 1.0, d)
     one, two = (low - o) * over, (high - o) * over

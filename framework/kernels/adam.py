@@ -16,7 +16,8 @@ from torch import Tensor
 from torch.optim.adam import adam
 
 from framework.kernels import native
-from framework.kernels.dispatch import CPP, TORCH, Operation
+from framework.kernels.dispatch import CPP, TORCH, TRITON, Operation
+from framework.kernels.triton_kernels import later
 
 _sparse = native.Function("adam_sparse", "pppppqifddfi", "q")
 _dense = native.Function("adam_dense", "ppppppifddfi")
@@ -48,7 +49,7 @@ def sparse_adam_reference(
 def sparse_adam(
     values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
     rate: float, betas: tuple[float, float], eps: float,
-) -> int:  # fmt: skip
+) -> int | Tensor:  # fmt: skip
     """Update, in place, the entries whose gradient is not zero, and set their gradient to zero.
 
     Args:
@@ -62,13 +63,14 @@ def sparse_adam(
         eps: added to the square root of the second moment.
 
     Returns:
-        the number of entries that were updated.
+        the number of entries that were updated; of a table on a GPU a tensor without dimensions, which it is not waited
+        for.
     """
     tensors = values, grad, mean, square, seen
     return SPARSE_ADAM(tensors, *tensors, rate, betas, eps)
 
 
-SPARSE_ADAM = Operation("sparse_adam", sparse_adam_reference)
+SPARSE_ADAM: Operation[..., int | Tensor] = Operation("sparse_adam", sparse_adam_reference)
 
 
 @SPARSE_ADAM.implementation(CPP)
@@ -82,6 +84,16 @@ def _sparse_adam(
         native.pointer(square, "square", shape), native.pointer(grad, "grad", shape),
         native.pointer(seen, "seen", shape[:1]), *shape, rate, *betas, eps, native.threads(),
     )  # fmt: skip
+
+
+def _all_rows_contiguous(
+    values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
+    rate: float, betas: tuple[float, float], eps: float,
+) -> bool:  # fmt: skip
+    return all(tensor.is_contiguous() for tensor in (values, grad, mean, square, seen))
+
+
+SPARSE_ADAM.implementation(TRITON, fits=_all_rows_contiguous)(later("adam", "sparse_adam"))
 
 
 @torch.no_grad()

@@ -20,8 +20,9 @@ from torch.nn import functional
 
 from framework.geometry.rays import Samples
 from framework.kernels import native
-from framework.kernels.dispatch import CPP, Operation
+from framework.kernels.dispatch import CPP, TRITON, Operation
 from framework.kernels.given import check_offsets
+from framework.kernels.triton_kernels import later
 
 MAX_OPTICAL_DEPTH = 1e3
 """Maximum optical depth of an interval, so that sums stay finite. exp(-1000) is 0 even in float64."""
@@ -211,6 +212,9 @@ def _composite(samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor,
     return Composited(*_Composite.apply(*inputs, points, samples.offsets, background.contiguous(), fars.contiguous()))
 
 
+COMPOSITE.implementation(TRITON, differentiable=2)(later("compositing", "composite"))
+
+
 def distortion_by_pairs(weights: Tensor, samples: Samples) -> Tensor:
     """Compute `distortion` of `weights` and `samples` over all pairs of samples of a ray, as its definition says."""
     middles, losses = (samples.t_starts + samples.t_ends) / 2, []
@@ -282,3 +286,6 @@ DISTORTION = Operation("distortion", distortion_reference)
 def _distortion_compiled(weights: Tensor, samples: Samples) -> Tensor:
     inputs = (tensor.contiguous() for tensor in (weights, samples.t_starts, samples.t_ends))
     return _Distortion.apply(*inputs, samples.offsets)
+
+
+DISTORTION.implementation(TRITON, differentiable=1)(later("compositing", "distortion"))

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from framework.geometry.bounds import contract
 from framework.kernels import kept, native
-from framework.kernels.dispatch import CPP, Operation
+from framework.kernels.dispatch import CPP, TRITON, Operation
+from framework.kernels.triton_kernels import later
 
 
 def contract_to_unit_reference(positions: Tensor, box: Tensor) -> Tensor:
@@ -40,6 +41,9 @@ CONTRACT = Operation("contract_to_unit", contract_to_unit_reference)
 @CONTRACT.implementation(CPP, differentiable=1)
 def _compiled(positions: Tensor, box: Tensor) -> Tensor:
     return _Contract.apply(positions.contiguous(), box)
+
+
+CONTRACT.implementation(TRITON, differentiable=1)(later("encodings", "contract_to_unit"))
 
 
 _forward = native.Function("contract_positions", "pppqpi")

@@ -16,7 +16,7 @@ from typing import Any, Generic, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-from framework.kernels import native
+from framework.kernels import native, triton_kernels
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -38,6 +38,10 @@ REFERENCE = Backend("reference", lambda tensor: True, lambda: True)
 TORCH = Backend("torch", lambda tensor: True, lambda: True)
 """Fast implementations by PyTorch itself, if they differ from the reference."""
 CPP = Backend("c++", attrgetter("is_cpu"), lambda: native.available())
+TRITON = Backend(
+    "triton", attrgetter("is_cpu" if triton_kernels.INTERPRETED else "is_cuda"), lambda: triton_kernels.available()
+)
+"""Kernels for NVIDIA's and AMD's GPUs. PyTorch names both "cuda"."""
 FLOAT32, INT64, BOOL = (frozenset({kind}) for kind in (torch.float32, torch.int64, torch.bool))
 
 

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from framework.kernels import kept, native
-from framework.kernels.dispatch import CPP, Operation
+from framework.kernels.dispatch import CPP, TRITON, Operation
+from framework.kernels.triton_kernels import later
 
 MAX_FREQUENCIES = 32
 """Maximum number of frequencies. In float32 the sines of the highest ones are noise already with fewer."""
@@ -93,3 +94,6 @@ FREQUENCY_ENCODING = Operation("frequency_encoding", frequency_encoding_referenc
 def _compiled(x: Tensor, num_frequencies: int, include_input: bool = True) -> Tensor:
     rows = x.flatten(0, -2).contiguous()
     return _FrequencyEncoding.apply(rows, num_frequencies, include_input).unflatten(0, x.shape[:-1])
+
+
+FREQUENCY_ENCODING.implementation(TRITON, fits=lambda x, *_: x.ndim >= 2)(later("encodings", "frequency_encoding"))

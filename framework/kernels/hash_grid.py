@@ -19,7 +19,8 @@ from framework.base.errors import ConfigError, shown
 from framework.kernels import kept, memory, native
 from framework.kernels.adam import all_finite
 from framework.kernels.deferred import Parts, waiting
-from framework.kernels.dispatch import CPP, Operation
+from framework.kernels.dispatch import CPP, TRITON, Operation
+from framework.kernels.triton_kernels import later
 
 PRIMES = (1, 2654435761, 805459861)
 """Factors of the hash (equation 4)."""
@@ -320,10 +321,17 @@ def _reference(positions: Tensor, table: Tensor, layout: HashGridLayout, deferre
 HASH_GRID = Operation("hash_grid", _reference)
 
 
-@HASH_GRID.implementation(CPP, fits=lambda positions, table, *_: table.shape[1] in (1, 2, 4, 8))
+def _fits(positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> bool:
+    return table.shape[1] in (1, 2, 4, 8)
+
+
+@HASH_GRID.implementation(CPP, fits=_fits)
 def _compiled(positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> Tensor:
     positions, table, placeholder = positions.contiguous(), table.contiguous(), None
     if deferred is not None and table.requires_grad:
         placeholder = waiting(table, positions, layout.num_levels * table.shape[1], deferred.parts)
         table = table.detach()
     return _HashGrid.apply(positions, table, placeholder, layout)
+
+
+HASH_GRID.implementation(TRITON, fits=_fits)(later("hash_grid", "hash_grid"))

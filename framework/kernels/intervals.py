@@ -12,7 +12,8 @@ from torch import Tensor
 
 from framework.kernels import native
 from framework.kernels.compositing import exclusive_cumsum, optical_depth
-from framework.kernels.dispatch import CPP, Operation
+from framework.kernels.dispatch import CPP, TRITON, Operation
+from framework.kernels.triton_kernels import later
 
 EPS = 1e-7
 """Added to weights in a denominator, so that the loss of intervals with weight 0 is finite."""
@@ -45,6 +46,9 @@ INTERVAL_WEIGHTS = Operation("interval_weights", interval_weights_reference)
 @INTERVAL_WEIGHTS.implementation(CPP)
 def _interval_weights(sigma: Tensor, t: Tensor) -> Tensor:
     return _Weights.apply(sigma.contiguous(), t.contiguous())
+
+
+INTERVAL_WEIGHTS.implementation(TRITON)(later("intervals", "interval_weights"))
 
 
 _weights = native.Function("interval_weights", "ppqqpi")
@@ -126,6 +130,9 @@ def _resample(edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: 
     return out
 
 
+RESAMPLE.implementation(TRITON)(later("intervals", "resample"))
+
+
 _resample_intervals = native.Function("resample_intervals", "pppqqqffpi")
 
 
@@ -162,6 +169,9 @@ PROPOSAL_EXCESS = Operation("proposal_excess", proposal_excess_reference)
 @PROPOSAL_EXCESS.implementation(CPP)
 def _proposal_excess(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor) -> Tensor:
     return _Excess.apply(*(tensor.contiguous() for tensor in (edges, weights, proposed, proposed_weights)))
+
+
+PROPOSAL_EXCESS.implementation(TRITON)(later("intervals", "proposal_excess"))
 
 
 _excess = native.Function("proposal_excess", "ppqppqqfppi")

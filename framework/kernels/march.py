@@ -22,8 +22,9 @@ from framework.geometry.bounds import intersect_box
 from framework.geometry.rays import Rays
 from framework.kernels import native
 from framework.kernels.compositing import optical_depth, segmented_sum
-from framework.kernels.dispatch import CPP, INT64, Operation
+from framework.kernels.dispatch import CPP, INT64, TRITON, Operation
 from framework.kernels.given import check_indices
+from framework.kernels.triton_kernels import later
 
 BLOCK = 4
 """Cells along an edge of a block, which is a cell of the coarser level."""
@@ -56,6 +57,11 @@ class Occupancy:
         address = native.pointer(self.occupied, "the occupancy", (self.resolution**3,), torch.bool)
         _pack(address, self.resolution, bits.data_ptr(), blocks.data_ptr())
         return bits, blocks
+
+    @cached_property
+    def distances(self) -> Tensor:
+        """(ceil(n / 4)^3,) uint8 distances of blocks, as in `packed`, but at most 16, for the march on a GPU."""
+        return later("march", "block_distances")(self.occupied, self.resolution)
 
     def cells(self, positions: Tensor) -> Tensor:
         """Return the index (N,) of the cell of each of `positions` (N, 3), or of the nearest cell if it is outside."""
@@ -305,6 +311,8 @@ def march(rays: Rays, occupancy: Occupancy, step: float, cone: float, shift: Ten
 
 MARCH: Operation[..., March] = Operation("march", ReferenceMarch)
 MARCH.implementation(CPP)(CompiledMarch)
+MARCH.implementation(TRITON)(later("march", "TritonMarch"))
+SORT_BY_RAY.implementation(TRITON, types=INT64)(later("march", "sort_by_ray"))
 
 
 def step_start(first: Tensor, k: Tensor, step: float, cone: float) -> Tensor:

@@ -5,8 +5,8 @@ them. A C function returns a status, which is raised as an exception here. The l
 (`csrc/parallel.h`), as many as torch is set to use. ctypes releases Python's lock during a call.
 
 The environment variable `NERFLOOM_KERNELS` overrides the choice: a variant's name (baseline, avx2, avx512,
-avx512_bf16), or "reference" for PyTorch only. `NERFLOOM_KERNEL_FOLDER` is a folder of libraries to use instead of the
-installed one (`make sanitize`).
+avx512_bf16), "triton" for Triton's kernels only, or "reference" for PyTorch only. `NERFLOOM_KERNEL_FOLDER` is a folder
+of libraries to use instead of the installed one (`make sanitize`).
 """
 
 from __future__ import annotations
@@ -68,14 +68,15 @@ def available() -> bool:
 @functools.cache
 def _load() -> tuple[str, ctypes.CDLL | None]:
     asked = os.environ.get("NERFLOOM_KERNELS", "auto")
-    if asked == "reference":
+    if asked in ("reference", "triton"):
         return "reference", None
     if asked == "auto":
         fitting = [name for name, needs in NEEDS.items() if cpu_features().issuperset(needs)]
     elif asked in NEEDS:
         fitting = [asked]
     else:
-        raise ConfigError(f"NERFLOOM_KERNELS is '{asked}'; it must be one of auto, reference, {', '.join(NEEDS)}")
+        known = ", ".join(("auto", "reference", *NEEDS, "triton"))
+        raise ConfigError(f"NERFLOOM_KERNELS is '{asked}'; it must be one of {known}")
     problem = "they were not built"
     for name in fitting:
         path = FOLDER / f"{name}{SUFFIX}"

@@ -22,7 +22,8 @@ from framework.base.errors import ConfigError, shown
 from framework.kernels import kept, memory, native
 from framework.kernels.adam import all_finite, sparse_adam
 from framework.kernels.deferred import Parts, waiting
-from framework.kernels.dispatch import CPP, Operation
+from framework.kernels.dispatch import CPP, TRITON, Operation
+from framework.kernels.triton_kernels import later
 
 MAX_GROUPS, MAX_FACTORS = 64, 6
 """Maximum number of groups, and of factors of a group."""
@@ -218,7 +219,7 @@ class PlanesGradient:
     def adam(
         self, table: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
         rate: float, betas: tuple[float, float], eps: float,
-    ) -> int:  # fmt: skip
+    ) -> int | Tensor:  # fmt: skip
         """Update `table` (E, F) by `framework.kernels.adam.sparse_adam` with this gradient, and discard the gradient.
 
         `mean`, `square`, `seen`, `rate`, `betas`, `eps` and the result are as in `sparse_adam`.
@@ -389,3 +390,6 @@ def _compiled(positions: Tensor, table: Tensor, layout: PlanesLayout, deferred: 
         placeholder = waiting(table, positions, layout.num_groups * table.shape[1], deferred.parts)
         table = table.detach()
     return _Planes.apply(positions, table, placeholder, layout)
+
+
+PLANES.implementation(TRITON)(later("planes", "planes"))

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from framework.kernels import kept, native
-from framework.kernels.dispatch import CPP, Operation
+from framework.kernels.dispatch import CPP, TRITON, Operation
+from framework.kernels.triton_kernels import later
 
 MAX_LEVELS = 4
 """Maximum number of bands."""
@@ -77,3 +78,6 @@ def _compiled(directions: Tensor, levels: int = 4) -> Tensor:
         return out
 
     return kept.result(("spherical_harmonics", levels), (rows,), (), compute)
+
+
+SPHERICAL_HARMONICS.implementation(TRITON, order=0)(later("encodings", "spherical_harmonics"))

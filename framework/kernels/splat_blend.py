@@ -20,9 +20,10 @@ import torch
 from torch import Tensor
 
 from framework.kernels import native
-from framework.kernels.dispatch import CPP, Operation
+from framework.kernels.dispatch import CPP, TRITON, Operation
 from framework.kernels.splat_project import CUT, DISTANCE, OPACITY, RECORD, RGB
 from framework.kernels.splat_tiles import TILE, TileLists
+from framework.kernels.triton_kernels import later
 
 MAX_ALPHA = 0.999
 """No Gaussian is more opaque: the gradient divides by 1 - alpha."""
@@ -193,3 +194,6 @@ def _compiled(
     records: Tensor, lists: TileLists, width: int, height: int, background: Tensor, channels: int, median: bool
 ) -> Blended:
     return Blended(*_Blend.apply(records.contiguous(), lists, width, height, background.contiguous(), channels, median))
+
+
+BLEND.implementation(TRITON, fits=_gradients_there)(later("splat_blend", "blend"))

@@ -24,8 +24,9 @@ from torch import Tensor
 
 from framework.geometry.lenses import Distortion, distort
 from framework.kernels import native
-from framework.kernels.dispatch import CPP, Operation
+from framework.kernels.dispatch import CPP, TRITON, Operation
 from framework.kernels.spherical_harmonics import spherical_harmonics_reference
+from framework.kernels.triton_kernels import later
 
 RECORD = 16
 """Values of a Gaussian on the image."""
@@ -82,7 +83,7 @@ class SplatCamera:
 def project_gaussians(
     means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
     camera: SplatCamera, degree: int = 3,
-) -> tuple[Tensor, int]:  # fmt: skip
+) -> tuple[Tensor, int | Tensor]:  # fmt: skip
     """Project N Gaussians to an image.
 
     All parameters and the camera's pose get gradients. Normals and the columns CUT, REACH_X and REACH_Y pass none on.
@@ -99,7 +100,8 @@ def project_gaussians(
 
     Returns:
         Records (N, RECORD), all zeros for a Gaussian that the image does not show, and the number of Gaussians that are
-        left out because a parameter is not finite or a quaternion is 0.
+        left out because a parameter is not finite or a quaternion is 0, which on a GPU may be a tensor without
+        dimensions.
 
     Raises:
         ValueError: if there is another number of harmonics.
@@ -222,7 +224,7 @@ def _angles(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return scale * x, scale * y, jacobian.unflatten(-1, (2, 2))
 
 
-PROJECT = Operation("project_gaussians", project_reference)
+PROJECT: Operation[..., tuple[Tensor, int | Tensor]] = Operation("project_gaussians", project_reference)
 _forward = native.Function("splat_project", "ppppppqiippi", "q")
 _backward = native.Function("splat_project_backward", "ppppppqiipppppppppp" + "i")
 
@@ -275,3 +277,13 @@ def _compiled(
     dropped: list[int] = []
     records = _Project.apply(camera, basis, dropped, *parameters, camera.pose)
     return records, dropped[0]
+
+
+def _is_pinhole(
+    means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
+    camera: SplatCamera, basis: int,
+) -> bool:  # fmt: skip
+    return camera.lens is None
+
+
+PROJECT.implementation(TRITON, fits=_is_pinhole)(later("splat_project", "project_gaussians"))

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from framework.kernels import native
-from framework.kernels.dispatch import CPP, Operation
+from framework.kernels.dispatch import CPP, TRITON, Operation
 from framework.kernels.splat_project import CUT, DISTANCE, REACH_X, REACH_Y, RECORD
+from framework.kernels.triton_kernels import later
 
 TILE = 16
 """Pixels along a tile's edge."""
@@ -98,3 +99,6 @@ def _compiled(records: Tensor, width: int, height: int) -> TileLists:
         ids.data_ptr(), slots.data_ptr(), threads,
     )  # fmt: skip
     return TileLists(offsets, ids[:entries], slots[:entries], firsts)
+
+
+TILES.implementation(TRITON)(later("splat_tiles", "tile_lists"))

@@ -27,7 +27,8 @@ import torch
 from torch import Tensor
 
 from framework.kernels import native
-from framework.kernels.dispatch import CPP, Operation
+from framework.kernels.dispatch import CPP, TRITON, Operation
+from framework.kernels.triton_kernels import later
 
 WINDOW = 11
 """Pixels along each side of the window."""
@@ -161,3 +162,6 @@ def _compiled(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
     learned = image.requires_grad and torch.is_grad_enabled()
     out: Tensor = _Photometric.apply(image.contiguous(), target.contiguous(), ssim_weight, learned)
     return out
+
+
+PHOTOMETRIC.implementation(TRITON, differentiable=1)(later("ssim", "photometric_loss"))

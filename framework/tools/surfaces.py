@@ -39,7 +39,6 @@ def found_surfaces(
     from framework.base.registry import load_method
     from framework.export.points import joined, surface_points
     from framework.training.run import Run
-    from framework.training.state import agree
     from framework.training.trainer import Trainer
 
     method = "nerfacto" if dataset.scene.unbounded else "instant-ngp"
@@ -53,7 +52,6 @@ def found_surfaces(
     trainer = Trainer(Run(method, settings, "", cast("Any", None), Path()), dataset, None)
     for _ in track(range(steps), "Looking for surfaces", total=steps):
         trainer.train_step()
-        agree(trainer.state, ())  # several processes stop after the same step
         if trainer.state.seconds >= seconds:
             break
     model = trainer.model.eval()

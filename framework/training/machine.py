@@ -12,7 +12,7 @@ import torch
 
 import framework
 from framework.base.device import machine_memory
-from framework.kernels import native
+from framework.kernels import native, triton_kernels
 
 
 def machine(device: torch.device | None = None) -> dict[str, Any]:
@@ -39,12 +39,14 @@ def machine(device: torch.device | None = None) -> dict[str, Any]:
 
 
 def kernels(device: torch.device | None = None) -> str:
-    """Return the variant of the compiled kernels used on a device, or "reference" for PyTorch alone.
+    """Return the variant of the compiled kernels used on a device, "triton", or "reference" for PyTorch alone.
 
     Args:
         device: device of the computation; the CPU if None.
     """
-    return native.variant() if device is None or device.type == "cpu" else "reference"
+    if device is None or device.type == "cpu":
+        return native.variant()
+    return "triton" if device.type == "cuda" and triton_kernels.available() else "reference"
 
 
 def processor() -> str:

@@ -40,7 +40,7 @@ class Adam(torch.optim.Optimizer):
     ) -> None:
         super().__init__(groups, {"lr": lr, "betas": betas, "eps": eps, "sparse": False})
         self.deferred = deferred
-        self.entries_updated = 0
+        self.entries_updated: int | Tensor = 0
         """Number of entries of sparse groups that were updated, summed over all steps."""
         self.entries_there = 0
         """Number of entries of sparse groups, summed over all steps."""

@@ -16,7 +16,7 @@ from framework.kernels import dispatch, native
 from framework.kernels.adam import ALL_FINITE, DENSE_ADAM, SPARSE_ADAM
 from framework.kernels.compositing import COMPOSITE, DISTORTION
 from framework.kernels.contraction import CONTRACT
-from framework.kernels.dispatch import Backend, Operation, derivatives
+from framework.kernels.dispatch import TRITON, Backend, Operation, derivatives
 from framework.kernels.frequency import FREQUENCY_ENCODING
 from framework.kernels.hash_grid import HASH_GRID, HashGridLayout, hash_grid
 from framework.kernels.intervals import INTERVAL_WEIGHTS, PROPOSAL_EXCESS, RESAMPLE
@@ -167,11 +167,16 @@ def test_every_operation_is_compared_with_its_reference() -> None:
     listed = dispatch.table()
     assert all(names[-1] == "reference" for names in listed.values())
     assert {name for name, names in listed.items() if len(names) > 1} == {operation.name for operation in CASES}
-    assert listed["hash_grid"] == ("c++", "reference")
+    assert listed["hash_grid"] == ("c++", "triton", "reference")
     assert listed["dense_adam"] == ("c++", "torch", "reference")
 
 
-PAIRS = [(operation, index) for operation in CASES for index in range(len(operation.implementations))]
+PAIRS = [  # Triton's are compared in tests/kernels/triton
+    (operation, index)
+    for operation in CASES
+    for index, implementation in enumerate(operation.implementations)
+    if implementation.backend is not TRITON
+]
 
 
 @pytest.mark.parametrize(
@@ -321,4 +326,4 @@ def test_a_third_backend_is_one_more_implementation(elsewhere: list[int]) -> Non
     out = hash_grid(torch.rand(5, 3, device="meta"), table.to("meta"), GRID)
     assert elsewhere == [5]
     assert out.is_meta
-    assert dispatch.table()["hash_grid"] == ("c++", "elsewhere", "reference")
+    assert dispatch.table()["hash_grid"] == ("c++", "triton", "elsewhere", "reference")

@@ -1,0 +1,63 @@
+"""Triton's kernels, by its interpreter: the tests in tests/kernels/triton, in a process of their own.
+
+Triton must know before it is imported whether it interprets, and the other tests must not be affected.
+"""
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from framework.kernels import native, triton_kernels
+
+ROOT = Path(__file__).parents[2]
+needs_triton = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="triton is not installed")
+
+
+def python(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    given = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **environment}
+    return subprocess.run([sys.executable, *words], env=given, capture_output=True, text=True, check=False, cwd=ROOT)
+
+
+@needs_triton
+def test_every_kernel_computes_what_its_reference_does() -> None:
+    words = "-m", "pytest", "-q", "-s", "-p", "no:cacheprovider", "-p", "no:xdist", "tests/kernels/triton"
+    done = python(*words, TRITON_INTERPRET="1", NERFLOOM_KERNELS="triton")
+    print(done.stdout)
+    assert done.returncode == 0, done.stdout[-8000:]
+    assert "passed" in done.stdout
+
+
+def test_triton_is_imported_by_no_user_of_the_cpu() -> None:
+    code = (
+        "import sys, torch\n"
+        "from framework.kernels.hash_grid import HashGridLayout, hash_grid\n"
+        "layout = HashGridLayout.build(2, 2, 4, 6)\n"
+        "hash_grid(torch.rand(3, 3), torch.rand(layout.num_entries, 2), layout)\n"
+        "print('triton' in sys.modules, any('triton_kernels.' in name for name in sys.modules))"
+    )
+    done = python("-c", code, TRITON_INTERPRET="0")
+    assert done.stdout.split() == ["False", "False"], done.stderr
+
+
+def test_asking_for_triton_without_a_gpu_is_an_error() -> None:
+    code = "from framework.kernels import triton_kernels as t; print(t.available())"
+    assert python("-c", code, NERFLOOM_KERNELS="reference").stdout.split() == ["False"]
+    done = python("-c", code, NERFLOOM_KERNELS="triton", TRITON_INTERPRET="0", CUDA_VISIBLE_DEVICES="")
+    assert done.returncode == 1
+    assert "NERFLOOM_KERNELS asks for 'triton', but " in done.stderr
+
+
+def test_the_processors_kernels_come_first() -> None:
+    """Also while Triton interprets, unless they are left out."""
+    from framework.kernels.compositing import COMPOSITE
+
+    names = [implementation.backend.name for implementation in COMPOSITE.implementations]
+    assert names == ["c++", "triton"]
+    if native.available() and not triton_kernels.INTERPRETED:
+        import torch
+
+        assert COMPOSITE.choose((torch.rand(3),)).backend.name == "c++"

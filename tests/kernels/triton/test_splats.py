@@ -1,0 +1,148 @@
+"""Gaussians: their projection, the lists of tiles, and their blending."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from framework.kernels.splat_blend import blend
+from framework.kernels.splat_project import CUT, REACH_X, RGB, SplatCamera, project_gaussians, project_reference
+from framework.kernels.splat_tiles import TileLists, tile_lists, tile_lists_reference
+from tests.kernels.test_splat_lists import check, needed
+from tests.kernels.triton.compared import DEVICE, compare
+
+WIDTH, HEIGHT = 37, 30
+NAMES = "means log_scales rotations logits colors harmonics pose"
+
+
+def gaussians(count: int, harmonics: int = 3) -> dict[str, Tensor]:
+    """Gaussians in front of a camera that is turned a little, some of them beyond the image's edge."""
+    torch.manual_seed(0)
+    turn = torch.linalg.qr(torch.eye(3) + 0.1 * torch.randn(3, 3)).Q
+    turn = turn * turn.diagonal().sign()
+    rows = (torch.randn(count, 3), torch.randn(count, 3) / 2 - 1.5, torch.randn(count, 4), torch.randn(count) + 1)
+    pose = torch.cat([turn, torch.tensor([[0.1], [-0.2], [4.0]])], 1)
+    values = (*rows, torch.randn(count, 3), torch.rand(count, 3, harmonics) / 3, pose)
+    return dict(zip(NAMES.split(), values, strict=True))
+
+
+def projected(antialiased: bool = False, degree: int = 3):
+    def run(pose: Tensor, **rows: Tensor) -> tuple[Tensor, Tensor]:
+        camera = SplatCamera(pose, (30.0, 32.0, 20.0, 15.0), WIDTH, HEIGHT, antialiased=antialiased)
+        records, dropped = project_gaussians(**rows, camera=camera, degree=degree)
+        # Bounds and normals pass no gradient on.
+        records = torch.cat([records[:, :CUT], records[:, CUT:RGB].detach(), records[:, RGB : RGB + 4],
+                             records[:, RGB + 4 :].detach()], 1)  # fmt: skip
+        return records, torch.as_tensor(dropped, dtype=torch.int64)
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("count", "harmonics", "degree", "antialiased"),
+    [(0, 3, 3, False), (1, 0, 3, False), (60, 15, 3, True), (40, 8, 1, False)],
+)
+def test_projection(count: int, harmonics: int, degree: int, antialiased: bool) -> None:
+    given = gaussians(count, harmonics)
+    followed = NAMES if degree == 3 and harmonics else NAMES.replace(" harmonics", "")
+    compare(projected(antialiased, degree), given, followed if count else "")
+
+
+def test_extremes_of_projection() -> None:
+    """Behind the camera, beside it, of no size and of all, hardly visible, with NaN, infinity, or no rotation."""
+    given = gaussians(12, 8)
+    given["means"][0], given["means"][1] = torch.tensor([0.0, 0.0, -9.0]), torch.tensor([90.0, 0.0, 1.0])
+    given["log_scales"][2], given["log_scales"][3] = -30.0, 3.0
+    given["logits"][4], given["logits"][5], given["logits"][6] = -100.0, 100.0, math.inf
+    given["means"][7, 1], given["rotations"][8], given["harmonics"][9, 0, 0] = math.nan, 0.0, math.nan
+    given["rotations"][10] *= 1e-6
+    found = compare(projected(), given, NAMES)
+    assert found[1] == 4
+    for gradient in found[2:-1]:
+        assert bool(gradient.isfinite().all())
+        assert not gradient[[0, 1, 4, 6, 7, 8, 9]].any()
+
+
+def test_what_overflows_is_not_visible() -> None:
+    given = {name: value.to(DEVICE) for name, value in gaussians(3).items()}
+    given["log_scales"][1] = 100.0
+    records, dropped = projected()(**given)
+    assert dropped == 0
+    assert not records[1].any()
+    assert bool(records.isfinite().all())
+
+
+def test_lenses_are_the_references() -> None:
+    from framework.geometry.lenses import Distortion
+
+    given = gaussians(5)
+    lens = Distortion.of("opencv", torch.tensor([[-0.1, 0.01, 0, 0, 0, 0, 0, 0, 0]], dtype=torch.float64))
+
+    def run(pose: Tensor, **rows: Tensor) -> Tensor:
+        return project_gaussians(**rows, camera=SplatCamera(pose, (30.0, 32.0, 20.0, 15.0), 37, 30, lens=lens))[0]
+
+    if DEVICE.type == "cpu":
+        compare(run, given, expected="reference", tolerance=1e-4)
+
+
+def records_of(given: dict[str, Tensor], width: int = WIDTH, height: int = HEIGHT) -> Tensor:
+    *rows, pose = given.values()
+    camera = SplatCamera(pose, (30.0, 32.0, width / 2, height / 2), width, height)
+    return project_reference(*rows, camera, 0)[0]
+
+
+@pytest.mark.parametrize(("count", "width", "height"), [(0, 20, 9), (1, 1, 1), (50, 37, 30), (40, 130, 7)])
+def test_lists(count: int, width: int, height: int) -> None:
+    records = records_of(gaussians(count), width, height)
+    records[: count // 5, CUT] = 0  # not visible
+    found = TileLists(*(part.cpu() for part in tile_lists(records.to(DEVICE), width, height)))
+    listed = check(found, records, width, height)
+    assert not (needed(records, width, height) & (records[:, CUT:] > 0)[:, :1] & ~listed).any()
+    boxes = check(tile_lists_reference(records, width, height), records, width, height)
+    assert not (listed & ~boxes).any()
+
+
+def blended(width: int, height: int, channels: int, median: bool):
+    def run(records: Tensor, background: Tensor) -> list[Tensor]:
+        lists = tile_lists_reference(records, width, height)
+        # The columns of bounds get the sums of absolute gradients.
+        records = torch.cat([records[:, :CUT], records[:, CUT:RGB].detach(), records[:, RGB:]], 1)
+        found = blend(records, lists, width, height, background, channels, median)
+        return [part for part in found if part is not None]
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("count", "width", "height", "channels"), [(0, 5, 3, 3), (1, 1, 1, 4), (40, 17, 20, 4), (30, 16, 16, 7)]
+)
+def test_blending(count: int, width: int, height: int, channels: int) -> None:
+    given = {"records": records_of(gaussians(count), width, height), "background": torch.tensor([0.2, 0.5, 1.0])}
+    compare(blended(width, height, channels, median=channels > 3), given, "records" if channels < 7 and count else "")
+
+
+def test_extremes_of_blending() -> None:
+    """A stack of walls, at which light ends within a batch and a pixel's alpha is at its bound; and thin veils."""
+    records = torch.zeros(30, 16)
+    records[:, :2], records[:, [2, 4]] = torch.tensor([8.5, 7.5]), 0.05
+    records[:, 5] = torch.tensor([0.004, 0.9, 1.0, 0.5, 0.99, 0.3] * 5)
+    records[:, CUT], records[:, [REACH_X, 15]] = (records[:, 5] * 255).log(), 40.0
+    records[:, RGB : RGB + 3] = torch.rand(30, 3, generator=torch.Generator().manual_seed(0))
+    records[:, 11] = torch.arange(30.0) + 1
+    given = {"records": records, "background": torch.zeros(3)}
+    compare(blended(16, 16, 4, median=True), given, "records", tolerance=1e-4)  # what is left is 1e-4 at most
+
+
+def test_sums_of_absolute_gradients() -> None:
+    """Two pixels that pull a Gaussian apart: the gradients of its centre cancel, and their magnitudes do not."""
+    records = torch.zeros(1, 16, device=DEVICE)
+    records[:, :2], records[:, [2, 4]], records[:, 5], records[:, CUT] = 8.0, 0.3, 0.5, math.log(127)
+    records[:, [REACH_X, 15]], records[:, RGB], records[:, 11] = 8.0, 1.0, 1.0
+    records.requires_grad_()
+    lists = tile_lists(records, 16, 16)
+    image = blend(records, lists, 16, 16, torch.zeros(3, device=DEVICE)).image
+    (gradient,) = torch.autograd.grad(image.sum(), records)
+    assert gradient[0, :2].abs().max() < 1e-5
+    assert gradient[0, CUT] > 0.1
+    torch.testing.assert_close(gradient[0, CUT], gradient[0, REACH_X])

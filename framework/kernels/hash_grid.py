@@ -8,18 +8,17 @@ cell.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import accumulate, pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from framework.base.errors import ConfigError, shown
 from framework.kernels import kept, native
-from framework.kernels.adam import all_finite
 from framework.kernels.deferred import Parts, waiting
-from framework.kernels.dispatch import CPP, Operation
+from framework.kernels.dispatch import CPP, FEW_OPERATIONS, Operation
 
 PRIMES = (1, 2654435761, 805459861)
 """Factors of the hash (equation 4)."""
@@ -29,6 +28,8 @@ MAX_RESOLUTION = 2**20
 """Maximum number of cells along an axis; float32 then has 4 bits left for the position in a cell."""
 MAX_LOG2_TABLE_SIZE = 28
 """Maximum number of entries of a level, as a power of two, so that 32 bits can index them."""
+MAX_HELD = 2**26
+"""Maximum number of features at corners that the form in few operations holds at once; it takes positions in parts."""
 
 
 @dataclass(frozen=True)
@@ -134,9 +135,13 @@ def corners(positions: Tensor, layout: HashGridLayout, level: int) -> tuple[Tens
 
 def _both_ends(cell: Tensor, strides: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
     """Return the cell's two ends along x, y, z times the stride of the axis, which broadcast to (2, 2, 2, N)."""
-    signed = [(stride + 2**31) % 2**32 - 2**31 for stride in strides]
-    x, y, z = (torch.stack([row * s, row * s + s]) for row, s in zip(cell, signed, strict=True))
+    x, y, z = (torch.stack([row * s, row * s + s]) for row, s in zip(cell, _signed(strides), strict=True))
     return x[:, None, None], y[:, None], z
+
+
+def _signed(strides: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the int32 values with the same bits."""
+    return tuple((stride + 2**31) % 2**32 - 2**31 for stride in strides)
 
 
 def hash_grid_reference(positions: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
@@ -187,9 +192,10 @@ class TableGradient:
         """Discard the gradient."""
         self.parts.clear()
 
-    def finite(self) -> bool:
-        """Return whether no value of the collected gradients is infinite or NaN."""
-        return all(all_finite(grad) for _, grad in self.parts)
+    @property
+    def gradients(self) -> list[Tensor]:
+        """The collected gradients (N, L * F) of encodings."""
+        return [grad for _, grad in self.parts]
 
     def _arguments(self, features: int) -> tuple[Any, ...]:
         ends = tuple(accumulate(len(positions) for positions, _ in self.parts))
@@ -316,3 +322,70 @@ def _compiled(positions: Tensor, table: Tensor, layout: HashGridLayout, deferred
         placeholder = waiting(table, positions, layout.num_levels * table.shape[1], deferred.parts)
         table = table.detach()
     return _HashGrid.apply(positions, table, placeholder, layout)
+
+
+class _Levels(NamedTuple):
+    """Constants of all levels on a device, in the shapes in which they are combined with positions."""
+
+    cells: Tensor
+    """(L, 1, 1) number of cells along each axis."""
+    strides: Tensor
+    """(L, 3, 1) int32 factor of the vertex's index along each axis."""
+    dense: Tensor
+    """(L, 1, 1, 1, 1) bool, whether each vertex has an entry of its own."""
+    masks: Tensor
+    """(L, 1, 1, 1, 1) int32 bits of a hash that are used."""
+    offsets: Tensor
+    """(L, 1, 1, 1, 1) int32 index of the first entry."""
+
+
+@lru_cache(maxsize=64)
+def _levels(layout: HashGridLayout, dtype: torch.dtype, device: torch.device) -> _Levels:
+    """Return the constants; they are kept, since bringing them to a device means to wait for it."""
+    sizes = [end - first for first, end in pairwise(layout.offsets)]
+    dense = [layout.is_dense(level) for level in range(layout.num_levels)]
+    strides = [
+        ((cells + 1) ** 2, cells + 1, 1) if own else _signed(PRIMES)
+        for cells, own in zip(layout.resolutions, dense, strict=True)
+    ]
+    shape = (-1, 1, 1, 1, 1)
+    return _Levels(
+        torch.tensor(layout.resolutions, dtype=dtype, device=device).view(-1, 1, 1),
+        torch.tensor(strides, dtype=torch.int32, device=device)[:, :, None],
+        torch.tensor(dense, device=device).view(shape),
+        torch.tensor([size - 1 for size in sizes], dtype=torch.int32, device=device).view(shape),
+        torch.tensor(layout.offsets[:-1], dtype=torch.int32, device=device).view(shape),
+    )
+
+
+def _fits(positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> bool:
+    return layout.num_entries < 2**31
+
+
+@HASH_GRID.implementation(FEW_OPERATIONS, types=None, order=torch.inf, fits=_fits)
+def _all_levels(positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> Tensor:
+    """Compute `hash_grid` with one set of operations for all levels, for any device and float type."""
+    held = 8 * layout.num_levels * table.shape[1]
+    parts = positions.split(max(MAX_HELD // held, 1))
+    found = [_at_all_levels(part, table, layout) for part in parts]
+    return found[0] if len(found) == 1 else torch.cat(found)
+
+
+def _at_all_levels(positions: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
+    levels = _levels(layout, positions.dtype, positions.device)
+    scaled = positions.t().clamp(0, 1) * levels.cells  # (L, 3, N)
+    cell = torch.minimum(scaled.detach().nan_to_num().floor(), levels.cells - 1)
+    fractions, low = scaled - cell, cell.int() * levels.strides
+    x, y, z = _spread(torch.stack([low, low + levels.strides], 2))
+    entries = torch.where(levels.dense, x + y + z, (x ^ y ^ z) & levels.masks) + levels.offsets
+    wx, wy, wz = _spread(torch.stack([1 - fractions, fractions], 2))
+    # By index_select, whose gradient is added up in place; that of table[entries] is sorted first on a GPU.
+    rows = table.index_select(0, entries.flatten()).view(layout.num_levels, 8, len(positions), table.shape[1])
+    features = (rows * (wx * wy * wz).flatten(1, 3)[..., None]).sum(1)
+    return features.transpose(0, 1).flatten(1)
+
+
+def _spread(ends: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the values (L, 3, 2, N) at a cell's two ends along x, y, z, which broadcast to (L, 2, 2, 2, N)."""
+    x, y, z = ends.unbind(1)
+    return x[:, :, None, None], y[:, None, :, None], z[:, None, None]

@@ -297,7 +297,7 @@ def _updating() -> Kernel:
     grad = torch.randn(entries, 2) * (torch.rand(entries, 1) < 0.5)
     updated = int((grad != 0).any(dim=1).sum())
 
-    def steps(update: Callable[..., int]) -> Run:
+    def steps(update: Callable[..., object]) -> Run:
         values, mean, square, uses = torch.randn(entries, 2), *torch.zeros(2, entries, 2), torch.zeros(entries)
 
         def step() -> Sequence[float]:

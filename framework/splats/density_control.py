@@ -85,7 +85,7 @@ def image_gradients(records: Tensor, gradient: Tensor, longer_side: int) -> Tens
             and REACH_X; where those are 0 (the reference), the position's own gradient is taken.
         longer_side: of the image, pixels.
     """
-    absolute = gradient[:, [CUT, REACH_X]]
+    absolute = torch.stack([gradient[:, CUT], gradient[:, REACH_X]], -1)
     plain = gradient[:, X : X + 2]
     chosen = torch.where(absolute.any(), absolute, plain)
     return chosen.norm(dim=-1) * (longer_side / 2)

@@ -18,6 +18,7 @@ from framework import Cameras, Decision, Loss, Method, Model, Optimised, Picture
 from framework.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
 from framework.base.console import say
 from framework.base.decisions import Choice, fill
+from framework.base.device import HostValue
 from framework.cameras.refinement import PoseRefinement
 from framework.data.dataset import Dataset
 from framework.fields.appearance import AFFINE, Appearance, affine_colors
@@ -210,6 +211,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
             self.poses.optimised = Optimised("poses", config.camera_learning_rate, schedule="exponential")
         self.gradients = GradientMean()
         self._on_image: Tensor | None = None
+        self._found, self._extent = HostValue(), HostValue()
         box = scene.box
         anywhere = box[0] + torch.rand(min(config.start_gaussians, WITHOUT_IMAGES), 3) * (box[1] - box[0])
         self.set_gaussians(from_points(anywhere, torch.full_like(anywhere, 0.5), config.degree))
@@ -225,9 +227,8 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
     def _chosen(self, given: float | None, otherwise: float) -> float:
         """Return a setting that is by the start if not given: Gaussians on surfaces need no search for places, but for
         those far away, where a field that was trained for seconds is mist."""
-        if given is not None:
-            return given
-        return 0.0 if bool(self.found) and not self.scene.unbounded else otherwise
+        on_surfaces = self._found.of(self.found) and not self.scene.unbounded
+        return given if given is not None else 0.0 if on_surfaces else otherwise
 
     def parameters_of_gaussians(self) -> list[nn.Parameter]:
         """Return the six tables."""
@@ -289,10 +290,9 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
     def loss(self, batch: ViewBatch, step: int) -> Loss:
         config = self.config
         reduced = 2 if self.progress < config.reduced_until else 1
-        pose = None
-        if self.poses is not None:
-            pose = self.poses.pose(batch.index, batch.view.camera.camera_to_worlds[0])
-        camera = splat_camera(batch.view.camera, self._near, config.antialiased, pose, reduced)
+        seen, poses = batch.view.camera, self.poses
+        pose = None if poses is None else poses.pose(batch.index, seen.camera_to_worlds[0])
+        camera = splat_camera(seen, self._near, config.antialiased, pose, reduced)
         target = batch.rgb if reduced == 1 else halved(batch.rgb)
         gaussians = self._all()
         records = on_image(gaussians, camera, self._degree)
@@ -313,8 +313,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
             terms["opacity"] = weight * torch.sigmoid(gaussians.logits).mean()
         if (weight := self._chosen(config.scale_penalty, SCALE_PENALTY)) > 0:
             terms["scale"] = weight / self.extent * gaussians.log_scales.exp().mean()
-        shown = rgb.detach() if reduced == 1 else doubled(rgb.detach(), batch.rgb)
-        return Loss(terms, shown)
+        return Loss(terms, rgb.detach() if reduced == 1 else doubled(rgb.detach(), batch.rgb))
 
     def _behind(self, batch: ViewBatch) -> Tensor:
         """Return the background (3,) of a step. Images without alpha show something everywhere: a background that
@@ -327,8 +326,8 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         """Return colours (..., 3) as an image shows them: a training image, or one with the appearance that is set."""
         if self.appearance is None:
             return rgb
-        image = None if index is None else torch.tensor([index], device=rgb.device)
-        return affine_colors(rgb, self.appearance(image, 1)[0])
+        which = None if index is None else torch.arange(index, index + 1, device=rgb.device)
+        return affine_colors(rgb, self.appearance(which, 1)[0])
 
     @property
     def _degree(self) -> int:
@@ -341,7 +340,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         self.gradients.add(self._on_image, self.scene.image_size)
         self._on_image = None
         if (noise := self._chosen(config.noise, NOISE)) > 0:
-            rate = self.position_rate * float(self.extent) * learning_rate_factor(config, step, progress)
+            rate = self.position_rate * self._extent.of(self.extent) * learning_rate_factor(config, step, progress)
             which, by = shaken(self.gaussians(), noise * rate)
             self.means.values.data[which] += by / self.extent
         if step % config.steps_per_move != config.steps_per_move - 1 or progress > config.growth_end:
@@ -363,7 +362,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
             lowered = self.logits.values.clamp(max=math.log(RESET / (1 - RESET)))
             none = torch.zeros(0, dtype=torch.long, device=lowered.device)
             return [RowChange(self.logits.values, none, lowered)]  # new rows, as Adam's state is reset too
-        change = grown(self.gaussians(), mean, most, float(self.extent))
+        change = grown(self.gaussians(), mean, most, self._extent.of(self.extent))
         return [] if change is None else self._changed(*change)
 
     def refined_cameras(self, cameras: Cameras) -> Cameras:

@@ -18,7 +18,7 @@ from framework.encodings.planes import FeaturePlanes
 from framework.fields.base import MLP
 from framework.fields.encoded import BoxField, EncodedField
 from framework.kernels.math import truncated_exp
-from framework.kernels.planes import MAX_VERTICES, plane_band
+from framework.kernels.planes_layout import MAX_VERTICES
 from framework.kernels.spherical_harmonics import spherical_harmonics
 from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_choice
 
@@ -117,18 +117,15 @@ class KPlanes(RayModel[KPlanesConfig], LearnsMotion):
         assert isinstance(self.field, BoxField)
         planes = self.field.encoding
         assert isinstance(planes, FeaturePlanes)
+        factors = [(scale, index) for scale, group in enumerate(planes.layout.axes) for index in range(len(group))]
         variations, roughness, activity = [], [zero], [zero]
-        for scale in range(planes.layout.num_groups):
-            for index, axes in enumerate(planes.layout.axes[scale]):
-                if 3 not in axes:
-                    band = planes.random_band(scale, index)
-                    variations.append((_squared_steps(band, 0) + _squared_steps(band, 1)) / 2)
-                    continue
-                height, _ = planes.layout.shape(scale, index)
-                plane = plane_band(planes.table, planes.layout, scale, index, 0, height, planes.deferred)
-                variations.append(_squared_steps(plane, 1))
-                roughness.append(plane.diff(n=2, dim=0).square().mean())
-                activity.append((1 - plane).abs().mean())
+        for (scale, index), plane in zip(factors, planes.bands(factors, whole={3}), strict=True):
+            if 3 not in planes.layout.axes[scale][index]:
+                variations.append((_squared_steps(plane, 0) + _squared_steps(plane, 1)) / 2)
+                continue
+            variations.append(_squared_steps(plane, 1))
+            roughness.append(plane.diff(n=2, dim=0).square().mean())
+            activity.append((1 - plane).abs().mean())
         count = max(len(roughness) - 1, 1)
         return torch.stack(variations).mean(), torch.stack(roughness).sum() / count, torch.stack(activity).sum() / count
 

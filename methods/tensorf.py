@@ -28,6 +28,7 @@ from framework import (
 )
 from framework.base.config import AT_LEAST_0, AUTO, Auto, Range
 from framework.base.decisions import Choice, fill
+from framework.base.device import HostValue
 from framework.base.optimised import Optimised
 from framework.encodings.planes import FeaturePlanes
 from framework.fields.base import MLP
@@ -171,6 +172,7 @@ class TensoRF(RayModel[TensoRFConfig]):
     def __init__(self, config: TensoRFConfig, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer) -> None:
         super().__init__(config, scene, field, sampler, renderer)
         self.register_buffer("growths", torch.zeros((), dtype=torch.int64))
+        self._growths = HostValue()
 
     @property
     def factors(self) -> TensorField:
@@ -182,7 +184,7 @@ class TensoRF(RayModel[TensoRFConfig]):
         if step >= BLIND_STEPS or not isinstance(self.sampler, SkipsCells):
             super().before_step(step, progress)
         due = sum(progress >= share for share in self.config.upsample_at)
-        if due > int(self.growths):
+        if due > self._growths.of(self.growths):
             self.growths.fill_(due)
             self._grow(due / len(self.config.upsample_at))
 
@@ -217,7 +219,7 @@ class TensoRF(RayModel[TensoRFConfig]):
     def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
         losses, field = dict[str, Tensor](), self.factors
         if self.config.sparsity:
-            weight = self.config.sparsity * (0.5 if int(self.growths) else 1.0)
+            weight = self.config.sparsity * (0.5 if self._growths.of(self.growths) else 1.0)
             losses["sparsity"] = weight * _sum_over_bands(field.density_factors, lambda band: band.abs().mean())
         if self.config.total_variation:
             variation = _sum_over_bands(field.density_factors, _variation)
@@ -228,9 +230,8 @@ class TensoRF(RayModel[TensoRFConfig]):
 
 def _sum_over_bands(factors: FeaturePlanes, measure: Callable[[Tensor], Tensor]) -> Tensor:
     """Return the sum of `measure` over a random band of rows of each factor."""
-    axes = factors.layout.axes
-    bands = (factors.random_band(group, index) for group in range(len(axes)) for index in range(len(axes[group])))
-    return torch.stack([measure(band) for band in bands]).sum()
+    numbers = [(group, index) for group, along in enumerate(factors.layout.axes) for index in range(len(along))]
+    return torch.stack([measure(band) for band in factors.bands(numbers)]).sum()
 
 
 def _variation(band: Tensor) -> Tensor:

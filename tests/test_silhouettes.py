@@ -54,7 +54,7 @@ def test_every_pixel_that_could_see_the_hull_is_kept(ball: Dataset) -> None:
     grid = Occupancy(hull, BOX, resolution)
     for image in range(len(ball)):
         rays = ball.cameras.pixel_rays(ball.cameras.image_pixels(image), 0.1, 20)
-        _, _, offsets = candidates(rays, grid, 0.01, 0.0, None)
+        _, _, _, offsets, _ = candidates(rays, grid, 0.01, 0.0, None)
         sees = offsets.diff() > 0
         mine = kept[image * 6400 : (image + 1) * 6400]
         assert not bool((sees & ~mine).any())

@@ -72,6 +72,20 @@ def to_float64(values: Tensor) -> Tensor:
     return (values.cpu() if values.device.type == "mps" else values).double()
 
 
+class HostValue:
+    """The value of a scalar tensor in Python, which is read from the device only where it has changed."""
+
+    def __init__(self) -> None:
+        self._state, self._value = (0, -1), 0.0
+
+    def of(self, scalar: Tensor) -> float:
+        """Return the value of a `scalar` (), always the same tensor, that is changed in place."""
+        state = scalar.data_ptr(), scalar._version
+        if state != self._state:
+            self._state, self._value = state, float(scalar)
+        return self._value
+
+
 @cache
 def cpu_features() -> frozenset[str]:
     """Return the CPU's instruction sets by Linux's names; elsewhere, AVX2 and AVX-512 if PyTorch detects them."""

@@ -183,6 +183,21 @@ class Cameras:
         sizes = (self.widths * self.heights).cumsum(0)
         return torch.cat([torch.zeros_like(sizes[:1]), sizes])
 
+    @cached_property
+    def ends(self) -> list[int]:
+        """`offsets` in Python, read once from the device."""
+        return self.offsets.tolist()
+
+    @cached_property
+    def sizes(self) -> list[list[int]]:
+        """Height and width of each camera's image in Python, read once from the device."""
+        return torch.stack([self.heights, self.widths], dim=-1).tolist()
+
+    @cached_property
+    def intrinsics(self) -> list[list[float]]:
+        """Each camera's fx, fy, cx and cy in Python, read once from the device."""
+        return torch.stack([self.fx, self.fy, self.cx, self.cy], dim=-1).tolist()
+
     def pixel_rays(
         self, flat: Tensor, near: float, far: float, times: Tensor | None = None, subpixels: Tensor = CENTER
     ) -> Rays:
@@ -210,7 +225,7 @@ class Cameras:
 
         `flat`, `near`, `far`, `times` and `subpixels` are as in `pixel_rays`.
         """
-        check_indices(flat, int(self.offsets[-1]) if flat.device.type == "cpu" else 0, "pixels")
+        check_indices(flat, self.offsets[-1], "pixels")
         indices = torch.searchsorted(self.offsets, flat, right=True) - 1
         within, widths = flat - self.offsets[indices], self.widths[indices]
         subpixels = subpixels.to(self.fx)
@@ -220,7 +235,7 @@ class Cameras:
 
     def image_pixels(self, index: int) -> Tensor:
         """Return the numbers (H * W,) of the pixels of image `index`, row by row, counted through all images."""
-        start, end = self.offsets[index : index + 2].tolist()
+        start, end = self.ends[index : index + 2]
         return torch.arange(start, end, device=self.fx.device)
 
 

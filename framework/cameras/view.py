@@ -34,22 +34,21 @@ class View:
             times: (M,) time of each camera in [0, 1]; None for a static scene.
             stride: distance in pixels between the rows and columns that are rendered.
         """
-        chosen = cameras[torch.tensor([index], device=cameras.fx.device)]
-        return cls(chosen, None if times is None else float(times[index]), stride=stride)
+        return cls(cameras[index : index + 1], None if times is None else float(times[index]), stride=stride)
 
     @property
     def height(self) -> int:
         """Height of the rendered image in pixels."""
-        return len(range(self.stride // 2, int(self.camera.heights[0]), self.stride))
+        return len(range(self.stride // 2, self.camera.sizes[0][0], self.stride))
 
     @property
     def width(self) -> int:
         """Width of the rendered image in pixels."""
-        return len(range(self.stride // 2, int(self.camera.widths[0]), self.stride))
+        return len(range(self.stride // 2, self.camera.sizes[0][1], self.stride))
 
     def pixels(self) -> Tensor:
         """Return the numbers (height, width) int64 of the camera's pixels that are rendered."""
-        grid = self.camera.image_pixels(0).view(int(self.camera.heights[0]), -1)
+        grid = self.camera.image_pixels(0).view(self.camera.sizes[0][0], -1)
         return every(grid, self.stride)
 
     def times(self) -> Tensor | None:

@@ -153,8 +153,8 @@ class Dataset:
 
     def image(self, index: int) -> Tensor:
         """Return image `index` as (H, W, 3 or 4) uint8, with alpha if the scene has it."""
-        height, width = int(self.cameras.heights[index]), int(self.cameras.widths[index])
-        start, end = self.cameras.offsets[index : index + 2].tolist()
+        height, width = self.cameras.sizes[index]
+        start, end = self.cameras.ends[index : index + 2]
         pixels = self.pixels[start:end]
         if self.mapped is not None:
             pixels = pixels.clone()

@@ -142,6 +142,8 @@ class ViewSource(BatchSource):
     def __init__(self, dataset: Dataset, background: Background, seed: int) -> None:
         self.dataset, self.background, self.seed = dataset, background, seed
         self._order: tuple[int, list[int]] | None = None
+        self._views: dict[int, View] = {}
+        """Views of images that have been drawn, whose sizes and lenses are read from the device once."""
 
     def draw(self, request: Request) -> ViewBatch:
         dataset = self.dataset
@@ -149,10 +151,12 @@ class ViewSource(BatchSource):
         behind = background_colors(self.background, 1, dataset.device)[0]
         rgba = dataset.image(index).float().div_(255)
         alpha = rgba[..., 3] if rgba.shape[-1] == 4 else None
-        view = View.of(dataset.cameras, index, dataset.times)
+        if index not in self._views:
+            self._views[index] = View.of(dataset.cameras, index, dataset.times)
+        view = self._views[index]
         kept = None
         if dataset.kept is not None:
-            first, last = dataset.cameras.offsets[index : index + 2].tolist()
+            first, last = dataset.cameras.ends[index : index + 2]
             kept = dataset.kept.mask(first, last).view(rgba.shape[:2])
         return ViewBatch(index, view, composite(rgba, behind), behind, alpha, kept, self._distances(index))
 
@@ -163,7 +167,7 @@ class ViewSource(BatchSource):
         pixels = dataset.cameras.image_pixels(index)
         rays = dataset.cameras.pixel_rays(pixels, dataset.scene.near, dataset.scene.far, dataset.times)
         found = known_distances(dataset, pixels, rays)
-        return None if found is None else found.view(int(dataset.cameras.heights[index]), -1)
+        return None if found is None else found.view(dataset.cameras.sizes[index][0], -1)
 
     def _index(self, step: int) -> int:
         """Return the image of a training step, a function of seed, step and process alone."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container, Sequence
 from typing import Any
 
 import torch
@@ -9,10 +10,10 @@ from torch import Tensor, nn
 
 from framework.base.optimised import Optimised
 from framework.kernels.memory import table
-from framework.kernels.planes import PlanesGradient, PlanesLayout, plane_band, planes
+from framework.kernels.planes import PlanesGradient, PlanesLayout, plane_bands, planes
 
 BANDS = 16
-"""Number of bands into which `random_band` divides the rows of a factor."""
+"""Number of bands into which `FeaturePlanes.bands` divides the rows of a factor."""
 
 
 class FeaturePlanes(nn.Module):
@@ -58,24 +59,30 @@ class FeaturePlanes(nn.Module):
         """Return the features (N, G * F) at `positions` (N, D) in [0, 1]."""
         return planes(positions, self.table, self.layout, self.deferred)
 
-    def random_band(self, group: int, index: int) -> Tensor:
-        """Return a random band of consecutive rows of a factor, for regularisers.
+    def bands(self, factors: Sequence[tuple[int, int]], whole: Container[int] = ()) -> list[Tensor]:
+        """Return a random band of consecutive rows of each of several factors, for regularisers.
 
-        Reading all of a large table in every step would be slow. The band may extend beyond the factor, where it is
-        cut off, so that all rows are equally likely.
+        Reading all of a large table in every step would be slow. A band may extend beyond the factor, where it is cut
+        off, so that all rows are equally likely.
 
         Args:
-            group: number of the group.
-            index: number of the factor in the group.
+            factors: group, and index in the group, of each factor.
+            whole: axes; factors along any of them are returned whole.
 
         Returns:
-            (B, vertices along the first axis, F) values, where B is at most 1/16 of the rows, or 2.
+            (B, vertices along the first axis, F) values of each, where B is at most 1/16 of the rows, or 2.
         """
-        height, _ = self.layout.shape(group, index)
-        rows = max(height // BANDS, 2)
-        first = int(torch.randint(1 - rows, height, ()))
-        first, last = max(first, 0), min(first + rows, height)
-        return plane_band(self.table, self.layout, group, index, first, last - first, self.deferred)
+        chosen = []
+        for group, index in factors:
+            height, _ = self.layout.shape(group, index)
+            if any(axis in whole for axis in self.layout.axes[group][index]):
+                chosen.append((group, index, 0, height))
+                continue
+            rows = max(height // BANDS, 2)
+            first = int(torch.randint(1 - rows, height, ()))
+            first, last = max(first, 0), min(first + rows, height)
+            chosen.append((group, index, first, last - first))
+        return plane_bands(self.table, self.layout, chosen, self.deferred)
 
     @torch.no_grad()
     def resample(self, resolutions: tuple[tuple[int, ...], ...], lower: Tensor, upper: Tensor) -> None:

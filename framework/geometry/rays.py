@@ -112,6 +112,8 @@ class Samples:
     """S if every ray has exactly S samples."""
     owners: Tensor | None = None
     """(N,) `ray_indices`, if the sampler has them."""
+    longest: int | None = None
+    """Upper bound of the number of samples on a ray, if the sampler knows one."""
     sigma: Tensor | None = None
     """(N,) density, if the sampler evaluated it."""
     features: Tensor | None = None

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.optim.adam import adam
 
 from framework.kernels import native
-from framework.kernels.dispatch import CPP, TORCH, TRITON, Operation
+from framework.kernels.dispatch import CPP, FEW_OPERATIONS, TORCH, TRITON, Operation
 from framework.kernels.triton_kernels import later
 
 _sparse = native.Function("adam_sparse", "pppppqifddfi", "q")
@@ -28,7 +28,7 @@ _finite = native.Function("all_finite", "pqi", "i")
 def sparse_adam_reference(
     values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
     rate: float, betas: tuple[float, float], eps: float,
-) -> int:  # fmt: skip
+) -> int | Tensor:  # fmt: skip
     """Compute `sparse_adam` in PyTorch, on any device and for any float type.
 
     `values`, `grad`, `mean`, `square`, `seen`, `rate`, `betas` and `eps` are as in `sparse_adam`.
@@ -63,8 +63,7 @@ def sparse_adam(
         eps: added to the square root of the second moment.
 
     Returns:
-        the number of entries that were updated; of a table on a GPU a tensor without dimensions, which it is not waited
-        for.
+        the number of entries that were updated, which may still be on the device, () int64.
     """
     tensors = values, grad, mean, square, seen
     return SPARSE_ADAM(tensors, *tensors, rate, betas, eps)
@@ -77,13 +76,35 @@ SPARSE_ADAM: Operation[..., int | Tensor] = Operation("sparse_adam", sparse_adam
 def _sparse_adam(
     values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
     rate: float, betas: tuple[float, float], eps: float,
-) -> int:  # fmt: skip
+) -> int | Tensor:  # fmt: skip
     shape = (values.shape[0], values.shape[1])
-    return _sparse(
+    updated: int = _sparse(
         native.pointer(values, "values", shape), native.pointer(mean, "mean", shape),
         native.pointer(square, "square", shape), native.pointer(grad, "grad", shape),
         native.pointer(seen, "seen", shape[:1]), *shape, rate, *betas, eps, native.threads(),
     )  # fmt: skip
+    return updated
+
+
+@SPARSE_ADAM.implementation(FEW_OPERATIONS, types=None)
+@torch.no_grad()
+def _masked_adam(
+    values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
+    rate: float, betas: tuple[float, float], eps: float,
+) -> int | Tensor:  # fmt: skip
+    """Update all entries, by nothing where the gradient is zero: the device need not say which entries have one."""
+    touched = (grad != 0).any(-1)
+    seen += touched
+    used, count = touched[:, None].to(values.dtype), seen.clamp(min=1)[:, None]
+    mean.mul_(1 - (1 - betas[0]) * used).add_(grad, alpha=1 - betas[0])
+    square.mul_(1 - (1 - betas[1]) * used).addcmul_(grad, grad, value=1 - betas[1])
+    logs = [math.log(beta) if beta else -math.inf for beta in betas]
+    unbias1, unbias2 = (torch.expm1(count * log).reciprocal_().neg_() for log in logs)
+    scale = (unbias2 * square).sqrt_().add_(eps)
+    # An entry that has never had a gradient may have a scale of 0.
+    values.addcdiv_(mean * (unbias1 * used), torch.where(touched[:, None], scale, 1), value=-rate)
+    grad.zero_()
+    return touched.sum()
 
 
 def _all_rows_contiguous(
@@ -162,26 +183,38 @@ def _torch_adam(
     values: Sequence[Tensor], grads: Sequence[Tensor], means: Sequence[Tensor], squares: Sequence[Tensor],
     steps: Sequence[Tensor], rate: float, betas: tuple[float, float], eps: float,
 ) -> None:  # fmt: skip
-    fused = bool(values) and values[0].device.type in ("cpu", "cuda")
+    fused = bool(values) and values[0].device.type in ("cpu", "cuda", "mps")
     adam(
         [*values], [*grads], [*means], [*squares], [], [*steps], fused=fused, amsgrad=False, beta1=betas[0],
         beta2=betas[1], lr=rate, weight_decay=0.0, eps=eps, maximize=False,
     )  # fmt: skip
 
 
-def all_finite_reference(values: Tensor) -> bool:
+def all_finite_reference(values: Sequence[Tensor]) -> bool:
     """Compute `all_finite` of `values` in PyTorch, on any device."""
-    return bool(torch.isfinite(values).all())
+    return all(bool(torch.isfinite(value).all()) for value in values)
 
 
-def all_finite(values: Tensor) -> bool:
-    """Return whether none of `values` is infinite or NaN, in one pass."""
-    return ALL_FINITE((values,), values)
+def all_finite(values: Sequence[Tensor]) -> bool:
+    """Return whether no value of several tensors is infinite or NaN, in one pass over each.
+
+    Args:
+        values: float tensors of any shapes on one device.
+    """
+    return ALL_FINITE(values, values)
 
 
 ALL_FINITE = Operation("all_finite", all_finite_reference)
 
 
-@ALL_FINITE.implementation(CPP, fits=lambda values: values.is_contiguous())
-def _all_finite(values: Tensor) -> bool:
-    return bool(_finite(values.data_ptr(), values.numel(), native.threads()))
+@ALL_FINITE.implementation(CPP, fits=lambda values: all(value.is_contiguous() for value in values))
+def _all_finite(values: Sequence[Tensor]) -> bool:
+    return all(_finite(value.data_ptr(), value.numel(), native.threads()) for value in values)
+
+
+@ALL_FINITE.implementation(FEW_OPERATIONS, types=None)
+@torch.no_grad()
+def _largest_is_finite(values: Sequence[Tensor]) -> bool:
+    """Ask the device once for all tensors: the largest size of a value is finite only if all are; NaN is largest."""
+    filled = [value for value in values if value.numel()]
+    return not filled or bool(torch.stack([*torch._foreach_norm(filled, torch.inf)]).isfinite().all())

@@ -24,6 +24,8 @@ from framework.kernels.dispatch import CPP, TRITON, Operation
 from framework.kernels.given import check_offsets
 from framework.kernels.triton_kernels import later
 
+MAX_PADDED = 2**26
+"""Maximum number of values of rays that are padded to the longest, so that they are added up in one pass."""
 MAX_OPTICAL_DEPTH = 1e3
 """Maximum optical depth of an interval, so that sums stay finite. exp(-1000) is 0 even in float64."""
 
@@ -72,10 +74,32 @@ def segmented_sum(values: Tensor, places: Tensor) -> Tensor:
     return total
 
 
+def bounded_sum(values: Tensor, owners: Tensor, places: Tensor, num_rays: int, longest: int) -> Tensor:
+    """Return `segmented_sum` of `values` (N,) where the number of samples on a ray is bounded.
+
+    Rays are padded to the bound, unless that takes too much memory; no device is waited for.
+
+    Args:
+        values: (N,) one value per sample.
+        owners: (N,) int64 ray of each sample.
+        places: (N,) int64 number of samples in front of each sample on its ray.
+        num_rays: number of rays.
+        longest: upper bound of the number of samples on a ray.
+    """
+    width = longest + 1
+    if num_rays * width > MAX_PADDED:
+        return segmented_sum(values, places)
+    slots = owners * width + places
+    padded = values.new_zeros(num_rays * width).index_copy_(0, slots + 1, values)  # a place behind its own
+    return padded.view(num_rays, width).cumsum(-1).view(-1).index_select(0, slots)
+
+
 def exclusive_sum(values: Tensor, samples: Samples) -> Tensor:
     """Return the sum (N,) of `values` (N,) over the samples in front of each of `samples` on its ray."""
     if samples.per_ray is not None:
         return exclusive_cumsum(samples.padded(values)).reshape(-1)
+    if samples.longest is not None:
+        return bounded_sum(values, samples.ray_indices, samples.ranks, samples.num_rays, samples.longest)
     return segmented_sum(values, samples.ranks)
 
 

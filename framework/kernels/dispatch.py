@@ -37,6 +37,9 @@ class Backend:
 REFERENCE = Backend("reference", lambda tensor: True, lambda: True)
 TORCH = Backend("torch", lambda tensor: True, lambda: True)
 """Fast implementations by PyTorch itself, if they differ from the reference."""
+FEW_OPERATIONS = Backend("few operations", lambda tensor: not (tensor.is_cpu and native.available()), lambda: True)
+"""Implementations by PyTorch in few operations and without waiting for the device: for GPUs, and where there are no
+compiled kernels. Beside these the CPU takes the reference, so that runs on it stay the same to the bit."""
 CPP = Backend("c++", attrgetter("is_cpu"), lambda: native.available())
 TRITON = Backend(
     "triton", attrgetter("is_cpu" if triton_kernels.INTERPRETED else "is_cuda"), lambda: triton_kernels.available()
@@ -111,6 +114,7 @@ class Operation(Generic[P, R]):
 
         def add(run: Callable[P, R]) -> Callable[P, R]:
             self.implementations.append(Implementation(backend, run, types, order, differentiable, fits))
+            self.implementations.sort(key=lambda each: each.backend in (TORCH, FEW_OPERATIONS))  # others are preferred
             return run
 
         return add

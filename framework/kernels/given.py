@@ -11,7 +11,12 @@ def is_followed(*tensors: Tensor | None) -> bool:
     return torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors)
 
 
-def check_indices(indices: Tensor, count: int, what: str) -> None:
+def is_bad_here(scalar: Tensor) -> bool:
+    """Return whether a `scalar` on the CPU is not finite; False on other devices, which would have to be waited for."""
+    return scalar.device.type == "cpu" and not bool(torch.isfinite(scalar))
+
+
+def check_indices(indices: Tensor, count: int | Tensor, what: str) -> None:
     """Check that indices are in range.
 
     Indices on other devices than the CPU are not checked: reading them would wait for the device, which reports indices
@@ -19,7 +24,7 @@ def check_indices(indices: Tensor, count: int, what: str) -> None:
 
     Args:
         indices: integers of any shape.
-        count: number of items that are indexed.
+        count: number of items that are indexed, possibly a tensor (), which is read only if there is a check.
         what: name of the items, for the error.
 
     Raises:
@@ -27,7 +32,7 @@ def check_indices(indices: Tensor, count: int, what: str) -> None:
     """
     if indices.device.type != "cpu" or indices.numel() == 0:
         return
-    least, most = (int(end) for end in indices.aminmax())
+    count, (least, most) = int(count), (int(end) for end in indices.aminmax())
     if least < 0 or most >= count:
         raise IndexError(f"{what}: index {least if least < 0 else most} is out of range; there are {count}, from 0")
 

@@ -7,103 +7,23 @@ cell.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from functools import lru_cache
 from itertools import accumulate, pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from framework.base.errors import ConfigError, shown
 from framework.kernels import kept, memory, native
-from framework.kernels.adam import all_finite
 from framework.kernels.deferred import Parts, waiting
-from framework.kernels.dispatch import CPP, TRITON, Operation
+from framework.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
+from framework.kernels.hash_grid_layout import HashGridLayout as HashGridLayout
 from framework.kernels.triton_kernels import later
 
 PRIMES = (1, 2654435761, 805459861)
 """Factors of the hash (equation 4)."""
-MAX_LEVELS = 64
-"""Maximum number of levels."""
-MAX_RESOLUTION = 2**20
-"""Maximum number of cells along an axis; float32 then has 4 bits left for the position in a cell."""
-MAX_LOG2_TABLE_SIZE = 28
-"""Maximum number of entries of a level, as a power of two, so that 32 bits can index them."""
-
-
-@dataclass(frozen=True)
-class HashGridLayout:
-    """Resolution and entries of each of L levels, in one table (E, F) that all levels share.
-
-    Raises:
-        ConfigError: if the numbers are inconsistent or out of range; the kernels rely on them.
-    """
-
-    resolutions: tuple[int, ...]
-    """Number of cells along each axis, for each level."""
-    offsets: tuple[int, ...]
-    """Index of the first entry of each level, followed by the number E of all entries: L + 1 values."""
-
-    def __post_init__(self) -> None:
-        _check("levels", len(self.resolutions), MAX_LEVELS)
-        if len(self.offsets) != len(self.resolutions) + 1 or self.offsets[0] != 0:
-            raise ConfigError(f"a hash grid of {len(self.resolutions)} levels needs one more offset, the first being 0")
-        for resolution, (first, end) in zip(self.resolutions, pairwise(self.offsets), strict=True):
-            _check("cells along an axis", resolution, MAX_RESOLUTION)
-            _check("entries of a level", end - first, 2**MAX_LOG2_TABLE_SIZE)
-            if (resolution + 1) ** 3 > end - first and (end - first) & (end - first - 1):
-                raise ConfigError(f"a hashed level of a hash grid needs a power of two of entries, not {end - first}")
-
-    @classmethod
-    def build(cls, num_levels: int, base_resolution: int, max_resolution: int, log2_table_size: int) -> HashGridLayout:
-        """Return a layout whose resolutions grow geometrically: equations 2 and 3.
-
-        Args:
-            num_levels: number L of levels.
-            base_resolution: cells along an axis at the first level.
-            max_resolution: cells along an axis at the last level.
-            log2_table_size: maximum number of entries of one level, as a power of two.
-
-        Raises:
-            ConfigError: if a number is less than 1 or exceeds MAX_LEVELS, MAX_RESOLUTION or MAX_LOG2_TABLE_SIZE.
-        """
-        _check("levels", num_levels, MAX_LEVELS)
-        _check("cells along an axis", base_resolution, MAX_RESOLUTION)
-        _check("cells along an axis", max_resolution, MAX_RESOLUTION)
-        _check("for log2 of a level's entries", log2_table_size, MAX_LOG2_TABLE_SIZE)
-        growth = (max_resolution / base_resolution) ** (1 / max(num_levels - 1, 1))
-        resolutions = tuple(int(base_resolution * growth**level + 1e-6) for level in range(num_levels))
-        sizes = [min((resolution + 1) ** 3, 2**log2_table_size) for resolution in resolutions]
-        offsets = [0]
-        for size in sizes:
-            offsets.append(offsets[-1] + (size + 7) // 8 * 8)
-        return cls(resolutions, tuple(offsets))
-
-    @property
-    def num_entries(self) -> int:
-        """Number E of entries of all levels."""
-        return self.offsets[-1]
-
-    @property
-    def num_levels(self) -> int:
-        """Number L of levels."""
-        return len(self.resolutions)
-
-    @cached_property
-    def arrays(self) -> tuple[Any, Any]:
-        """Resolutions and offsets as C arrays."""
-        return native.integers(self.resolutions), native.integers(self.offsets)
-
-    def is_dense(self, level: int) -> bool:
-        """Return whether each vertex of `level` has an entry of its own."""
-        return (self.resolutions[level] + 1) ** 3 <= self.offsets[level + 1] - self.offsets[level]
-
-
-def _check(what: str, count: int, most: int) -> None:
-    """Check that a count is an integer from 1 to `most`."""
-    if not isinstance(count, int) or not 1 <= count <= most:
-        raise ConfigError(f"a hash grid has 1 to {most} {what}, not {shown(count)}")
+MAX_HELD = 2**26
+"""Maximum number of features at corners that the form in few operations holds at once; it takes positions in parts."""
 
 
 def corners(positions: Tensor, layout: HashGridLayout, level: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -135,9 +55,13 @@ def corners(positions: Tensor, layout: HashGridLayout, level: int) -> tuple[Tens
 
 def _both_ends(cell: Tensor, strides: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
     """Return the cell's two ends along x, y, z times the stride of the axis, which broadcast to (2, 2, 2, N)."""
-    signed = [(stride + 2**31) % 2**32 - 2**31 for stride in strides]
-    x, y, z = (torch.stack([row * s, row * s + s]) for row, s in zip(cell, signed, strict=True))
+    x, y, z = (torch.stack([row * s, row * s + s]) for row, s in zip(cell, _signed(strides), strict=True))
     return x[:, None, None], y[:, None], z
+
+
+def _signed(strides: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the int32 values with the same bits."""
+    return tuple((stride + 2**31) % 2**32 - 2**31 for stride in strides)
 
 
 def hash_grid_reference(positions: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
@@ -189,9 +113,10 @@ class TableGradient:
         """Discard the gradient."""
         self.parts.clear()
 
-    def finite(self) -> bool:
-        """Return whether no value of the collected gradients is infinite or NaN."""
-        return all(all_finite(grad) for _, grad in self.parts)
+    @property
+    def gradients(self) -> list[Tensor]:
+        """The collected gradients (N, L * F) of encodings."""
+        return [grad for _, grad in self.parts]
 
     def _arguments(self, features: int) -> tuple[Any, ...]:
         ends = tuple(accumulate(len(positions) for positions, _ in self.parts))
@@ -335,3 +260,72 @@ def _compiled(positions: Tensor, table: Tensor, layout: HashGridLayout, deferred
 
 
 HASH_GRID.implementation(TRITON, fits=_fits)(later("hash_grid", "hash_grid"))
+
+
+class _Levels(NamedTuple):
+    """Constants of all levels on a device, in the shapes in which they are combined with positions."""
+
+    cells: Tensor
+    """(L, 1, 1) number of cells along each axis."""
+    strides: Tensor
+    """(L, 3, 1) int32 factor of the vertex's index along each axis."""
+    dense: Tensor
+    """(L, 1, 1, 1, 1) bool, whether each vertex has an entry of its own."""
+    masks: Tensor
+    """(L, 1, 1, 1, 1) int32 bits of a hash that are used."""
+    offsets: Tensor
+    """(L, 1, 1, 1, 1) int32 index of the first entry."""
+
+
+@lru_cache(maxsize=64)
+def _levels(layout: HashGridLayout, dtype: torch.dtype, device: torch.device) -> _Levels:
+    """Return the constants; they are kept, since bringing them to a device means to wait for it."""
+    sizes = [end - first for first, end in pairwise(layout.offsets)]
+    dense = [layout.is_dense(level) for level in range(layout.num_levels)]
+    strides = [
+        ((cells + 1) ** 2, cells + 1, 1) if own else _signed(PRIMES)
+        for cells, own in zip(layout.resolutions, dense, strict=True)
+    ]
+    shape = (-1, 1, 1, 1, 1)
+    return _Levels(
+        torch.tensor(layout.resolutions, dtype=dtype, device=device).view(-1, 1, 1),
+        torch.tensor(strides, dtype=torch.int32, device=device)[:, :, None],
+        torch.tensor(dense, device=device).view(shape),
+        torch.tensor([size - 1 for size in sizes], dtype=torch.int32, device=device).view(shape),
+        torch.tensor(layout.offsets[:-1], dtype=torch.int32, device=device).view(shape),
+    )
+
+
+def _has_int32_indices(
+    positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None
+) -> bool:
+    return layout.num_entries < 2**31
+
+
+@HASH_GRID.implementation(FEW_OPERATIONS, types=None, order=torch.inf, fits=_has_int32_indices)
+def _all_levels(positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> Tensor:
+    """Compute `hash_grid` with one set of operations for all levels, for any device and float type."""
+    held = 8 * layout.num_levels * table.shape[1]
+    parts = positions.split(max(MAX_HELD // held, 1))
+    found = [_at_all_levels(part, table, layout) for part in parts]
+    return found[0] if len(found) == 1 else torch.cat(found)
+
+
+def _at_all_levels(positions: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
+    levels = _levels(layout, positions.dtype, positions.device)
+    scaled = positions.t().clamp(0, 1) * levels.cells  # (L, 3, N)
+    cell = torch.minimum(scaled.detach().nan_to_num().floor(), levels.cells - 1)
+    fractions, low = scaled - cell, cell.int() * levels.strides
+    x, y, z = _spread(torch.stack([low, low + levels.strides], 2))
+    entries = torch.where(levels.dense, x + y + z, (x ^ y ^ z) & levels.masks) + levels.offsets
+    wx, wy, wz = _spread(torch.stack([1 - fractions, fractions], 2))
+    # By index_select, whose gradient is added up in place; that of table[entries] is sorted first on a GPU.
+    rows = table.index_select(0, entries.flatten()).view(layout.num_levels, 8, len(positions), table.shape[1])
+    features = (rows * (wx * wy * wz).flatten(1, 3)[..., None]).sum(1)
+    return features.transpose(0, 1).flatten(1)
+
+
+def _spread(ends: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the values (L, 3, 2, N) at a cell's two ends along x, y, z, which broadcast to (L, 2, 2, 2, N)."""
+    x, y, z = ends.unbind(1)
+    return x[:, :, None, None], y[:, None, :, None], z[:, None, None]

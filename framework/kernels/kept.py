@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from framework.kernels.rows import gather_rows, take_rows
+from framework.kernels.rows import gather_rows, joined, take_rows
 
 CLOSE, ALMOST_ZERO = 1e-4, 1e-6
 """Relative and absolute tolerance of equal inputs, since torch's rounding depends on the batch size."""
@@ -221,6 +221,6 @@ class Waves:
             the values, each with M rows.
         """
         if not self._tapes:
-            return tuple(take_rows(torch.cat(column), order) for column in zip(*self._values, strict=True))
+            return tuple(take_rows(joined(column), order) for column in zip(*self._values, strict=True))
         with _used(_Replay(self._tapes, order)):
             return function()

@@ -3,7 +3,8 @@
 The candidates of a ray are the steps first + k * step, which grow with distance beyond step / cone (Instant-NGP,
 Mueller et al. 2022, appendix E.1). Candidates whose middle lies in an occupied cell are samples. A wave consists of the
 next few samples of every ray that has not ended. When their density is known, `advance` ends rays whose transmittance
-is low, so that hidden samples are never evaluated, and no sample is evaluated twice.
+is low, so that hidden samples are never evaluated, and no sample is evaluated twice. On other devices than the CPU a
+wave costs more than samples that are evaluated in vain: the form in PyTorch takes all in one wave if they are not many.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -21,88 +21,20 @@ from torch.nn import functional
 from framework.geometry.bounds import intersect_box
 from framework.geometry.rays import Rays
 from framework.kernels import native
-from framework.kernels.compositing import optical_depth, segmented_sum
+from framework.kernels.compositing import bounded_sum, optical_depth
 from framework.kernels.dispatch import CPP, INT64, TRITON, Operation
 from framework.kernels.given import check_indices
+from framework.kernels.occupancy import Occupancy as Occupancy
+from framework.kernels.occupancy import refresh_occupancy as refresh_occupancy
 from framework.kernels.triton_kernels import later
 
-BLOCK = 4
-"""Cells along an edge of a block, which is a cell of the coarser level."""
 RUN = 8
 """Number of steps that the reference tests together."""
-ROUNDING = 1e-5
-"""Relative tolerance of the mean opacity, so that rounding errors do not empty a grid whose cells are all equal."""
-
-
-@dataclass(frozen=True)
-class Occupancy:
-    """The occupied cells of a grid over a box."""
-
-    occupied: Tensor
-    """(n^3,) bool; the index of cell (x, y, z) is (x n + y) n + z."""
-    box: Tensor
-    """(2, 3) minimum and maximum corner, scene units."""
-    resolution: int
-    """Number n of cells along each axis."""
-
-    @cached_property
-    def packed(self) -> tuple[Tensor, Tensor]:
-        """(ceil(n^3 / 8),) uint8 with one bit per cell, and (ceil(n / 4)^3,) uint8, for the compiled march.
-
-        The second tensor has, for each block of 4^3 cells, the distance in blocks to the nearest block with an occupied
-        cell.
-        """
-        bits = torch.empty((self.resolution**3 + 7) // 8, dtype=torch.uint8)
-        blocks = torch.empty(math.ceil(self.resolution / BLOCK) ** 3, dtype=torch.uint8)
-        address = native.pointer(self.occupied, "the occupancy", (self.resolution**3,), torch.bool)
-        _pack(address, self.resolution, bits.data_ptr(), blocks.data_ptr())
-        return bits, blocks
-
-    @cached_property
-    def distances(self) -> Tensor:
-        """(ceil(n / 4)^3,) uint8 distances of blocks, as in `packed`, but at most 16, for the march on a GPU."""
-        return later("march", "block_distances")(self.occupied, self.resolution)
-
-    def cells(self, positions: Tensor) -> Tensor:
-        """Return the index (N,) of the cell of each of `positions` (N, 3), or of the nearest cell if it is outside."""
-        scale = self.resolution / (self.box[1] - self.box[0])
-        x, y, z = ((positions - self.box[0]) * scale).long().clamp(0, self.resolution - 1).unbind(-1)
-        return (x * self.resolution + y) * self.resolution + z
-
-
-def refresh_occupancy_reference(density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float) -> None:
-    """Compute `refresh_occupancy` of `density`, `occupied`, `decay`, `step` and `threshold` in PyTorch."""
-    density *= decay
-    alpha = -torch.expm1(-density * step)
-    least = min(threshold, alpha.nanmean().item() * (1 - ROUNDING))  # the threshold if all are NaN
-    occupied.copy_(~(alpha < least))
-
-
-@torch.no_grad()
-def refresh_occupancy(density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float) -> None:
-    """Mark, in place, the cells whose opacity over one step is at least a threshold.
-
-    Args:
-        density: (n^3,) density of each cell, 1/length, which is multiplied by `decay` in place; infinite if unknown.
-            Cells of NaN are marked, so that a broken field is noticed, and left out of the mean.
-        occupied: (n^3,) bool, to be written.
-        decay: factor of the densities.
-        step: length of a step, scene units.
-        threshold: minimum opacity, or the mean opacity over all cells if that is less.
-    """
-    REFRESH_OCCUPANCY((density,), density, occupied, decay, step, threshold)
-
-
-REFRESH_OCCUPANCY = Operation("refresh_occupancy", refresh_occupancy_reference)
-
-
-@REFRESH_OCCUPANCY.implementation(CPP)
-def _refresh_compiled(density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float) -> None:
-    cells = len(density)
-    _refresh(
-        native.pointer(density, "density", (cells,)), cells, decay, step, threshold,
-        native.pointer(occupied, "the occupancy", (cells,), torch.bool), native.threads(),
-    )  # fmt: skip
+WAVES = (8, 8, 16, 32, 64, 128)
+"""Samples per ray in each wave of a compiled march; the last size repeats."""
+CAPACITY = 2**18
+"""Number of samples up to which the reference takes all candidates in one wave, for the next one means to wait for a
+GPU; about the number in a wave if there are more."""
 
 
 @dataclass(frozen=True)
@@ -138,6 +70,13 @@ class March(ABC):
         self.waves: list[Wave] = []
         self.reached: list[Tensor] = []
         """(N,) uint8 for each wave: 1 for samples in front of which the transmittance is not below `early_stop`."""
+        self.longest: int | None = None
+        """Upper bound of the number of samples on a ray; None if finding it would take a pass over them."""
+
+    @property
+    def next_limit(self) -> int:
+        """The number of samples per ray that the next wave should have at most."""
+        return WAVES[min(len(self.waves), len(WAVES) - 1)]
 
     @abstractmethod
     def wave(self, limit: int) -> Wave | None:
@@ -235,9 +174,31 @@ def sort_by_ray_reference(owners: Tensor, reached: Tensor, num_rays: int) -> tup
     """Compute `sort_by_ray` of `owners`, `reached` and `num_rays` in PyTorch, on any device."""
     check_indices(owners, num_rays, "rays")
     chosen = reached.nonzero().squeeze(-1)
-    order = chosen[owners[chosen].argsort(stable=True)]
-    counts = torch.bincount(owners[chosen], minlength=num_rays)
-    return order, functional.pad(counts.cumsum(0), (1, 0))
+    owners = owners.index_select(0, chosen)
+    return chosen.index_select(0, owners.argsort(stable=True)), _offsets(owners, num_rays)
+
+
+def _offsets(owners: Tensor, num_rays: int) -> Tensor:
+    """Return the offsets (R + 1,) of rays from the owners (N,) of samples."""
+    counts = owners.new_zeros(num_rays).index_add_(0, owners, torch.ones_like(owners))
+    return functional.pad(counts.cumsum(0), (1, 0))
+
+
+def _chosen(mask: Tensor, owners: Tensor, num_rays: int) -> tuple[Tensor, Tensor, int]:
+    """Return indices (M,) of samples, offsets (R + 1,) of their rays, and the maximum number on a ray.
+
+    A device is waited for once, for both numbers, which is as often as by `nonzero`.
+
+    Args:
+        mask: (N,) bool, the samples.
+        owners: (N,) int64 ray of each of them, in ascending order.
+        num_rays: number R of rays.
+    """
+    counts = owners.new_zeros(num_rays).index_add_(0, owners, mask.long())
+    total, longest = torch.stack([counts.sum(), counts.amax()]).tolist() if num_rays else (0, 0)
+    places = torch.where(mask, mask.cumsum(0) - 1, total)  # the others are written behind the end
+    indices = owners.new_empty(total + 1).scatter_(0, places, torch.arange(len(mask), device=mask.device))[:total]
+    return indices, functional.pad(counts.cumsum(0), (1, 0)), longest
 
 
 SORT_BY_RAY = Operation("sort_by_ray", sort_by_ray_reference)
@@ -265,20 +226,38 @@ class ReferenceMarch(March):
         self, rays: Rays, occupancy: Occupancy, step: float, cone: float, shift: Tensor | None, early_stop: float
     ) -> None:
         super().__init__(rays, early_stop)
-        self.t_starts, self.t_ends, self.offsets = candidates(rays, occupancy, step, cone, shift)
-        self.counts = self.offsets[1:] - self.offsets[:-1]
+        found = candidates(rays, occupancy, step, cone, shift)
+        self.t_starts, self.t_ends, self.owners, self.offsets, self._most = found
+        self.longest, self._in_wave = self._most, 0
         self.spent = rays.origins.new_zeros(len(rays))
-        self.alive = self.counts.nonzero().squeeze(-1)
+        self.alive: Tensor | None = None
+        """(A,) rays that have not ended; None before the first wave, and after one that had all candidates."""
         self.num_returned = 0
 
+    @property
+    def next_limit(self) -> int:
+        if self.num_returned == 0 and len(self.t_starts) <= CAPACITY:
+            return self._most
+        return max(CAPACITY // max(len(self.rays if self.alive is None else self.alive), 1), WAVES[0])
+
     def wave(self, limit: int) -> Wave | None:
-        if len(self.alive) == 0:
+        if self.num_returned >= self._most:
             return None
-        ray_numbers, self.ranks = ranges((self.counts[self.alive] - self.num_returned).clamp(max=limit))
-        owners = self.alive[ray_numbers]
-        chosen = self.offsets[:-1][owners] + self.num_returned + self.ranks
-        starts, ends = self.t_starts[chosen], self.t_ends[chosen]
+        if limit >= self._most and self.num_returned == 0:
+            starts, ends, owners = self.t_starts, self.t_ends, self.owners
+            self.ranks = torch.arange(len(owners), device=owners.device) - self.offsets.index_select(0, owners)
+        else:
+            counts = self.offsets.diff()
+            self.alive = counts.nonzero().squeeze(-1) if self.alive is None else self.alive
+            if len(self.alive) == 0:
+                return None
+            left = counts.index_select(0, self.alive) - self.num_returned
+            numbers, self.ranks = ranges(left.clamp(max=limit))
+            owners = self.alive.index_select(0, numbers)
+            chosen = self.offsets.index_select(0, owners) + self.num_returned + self.ranks
+            starts, ends = self.t_starts.index_select(0, chosen), self.t_ends.index_select(0, chosen)
         self.num_returned += limit
+        self._in_wave = min(limit, self._most)
         wave = Wave(starts, ends, owners, self.rays.points(owners, (starts + ends) / 2))
         self.waves.append(wave)
         return wave
@@ -287,11 +266,23 @@ class ReferenceMarch(March):
     def advance(self, sigma: Tensor) -> None:
         wave = self.waves[-1]
         tau = optical_depth(sigma.detach().to(self.spent.dtype), wave.t_ends - wave.t_starts)
-        before = self.spent[wave.owners] + segmented_sum(tau, self.ranks)
+        before = bounded_sum(tau, wave.owners, self.ranks, len(self.rays), self._in_wave)
+        if self.alive is None:
+            self.reached.append((~(before >= self.budget)).to(torch.uint8))
+            return
+        before = self.spent.index_select(0, wave.owners) + before
         self.reached.append((~(before >= self.budget)).to(torch.uint8))
         self.spent.index_add_(0, wave.owners, tau)
-        remaining = self.counts[self.alive] > self.num_returned
-        self.alive = self.alive[remaining & ~(self.spent[self.alive] >= self.budget)]
+        remaining = self.offsets.diff().index_select(0, self.alive) > self.num_returned
+        going_on = remaining & ~(self.spent.index_select(0, self.alive) >= self.budget)
+        self.alive = self.alive.index_select(0, going_on.nonzero().squeeze(-1))
+
+    def finish(self) -> tuple[Tensor, Tensor]:
+        if self.alive is not None or not self.waves:
+            return super().finish()
+        # The samples of a single wave are sorted already.
+        order, offsets, self.longest = _chosen(self.reached[0] > 0, self.owners, len(self.rays))
+        return order, offsets
 
 
 def march(rays: Rays, occupancy: Occupancy, step: float, cone: float, shift: Tensor | None, early_stop: float) -> March:
@@ -331,10 +322,14 @@ def step_start(first: Tensor, k: Tensor, step: float, cone: float) -> Tensor:
 @torch.no_grad()
 def candidates(
     rays: Rays, occupancy: Occupancy, step: float, cone: float, shift: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the starts (N,), ends (N,) and offsets (R + 1,) of all steps whose middle is in an occupied cell.
+) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
+    """Return all steps whose middle is in an occupied cell.
 
     `rays`, `occupancy`, `step`, `cone` and `shift` are as in `march`.
+
+    Returns:
+        Starts (N,), ends (N,) and rays (N,) of the steps, sorted by ray; offsets (R + 1,) of the rays; and the maximum
+        number of steps on a ray.
     """
     enter, leave = intersect_box(rays.origins, rays.directions, occupancy.box)
     enter, leave = torch.maximum(enter, rays.nears), torch.minimum(leave, rays.fars)
@@ -346,53 +341,43 @@ def candidates(
         grown = turn + ((leave / base).clamp(min=1).log() / math.log1p(cone)).ceil() + 1
         counts = torch.where(counts > turn, torch.minimum(counts, grown), counts)
     counts = torch.where(leave > enter, counts.clamp(min=0), torch.zeros_like(counts)).long()
-    owners, k = ranges(counts)
+    run = RUN if cone == 0 else 1
+    # The device is waited for three times: for the number of runs, of those near an occupied cell, and of candidates.
+    runs = (counts + run - 1) // run
+    owners, k = ranges(runs)
     if cone == 0:
-        owners, k = _near_occupied(rays, occupancy, step, first, counts)
-    starts, ends = (step_start(first[owners], k + after, step, cone) for after in (0, 1))
+        owners, k = _near_occupied(rays, occupancy, step, first, owners, k)
+    starts, ends = (step_start(first.index_select(0, owners), k + after, step, cone) for after in (0, 1))
     middle = (starts + ends) / 2
     cells = occupancy.cells(rays.points(owners, middle))
-    keep = occupancy.occupied[cells] & (middle >= enter[owners]) & (middle < leave[owners])
-    per_ray = torch.bincount(owners[keep], minlength=len(rays))
-    return starts[keep], ends[keep], functional.pad(per_ray.cumsum(0), (1, 0))
+    inside = (middle >= enter.index_select(0, owners)) & (middle < leave.index_select(0, owners))
+    kept, offsets, longest = _chosen(occupancy.occupied.index_select(0, cells) & inside, owners, len(rays))
+    starts, ends, owners = (values.index_select(0, kept) for values in (starts, ends, owners))
+    return starts, ends, owners, offsets, longest
 
 
 def _near_occupied(
-    rays: Rays, occupancy: Occupancy, step: float, first: Tensor, counts: Tensor
+    rays: Rays, occupancy: Occupancy, step: float, first: Tensor, owners: Tensor, run: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the rays and numbers of the steps in those runs of RUN steps that are near an occupied cell."""
-    cell = ((occupancy.box[1] - occupancy.box[0]) / occupancy.resolution).min().item()
-    reach = dilated(occupancy, math.ceil((RUN - 1) / 2 * step / cell))
-    owners, run = ranges((counts + RUN - 1) // RUN)
-    middle = first[owners] + (run * RUN + RUN / 2) * step
-    keep = reach[occupancy.cells(rays.points(owners, middle))]
-    owners, run = owners[keep], run[keep]
+    """Return the rays and numbers of the steps in those of the runs, of RUN steps each, that are near an occupied cell.
+
+    `owners` and `run` are ray and number of each run; `rays`, `occupancy`, `step` and `first` are as in `candidates`.
+    """
+    reach = occupancy.near(math.ceil((RUN - 1) / 2 * step / occupancy.edge))
+    middle = first.index_select(0, owners) + (run * RUN + RUN / 2) * step
+    kept = reach.index_select(0, occupancy.cells(rays.points(owners, middle))).nonzero().squeeze(-1)
+    owners, run = owners.index_select(0, kept), run.index_select(0, kept)
     k = run[:, None] * RUN + torch.arange(RUN, device=run.device)
     return owners.repeat_interleave(RUN), k.reshape(-1)
-
-
-def dilated(occupancy: Occupancy, radius: int) -> Tensor:
-    """Return the cells (n^3,) bool of `occupancy` that have an occupied cell within `radius` cells along every axis."""
-    n = occupancy.resolution
-    grid = occupancy.occupied.view(n, n, n)
-    for axis in range(3):
-        out = grid.clone()
-        for shift in range(1, min(radius, n - 1) + 1):
-            out.narrow(axis, 0, n - shift).logical_or_(grid.narrow(axis, shift, n - shift))
-            out.narrow(axis, shift, n - shift).logical_or_(grid.narrow(axis, 0, n - shift))
-        grid = out
-    return grid.reshape(-1)
 
 
 def ranges(counts: Tensor) -> tuple[Tensor, Tensor]:
     """Return the owner (N,) and rank (N,) of each item, where owner i has `counts[i]` items, ranked from 0."""
     owners = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
     firsts = counts.cumsum(0) - counts
-    return owners, torch.arange(len(owners), device=counts.device) - firsts[owners]
+    return owners, torch.arange(len(owners), device=counts.device) - firsts.index_select(0, owners)
 
 
-_pack: Callable[..., None] = native.Function("pack_occupancy", "pipp")
-_refresh: Callable[..., None] = native.Function("refresh_occupancy", "pqfffpi")
 _begin: Callable[..., int] = native.Function("march_begin", "pppppqpfppppi", "q")
 _wave: Callable[..., int] = native.Function("march_wave", "pppppppqipffppipppppi", "q")
 _advance: Callable[..., int] = native.Function("march_advance", "pqpipppfppp", "q")

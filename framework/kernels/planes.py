@@ -9,133 +9,26 @@ group of three lines (equations 4 and 3).
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-from functools import cached_property
-from itertools import combinations
-from typing import Any
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from framework.base.errors import ConfigError, shown
 from framework.kernels import kept, memory, native
-from framework.kernels.adam import all_finite, sparse_adam
+from framework.kernels.adam import sparse_adam
 from framework.kernels.deferred import Parts, waiting
-from framework.kernels.dispatch import CPP, TRITON, Operation
+from framework.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
+from framework.kernels.planes_layout import PlanesLayout as PlanesLayout
 from framework.kernels.triton_kernels import later
 
-MAX_GROUPS, MAX_FACTORS = 64, 6
-"""Maximum number of groups, and of factors of a group."""
-MAX_VERTICES = 2**20
-"""Maximum number of vertices along an axis; float32 then has 4 bits left for the position between two vertices."""
-
-
-@dataclass(frozen=True)
-class PlanesLayout:
-    """Axes, resolution and entries of each factor, in one table (E, F) that all factors share.
-
-    Raises:
-        ConfigError: if the numbers are inconsistent or out of range; the kernels rely on them.
-    """
-
-    resolutions: tuple[tuple[int, ...], ...]
-    """Vertices along each of the D axes, for each of the G groups."""
-    axes: tuple[tuple[tuple[int, ...], ...], ...]
-    """The axis or two axes of each factor, per group. The index along the first axis varies fastest."""
-    offsets: tuple[tuple[int, ...], ...]
-    """Index of the first entry of each factor, per group."""
-    num_entries: int
-    """Number E of entries of all factors."""
-
-    def __post_init__(self) -> None:
-        _check_factors(self.resolutions, self.axes)
-        for sizes, group, firsts in zip(self.resolutions, self.axes, self.offsets, strict=True):
-            for along, first in zip(group, firsts, strict=True):
-                last = first + math.prod(sizes[axis] for axis in along)
-                if not 0 <= first < last <= self.num_entries:
-                    raise ConfigError(f"planes of {self.num_entries} entries have no entries {first} to {last}")
-
-    @classmethod
-    def build(
-        cls, resolutions: tuple[tuple[int, ...], ...], axes: tuple[tuple[tuple[int, ...], ...], ...] | None = None
-    ) -> PlanesLayout:
-        """Return the layout of factors, one after the other in the table.
-
-        Args:
-            resolutions: vertices along each of the D axes, for each of the G groups.
-            axes: the axis or two axes of each factor, per group; a plane for every pair of axes if None.
-
-        Raises:
-            ConfigError: if an axis has less than 2 or more than MAX_VERTICES vertices, or the groups differ in their
-                number of axes or factors.
-        """
-        axes = axes or tuple(tuple(combinations(range(len(scale)), 2)) for scale in resolutions)
-        _check_factors(resolutions, axes)
-        offsets, total = [], 0
-        for sizes, group in zip(resolutions, axes, strict=True):
-            firsts = []
-            for along in group:
-                firsts.append(total)
-                total += math.prod(sizes[axis] for axis in along)
-            offsets.append(tuple(firsts))
-        return cls(resolutions, axes, tuple(offsets), total)
-
-    @property
-    def dims(self) -> int:
-        """Number D of axes."""
-        return len(self.resolutions[0])
-
-    @property
-    def num_groups(self) -> int:
-        """Number G of groups."""
-        return len(self.resolutions)
-
-    def shape(self, group: int, index: int) -> tuple[int, int]:
-        """Return the vertices along the second axis, 1 for a line, and the first axis of factor `index` of `group`."""
-        sizes = [self.resolutions[group][axis] for axis in self.axes[group][index]]
-        return (sizes[1] if len(sizes) == 2 else 1), sizes[0]
-
-    def factor(self, table: Tensor, group: int, index: int) -> Tensor:
-        """Return a view of a factor's entries.
-
-        Args:
-            table: (E, F) entries of all factors.
-            group: number of the group.
-            index: number of the factor in the group.
-
-        Returns:
-            (vertices along the second axis, or 1, vertices along the first axis, F) entries.
-        """
-        up, across = self.shape(group, index)
-        first = self.offsets[group][index]
-        return table[first : first + across * up].view(up, across, -1)
-
-    @cached_property
-    def arrays(self) -> tuple[Any, Any, Any]:
-        """Axes, resolutions and offsets as C arrays."""
-        axes = tuple(axis for group in self.axes for along in group for axis in (*along, -1)[:2])
-        flat = (tuple(value for row in rows for value in row) for rows in (self.resolutions, self.offsets))
-        resolutions, offsets = (native.integers(values) for values in flat)
-        return native.integers(axes), resolutions, offsets
-
-
-def _check_factors(resolutions: tuple[tuple[int, ...], ...], axes: tuple[tuple[tuple[int, ...], ...], ...]) -> None:
-    """Check vertices and axes, on which the kernels rely; a ConfigError says what is wrong."""
-    dims = {len(scale) for scale in resolutions}
-    if len(dims) != 1 or not dims <= {2, 3, 4} or len(resolutions) > MAX_GROUPS:
-        groups = f"{len(resolutions)} groups of {sorted(dims)} axes"
-        raise ConfigError(f"planes need 1 to {MAX_GROUPS} groups of the same 2 to 4 axes, not {groups}")
-    for size in (size for scale in resolutions for size in scale):
-        if not isinstance(size, int) or not 2 <= size <= MAX_VERTICES:
-            raise ConfigError(f"planes need 2 to {MAX_VERTICES} vertices along each axis, not {shown(size)}")
-    (count,) = dims
-    numbers = {len(group) for group in axes}
-    if len(axes) != len(resolutions) or len(numbers) != 1 or not numbers <= set(range(1, MAX_FACTORS + 1)):
-        raise ConfigError(f"planes need 1 to {MAX_FACTORS} factors, as many in every group, not {shown(axes)}")
-    for along in (along for group in axes for along in group):
-        if len(along) not in (1, 2) or len(set(along)) != len(along) or not set(along) <= set(range(count)):
-            raise ConfigError(f"planes need one or two of the axes 0 to {count - 1} for each factor, not {along}")
+Band = tuple[int, int, int, int]
+"""Group, factor in the group, first row, and number of rows."""
+Spans = tuple[tuple[int, int], ...]
+"""Indices of the first entry, and of the one behind the last."""
+MAX_HELD = 2**26
+"""Maximum number of features at corners that the form in few operations holds at once; it takes positions in parts."""
 
 
 def planes_reference(positions: Tensor, table: Tensor, layout: PlanesLayout) -> Tensor:
@@ -194,12 +87,13 @@ class PlanesGradient:
         self.parts: Parts = []
         """Positions (N, D) of each look-up, and gradient (N, G * F) of its result."""
         self.bands: list[tuple[int, Tensor]] = []
-        """Index of the first entry, and gradient (B, F), of each band of entries that `plane_band` has read."""
+        """Index of the first entry, and gradient (B, F), of each band of entries that `plane_bands` has read."""
         self._sum: Tensor | None = None
 
-    def finite(self) -> bool:
-        """Return whether no value of the collected gradients is infinite or NaN."""
-        return all(all_finite(grad) for _, grad in (*self.parts, *self.bands))
+    @property
+    def gradients(self) -> list[Tensor]:
+        """The collected gradients of look-ups and bands."""
+        return [grad for _, grad in (*self.parts, *self.bands)]
 
     @property
     def pending(self) -> bool:
@@ -311,39 +205,66 @@ class _Band(torch.autograd.Function):
         return None, None, None, None
 
 
-def _band_reference(table: Tensor, first: int, end: int, deferred: PlanesGradient | None) -> Tensor:
-    return table[first:end]
+class _Bands(torch.autograd.Function):
+    """Rows [first, end) of a table, for several such spans, with one gradient of the table for all of them."""
+
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, spans: Spans) -> tuple[Tensor, ...]:
+        ctx.spans, ctx.shape = spans, table.shape
+        ctx.set_materialize_grads(False)
+        return tuple(table[first:end].clone() for first, end in spans)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, None]:
+        known = [(span, grad) for span, grad in zip(ctx.spans, grads, strict=True) if grad is not None]
+        if not known:
+            return None, None
+        total = known[0][1].new_zeros(ctx.shape)
+        for (first, end), grad in known:
+            total[first:end] += grad
+        return total, None
 
 
-PLANE_BAND = Operation("plane_band", _band_reference)
+def _bands_reference(table: Tensor, spans: Spans, deferred: PlanesGradient | None) -> list[Tensor]:
+    return [table[first:end] for first, end in spans]
 
 
-@PLANE_BAND.implementation(CPP, fits=lambda table, first, end, deferred: deferred is not None)
-def _band_deferred(table: Tensor, first: int, end: int, deferred: PlanesGradient | None) -> Tensor:
-    return _Band.apply(table, first, end, deferred)
+PLANE_BANDS = Operation("plane_bands", _bands_reference)
 
 
-def plane_band(
-    table: Tensor, layout: PlanesLayout, group: int, index: int, first_row: int, rows: int,
-    deferred: PlanesGradient | None = None,
-) -> Tensor:  # fmt: skip
-    """Return consecutive rows of a factor, for regularisers, for which reading all of a large table is slow.
+@PLANE_BANDS.implementation(CPP, fits=lambda table, spans, deferred: deferred is not None)
+def _bands_deferred(table: Tensor, spans: Spans, deferred: PlanesGradient | None) -> list[Tensor]:
+    return [_Band.apply(table, first, end, deferred) for first, end in spans]
+
+
+@PLANE_BANDS.implementation(FEW_OPERATIONS, types=None)
+def _bands_at_once(table: Tensor, spans: Spans, deferred: PlanesGradient | None) -> list[Tensor]:
+    return list(_Bands.apply(table, spans))
+
+
+def plane_bands(
+    table: Tensor, layout: PlanesLayout, bands: Sequence[Band], deferred: PlanesGradient | None = None
+) -> list[Tensor]:
+    """Return consecutive rows of factors, for regularisers, for which reading all of a large table is slow.
 
     Args:
         table: (E, F) entries of all factors.
         layout: axes, resolutions and offsets of the factors.
-        group: number of the group.
-        index: number of the factor in the group.
-        first_row: index of the first row, along the factor's second axis.
-        rows: number of rows.
+        bands: group, factor in the group, first row and number of rows of each band; rows are along the second axis.
         deferred: collects the gradient of the table on the CPU, instead of autograd, as in `planes`; None for autograd.
 
     Returns:
-        (rows, vertices along the first axis, F) entries.
+        (rows, vertices along the first axis, F) entries of each band.
     """
-    _, across = layout.shape(group, index)
-    first = layout.offsets[group][index] + first_row * across
-    return PLANE_BAND((table,), table, first, first + rows * across, deferred).view(rows, across, -1)
+    widths, spans = [], []
+    for group, index, first_row, rows in bands:
+        _, across = layout.shape(group, index)
+        first = layout.offsets[group][index] + first_row * across
+        widths.append(across)
+        spans.append((first, first + rows * across))
+    found = PLANE_BANDS((table,), table, tuple(spans), deferred)
+    return [band.view(-1, across, band.shape[1]) for band, across in zip(found, widths, strict=True)]
 
 
 def planes(
@@ -393,3 +314,68 @@ def _compiled(positions: Tensor, table: Tensor, layout: PlanesLayout, deferred: 
 
 
 PLANES.implementation(TRITON)(later("planes", "planes"))
+
+
+class _Factors(NamedTuple):
+    """Constants of all P factors on a device, in the shapes in which they are combined with positions (2 P, N)."""
+
+    axes: Tensor
+    """(2 P,) int64 first axes of all factors, then their second axes; a line has its only axis twice."""
+    cells: Tensor
+    """(2 P, 1) number of cells along these axes."""
+    planes: Tensor
+    """(P, 1) 1 for planes and 0 for lines, along whose second axis nothing changes."""
+    offsets: Tensor
+    """(P, 1, 1, 1) int64 index of the first entry."""
+    strides: Tensor
+    """(P, 1, 1, 1) int64 entries from one row to the next; 0 for lines."""
+    ends: Tensor
+    """(2,) int64: 0 and 1."""
+
+
+@lru_cache(maxsize=64)
+def _factors(layout: PlanesLayout, dtype: torch.dtype, device: torch.device) -> _Factors:
+    """Return the constants; they are kept, since bringing them to a device means to wait for it."""
+    factors = [(sizes, along) for sizes, group in zip(layout.resolutions, layout.axes, strict=True) for along in group]
+    pairs = [(along[0], along[-1]) for _, along in factors]
+    axes = [first for first, _ in pairs] + [second for _, second in pairs]
+    cells = [sizes[axis] - 1 for (sizes, _), axis in zip(factors * 2, axes, strict=True)]
+    strides = [sizes[along[0]] if len(along) == 2 else 0 for sizes, along in factors]
+    offsets = [first for firsts in layout.offsets for first in firsts]
+
+    def column(values: list[Any], kind: torch.dtype, dims: int) -> Tensor:
+        return torch.tensor(values, dtype=kind, device=device).view(-1, *[1] * dims)
+
+    return _Factors(
+        column(axes, torch.int64, 0), column(cells, dtype, 1), column([min(stride, 1) for stride in strides], dtype, 1),
+        column(offsets, torch.int64, 3), column(strides, torch.int64, 3), column([0, 1], torch.int64, 0),
+    )  # fmt: skip
+
+
+@PLANES.implementation(FEW_OPERATIONS, types=None, order=torch.inf)
+def _all_factors(positions: Tensor, table: Tensor, layout: PlanesLayout, deferred: PlanesGradient | None) -> Tensor:
+    """Compute `planes` with one set of operations for all factors, for any device and float type."""
+    held = 4 * layout.num_groups * len(layout.axes[0]) * table.shape[1]
+    found = [_at_all_factors(part, table, layout) for part in positions.split(max(MAX_HELD // held, 1))]
+    return found[0] if len(found) == 1 else torch.cat(found)
+
+
+def _at_all_factors(positions: Tensor, table: Tensor, layout: PlanesLayout) -> Tensor:
+    constants = _factors(layout, positions.dtype, positions.device)
+    scaled = positions.t().clamp(0, 1).index_select(0, constants.axes) * constants.cells  # (2 P, N)
+    cell = torch.minimum(scaled.detach().nan_to_num().floor(), constants.cells - 1)
+    first, second = (scaled - cell).chunk(2)
+    across, up = cell.long()[:, None].chunk(2)  # (P, 1, N)
+    ends = constants.ends
+    rows = (up + ends[:, None])[:, :, None] * constants.strides  # (P, 2, 1, N)
+    entries = rows + (across + ends[:, None])[:, None] + constants.offsets  # (P, 2, 2, N)
+    second = second * constants.planes
+    along, beside = (torch.stack([1 - fraction, fraction], 1) for fraction in (first, second))
+    weights = beside[:, :, None] * along[:, None]
+    # By index_select, whose gradient is added up in place; that of table[entries] is sorted first on a GPU.
+    corners = table.index_select(0, entries.flatten()).view(len(constants.offsets), 4, len(positions), table.shape[1])
+    values = (corners * weights.flatten(1, 2)[..., None]).sum(1).unflatten(0, (layout.num_groups, -1))
+    product, *others = values.unbind(1)
+    for other in others:
+        product = product * other
+    return product.transpose(0, 1).flatten(1)

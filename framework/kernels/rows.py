@@ -59,7 +59,12 @@ def gather_rows(columns: Sequence[Sequence[Tensor]], order: Tensor) -> list[Tens
 def gather_rows_reference(columns: Sequence[Sequence[Tensor]], order: Tensor) -> list[Tensor]:
     """Compute `gather_rows` of `columns` and `order` in PyTorch, on any device."""
     check_indices(order, sum(len(part) for part in columns[0]), "rows")
-    return [torch.cat(list(parts)).index_select(0, order) for parts in columns]
+    return [joined(parts).index_select(0, order) for parts in columns]
+
+
+def joined(parts: Sequence[Tensor]) -> Tensor:
+    """Return `parts` concatenated; a single one is not copied."""
+    return parts[0] if len(parts) == 1 else torch.cat(list(parts))
 
 
 GATHER_ROWS = Operation("gather_rows", gather_rows_reference)

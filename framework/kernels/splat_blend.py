@@ -14,14 +14,16 @@ of them.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from framework.kernels import native
-from framework.kernels.dispatch import CPP, TRITON, Operation
-from framework.kernels.splat_project import CUT, DISTANCE, OPACITY, RECORD, RGB
+from framework.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
+from framework.kernels.splat_project import CUT, DISTANCE, OPACITY, RECORD, RGB, X, Y
 from framework.kernels.splat_tiles import TILE, TileLists
 from framework.kernels.triton_kernels import later
 
@@ -29,6 +31,8 @@ MAX_ALPHA = 0.999
 """No Gaussian is more opaque: the gradient divides by 1 - alpha."""
 OPAQUE = 1e-4
 """Transmittance below which a pixel is done."""
+MAX_PAIRS = 2**24
+"""Maximum number of pairs of a Gaussian and a pixel that the form in few operations holds at once."""
 CHANNELS = {"rgb": 3, "distance": 4, "normals": 7}
 """Content of an image -> its channels: colours; then the sum of weight times distance; then that of the normals."""
 
@@ -119,6 +123,56 @@ def _weights(records: Tensor, lists: TileLists, tile: int, columns: int) -> tupl
     return listed, (alpha * through[:, :-1]).masked_fill(through[:, :-1] < OPAQUE, 0), through
 
 
+def _blend_together(
+    records: Tensor, lists: TileLists, width: int, height: int, background: Tensor, channels: int, median: bool
+) -> Blended:
+    """Compute `blend` for many tiles at once, those with lists of like lengths together.
+
+    The device is waited for once, for the lengths. If the tiles do not fit into memory at once, what is computed of
+    them is computed again in the backward pass.
+    """
+    columns, rows = -(-width // TILE), -(-height // TILE)
+    behind = torch.nn.functional.pad(background.to(records), (0, channels - 3))
+    lengths, order = lists.offsets.diff().sort(descending=True)
+    longest, first, parts = lengths.tolist(), 0, []
+    whole = longest[0] * len(longest) * TILE**2 <= MAX_PAIRS
+    run = (
+        _blended_tiles if whole else partial(checkpoint, _blended_tiles, use_reentrant=False, preserve_rng_state=False)
+    )
+    while first < len(longest):
+        last = first + max(MAX_PAIRS // (max(longest[first], 1) * TILE**2), 1)
+        parts.append(run(records, lists, order[first:last], longest[first], columns, behind))
+        first = last
+    tiles = torch.cat(parts).index_select(0, order.argsort()).view(rows, columns, TILE, TILE, -1)
+    image = tiles.permute(0, 2, 1, 3, 4).reshape(rows * TILE, columns * TILE, -1)[:height, :width]
+    return Blended(image[..., :channels], image[..., channels], image[..., channels + 1].detach() if median else None)
+
+
+def _blended_tiles(
+    records: Tensor, lists: TileLists, tiles: Tensor, longest: int, columns: int, behind: Tensor
+) -> Tensor:
+    """Return channels, transmittance and median distance (T, P, C + 2) of the P pixels of T tiles."""
+    place = torch.arange(longest, device=records.device)
+    first, end = lists.offsets.index_select(0, tiles), lists.offsets.index_select(0, tiles + 1)
+    entries = (first[:, None] + place).clamp(max=max(len(lists.ids) - 1, 0)).flatten()
+    listed = records.index_select(0, lists.ids.index_select(0, entries)).view(len(tiles), 1, longest, RECORD)
+    within = torch.arange(TILE, device=records.device) + 0.5
+    x = ((tiles % columns * TILE)[:, None, None] + within).expand(-1, TILE, -1).flatten(1)
+    y = ((tiles // columns * TILE)[:, None, None] + within[:, None]).expand(-1, -1, TILE).flatten(1)
+    dx, dy = x.to(records.dtype)[..., None] - listed[..., X], y.to(records.dtype)[..., None] - listed[..., Y]
+    q = (listed[..., 2] * dx + listed[..., 3] * dy) ** 2 + (listed[..., 4] * dy) ** 2
+    alpha = (listed[..., OPACITY] * torch.exp(-q)).clamp(max=MAX_ALPHA)
+    alpha = alpha.masked_fill((q >= listed[..., CUT]) | (place >= (end - first)[:, None])[:, None], 0)
+    # A sum of logarithms: the gradient of a product asks the device whether a factor is 0.
+    through = torch.exp(torch.nn.functional.pad(torch.log1p(-alpha).cumsum(-1), (1, 0)))
+    in_front = through[..., :-1]
+    weights = (alpha * in_front).masked_fill(in_front < OPAQUE, 0)
+    rest = 1 - weights.sum(-1, keepdim=True)
+    values = weights @ listed[:, 0, :, RGB : RGB + len(behind)] + rest * behind
+    crossed = (in_front > 0.5) & (through[..., 1:] <= 0.5)
+    return torch.cat([values, rest, (crossed * listed[..., DISTANCE]).sum(-1, keepdim=True)], -1)
+
+
 def blended_pairs(records: Tensor, lists: TileLists, width: int, height: int) -> int:
     """Return the number of pairs of a Gaussian and a pixel into which it is blended, for measurements.
 
@@ -137,6 +191,7 @@ def blended_pairs(records: Tensor, lists: TileLists, width: int, height: int) ->
 
 
 BLEND = Operation("blend", blend_reference)
+BLEND.implementation(FEW_OPERATIONS, types=None, order=torch.inf)(_blend_together)
 _forward = native.Function("splat_blend", "pqppqiiipppppi")
 _backward = native.Function("splat_blend_backward", "pqpppqiiipppppp" + "i")
 _gather = native.Function("splat_gather", "pqpqppi")

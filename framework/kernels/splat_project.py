@@ -100,8 +100,7 @@ def project_gaussians(
 
     Returns:
         Records (N, RECORD), all zeros for a Gaussian that the image does not show, and the number of Gaussians that are
-        left out because a parameter is not finite or a quaternion is 0, which on a GPU may be a tensor without
-        dimensions.
+        left out because a parameter is not finite or a quaternion is 0, which may still be on the device, () int64.
 
     Raises:
         ValueError: if there is another number of harmonics.
@@ -130,7 +129,7 @@ def rotation_matrices(quaternions: Tensor) -> Tensor:
 def project_reference(
     means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
     camera: SplatCamera, basis: int,
-) -> tuple[Tensor, int]:  # fmt: skip
+) -> tuple[Tensor, int | Tensor]:  # fmt: skip
     """Compute `project_gaussians` in torch, on any device and in any float type.
 
     Args:
@@ -180,10 +179,10 @@ def project_reference(
         center_x, center_y, u_x, -b / c * u_x, (0.5 / c).sqrt(), opacity, cut.detach(), reach_x.detach(),
         *rgb.clamp(min=0).unbind(-1), at.norm(dim=-1), *normals.unbind(-1), reach_y.detach(),
     ]  # fmt: skip
-    records = means.new_zeros(len(means), RECORD)
     table = torch.stack(columns, -1)
     sound = visible & table.isfinite().all(1)
-    return records.index_copy(0, kept[sound], table[sound]), int((~finite).sum())
+    records = means.new_zeros(len(means), RECORD).index_copy_(0, kept, torch.where(sound[:, None], table, 0))
+    return records, (~finite).sum()
 
 
 def _onto_image(at: Tensor, camera: SplatCamera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -208,8 +207,8 @@ def _onto_image(at: Tensor, camera: SplatCamera) -> tuple[Tensor, Tensor, Tensor
         coefficients = camera.lens.coefficients.reshape(1, -1).expand(len(x), -1).to(x)
         x, y, (uu, uv, vv) = distort(inside_x, inside_y, coefficients)
         to_plane = torch.stack([uu, uv, uv, vv], -1).detach().unflatten(-1, (2, 2)) @ to_plane
-    focal = torch.tensor([fx, fy], dtype=at.dtype, device=at.device)
-    return fx * x + cx, fy * y + cy, focal[:, None] * to_plane, within
+    to_image = torch.stack([fx * to_plane[:, 0], fy * to_plane[:, 1]], 1)
+    return fx * x + cx, fy * y + cy, to_image, within
 
 
 def _angles(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -272,7 +271,7 @@ def _sizes(parameters: list[Tensor], basis: int) -> tuple[int, int, int]:
 def _compiled(
     means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
     camera: SplatCamera, basis: int,
-) -> tuple[Tensor, int]:  # fmt: skip
+) -> tuple[Tensor, int | Tensor]:  # fmt: skip
     parameters = [t.contiguous() for t in (means, log_scales, rotations, logits, colors, harmonics)]
     dropped: list[int] = []
     records = _Project.apply(camera, basis, dropped, *parameters, camera.pose)

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from framework.kernels import native
-from framework.kernels.dispatch import CPP, TRITON, Operation
-from framework.kernels.splat_project import CUT, DISTANCE, REACH_X, REACH_Y, RECORD
+from framework.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
+from framework.kernels.march import ranges
+from framework.kernels.splat_project import CUT, DISTANCE, REACH_X, REACH_Y, RECORD, X, Y
 from framework.kernels.triton_kernels import later
 
 TILE = 16
@@ -55,7 +56,7 @@ def tile_lists_reference(records: Tensor, width: int, height: int) -> TileLists:
     device = records.device
     order = records[:, DISTANCE].sort(stable=True).indices
     order = order[records[order, CUT] > 0]
-    x, y, wide, high = records[order][:, [0, 1, REACH_X, REACH_Y]].unbind(-1)
+    x, y, wide, high = records[order][:, [X, Y, REACH_X, REACH_Y]].unbind(-1)
     edges_x, edges_y = (torch.arange(count, device=device) * TILE for count in (columns, rows))
 
     def met(center: Tensor, reach: Tensor, edges: Tensor) -> Tensor:
@@ -64,17 +65,54 @@ def tile_lists_reference(records: Tensor, width: int, height: int) -> TileLists:
 
     touched = met(y, high, edges_y)[:, :, None] & met(x, wide, edges_x)[:, None]
     place, tile = touched.flatten(1).nonzero().unbind(-1)  # by Gaussian in order of distance, then by tile
-    by_tile = tile.sort(stable=True).indices
-    ids = order[place[by_tile]]
-    counts = torch.bincount(tile, minlength=columns * rows)
+    return _dealt(order.index_select(0, place), tile, columns * rows, len(records))
+
+
+def _dealt(ids: Tensor, tiles: Tensor, num_tiles: int, num_gaussians: int) -> TileLists:
+    """Return the lists of entries (E,) of a Gaussian and a tile each, sorted by distance and then by tile."""
+    by_tile = tiles.sort(stable=True).indices
+    ids = ids.index_select(0, by_tile)
     slots = torch.empty_like(ids)
-    slots[ids.sort(stable=True).indices] = torch.arange(len(ids), device=device)
-    firsts = torch.bincount(ids, minlength=len(records))
-    starts = [torch.nn.functional.pad(each.cumsum(0), (1, 0)).int() for each in (counts, firsts)]
+    slots[ids.sort(stable=True).indices] = torch.arange(len(ids), device=ids.device)
+    starts = [
+        torch.nn.functional.pad(counts.cumsum(0), (1, 0)).int()
+        for counts in (_counts(tiles, num_tiles), _counts(ids, num_gaussians))
+    ]
     return TileLists(starts[0], ids.int(), slots.int(), starts[1])
 
 
+def _counts(values: Tensor, count: int) -> Tensor:
+    """Return how often each of the integers from 0 to `count` - 1 is among `values`; no device is waited for."""
+    return values.new_zeros(count).index_add_(0, values, torch.ones_like(values))
+
+
 TILES = Operation("tile_lists", tile_lists_reference)
+
+
+@TILES.implementation(FEW_OPERATIONS, types=None)
+def _by_entries(records: Tensor, width: int, height: int) -> TileLists:
+    """Compute `tile_lists` without a table of all Gaussians and tiles; the device is waited for once."""
+    columns, rows = -(-width // TILE), -(-height // TILE)
+    order = torch.sort(records[:, DISTANCE], stable=True).indices
+    sorted_records = records.index_select(0, order)
+    x, y, wide, high = (sorted_records[:, column] for column in (X, Y, REACH_X, REACH_Y))
+    left, right = _met(x, wide, columns)
+    top, bottom = _met(y, high, rows)
+    across, down = (right - left).clamp(min=0), (bottom - top).clamp(min=0)
+    owners, number = ranges((across * down).masked_fill(sorted_records[:, CUT] <= 0, 0))
+    along = across.index_select(0, owners).clamp(min=1)
+    column = left.index_select(0, owners) + number % along
+    row = top.index_select(0, owners) + number // along
+    return _dealt(order.index_select(0, owners), row * columns + column, columns * rows, len(records))
+
+
+def _met(centers: Tensor, reaches: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return the first (N,) of `count` tiles in a row with a pixel within reach, and the one behind the last."""
+    first = ((centers - reaches - (TILE - 0.5)) / TILE).ceil().clamp(0, count)
+    last = ((centers + reaches - 0.5) / TILE).floor().clamp(-1, count - 1)
+    return first.long(), last.long() + 1
+
+
 _sort = native.Function("splat_sort", "pqp", "q")
 _bound = native.Function("splat_bound", "pqiii", "q")
 _bin = native.Function("splat_bin", "pqpqiiqppppi", "q")

@@ -21,6 +21,7 @@ rows are in the processor's cache, and the backward pass only multiplies it.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -110,23 +111,22 @@ def ssim_reference(image: Tensor, target: Tensor) -> Tensor:
     Returns:
         The mean over channels and windows, a tensor without dimensions.
     """
-    mean_x, mean_y = _blurred(image), _blurred(target)
-    variance_x, variance_y = _blurred(image * image) - mean_x**2, _blurred(target * target) - mean_y**2
-    covariance = _blurred(image * target) - mean_x * mean_y
+    maps = torch.cat([image, target, image * image, target * target, image * target], dim=-1)
+    mean_x, mean_y, square_x, square_y, product = _blurred(maps).chunk(5, dim=-1)
+    variance_x, variance_y, covariance = square_x - mean_x**2, square_y - mean_y**2, product - mean_x * mean_y
     similarity = (2 * mean_x * mean_y + C1) * (2 * covariance + C2)
     return (similarity / ((mean_x**2 + mean_y**2 + C1) * (variance_x + variance_y + C2))).mean()
 
 
 def _blurred(values: Tensor) -> Tensor:
     """Return the weighted sums of values (H, W, C) over each window that lies inside, (H - 10, W - 10, C)."""
-    offsets = torch.arange(WINDOW, device=values.device, dtype=values.dtype) - WINDOW // 2
-    line = torch.exp(-(offsets**2) / (2 * SIGMA**2))
-    line = line / line.sum()
+    weights = [math.exp(-((offset - WINDOW // 2) ** 2) / (2 * SIGMA**2)) for offset in range(WINDOW)]
+    line = [weight / math.fsum(weights) for weight in weights]
     for dim in (0, 1):
         size = values.shape[dim] - WINDOW + 1
         total = line[0] * values.narrow(dim, 0, size)
         for k in range(1, WINDOW):
-            total = total + line[k] * values.narrow(dim, k, size)
+            total = torch.add(total, values.narrow(dim, k, size), alpha=line[k])
         values = total
     return values
 

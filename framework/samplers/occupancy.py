@@ -36,8 +36,6 @@ TIMES_PER_VISIT, MOVING_DECAY = 4, 0.95
 is larger because a cell may be occupied for a short time only."""
 SHUFFLE_STRIDE = 2654435761
 """A prime number, whose multiples modulo the number of cells visit every cell once per pass, in scattered order."""
-WAVES = (8, 8, 16, 32, 64, 128)
-"""Samples per ray in each wave; the last size repeats."""
 
 
 class OccupancySampler(Sampler):
@@ -103,11 +101,6 @@ class OccupancySampler(Sampler):
         return self.occupied.float().mean().item()
 
     @property
-    def any_carved(self) -> bool:
-        """True if silhouettes have marked cells as empty permanently."""
-        return bool(self.carved.any())
-
-    @property
     def occupancy(self) -> Occupancy:
         """The grid in the form that `march` needs."""
         if self._packed is None or self._packed.occupied is not self.occupied:
@@ -150,7 +143,7 @@ class OccupancySampler(Sampler):
 
         surface = field if isinstance(field, HasAlpha) else None
         evaluated = Waves()
-        while (wave := marched.wave(WAVES[min(len(marched.waves), len(WAVES) - 1)])) is not None:
+        while (wave := marched.wave(marched.next_limit)) is not None:
             stopping = evaluated.evaluate(len(wave.owners), partial(evaluate, wave))[0]
             if surface is not None:  # the march needs the density with the same opacity in each interval
                 stopping = alpha_depth(stopping.detach()) / (wave.t_ends - wave.t_starts)
@@ -168,7 +161,7 @@ class OccupancySampler(Sampler):
             (positions,) = gather_rows([[w.positions for w in waves]], order)
             return evaluate(Wave(starts, ends, owners, positions))
 
-        samples = Samples(starts, ends, offsets, owners=owners, early_stop=stop)
+        samples = Samples(starts, ends, offsets, owners=owners, longest=marched.longest, early_stop=stop)
         return _attached(samples, surface, *evaluated.choose(order, chosen))
 
     # -- updating the grid ------------------------------------------------------------------------------------
@@ -206,8 +199,7 @@ class OccupancySampler(Sampler):
         evaluated = torch.isfinite(before)
         self.density_grid.index_copy_(0, cells, torch.where(evaluated, torch.maximum(before, sigma), sigma))
         refresh_occupancy(self.density_grid, self.occupied, 1.0, self.step_size, self.alpha_threshold)
-        if self.any_carved:
-            self.occupied.logical_and_(~self.carved)
+        self.occupied.logical_and_(~self.carved)
         self.forget()
 
     def _shuffled(self, turn: int) -> Tensor:

@@ -11,8 +11,9 @@ beyond.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import torch
@@ -137,7 +138,7 @@ def propose(
         rays: R rays, sampled from the near to the far end.
         densities: density of each level but the last.
         counts: intervals per ray of each level, followed by the number of samples per ray: one more than densities.
-        scale: the distance up to which normalised distance is linear, as in `distances`.
+        scale: the distance up to which normalised distance is linear, as in `spacing`.
         jitter: True for random positions, False for fixed ones.
         power: exponent of the weights that are drawn from; less than 1 flattens them.
         learning: whether to keep the proposals' weights, gradients attached, in `Samples.proposals`.
@@ -150,8 +151,9 @@ def propose(
         moved = edges + (torch.rand(count, 1, device=device) - 0.5) / counts[0]
         edges = torch.cat([edges[:, :1], moved[:, 1:-1], edges[:, -1:]], dim=-1)
     proposals: list[Histogram] = []
+    placed = spacing(nears, fars, scale)
     for (num_intervals, num_next), density in zip(pairwise(counts), densities, strict=True):
-        t = distances(edges, nears, fars, scale)
+        t = placed(edges)
         middles = (t[:, 1:] + t[:, :-1]) / 2
         with torch.set_grad_enabled(learning):
             positions = _positions(rays, middles)
@@ -161,7 +163,7 @@ def propose(
         proposals.append(Histogram(edges, weights))
         shift = torch.rand(count, device=device) if jitter else torch.full((count,), 0.5, device=device)
         edges = resample(edges, weights.detach(), shift, num_next, power, PADDING / num_intervals)
-    t = distances(edges, nears, fars, scale)
+    t = placed(edges)
     ends = t[:, 1:]
     if endless:
         ends = torch.cat([ends[:, :-1], torch.full_like(ends[:, :1], FARTHEST)], dim=-1)
@@ -173,19 +175,18 @@ def propose(
     )
 
 
-def distances(edges: Tensor, nears: Tensor, fars: Tensor, scale: float | None) -> Tensor:
-    """Return distances (R, B) along rays, scene units, for normalised distances.
+def spacing(nears: Tensor, fars: Tensor, scale: float | None) -> Callable[[Tensor], Tensor]:
+    """Return the function from normalised distances (R, B) in [0, 1] to distances (R, B) along rays, scene units.
 
     Args:
-        edges: (R, B) normalised distances in [0, 1].
         nears, fars: (R,) distances of the rays' ends, which correspond to 0 and 1.
         scale: the distance up to which normalised distance is linear; beyond, it is linear in disparity. None if it is
             linear throughout.
     """
     if scale is None:
-        return torch.lerp(nears[:, None], fars[:, None], edges)
+        return partial(torch.lerp, nears[:, None], fars[:, None])
     near, far = (to_disparity(t / scale)[:, None] for t in (nears, fars))
-    return scale * from_disparity(torch.lerp(near, far, edges))
+    return lambda edges: scale * from_disparity(torch.lerp(near, far, edges))
 
 
 def half_edge(box: Tensor) -> float:

@@ -43,17 +43,23 @@ def splat_camera(
             "undistort the images first, or take a method that casts rays, such as nerfacto"
         )
     pose = camera.camera_to_worlds[0] if pose is None else pose
-    rotation = pose.new_tensor(FLIPPED) @ pose[:, :3].T
+    rotation = _flipped(pose.dtype, pose.device) @ pose[:, :3].T
     to_camera = torch.cat([rotation, -(rotation @ pose[:, 3])[:, None]], 1)
-    fx, fy, cx, cy = (float(value[0]) / reduced for value in (camera.fx, camera.fy, camera.cx, camera.cy))
+    fx, fy, cx, cy = (value / reduced for value in camera.intrinsics[0])
     lens, fisheye = None, camera.model == "fisheye"
     if fisheye or (camera.lens is not None and LENSES[camera.model]):
         given = (0.0,) * len(LENSES[camera.model]) if camera.lens is None else tuple(camera.lens[0].tolist())
         lens = _lens(camera.model, given)
-    width, height = int(camera.widths[0]) // reduced, int(camera.heights[0]) // reduced
+    height, width = (side // reduced for side in camera.sizes[0])
     return SplatCamera(
         to_camera, (fx, fy, cx, cy), width, height, near, antialiased=antialiased, lens=lens, fisheye=fisheye
     )
+
+
+@lru_cache(maxsize=16)
+def _flipped(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return FLIPPED (3, 3), which is kept: bringing it to a device means to wait for it."""
+    return torch.tensor(FLIPPED, dtype=dtype, device=device)
 
 
 @lru_cache(maxsize=1024)

@@ -41,7 +41,7 @@ class Adam(torch.optim.Optimizer):
         super().__init__(groups, {"lr": lr, "betas": betas, "eps": eps, "sparse": False})
         self.deferred = deferred
         self.entries_updated: int | Tensor = 0
-        """Number of entries of sparse groups that were updated, summed over all steps."""
+        """Number of entries of sparse groups that were updated, summed over all steps, possibly on the device."""
         self.entries_there = 0
         """Number of entries of sparse groups, summed over all steps."""
         for group in self.param_groups:
@@ -65,10 +65,7 @@ class Adam(torch.optim.Optimizer):
     def first_bad(self) -> Tensor | None:
         """Return the first parameter whose gradient is not finite; None if all are finite."""
         for parameter in (p for group in self.param_groups for p in group["params"]):
-            deferred = self.deferred.get(parameter)
-            if parameter.grad is not None and not all_finite(parameter.grad):
-                return parameter
-            if deferred is not None and not deferred.finite():
+            if not all_finite(self._gradients(parameter)):
                 return parameter
         return None
 
@@ -87,6 +84,21 @@ class Adam(torch.optim.Optimizer):
         elif parameter.grad is None:
             parameter.grad = torch.zeros_like(parameter)
         return parameter.grad
+
+    def finite(self, loss: Tensor) -> bool:
+        """Return whether a loss and all gradients are finite; the device is waited for once.
+
+        Args:
+            loss: a scalar.
+        """
+        parameters = (p for group in self.param_groups for p in group["params"])
+        return all_finite([loss.detach(), *(grad for p in parameters for grad in self._gradients(p))])
+
+    def _gradients(self, parameter: Tensor) -> list[Tensor]:
+        """Return the gradient of a parameter, and what is deferred of it; empty if it has none."""
+        deferred = self.deferred.get(parameter)
+        own = [] if parameter.grad is None else [parameter.grad]
+        return own if deferred is None else own + deferred.gradients
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
@@ -222,7 +234,7 @@ def first_non_finite(model: Model, optimizer: Adam) -> str | None:
     """
     bad = optimizer.first_bad()
     for name, parameter in model.named_parameters():
-        if not all_finite(parameter):
+        if not all_finite([parameter.detach()]):
             return name
         if parameter is bad:
             return f"{name}.grad"

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import torch
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
@@ -15,6 +17,8 @@ from framework.base.console import console, say
 
 SECONDS_BETWEEN_LINES = 15.0
 """Seconds between lines of progress where there is no terminal."""
+SECONDS_BETWEEN_STATES = 0.1
+"""Seconds between changes of the progress bar, which shows losses: reading them means to wait for a GPU."""
 
 
 @dataclass(frozen=True)
@@ -27,14 +31,20 @@ class StepReport:
     """Seconds of training so far."""
     progress: float
     """Fraction of the budget spent, 0 to 1."""
-    losses: dict[str, float]
-    """Loss terms of the batch, by name."""
+    terms: dict[str, Tensor]
+    """Loss terms () of the batch, by name, possibly on the device."""
     psnr: float
-    """PSNR of the batches, dB, smoothed."""
+    """PSNR of the batches, dB, smoothed; on other devices than the CPU that of the last step that was read."""
     rays_per_second: float
     """Rays of the batch per second of this step."""
     held_out_psnr: float | None
     """PSNR of the last evaluation of a few held-out images, dB; None before the first."""
+
+    @cached_property
+    def losses(self) -> dict[str, float]:
+        """Loss terms of the batch, by name; they are read from the device when they are first asked for."""
+        values = torch.stack(list(self.terms.values())).tolist() if self.terms else []
+        return dict(zip(self.terms, values, strict=True))
 
     def line(self) -> str:
         """Return the report as a line of text."""
@@ -58,6 +68,7 @@ class ProgressBar:
         self._bar = Progress(*columns, state, console=console, transient=True, disable=not console.is_terminal)
         self._task = self._bar.add_task(title, total=1.0, state="")
         self._last_line = time.monotonic()
+        self._last_state = 0.0
 
     def __enter__(self) -> ProgressBar:
         self._bar.start()
@@ -69,10 +80,13 @@ class ProgressBar:
         self._bar.stop()
 
     def show(self, report: StepReport) -> None:
-        """Show the `report` of the last training step."""
-        self._bar.update(self._task, completed=report.progress, state=report.line())
-        if not console.is_terminal and time.monotonic() - self._last_line > SECONDS_BETWEEN_LINES:
-            self._last_line = time.monotonic()
+        """Show the `report` of the last training step, unless another was shown a moment ago."""
+        now = time.monotonic()
+        if console.is_terminal and now - self._last_state > SECONDS_BETWEEN_STATES:
+            self._last_state = now
+            self._bar.update(self._task, completed=report.progress, state=report.line())
+        if not console.is_terminal and now - self._last_line > SECONDS_BETWEEN_LINES:
+            self._last_line = now
             say(f"{report.seconds:5.0f} s  {report.line()}")
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from framework.base.device import AFTER_STEP, BEFORE_STEP, shared_stream
+from framework.kernels.given import is_bad_here
 from framework.model import Loss, Model
 from framework.training.mean_gradients import mean_gradients
 from framework.training.optim import Adam, set_learning_rate
@@ -79,9 +80,12 @@ def backward(loss: Tensor, optimizer: Adam) -> bool:
         Whether the loss and all gradients are finite.
     """
     optimizer.zero_grad(set_to_none=True)
-    if not bool(torch.isfinite(loss)):
+    if is_bad_here(loss):
         return False
-    if not loss.requires_grad:
+    if loss.requires_grad:
+        loss.backward()
+    if optimizer.finite(loss):
         return True
-    loss.backward()
-    return optimizer.first_bad() is None
+    if not bool(torch.isfinite(loss)):
+        optimizer.zero_grad()  # so that the loss is found to be the first that is bad
+    return False

@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from framework.base.checked import checked
 from framework.base.config import RayConfig, TrainConfig, to_plain
 from framework.base.console import say
-from framework.base.device import seed_step, wait_for
+from framework.base.device import seed_step
 from framework.base.errors import CheckpointError, DivergenceError
 from framework.base.processes import alone, from_first, processes
 from framework.base.registry import load_method
@@ -42,7 +43,7 @@ from framework.training.step import train_step
 from framework.training.trained import build_model, restore_model
 
 STEPS_PER_LOG = 25
-"""Steps between points of TensorBoard's curves."""
+"""Steps between points of TensorBoard's curves, and between readings of errors from a device."""
 PICTURE_SHARE = 0.1
 """Maximum time for TensorBoard's images, as a fraction of the training time."""
 TOLD_SECONDS = 0.5
@@ -81,6 +82,9 @@ class Trainer:
         self.source = make_source(self.model.batches, train_set, self.config) if source is None else source
         self.state = State()
         self.first_step = 0
+        self.steps_per_read = 1 if self.device.type == "cpu" else STEPS_PER_LOG
+        """Steps after which the errors of batches are read from the device, which is waited for."""
+        self._unread: list[Tensor] = []
         limit = self.config.max_eval_images
         self._few = None if eval_set is None else FewImages(eval_set, limit, self.model.rays_per_pixel)
         self._bad_in_a_row = 0
@@ -97,6 +101,7 @@ class Trainer:
 
     def save(self) -> Path:
         """Write a checkpoint, from which training continues with the same bits, and return its path."""
+        self._read_errors(self.state.step)
         self._last_save = self.state.seconds
         step, keep_all = self.state.step, not self.config.save_only_latest_checkpoint
         path = save_checkpoint(self.checkpoint_folder, step, self._content(), keep_all, before=self._saved_step)
@@ -137,6 +142,7 @@ class Trainer:
             for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
                 group["initial_lr"] = rate  # a rate given on the command line counts
             self.state = checked(State, checkpoint["state"])
+            self._unread.clear()
             self.source.restore(checkpoint.get("errors"))
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise CheckpointError(f"the checkpoint's optimiser or state does not fit: {error}") from error
@@ -260,16 +266,17 @@ class Trainer:
         self._count_bad(result.finite)
         self.source.learn(batch, result.squared_errors)
         weights = getattr(batch, "weights", None)
-        mse = float((result.squared_errors if weights is None else result.squared_errors * weights).mean())
-        wait_for(self.device)
+        self._unread.append((result.squared_errors if weights is None else result.squared_errors * weights).mean())
+        if (state.step + 1) % self.steps_per_read == 0:
+            self._read_errors(state.step + 1)
         seconds = time.perf_counter() - start
         num_rays = len(batch) * getattr(batch, "rays_per_pixel", 1)  # about as many in each process
-        self._account(num_rays, result.loss.num_samples, mse, seconds)
+        self._account(num_rays, result.loss.num_samples, seconds)
         return StepReport(
             step=state.step,
             seconds=state.seconds,
             progress=self.progress,
-            losses={name: float(value.detach()) for name, value in result.loss.terms.items()},
+            terms={name: value.detach() for name, value in result.loss.terms.items()},
             psnr=self._train_psnr(),
             rays_per_second=num_rays * processes().count / seconds,
             held_out_psnr=state.looks[-1][2] if state.looks else None,
@@ -302,14 +309,20 @@ class Trainer:
                 f"the last good checkpoint is in {self.checkpoint_folder}. Lower --learning-rate, or check the data"
             )
 
-    def _account(self, num_rays: int, num_samples: int, mse: float, seconds: float) -> None:
+    def _account(self, num_rays: int, num_samples: int, seconds: float) -> None:
         state = self.state
         state.step += 1
         state.seconds += seconds
         state.rays += num_rays * processes().count
         state.samples_per_ray += 0.2 * (num_samples / max(num_rays, 1) - state.samples_per_ray)
-        if math.isfinite(mse):  # a dropped step's may be NaN, which would stay in the mean
-            state.train_mse += max(0.02, 1 / state.step) * (mse - state.train_mse)
+
+    def _read_errors(self, done: int) -> None:
+        """Take the errors of the last of `done` steps, which were left on the device, into the running mean."""
+        errors = torch.stack(self._unread).tolist() if self._unread else []
+        self._unread.clear()
+        for step, mse in enumerate(errors, done - len(errors) + 1):
+            if math.isfinite(mse):  # a dropped step's may be NaN, which would stay in the mean
+                self.state.train_mse += max(0.02, 1 / step) * (mse - self.state.train_mse)
 
     def _train_psnr(self) -> float:
         return min(-10 * float(torch.tensor(max(self.state.train_mse, 1e-12)).log10()), MAX_PSNR)

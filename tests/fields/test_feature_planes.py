@@ -59,7 +59,7 @@ def test_every_row_is_as_likely_in_a_band(axes: tuple[tuple[tuple[int, ...], ...
         planes.layout.factor(planes.table, 0, 0).copy_(torch.arange(height)[:, None, None].expand(height, across, 1))
     counts = torch.zeros(height)
     for _ in range(4000):
-        band = planes.random_band(0, 0)
+        (band,) = planes.bands([(0, 0)])
         counts[band[:, 0, 0].long()] += 1
         assert len(band) <= 2
     assert chisquare(counts.numpy()).pvalue > 1e-3
@@ -68,7 +68,7 @@ def test_every_row_is_as_likely_in_a_band(axes: tuple[tuple[tuple[int, ...], ...
 def loss(planes: FeaturePlanes, positions: torch.Tensor) -> torch.Tensor:
     """A look-up and a band."""
     torch.manual_seed(1)
-    return planes(positions).square().mean() + planes.random_band(0, 0).square().mean()
+    return planes(positions).square().mean() + planes.bands([(0, 0)])[0].square().mean()
 
 
 @pytest.mark.parametrize("features", [3, 16, 32])

@@ -5,10 +5,21 @@ import functools
 import pytest
 import torch
 
-from framework.kernels.adam import all_finite, sparse_adam, sparse_adam_reference
+from framework.kernels import native
+from framework.kernels.adam import (
+    ALL_FINITE,
+    SPARSE_ADAM,
+    all_finite,
+    all_finite_reference,
+    sparse_adam,
+    sparse_adam_reference,
+)
+from framework.kernels.dispatch import FEW_OPERATIONS
 from tests.kernels.compiled import needs_kernels, relative_error
 
 BETAS, EPS = (0.9, 0.99), 1e-15
+MASKED = next(each.run for each in SPARSE_ADAM.implementations if each.backend is FEW_OPERATIONS)
+"""The form that does not ask which entries have a gradient."""
 
 
 def tables(entries: int, features: int, dtype: torch.dtype = torch.float32) -> list[torch.Tensor]:
@@ -42,7 +53,7 @@ def truth(entries: int, features: int, steps: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("features", [1, 2, 3, 4, 8, 16, 32, 48])
-@pytest.mark.parametrize("update", [sparse_adam, sparse_adam_reference])
+@pytest.mark.parametrize("update", [sparse_adam, sparse_adam_reference, MASKED])
 def test_each_entry_sees_adam_on_its_own_gradients(update, features: int) -> None:
     entries, steps = 301, 60
     values, mean, square, seen = tables(entries, features)
@@ -96,8 +107,13 @@ def test_threads_give_the_same_bits() -> None:
 @pytest.mark.parametrize("place", [0, 4999, 10_002])
 def test_all_finite_sees_a_single_bad_value(bad: float, place: int) -> None:
     values = torch.randn(10_003)
-    assert all_finite(values)
-    values[place] = bad
-    assert not all_finite(values)
-    assert all_finite(torch.full((100,), 3e38))
-    assert all_finite(torch.zeros(0))
+    others = [torch.full((100,), 3e38), torch.zeros(0)]  # whose squares are infinite, and nothing
+    for judged in (all_finite, all_finite_reference, *(each.run for each in ALL_FINITE.implementations)):
+        if judged is ALL_FINITE.implementations[0].run and not native.available():
+            continue
+        assert judged([values, *others])
+        assert judged(others[1:])
+        assert judged([])
+        broken = values.clone()
+        broken[place] = bad
+        assert not judged([*others, broken])

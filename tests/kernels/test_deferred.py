@@ -125,7 +125,7 @@ def test_autograd_grad_of_the_table_says_that_it_has_none(make) -> None:
 def test_a_band_of_a_plane_waits_only_when_the_table_is_asked_for() -> None:
     planes = FeaturePlanes(RESOLUTIONS, 4, sparse=True)
     weight = torch.ones(4, requires_grad=True)
-    loss = (planes.random_band(0, 0) * weight).sum()
+    loss = (planes.bands([(0, 0)])[0] * weight).sum()
     torch.autograd.grad(loss, weight, retain_graph=True)
     assert waits(planes) == 0
     loss.backward()

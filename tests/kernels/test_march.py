@@ -157,8 +157,9 @@ def test_cone_steps_are_even_and_then_geometric() -> None:
 
 def test_candidates_lie_inside_the_box_and_the_bounds() -> None:
     rays, grid = random_rays(200), occupancy(16, 1.0)
-    starts, ends, offsets = candidates(rays, grid, 0.05, 1 / 32, None)
-    owners = torch.repeat_interleave(torch.arange(200), offsets.diff())
+    starts, ends, owners, offsets, longest = candidates(rays, grid, 0.05, 1 / 32, None)
+    assert torch.equal(owners, torch.repeat_interleave(torch.arange(200), offsets.diff()))
+    assert longest == int(offsets.diff().max())
     points = rays.points(owners, (starts + ends) / 2)
     assert bool(((points > BOX[0] - 1e-4) & (points < BOX[1] + 1e-4)).all())
 

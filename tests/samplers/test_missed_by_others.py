@@ -5,7 +5,7 @@ import torch
 
 from framework.geometry.points import Points
 from framework.samplers.occupancy import DECAY, MOVING_DECAY, WARM_UP_STEPS, OccupancySampler
-from framework.samplers.proposal import distances
+from framework.samplers.proposal import spacing
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
 
@@ -27,7 +27,7 @@ def test_a_cell_fades_slower_where_something_moves(moving: bool, decay: float) -
 @pytest.mark.parametrize("scale", [0.1, 1.0, 30.0])
 def test_a_ray_is_sampled_from_its_near_to_its_far_end_whatever_the_unit(scale: float) -> None:
     nears, fars = scale * torch.tensor([0.2, 1.5]), scale * torch.tensor([40.0, 3.0])
-    t = distances(torch.tensor([[0.0, 0.5, 1.0]]).expand(2, -1), nears, fars, scale)
+    t = spacing(nears, fars, scale)(torch.tensor([[0.0, 0.5, 1.0]]).expand(2, -1))
     torch.testing.assert_close(t[:, 0], nears)
     torch.testing.assert_close(t[:, 2], fars, rtol=1e-4, atol=0)
     # Half way in disparity (t / 2 up to 1, 1 - 1 / (2 t) beyond), by hand: of 0.1 and 0.9875; of 2/3 and 5/6.

@@ -19,7 +19,7 @@ from framework.encodings.planes import FeaturePlanes
 from framework.evaluation.metrics import MAX_PSNR, load_lpips, psnr, ssim
 from framework.geometry.rays import Histogram, Samples
 from framework.kernels.compositing import distortion, distortion_by_pairs
-from framework.kernels.planes import PlanesLayout, plane_band
+from framework.kernels.planes import PlanesLayout
 from framework.rendering.losses import depth_error, mean_squared_error
 from framework.samplers.proposal import interlevel_loss
 from methods.kplanes import METHOD, KPlanes, KPlanesConfig, _squared_steps
@@ -157,10 +157,8 @@ def moving_planes(monkeypatch: pytest.MonkeyPatch) -> KPlanes:
     model = METHOD.build(config, scene)
     assert isinstance(model, KPlanes)
 
-    def whole(self: FeaturePlanes, group: int, index: int) -> Tensor:
-        return plane_band(self.table, self.layout, group, index, 0, self.layout.shape(group, index)[0], self.deferred)
-
-    monkeypatch.setattr(FeaturePlanes, "random_band", whole)
+    bands = FeaturePlanes.bands
+    monkeypatch.setattr(FeaturePlanes, "bands", lambda planes, factors, whole: bands(planes, factors, range(4)))
     return model
 
 

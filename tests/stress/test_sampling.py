@@ -15,7 +15,7 @@ from framework.kernels.intervals import resample
 from framework.kernels.march import CompiledMarch, Occupancy, ReferenceMarch
 from framework.rendering.volume import VolumeRenderer
 from framework.samplers.inverse_cdf import inverse_cdf
-from framework.samplers.proposal import FARTHEST, ProposalSampler, distances, half_edge, interlevel_loss
+from framework.samplers.proposal import FARTHEST, ProposalSampler, half_edge, interlevel_loss, spacing
 from tests.kernels.test_march import walk
 from tests.stress.backends import COMPILED, FEW, backends
 
@@ -205,7 +205,7 @@ def test_proposals_from_zero_to_infinity(backend: str, unbounded: bool, jitter: 
 @pytest.mark.parametrize("far", [1.0, 1e3, 1e30, math.inf])
 def test_normalised_distances_begin_and_end_with_the_ray(far: float) -> None:
     edges = torch.tensor([[0.0, 0.25, 0.5, 0.75, 1.0]])
-    t = distances(edges, torch.zeros(1), torch.tensor([far]), scale=half_edge(BOX))[0]
+    t = spacing(torch.zeros(1), torch.tensor([far]), scale=half_edge(BOX))(edges)[0]
     assert t[0] == 0
     assert bool(t.isfinite().all())
     assert bool((t.diff() > 0).all())

@@ -103,9 +103,12 @@ def test_a_long_run_of_equal_gradients_takes_equal_steps(backend: str, seen: flo
 
 @pytest.mark.entry(3)
 def test_counts_and_means_after_a_hundred_thousand_steps() -> None:
-    run = SimpleNamespace(state=State())
-    for _ in range(100_000):
-        Trainer._account(run, 4097, 3 * 4097, 0.01, 1e-3)  # type: ignore[arg-type]
+    run, error = SimpleNamespace(state=State(), _unread=[]), torch.tensor(0.01, dtype=torch.float64)
+    for done in range(1, 100_001):
+        Trainer._account(run, 4097, 3 * 4097, 1e-3)  # type: ignore[arg-type]
+        run._unread.append(error)
+        if done % 1000 == 0:
+            Trainer._read_errors(run, done)  # type: ignore[arg-type]
     state = run.state
     assert state.step == 100_000
     assert state.rays == 409_700_000

@@ -15,15 +15,16 @@ from torch import Tensor
 from torch.nn import functional
 
 from framework.geometry.rays import Rays
-from framework.kernels import march
-from framework.kernels.march import March, Occupancy, Wave
+from framework.kernels.march import March, Wave
+from framework.kernels.occupancy import BLOCK as CELLS
+from framework.kernels.occupancy import Occupancy
 from framework.kernels.triton_kernels.launch import blocks, launch, optical_depth
 
 RAYS, SAMPLES = 32, 256
 """Rays, and samples, that are taken together."""
 FARTHEST = 16
 """Largest distance that is told apart, in blocks."""
-EDGE = tl.constexpr(march.BLOCK)
+EDGE = tl.constexpr(CELLS)
 INFINITY = tl.constexpr(math.inf)
 
 
@@ -37,9 +38,9 @@ def block_distances(occupied: Tensor, resolution: int) -> Tensor:
     Returns:
         (ceil(n / 4)^3,) uint8, the largest of the distances along the axes.
     """
-    short = -resolution % march.BLOCK
+    short = -resolution % CELLS
     grid = functional.pad(occupied.view(1, 1, *[resolution] * 3).float(), (0, short) * 3)
-    near = functional.max_pool3d(grid, march.BLOCK)
+    near = functional.max_pool3d(grid, CELLS)
     distances = 1 - near
     for _ in range(FARTHEST - 1):
         near = functional.max_pool3d(near, 3, stride=1, padding=1)

@@ -181,7 +181,7 @@ def unsound(trainer: Trainer, test: Dataset) -> str | None:
         test: the test images.
     """
     for name, parameter in trainer.model.named_parameters():
-        if not all_finite(parameter):
+        if not all_finite([parameter]):
             return f"the parameter {name} is not finite"
     if not math.isfinite(trainer.state.train_mse):
         return "the running mean of the training error is not finite"

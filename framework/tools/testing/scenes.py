@@ -15,7 +15,7 @@ from framework.geometry.rays import Rays
 from framework.tools.testing.ball import cameras_at, trace
 
 COUNT, SIZE = 8, 24
-"""Number of images, and their width and height, pixels."""
+"""Number of images, and their usual width and height, pixels."""
 DISTANCE = 3.0
 """Distance of the cameras from the origin, scene units. The box is [-1, 1]^3."""
 FIELD_OF_VIEW = 40.0
@@ -24,38 +24,42 @@ RISE = 0.25
 """Maximum height of the moving ball above and below the origin, scene units."""
 
 
-def ball_in_a_box() -> Dataset:
-    """Return images of a ball at the origin, transparent around it."""
-    colors, hits = _ball(_rays(), torch.zeros(3))
-    return _dataset(torch.cat([colors, hits[:, None]], dim=-1))
+def ball_in_a_box(size: int = SIZE) -> Dataset:
+    """Return images of a ball at the origin, transparent around it, `size` pixels wide and high."""
+    colors, hits = _ball(_rays(size), torch.zeros(3))
+    return _dataset(torch.cat([colors, hits[:, None]], dim=-1), size)
 
 
-def ball_under_a_sky() -> Dataset:
-    """Return images of a ball at the origin before a sky at infinity: without alpha, in an unbounded scene."""
-    rays = _rays()
+def ball_under_a_sky(size: int = SIZE) -> Dataset:
+    """Return images of a ball at the origin before a sky at infinity: without alpha, in an unbounded scene.
+
+    Args:
+        size: width and height of the images, pixels.
+    """
+    rays = _rays(size)
     colors, hits = _ball(rays, torch.zeros(3))
-    return _dataset(torch.where(hits[:, None] > 0, colors, 0.5 + 0.4 * rays.directions), unbounded=True)
+    return _dataset(torch.where(hits[:, None] > 0, colors, 0.5 + 0.4 * rays.directions), size, unbounded=True)
 
 
-def moving_ball() -> Dataset:
-    """Return images of a ball that rises over time, transparent around it."""
-    rays, times = _rays(), torch.linspace(0, 1, COUNT)
+def moving_ball(size: int = SIZE) -> Dataset:
+    """Return images of a ball that rises over time, transparent around it, `size` pixels wide and high."""
+    rays, times = _rays(size), torch.linspace(0, 1, COUNT)
     assert rays.camera_indices is not None
     heights = RISE * (2 * times[rays.camera_indices] - 1)
     colors, hits = _ball(rays, heights[:, None] * torch.tensor([0.0, 0.0, 1.0]))
-    return _dataset(torch.cat([colors, hits[:, None]], dim=-1), times)
+    return _dataset(torch.cat([colors, hits[:, None]], dim=-1), size, times)
 
 
-def _cameras() -> Cameras:
+def _cameras(size: int) -> Cameras:
     """Return cameras around the origin that look at it, some from above and some from below."""
     angle = torch.arange(COUNT) * (2 * math.pi / COUNT)
     back = normalize(torch.stack([angle.cos(), angle.sin(), 0.5 * (3 * angle).sin()], dim=-1), dim=-1)
-    return cameras_at(DISTANCE * back, FIELD_OF_VIEW, SIZE)
+    return cameras_at(DISTANCE * back, FIELD_OF_VIEW, size)
 
 
-def _rays() -> Rays:
+def _rays(size: int) -> Rays:
     """Return rays through all pixels of all images."""
-    return _cameras().pixel_rays(torch.arange(COUNT * SIZE * SIZE), 0.0, 2 * DISTANCE)
+    return _cameras(size).pixel_rays(torch.arange(COUNT * size * size), 0.0, 2 * DISTANCE)
 
 
 def _ball(rays: Rays, centers: Tensor) -> tuple[Tensor, Tensor]:
@@ -64,9 +68,9 @@ def _ball(rays: Rays, centers: Tensor) -> tuple[Tensor, Tensor]:
     return 0.5 + 0.4 * normals.clamp(-1, 1), hits.float()
 
 
-def _dataset(colors: Tensor, times: Tensor | None = None, unbounded: bool = False) -> Dataset:
+def _dataset(colors: Tensor, size: int, times: Tensor | None = None, unbounded: bool = False) -> Dataset:
     """Return a data set of images with colours (P, 3 or 4) in [0, 1]."""
-    cameras = _cameras()
+    cameras = _cameras(size)
     scene = Scene(
         box=torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]),
         near=0.05 if unbounded else 1.0,
@@ -74,7 +78,7 @@ def _dataset(colors: Tensor, times: Tensor | None = None, unbounded: bool = Fals
         num_cameras=COUNT,
         has_alpha=colors.shape[1] == 4,
         moving=times is not None,
-        image_size=SIZE,
+        image_size=size,
         unbounded=unbounded,
         poses="photographs" if unbounded else "exact",
         camera_to_worlds=cameras.camera_to_worlds,

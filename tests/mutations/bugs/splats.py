@@ -97,8 +97,8 @@ BUGS = (
         "splats-slots-by-place",
         "splats",
         TILES,
-        "slots[ids.sort(stable=True).indices] = torch.arange(len(ids), device=device)",
-        "slots = torch.arange(len(ids), device=device)",
+        "slots[ids.sort(stable=True).indices] = torch.arange(len(ids), device=ids.device)",
+        "slots = torch.arange(len(ids), device=ids.device)",
         "gradients go to other Gaussians where lists are not compiled, and blending is",
     ),
     Bug(

@@ -18,7 +18,7 @@ from framework.fields.deformed import DeformedField
 from framework.fields.encoded import EncodedField
 from framework.fields.nerf import NeRFField
 from framework.kernels.frequency import MAX_FREQUENCIES
-from framework.kernels.hash_grid import MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
+from framework.kernels.hash_grid_layout import MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
 from framework.samplers.choice import HierarchicalConfig, contracted_box, make_sampler, sampler_choice
 from methods.vanilla_nerf import A_RAY, OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH
 

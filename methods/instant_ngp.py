@@ -14,7 +14,7 @@ from framework.base.config import AUTO, Auto, Range
 from framework.base.decisions import Choice, fill
 from framework.encodings.hash_grid import HashGrid
 from framework.fields.encoded import EncodedField
-from framework.kernels.hash_grid import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
+from framework.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
 from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_choice
 
 PLANS = (

@@ -37,7 +37,7 @@ from framework.fields.appearance import Appearance
 from framework.fields.encoded import NUM_FEATURES, EncodedField
 from framework.fields.normals import NormalHead, density_normals, normal_penalties
 from framework.kernels.compositing import distortion, ray_sum
-from framework.kernels.hash_grid import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
+from framework.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
 from framework.rendering.losses import depth_error
 from framework.rendering.volume import VolumeRenderer, shade
 from framework.samplers.choice import SamplingConfig, make_sampler, sampler_choice

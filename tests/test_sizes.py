@@ -18,7 +18,7 @@ from framework.encodings.hash_grid import HashGrid
 from framework.encodings.planes import FeaturePlanes
 from framework.fields.base import MLP
 from framework.kernels.frequency import frequency_encoding
-from framework.kernels.hash_grid import MAX_RESOLUTION, HashGridLayout
+from framework.kernels.hash_grid_layout import MAX_RESOLUTION, HashGridLayout
 from framework.kernels.memory import table
 from framework.kernels.planes import PlanesLayout
 from framework.samplers.occupancy import OccupancySampler

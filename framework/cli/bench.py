@@ -13,12 +13,15 @@ from framework.base.child import python_command
 from framework.base.console import say
 from framework.base.errors import ConfigError, nearest
 from framework.base.extras import install_command
+from framework.cli.bench_gpu import GpuFlags, measure_gpu
+from framework.cli.bench_results import RESULTS, write_results
 from framework.cli.common import chosen_kind, make_room, run_command
 
 USAGE = """\
 usage: ns-bench WHAT [flags]
 
   kernels          time and error of every compiled kernel against torch, and the machine's measured limits
+  gpu              the same on a GPU, and PSNR after 2 to 60 seconds of training, in less than eight minutes
   quadrature       error of every sampler against field evaluations per ray, on scenes with a known integral
   methods          time to each PSNR of every built-in method, on the embedded scene or on --data
   ablation         effect of each part of instant-ngp: training with one part switched off, or on, in turn
@@ -34,8 +37,6 @@ usage: ns-bench WHAT [flags]
 ns-bench WHAT --help shows its flags. Results are written as JSON to docs/results in the working folder, or to
 --output-dir or --output; poses prints them.
 """
-RESULTS = Path("docs/results")
-"""Default folder of the results."""
 
 
 @dataclass(frozen=True)
@@ -257,7 +258,7 @@ def _kernels(flags: KernelFlags) -> None:
 
         rows, content = measure(flags.samples, flags.repeats)
         name = f"kernels-{native.variant()}"
-        _write(flags.output_dir / f"{name}.json", content)
+        write_results(flags.output_dir / f"{name}.json", content)
         most = max(row.threads for row in rows)
         if flags.plot_dir:
             bars.draw([row for row in rows if row.threads == most], flags.plot_dir / f"{name}.png")
@@ -277,7 +278,7 @@ def _methods(flags: MethodFlags) -> None:
     name = "procedural" if flags.data is None else flags.data.resolve().name
     folder = flags.run_dir or Path("outputs") / f"bench-{name}"
     rows = compare(standard_plan(flags.data, flags.max_seconds, flags.repeats, folder))
-    _write(flags.output_dir / f"methods-{name}.json", published(folder))
+    write_results(flags.output_dir / f"methods-{name}.json", published(folder))
     if flags.plot_dir:
         draw(rows, flags.plot_dir / f"methods-{name}.svg")
     failed = [row.label for row in rows if row.failures]
@@ -290,7 +291,7 @@ def _ablation(flags: AblationFlags) -> None:
 
     path = flags.output_dir / f"ablation-{flags.data.resolve().name}.json"
     make_room(path)
-    _write(path, measure(flags.data, flags.seconds, flags.seeds, flags.target))
+    write_results(path, measure(flags.data, flags.seconds, flags.seeds, flags.target))
 
 
 def _starts(flags: StartsFlags) -> None:
@@ -298,7 +299,7 @@ def _starts(flags: StartsFlags) -> None:
 
     path = flags.output_dir / f"starts-{flags.data.resolve().name}.json"
     make_room(path)
-    _write(path, measure(flags.data, flags.seconds, flags.seeds, flags.target))
+    write_results(path, measure(flags.data, flags.seconds, flags.seeds, flags.target))
 
 
 def _profile(flags: ProfileFlags) -> None:
@@ -306,14 +307,14 @@ def _profile(flags: ProfileFlags) -> None:
 
     path = flags.output_dir / f"profile-{flags.method}.json"
     make_room(path)
-    _write(path, measure(flags.data, flags.method, flags.steps, flags.max_seconds))
+    write_results(path, measure(flags.data, flags.method, flags.steps, flags.max_seconds))
 
 
 def _contention(flags: ContentionFlags) -> None:
     from framework.tools.benchmarks.contention import WORK, measure
 
     make_room(flags.output)
-    _write(flags.output, measure(flags.data, flags.seconds, flags.rows, (flags.work,) if flags.work else WORK))
+    write_results(flags.output, measure(flags.data, flags.seconds, flags.rows, (flags.work,) if flags.work else WORK))
 
 
 def _cache(flags: CacheFlags) -> None:
@@ -321,7 +322,7 @@ def _cache(flags: CacheFlags) -> None:
 
     make_room(flags.output)
     size = (flags.width, flags.height)
-    _write(flags.output, measure(flags.images, size, flags.seconds, flags.limit, flags.folder))
+    write_results(flags.output, measure(flags.images, size, flags.seconds, flags.limit, flags.folder))
 
 
 def _poses(flags: PosesFlags) -> None:
@@ -335,7 +336,7 @@ def _pose_refinement(flags: PoseRefinementFlags) -> None:
 
     path = flags.output_dir / "pose-refinement.json"
     make_room(path)
-    _write(path, measure(flags.method, flags.seconds, flags.degrees, flags.percent))
+    write_results(path, measure(flags.method, flags.seconds, flags.degrees, flags.percent))
 
 
 def _meshes(flags: MeshFlags) -> None:
@@ -344,7 +345,7 @@ def _meshes(flags: MeshFlags) -> None:
     from framework.tools.benchmarks.meshes import measure
 
     make_room(flags.output)
-    _write(flags.output, measure(flags.load_config, flags.seconds, flags.exports, flags.resolutions))
+    write_results(flags.output, measure(flags.load_config, flags.seconds, flags.exports, flags.resolutions))
 
 
 def _viewer(flags: ViewerBenchFlags) -> None:
@@ -366,11 +367,12 @@ def _viewer(flags: ViewerBenchFlags) -> None:
             f"finished {row.finished:.2f} s"
         )
     content = {"machine": machine(torch.device("cpu")), "pictures": [dataclasses.asdict(row) for row in rows]}
-    _write(flags.output_dir / "viewer.json", content)
+    write_results(flags.output_dir / "viewer.json", content)
 
 
 KINDS: dict[str, tuple[type, Any]] = {
     "kernels": (KernelFlags, _kernels),
+    "gpu": (GpuFlags, measure_gpu),
     "quadrature": (QuadratureFlags, _quadrature),
     "methods": (MethodFlags, _methods),
     "ablation": (AblationFlags, _ablation),
@@ -383,14 +385,6 @@ KINDS: dict[str, tuple[type, Any]] = {
     "meshes": (MeshFlags, _meshes),
     "viewer": (ViewerBenchFlags, _viewer),
 }
-
-
-def _write(path: Path, content: dict[str, Any]) -> None:
-    from framework.training.run import write_json
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, content)
-    say(f"written to {path}")
 
 
 if __name__ == "__main__":

@@ -27,13 +27,16 @@ from framework.cli.bench_flags import (
     StartsFlags,
     ViewerBenchFlags,
 )
+from framework.cli.bench_gpu import GpuFlags, measure_gpu
 from framework.cli.bench_processes import ProcessesFlags, measure_processes
+from framework.cli.bench_results import write_results
 from framework.cli.common import chosen_kind, make_room, run_command
 
 USAGE = """\
 usage: ns-bench WHAT [flags]
 
   kernels          time and error of every compiled kernel against torch, and the machine's measured limits
+  gpu              the same on a GPU, and PSNR after 2 to 60 seconds of training, in less than eight minutes
   quadrature       error of every sampler against field evaluations per ray, on scenes with a known integral
   methods          time to each PSNR of every built-in method, on the embedded scene or on --data
   ablation         effect of each part of instant-ngp: training with one part switched off, or on, in turn
@@ -84,7 +87,7 @@ def _kernels(flags: KernelFlags) -> None:
 
         rows, content = measure(flags.samples, flags.repeats)
         name = f"kernels-{native.variant()}"
-        _write(flags.output_dir / f"{name}.json", content)
+        write_results(flags.output_dir / f"{name}.json", content)
         most = max(row.threads for row in rows)
         if flags.plot_dir:
             bars.draw([row for row in rows if row.threads == most], flags.plot_dir / f"{name}.png")
@@ -104,7 +107,7 @@ def _methods(flags: MethodFlags) -> None:
     name = "procedural" if flags.data is None else flags.data.resolve().name
     folder = flags.run_dir or Path("outputs") / f"bench-{name}"
     rows = compare(standard_plan(flags.data, flags.max_seconds, flags.repeats, folder))
-    _write(flags.output_dir / f"methods-{name}.json", published(folder))
+    write_results(flags.output_dir / f"methods-{name}.json", published(folder))
     if flags.plot_dir:
         draw(rows, flags.plot_dir / f"methods-{name}.svg")
     failed = [row.label for row in rows if row.failures]
@@ -117,7 +120,7 @@ def _ablation(flags: AblationFlags) -> None:
 
     path = flags.output_dir / f"ablation-{flags.data.resolve().name}.json"
     make_room(path)
-    _write(path, measure(flags.data, flags.seconds, flags.seeds, flags.target))
+    write_results(path, measure(flags.data, flags.seconds, flags.seeds, flags.target))
 
 
 def _starts(flags: StartsFlags) -> None:
@@ -125,7 +128,7 @@ def _starts(flags: StartsFlags) -> None:
 
     path = flags.output_dir / f"starts-{flags.data.resolve().name}.json"
     make_room(path)
-    _write(path, measure(flags.data, flags.seconds, flags.seeds, flags.target))
+    write_results(path, measure(flags.data, flags.seconds, flags.seeds, flags.target))
 
 
 def _profile(flags: ProfileFlags) -> None:
@@ -133,7 +136,7 @@ def _profile(flags: ProfileFlags) -> None:
 
     path = flags.output_dir / f"profile-{flags.method}.json"
     make_room(path)
-    _write(path, measure(flags.data, flags.method, flags.steps, flags.max_seconds))
+    write_results(path, measure(flags.data, flags.method, flags.steps, flags.max_seconds))
 
 
 def _operations(flags: OperationsFlags) -> None:
@@ -141,14 +144,14 @@ def _operations(flags: OperationsFlags) -> None:
     from framework.tools.benchmarks.operations import METHODS, measure
 
     make_room(flags.output)
-    _write(flags.output, measure(flags.methods or METHODS, flags.before, flags.steps))
+    write_results(flags.output, measure(flags.methods or METHODS, flags.before, flags.steps))
 
 
 def _contention(flags: ContentionFlags) -> None:
     from framework.tools.benchmarks.contention import WORK, measure
 
     make_room(flags.output)
-    _write(flags.output, measure(flags.data, flags.seconds, flags.rows, (flags.work,) if flags.work else WORK))
+    write_results(flags.output, measure(flags.data, flags.seconds, flags.rows, (flags.work,) if flags.work else WORK))
 
 
 def _cache(flags: CacheFlags) -> None:
@@ -156,7 +159,7 @@ def _cache(flags: CacheFlags) -> None:
 
     make_room(flags.output)
     size = (flags.width, flags.height)
-    _write(flags.output, measure(flags.images, size, flags.seconds, flags.limit, flags.folder))
+    write_results(flags.output, measure(flags.images, size, flags.seconds, flags.limit, flags.folder))
 
 
 def _poses(flags: PosesFlags) -> None:
@@ -170,7 +173,7 @@ def _pose_refinement(flags: PoseRefinementFlags) -> None:
 
     path = flags.output_dir / "pose-refinement.json"
     make_room(path)
-    _write(path, measure(flags.method, flags.seconds, flags.degrees, flags.percent))
+    write_results(path, measure(flags.method, flags.seconds, flags.degrees, flags.percent))
 
 
 def _meshes(flags: MeshFlags) -> None:
@@ -179,7 +182,7 @@ def _meshes(flags: MeshFlags) -> None:
     from framework.tools.benchmarks.meshes import measure
 
     make_room(flags.output)
-    _write(flags.output, measure(flags.load_config, flags.seconds, flags.exports, flags.resolutions))
+    write_results(flags.output, measure(flags.load_config, flags.seconds, flags.exports, flags.resolutions))
 
 
 def _viewer(flags: ViewerBenchFlags) -> None:
@@ -201,11 +204,12 @@ def _viewer(flags: ViewerBenchFlags) -> None:
             f"finished {row.finished:.2f} s"
         )
     content = {"machine": machine(torch.device("cpu")), "pictures": [dataclasses.asdict(row) for row in rows]}
-    _write(flags.output_dir / "viewer.json", content)
+    write_results(flags.output_dir / "viewer.json", content)
 
 
 KINDS: dict[str, tuple[type, Any]] = {
     "kernels": (KernelFlags, _kernels),
+    "gpu": (GpuFlags, measure_gpu),
     "quadrature": (QuadratureFlags, _quadrature),
     "methods": (MethodFlags, _methods),
     "ablation": (AblationFlags, _ablation),
@@ -220,14 +224,6 @@ KINDS: dict[str, tuple[type, Any]] = {
     "meshes": (MeshFlags, _meshes),
     "viewer": (ViewerBenchFlags, _viewer),
 }
-
-
-def _write(path: Path, content: dict[str, Any]) -> None:
-    from framework.training.run import write_json
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, content)
-    say(f"written to {path}")
 
 
 if __name__ == "__main__":

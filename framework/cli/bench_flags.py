@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-RESULTS = Path("docs/results")
-"""Default folder of the results."""
+from framework.cli.bench_results import RESULTS
 
 
 @dataclass(frozen=True)

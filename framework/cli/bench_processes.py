@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from framework.cli.bench_results import RESULTS, write_results
+from framework.cli.common import make_room
+
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessesFlags:
@@ -22,7 +25,7 @@ class ProcessesFlags:
     """Samples of a training step of one process."""
     targets: tuple[float, ...] = (24.0, 26.0, 28.0)
     """PSNRs of validation views, dB, to which the time is reported."""
-    output_dir: Path = Path("docs/results")
+    output_dir: Path = RESULTS
     """Folder of processes-DATA.json."""
 
 
@@ -32,12 +35,8 @@ def measure_processes(flags: ProcessesFlags) -> None:
     Args:
         flags: the flags of the command.
     """
-    from framework.base.console import say
-    from framework.cli.common import make_room
     from framework.tools.benchmarks.processes import measure
-    from framework.training.run import write_json
 
     path = flags.output_dir / f"processes-{flags.data.resolve().name}.json"
     make_room(path)
-    write_json(path, measure(flags.data, flags.processes, flags.seconds, flags.seeds, flags.samples, flags.targets))
-    say(f"written to {path}")
+    write_results(path, measure(flags.data, flags.processes, flags.seconds, flags.seeds, flags.samples, flags.targets))

@@ -5,6 +5,7 @@ Triton must know before it is imported whether it interprets, and the other test
 
 import importlib.util
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -29,6 +30,24 @@ def test_every_kernel_computes_what_its_reference_does() -> None:
     print(done.stdout)
     assert done.returncode == 0, done.stdout[-8000:]
     assert "passed" in done.stdout
+
+
+@needs_triton
+@pytest.mark.slow
+@pytest.mark.parametrize("target", [("cuda", "80"), ("hip", "gfx942")], ids=" ".join)
+def test_every_kernel_compiles_for_a_gpu_that_is_not_there(target: tuple[str, str], tmp_path: Path) -> None:
+    done = python(
+        "-m", "tests.kernels.triton.compile_all", *target, TRITON_INTERPRET="0", TRITON_CACHE_DIR=str(tmp_path)
+    )
+    print(done.stdout)
+    assert done.returncode == 0, done.stderr[-4000:]
+    started = {
+        f"{file.stem}.{name}"
+        for file in (ROOT / "framework" / "kernels" / "triton_kernels").glob("*.py")
+        for name in re.findall(r"\blaunch\(\s*(_\w+),", file.read_text(encoding="utf-8"))
+    }
+    assert started <= set(done.stdout.split())
+    assert len(started) > 30
 
 
 def test_triton_is_imported_by_no_user_of_the_cpu() -> None:

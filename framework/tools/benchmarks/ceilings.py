@@ -1,12 +1,13 @@
-"""Limits of the machine, with which the times of kernels are compared: copying, matrix products and gathers."""
+"""Limits of a device, with which the times of kernels are compared: copying, matrix products and gathers."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
+
+from framework.tools.benchmarks.timing import now
 
 TABLES = (1, 8, 64)
 """Sizes of the tables from which is gathered, MiB."""
@@ -35,18 +36,23 @@ class Ceilings:
     copy: float
     """Bytes read and written, 1/s."""
     float32: float
-    """Product of 1024 x 1024 matrices, FLOP/s."""
+    """Product of matrices, FLOP/s."""
     bfloat16: float
     """Product of such matrices in bfloat16, FLOP/s."""
     gathers: dict[int, float] = field(default_factory=dict)
     """Random reads of 8 bytes, 1/s, by the size of the table, MiB."""
 
     @classmethod
-    def measured(cls) -> Ceilings:
-        """Measure the limits, each as the best of eight runs."""
-        source = torch.rand(2**25)
+    def measured(cls, copied: int = 2**25, edge: int = 1024) -> Ceilings:
+        """Measure the limits on torch's default device, each as the best of eight runs.
+
+        Args:
+            copied: number of values that are copied.
+            edge: rows and columns of the matrices.
+        """
+        source = torch.rand(copied)
         target = torch.empty_like(source)
-        a, b = torch.rand(1024, 1024), torch.rand(1024, 1024)
+        a, b = torch.rand(edge, edge), torch.rand(edge, edge)
         half_a, half_b = a.bfloat16(), b.bfloat16()
         gathers = {}
         for megabytes in TABLES:
@@ -55,8 +61,8 @@ class Ceilings:
             gathers[megabytes] = len(index) / _best(lambda t=table, i=index: t.index_select(0, i))  # type: ignore[misc]
         return cls(
             copy=2 * source.nbytes / _best(lambda: target.copy_(source)),
-            float32=2 * 1024**3 / _best(lambda: a @ b),
-            bfloat16=2 * 1024**3 / _best(lambda: half_a @ half_b),
+            float32=2 * edge**3 / _best(lambda: a @ b),
+            bfloat16=2 * edge**3 / _best(lambda: half_a @ half_b),
             gathers=gathers,
         )
 
@@ -83,7 +89,7 @@ class Ceilings:
 def _best(run: Callable[[], object]) -> float:
     times = []
     for _ in range(8):
-        start = time.perf_counter()
+        start = now()
         run()
-        times.append(time.perf_counter() - start)
+        times.append(now() - start)
     return min(times)

@@ -26,7 +26,7 @@ from framework.kernels.adam import sparse_adam, sparse_adam_reference
 from framework.kernels.compositing import composite, composite_reference
 from framework.kernels.frequency import frequency_encoding, frequency_encoding_reference
 from framework.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
-from framework.kernels.march import CompiledMarch, Occupancy, ReferenceMarch
+from framework.kernels.march import March, Occupancy, ReferenceMarch, march
 from framework.kernels.mlp import Activation, mlp, mlp_reference
 from framework.kernels.planes import PlanesLayout, planes, planes_reference
 from framework.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
@@ -40,7 +40,6 @@ from framework.training.machine import machine
 
 UNITS = "sample, ray, entry, pixel, Gaussian or pair"
 """Units of the kernels' work."""
-BOX = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
 LENSES: tuple[tuple[str, list[float]], ...] = (
     ("pinhole", []),
     ("opencv", [-0.28, 0.09, 6e-4, -9e-4, 0, 0, 0, 0, 0]),
@@ -153,16 +152,23 @@ def table(rows: Sequence[Row]) -> Table:
 
 def kernels(count: int) -> Iterator[Kernel]:
     """Yield all kernels, with batches of `count` samples."""
-    torch.manual_seed(0)
-    positions = rays_and_positions(count)[1]
-    for log2 in (15, 17, 19):
-        yield of_function(f"hash grid, 16 levels x 2, tables of 2^{log2}", *_hash_grid(positions, log2, False))
-    yield of_function("hash grid, gradient of positions too, 2^17", *_hash_grid(positions, 17, True))
+    yield from on_any_device(count)
     networks: list[tuple[tuple[int, ...], Activation]] = [((32, 64, 16), "none"), ((32, 64, 64, 3), "sigmoid")]
     for widths, activation in networks:
         for kind in ("float32", "bfloat16") if native.has("mlp_forward_bf16") else ("float32",):
             name = f"network {'-'.join(map(str, widths))}, {kind}"
             yield of_function(name, *_network(count, widths, activation, kind == "bfloat16"))
+    for model, lens in LENSES:
+        yield _ray_generation(model, lens)
+
+
+def on_any_device(count: int) -> Iterator[Kernel]:
+    """Yield the kernels that processors and GPUs have, on torch's default device, with batches of `count` samples."""
+    torch.manual_seed(0)
+    positions = rays_and_positions(count)[1]
+    for log2 in (15, 17, 19):
+        yield of_function(f"hash grid, 16 levels x 2, tables of 2^{log2}", *_hash_grid(positions, log2, False))
+    yield of_function("hash grid, gradient of positions too, 2^17", *_hash_grid(positions, 17, True))
     yield of_function("compositing, 16 samples a ray", *_compositing(count))
     yield of_function(
         "frequency encoding, 10 octaves of 3",
@@ -185,8 +191,6 @@ def kernels(count: int) -> Iterator[Kernel]:
     yield _updating()
     yield _similarity()
     yield from splatting()
-    for model, lens in LENSES:
-        yield _ray_generation(model, lens)
 
 
 def rays_and_positions(count: int) -> tuple[Rays, Tensor]:
@@ -280,14 +284,15 @@ def _marching() -> Kernel:
     """Find all samples of 8192 rays through a grid with 3 % of its cells occupied."""
     rays, _ = rays_and_positions(8192 * 16)
     centers = (torch.cartesian_prod(*[torch.arange(128)] * 3) + 0.5) / 128 - 0.5
-    grid = Occupancy((centers.norm(dim=-1) - 0.3).abs() < 0.015, BOX, 128)
+    box = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+    grid = Occupancy((centers.norm(dim=-1) - 0.3).abs() < 0.015, box, 128)
 
-    def march(kind: type[CompiledMarch] | type[ReferenceMarch]) -> None:
-        marching = kind(rays, grid, 3**0.5 / 512, 0.0, None, 1e-4)
+    def through(start: Callable[..., March]) -> None:
+        marching = start(rays, grid, 3**0.5 / 512, 0.0, None, 1e-4)
         while (wave := marching.wave(16)) is not None:
             marching.advance(torch.zeros_like(wave.t_starts))
 
-    runs = once(lambda: march(CompiledMarch)), once(lambda: march(ReferenceMarch))
+    runs = once(lambda: through(march)), once(lambda: through(ReferenceMarch))
     return Kernel("marching through a grid of 128^3, 3 % occupied", "ray", len(rays), runs, None)
 
 

@@ -8,7 +8,16 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
+import torch
 from torch import Tensor
+
+
+def now() -> float:
+    """Return the time in seconds when all work that the GPU was given is done."""
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+    return time.perf_counter()
+
 
 Run = Callable[[], Sequence[float]]
 """Function that does some work once and returns the seconds of each of its stages."""
@@ -48,9 +57,9 @@ def once(run: Callable[[], Any]) -> Run:
     """Return a measurement of `run` as one stage."""
 
     def timed() -> list[float]:
-        start = time.perf_counter()
+        start = now()
         run()
-        return [time.perf_counter() - start]
+        return [now() - start]
 
     return timed
 
@@ -69,12 +78,12 @@ def differentiated(
 
     def timed() -> list[float]:
         leaves = [tensor.clone().requires_grad_(backward) for tensor in inputs]
-        start = time.perf_counter()
+        start = now()
         value = function(*leaves)
-        middle = time.perf_counter()
+        middle = now()
         if not backward:
             return [middle - start]
         (value.sum() if gradient is None else value).backward(gradient)
-        return [middle - start, time.perf_counter() - middle]
+        return [middle - start, now() - middle]
 
     return timed

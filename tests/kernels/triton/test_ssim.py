@@ -13,10 +13,8 @@ from tests.kernels.triton.compared import compare
 def test_random_images(shape: tuple[int, ...]) -> None:
     torch.manual_seed(0)
     compare(ssim, {"image": torch.rand(shape), "target": torch.rand(shape)}, "image", tolerance=2e-5)
-    given = torch.rand(shape)
-    compare(ssim, {"image": given + 0.01 * torch.rand(shape), "target": given}, "image", tolerance=2e-5)
     loss = partial(photometric_loss, ssim_weight=0.2)
-    compare(loss, {"image": torch.rand(shape), "target": given}, "image", tolerance=2e-5)
+    compare(loss, {"image": torch.rand(shape), "target": torch.rand(shape)}, "image", tolerance=2e-5)
 
 
 def test_extremes() -> None:

@@ -1,0 +1,52 @@
+"""The benchmark `ns-bench gpu`: every kernel on a GPU, and training there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from framework.base.errors import ConfigError
+from framework.cli.bench_results import RESULTS, write_results
+from framework.cli.common import make_room
+
+
+@dataclass(frozen=True)
+class GpuFlags:
+    """Measure error and time of every kernel on a GPU, and its limits; train instant-ngp and gaussian-splatting."""
+
+    data: Path | None = None
+    """Folder of the data set; the embedded scene if not given."""
+    seconds: float = 60.0
+    """Seconds of training of each method."""
+    samples: int = 2**18
+    """Number of samples in a batch of the kernels."""
+    repeats: int = 9
+    """Number of runs of each kernel, of which medians are reported."""
+    run_dir: Path | None = None
+    """Folder of runs and report; outputs/bench-gpu-DATA if not given."""
+    output_dir: Path = RESULTS
+    """Folder of gpu-DATA.json."""
+
+
+def measure_gpu(flags: GpuFlags) -> None:
+    """Run the benchmark.
+
+    Args:
+        flags: its settings.
+
+    Raises:
+        ConfigError: if there is no GPU that this PyTorch can use.
+    """
+    import torch
+
+    if not torch.cuda.is_available():
+        raise ConfigError("ns-bench gpu: this machine or this PyTorch has no GPU; ns-bench kernels needs none")
+    from framework.cli.compare import compare
+    from framework.tools.benchmarks.gpu import gpu_plan, measured_kernels, reached
+
+    name = "procedural" if flags.data is None else flags.data.resolve().name
+    path = flags.output_dir / f"gpu-{name}.json"
+    make_room(path)
+    content = measured_kernels(torch.device("cuda"), flags.samples, flags.repeats)
+    plan = gpu_plan(flags.data, flags.seconds, flags.run_dir or Path("outputs") / f"bench-gpu-{name}")
+    write_results(path, {**content, "training": reached(compare(plan))})

@@ -1,0 +1,25 @@
+"""Files of results, as `ns-bench` writes them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from framework.base.console import say
+
+RESULTS = Path("docs/results")
+"""Default folder of the results."""
+
+
+def write_results(path: Path, content: dict[str, Any]) -> None:
+    """Write plain data as JSON, and say where.
+
+    Args:
+        path: the file; its folder is created if missing.
+        content: the data.
+    """
+    from framework.training.run import write_json
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, content)
+    say(f"written to {path}")

@@ -1,0 +1,173 @@
+"""Kernels on a GPU, with their errors, torch's times and the device's limits; and the PSNR after some seconds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from framework.base.console import console, say
+from framework.geometry.rays import Samples
+from framework.kernels.compositing import distortion, distortion_reference
+from framework.kernels.contraction import contract_to_unit, contract_to_unit_reference
+from framework.kernels.intervals import (
+    interval_weights,
+    interval_weights_reference,
+    proposal_excess,
+    proposal_excess_reference,
+    resample,
+    resample_reference,
+)
+from framework.tools.benchmarks.ceilings import Ceilings, Work
+from framework.tools.benchmarks.compared import Kernel, of_function
+from framework.tools.benchmarks.kernels import Row, measured, on_any_device, table
+from framework.tools.comparison.measures import Curve
+from framework.tools.comparison.measures import Row as Compared
+from framework.tools.comparison.plan import Conditions, Contender, Plan
+from framework.training.machine import machine
+
+COPIED, EDGE = 2**28, 8192
+"""Values copied, and rows of the matrices multiplied, to measure a GPU's limits."""
+METHODS = ("instant-ngp", "gaussian-splatting")
+"""Methods that are trained."""
+MOMENTS = (2, 5, 15, 60)
+"""Seconds of training after which the PSNR is reported."""
+BINS = 64
+"""Intervals of a ray."""
+
+
+def measured_kernels(device: torch.device, samples: int, repeats: int) -> dict[str, Any]:
+    """Measure every kernel on a device, and print a table.
+
+    Args:
+        device: the device.
+        samples: number of samples in a batch.
+        repeats: number of runs, of which medians are taken.
+
+    Returns:
+        The machine, its limits and a row for each kernel, as plain data.
+    """
+    rows: list[Row] = []
+    threads = torch.get_num_threads()
+    with torch.device(device):
+        ceilings = Ceilings.measured(COPIED, EDGE) if device.type == "cuda" else Ceilings.measured()
+        for line in ceilings.lines():
+            say(f"ceiling: {line}")
+        for kernel in (*on_any_device(samples), *along_rays(samples)):
+            say(f"measuring {kernel.name}")
+            rows += measured(kernel, ceilings, repeats, 1)
+    torch.set_num_threads(threads)
+    console.print(table(rows))
+    return {"machine": machine(device), "ceilings": asdict(ceilings), "kernels": [_plain(row) for row in rows]}
+
+
+def _plain(row: Row) -> dict[str, Any]:
+    share = None if row.at_ceiling is None else row.at_ceiling / row.forward
+    return {name: value for name, value in asdict(row).items() if name != "threads"} | {"share of the limit": share}
+
+
+def along_rays(count: int) -> Iterator[Kernel]:
+    """Yield kernels of rays with `BINS` intervals, on torch's default device, with batches of `count` samples."""
+    rays = count // BINS
+    edges, weights = torch.rand(rays, BINS + 1).sort(-1).values, torch.rand(rays, BINS) / BINS
+    starts, offsets = torch.rand(count).cumsum(0), torch.arange(0, rays * BINS + 1, BINS)
+    box = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+
+    def packed(like: Tensor) -> Samples:
+        return Samples(starts[: rays * BINS].to(like), starts[: rays * BINS].to(like) + 0.5, offsets)
+
+    yield of_function(
+        "contraction",
+        [3 * torch.randn(count, 3)],
+        lambda x: contract_to_unit(x, box),
+        lambda x: contract_to_unit_reference(x, box.to(x)),
+        Work(bytes=4 * 6),
+    )
+    yield of_function(
+        f"distortion, {BINS} samples a ray",
+        [torch.rand(rays * BINS)],
+        lambda w: distortion(w, packed(w)),
+        lambda w: distortion_reference(w, packed(w)),
+        Work(bytes=4 * 3),
+    )
+    each_ray = [
+        of_function(
+            f"weights of {BINS} intervals",
+            [torch.rand(rays, BINS) * 9],
+            lambda sigma: interval_weights(sigma, edges),
+            lambda sigma: interval_weights_reference(sigma, edges.to(sigma)),
+            Work(bytes=4 * 3 * BINS),
+        ),
+        of_function(
+            f"resampling of {BINS} intervals",
+            [edges, weights, torch.rand(rays)],
+            lambda t, w, shift: resample(t, w, shift, BINS, 1.0, 0.01),
+            lambda t, w, shift: resample_reference(t, w, shift, BINS, 1.0, 0.01),
+            Work(bytes=4 * 3 * BINS),
+            backward=False,
+        ),
+        of_function(
+            f"loss of a proposal of {BINS} intervals",
+            [weights.flip(-1) / 2],
+            lambda p: proposal_excess(edges, weights, edges, p),
+            lambda p: proposal_excess_reference(edges.to(p), weights.to(p), edges.to(p), p),
+            Work(bytes=4 * 4 * BINS),
+        ),
+    ]
+    yield from (replace(kernel, unit="ray") for kernel in each_ray)
+
+
+def gpu_plan(data: Path | None, seconds: float, folder: Path) -> Plan:
+    """Return the plan of the training.
+
+    Args:
+        data: folder of the data set; the embedded scene if None.
+        seconds: seconds of training of each method.
+        folder: folder of runs and report.
+    """
+    conditions = Conditions(
+        data=None if data is None else str(data.resolve()),
+        data_flags=(),
+        max_seconds=seconds,
+        max_num_iterations=None,
+        target_psnr=None,
+        num_threads=None,
+        device_type="cuda",
+        curve_images=4,
+        max_eval_images=20,
+    )
+    return Plan(tuple(map(Contender.of, METHODS)), conditions, 1, folder.resolve())
+
+
+def reached(rows: Sequence[Compared]) -> list[dict[str, Any]]:
+    """Return what the methods reached, as plain data.
+
+    Args:
+        rows: rows of the comparison's table.
+    """
+    return [
+        {
+            "method": run.method,
+            "PSNR, dB": run.psnr,
+            "seconds": run.seconds,
+            "steps": run.steps,
+            "rays per second": run.rays_per_second,
+            "PSNR after seconds, dB": {str(moment): psnr_at(run.curve, moment) for moment in MOMENTS},
+        }
+        for row in rows
+        for run in row.runs
+    ] + [{"method": row.label, "failures": [str(failure) for failure in row.failures]} for row in rows if row.failures]
+
+
+def psnr_at(curve: Curve, seconds: float) -> float | None:
+    """Return the PSNR, dB, of the last evaluation that was not later than some `seconds`; None before the first.
+
+    Args:
+        curve: pairs of seconds of training and PSNR, in order.
+        seconds: seconds of training.
+    """
+    return next((psnr for time, psnr in reversed(curve) if time <= seconds), None)

@@ -1,0 +1,44 @@
+"""ns-bench gpu: what can be tested of it without a GPU."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from framework.cli.bench import main
+from framework.tools.benchmarks.gpu import METHODS, along_rays, gpu_plan, psnr_at, reached
+from framework.tools.comparison.measures import Row
+from tests.conftest import Refused
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_gpu_it_is_refused_in_a_line(refused: Refused, tmp_path: Path) -> None:
+    assert "this machine or this PyTorch has no GPU" in refused(main, "gpu", "--output-dir", tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_kernels_of_rays_are_right() -> None:
+    names = set()
+    for kernel in along_rays(256):
+        assert kernel.errors is not None
+        for found in kernel.errors():
+            assert found.value < 1e-4
+            assert found.gradient is None or found.gradient < 1e-4
+        assert min(kernel.runs[0]()) > 0
+        names.add((kernel.name, kernel.count))
+    assert ("contraction", 256) in names
+    assert ("weights of 64 intervals", 4) in names
+
+
+def test_the_psnr_after_some_seconds_is_that_of_the_last_evaluation_until_then() -> None:
+    curve = ((1.9, 20.0), (4.0, 25.0), (60.0, 30.0))
+    assert [psnr_at(curve, seconds) for seconds in (1, 2, 5, 15, 60)] == [None, 20.0, 25.0, 25.0, 30.0]
+
+
+def test_methods_are_trained_on_the_gpu_and_failures_are_told(tmp_path: Path) -> None:
+    plan = gpu_plan(None, 60.0, tmp_path)
+    assert tuple(contender.method for contender in plan.contenders) == METHODS
+    assert plan.conditions.device_type == "cuda"
+    assert reached([Row("instant-ngp", (), ("out of memory",))]) == [
+        {"method": "instant-ngp", "failures": ["out of memory"]}
+    ]

@@ -1,0 +1,132 @@
+"""All kernels, compiled for a GPU that need not be there: `python -m tests.kernels.triton.compile_all cuda 80`.
+
+The interpreter accepts what the compiler does not, such as a variable whose type changes in a loop.
+"""
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from torch import Tensor
+from triton.backends.compiler import GPUTarget
+from triton.runtime.driver import driver
+from triton.runtime.jit import JITFunction
+
+from framework.geometry.rays import Samples
+from framework.kernels.hash_grid import HashGridLayout
+from framework.kernels.planes import PlanesLayout
+from framework.kernels.splat_project import SplatCamera, project_reference
+from framework.kernels.splat_tiles import tile_lists_reference
+from framework.kernels.triton_kernels import (
+    adam,
+    compositing,
+    encodings,
+    hash_grid,
+    intervals,
+    launch,
+    march,
+    planes,
+    splat_blend,
+    splat_project,
+    splat_tiles,
+    ssim,
+)
+from tests.kernels.test_march import occupancy, random_rays
+
+
+class Machine:
+    """The answers of a driver about a GPU that there is code for, and nothing to run it on."""
+
+    def __init__(self, target: GPUTarget) -> None:
+        self.get_current_target = lambda: target
+        self.get_current_device = lambda: 0
+        self.get_current_stream = lambda device=0: 0
+
+
+compiled: set[str] = set()
+
+
+def compile_only(kernel: JITFunction, programs: tuple[int, ...]) -> Callable[..., Any]:
+    """What starts a kernel, but only compiles it."""
+
+    def run(*arguments: Any, **constants: Any) -> Any:
+        found = kernel.warmup(*arguments, grid=programs, **constants)
+        compiled.add(f"{kernel.fn.__module__.split('.')[-1]}.{kernel.fn.__name__}")
+        return found
+
+    return run
+
+
+def learned(*shape: int) -> Tensor:
+    return torch.rand(shape, requires_grad=True)
+
+
+def back(*results: Tensor) -> None:
+    sum(result.sum() for result in results if result.requires_grad).backward()
+
+
+def compile_all() -> None:
+    offsets = torch.tensor([0, 3, 3, 8])
+    samples = Samples(torch.rand(8), torch.rand(8), offsets)
+    back(*compositing.composite(samples, learned(8), learned(8, 3), torch.rand(3, 3), torch.rand(3)))
+    compositing.composite(replace(samples, points=torch.rand(8)), learned(8), torch.rand(8, 3), torch.rand(3, 3),
+                          torch.rand(3))  # fmt: skip
+    back(compositing.distortion(learned(8), samples))
+    grid = HashGridLayout.build(2, 4, 40, 8)
+    for features in (1, 2):
+        back(hash_grid.hash_grid(learned(9, 3), learned(grid.num_entries, features), grid, None))
+    layout = PlanesLayout.build(((5, 6, 7), (8, 9, 10)))
+    back(planes.planes(learned(9, 3), learned(layout.num_entries, 6), layout, None))
+    encodings.spherical_harmonics(torch.rand(9, 3), 4)
+    back(encodings.frequency_encoding(learned(9, 3), 4, True))
+    back(encodings.contract_to_unit(learned(9, 3), torch.rand(2, 3)))
+    back(intervals.interval_weights(learned(5, 9), torch.rand(5, 10)))
+    intervals.resample(torch.rand(5, 10), torch.rand(5, 9), torch.rand(5), 7, 0.5, 0.01)
+    back(intervals.proposal_excess(torch.rand(5, 10), torch.rand(5, 9), torch.rand(5, 8), learned(5, 7)))
+    adam.sparse_adam(*torch.rand(4, 9, 2), torch.rand(9), 0.01, (0.9, 0.99), 1e-15)
+    back(ssim.ssim(learned(13, 15, 3), torch.rand(13, 15, 3)))
+    gaussians()
+    marching()
+
+
+def gaussians() -> None:
+    rows = [torch.randn(20, width) for width in (3, 3, 4)] + [torch.randn(20), torch.randn(20, 3)]
+    camera = SplatCamera(torch.eye(3, 4), (30.0, 32.0, 20.0, 15.0), 37, 30)
+    for count, antialiased in ((0, False), (15, True)):
+        pose = torch.eye(3, 4, requires_grad=antialiased)
+        view = replace(camera, pose=pose, antialiased=antialiased)
+        leaves = [row.clone().requires_grad_() for row in (*rows, torch.rand(20, 3, count))]
+        back(splat_project.project_gaussians(*leaves, view, count)[0])
+    records = project_reference(*rows, torch.zeros(20, 3, 0), camera, 0)[0]
+    lists = tile_lists_reference(records, 37, 30)
+    for channels in (3, 4):
+        shown = records.clone().requires_grad_()
+        back(*splat_blend.blend(shown, lists, 37, 30, torch.rand(3), channels, False)[:2])
+    splat_blend.blend(records, lists, 37, 30, torch.rand(3), 7, True)
+    counts, keys = torch.zeros(20, dtype=torch.int32), torch.zeros(9, dtype=torch.int64)
+    for given in ((counts, None, None, None), (None, keys, keys, counts)):
+        launch.launch(splat_tiles._list, (1,), records, *given, 20, 3, 2, BLOCK=32, num_warps=1)
+
+
+def marching() -> None:
+    def four_each(counts: Tensor, _: Any) -> Tensor:
+        return torch.arange(len(counts) + 1) * 4
+
+    for cone, shift in ((0.0, None), (1 / 64, torch.rand(33))):
+        marched = march.TritonMarch(random_rays(33), occupancy(8, 0.5), 0.1, cone, shift, 0.01)
+        with patch.object(march.functional, "pad", four_each):
+            wave = marched.wave(4)
+        assert wave is not None
+        marched.advance(torch.ones(len(wave.owners)))
+
+
+if __name__ == "__main__":
+    kind, name = sys.argv[1], sys.argv[2]
+    target = GPUTarget(kind, int(name), 32) if kind == "cuda" else GPUTarget(kind, name, 64)
+    driver.set_active(Machine(target))
+    JITFunction.__getitem__ = compile_only  # type: ignore[method-assign]
+    compile_all()
+    print(f"{len(compiled)} kernels compiled for {kind} {name}:", *sorted(compiled))

@@ -108,7 +108,7 @@ def check_view(subject: Subject) -> str:
             _require(getattr(picture, name), shape, f"{name} of a picture")
         if picture.normals is not None:
             _require(picture.normals, (*size, 3), "normals of a picture")
-        colors = learner.model.render_rgb(view, torch.ones(3))
+        colors = learner.colors()
         _require(colors, (*size, 3), "the result of render_rgb")
         if not torch.allclose(colors, picture.rgb, atol=1e-4):
             raise Fault("render_rgb returns other colours than render_view")

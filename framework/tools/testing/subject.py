@@ -169,6 +169,14 @@ class Learner:
         seed_step(seed, 0)
         return self.model.render_view(self.dataset.view(index, STRIDE), torch.full((3,), background))
 
+    def colors(self, index: int = 0, background: float = 1.0, seed: int = SEED) -> Tensor:
+        """Render the colours of the same rows and columns alone.
+
+        `index`, `background` and `seed` are as in `picture`.
+        """
+        seed_step(seed, 0)
+        return self.model.render_rgb(self.dataset.view(index, STRIDE), torch.full((3,), background))
+
     def error(self) -> float:
         """Return the mean squared error of every STRIDE-th row and column of all images, over white."""
         errors = []

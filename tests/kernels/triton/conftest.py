@@ -10,6 +10,7 @@ from framework.kernels import triton_kernels
 if importlib.util.find_spec("triton") is None or not (triton_kernels.INTERPRETED or torch.cuda.is_available()):
     collect_ignore_glob = ["test_*.py"]
 elif triton_kernels.INTERPRETED:
+    from triton.language import core
     from triton.runtime import interpreter
 
     patch, patched = interpreter._patch_lang, set[int]()
@@ -22,6 +23,8 @@ elif triton_kernels.INTERPRETED:
         if id(function.__globals__) not in patched:
             patched.add(id(function.__globals__))
             patch(function)
+            # Triton 3.6's takes arrays of one number for numbers, which numpy 2.4 refuses.
+            core.tensor.__index__ = lambda self: int(self.handle.data.squeeze())
         return _Kept()
 
     # The interpreter replaces Triton's functions at each call of each function, which takes most of the time.

@@ -86,6 +86,8 @@ def _prepare(run: Run) -> Trainer:
     if processes().count > 1:
         threads = torch.get_num_threads()
         say(f"{processes().count} processes with batches of their own; CPU threads of each: {threads}")
+        if device.type == "cpu" and processes().local_count > 1:
+            say("note: on the cores of one CPU, several processes learn more slowly than one (docs/benchmarks.md)")
     trainer = Trainer(run, train_set, None if eval_set is None else eval_set.to(device))
     for line in trainer.profile().lines():
         say(line)

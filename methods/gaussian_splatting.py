@@ -28,9 +28,10 @@ from framework.kernels.ssim import photometric_loss
 from framework.rendering.losses import mean_depth_error
 from framework.scene.reasons import DEPTH_REASONS, LIGHT_REASONS, POSE_REASONS
 from framework.splats.density_control import RESET, GradientMean, grown
-from framework.splats.drawing import draw, draw_colors, draw_view, on_image, splat_camera
+from framework.splats.drawing import draw, draw_view, on_image, splat_camera
 from framework.splats.gaussians import MAX_DEGREE, Gaussians
 from framework.splats.mcmc import moved, shaken
+from framework.splats.redrawn import Redrawn
 from framework.splats.resolution import doubled, halved
 from framework.splats.start import PLACES, first_points, from_points, scene_size, seen_colors
 from framework.splats.table import Table
@@ -211,6 +212,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
             self.poses.optimised = Optimised("poses", config.camera_learning_rate, schedule="exponential")
         self.gradients = GradientMean()
         self._on_image: Tensor | None = None
+        self._redrawn: Redrawn | None = None
         self._found, self._extent = HostValue(), HostValue()
         box = scene.box
         anywhere = box[0] + torch.rand(min(config.start_gaussians, WITHOUT_IMAGES), 3) * (box[1] - box[0])
@@ -281,11 +283,13 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         gaussians = replace(gaussians, means=gaussians.means / self.extent)
         for parameter, values in zip(self.parameters_of_gaussians(), vars(gaussians).values(), strict=True):
             parameter.data = values.reshape(len(gaussians), parameter.shape[1]).contiguous()
+        self._redrawn = None
 
     # -- training ---------------------------------------------------------------------------------------------
 
     def before_step(self, step: int, progress: float) -> None:
         self.progress = progress
+        self._redrawn = None
 
     def loss(self, batch: ViewBatch, step: int) -> Loss:
         config = self.config
@@ -380,7 +384,8 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         return replace(picture, rgb=self._lit(picture.rgb, None))
 
     def render_rgb(self, view: View, background: Tensor) -> Tensor:
-        return self._lit(draw_colors(self.gaussians(), self._camera(view), view.stride, background), None)
+        self._redrawn = self._redrawn or Redrawn(self.gaussians())
+        return self._lit(self._redrawn.colors(self._camera(view), view.stride, background), None)
 
     def _camera(self, view: View) -> SplatCamera:
         """Return the camera of a view that is not trained on."""

@@ -16,6 +16,7 @@ from framework.cli.bench_flags import (
     AblationFlags,
     CacheFlags,
     ContentionFlags,
+    FramesFlags,
     KernelFlags,
     MeshFlags,
     MethodFlags,
@@ -49,6 +50,7 @@ usage: ns-bench WHAT [flags]
   poses            differences between poses from ns-process-data and from a COLMAP model of the same images
   pose-refinement  effect of refining camera poses, on the embedded scene with disturbed training poses
   meshes           distance of exported meshes from the exact surface or from sparse points; their time and memory
+  frames           pictures a second of trained runs, at several sizes and numbers of threads
   viewer           times of the viewer's first picture, of pictures of a moving camera, and of the finished picture
 
 ns-bench WHAT --help shows its flags. Results are written as JSON to docs/results in the working folder, or to
@@ -207,6 +209,29 @@ def _viewer(flags: ViewerBenchFlags) -> None:
     write_results(flags.output_dir / "viewer.json", content)
 
 
+def _frames(flags: FramesFlags) -> None:
+    import dataclasses
+
+    import torch
+
+    from framework.tools.benchmarks.frames import measure
+    from framework.training.machine import machine
+
+    if not flags.runs or min(*flags.widths, 8) < 8 or min(*flags.threads, 1) < 1 or flags.pictures < 1:
+        raise ConfigError(
+            "--runs: name the folders of trained runs; --widths are at least 8, --threads and --pictures at least 1"
+        )
+    make_room(flags.output)
+    rows = [row for run in flags.runs for row in measure(run, flags.widths, flags.threads, flags.pictures)]
+    for row in rows:
+        say(
+            f"{row.run} {row.method} {row.width}x{row.height}, {row.threads} threads: {row.per_second:.1f} pictures a "
+            f"second ({1e3 * row.median:.1f} ms, at most {1e3 * row.slowest:.1f})"
+        )
+    content = {"machine": machine(torch.device("cpu")), "frames": [dataclasses.asdict(row) for row in rows]}
+    write_results(flags.output, content)
+
+
 KINDS: dict[str, tuple[type, Any]] = {
     "kernels": (KernelFlags, _kernels),
     "gpu": (GpuFlags, measure_gpu),
@@ -222,6 +247,7 @@ KINDS: dict[str, tuple[type, Any]] = {
     "poses": (PosesFlags, _poses),
     "pose-refinement": (PoseRefinementFlags, _pose_refinement),
     "meshes": (MeshFlags, _meshes),
+    "frames": (FramesFlags, _frames),
     "viewer": (ViewerBenchFlags, _viewer),
 }
 

@@ -54,6 +54,22 @@ class ViewerBenchFlags:
 
 
 @dataclass(frozen=True)
+class FramesFlags:
+    """Measure pictures a second of trained runs on the CPU, in colour, along the cameras of held-out images."""
+
+    runs: tuple[Path, ...] = ()
+    """Folders of trained runs."""
+    widths: tuple[int, ...] = (400, 540, 1080)
+    """Widths of the pictures, pixels; heights follow from the cameras."""
+    threads: tuple[int, ...] = (1, 2)
+    """Numbers of CPU threads."""
+    pictures: int = 60
+    """Number of pictures at each size."""
+    output: Path = RESULTS / "frames.json"
+    """File of the results."""
+
+
+@dataclass(frozen=True)
 class MethodFlags:
     """Train every built-in method on one data set for the same time and compare them, as ns-compare does."""
 

@@ -66,7 +66,7 @@ def blend(
 
     Args:
         records: (N, RECORD) Gaussians on the image.
-        lists: Gaussians that each tile may show.
+        lists: Gaussians that each tile may show, with slots if there is to be a gradient.
         width, height: size of the image, pixels.
         background: (3,) colour behind everything. It gets no gradient.
         channels: number of channels, a value of `CHANNELS`. Normals have a gradient only in the reference.
@@ -227,7 +227,8 @@ class _Blend(torch.autograd.Function):
         of_through = None if grads[1] is None else grads[1].contiguous()
         parts, out = records.new_empty(len(ids), RECORD), torch.empty_like(records)
         _backward(
-            records.data_ptr(), len(records), offsets.data_ptr(), ids.data_ptr(), slots.data_ptr(), len(ids),
+            records.data_ptr(), len(records), offsets.data_ptr(), ids.data_ptr(),
+            native.pointer(slots, "the slots, which lists `for_gradients` have,", (len(ids),), torch.int32), len(ids),
             width, height, channels, image.data_ptr(), through.data_ptr(), used.data_ptr(),
             native.pointer(of_image, "the image's gradient", tuple(image.shape)),
             None if of_through is None else native.pointer(of_through, "the transmittance's", tuple(through.shape)),

@@ -29,28 +29,31 @@ class TileLists(NamedTuple):
     ids: Tensor
     """(E,) int32 index of each entry's Gaussian."""
     slots: Tensor
-    """(E,) int32 place of each entry if all are sorted by Gaussian, and those of a Gaussian by tile."""
+    """(E,) int32 place of each entry if all are sorted by Gaussian, and those of a Gaussian by tile; (0,) if lists are
+    not `for_gradients`."""
     firsts: Tensor
     """(N + 1,) int32; Gaussian g has the slots from firsts[g] to firsts[g + 1] - 1."""
 
 
-def tile_lists(records: Tensor, width: int, height: int) -> TileLists:
+def tile_lists(records: Tensor, width: int, height: int, for_gradients: bool = True) -> TileLists:
     """Return lists of the Gaussians that each tile of an image may show, nearest first, those as near by their index.
 
     Args:
         records: (N, RECORD) Gaussians on the image, from `project_gaussians`.
         width, height: size of the image, pixels.
+        for_gradients: whether a gradient will be asked for; without one the lists may have no slots.
     """
     records = records.detach()
-    return TILES((records,), records, width, height)
+    return TILES((records,), records, width, height, for_gradients)
 
 
-def tile_lists_reference(records: Tensor, width: int, height: int) -> TileLists:
+def tile_lists_reference(records: Tensor, width: int, height: int, for_gradients: bool = True) -> TileLists:
     """Compute `tile_lists` in torch. A Gaussian is listed in every tile that the box around it touches.
 
     Args:
         records: (N, RECORD) Gaussians on the image, from `project_gaussians`.
         width, height: size of the image, pixels.
+        for_gradients: makes no difference here.
     """
     columns, rows = -(-width // TILE), -(-height // TILE)
     device = records.device
@@ -90,7 +93,7 @@ TILES = Operation("tile_lists", tile_lists_reference)
 
 
 @TILES.implementation(FEW_OPERATIONS, types=None)
-def _by_entries(records: Tensor, width: int, height: int) -> TileLists:
+def _by_entries(records: Tensor, width: int, height: int, for_gradients: bool = True) -> TileLists:
     """Compute `tile_lists` without a table of all Gaussians and tiles; the device is waited for once."""
     columns, rows = -(-width // TILE), -(-height // TILE)
     order = torch.sort(records[:, DISTANCE], stable=True).indices
@@ -119,7 +122,7 @@ _bin = native.Function("splat_bin", "pqpqiiqppppi", "q")
 
 
 @TILES.implementation(CPP)
-def _compiled(records: Tensor, width: int, height: int) -> TileLists:
+def _compiled(records: Tensor, width: int, height: int, for_gradients: bool = True) -> TileLists:
     records = records.contiguous()  # kept until the kernels have read it
     count, threads = len(records), native.threads()
     tiles = -(-width // TILE) * -(-height // TILE)
@@ -131,10 +134,11 @@ def _compiled(records: Tensor, width: int, height: int) -> TileLists:
     order = room(count)
     visible = _sort(address, count, order.data_ptr())
     bound = _bound(address, count, width, height, threads)
-    offsets, ids, slots, firsts = room(tiles + 1), room(bound), room(bound), room(count + 1)
+    offsets, ids, firsts = room(tiles + 1), room(bound), room(count + 1)
+    slots = room(bound if for_gradients else 0)
     entries = _bin(
         address, count, order.data_ptr(), visible, width, height, bound, firsts.data_ptr(), offsets.data_ptr(),
-        ids.data_ptr(), slots.data_ptr(), threads,
+        ids.data_ptr(), slots.data_ptr() if for_gradients else None, threads,
     )  # fmt: skip
     return TileLists(offsets, ids[:entries], slots[:entries], firsts)
 

@@ -92,7 +92,7 @@ def draw(records: Tensor, camera: SplatCamera, background: Tensor, channels: int
         background: (3,) colour behind everything.
         channels: number of channels, a value of `CHANNELS`.
     """
-    lists = tile_lists(records, camera.width, camera.height)
+    lists = tile_lists(records, camera.width, camera.height, torch.is_grad_enabled())
     return blend(records, lists, camera.width, camera.height, background, channels)
 
 
@@ -121,7 +121,7 @@ def draw_view(gaussians: Gaussians, camera: SplatCamera, stride: int, background
         far: depth where nothing is seen, scene units.
     """
     records = on_image(gaussians, camera)
-    lists = tile_lists(records, camera.width, camera.height)
+    lists = tile_lists(records, camera.width, camera.height, for_gradients=False)
     image, through, median = blend(
         records, lists, camera.width, camera.height, background, CHANNELS["normals"], median=True
     )

@@ -28,7 +28,7 @@ def test_help_lists_every_benchmark_in_a_line_without_torch() -> None:
 def test_every_benchmark_shows_its_flags(name: str) -> None:
     done = called("ns-bench", name, "--help")
     assert done.returncode == 0
-    named = {"contention", "cache", "meshes", "operations"}
+    named = {"contention", "cache", "meshes", "operations", "frames"}
     flags = {"poses": "--processed"} | dict.fromkeys(named, "--output")
     assert flags.get(name, "--output-dir") in done.stdout
 

@@ -28,6 +28,7 @@ from framework.kernels.rows import GATHER_ROWS
 from framework.kernels.silhouettes import HOLD_BALLS, OPAQUE_SUMS, PIXELS_NEAR_BALLS, Photograph, opaque_sums
 from framework.kernels.spherical_harmonics import SPHERICAL_HARMONICS
 from framework.kernels.splat_blend import BLEND
+from framework.kernels.splat_packed import PROJECT_PACKED, pack_gaussians
 from framework.kernels.splat_project import (
     CUT,
     DISTANCE,
@@ -136,7 +137,8 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     HOLD_BALLS: lambda: (photograph(), torch.rand(200, 3) * 2 - 1, 0.05, torch.rand(200) > 0.5, True),
     PIXELS_NEAR_BALLS: lambda: (photograph(), torch.rand(20, 3) * 2 - 1, 0.05),
     PROJECT: lambda: (*gaussians(), splat_camera(), 3),
-    TILES: lambda: (everywhere(1, 9), 32, 32),
+    PROJECT_PACKED: lambda: (pack_gaussians(*(rows[:32] for rows in gaussians())), splat_camera(), 3),
+    TILES: lambda: (everywhere(1, 9), 32, 32, True),
     BLEND: lambda: (records := projected(), tile_lists(records, 37, 30), 37, 30, rand(3), 7, True),
     PHOTOMETRIC: lambda: (rand(13, 15, 3), rand(13, 15, 3), 0.2),
     GATHER_COLORS: lambda: (torch.randint(256, (60, 4), dtype=torch.uint8), torch.randint(60, (9,)), rand(9, 3)),

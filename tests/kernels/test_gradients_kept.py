@@ -239,6 +239,7 @@ WITHOUT_A_GRADIENT = {
     "adam_sparse", "adam_dense", "all_finite", "hash_grid_adam",  # of the optimiser
     "opaque_sums", "hold_balls", "pixels_near_balls",  # whose results are counted or true and false
     "splat_sort", "splat_bound", "splat_bin",  # whose results are indices
+    "splat_project_packed",  # for pictures alone, and refused where a gradient is asked for
 }  # fmt: skip
 
 

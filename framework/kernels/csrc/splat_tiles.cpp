@@ -2,6 +2,7 @@
 #include "splat.h"
 
 #include <algorithm>
+#include <memory>
 #include <vector>
 
 namespace {
@@ -23,39 +24,37 @@ struct Span {
     // Centres lie at 0.5, 1.5, ...: a tile's go from 0.5 to TILE - 0.5 after its edge.
     static int first(float from, int count) {
         const float tile = std::ceil((from - (TILE - 0.5f)) / TILE);
-        return tile < 0 ? 0 : (tile > count ? count : int(tile));
+        return tile > 0 ? (tile > count ? count : int(tile)) : 0;  // NaN too
     }
     static int last(float to, int count) {
         const float tile = std::floor((to - 0.5f) / TILE) + 1;
-        return tile < 0 ? 0 : (tile > count ? count : int(tile));
+        return tile < count ? (tile > 0 ? int(tile) : 0) : count;  // NaN too
     }
 };
 
-// Whether an ellipse comes within CUT on a tile: the least of a quadratic form over a rectangle.
-bool touches(const float* g, int column, int row) {
-    const float x0 = column * TILE + 0.5f - g[X], x1 = x0 + (TILE - 1), y0 = row * TILE + 0.5f - g[Y], y1 = y0 + (TILE - 1);
-    const float near_x = x0 > 0 ? x0 : (x1 < 0 ? x1 : 0), near_y = y0 > 0 ? y0 : (y1 < 0 ? y1 : 0);
-    if (near_x == 0 && near_y == 0) return true;
-    const float ux = g[U_X], uy = g[U_Y], vy = g[V_Y], yy = uy * uy + vy * vy;
-    float least = 3e38f;
-    if (near_x != 0) {  // along the vertical edge that faces the centre
-        const float y = std::min(std::max(-ux * uy * near_x / yy, y0), y1), u = ux * near_x + uy * y, v = vy * y;
-        least = u * u + v * v;
-    }
-    if (near_y != 0) {
-        const float x = std::min(std::max(-uy * near_y / ux, x0), x1), u = ux * x + uy * near_y, v = vy * near_y;
-        least = std::min(least, u * u + v * v);
-    }
-    return least <= g[CUT] * 1.0001f;
-}
-
+// Calls `body` with each tile of which a Gaussian's ellipse meets the rectangle between the centres of its pixels. In a
+// row of tiles these lie side by side: from the leftmost point of the ellipse within the row to the rightmost.
 template <typename Body>
 void for_tiles(const float* g, const Grid& grid, const Body& body) {
     const Span span(g, grid);
-    const bool one = span.right - span.left <= 1 && span.bottom - span.top <= 1;
-    for (int row = span.top; row < span.bottom; row++)
-        for (int column = span.left; column < span.right; column++)
-            if (one || touches(g, column, row)) body(row * grid.columns + column);
+    if (span.right - span.left <= 1 && span.bottom - span.top <= 1) {
+        if (span.left < span.right && span.top < span.bottom) body(span.top * grid.columns + span.left);
+        return;
+    }
+    // At a height y the ellipse reaches from (-u_y y - root) / u_x to (-u_y y + root) / u_x, root = sqrt(cut - (v_y y)^2).
+    const float ux = g[U_X], uy = g[U_Y], vy = g[V_Y], cut = g[CUT] * 1.0001f;
+    const float top = std::sqrt(cut) / vy, rightmost = -uy / (std::sqrt(uy * uy + vy * vy) + 1e-30f) * top;  // heights
+    const auto x = [&](float y, float sign) {
+        return g[X] + (-uy * y + sign * std::sqrt(std::max(cut - vy * vy * y * y, 0.0f))) / ux;
+    };
+    for (int row = span.top; row < span.bottom; row++) {
+        const float first_y = row * TILE + 0.5f - g[Y];
+        const float low = std::max(first_y, -top), high = std::min(first_y + (TILE - 1), top);
+        if (low > high) continue;
+        const float left = x(std::min(std::max(-rightmost, low), high), -1), right = x(std::min(std::max(rightmost, low), high), 1);
+        const int from = std::max(Span::first(left, grid.columns), span.left), to = std::min(Span::last(right, grid.columns), span.right);
+        for (int column = from; column < to; column++) body(row * grid.columns + column);
+    }
 }
 
 }  // namespace
@@ -112,7 +111,7 @@ EXPORT int splat_bound(const float* records, int64_t count, int width, int heigh
 
 // The lists: tile t's entries are [offsets[t], offsets[t + 1]), from front to back. Each says which Gaussian, and its
 // slot: the place of the entry where they are sorted by Gaussian; Gaussian g's are from firsts[g]. There is room for
-// `bound` entries. Returns how many there are.
+// `bound` entries. Without `slots` they are left out. Returns how many entries there are.
 EXPORT int splat_bin(const float* records, int64_t count, const int32_t* order, int64_t visible, int width, int height,
                      int64_t bound, int32_t* firsts, int32_t* offsets, int32_t* ids, int32_t* slots, int threads,
                      int64_t* entries) {
@@ -126,45 +125,55 @@ EXPORT int splat_bin(const float* records, int64_t count, const int32_t* order, 
             std::vector<int32_t>& own = found[size_t(chunk)];
             own.reserve(size_t(4 * GRAIN));
             for (int64_t g = chunk * GRAIN; g < std::min(count, (chunk + 1) * GRAIN); g++) {
-                const size_t before = own.size();
                 if (records[g * RECORD + CUT] > 0) for_tiles(records + g * RECORD, grid, [&](int tile) { own.push_back(tile); });
-                firsts[g + 1] = int32_t(own.size() - before);
+                firsts[g + 1] = int32_t(own.size());  // of those in the chunk
             }
         });
-        for (int64_t g = 0; g < count; g++) firsts[g + 1] += firsts[g];
-        *entries = firsts[count];
+        std::vector<int64_t> before(found.size() + 1, 0);
+        for (size_t chunk = 0; chunk < found.size(); chunk++) before[chunk + 1] = before[chunk] + int64_t(found[chunk].size());
+        *entries = before.back();
         if (*entries > bound) throw std::invalid_argument("more entries than there is room for");
-        std::vector<int32_t> tile_of;
-        tile_of.reserve(size_t(*entries));
-        for (const auto& own : found) tile_of.insert(tile_of.end(), own.begin(), own.end());
-        // Dealt in the order of distance: how many of each tile a chunk has, where they go, and there.
-        const int64_t chunks = (visible + GRAIN - 1) / GRAIN;
-        std::vector<int32_t> counts(size_t(chunks * tiles), 0);
-        for_chunks(threads, chunks, [&](int64_t chunk, int) {
-            int32_t* own = counts.data() + chunk * tiles;
-            for (int64_t i = chunk * GRAIN; i < std::min(visible, (chunk + 1) * GRAIN); i++) {
-                check_index(order[i], count, "Gaussians");
-                for (int32_t slot = firsts[order[i]]; slot < firsts[order[i] + 1]; slot++) own[tile_of[size_t(slot)]]++;
-            }
+        const std::unique_ptr<int32_t[]> tile_of(new int32_t[size_t(*entries)]);
+        for_chunks(threads, int64_t(found.size()), [&](int64_t chunk, int) {
+            const auto& own = found[size_t(chunk)];
+            std::copy(own.begin(), own.end(), tile_of.get() + before[size_t(chunk)]);
+            for (int64_t g = chunk * GRAIN; g < std::min(count, (chunk + 1) * GRAIN); g++)
+                firsts[g + 1] += int32_t(before[size_t(chunk)]);
+        });
+        // Dealt in the order of distance: how many of each tile a part of them has, where they go, and there. Few parts,
+        // as each has a number for every tile.
+        const int64_t parts = std::min<int64_t>((visible + GRAIN - 1) / GRAIN, 4 * threads);
+        const auto part_of = [&](int64_t part, const auto& body) {
+            for (int64_t i = visible * part / parts; i < visible * (part + 1) / parts; i++) body(order[i]);
+        };
+        std::vector<int32_t> counts(size_t(parts * tiles), 0);
+        for_chunks(threads, parts, [&](int64_t part, int) {
+            int32_t* own = counts.data() + part * tiles;
+            part_of(part, [&](int32_t g) {
+                check_index(g, count, "Gaussians");
+                for (int32_t slot = firsts[g]; slot < firsts[g + 1]; slot++) own[tile_of[size_t(slot)]]++;
+            });
         });
         int32_t sum = 0;
         for (int64_t tile = 0; tile < tiles; tile++) {
             offsets[tile] = sum;
-            for (int64_t chunk = 0; chunk < chunks; chunk++) {
-                int32_t& start = counts[size_t(chunk * tiles + tile)];
+            for (int64_t part = 0; part < parts; part++) {
+                int32_t& start = counts[size_t(part * tiles + tile)];
                 const int32_t inside = start;
                 start = sum, sum += inside;
             }
         }
         offsets[tiles] = sum;
         if (sum != *entries) throw std::invalid_argument("the order is not of these Gaussians");
-        for_chunks(threads, chunks, [&](int64_t chunk, int) {
-            int32_t* next = counts.data() + chunk * tiles;
-            for (int64_t i = chunk * GRAIN; i < std::min(visible, (chunk + 1) * GRAIN); i++)
-                for (int32_t slot = firsts[order[i]]; slot < firsts[order[i] + 1]; slot++) {
+        for_chunks(threads, parts, [&](int64_t part, int) {
+            int32_t* next = counts.data() + part * tiles;
+            part_of(part, [&](int32_t g) {
+                for (int32_t slot = firsts[g]; slot < firsts[g + 1]; slot++) {
                     const int32_t at = next[tile_of[size_t(slot)]]++;
-                    ids[at] = order[i], slots[at] = slot;
+                    ids[at] = g;
+                    if (slots) slots[at] = slot;
                 }
+            });
         });
     });
 }

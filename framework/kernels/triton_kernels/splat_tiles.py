@@ -87,8 +87,8 @@ def _list(records, counts, firsts, keys, owners, count, columns, rows, BLOCK: tl
         tl.store(counts + g, found, mask=g < count)
 
 
-def tile_lists(records: Tensor, width: int, height: int) -> TileLists:
-    """Compute `framework.kernels.splat_tiles.tile_lists` of `records`, `width` and `height`.
+def tile_lists(records: Tensor, width: int, height: int, for_gradients: bool = True) -> TileLists:
+    """Compute `framework.kernels.splat_tiles.tile_lists` of `records`, `width` and `height`; `for_gradients` or not.
 
     A Gaussian is listed in a tile only if its ellipse reaches it, not its box alone.
 

@@ -1,0 +1,114 @@
+"""Pictures a second of trained runs, in colour, along the cameras of their held-out images."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+import torch
+from torch import Tensor
+
+from framework.base.console import track
+from framework.cameras.cameras import Cameras
+from framework.cameras.view import View
+from framework.evaluation.evaluator import evaluation_background
+from framework.kernels import native
+from framework.model import Model
+from framework.splats.gaussians import HasGaussians
+from framework.training.trained import load_trained
+
+WARM_UP = 4
+"""Pictures before those that are measured."""
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Seconds of the pictures of one run at one size."""
+
+    run: str
+    """Last three folders of the run: data, method and time."""
+    method: str
+    """Name of the method."""
+    num_gaussians: int | None
+    """Number of its Gaussians; None of other methods."""
+    width: int
+    """Width of the pictures, pixels."""
+    height: int
+    """Height of the first one, pixels."""
+    threads: int
+    """Number of CPU threads."""
+    pictures: int
+    """Number of pictures."""
+    per_second: float
+    """Pictures a second: their number over the sum of their seconds."""
+    median: float
+    """Median of the seconds of a picture."""
+    slowest: float
+    """Longest time of a picture, seconds."""
+    kernels: dict[str, float]
+    """Mean seconds of a picture in each compiled kernel, by its name."""
+
+
+@torch.no_grad()
+def measure(run: Path, widths: tuple[int, ...], threads: tuple[int, ...], count: int) -> list[Frames]:
+    """Draw pictures of a trained run on the CPU and measure how long each takes.
+
+    Args:
+        run: the run's folder.
+        widths: widths of the pictures, pixels; heights follow from the cameras.
+        threads: numbers of CPU threads.
+        count: number of pictures at each size, of as many held-out cameras in turn.
+    """
+    trained = load_trained(run, device_type="cpu")
+    model, cameras = trained.model, trained.run.parse("test").cameras
+    gaussians = len(model.gaussians()) if isinstance(model, HasGaussians) else None
+    background, name = evaluation_background(model), "/".join(run.resolve().parts[-3:])
+    rows = []
+    for width in widths:
+        sized = [_resized(cameras, index % len(cameras), width) for index in range(count)]
+        for number in threads:
+            with _threads(number):
+                seconds, kernels = _seconds(model, sized, background)
+            rows.append(
+                Frames(
+                    name, trained.run.method, gaussians, width, sized[0].sizes[0][0], number, count,
+                    count / sum(seconds), median(seconds), max(seconds), kernels,
+                )
+            )  # fmt: skip
+    return rows
+
+
+def _resized(cameras: Cameras, index: int, width: int) -> Cameras:
+    camera = cameras[index : index + 1]
+    return camera.scaled(width / camera.sizes[0][1])
+
+
+def _seconds(model: Model, cameras: list[Cameras], background: Tensor) -> tuple[list[float], dict[str, float]]:
+    """Return the seconds of each picture, and the mean seconds of a picture in each kernel."""
+    moment = 0.5 if model.scene.moving else None
+    for camera in cameras[:WARM_UP]:
+        model.render_rgb(View(camera, moment), background)
+    seconds = []
+    native.spent = {}
+    try:
+        for camera in track(cameras, f"{cameras[0].sizes[0][1]} pixels wide", total=len(cameras)):
+            begun = time.perf_counter()
+            model.render_rgb(View(camera, moment), background)
+            seconds.append(time.perf_counter() - begun)
+        return seconds, {name: spent / len(cameras) for name, spent in native.spent.items()}
+    finally:
+        native.spent = None
+
+
+@contextmanager
+def _threads(number: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(number)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

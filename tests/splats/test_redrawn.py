@@ -1,0 +1,94 @@
+"""Gaussians that are drawn again and again: the same pictures, and new ones after a change."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+
+from framework import View
+from framework.splats.drawing import draw_colors, splat_camera
+from framework.splats.gaussians import Gaussians
+from framework.splats.redrawn import Redrawn, packed
+from framework.tools.benchmarks.frames import measure
+from tests.kernels.compiled import needs_kernels
+from tests.kernels.splat_truth import scene
+from tests.splats.test_method import ball, camera
+from tests.training.helpers import tiny_trainer
+
+
+def cloud(count: int = 700) -> Gaussians:
+    torch.manual_seed(0)
+    means, log_scales, rotations, logits, colors, harmonics, _ = scene(count)
+    return Gaussians(means - torch.tensor([0.0, 0, 4]), log_scales, rotations, logits, colors, harmonics)
+
+
+def test_every_picture_is_the_first() -> None:
+    """But for Gaussians as far as others, which come in another order; here there are none."""
+    seen, background = splat_camera(camera(), near=0.1), torch.rand(3)
+    truth = draw_colors(cloud(), seen, 1, background)
+    redrawn = Redrawn(cloud())
+    for _ in range(3):
+        torch.testing.assert_close(redrawn.colors(seen, 1, background), truth, atol=1e-6, rtol=0)
+    torch.testing.assert_close(redrawn.colors(seen, 4, background), truth[2::4, 2::4], atol=1e-6, rtol=0)
+
+
+@needs_kernels
+def test_what_no_picture_shows_is_not_packed() -> None:
+    given = cloud(100)
+    given.logits[:40] = -6.0  # an opacity of 1/404
+    given.means[50] = torch.nan
+    given.rotations[60] = 0
+    kept = packed(given)
+    assert kept is not None
+    assert int((kept.values[:, 10] > -30).sum()) == 100 - 42 - int((given.logits[40:] <= -5.54).sum())
+    assert packed(given[:40]) is None
+    seen, background = splat_camera(camera(), near=0.1), torch.rand(3)
+    nothing = Redrawn(given[:40])
+    for _ in range(3):
+        torch.testing.assert_close(nothing.colors(seen, 1, background), background.expand(33, 33, 3))
+
+
+def test_one_far_away_does_not_matter() -> None:
+    given = cloud(500)
+    given.means[7] = 1e9
+    seen, background = splat_camera(camera(), near=0.1), torch.rand(3)
+    redrawn = Redrawn(given)
+    first, _, third = (redrawn.colors(seen, 1, background) for _ in range(3))
+    torch.testing.assert_close(first, third, atol=1e-6, rtol=0)
+
+
+def test_a_model_forgets_when_it_changes(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path / "run", max_num_iterations=6)
+    model, view, black = trainer.model, View(camera()), torch.zeros(3)
+
+    def look() -> torch.Tensor:
+        for _ in range(2):
+            shown = model.render_rgb(view, black)
+        return shown
+
+    before = look()
+    trainer.train()
+    after = look()
+    assert not torch.allclose(before, after, atol=1e-3)
+    torch.testing.assert_close(after, model.render_view(view, black).rgb, atol=1e-5, rtol=0)
+    model.set_gaussians(dataclasses.replace(ball(), harmonics=torch.zeros(1, 3, 15)))
+    torch.testing.assert_close(look(), model.render_view(view, black).rgb, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("method", ["gaussian-splatting", "instant-ngp"])
+def test_frames_are_measured(method: str, shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer(method, shared_tiny, tmp_path / "run", max_num_iterations=3)
+    trainer.train()
+    rows = measure(trainer.run.folder, (20, 30), (1, 2), 3)
+    assert [(row.width, row.height, row.threads) for row in rows] == [
+        (20, 20, 1),
+        (20, 20, 2),
+        (30, 30, 1),
+        (30, 30, 2),
+    ]
+    assert all((row.num_gaussians is not None) == (method == "gaussian-splatting") for row in rows)
+    for row in rows:
+        assert 0 < row.median <= row.slowest
+        assert row.per_second == pytest.approx(1 / row.median, rel=1)
+        assert sum(row.kernels.values()) <= 3 * row.slowest

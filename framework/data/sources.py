@@ -42,6 +42,10 @@ class Request:
     """Number of rays through each pixel: 1, through its centre, or another square number."""
 
 
+KEYPOINTS = 1 / 8
+"""Share of a batch's pixels that are drawn from those with a sparse depth, where they are to be learned from."""
+
+
 class BatchSource(ABC):
     """Base class of sources, which draw the training batches.
 
@@ -92,17 +96,21 @@ class PixelSource(BatchSource):
         background: background of transparent pixels.
         seed: seed of the run.
         by_error: whether half of the pixels are drawn with a probability proportional to their recent error.
+        keypoints: share of the pixels that are drawn from those with a sparse depth, if there are any.
     """
 
-    def __init__(self, dataset: Dataset, background: Background, seed: int, by_error: bool = False) -> None:
+    def __init__(
+        self, dataset: Dataset, background: Background, seed: int, by_error: bool = False, keypoints: float = 0.0
+    ) -> None:
         self.dataset, self.background, self.seed = dataset, background, seed
+        self.keypoints = keypoints if dataset.sparse_depth is not None else 0.0
         self.errors = ErrorMap(dataset) if by_error else None
         self.stream: PixelStream | None = None
 
     def draw(self, request: Request) -> PixelBatch:
         offsets = CENTER if request.rays_per_pixel == 1 else subpixels(request.rays_per_pixel)
-        look_up = self._look_up(request.step)
-        return draw_batch(self.dataset, request.num_pixels, self.background, self.errors, offsets, look_up)
+        look_up, keypoints = self._look_up(request.step), round(self.keypoints * request.num_pixels)
+        return draw_batch(self.dataset, request.num_pixels, self.background, self.errors, offsets, look_up, keypoints)
 
     def _look_up(self, step: int) -> LookUp | None:
         """Return the function that looks up the colours of a step's pixels in a file; None if they are in memory."""
@@ -112,7 +120,7 @@ class PixelSource(BatchSource):
         return partial(self.stream.look_up, step)
 
     def drawing_from(self, dataset: Dataset) -> PixelSource:
-        source = PixelSource(dataset, self.background, self.seed)
+        source = PixelSource(dataset, self.background, self.seed, keypoints=self.keypoints)
         source.errors = self.errors
         return source
 
@@ -193,5 +201,7 @@ def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource
     background = training_background(config.background, dataset.scene.has_alpha)
     if kind == "views":
         return ViewSource(dataset, background, config.machine.seed)
-    by_error = isinstance(config, RayConfig) and config.draw_by_error
-    return PixelSource(dataset, background, config.machine.seed, by_error)
+    if not isinstance(config, RayConfig):
+        return PixelSource(dataset, background, config.machine.seed)
+    keypoints = KEYPOINTS if config.depth_loss_mult > 0 and not dataset.scene.has_depth else 0.0
+    return PixelSource(dataset, background, config.machine.seed, config.draw_by_error, keypoints)

@@ -203,5 +203,5 @@ def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource
         return ViewSource(dataset, background, config.machine.seed)
     if not isinstance(config, RayConfig):
         return PixelSource(dataset, background, config.machine.seed)
-    keypoints = KEYPOINTS if config.depth_loss_mult > 0 and not dataset.scene.has_depth else 0.0
+    keypoints = KEYPOINTS if config.depth_loss_mult and not dataset.scene.has_depth else 0.0
     return PixelSource(dataset, background, config.machine.seed, config.draw_by_error, keypoints)

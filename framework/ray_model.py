@@ -19,7 +19,7 @@ from framework.geometry.rays import Rays
 from framework.kernels.math import safe_normalize
 from framework.kernels.native import torch_on_one_thread
 from framework.model import Loss, Model
-from framework.rendering.losses import depth_error, distance_likelihood, mean_squared_error
+from framework.rendering.losses import depth_error, distance_likelihood, matter_before, mean_squared_error
 from framework.rendering.rendered import Picture, Rendered
 from framework.rendering.renderer import Renderer
 from framework.samplers.base import Sampler
@@ -73,6 +73,10 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
         for name, level in (("depth", rendered), ("depth_coarse", rendered.coarse)):
             if level is not None and (error := depth_loss(level, batch)) is not None and self.config.depth_loss_mult:
                 terms[name] = self.config.depth_loss_mult * error
+        if batch.clear is not None and rendered.samples is not None and rendered.weights is not None:
+            clear = batch.clear.repeat_interleave(per_pixel)
+            matter = matter_before(rendered.weights, rendered.samples, clear)
+            terms["free_space"] = self.config.free_space_loss_mult * matter
         terms |= self.regularizers(rendered, batch, step)
         return Loss(terms, pixels.rgb.detach(), rendered.num_samples)
 

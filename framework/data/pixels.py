@@ -44,6 +44,8 @@ class PixelBatch:
     deviations: Tensor | None = None
     """(R,) standard deviation of `distances`, if they are those of a reconstruction's points; None if they were
     measured, by depth images."""
+    clear: Tensor | None = None
+    """(R,) distance before which the pixel's image shows nothing; None if that is not known."""
     weights: Tensor | None = None
     """(R,) factors of the pixels' losses, with mean 1, if the pixels were not drawn uniformly."""
 

@@ -48,6 +48,22 @@ def depth_error(weights: Tensor, samples: Samples, known: Tensor) -> Tensor:
     return ray_sum(weights * apart, samples)[has_depth].mean()
 
 
+def matter_before(weights: Tensor, samples: Samples, clear: Tensor) -> Tensor:
+    """Return the mean optical depth () before distances up to which rays should meet nothing.
+
+    With B the light that is stopped before, a ray's term is -log((1 - B + e) / (1 + e)), e = `WRONG`: the optical depth,
+    but bounded, so that a wall that all images show stays.
+
+    Args:
+        weights: (N,) weights of the samples of R rays.
+        samples: N samples.
+        clear: (R,) distances along the rays, scene units.
+    """
+    before = samples.t_ends < clear[samples.ray_indices]
+    left = (1 - ray_sum(weights * before, samples)).clamp(min=0)
+    return -((left + WRONG) / (1 + WRONG)).log().mean()
+
+
 def distance_likelihood(weights: Tensor, samples: Samples, known: Tensor, deviations: Tensor) -> Tensor:
     """Return the mean negative log-likelihood () of what rays show being at distances that points are known to have.
 

@@ -171,7 +171,9 @@ def _points(model: Any, numbers: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]
         numbers: COLMAP's numbers of the images; sightings in others, which have no pose, are left out.
     """
     rows = {number: row for row, number in enumerate(numbers)}
-    positions, errors, sightings = [], [], []
+    positions: list[np.ndarray] = []
+    errors: list[float] = []
+    sightings: list[tuple[int, int]] = []
     for point in model.points3D.values():
         # The error is -1 if it was not computed.
         if point.track.length() < SHORTEST_TRACK or point.error > LARGEST_ERROR or not np.isfinite(point.xyz).all():

@@ -18,7 +18,6 @@ from framework.rendering.volume import VolumeRenderer
 from framework.samplers.base import Sampler
 from framework.scene.reasons import DEPTH_REASONS, SPARSE_DEPTH_REASON
 
-
 DEPTH = 0.1
 """Default weight of the depth loss if there are depth images."""
 SPARSE_DEPTH = 0.01

@@ -98,8 +98,8 @@ class NerfactoConfig(
     """Whether gradients near cameras are scaled down, by squared distance up to half of the box's edge, against
     floaters. If not given: in unbounded scenes."""
     initial_density: float = 1.0
-    """Density before training, per scene unit. Space that no image shows keeps it more or less, and is fog to views that
-    look through it; with 0.01 such space starts nearly empty."""
+    """Density before training, per scene unit. Space that no image shows keeps it more or less, and is fog to views
+    through it; with 0.01 it starts nearly empty."""
     num_levels: int = 16
     """Number of levels of the hash grid."""
     features_per_level: int = 2

@@ -60,8 +60,8 @@ def test_the_penalty_in_closed_form() -> None:
     """The optical depth before the distance, with its gradient; a wall is not fought against."""
     edges = torch.tensor([[1.0, 2.0, 3.0, 4.0]], dtype=torch.float64)
     samples = Samples.regular(edges[:, :-1], edges[:, 1:])
-    for depths, clear, before in (((0.3, 0.5, 2.0), 3.5, 0.8), ((0.3, 0.5, 2.0), 2.5, 0.3), ((0.3, 0.5, 2.0), 0.5, 0.0)):
-        sigma = torch.tensor(depths, dtype=torch.float64, requires_grad=True)
+    for clear, before in ((3.5, 0.8), (2.5, 0.3), (0.5, 0.0)):
+        sigma = torch.tensor([0.3, 0.5, 2.0], dtype=torch.float64, requires_grad=True)
         weights = weights_and_transmittance(sigma, samples)[0]
         loss = matter_before(weights, samples, torch.tensor([clear], dtype=torch.float64))
         left = math.exp(-before)

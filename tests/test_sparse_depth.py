@@ -195,7 +195,7 @@ def test_a_batch_without_keypoints_is_as_it_was(dataset: Dataset) -> None:
     assert torch.equal(batches[0].rgb, batches[2].rgb[:50])
 
 
-def test_a_source_draws_keypoints_where_they_are_learned_from(dataset: Dataset, tmp_path: Path, shared_tiny: Path) -> None:
+def test_a_source_draws_keypoints_where_they_count(dataset: Dataset, tmp_path: Path, shared_tiny: Path) -> None:
     run = tiny_run("nerfacto", shared_tiny, tmp_path)
     for mult, share in ((0.01, KEYPOINTS), (0.0, 0.0)):
         source = make_source("pixels", dataset, dataclasses.replace(run.config, depth_loss_mult=mult))
@@ -225,7 +225,8 @@ def test_every_method_that_casts_rays_learns_from_them(
     run = tiny_run(kind, shared_tiny, tmp_path)
     trainer = Trainer(run, dataset, None)
     said = [decision.line() for decision in trainer.decisions]
-    assert f"  depth loss: 0.01, as the reconstruction's points are seen in {len(dataset.sparse_depth):,} pixels" in said
+    count = dataset.scene.num_sparse_depths
+    assert f"  depth loss: 0.01, as the reconstruction's points are seen in {count:,} pixels" in said
     report = trainer.train_step()
     assert report.losses["depth"] > 0
     assert ("depth_coarse" in report.losses) == (kind in ("vanilla-nerf", "dnerf"))
@@ -240,7 +241,8 @@ def test_points_teach_where_the_surface_is_and_that_space_before_it_is_empty(
     blind = dataclasses.replace(dataset, pixels=torch.full_like(dataset.pixels, 255))
     found = []
     for mult in (0.0, 0.05):
-        run = tiny_run("nerfacto", shared_tiny, tmp_path, max_num_iterations=150, max_eval_images=0, depth_loss_mult=mult)
+        changes = {"max_num_iterations": 150, "max_eval_images": 0, "depth_loss_mult": mult}
+        run = tiny_run("nerfacto", shared_tiny, tmp_path, **changes)
         run = dataclasses.replace(run, folder=tmp_path / f"{mult}")
         trainer = Trainer(run, blind, None)
         for _ in range(150):

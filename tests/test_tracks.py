@@ -89,4 +89,5 @@ def test_points_that_leave_the_range_of_numbers_go_with_their_sightings() -> Non
 def test_nothing_is_something_too() -> None:
     tracks = Tracks(torch.zeros(0, 3), *[torch.zeros(0, dtype=torch.int64)] * 2, torch.zeros(0))
     assert len(tracks.of_images(torch.tensor([0, 1])).sightings(torch.zeros(2, 3))) == 0
-    assert len(tracks.without(torch.zeros(2, dtype=torch.bool)).sightings(torch.zeros(2, 3)).of_images(torch.tensor([1]))) == 0
+    without = tracks.without(torch.zeros(2, dtype=torch.bool)).sightings(torch.zeros(2, 3))
+    assert len(without.of_images(torch.tensor([1]))) == 0

@@ -202,12 +202,10 @@ def evaluate(
         if round_to_uint8:
             rgb = (rgb * 255).round() / 255
         pair, kept = _judged(rgb, target, dataset.kept_of(index), half)
-        measured = measure(*pair, kept)
         rows.append(
             {
                 "name": dataset.names[index],
-                "psnr": measured.psnr,
-                "ssim": measured.ssim,
+                **vars(measure(*pair, kept)),
                 "lpips": None if lpips is None else lpips(*pair),
                 "floaters": floaters(picture, dataset, index),
                 "seconds": spent,

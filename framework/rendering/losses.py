@@ -8,7 +8,6 @@ from torch import Tensor
 from framework.geometry.rays import Samples
 from framework.kernels.compositing import ray_sum
 
-
 WIDTH = 3.0
 """Standard deviations from a known distance within which a ray is to end."""
 WRONG = 0.01
@@ -51,8 +50,8 @@ def depth_error(weights: Tensor, samples: Samples, known: Tensor) -> Tensor:
 def matter_before(weights: Tensor, samples: Samples, clear: Tensor) -> Tensor:
     """Return the mean optical depth () before distances up to which rays should meet nothing.
 
-    With B the light that is stopped before, a ray's term is -log((1 - B + e) / (1 + e)), e = `WRONG`: the optical depth,
-    but bounded, so that a wall that all images show stays.
+    With B the light that is stopped before, a ray's term is -log((1 - B + e) / (1 + e)), e = `WRONG`. It is the optical
+    depth, but bounded, so that a wall that all images show stays.
 
     Args:
         weights: (N,) weights of the samples of R rays.

@@ -70,15 +70,22 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
             terms["rgb_coarse"] = mean_squared_error(coarse.rgb, batch.rgb, batch.weights)
         if rendered.samples is not None and rendered.weights is not None:
             terms |= self.sampler.losses(rendered.samples, rendered.weights)
-        for name, level in (("depth", rendered), ("depth_coarse", rendered.coarse)):
-            if level is not None and (error := depth_loss(level, batch)) is not None and self.config.depth_loss_mult:
-                terms[name] = self.config.depth_loss_mult * error
-        if batch.clear is not None and rendered.samples is not None and rendered.weights is not None:
-            clear = batch.clear.repeat_interleave(per_pixel)
-            matter = matter_before(rendered.weights, rendered.samples, clear)
-            terms["free_space"] = self.config.free_space_loss_mult * matter
+        terms |= self._depth_terms(rendered, batch)
         terms |= self.regularizers(rendered, batch, step)
         return Loss(terms, pixels.rgb.detach(), rendered.num_samples)
+
+    def _depth_terms(self, rendered: Rendered, batch: PixelBatch) -> dict[str, Tensor]:
+        """Return the losses of what is known of distances, of both levels, and of space that is known to be empty."""
+        terms: dict[str, Tensor] = {}
+        for name, level in (("depth", rendered), ("depth_coarse", rendered.coarse)):
+            if self.config.depth_loss_mult > 0 and level is not None:
+                error = depth_loss(level, batch)
+                terms |= {} if error is None else {name: self.config.depth_loss_mult * error}
+        if batch.clear is not None and rendered.samples is not None and rendered.weights is not None:
+            clear = batch.clear.repeat_interleave(batch.rays_per_pixel)
+            matter = matter_before(rendered.weights, rendered.samples, clear)
+            terms["free_space"] = self.config.free_space_loss_mult * matter
+        return terms
 
     def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
         """Return further terms of the loss by name, each a scalar; none by default.

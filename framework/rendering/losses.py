@@ -84,15 +84,13 @@ def distance_likelihood(weights: Tensor, samples: Samples, known: Tensor, deviat
         deviations: (R,) their standard deviations.
     """
     has_point = known > 0
-    if not bool(has_point.any()):
-        return weights.sum() * 0
     first, last = known - WIDTH * deviations, known + WIDTH * deviations
     owners = samples.ray_indices
     before = samples.t_ends < first[owners]
     there = ~before & (samples.t_starts <= last[owners])
-    stopped, hit = ray_sum(torch.stack([weights * before, weights * there], dim=-1), samples)[has_point].unbind(-1)
+    stopped, hit = ray_sum(torch.stack([weights * before, weights * there], dim=-1), samples).unbind(-1)
     likelihood = (hit + WRONG * (1 - stopped).clamp(min=0) + WRONG**2) / (1 + WRONG + WRONG**2)
-    return -likelihood.log().mean()
+    return -(likelihood.log() * has_point).sum() / has_point.sum().clamp(min=1)
 
 
 def mean_depth_error(distances: Tensor, transmittance: Tensor, known: Tensor) -> Tensor:

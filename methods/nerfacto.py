@@ -70,7 +70,6 @@ class NerfactoConfig(
         "appearance_embedding_dim": (0, 2**10),
         "camera_learning_rate": AT_LEAST_0,
         "orientation_loss_mult": AT_LEAST_0,
-        "initial_density": (1e-6, 1e3),
         "num_levels": (1, MAX_LEVELS),
         "features_per_level": (1, 64),
         "base_resolution": (1, MAX_RESOLUTION),
@@ -97,9 +96,6 @@ class NerfactoConfig(
     gradient_scaling: Auto[bool] = AUTO
     """Whether gradients near cameras are scaled down, by squared distance up to half of the box's edge, against
     floaters. If not given: in unbounded scenes."""
-    initial_density: float = 1.0
-    """Density before training, per scene unit. Space that no image shows keeps it more or less, and is fog to views
-    through it; with 0.01 it starts nearly empty."""
     num_levels: int = 16
     """Number of levels of the hash grid."""
     features_per_level: int = 2
@@ -265,7 +261,6 @@ def make_field(config: NerfactoConfig, scene: Scene) -> EncodedField:
         config.hidden_width,
         unbounded=config.contraction and config.sampler == "proposal",
         appearance=(size, scene.num_cameras) if size else None,
-        initial_density=config.initial_density,
     )
 
 

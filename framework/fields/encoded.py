@@ -103,7 +103,6 @@ class EncodedField(BoxField):
         unbounded: whether the encoding covers all of space, contracted by `contract_to_unit`.
         appearance: size of an image's appearance vector, and number of images (NeRF-W, Martin-Brualla et al. 2021,
             section 4.1); None for no appearance vectors.
-        initial_density: density before training, in 1/length, which space that no image shows keeps more or less.
     """
 
     def __init__(
@@ -115,10 +114,8 @@ class EncodedField(BoxField):
         direction_levels: int = 4,
         unbounded: bool = False,
         appearance: tuple[int, int] | None = None,
-        initial_density: float = 1.0,
     ) -> None:
         super().__init__(box, encoding, unbounded)
-        self.initial_density = initial_density
         self.direction_levels, self.num_features = direction_levels, num_features
         self.density_head = MLP(encoding.num_features, width, num_features, bias=False)
         inputs = num_features + direction_levels**2
@@ -129,8 +126,7 @@ class EncodedField(BoxField):
         self.color_head = MLP(inputs, width, width, 3, bias=False, activation="sigmoid")
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
-        sigma, features = split_density(self.density_head(self.encode(points.positions, points.times)))
-        return (sigma if self.initial_density == 1 else self.initial_density * sigma), features
+        return split_density(self.density_head(self.encode(points.positions, points.times)))
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         inputs = [features]

@@ -15,6 +15,7 @@ from framework.cameras.cameras import LENSES
 from framework.cameras.poses import Center, Orientation, Placement, estimate_near, held_out, place
 from framework.data.dataset import Split, existing_files, image_size
 from framework.data.scene import PoseSource
+from framework.data.tracks import Sightings, Tracks
 
 LARGEST_SIDE = 1600
 """Longer side of an image, pixels, above which images are reduced by default."""
@@ -88,6 +89,8 @@ class PosedImages:
     """(M,) time of each image in [0, 1]; None for a static scene."""
     points: Tensor | None = None
     """(K, 3) sparse points in the input's frame."""
+    tracks: Tracks | None = None
+    """Which images see which sparse points, in the input's frame; None if that is not known."""
 
     def __getitem__(self, index: Tensor) -> PosedImages:
         """Return the images selected by an index tensor."""
@@ -103,6 +106,7 @@ class PosedImages:
             masks=None if self.masks is None else tuple(self.masks[i] for i in chosen),
             depths=None if self.depths is None else tuple(self.depths[i] for i in chosen),
             times=None if self.times is None else self.times[index],
+            tracks=None if self.tracks is None else self.tracks.of_images(index),
         )
 
 
@@ -136,8 +140,8 @@ def captured_scene(flags: Captured, images: PosedImages, split: Split, division:
         )
     placement = place(images.poses, flags.orientation_method, flags.center_method, flags.auto_scale_poses)
     placement = replace(placement, scale=placement.scale * flags.scale_factor)
-    points = None if images.points is None else _placed(images.points, placement)
     cameras = _cameras(images, placement)
+    points, sightings = _sparse_points(images, placement, cameras, chosen if split == "train" else None)
     near = min(estimate_near(cameras, points), flags.far / 2) if flags.near is None else flags.near
     images = images[chosen]
     _check_masks(images.masks)
@@ -153,6 +157,7 @@ def captured_scene(flags: Captured, images: PosedImages, split: Split, division:
         downscale_factor=reduction,
         mask_paths=images.masks,
         points=points,
+        sightings=None if sightings is None else sightings.of_images(chosen),
         unbounded=True,
         poses=flags.poses,
         depth_paths=images.depths,
@@ -293,10 +298,34 @@ def checked_box(box: Tensor, source: str) -> Tensor:
     return box
 
 
-def _placed(points: Tensor, placement: Placement) -> Tensor:
-    """Transform sparse points (K, 3) to the scene's frame, without those beyond the range of float32."""
-    points = _in_float64(placement).points(points.double()).float()
-    return points[points.isfinite().all(-1)]
+def _sparse_points(
+    images: PosedImages, placement: Placement, cameras: Cameras, known: Tensor | None
+) -> tuple[Tensor | None, Sightings | None]:
+    """Return the sparse points (K, 3) in the scene's frame, and how images see them; None if there are none.
+
+    Points beyond the range of float32 are left out. So are those that fewer than two of the `known` images see, as far
+    as tracks say so: only held-out images know of them. (The others' positions were found by all images together, as
+    all poses were.)
+
+    Args:
+        images: M images.
+        placement: placement of the scene.
+        cameras: M cameras in the scene's frame.
+        known: the images that may be learned from; all if None.
+    """
+    if images.points is None:
+        return None, None
+    precise = _in_float64(placement)
+    tracks = None if images.tracks is None else images.tracks.at(precise.points(images.tracks.points).float())
+    if tracks is None:
+        points = precise.points(images.points.double()).float()
+        return points[points.isfinite().all(-1)], None
+    if known is not None:
+        others = torch.ones(len(cameras), dtype=torch.bool)
+        others[known] = False
+        tracks = tracks.without(others)
+    points = tracks.points[tracks.confirmed()]
+    return (points, tracks.sightings(cameras.camera_to_worlds[:, :, 3])) if len(points) else (None, None)
 
 
 def _in_float64(placement: Placement) -> Placement:

@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from torch import Tensor
+
 from dataparsers.captured import Captured, PosedImages, captured_scene, has_transforms
 from dataparsers.colmap_lens import lenses_of
-from dataparsers.colmap_model import choose_model, find_models, read_model
+from dataparsers.colmap_model import SparseModel, choose_model, find_models, read_model
 from dataparsers.masks import find_masks
 from framework import DataError, ParsedScene
 from framework.data.dataset import Split
+from framework.data.tracks import Tracks
 
 
 @dataclass(frozen=True)
@@ -62,4 +65,18 @@ def read_images(path: Path, model: Path, images: str, masks: str) -> PosedImages
         lens=optics.lens,
         masks=find_masks(path / masks, sparse.names),
         points=sparse.points if len(sparse.points) else None,
+        tracks=tracks_of(sparse, optics.intrinsics),
     )
+
+
+def tracks_of(sparse: SparseModel, intrinsics: Tensor) -> Tracks | None:
+    """Return the tracks of a reconstruction in its own frame; None if it has no points.
+
+    Args:
+        sparse: the reconstruction of M images.
+        intrinsics: (M, 4) fx, fy, cx, cy of the images that it was made from.
+    """
+    if not len(sparse.points):
+        return None
+    images, seen = sparse.sightings.unbind(-1)
+    return Tracks(sparse.points, images, seen, sparse.errors[seen] / intrinsics[images, :2].mean(-1))

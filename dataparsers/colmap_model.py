@@ -5,10 +5,12 @@ Schönberger and Frahm 2016.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,6 +29,8 @@ SHORTEST_TRACK = 3
 """Minimum number of images that observe a sparse point; two can agree on a wrong one."""
 LARGEST_ERROR = 2.0
 """Maximum mean reprojection error of a sparse point, pixels."""
+LEAST_ERROR = 0.5
+"""Least error that is believed, pixels; also that of a point whose error was not computed."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,10 @@ class SparseModel:
     """The camera of each image."""
     points: Tensor
     """(K, 3) float64 sparse points confirmed by several images."""
+    errors: Tensor
+    """(K,) float64 mean reprojection error of each point, pixels."""
+    sightings: Tensor
+    """(O, 2) int64 image, and point that it sees."""
 
 
 def find_models(path: Path, locations: tuple[str, ...] = LOCATIONS) -> list[Path]:
@@ -127,7 +135,7 @@ def read_model(folder: Path) -> SparseModel:
         names = tuple(image.name for image in images)
         poses = [_camera_to_world(image) for image in images]
         cameras = tuple(_camera(model.cameras[image.camera_id]) for image in images)
-        points = _points(model)
+        points, errors, sightings = _points(model, [image.image_id for image in images])
     except Exception as error:  # pycolmap raises IndexError, ValueError, RuntimeError, UnicodeDecodeError and more
         raise DataError(
             f"{folder} cannot be read: its files are damaged or inconsistent ({one_line(error)})"
@@ -136,7 +144,7 @@ def read_model(folder: Path) -> SparseModel:
         raise DataError(f"{folder} has no image with a pose; COLMAP could not register any")
     for name, pose in zip(names, poses, strict=True):
         _check(name, pose, folder)
-    return SparseModel(names, torch.stack(poses), cameras, points)
+    return SparseModel(names, torch.stack(poses), cameras, points, errors, sightings)
 
 
 def _camera_to_world(image: Any) -> Tensor:
@@ -155,16 +163,29 @@ def _camera(camera: Any) -> SparseCamera:
     return SparseCamera(camera.model.name, tuple(float(p) for p in camera.params), camera.width, camera.height)
 
 
-def _points(model: Any) -> Tensor:
-    """Return the sparse points (K, 3) float64 that enough images confirm."""
-    confirmed = [
-        torch.from_numpy(point.xyz)
-        for point in model.points3D.values()
+def _points(model: Any, numbers: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the sparse points that enough images confirm, their errors, and which images see them.
+
+    Args:
+        model: the reconstruction.
+        numbers: COLMAP's numbers of the images; sightings in others, which have no pose, are left out.
+    """
+    rows = {number: row for row, number in enumerate(numbers)}
+    positions: list[np.ndarray] = []
+    errors: list[float] = []
+    sightings: list[tuple[int, int]] = []
+    for point in model.points3D.values():
         # The error is -1 if it was not computed.
-        if point.track.length() >= SHORTEST_TRACK and point.error <= LARGEST_ERROR
-    ]
-    points = torch.stack(confirmed) if confirmed else torch.zeros(0, 3, dtype=torch.float64)
-    return points[torch.isfinite(points).all(-1)]
+        if point.track.length() < SHORTEST_TRACK or point.error > LARGEST_ERROR or not np.isfinite(point.xyz).all():
+            continue
+        # A track may meet an image twice.
+        images = {rows[number] for number in (sighting.image_id for sighting in point.track.elements) if number in rows}
+        sightings += [(image, len(positions)) for image in sorted(images)]
+        positions.append(point.xyz)
+        errors.append(max(float(point.error), LEAST_ERROR))
+    points = torch.from_numpy(np.stack(positions)) if positions else torch.zeros(0, 3, dtype=torch.float64)
+    seen = torch.tensor(sightings, dtype=torch.int64).view(-1, 2)
+    return points, torch.tensor(errors, dtype=torch.float64), seen
 
 
 def _check(name: str, pose: Tensor, folder: Path) -> None:

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from framework.base.config import TrainConfig
-from framework.base.decisions import Decision
+from framework.base.config import RayConfig, TrainConfig
+from framework.base.decisions import Choice, Decision, fill
 from framework.base.errors import ConfigError
 from framework.data.scene import Scene
 from framework.fields.base import Field
@@ -16,6 +16,12 @@ from framework.ray_model import RayModel
 from framework.rendering.renderer import Renderer
 from framework.rendering.volume import VolumeRenderer
 from framework.samplers.base import Sampler
+from framework.scene.reasons import DEPTH_REASONS, SPARSE_DEPTH_REASON
+
+DEPTH = 0.1
+"""Default weight of the depth loss if there are depth images."""
+SPARSE_DEPTH = 0.01
+"""Default weight of the depth loss if there are points of a reconstruction."""
 
 
 def nothing_to_decide(config: Any, scene: Scene) -> tuple[Any, list[Decision]]:
@@ -36,6 +42,18 @@ def volume_renderer(config: Any, scene: Scene) -> Renderer:
         scene: properties of the scene; not used.
     """
     return VolumeRenderer()
+
+
+def depth_choice(scene: Scene) -> Choice:
+    """Return the weight of the depth loss that suits the scene.
+
+    Args:
+        scene: properties of the scene.
+    """
+    points = scene.num_sparse_depths > 0 and not scene.has_depth
+    weight = SPARSE_DEPTH if points else DEPTH if scene.has_depth else 0.0
+    reason = SPARSE_DEPTH_REASON.format(scene.num_sparse_depths) if points else DEPTH_REASONS[scene.has_depth]
+    return Choice("depth_loss_mult", weight, reason, "depth loss")
 
 
 @dataclass(frozen=True)
@@ -64,6 +82,22 @@ class Method:
     interface: int = 2
     """Version of the plugin interface that the method was written for (`registry.INTERFACE`)."""
 
+    def decided(self, config: Any, scene: Scene) -> tuple[Any, list[Decision]]:
+        """Return settings with nothing left open: those of the method, and those of all methods that cast rays.
+
+        Args:
+            config: the method's settings.
+            scene: properties of the scene.
+
+        Returns:
+            The settings, and the decisions that were made.
+        """
+        config, made = self.decide(config, scene)
+        if not isinstance(config, RayConfig):
+            return config, made
+        config, more = fill(config, depth_choice(scene))
+        return config, made + more
+
     def build(self, config: TrainConfig, scene: Scene) -> Model[Any]:
         """Return the model, with newly initialised parameters.
 
@@ -74,7 +108,7 @@ class Method:
         Raises:
             ConfigError: if the settings do not fit the scene or each other.
         """
-        config, _ = self.decide(config, scene)
+        config, _ = self.decided(config, scene)
         if self.field is None:
             return self.model(config, scene)
         if self.sampler is None or not issubclass(self.model, RayModel):

@@ -19,7 +19,7 @@ from framework.geometry.rays import Rays
 from framework.kernels.math import safe_normalize
 from framework.kernels.native import torch_on_one_thread
 from framework.model import Loss, Model
-from framework.rendering.losses import mean_squared_error
+from framework.rendering.losses import depth_error, distance_likelihood, matter_before, mean_squared_error
 from framework.rendering.rendered import Picture, Rendered
 from framework.rendering.renderer import Renderer
 from framework.samplers.base import Sampler
@@ -55,7 +55,7 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
         return self.renderer.render(rays, samples, self.field, background)
 
     def loss(self, batch: PixelBatch, step: int) -> Loss:
-        """Return the mean squared error of the pixels' colours, the losses of the sampler, and `regularizers`.
+        """Return the mean squared error of the pixels' colours, that of depths, the sampler's, and `regularizers`.
 
         Args:
             batch: pixels with their true colours.
@@ -70,8 +70,22 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
             terms["rgb_coarse"] = mean_squared_error(coarse.rgb, batch.rgb, batch.weights)
         if rendered.samples is not None and rendered.weights is not None:
             terms |= self.sampler.losses(rendered.samples, rendered.weights)
+        terms |= self._depth_terms(rendered, batch)
         terms |= self.regularizers(rendered, batch, step)
         return Loss(terms, pixels.rgb.detach(), rendered.num_samples)
+
+    def _depth_terms(self, rendered: Rendered, batch: PixelBatch) -> dict[str, Tensor]:
+        """Return the losses of what is known of distances, of both levels, and of space that is known to be empty."""
+        terms: dict[str, Tensor] = {}
+        for name, level in (("depth", rendered), ("depth_coarse", rendered.coarse)):
+            if self.config.depth_loss_mult > 0 and level is not None:
+                error = depth_loss(level, batch)
+                terms |= {} if error is None else {name: self.config.depth_loss_mult * error}
+        if batch.clear is not None and rendered.samples is not None and rendered.weights is not None:
+            clear = batch.clear.repeat_interleave(batch.rays_per_pixel)
+            matter = matter_before(rendered.weights, rendered.samples, clear)
+            terms["free_space"] = self.config.free_space_loss_mult * matter
+        return terms
 
     def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
         """Return further terms of the loss by name, each a scalar; none by default.
@@ -135,3 +149,19 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
     def rays_per_pixel(self) -> int:
         """Number of rays that are averaged for each pixel of an image, as configured."""
         return self.config.rays_per_pixel
+
+
+def depth_loss(rendered: Rendered, batch: PixelBatch) -> Tensor | None:
+    """Return the loss () of the distances that are known of some pixels; None without samples, or if none is known.
+
+    Args:
+        rendered: the rays of the batch.
+        batch: the pixels.
+    """
+    weights, samples = rendered.weights, rendered.samples
+    if batch.distances is None or samples is None or weights is None or not samples.num_rays:
+        return None
+    known = batch.distances.repeat_interleave(batch.rays_per_pixel)
+    if batch.deviations is None:
+        return depth_error(weights, samples, known)
+    return distance_likelihood(weights, samples, known, batch.deviations.repeat_interleave(batch.rays_per_pixel))

@@ -38,18 +38,15 @@ from framework.fields.encoded import NUM_FEATURES, EncodedField
 from framework.fields.normals import NormalHead, density_normals, normal_penalties
 from framework.kernels.compositing import distortion, ray_sum
 from framework.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
-from framework.rendering.losses import depth_error
 from framework.rendering.volume import VolumeRenderer, shade
 from framework.samplers.choice import SamplingConfig, make_sampler, sampler_choice
 from framework.samplers.proposal import half_edge
-from framework.scene.reasons import DEPTH_REASONS, LIGHT_REASONS, POSE_REASONS
+from framework.scene.reasons import LIGHT_REASONS, POSE_REASONS
 
 APPEARANCE_SIZE = 16
 """Default length of appearance vectors where the appearance varies."""
 DISTORTION = 2e-3
 """Default weight of the distortion loss in unbounded scenes."""
-DEPTH = 0.1
-"""Default weight of the depth loss if there are depth images."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +69,6 @@ class NerfactoConfig(
         "distortion_loss_mult": AT_LEAST_0,
         "appearance_embedding_dim": (0, 2**10),
         "camera_learning_rate": AT_LEAST_0,
-        "depth_loss_mult": AT_LEAST_0,
         "orientation_loss_mult": AT_LEAST_0,
         "num_levels": (1, MAX_LEVELS),
         "features_per_level": (1, 64),
@@ -92,8 +88,6 @@ class NerfactoConfig(
     """Refinement of the training cameras' poses; auto: SO3xR3 if a device tracked them, else off."""
     camera_learning_rate: float = 1e-3
     """Initial learning rate of the poses."""
-    depth_loss_mult: Auto[float] = AUTO
-    """Weight of the depth loss. If not given: 0.1 if there are depth images, else 0."""
     predict_normals: bool = False
     """Whether to predict normals, which are smoother than those of the density's gradient."""
     orientation_loss_mult: float = 0.1
@@ -156,7 +150,7 @@ class NerfactoRenderer(VolumeRenderer):
 
 
 class Nerfacto(RayModel[NerfactoConfig]):
-    """A model whose training poses can be refined, with appearance vectors, distortion and depth losses.
+    """A model whose training poses can be refined, with appearance vectors and a distortion loss.
 
     Args:
         config: the method's settings, none left open.
@@ -208,9 +202,6 @@ class Nerfacto(RayModel[NerfactoConfig]):
         if config.distortion_loss_mult > 0 and samples.edges is not None:
             normalised = Samples.regular(samples.edges[:, :-1], samples.edges[:, 1:])
             losses["distortion"] = config.distortion_loss_mult * distortion(weights, normalised).mean()
-        if config.depth_loss_mult > 0 and batch.distances is not None:
-            distances = batch.distances.repeat_interleave(batch.rays_per_pixel)
-            losses["depth"] = config.depth_loss_mult * depth_error(weights, samples, distances)
         for name, penalty in rendered.penalties.items():
             losses[name] = (config.orientation_loss_mult if name == "orientation" else 1.0) * penalty.mean()
         return losses
@@ -243,7 +234,6 @@ def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[D
             LIGHT_REASONS[scene.appearance_varies],
             "appearance features",
         ),
-        Choice("depth_loss_mult", DEPTH if scene.has_depth else 0.0, DEPTH_REASONS[scene.has_depth], "depth loss"),
         Choice("camera_optimizer", refined, POSE_REASONS[scene.poses], "pose refinement"),
     )
     return config, made + more

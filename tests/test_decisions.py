@@ -67,11 +67,11 @@ def test_filling_in_twice_changes_nothing() -> None:
 def test_every_method_decides_once(method: str, facts: dict) -> None:
     """What was decided is complete and stands: read from a run's config.yml, it is not decided anew."""
     loaded, scene = load_method(method), dataclasses.replace(SCENE, **facts)
-    config, _ = loaded.decide(loaded.config, scene)
+    config, _ = loaded.decided(loaded.config, scene)
     assert not [
         name for name in ("sampler", "camera_optimizer", "log2_table_size") if is_open(getattr(config, name, 0))
     ]
     changed = dataclasses.replace(config, max_seconds=7.0)
-    again, made = loaded.decide(changed, dataclasses.replace(SCENE, unbounded=not scene.unbounded))
+    again, made = loaded.decided(changed, dataclasses.replace(SCENE, unbounded=not scene.unbounded))
     assert again == changed
     assert [decision for decision in made if decision.choice != "left out"] == []

@@ -207,6 +207,8 @@ class RayConfig(TrainConfig):
         "eval_num_rays_per_chunk": (1, 2**20),
         "samples_per_batch": (1, 2**24),
         "train_rays_per_pixel_from": (0, 1),
+        "depth_loss_mult": AT_LEAST_0,
+        "free_space_loss_mult": AT_LEAST_0,
     }
     """Allowed ranges."""
     num_rays_per_batch: int = 4_096
@@ -219,6 +221,12 @@ class RayConfig(TrainConfig):
     """Samples per training step; the number of rays is adjusted to reach about this many."""
     draw_by_error: bool = False
     """Draw half of the pixels in proportion to their recent error, with weights that keep the mean loss unbiased."""
+    depth_loss_mult: Auto[float] = AUTO
+    """Weight of the depth loss; 0 for none. If not given: 0.1 if there are depth images, 0.01 if there are points of a
+    reconstruction, which some pixels are known to show, else 0."""
+    free_space_loss_mult: float = 0.0
+    """Weight of the penalty on matter right before cameras: nearer than most of the points that a camera sees, or than
+    any other camera sees; 0 for none."""
     eval_num_rays_per_chunk: int = 8_192
     """Rays rendered at once in evaluation. This changes memory and speed, never the result."""
 

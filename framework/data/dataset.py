@@ -30,6 +30,8 @@ from framework.data.mapped_pixels import MappedPixels
 from framework.data.pixel_cache import PixelMemory
 from framework.data.pixel_set import PixelSet
 from framework.data.scene import PoseSource, Scene
+from framework.data.sparse_depth import SparseDepth, sparse_depth
+from framework.data.tracks import Sightings
 
 Masks = Literal["auto", "ignored", "empty"]
 """Meaning of masked-out pixels: nothing is known about them, or nothing is there."""
@@ -61,6 +63,8 @@ class ParsedScene:
     """M mask files, white for pixels to train on and black for others; None for an image without mask."""
     points: Tensor | None = None
     """(K, 3) sparse points on surfaces, scene coordinates."""
+    sightings: Sightings | None = None
+    """Which of the images see which sparse points; None if that is not known."""
     unbounded: bool = False
     """Whether there may be visible content outside `box`."""
     poses: PoseSource = "exact"
@@ -82,6 +86,7 @@ class ParsedScene:
             times=None if self.times is None else self.times[index],
             mask_paths=None if self.mask_paths is None else tuple(self.mask_paths[i] for i in chosen),
             depth_paths=None if self.depth_paths is None else tuple(self.depth_paths[i] for i in chosen),
+            sightings=None if self.sightings is None else self.sightings.of_images(index),
         )
 
 
@@ -142,6 +147,8 @@ class Dataset:
     """The file of `pixels`, if they exceed the memory limit; they then stay on the CPU."""
     points: Tensor | None = None
     """(K, 3) sparse points on surfaces, scene coordinates; None if there are none."""
+    sparse_depth: SparseDepth | None = None
+    """Pixels in which images see sparse points, and their distances; None if there are none."""
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -206,6 +213,7 @@ class Dataset:
             kept=None if self.kept is None else self.kept.to(device),
             opaque=None if self.opaque is None else self.opaque.to(device),
             depths=None if self.depths is None else self.depths.to(device),
+            sparse_depth=None if self.sparse_depth is None else self.sparse_depth.to(device),
         )
 
 
@@ -273,6 +281,13 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
     kept, opaque, light = decoded.kept, None, None if decoded.pixels.shape[1] == 4 else decoded.light
     if kept is not None and (masks == "empty" or (masks == "auto" and cuts_out(kept, cameras))):
         kept, opaque = None, kept
+    names = tuple(path.name for path in parsed.image_paths)
+    visible = pixels_with_rays(cameras, names, split)
+    if visible is not None:
+        kept = visible if kept is None else PixelSet.shared([kept, visible], 2)
+        if not len(kept):
+            raise DataError(f"split '{split}': masks keep only pixels for which the lens has no ray")
+    sparse = _sparse_depth(parsed, cameras, kept if opaque is None else opaque)
     scene = Scene(
         box=parsed.box,
         near=parsed.near,
@@ -289,14 +304,8 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         appearance_varies=parsed.appearance_varies or (light is not None and light_spread(light) > APPEARANCE_STOPS),
         camera_to_worlds=cameras.camera_to_worlds,
         image_pixels=int(cameras.offsets[-1]) // len(cameras),
+        num_sparse_depths=0 if sparse is None else len(sparse),
     )
-    depths = _depths(parsed, cameras, decoded.mapped is not None)
-    names = tuple(path.name for path in parsed.image_paths)
-    visible = pixels_with_rays(cameras, names, split)
-    if visible is not None:
-        kept = visible if kept is None else PixelSet.shared([kept, visible], 2)
-        if not len(kept):
-            raise DataError(f"split '{split}': masks keep only pixels for which the lens has no ray")
     return Dataset(
         pixels=decoded.pixels,
         cameras=cameras,
@@ -309,9 +318,10 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         kept=kept,
         opaque=opaque,
         light=light,
-        depths=depths,
+        depths=_depths(parsed, cameras, decoded.mapped is not None),
         mapped=decoded.mapped,
         points=parsed.points,
+        sparse_depth=sparse,
     )
 
 
@@ -329,6 +339,16 @@ def cuts_out(kept: PixelSet, cameras: Cameras) -> bool:
         return False
     first = kept.mask(0, ends[1])
     return any(not torch.equal(kept.mask(start, end), first) for start, end in pairwise(ends))
+
+
+def _sparse_depth(parsed: ParsedScene, cameras: Cameras, shown: PixelSet | None) -> SparseDepth | None:
+    """Return the pixels, of those `shown` (None for all), in which images see sparse points; None if there are none."""
+    if parsed.sightings is None or isinstance(cameras, NdcCameras):
+        return None
+    found = sparse_depth(parsed.sightings, cameras)
+    if shown is not None:
+        found = found[shown.contains(found.pixels)]
+    return found if len(found) else None
 
 
 def _depths(parsed: ParsedScene, cameras: Cameras, in_file: bool) -> Tensor | None:

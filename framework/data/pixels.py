@@ -40,7 +40,12 @@ class PixelBatch:
     alpha: Tensor | None
     """(R,) opacity, if the images have alpha."""
     distances: Tensor | None = None
-    """(R,) measured distance along the pixel's ray, 0 where unknown; None without depth images."""
+    """(R,) known distance along the pixel's ray, 0 where unknown; None if no pixel has one."""
+    deviations: Tensor | None = None
+    """(R,) standard deviation of `distances`, if they are those of a reconstruction's points; None if they were
+    measured, by depth images."""
+    clear: Tensor | None = None
+    """(R,) distance before which the pixel's image shows nothing; None if that is not known."""
     weights: Tensor | None = None
     """(R,) factors of the pixels' losses, with mean 1, if the pixels were not drawn uniformly."""
 
@@ -123,8 +128,12 @@ def draw_batch(
     errors: ErrorMap | None = None,
     subpixels: Tensor = CENTER,
     look_up: LookUp | None = None,
+    keypoints: int = 0,
 ) -> PixelBatch:
     """Draw a batch of pixels.
+
+    Of pixels with a sparse depth, some are drawn besides: they are few, and each tells where its surface is, and that
+    the space before it is empty. Their colours count as those of all others.
 
     Args:
         dataset: the training images.
@@ -134,18 +143,27 @@ def draw_batch(
         subpixels: (K, 2) positions in a pixel through which its rays pass, as in `Cameras.pixel_rays`.
         look_up: for pixels in a file, returns the stored colours of all drawn pixels, in the order of drawing
             (`PixelStream.look_up`).
+        keypoints: number of these pixels that are drawn from `dataset.sparse_depth`; they stand last.
     """
+    uniform, sparse = count - keypoints, dataset.sparse_depth
     # Pixels are drawn before any other random number, so that `PixelStream` can predict them from the seed.
-    flat, stored = draw_pixels(dataset, count if errors is None else 2 * count), None
+    flat, stored = draw_pixels(dataset, uniform if errors is None else 2 * uniform), None
     if dataset.mapped is not None:
         stored = (look_up or dataset.mapped.look_up)(flat).to(dataset.device)
         flat = flat.to(dataset.device)
-    behind = background_colors(background, count, dataset.device)
-    if errors is None:
-        return gather_batch(dataset, flat, behind, subpixels, stored)
-    selected, weights = errors.choose(flat, count)
-    stored = None if stored is None else stored[selected]
-    return replace(gather_batch(dataset, flat[selected], behind, subpixels, stored), weights=weights)
+    behind, weights = background_colors(background, count, dataset.device), None
+    if errors is not None:
+        selected, weights = errors.choose(flat, uniform)
+        flat, stored = flat[selected], None if stored is None else stored[selected]
+        weights = torch.cat([weights, weights.new_ones(keypoints)])
+    if not keypoints or sparse is None:
+        return replace(gather_batch(dataset, flat, behind, subpixels, stored), weights=weights)
+    chosen = torch.randint(len(sparse), (keypoints,), device=dataset.device)
+    if dataset.mapped is not None and stored is not None:
+        stored = torch.cat([stored, dataset.mapped.look_up(sparse.pixels[chosen].cpu()).to(stored)])
+    batch = gather_batch(dataset, torch.cat([flat, sparse.pixels[chosen]]), behind, subpixels, stored)
+    known = [torch.cat([values.new_zeros(uniform), values[chosen]]) for values in (sparse.distances, sparse.deviations)]
+    return replace(batch, weights=weights, distances=known[0], deviations=known[1])
 
 
 def gather_batch(

@@ -54,6 +54,8 @@ class Scene:
     """(num_cameras, 3, 4) given poses of the training cameras."""
     image_pixels: int | None = None
     """Mean number of pixels of a training image; None if unknown."""
+    num_sparse_depths: int = 0
+    """Number of pixels of the images whose distance is known from a reconstruction's points."""
 
     @classmethod
     def of(cls, facts: Any) -> Scene:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -16,6 +16,7 @@ from framework.cameras.cameras import CENTER, subpixels
 from framework.cameras.view import View
 from framework.data.dataset import Dataset
 from framework.data.error_map import ErrorMap
+from framework.data.free_space import clear_distances
 from framework.data.pixel_stream import PixelStream
 from framework.data.pixels import (
     Background,
@@ -40,6 +41,10 @@ class Request:
     """Number of pixels to draw; not used if batches are whole images."""
     rays_per_pixel: int = 1
     """Number of rays through each pixel: 1, through its centre, or another square number."""
+
+
+KEYPOINTS = 1 / 8
+"""Share of a batch's pixels that are drawn from those with a sparse depth, where they are to be learned from."""
 
 
 class BatchSource(ABC):
@@ -92,17 +97,33 @@ class PixelSource(BatchSource):
         background: background of transparent pixels.
         seed: seed of the run.
         by_error: whether half of the pixels are drawn with a probability proportional to their recent error.
+        keypoints: share of the pixels that are drawn from those with a sparse depth, if there are any.
+        clear: (M,) distances before which images show nothing; None if they are not to be learned from.
     """
 
-    def __init__(self, dataset: Dataset, background: Background, seed: int, by_error: bool = False) -> None:
+    def __init__(
+        self,
+        dataset: Dataset,
+        background: Background,
+        seed: int,
+        by_error: bool = False,
+        keypoints: float = 0.0,
+        clear: Tensor | None = None,
+    ) -> None:
+        self.clear = clear
         self.dataset, self.background, self.seed = dataset, background, seed
+        self.keypoints = keypoints if dataset.sparse_depth is not None else 0.0
         self.errors = ErrorMap(dataset) if by_error else None
         self.stream: PixelStream | None = None
 
     def draw(self, request: Request) -> PixelBatch:
         offsets = CENTER if request.rays_per_pixel == 1 else subpixels(request.rays_per_pixel)
-        look_up = self._look_up(request.step)
-        return draw_batch(self.dataset, request.num_pixels, self.background, self.errors, offsets, look_up)
+        look_up, keypoints = self._look_up(request.step), round(self.keypoints * request.num_pixels)
+        count = request.num_pixels
+        batch = draw_batch(self.dataset, count, self.background, self.errors, offsets, look_up, keypoints)
+        if self.clear is None or batch.rays.camera_indices is None:
+            return batch
+        return replace(batch, clear=self.clear[batch.rays.camera_indices[:: batch.rays_per_pixel]])
 
     def _look_up(self, step: int) -> LookUp | None:
         """Return the function that looks up the colours of a step's pixels in a file; None if they are in memory."""
@@ -112,7 +133,7 @@ class PixelSource(BatchSource):
         return partial(self.stream.look_up, step)
 
     def drawing_from(self, dataset: Dataset) -> PixelSource:
-        source = PixelSource(dataset, self.background, self.seed)
+        source = PixelSource(dataset, self.background, self.seed, keypoints=self.keypoints, clear=self.clear)
         source.errors = self.errors
         return source
 
@@ -193,5 +214,10 @@ def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource
     background = training_background(config.background, dataset.scene.has_alpha)
     if kind == "views":
         return ViewSource(dataset, background, config.machine.seed)
-    by_error = isinstance(config, RayConfig) and config.draw_by_error
-    return PixelSource(dataset, background, config.machine.seed, by_error)
+    if not isinstance(config, RayConfig):
+        return PixelSource(dataset, background, config.machine.seed)
+    keypoints = KEYPOINTS if config.depth_loss_mult and not dataset.scene.has_depth else 0.0
+    clear = None
+    if config.free_space_loss_mult > 0 and not dataset.scene.warped:
+        clear = clear_distances(dataset.cameras, dataset.sparse_depth, dataset.scene.near, dataset.scene.far)
+    return PixelSource(dataset, background, config.machine.seed, config.draw_by_error, keypoints, clear)

@@ -27,6 +27,8 @@ from framework.evaluation.panels import composed, view_panels
 from framework.model import Model
 from framework.rendering.rendered import Picture
 
+BEFORE = 0.9
+"""Share of a sparse point's distance before which a view that sees the point should show nothing."""
 LONGEST_STEM = 150
 """Maximum number of bytes of an image's name in the names of the files written for it."""
 
@@ -103,12 +105,39 @@ def timed_view(model: Model, view: View, background: Tensor) -> tuple[Picture, f
     return picture, time.perf_counter() - start
 
 
+def floaters(picture: Picture, dataset: Dataset, index: int) -> float | None:
+    """Return the share, in per cent, of the sparse points that a view sees with something before them.
+
+    These are the points that a reconstruction's tracks say the image sees, and whose pixel's median depth is less than
+    `BEFORE` of their distance: so half of the pixel's light is stopped in space that the image shows to be empty. This
+    is defined for every method that renders depth.
+
+    Args:
+        picture: the rendered view.
+        dataset: the views.
+        index: index of the view.
+
+    Returns:
+        The share; None if the image sees no point whose distance is known well enough.
+    """
+    if dataset.sparse_depth is None:
+        return None
+    start, end = dataset.cameras.ends[index : index + 2]
+    pixels = dataset.sparse_depth.pixels
+    known = dataset.sparse_depth[(pixels >= start) & (pixels < end)]
+    known = known[known.deviations < (1 - BEFORE) / 3 * known.distances]
+    if not len(known):
+        return None
+    before = picture.median_depth.reshape(-1)[known.pixels - start] < BEFORE * known.distances
+    return 100 * before.float().mean().item()
+
+
 @dataclass(frozen=True)
 class Evaluation:
     """Metrics of a set of images."""
 
     per_image: list[dict[str, Any]]
-    """Name, psnr, ssim, lpips and rendering seconds of each image."""
+    """Name, psnr, ssim, lpips, floaters and rendering seconds of each image."""
     results: dict[str, Any]
     """Means, standard deviations and rendering speed, with nerfstudio's keys."""
     lpips_note: str
@@ -122,9 +151,10 @@ class Evaluation:
         """Return the results as a line of text."""
         r = self.results
         ssim, lpips = ("absent" if r[name] is None else f"{r[name]:.4f}" for name in ("ssim", "lpips"))
+        before = "" if r["floaters"] is None else f"  floaters {r['floaters']:.1f} %"
         rays = r["num_rays_per_sec"]  # 0 of a method that casts none
         speed = f"{rays / 1e3:.1f}k rays/s  {1 / r['fps']:.2f} s/image" if rays else f"{r['fps']:.1f} images/s"
-        return f"PSNR {r['psnr']:.2f} dB  SSIM {ssim}  LPIPS {lpips}  {speed}  ({r['num_images']} images)"
+        return f"PSNR {r['psnr']:.2f} dB  SSIM {ssim}  LPIPS {lpips}{before}  {speed}  ({r['num_images']} images)"
 
 
 def evaluate(
@@ -172,13 +202,12 @@ def evaluate(
         if round_to_uint8:
             rgb = (rgb * 255).round() / 255
         pair, kept = _judged(rgb, target, dataset.kept_of(index), half)
-        measured = measure(*pair, kept)
         rows.append(
             {
                 "name": dataset.names[index],
-                "psnr": measured.psnr,
-                "ssim": measured.ssim,
+                **vars(measure(*pair, kept)),
                 "lpips": None if lpips is None else lpips(*pair),
+                "floaters": floaters(picture, dataset, index),
                 "seconds": spent,
             }
         )
@@ -235,7 +264,7 @@ def spread(total: int, limit: int | None) -> list[int]:
 def _statistics(rows: list[dict[str, Any]]) -> dict[str, float | None]:
     """Return the mean and the standard deviation of each metric; None if it is absent."""
     statistics: dict[str, float | None] = {}
-    for name in ("psnr", "ssim", "lpips"):
+    for name in ("psnr", "ssim", "lpips", "floaters"):
         values = [row[name] for row in rows if row[name] is not None]
         statistics[name] = fmean(values) if values else None
         statistics[f"{name}_std"] = (stdev(values) if len(values) > 1 else 0.0) if values else None

@@ -8,6 +8,11 @@ from torch import Tensor
 from framework.geometry.rays import Samples
 from framework.kernels.compositing import ray_sum
 
+WIDTH = 3.0
+"""Standard deviations from a known distance within which a ray is to end."""
+WRONG = 0.01
+"""Share of a reconstruction's points that are taken to be wrong."""
+
 
 def mean_squared_error(prediction: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
     """Return the mean () of weight * (prediction - target)^2 over all elements; 0 for empty input.
@@ -40,6 +45,52 @@ def depth_error(weights: Tensor, samples: Samples, known: Tensor) -> Tensor:
     # Without the bound, far samples, which are sparse where distances are in disparity, would dominate the mean.
     apart = ((samples.t - depths).abs() / depths).clamp(max=1)
     return ray_sum(weights * apart, samples)[has_depth].mean()
+
+
+def matter_before(weights: Tensor, samples: Samples, clear: Tensor) -> Tensor:
+    """Return the mean optical depth () before distances up to which rays should meet nothing.
+
+    With B the light that is stopped before, a ray's term is -log((1 - B + e) / (1 + e)), e = `WRONG`. It is the optical
+    depth, but bounded, so that a wall that all images show stays.
+
+    Args:
+        weights: (N,) weights of the samples of R rays.
+        samples: N samples.
+        clear: (R,) distances along the rays, scene units.
+    """
+    before = samples.t_ends < clear[samples.ray_indices]
+    left = (1 - ray_sum(weights * before, samples)).clamp(min=0)
+    return -((left + WRONG) / (1 + WRONG)).log().mean()
+
+
+def distance_likelihood(weights: Tensor, samples: Samples, known: Tensor, deviations: Tensor) -> Tensor:
+    """Return the mean negative log-likelihood () of what rays show being at distances that points are known to have.
+
+    With B the light that is stopped before the point, and H the light that is stopped at it, a ray's term is
+
+        -log((H + e (1 - B) + e^2) / (1 + e + e^2)),     e = `WRONG`
+
+    The first summand is DS-NeRF's (Deng et al. 2022): a ray ends at its point, so the term is the optical depth before
+    the point, whose gradient does not vanish behind dense fog, and what is missing at the point. The others are for
+    points that are wrong: in one of 1 / e the surface is somewhere behind, and the space before is still empty; in one
+    of 1 / e^2, nothing is known. "At the point" are all intervals that are within `WIDTH` standard deviations of it, in
+    whole, so that no sample is asked to be narrower than the sampler makes it (as in urban radiance fields, Rematas et
+    al. 2022, whose window shrinks by a schedule).
+
+    Args:
+        weights: (N,) weights of the samples of R rays.
+        samples: N samples.
+        known: (R,) known distances along the rays, scene units; 0 if unknown, in which case the ray is left out.
+        deviations: (R,) their standard deviations.
+    """
+    has_point = known > 0
+    first, last = known - WIDTH * deviations, known + WIDTH * deviations
+    owners = samples.ray_indices
+    before = samples.t_ends < first[owners]
+    there = ~before & (samples.t_starts <= last[owners])
+    stopped, hit = ray_sum(torch.stack([weights * before, weights * there], dim=-1), samples).unbind(-1)
+    likelihood = (hit + WRONG * (1 - stopped).clamp(min=0) + WRONG**2) / (1 + WRONG + WRONG**2)
+    return -(likelihood.log() * has_point).sum() / has_point.sum().clamp(min=1)
 
 
 def mean_depth_error(distances: Tensor, transmittance: Tensor, known: Tensor) -> Tensor:

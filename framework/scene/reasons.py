@@ -4,6 +4,8 @@ from __future__ import annotations
 
 DEPTH_REASONS = {True: "there are depth images", False: "there are no depth images"}
 """Reason of a depth loss, by whether there are depth images."""
+SPARSE_DEPTH_REASON = "the reconstruction's points are seen in {:,} pixels"
+"""Reason of a depth loss, by the number of pixels in which images see sparse points."""
 LIGHT_REASONS = {True: "light differs between the images", False: "the images are lit alike"}
 """Reason of an appearance of each image, by whether light, exposure or camera differ."""
 POSE_REASONS = {

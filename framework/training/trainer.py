@@ -72,7 +72,7 @@ class Trainer:
         self, run: Run, train_set: Dataset, eval_set: Dataset | None, source: BatchSource | None = None
     ) -> None:
         self.config: TrainConfig
-        self.config, self.decisions = load_method(run.method).decide(run.config, train_set.scene)
+        self.config, self.decisions = load_method(run.method).decided(run.config, train_set.scene)
         self.run = replace(run, config=self.config)
         self.train_set, self.eval_set = train_set, eval_set
         self.device = train_set.device

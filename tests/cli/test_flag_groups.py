@@ -180,7 +180,7 @@ def test_what_the_data_decide_is_not_called_none() -> None:
     hints = get_type_hints(type(config), include_extras=True)
     is_open = [name for name in hints if hints[name] == Auto[int] and getattr(config, name) is None]
     assert {"max_resolution", "log2_table_size", "num_steps"} <= set(is_open)
-    assert said.count(DECIDED) == len(is_open) + 1  # and --sparse-updates
+    assert said.count(DECIDED) == len(is_open) + 2  # and --sparse-updates, --depth-loss-mult
     assert "Stop after this many seconds of training; evaluation and saving are not counted. (default: None)" in said
 
 

@@ -1,5 +1,6 @@
 """Captured scenes for the tests of their formats, and what their cameras must fulfil. Written without our own maths."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,21 +73,30 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
 
 
 def write_colmap(
-    folder: Path, capture: Capture, camera: str = "PINHOLE 60 40 50 48 31 19", tracks: int = 3, error: float = 0.5
+    folder: Path,
+    capture: Capture,
+    camera: str = "PINHOLE 60 40 50 48 31 19",
+    tracks: int = 3,
+    error: float = 0.5,
+    seen_by: Sequence[int] | None = None,
 ) -> Path:
-    """A text model with ids that are neither contiguous nor in the order of the names, a camera an image."""
+    """A text model with ids that are neither contiguous nor in the order of the names, a camera an image.
+
+    Every point is seen by the first `tracks` images, or by those in `seen_by`.
+    """
     folder.mkdir(parents=True)
     images = list(range(len(capture.names)))
+    seeing = images[:tracks] if seen_by is None else list(seen_by)
     cameras = "".join(f"{3 * i + 5} {camera}\n" for i in images)
     (folder / "cameras.txt").write_text("# Camera list\n" + cameras)
     lines = ["# Image list"]
     for i in reversed(images):
         numbers = [*quaternion(capture.rotations[i]), *capture.translations[i]]
         lines.append(" ".join([str(100 - 2 * i), *map(repr, map(float, numbers)), str(3 * i + 5), capture.names[i]]))
-        seen = [f"1.5 2.5 {7 * k + 1}" if i < tracks else "1.5 2.5 -1" for k in range(len(capture.points))]
+        seen = [f"1.5 2.5 {7 * k + 1}" if i in seeing else "1.5 2.5 -1" for k in range(len(capture.points))]
         lines.append(" ".join(seen))
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
-    observations = " ".join(f"{100 - 2 * i} %d" for i in images[:tracks])
+    observations = " ".join(f"{100 - 2 * i} %d" for i in seeing)
     lines = ["# 3D point list"]
     for k, (x, y, z) in enumerate(capture.points.tolist()):
         lines.append(f"{7 * k + 1} {x!r} {y!r} {z!r} 9 9 9 {error} {observations.replace('%d', str(k))}")

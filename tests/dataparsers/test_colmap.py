@@ -115,6 +115,76 @@ def test_only_points_that_images_agree_on(
         np.testing.assert_allclose(found, np.array(sorted(expected.tolist())), atol=1e-5)
 
 
+@pytest.mark.parametrize("camera", ["PINHOLE 60 40 50 48 31 19", "OPENCV 60 40 50 48 31 19 0.1 -0.02 0.003 -0.001"])
+@pytest.mark.parametrize("kind", ["text", "binary"])
+def test_tracks_give_pixels_their_distances(tmp_path: Path, capture: Capture, camera: str, kind: str) -> None:
+    """Where COLMAP's own camera projects a point, at the distance from the camera that the capture says."""
+    write_images(tmp_path / "images", capture.names, (120, 80))  # twice as large as the model's
+    model = write_colmap(tmp_path / "sparse", capture, camera, seen_by=(1, 3, 4, 6))
+    if kind == "binary":
+        as_binary(model)
+    scene = Colmap(eval_interval=0).parse(tmp_path, "train")
+    assert scene.sightings is not None
+    assert sorted(scene.sightings.images.unique().tolist()) == [1, 3, 4, 6]
+    assert len(scene.sightings) == 4 * len(capture.points)
+    known = load_dataset(scene, "train").sparse_depth
+    assert known is not None
+    name, width, height, *params = camera.split()
+    own = pycolmap.Camera(model=name, width=int(width), height=int(height), params=[float(p) for p in params])
+    checked = 0
+    for image in (1, 3, 4, 6):
+        local = capture.points @ capture.rotations[image].T + capture.translations[image]
+        at = 2 * np.array([np.ravel(own.img_from_cam(point)) for point in local])
+        distances = scene.scale * np.linalg.norm(local, axis=-1)
+        for (x, y), distance in zip(at, distances, strict=True):
+            if not (0 <= x < 120 and 0 <= y < 80):
+                continue
+            place = (known.pixels == image * 120 * 80 + int(y) * 120 + int(x)).nonzero().flatten().tolist()
+            if abs(x - round(x)) > 1e-3 and abs(y - round(y)) > 1e-3:  # not between two pixels
+                assert len(place) == 1
+                checked += abs(float(known.distances[place[0]]) / distance - 1) < 1e-3
+    assert checked > 0.9 * len(known)  # but where two points share a pixel
+
+
+def test_what_held_out_images_know_is_not_learned_from(tmp_path: Path, capture: Capture) -> None:
+    """p00 and p08 are held out. With one training image left, a point's distance is known by them alone."""
+    write_images(tmp_path / "images", capture.names)
+    for folder, seen_by, count in (("a", (0, 1, 8), None), ("b", (0, 1, 2), 30)):
+        write_colmap(tmp_path / folder, capture, seen_by=seen_by)
+        train, held_out = (Colmap(colmap_path=folder).parse(tmp_path, split) for split in ("train", "test"))
+        assert (None if train.points is None else len(train.points)) == count
+        assert held_out.sightings is not None
+        assert set(held_out.sightings.images.tolist()) == ({0, 1} if folder == "a" else {0})
+        if folder == "a":
+            assert train.sightings is None
+        elif train.sightings is not None:
+            assert sorted(train.sightings.images.unique().tolist()) == [0, 1]
+            assert len(train.sightings) == 60
+            assert held_out.sightings.deviations.max() < train.sightings.deviations.max()  # three images know more
+
+
+def test_sightings_follow_the_images_that_exist(folder: Path) -> None:
+    """p01 is missing and p00 unreadable: their sightings go, and the others keep their images."""
+    (folder / "images" / "p01.png").unlink()
+    (folder / "images" / "p03.png").write_bytes(b"no picture")
+    scene = Colmap(eval_interval=0).parse(folder, "train")
+    assert scene.sightings is not None
+    names = [path.name for path in scene.image_paths]
+    assert [names[index] for index in scene.sightings.images.unique().tolist()] == ["p00.png", "p02.png"]
+    data = load_dataset(scene, "train")
+    assert data.sparse_depth is not None
+    images = (data.sparse_depth.pixels // (60 * 40)).unique().tolist()
+    assert [data.names[index] for index in images] == ["p00.png", "p02.png"]
+
+
+def test_a_track_that_names_no_image_is_refused_in_one_line(folder: Path) -> None:
+    file = folder / "sparse" / "0" / "points3D.txt"
+    file.write_text(file.read_text().replace(" 98 ", " 7777 "))
+    with pytest.raises(DataError, match=r"sparse/0 cannot be read: .*7777") as error:
+        Colmap(eval_interval=0).parse(folder, "train")
+    assert "\n" not in str(error.value)
+
+
 def test_the_largest_of_several_models_is_taken(
     folder: Path, capture: Capture, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -78,7 +78,7 @@ class Fog(Field):
 def test_rays_end_where_the_mode_says(training: bool, stop: float) -> None:
     """By what `--early-stop` and `--train-early-stop` are said to be, through the settings."""
     method = load_method("instant-ngp")
-    config, _ = method.decide(dataclasses.replace(method.config, early_stop=1e-4, train_early_stop=1e-2), SCENE)
+    config, _ = method.decided(dataclasses.replace(method.config, early_stop=1e-4, train_early_stop=1e-2), SCENE)
     assert isinstance(config, SamplingConfig)
     config = dataclasses.replace(config, num_steps=400, grid_resolution=8)
     sampler = make_sampler(config, SCENE).train(training)
@@ -227,7 +227,7 @@ def test_each_group_has_the_rate_and_the_schedule_that_it_names(shared_tiny: Pat
 @pytest.mark.parametrize(("seconds", "size"), [(20.0, 16), (60.0, 16), (120.0, 17), (300.0, 18), (None, 18)])
 def test_longer_runs_of_instant_ngp_get_larger_tables(seconds: float | None, size: int) -> None:
     method = load_method("instant-ngp")
-    config, _ = method.decide(dataclasses.replace(method.config, max_seconds=seconds), SCENE)
+    config, _ = method.decided(dataclasses.replace(method.config, max_seconds=seconds), SCENE)
     assert config.log2_table_size == size
     assert config.sparse_updates == (size >= 17)
 

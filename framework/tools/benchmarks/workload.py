@@ -31,7 +31,7 @@ def endless_trainer(method: str, data: Path, seconds: float, folder: Path) -> Tr
     config = dataclasses.replace(declared.config, data=data_folder, vis="none", max_seconds=seconds)
     run = Run(method, config, name, load_dataparser(name)(), folder / "run")
     train_set = load_split(run, "train")
-    config, _ = declared.decide(config, train_set.scene)
+    config, _ = declared.decided(config, train_set.scene)
     run = dataclasses.replace(run, config=dataclasses.replace(config, max_seconds=None))
     create_folder(run)
     trainer = Trainer(run, train_set, None)

@@ -29,6 +29,7 @@ class Measured:
         seed: seed of the run.
         ssim: mean SSIM over all evaluated views.
         lpips: mean LPIPS over all evaluated views; None if it was not computed.
+        floaters: mean share, in per cent, of sparse points with something before them; None without sparse points.
         steps: steps of training.
         parameters: number of parameters.
         skipped_steps: steps dropped because of non-finite values.
@@ -46,6 +47,7 @@ class Measured:
     """Mean PSNR of the final model over all evaluated views, dB."""
     ssim: float | None
     lpips: float | None
+    floaters: float | None
     views: int
     """Number of evaluated views."""
     steps: int
@@ -104,6 +106,7 @@ def measure(job: Job, conditions: Conditions) -> Measured | None:
         psnr=results["psnr"],
         ssim=results["ssim"],
         lpips=results["lpips"],
+        floaters=results.get("floaters"),
         views=results["num_images"],
         steps=summary["steps"],
         seconds=summary["seconds"],

@@ -46,6 +46,7 @@ COLUMNS = (
     Column("PSNR, dB", "psnr", "{:.2f}".format, max),
     Column("SSIM", "ssim", "{:.4f}".format, max),
     Column("LPIPS", "lpips", "{:.4f}".format, min),
+    Column("floaters, %", "floaters", "{:.1f}".format, min),
     Column("training, s", "seconds", "{:.1f}".format, min, SAME_TIME),
     Column("steps", "steps", "{:,.0f}".format, None),
     Column("training, rays/s", "rays_per_second", "{:,.0f}".format, max),
@@ -271,7 +272,9 @@ def _markdown_table(head: list[str], rows: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
-CSV_FIGURES = ("label", "method", "seed", "psnr", "ssim", "lpips", "views", "steps", "seconds", "rays_per_second")
+QUALITY = ("psnr", "ssim", "lpips", "floaters")
+"""Measures of the rendered views."""
+CSV_FIGURES = ("label", "method", "seed", *QUALITY, "views", "steps", "seconds", "rays_per_second")
 """First columns of results.csv."""
 CSV_MORE = ("render_seconds", "peak_memory_bytes", "parameters", "skipped_steps", "command")
 """Further columns of results.csv."""

@@ -39,7 +39,7 @@ def settings_of(run: Run, budget: Budget, scene: Scene) -> dict[str, Any]:
     """
     method = load_method(run.method)
     config = shortened(run.config, budget, method, scene)
-    config, _ = method.decide(config, scene)
+    config, _ = method.decided(config, scene)
     return {name: value for name, value in to_plain(config).items() if not isinstance(getattr(config, name), Path)}
 
 

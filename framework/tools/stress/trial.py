@@ -151,7 +151,7 @@ def shortened(config: TrainConfig, budget: Budget, method: Method, scene: Scene)
     )
     if not isinstance(config, RayConfig):
         return config
-    samples = method.decide(config, scene)[0].samples_per_batch
+    samples = method.decided(config, scene)[0].samples_per_batch
     return replace(
         config,
         num_rays_per_batch=min(config.num_rays_per_batch, MOST_RAYS),

@@ -25,7 +25,7 @@ def check_config(subject: Subject) -> str:
     # Python itself refuses a dataclass that derives from a frozen one and is not frozen.
     if "__dataclass_fields__" not in vars(kind) and inspect.get_annotations(kind):
         raise Fault(f"{kind.__name__} is no dataclass of its own; write @dataclass(frozen=True) above it")
-    decided, _ = subject.method.decide(config, subject.still.scene)
+    decided, _ = subject.method.decided(config, subject.still.scene)
     for label, before in (("the settings", config), ("decided settings", decided)):
         written = yaml.safe_dump(to_plain(before))
         after = from_plain(subject.method.config, yaml.safe_load(written), "config.yml")

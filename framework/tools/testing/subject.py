@@ -55,7 +55,7 @@ class Learner:
 
     def __init__(self, method: Method, config: TrainConfig, dataset: Dataset, seed: int) -> None:
         torch.manual_seed(seed)
-        self.config, _ = method.decide(config, dataset.scene)
+        self.config, _ = method.decided(config, dataset.scene)
         self.dataset = dataset
         self.model: Model[Any] = method.build(self.config, dataset.scene)
         self.source = make_source(self.model.batches, dataset, self.config)

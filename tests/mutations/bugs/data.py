@@ -145,8 +145,8 @@ BUGS = (
         "sparse-points-not-placed",
         "poses",
         "dataparsers/captured.py",
-        "points = None if images.points is None else _placed(images.points, placement)",
-        "points = None if images.points is None else images.points.float()",
+        "images.tracks.at(precise.points(images.tracks.points).float())",
+        "images.tracks.at(images.tracks.points.float())",
         "near is found from points in another frame than the cameras, so rays start too far away or too near",
     ),
     Bug(

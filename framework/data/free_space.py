@@ -1,0 +1,87 @@
+"""Free space before cameras: what lies nearer than all that an image is known to show, or than a second image can see.
+
+Matter right before a camera is seen by that camera alone, so it can show whatever makes the camera's image right, and
+is in the way of every other view.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from framework.cameras.cameras import Cameras
+from framework.data.sparse_depth import SparseDepth
+
+CLEAR_SHARE = 0.7
+"""Distance up to which space before a camera is taken to be empty, as a share of that of the nearest points it sees."""
+NEAREST = 0.02
+"""Share of a camera's points that may be nearer than "the nearest", as a few points are always wrong."""
+FEWEST_POINTS = 10
+"""Minimum number of points of a camera whose nearest mean something."""
+RAYS, STEPS = 8, 24
+"""Rays along each side of an image, and distances along a ray, that are asked whether another camera sees them."""
+MOST_CAMERAS = 64
+"""Maximum number of other cameras that are asked."""
+FARTHEST = 2.0
+"""Largest distance of space that is taken to be empty only because no other camera sees it, scene units."""
+ALONE = 0.1
+"""Maximum share of an image's rays of which another camera may see anything where it is said to see alone."""
+
+
+@torch.no_grad()
+def clear_distances(cameras: Cameras, known: SparseDepth | None, near: float, far: float) -> Tensor:
+    """Return the distance (M,) from each camera before which its image shows nothing, as far as can be told.
+
+    Args:
+        cameras: M training cameras.
+        known: pixels of their images whose distance is known; None if there are none.
+        near, far: ends of the scene's rays, scene units.
+    """
+    alone = distances_alone(cameras, near, min(far, FARTHEST))
+    return alone if known is None else torch.maximum(alone, before_points(cameras, known))
+
+
+def before_points(cameras: Cameras, known: SparseDepth) -> Tensor:
+    """Return `CLEAR_SHARE` of the distance (M,) of the nearest points that each image shows; 0 where it shows too few.
+
+    Args:
+        cameras: M cameras.
+        known: pixels of their images whose distance is known.
+    """
+    images = torch.searchsorted(cameras.offsets, known.pixels, right=True) - 1
+    counts = torch.bincount(images, minlength=len(cameras))
+    # Sorted by image and, within an image, by distance.
+    order = known.distances.argsort(stable=True)
+    order = order[images[order].argsort(stable=True)]
+    enough = counts >= FEWEST_POINTS
+    ranks = (counts.cumsum(0) - counts + (NEAREST * counts).long())[enough]
+    nearest = known.distances.new_zeros(len(cameras))
+    nearest[enough] = known.distances[order[ranks]]
+    return CLEAR_SHARE * nearest
+
+
+def distances_alone(cameras: Cameras, near: float, far: float) -> Tensor:
+    """Return the distance (M,) from each camera up to which no other camera sees what it sees.
+
+    Args:
+        cameras: M cameras.
+        near, far: least and largest distance that is looked at, scene units.
+    """
+    device = cameras.fx.device
+    steps = torch.linspace(near, far, STEPS, device=device)
+    across = (torch.arange(RAYS, device=device) + 0.5) / RAYS
+    asked = torch.linspace(0, len(cameras) - 1, min(len(cameras), MOST_CAMERAS), device=device).long()
+    found = torch.zeros(len(cameras), device=device)
+    for index in range(len(cameras)):
+        columns = (across * cameras.widths[index] - 0.5).repeat(RAYS)
+        rows = (across * cameras.heights[index] - 0.5).repeat_interleave(RAYS)
+        rays = cameras.rays(torch.full_like(rows, index, dtype=torch.int64), columns, rows, near, far)
+        points = (rays.origins[:, None] + rays.directions[:, None] * steps[:, None]).view(-1, 3)
+        others = asked[asked != index]
+        seeing = others.repeat_interleave(len(points))
+        left, top, ahead = cameras.project(points.repeat(len(others), 1), seeing)
+        inside = ahead & (left >= 0) & (left < cameras.widths[seeing]) & (top >= 0) & (top < cameras.heights[seeing])
+        shared = inside.view(len(others), RAYS * RAYS, STEPS).any(0).float().mean(0) > ALONE
+        alone = int(shared.int().argmax()) if bool(shared.any()) else STEPS
+        found[index] = steps[alone - 1] if alone > 0 else 0.0
+    return found

@@ -42,6 +42,7 @@ from framework.rendering.losses import depth_error
 from framework.rendering.volume import VolumeRenderer, shade
 from framework.samplers.choice import SamplingConfig, make_sampler, sampler_choice
 from framework.samplers.proposal import half_edge
+from framework.scene.few_images import FewImagesConfig, decide_few_images
 from framework.scene.reasons import DEPTH_REASONS, LIGHT_REASONS, POSE_REASONS
 
 APPEARANCE_SIZE = 16
@@ -55,6 +56,7 @@ DEPTH = 0.1
 @dataclass(frozen=True)
 class NerfactoConfig(
     SamplingConfig,
+    FewImagesConfig,
     AppearanceConfig,
     max_num_iterations=30_000,
     num_rays_per_batch=2_048,
@@ -246,7 +248,8 @@ def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[D
         Choice("depth_loss_mult", DEPTH if scene.has_depth else 0.0, DEPTH_REASONS[scene.has_depth], "depth loss"),
         Choice("camera_optimizer", refined, POSE_REASONS[scene.poses], "pose refinement"),
     )
-    return config, made + more
+    config, few = decide_few_images(config, scene)
+    return config, made + more + few
 
 
 def make_field(config: NerfactoConfig, scene: Scene) -> EncodedField:
@@ -263,6 +266,7 @@ def make_field(config: NerfactoConfig, scene: Scene) -> EncodedField:
         config.max_resolution,
         config.log2_table_size,
         config.sparse_updates,
+        opening=config.open_levels_until > 0,
     )
     size = config.appearance_embedding_dim
     return EncodedField(
@@ -271,6 +275,7 @@ def make_field(config: NerfactoConfig, scene: Scene) -> EncodedField:
         config.hidden_width,
         unbounded=config.contraction and config.sampler == "proposal",
         appearance=(size, scene.num_cameras) if size else None,
+        opening=config.open_levels_until > 0,
     )
 
 

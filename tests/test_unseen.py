@@ -95,8 +95,8 @@ def test_a_patch_is_a_square_of_pixels(stride: float) -> None:
     torch.testing.assert_close(patch.directions.mean(0), middle.directions[0], atol=1e-3, rtol=0)
     columns, rows, ahead = camera.project(patch.origins + patch.directions, 0)
     assert bool(ahead.all())
-    assert float(columns.max() - columns.min()) == pytest.approx((side - 1) * stride, rel=0.02)
-    assert float(rows.max() - rows.min()) == pytest.approx((side - 1) * stride, rel=0.02)
+    places = torch.stack([columns, rows], dim=-1)
+    assert float(torch.cdist(places, places).max()) == pytest.approx(2**0.5 * (side - 1) * stride, rel=0.02)
 
 
 def test_patches_have_all_that_rays_have() -> None:

@@ -63,7 +63,7 @@ class Opening(nn.Module):
 
     @property
     def complete(self) -> bool:
-        """Whether all levels are open."""
+        """True if all levels are open."""
         return self._opened.of(self.opened) >= self.num_levels
 
     def completed(self, features: Tensor, width: int, last: int | None = None) -> Tensor:

@@ -1,4 +1,4 @@
-"""What replaces images where there are few: settings of ray methods, and when they are switched on.
+"""Settings of ray methods that replace images where there are few, and the decision when to use them.
 
 Three parts, each with a setting of its own: levels of the encoding open from coarse to fine (FreeNeRF, Yang et al.
 2023), views between the training cameras show smooth depth (RegNeRF, Niemeyer et al. 2022), and space right before

@@ -84,7 +84,7 @@ def test_an_encoding_is_the_complete_one_times_the_factors(kind: str, opened: fl
 @pytest.mark.parametrize("kind", MAKERS)
 @pytest.mark.parametrize("sparse", [False, True])
 def test_a_step_changes_open_levels_as_it_would_in_the_complete_encoding(kind: str, sparse: bool) -> None:
-    opened, x = 2.5, torch.rand(60, 3, generator=torch.Generator().manual_seed(3))
+    opened, x = 1.5, torch.rand(60, 3, generator=torch.Generator().manual_seed(3))
     after = []
     for encoding in (made(kind, opened, sparse=sparse), made(kind, None, sparse=sparse)):
         deferred = {} if encoding.deferred is None else {encoding.table: encoding.deferred}
@@ -101,7 +101,7 @@ def test_a_step_changes_open_levels_as_it_would_in_the_complete_encoding(kind: s
     changed = (after[0] != before).any(1).nonzero()
     some = made(kind, opened)
     assert len(changed) > 0
-    assert int(changed.max()) < some.layout.first(3).num_entries < some.layout.num_entries
+    assert int(changed.max()) < some.layout.first(2).num_entries < some.layout.num_entries
 
 
 @pytest.mark.parametrize("kind", MAKERS)
@@ -132,7 +132,7 @@ def test_closed_bands_of_directions_do_not_count(opened: float) -> None:
     field.direction_opening.opened.fill_(opened)
     features = torch.randn(1, field.num_features).expand(50, -1)
     colors = field.color(features, nn.functional.normalize(torch.randn(50, 3), dim=-1))
-    spread = float((colors - colors[0]).abs().max())
+    spread = float((colors - colors[0]).detach().abs().max())
     assert spread < 1e-6 if opened == 1 else spread > 1e-3
 
 
@@ -146,7 +146,7 @@ def test_a_network_of_frequencies_is_smooth_while_they_are_closed() -> None:
     for progress in (0.0, 1.0):
         assert field.opening is not None
         field.opening.open(progress)
-        changes.append(float((field.density(points)[1] - field.density(near)[1]).abs().mean()))
+        changes.append(float((field.density(points)[1] - field.density(near)[1]).detach().abs().mean()))
     assert changes[0] < 0.1 * changes[1]
 
 

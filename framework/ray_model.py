@@ -10,21 +10,36 @@ from torch import Tensor
 
 from framework.base.config import RayConfig
 from framework.cameras.cameras import subpixels
+from framework.cameras.unseen import unseen_patches
 from framework.cameras.view import View
 from framework.data.pixels import PixelBatch
 from framework.data.scene import Scene
+from framework.encodings.opening import Opening
 from framework.fields.base import Field
 from framework.geometry.points import Points
 from framework.geometry.rays import Rays
 from framework.kernels.math import safe_normalize
 from framework.kernels.native import torch_on_one_thread
-from framework.model import Loss, Model
-from framework.rendering.losses import depth_error, distance_likelihood, matter_before, mean_squared_error
+from framework.model import Loss, Model, parts
+from framework.rendering.losses import (
+    density_before,
+    depth_error,
+    depth_roughness,
+    distance_likelihood,
+    matter_before,
+    mean_squared_error,
+)
 from framework.rendering.rendered import Picture, Rendered
 from framework.rendering.renderer import Renderer
 from framework.samplers.base import Sampler
+from framework.scene.few_images import FewImagesConfig, unseen_weight
 
 RayConfigT = TypeVar("RayConfigT", bound=RayConfig)
+PATCH = 8
+"""Rays along the edge of a patch of an unseen view, as in RegNeRF (Niemeyer et al. 2022)."""
+PATCH_IMAGE = 500
+"""Longer side of an image, pixels, in which neighbouring rays of a patch are a pixel apart; in larger ones, as far in
+relation to the image."""
 
 
 class RayModel(Model[RayConfigT], Generic[RayConfigT]):
@@ -72,6 +87,8 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
             terms |= self.sampler.losses(rendered.samples, rendered.weights)
         terms |= self._depth_terms(rendered, batch)
         terms |= self.regularizers(rendered, batch, step)
+        if isinstance(self.config, FewImagesConfig):
+            terms |= self._for_few_images(self.config, rendered, batch, step)
         return Loss(terms, pixels.rgb.detach(), rendered.num_samples)
 
     def _depth_terms(self, rendered: Rendered, batch: PixelBatch) -> dict[str, Tensor]:
@@ -96,6 +113,25 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
             step: number of training steps done.
         """
         return {}
+
+    def _for_few_images(
+        self, config: FewImagesConfig, rendered: Rendered, batch: PixelBatch, step: int
+    ) -> dict[str, Tensor]:
+        """Return the terms of the loss that replace images where there are few (`framework.scene.few_images`)."""
+        losses, poses = dict[str, Tensor](), self.scene.camera_to_worlds
+        if config.occlusion_loss_mult:
+            near = config.occlusion_range * self.scene.near
+            levels = [level.samples for level in (rendered, rendered.coarse) if level is not None]
+            before = [density_before(s, near) for s in levels if s is not None and s.sigma is not None]
+            losses |= {"occlusion": config.occlusion_loss_mult * torch.stack(before).sum()} if before else {}
+        if config.unseen_loss_mult and len(batch) and poses is not None:
+            rays = batch.rays[:: batch.rays_per_pixel][: config.unseen_patches]
+            stride = max(self.scene.image_size / PATCH_IMAGE, 1.0)
+            shown = self.render(unseen_patches(rays, poses, PATCH, stride), batch.background[0])
+            if shown.weights is not None and shown.samples is not None:
+                rough = depth_roughness(shown.weights, shown.samples, PATCH)
+                losses["unseen"] = unseen_weight(config, step) * rough
+        return losses
 
     @torch.no_grad()
     def render_view(self, view: View, background: Tensor) -> Picture:
@@ -128,7 +164,10 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
         )
 
     def before_step(self, step: int, progress: float) -> None:
-        """Update the sampler for `step`; `progress` is not used."""
+        """Open levels of encodings up to `progress`, and update the sampler for `step`."""
+        if isinstance(self.config, FewImagesConfig) and self.config.open_levels_until:
+            for opening in parts(self, Opening):
+                opening.open(progress / self.config.open_levels_until)
         self.sampler.update(step, self.field.density)
 
     def density(self, points: Points) -> Tensor:

@@ -16,6 +16,7 @@ from framework.encodings.hash_grid import HashGrid
 from framework.fields.encoded import EncodedField
 from framework.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
 from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_choice
+from framework.scene.few_images import FewImagesConfig, decide_few_images
 
 PLANS = (
     (60.0, 16, 512, 2**15, 1),
@@ -35,6 +36,7 @@ updates were 0.21 dB better."""
 @dataclass(frozen=True)
 class InstantNGPConfig(
     SamplingConfig,
+    FewImagesConfig,
     max_num_iterations=20_000,
     num_rays_per_batch=8_192,
     rays_per_pixel=4,
@@ -111,7 +113,8 @@ def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, li
         ),
         Choice("sparse_updates", pays, f"tables have 2^{config.log2_table_size} entries a level"),
     )
-    return config, made + more
+    config, few = decide_few_images(config, scene)
+    return config, made + more + few
 
 
 def make_field(config: InstantNGPConfig, scene: Scene) -> EncodedField:
@@ -128,6 +131,7 @@ def make_field(config: InstantNGPConfig, scene: Scene) -> EncodedField:
         config.max_resolution,
         config.log2_table_size,
         config.sparse_updates,
+        opening=config.open_levels_until > 0,
     )
     return EncodedField(
         scene.box,
@@ -135,6 +139,7 @@ def make_field(config: InstantNGPConfig, scene: Scene) -> EncodedField:
         config.hidden_width,
         direction_levels=4 if config.view_dependence else 0,
         unbounded=contracted_box(config, scene) is not None,
+        opening=config.open_levels_until > 0,
     )
 
 

@@ -21,6 +21,7 @@ from framework.kernels.math import truncated_exp
 from framework.kernels.planes_layout import MAX_VERTICES
 from framework.kernels.spherical_harmonics import spherical_harmonics
 from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_choice
+from framework.scene.few_images import FewImagesConfig, decide_few_images
 
 MAX_SCALES = 4
 """Maximum number of scales if the setting is left open; the paper's number."""
@@ -29,6 +30,7 @@ MAX_SCALES = 4
 @dataclass(frozen=True)
 class KPlanesConfig(
     SamplingConfig,
+    FewImagesConfig,
     max_num_iterations=30_000,
     samples_per_batch=2**15,
     learning_rate=1e-2,
@@ -153,6 +155,8 @@ def decide(config: KPlanesConfig, scene: Scene) -> tuple[KPlanesConfig, list[Dec
         sampler_choice(config, scene.unbounded),
         Choice("num_scales", scales, f"the images have {scene.image_size} pixels", "scales"),
     )
+    config, few = decide_few_images(config, scene)
+    made += few
     if not scene.moving:
         made.append(Decision("planes of time", "left out", "the images have no times"))
     return config, made
@@ -167,7 +171,8 @@ def make_field(config: KPlanesConfig, scene: Scene) -> BoxField:
     """
     time = (config.time_resolution,) if scene.moving else ()
     resolutions = tuple((config.base_resolution << scale,) * 3 + time for scale in range(config.num_scales))
-    planes = FeaturePlanes(resolutions, config.features_per_scale, sparse=config.sparse_updates)
+    opening = config.open_levels_until > 0
+    planes = FeaturePlanes(resolutions, config.features_per_scale, sparse=config.sparse_updates, opening=opening)
     kind = EncodedField if config.decoder == "hybrid" else ExplicitField
     return kind(scene.box, planes, config.hidden_width, unbounded=contracted_box(config, scene) is not None)
 

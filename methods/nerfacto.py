@@ -41,6 +41,7 @@ from framework.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, 
 from framework.rendering.volume import VolumeRenderer, shade
 from framework.samplers.choice import SamplingConfig, make_sampler, sampler_choice
 from framework.samplers.proposal import half_edge
+from framework.scene.few_images import FewImagesConfig, decide_few_images
 from framework.scene.reasons import LIGHT_REASONS, POSE_REASONS
 
 APPEARANCE_SIZE = 16
@@ -52,6 +53,7 @@ DISTORTION = 2e-3
 @dataclass(frozen=True)
 class NerfactoConfig(
     SamplingConfig,
+    FewImagesConfig,
     AppearanceConfig,
     max_num_iterations=30_000,
     num_rays_per_batch=2_048,
@@ -236,7 +238,8 @@ def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[D
         ),
         Choice("camera_optimizer", refined, POSE_REASONS[scene.poses], "pose refinement"),
     )
-    return config, made + more
+    config, few = decide_few_images(config, scene)
+    return config, made + more + few
 
 
 def make_field(config: NerfactoConfig, scene: Scene) -> EncodedField:
@@ -253,6 +256,7 @@ def make_field(config: NerfactoConfig, scene: Scene) -> EncodedField:
         config.max_resolution,
         config.log2_table_size,
         config.sparse_updates,
+        opening=config.open_levels_until > 0,
     )
     size = config.appearance_embedding_dim
     return EncodedField(
@@ -261,6 +265,7 @@ def make_field(config: NerfactoConfig, scene: Scene) -> EncodedField:
         config.hidden_width,
         unbounded=config.contraction and config.sampler == "proposal",
         appearance=(size, scene.num_cameras) if size else None,
+        opening=config.open_levels_until > 0,
     )
 
 

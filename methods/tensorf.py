@@ -39,6 +39,7 @@ from framework.kernels.planes import PlanesLayout
 from framework.kernels.spherical_harmonics import spherical_harmonics
 from framework.samplers.base import SkipsCells
 from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_choice
+from framework.scene.few_images import FewImagesConfig, decide_few_images
 
 VM = (((0, 1), (2,)), ((0, 2), (1,)), ((1, 2), (0,)))
 """Three groups: a plane, and the line across it (equation 4)."""
@@ -59,6 +60,7 @@ MARGIN = 1
 @dataclass(frozen=True)
 class TensoRFConfig(
     SamplingConfig,
+    FewImagesConfig,
     max_num_iterations=30_000,
     samples_per_batch=2**15,
     learning_rate=2e-2,
@@ -183,10 +185,15 @@ class TensoRF(RayModel[TensoRFConfig]):
     def before_step(self, step: int, progress: float) -> None:
         if step >= BLIND_STEPS or not isinstance(self.sampler, SkipsCells):
             super().before_step(step, progress)
-        due = sum(progress >= share for share in self.config.upsample_at)
+        due = sum(progress >= share for share in self._shares())
         if due > self._growths.of(self.growths):
             self.growths.fill_(due)
             self._grow(due / len(self.config.upsample_at))
+
+    def _shares(self) -> tuple[float, ...]:
+        """Return when the grid grows; with few images, the last time when the levels of other encodings are open."""
+        shares, until = self.config.upsample_at, self.config.open_levels_until
+        return tuple(until / max(shares) * share for share in shares) if until and any(shares) else shares
 
     @torch.no_grad()
     def _grow(self, share: float) -> None:
@@ -258,7 +265,7 @@ def decide(config: TensoRFConfig, scene: Scene) -> tuple[TensoRFConfig, list[Dec
     first, last = (min(side, resolved) for side in (FIRST_SIDE, LAST_SIDE[config.decomposition]))
     decomposed = f"the decomposition is {config.decomposition}"
     pixels = f"the images have {scene.image_size} pixels along a side"
-    return fill(
+    config, made = fill(
         config,
         sampler_choice(config, scene.unbounded),
         Choice("density_components", density, decomposed),
@@ -266,6 +273,8 @@ def decide(config: TensoRFConfig, scene: Scene) -> tuple[TensoRFConfig, list[Dec
         Choice("first_voxels", first**3, pixels, shown=f"{first}^3"),
         Choice("last_voxels", last**3, pixels, shown=f"{last}^3"),
     )
+    config, few = decide_few_images(config, scene)
+    return config, made + few
 
 
 def vertices_of(voxels: float, box: Tensor) -> tuple[int, ...]:

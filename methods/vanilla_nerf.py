@@ -18,6 +18,7 @@ from framework.base.optimised import Optimised
 from framework.fields.nerf import NeRFField
 from framework.kernels.frequency import MAX_FREQUENCIES
 from framework.samplers.choice import HierarchicalConfig, contracted_box, make_sampler, sampler_choice
+from framework.scene.few_images import FewImagesConfig, decide_few_images
 
 OCCUPANCY_SAMPLES_PER_BATCH = 2**12
 """Samples of a training step with the occupancy grid, where the number of samples per ray varies a hundredfold."""
@@ -31,6 +32,7 @@ marching steps (`num_steps`) at twice the rate reached 22.5 dB; 2^13 samples, 51
 @dataclass(frozen=True)
 class VanillaNeRFConfig(
     HierarchicalConfig,
+    FewImagesConfig,
     max_num_iterations=200_000,
     num_rays_per_batch=4_096,
     learning_rate=5e-4,
@@ -69,6 +71,8 @@ def decide(config: VanillaNeRFConfig, scene: Scene) -> tuple[VanillaNeRFConfig, 
         Settings without open ones, and a record of each that was filled in.
     """
     config, made = fill(config, sampler_choice(config, scene.unbounded))
+    config, few = decide_few_images(config, scene)
+    made += few
     if config.sampler != "occupancy":
         return config, made
     config, more = fill(config, Choice("samples_per_batch", OCCUPANCY_SAMPLES_PER_BATCH, A_RAY, "samples a step"))
@@ -89,6 +93,7 @@ def make_field(config: VanillaNeRFConfig, scene: Scene) -> NeRFField:
         position_frequencies=config.position_frequencies,
         direction_frequencies=config.direction_frequencies,
         contracted=contracted_box(config, scene),
+        opening=config.open_levels_until > 0,
     )
     if config.sampler == "occupancy":
         field.optimised = Optimised(learning_rate=OCCUPANCY_RATE * config.learning_rate)

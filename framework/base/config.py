@@ -88,6 +88,8 @@ class TrainConfig:
         "seconds_per_save": AT_LEAST_0,
         "seconds_per_eval_all_images": AT_LEAST_0,
         "max_eval_images": AT_LEAST_0,
+        "max_train_images": (1, math.inf),
+        "train_image_indices": AT_LEAST_0,
         "lr_warmup_steps": AT_LEAST_0,
         "viewer_share": (0.001, 1),
     }
@@ -95,6 +97,10 @@ class TrainConfig:
     is allowed, is in every range; of a tuple, each number must be in the range."""
     data: Path | None = None
     """Folder of the data set; the embedded scene if not given."""
+    max_train_images: int | None = None
+    """Number of training images, evenly spread over all of them by their order; all if not given."""
+    train_image_indices: tuple[int, ...] = ()
+    """Training images by number, from 0 in their order, as in 26 86 2; all if not given."""
     cache_limit: float | None = None
     """Memory for a split's decoded pixels, MB (1e6 bytes); more goes to disk. Half of memory if not given."""
     cache_dir: Path | None = None

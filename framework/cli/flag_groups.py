@@ -25,18 +25,20 @@ from tyro.constructors import (
 from framework.base.config import LEFT_TO_DATA, AppearanceConfig, RayConfig, TrainConfig
 from framework.data.dataset import DataParser
 from framework.samplers.choice import HierarchicalConfig, SamplingConfig
+from framework.scene.few_images import FewImagesConfig
 
 OWN = "METHOD"
 """Placeholder of the method's name, whose group has all settings that no other group has."""
 GROUPS: dict[str, tuple[str | type, ...]] = {
     "everyday": (
         "data", "max_seconds", "max_num_iterations", "output_dir", "experiment_name", "rays_per_pixel", "background",
-        "masks", "vis", "viewer_share",
+        "masks", "max_train_images", "train_image_indices", "vis", "viewer_share",
     ),
     OWN: (),
     "sampler": (SamplingConfig, HierarchicalConfig),
     "ray": (RayConfig,),
     "appearance": (AppearanceConfig,),
+    "few images": (FewImagesConfig,),
     "optimisation": (
         "learning_rate", "lr_schedule", "lr_final", "lr_warmup_steps", "adam_beta1", "adam_beta2", "adam_eps",
     ),

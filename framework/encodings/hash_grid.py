@@ -5,8 +5,12 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from framework.base.optimised import Optimised
+from framework.encodings.opening import Opening
 from framework.kernels.hash_grid import HashGridLayout, TableGradient, hash_grid
 from framework.kernels.memory import table
+
+FIRST_LEVELS = 4
+"""Number of levels that are open at the start if they open one after the other, as in Neuralangelo (Li et al. 2023)."""
 
 
 class HashGrid(nn.Module):
@@ -20,6 +24,7 @@ class HashGrid(nn.Module):
         log2_table_size: maximum number of entries of one level, as a power of two.
         sparse: whether the optimiser updates only the entries that a step has used. The compiled kernels then keep the
             gradient of the table in `deferred` for the optimiser, and `table.grad` stays None.
+        opening: whether levels open one after the other (`Opening`), rather than all being open.
 
     Raises:
         ConfigError: if a number is out of range, or the table needs more memory than the machine has.
@@ -35,6 +40,7 @@ class HashGrid(nn.Module):
         max_resolution: int = 2048,
         log2_table_size: int = 19,
         sparse: bool = False,
+        opening: bool = False,
     ) -> None:
         super().__init__()
         self.layout = HashGridLayout.build(num_levels, base_resolution, max_resolution, log2_table_size)
@@ -42,8 +48,18 @@ class HashGrid(nn.Module):
         self.table = nn.Parameter(table(self.layout.num_entries, features_per_level).uniform_(-1e-4, 1e-4))
         self.optimised = Optimised("tables", sparse=True) if sparse else None
         self.deferred = TableGradient(self.layout) if sparse else None
+        self.opening = Opening(num_levels, min(FIRST_LEVELS, num_levels)) if opening else None
         self.num_features = num_levels * features_per_level
 
     def forward(self, positions: Tensor) -> Tensor:
         """Return the features (N, L * F) at `positions` (N, 3) in [0, 1]."""
-        return hash_grid(positions, self.table, self.layout, self.deferred)
+        if self.opening is None or self.opening.complete:
+            return self._look_up(positions, self.table, self.layout)
+        layout = self.layout.first(self.opening.count)
+        features = self._look_up(positions, self.table[: layout.num_entries], layout)
+        return self.opening.completed(features, self.num_features)
+
+    def _look_up(self, positions: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
+        if self.deferred is not None:
+            self.deferred.layout = layout
+        return hash_grid(positions, table, layout, self.deferred)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from framework.base.optimised import Optimised
+from framework.encodings.opening import Opening
 from framework.kernels.memory import table
 from framework.kernels.planes import PlanesGradient, PlanesLayout, plane_bands, planes
 
@@ -25,6 +26,7 @@ class FeaturePlanes(nn.Module):
         axes: the axis or two axes of each factor, per group; a plane for every pair of axes if None.
         sparse: whether the optimiser updates only the entries that a step has used, as for `HashGrid`.
         resizable: whether `resample` may be called, so that a checkpoint may have other resolutions.
+        opening: whether groups open one after the other (`Opening`), for groups that are scales from coarse to fine.
 
     Raises:
         ConfigError: if a number is out of range, or the table needs more memory than the machine has.
@@ -39,6 +41,7 @@ class FeaturePlanes(nn.Module):
         axes: tuple[tuple[tuple[int, ...], ...], ...] | None = None,
         sparse: bool = False,
         resizable: bool = False,
+        opening: bool = False,
     ) -> None:
         super().__init__()
         self.resizable = resizable
@@ -54,10 +57,20 @@ class FeaturePlanes(nn.Module):
                         self.layout.factor(self.table, group, index).fill_(1)
         self.optimised = Optimised("tables", sparse=True) if sparse else None
         self.deferred = PlanesGradient(self.layout) if sparse else None
+        self.opening = Opening(self.layout.num_groups, 1) if opening else None
 
     def forward(self, positions: Tensor) -> Tensor:
         """Return the features (N, G * F) at `positions` (N, D) in [0, 1]."""
-        return planes(positions, self.table, self.layout, self.deferred)
+        if self.opening is None or self.opening.complete:
+            return self._look_up(positions, self.table, self.layout)
+        layout = self.layout.first(self.opening.count)
+        features = self._look_up(positions, self.table[: layout.num_entries], layout)
+        return self.opening.completed(features, self.num_features)
+
+    def _look_up(self, positions: Tensor, table: Tensor, layout: PlanesLayout) -> Tensor:
+        if self.deferred is not None:
+            self.deferred.layout = layout
+        return planes(positions, table, layout, self.deferred)
 
     def bands(self, factors: Sequence[tuple[int, int]], whole: Container[int] = ()) -> list[Tensor]:
         """Return a random band of consecutive rows of each of several factors, for regularisers.

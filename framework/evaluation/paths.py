@@ -11,6 +11,7 @@ from torch import Tensor
 from framework.cameras.cameras import Cameras
 from framework.cameras.ndc import NdcCameras
 from framework.cameras.view import View
+from framework.geometry.alignment import nearest_rotations
 from framework.kernels.math import safe_normalize
 from framework.model import Model
 
@@ -142,14 +143,6 @@ def focus_distance(model: Model[Any], camera: Cameras, background: Tensor) -> fl
 
 def _first_time(model: Model[Any]) -> Tensor | None:
     return torch.zeros(1) if model.scene.moving else None
-
-
-def nearest_rotations(matrices: Tensor) -> Tensor:
-    """Return the rotations (F, 3, 3) closest to `matrices` (F, 3, 3)."""
-    u, _, vh = torch.linalg.svd(matrices)
-    flips = torch.ones_like(matrices[:, 0])
-    flips[:, 2] = torch.linalg.det(u @ vh)
-    return (u * flips[:, None]) @ vh
 
 
 def replace_poses(cameras: Cameras, poses: Tensor) -> Cameras:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from framework.encodings.hash_grid import HashGrid
+from framework.encodings.opening import Opening
 from framework.encodings.planes import FeaturePlanes
 from framework.fields.appearance import Appearance
 from framework.fields.base import MLP, Field
@@ -103,6 +104,7 @@ class EncodedField(BoxField):
         unbounded: whether the encoding covers all of space, contracted by `contract_to_unit`.
         appearance: size of an image's appearance vector, and number of images (NeRF-W, Martin-Brualla et al. 2021,
             section 4.1); None for no appearance vectors.
+        opening: whether the bands of the viewing direction open one after the other (`Opening`).
     """
 
     def __init__(
@@ -114,11 +116,13 @@ class EncodedField(BoxField):
         direction_levels: int = 4,
         unbounded: bool = False,
         appearance: tuple[int, int] | None = None,
+        opening: bool = False,
     ) -> None:
         super().__init__(box, encoding, unbounded)
         self.direction_levels, self.num_features = direction_levels, num_features
         self.density_head = MLP(encoding.num_features, width, num_features, bias=False)
         inputs = num_features + direction_levels**2
+        self.direction_opening = Opening(direction_levels, 1) if opening and direction_levels else None
         self.appearance = None
         if appearance is not None:
             self.appearance = Appearance(*appearance)
@@ -131,7 +135,14 @@ class EncodedField(BoxField):
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         inputs = [features]
         if self.direction_levels:
-            inputs.append(spherical_harmonics(directions, self.direction_levels).to(features.dtype))
+            inputs.append(self._harmonics(directions).to(features.dtype))
         if self.appearance is not None:
             inputs.append(self.appearance(camera_indices, len(features)).to(features.dtype))
         return self.color_head(*inputs).float()
+
+    def _harmonics(self, directions: Tensor) -> Tensor:
+        opening, levels = self.direction_opening, self.direction_levels
+        if opening is None or opening.complete:
+            return spherical_harmonics(directions, levels)
+        open_bands = spherical_harmonics(directions, opening.count)
+        return opening.completed(open_bands, levels**2, 2 * opening.count - 1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
+from framework.encodings.opening import Opening
 from framework.fields.base import MLP, Field
 from framework.geometry.points import Points
 from framework.kernels.contraction import contract_to_unit
@@ -26,6 +27,7 @@ class NeRFField(Field):
             al. 2021, section 4); None for a field that does not change with time.
         contracted: (2, 3) box around which all of space is contracted into [-1, 1]^3, the range that the frequencies
             are made for; None to encode scene coordinates.
+        opening: whether the frequencies of positions and directions open one after the other (`Opening`).
     """
 
     contracted: Tensor | None
@@ -40,12 +42,15 @@ class NeRFField(Field):
         direction_frequencies: int = 4,
         time_frequencies: int | None = None,
         contracted: Tensor | None = None,
+        opening: bool = False,
     ) -> None:
         super().__init__()
         self.register_buffer("contracted", None if contracted is None else contracted.clone())
         self.position_frequencies = position_frequencies
         self.direction_frequencies = direction_frequencies
         self.time_frequencies = time_frequencies
+        self.opening = Opening(position_frequencies, 0) if opening else None
+        self.direction_opening = Opening(direction_frequencies, 0) if opening else None
         encoded = 3 + 6 * position_frequencies + (0 if time_frequencies is None else 1 + 2 * time_frequencies)
         self.before_skip = MLP(encoded, *[width] * skip, activation="relu")
         self.after_skip = MLP(width + encoded, *[width] * (depth - skip), activation="relu")
@@ -71,15 +76,28 @@ class NeRFField(Field):
         positions = points.positions
         if self.contracted is not None:
             positions = 2 * contract_to_unit(positions, self.contracted) - 1
-        encoded: tuple[Tensor, ...] = (frequency_encoding(positions, self.position_frequencies),)
+        encoded: tuple[Tensor, ...] = (opened_frequencies(positions, self.position_frequencies, self.opening),)
         if self.time_frequencies is not None:
             encoded += (encoded_times(points.times, self.time_frequencies),)
         hidden = self.after_skip(self.before_skip(*encoded), *encoded)
         return self.sigma_head(hidden).squeeze(-1).float(), hidden
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
-        encoded = frequency_encoding(directions, self.direction_frequencies)
+        encoded = opened_frequencies(directions, self.direction_frequencies, self.direction_opening)
         return self.color_head(self.feature_head(features), encoded).float()
+
+
+def opened_frequencies(x: Tensor, num_frequencies: int, opening: Opening | None) -> Tensor:
+    """Return the frequency encoding (N, 3 + 6 L) of vectors, with only the open frequencies other than 0.
+
+    Args:
+        x: (N, 3) vectors, which are always encoded themselves too.
+        num_frequencies: number L of frequencies.
+        opening: the open frequencies; None if all are.
+    """
+    if opening is None or opening.complete:
+        return frequency_encoding(x, num_frequencies)
+    return opening.completed(frequency_encoding(x, opening.count), 3 + 6 * num_frequencies, 6)
 
 
 def encoded_times(times: Tensor | None, num_frequencies: int) -> Tensor:

@@ -111,3 +111,11 @@ def pose_errors(estimated: Tensor, given: Tensor) -> PoseErrors:
     cosine = (rotated.diagonal(dim1=1, dim2=2).sum(-1) - 1) / 2
     angles = torch.rad2deg(torch.atan2(sine, cosine))
     return PoseErrors(angles, (centres - target[:, :, 3]).norm(dim=-1) / extent)
+
+
+def nearest_rotations(matrices: Tensor) -> Tensor:
+    """Return the rotations (F, 3, 3) closest to `matrices` (F, 3, 3)."""
+    u, _, vh = torch.linalg.svd(matrices)
+    flips = torch.ones_like(matrices[:, 0])
+    flips[:, 2] = torch.linalg.det(u @ vh)
+    return (u * flips[:, None]) @ vh

@@ -95,7 +95,7 @@ class TableGradient:
     table, while autograd's dense gradient takes many.
 
     Args:
-        layout: resolutions and offsets of the levels.
+        layout: resolutions and offsets of the levels that are looked up: all of the table's, or the first ones.
     """
 
     def __init__(self, layout: HashGridLayout) -> None:
@@ -129,7 +129,7 @@ class TableGradient:
     def add_to(self, grad: Tensor) -> None:
         """Add the gradient to `grad` (E, F), and discard it."""
         shape = (self.layout.num_entries, grad.shape[1])
-        into = native.pointer(grad, "the table's gradient", shape)
+        into = native.pointer(grad[: shape[0]], "the table's gradient", shape)
         _backward_table(*self._arguments(shape[1]), into, native.threads())
         self.parts.clear()
 
@@ -152,6 +152,7 @@ class TableGradient:
         `mean`, `square`, `seen`, `rate`, `betas`, `eps` and the result are as in `sparse_adam`.
         """
         shape = (self.layout.num_entries, table.shape[1])
+        table, mean, square, seen = (values[: shape[0]] for values in (table, mean, square, seen))
         updated = _adam(
             *self._arguments(shape[1]), native.pointer(table, "the table", shape), native.pointer(mean, "mean", shape),
             native.pointer(square, "square", shape), native.pointer(seen, "seen", shape[:1]), rate, *betas, eps,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import Any
 
@@ -66,6 +66,10 @@ class HashGridLayout:
             offsets.append(offsets[-1] + (size + 7) // 8 * 8)
         return cls(resolutions, tuple(offsets))
 
+    def first(self, count: int) -> HashGridLayout:
+        """Return the layout of the first `count` levels, 1 or more, whose entries stand first in the table."""
+        return _first(self, count)
+
     @property
     def num_entries(self) -> int:
         """Number E of entries of all levels."""
@@ -84,6 +88,11 @@ class HashGridLayout:
     def is_dense(self, level: int) -> bool:
         """Return whether each vertex of `level` has an entry of its own."""
         return (self.resolutions[level] + 1) ** 3 <= self.offsets[level + 1] - self.offsets[level]
+
+
+@lru_cache(maxsize=64)
+def _first(layout: HashGridLayout, count: int) -> HashGridLayout:
+    return HashGridLayout(layout.resolutions[:count], layout.offsets[: count + 1])
 
 
 def _check(what: str, count: int, most: int) -> None:

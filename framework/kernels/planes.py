@@ -79,7 +79,7 @@ class PlanesGradient:
     entries that were used to zero.
 
     Args:
-        layout: axes, resolutions and offsets of the factors.
+        layout: axes, resolutions and offsets of the factors that are looked up: all of the table's, or the first ones.
     """
 
     def __init__(self, layout: PlanesLayout) -> None:
@@ -127,8 +127,9 @@ class PlanesGradient:
         """
         if self._sum is None:
             self._sum = memory.table(*table.shape)
+        end = self.layout.num_entries
         for positions, grad in self.parts:
-            _add_to(self._sum, positions, table, grad, self.layout)
+            _add_to(self._sum[:end], positions, table[:end], grad, self.layout)
         for first, grad in self.bands:
             self._sum[first : first + len(grad)] += grad
         self.clear()

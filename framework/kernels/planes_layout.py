@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import combinations
 from typing import Any
 
@@ -69,6 +69,10 @@ class PlanesLayout:
             offsets.append(tuple(firsts))
         return cls(resolutions, axes, tuple(offsets), total)
 
+    def first(self, count: int) -> PlanesLayout:
+        """Return the layout of the first `count` groups, 1 or more, whose entries stand first in the table."""
+        return _first(self, count)
+
     @property
     def dims(self) -> int:
         """Number D of axes."""
@@ -106,6 +110,12 @@ class PlanesLayout:
         flat = (tuple(value for row in rows for value in row) for rows in (self.resolutions, self.offsets))
         resolutions, offsets = (native.integers(values) for values in flat)
         return native.integers(axes), resolutions, offsets
+
+
+@lru_cache(maxsize=64)
+def _first(layout: PlanesLayout, count: int) -> PlanesLayout:
+    end = layout.num_entries if count == layout.num_groups else layout.offsets[count][0]
+    return PlanesLayout(layout.resolutions[:count], layout.axes[:count], layout.offsets[:count], end)
 
 
 def _check_factors(resolutions: tuple[tuple[int, ...], ...], axes: tuple[tuple[tuple[int, ...], ...], ...]) -> None:

@@ -12,6 +12,8 @@ WIDTH = 3.0
 """Standard deviations from a known distance within which a ray is to end."""
 WRONG = 0.01
 """Share of a reconstruction's points that are taken to be wrong."""
+SMALLEST_DEPTH, SMALLEST_OPACITY = 1e-6, 1e-6
+"""Depth and opacity below which inverse depths are not divided any further."""
 
 
 def mean_squared_error(prediction: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
@@ -106,3 +108,43 @@ def mean_depth_error(distances: Tensor, transmittance: Tensor, known: Tensor) ->
     mean = distances / opacity.clamp(min=0.5)
     apart = ((mean - known).abs() / known.clamp(min=1e-6)).clamp(max=1)
     return torch.where(counts, apart, 0).sum() / counts.sum().clamp(min=1)
+
+
+def density_before(samples: Samples, distance: float) -> Tensor:
+    """Return the mean optical depth () of rays up to a distance from the camera: the loss of FreeNeRF, equation 6.
+
+    Yang et al. 2023 add up the densities of the first samples, whose intervals have equal lengths there. A camera sees
+    matter right before it alone, so that images do not contradict it where there are few.
+
+    Args:
+        samples: N samples of R rays, with density.
+        distance: length of ray, scene units, that should be empty.
+
+    Raises:
+        ValueError: if the samples have no density.
+    """
+    if samples.sigma is None:
+        raise ValueError("density_before() needs samples whose density is attached")
+    lengths = (samples.t_ends.clamp(max=distance) - samples.t_starts).clamp(min=0)
+    return (samples.sigma * lengths).sum() / max(samples.num_rays, 1)
+
+
+def depth_roughness(weights: Tensor, samples: Samples, side: int) -> Tensor:
+    """Return how rough the depth of square patches of rays is: RegNeRF (Niemeyer et al. 2022), equation 8.
+
+    It is the mean squared difference between neighbours of the inverse depth, which is linear in the image of a plane,
+    relative to its mean in the patch. Neighbours count as far as both are opaque.
+
+    Args:
+        weights: (N,) weights of the samples.
+        samples: N samples of P side^2 rays, those of a patch one after the other, row by row.
+        side: rays along an edge of a patch.
+    """
+    opacity = ray_sum(weights, samples)
+    inverse = ray_sum(weights / samples.t.clamp(min=SMALLEST_DEPTH), samples) / opacity.clamp(min=SMALLEST_OPACITY)
+    values, opaque = inverse.view(-1, side, side), opacity.detach().view(-1, side, side)
+    mean = (opaque * values).sum((1, 2), keepdim=True) / opaque.sum((1, 2), keepdim=True).clamp(min=SMALLEST_OPACITY)
+    values = values / mean.detach().clamp(min=SMALLEST_DEPTH)
+    down = opaque[:, 1:] * opaque[:, :-1] * values.diff(dim=1).square()
+    across = opaque[:, :, 1:] * opaque[:, :, :-1] * values.diff(dim=2).square()
+    return (down.sum() + across.sum()) / max(down.numel(), 1)

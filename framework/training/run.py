@@ -31,6 +31,7 @@ from framework.base.errors import ConfigError, DataError
 from framework.base.registry import load_dataparser, load_method
 from framework.data.data_folder import find_data
 from framework.data.dataset import DataParser, Dataset, ParsedScene, Split
+from framework.data.training_images import chosen_images
 from framework.training.checkpoint import write_atomically
 
 CONFIG = "config.yml"
@@ -58,15 +59,19 @@ class Run:
         return self.folder / CONFIG
 
     def parse(self, split: Split) -> ParsedScene:
-        """Read a `split` of the run's data.
+        """Read a `split` of the run's data; of the training images, those that the settings choose.
 
         Raises:
             DataError: if the data is missing or cannot be read.
+            ConfigError: if the settings choose training images that the data does not have.
         """
         data = self.config.data
         if data is not None and not os.path.exists(data):
             raise DataError(f"{data}, the run's data, is not there; say where it is now: --data DIR")
-        return self.parser.parse(data, split)
+        parsed = self.parser.parse(data, split)
+        if split != "train":
+            return parsed
+        return chosen_images(parsed, self.config.max_train_images, self.config.train_image_indices)
 
 
 def run_folder(method: str, config: TrainConfig) -> Path:

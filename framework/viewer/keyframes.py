@@ -12,7 +12,7 @@ from torch import Tensor
 
 from framework.cameras.camera_path import CameraPath, Keyframe
 from framework.cameras.poses import Placement
-from framework.evaluation.paths import nearest_rotations
+from framework.geometry.alignment import nearest_rotations
 
 MOST_KEYFRAMES = 500
 """Maximum number of cameras of a path."""

@@ -64,8 +64,8 @@ def test_every_flag_once_and_the_everyday_ones_first(method: str) -> None:
     assert sorted(flag for flags in found.values() for flag in flags) == sorted(known)
     assert list(found) == [
         "options", "everyday options", f"{method} options", "sampler options", "ray options",
-        *["appearance options"] * (method == "nerfacto"), "optimisation options", "evaluation and saving options",
-        "machine options", "viewer options", "procedural data options",
+        *["appearance options"] * (method == "nerfacto"), *["few images options"] * (method != "dnerf"),
+        "optimisation options", "evaluation and saving options", "machine options", "viewer options", "procedural data options",
     ]  # fmt: skip
     first = ["--data", "--max-seconds", "--max-num-iterations", "--output-dir", "--experiment-name", "--rays-per-pixel"]
     assert found["everyday options"][:6] == first
@@ -178,9 +178,13 @@ def test_what_the_data_decide_is_not_called_none() -> None:
     said = " ".join(called("ns-train", "instant-ngp", "--help").stdout.replace("│", " ").split())
     config = load_method("instant-ngp").config
     hints = get_type_hints(type(config), include_extras=True)
-    is_open = [name for name in hints if hints[name] == Auto[int] and getattr(config, name) is None]
+    is_open = [
+        name
+        for name in hints
+        if hints[name] in (Auto[int], Auto[float], Auto[bool]) and getattr(config, name) is None
+    ]
     assert {"max_resolution", "log2_table_size", "num_steps"} <= set(is_open)
-    assert said.count(DECIDED) == len(is_open) + 2  # and --sparse-updates, --depth-loss-mult
+    assert said.count(DECIDED) == len(is_open)
     assert "Stop after this many seconds of training; evaluation and saving are not counted. (default: None)" in said
 
 

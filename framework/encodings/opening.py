@@ -1,0 +1,90 @@
+"""Levels of an encoding that open one after the other, from coarse to fine, while a model is trained.
+
+FreeNeRF (Yang et al. 2023), section 3.2, multiplies the frequencies of NeRF's encoding by factors that rise from 0 to 1
+one after the other, so that a few images are first explained by smooth shapes. Here this holds for every encoding with
+levels: the frequencies of NeRF, the levels of a hash grid, the scales of feature planes. Closed levels are not
+evaluated.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor, nn, tensor
+from torch.nn.functional import pad
+
+from framework.base.device import HostValue
+
+
+def opened_levels(num_levels: int, first: float, progress: float) -> float:
+    """Return how many levels are open: FreeNeRF, equation 5, with `first` open levels at the start.
+
+    Level l, counted from 0, has the factor clamp(opened - l, 0, 1).
+
+    Args:
+        num_levels: number L of levels.
+        first: number of levels that are open at the start.
+        progress: fraction of the time in which they open, at least 0; from 1 on all are open.
+
+    Returns:
+        min(first + L progress, L), at least 0.
+    """
+    if progress >= 1:
+        return float(num_levels)
+    return min(max(first + num_levels * progress, 0.0), float(num_levels))
+
+
+class Opening(nn.Module):
+    """The open levels of one encoding; it is part of a checkpoint, and complete where a checkpoint does not have it.
+
+    Args:
+        num_levels: number of levels.
+        first: number of levels that are open at the start.
+    """
+
+    opened: Tensor
+
+    def __init__(self, num_levels: int, first: int) -> None:
+        super().__init__()
+        self.num_levels, self.first = num_levels, first
+        self.register_buffer("opened", tensor(opened_levels(num_levels, first, 0.0)))
+        self._opened = HostValue()
+
+    def open(self, progress: float) -> None:
+        """Open levels up to `progress`, a fraction of the time in which they open."""
+        opened = opened_levels(self.num_levels, self.first, progress)
+        if opened != self._opened.of(self.opened):
+            self.opened.fill_(opened)
+
+    @property
+    def count(self) -> int:
+        """Number of levels that are open, at least in part."""
+        return -int(-self._opened.of(self.opened) // 1)
+
+    @property
+    def complete(self) -> bool:
+        """True if all levels are open."""
+        return self._opened.of(self.opened) >= self.num_levels
+
+    def completed(self, features: Tensor, width: int, last: int | None = None) -> Tensor:
+        """Return the features of all levels, from those of the open ones.
+
+        Args:
+            features: (N, E) features, ending with those of the last open level.
+            width: number of features of the complete encoding.
+            last: number of features of the last open level; `width` over the number of levels if None.
+
+        Returns:
+            (N, width) features, those of the last open level times its factor, and those of closed levels 0.
+        """
+        share = self._opened.of(self.opened) - (self.count - 1)
+        if self.count and share < 1:
+            factors = features.new_ones(features.shape[1])
+            factors[features.shape[1] - (width // self.num_levels if last is None else last) :] = share
+            features = features * factors
+        return pad(features, (0, width - features.shape[1]))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        if prefix + "opened" not in state_dict:
+            state_dict = {**state_dict, prefix + "opened": tensor(float(self.num_levels))}
+        super()._load_from_state_dict(state_dict, prefix, *rest)

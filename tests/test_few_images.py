@@ -1,0 +1,141 @@
+"""Few images: when their regularisers are used, what a run says of it, and that they are the terms they should be."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from framework.base.registry import load_method
+from framework.scene.few_images import (
+    FEW,
+    FEW_WITH_ALPHA,
+    UNSEEN_START,
+    UNSEEN_STEPS,
+    FewImagesConfig,
+    unseen_weight,
+)
+from framework.training.trainer import Trainer
+from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
+from tests.truth.test_training import SCENE
+
+METHODS = ("instant-ngp", "kplanes", "nerfacto", "tensorf", "vanilla-nerf")
+CAPTURE = dataclasses.replace(
+    SCENE, has_alpha=False, unbounded=True, near=0.5, far=1000.0, camera_to_worlds=torch.eye(4)[:3].expand(3, 3, 4)
+)
+
+
+def decided(method: str, count: int, scene: Any = CAPTURE, **settings: Any) -> tuple[FewImagesConfig, str]:
+    loaded, scene = load_method(method), dataclasses.replace(scene, num_cameras=count)
+    config, made = loaded.decide(dataclasses.replace(loaded.config, **settings), scene)
+    assert isinstance(config, FewImagesConfig)
+    return config, "\n".join(decision.line() for decision in made)
+
+
+def parts(config: FewImagesConfig) -> tuple[float, float, float]:
+    return config.open_levels_until, config.unseen_loss_mult, config.occlusion_loss_mult
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_few_images_of_a_capture_are_recognised(method: str) -> None:
+    few, said = decided(method, FEW)
+    assert few.few_images
+    assert any(parts(few))
+    assert f"regularisers for few images: on, as there are {FEW} training images" in said
+    assert "(else: --few-images False)" in said
+    many, said = decided(method, FEW + 1)
+    assert not many.few_images
+    assert parts(many) == (0, 0, 0)
+    assert f"regularisers for few images: off, as there are {FEW + 1} training images" in said
+    assert "unseen" not in said
+
+
+def test_a_flag_turns_them_off_and_on() -> None:
+    off, said = decided("nerfacto", 3, few_images=False)
+    assert parts(off) == (0, 0, 0)
+    assert "few images" not in said
+    on, _ = decided("nerfacto", 500, few_images=True)
+    assert parts(on) == parts(decided("nerfacto", 3)[0])
+
+
+def test_each_part_has_a_flag() -> None:
+    for name in ("open_levels_until", "unseen_loss_mult", "occlusion_loss_mult"):
+        config, said = decided("nerfacto", 3, **{name: 0.25})
+        assert getattr(config, name) == 0.25
+        assert name.replace("_", " ") not in said
+
+
+def test_alpha_shows_what_is_empty_so_that_fewer_images_are_few() -> None:
+    for count, few in ((FEW_WITH_ALPHA, True), (FEW_WITH_ALPHA + 1, False)):
+        config, _ = decided("instant-ngp", count, dataclasses.replace(SCENE, has_alpha=True))
+        assert config.few_images == few
+        assert config.occlusion_loss_mult == 0
+
+
+def test_no_view_between_cameras_in_normalised_device_coordinates_or_in_motion() -> None:
+    assert decided("nerfacto", 3, dataclasses.replace(CAPTURE, warped=True, unbounded=False))[0].unseen_loss_mult == 0
+    assert not decided("kplanes", 3, dataclasses.replace(CAPTURE, moving=True))[0].few_images
+
+
+def test_the_weight_of_unseen_views_falls_to_what_is_asked_for() -> None:
+    config = load_method("nerfacto").config
+    assert isinstance(config, FewImagesConfig)
+    config = dataclasses.replace(config, unseen_loss_mult=0.3)
+    found = [unseen_weight(config, step) for step in (0, UNSEEN_STEPS // 2, UNSEEN_STEPS, 10 * UNSEEN_STEPS)]
+    assert found == pytest.approx([0.3 * UNSEEN_START, 0.15 * (1 + UNSEEN_START), 0.3, 0.3])
+
+
+def stepped(trainer: Trainer, steps: int = 3) -> dict[str, float]:
+    """Terms of the loss after some steps."""
+    for _ in range(steps):
+        report = trainer.train_step()
+    return {name: float(value) for name, value in report.terms.items()}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_terms_are_there_where_they_are_asked_for(method: str, shared_tiny: Path, tmp_path: Path) -> None:
+    """What is near is the whole scene here, so that there is density in it."""
+    asked = {"unseen_loss_mult": 1.0, "occlusion_loss_mult": 1.0, "occlusion_range": 3.0, "unseen_patches": 2}
+    found = stepped(tiny_trainer(method, shared_tiny, tmp_path / "with", **asked))
+    assert found["unseen"] > 0
+    assert found["occlusion"] > 0
+    assert not {"unseen", "occlusion"} & stepped(tiny_trainer(method, shared_tiny, tmp_path / "without")).keys()
+
+
+def test_matter_before_cameras_goes_away(shared_tiny: Path, tmp_path: Path) -> None:
+    """The whole ball is `near` here and its penalty large: the picture is given up for empty space."""
+    settings = {"silhouette_cells": False, "max_num_iterations": 200}
+    terms = [
+        stepped(
+            tiny_trainer(
+                "instant-ngp",
+                shared_tiny,
+                tmp_path / f"{mult}",
+                occlusion_loss_mult=mult,
+                occlusion_range=3.0,
+                **settings,
+            ),
+            40,
+        )["occlusion"]
+        / mult
+        for mult in (1e-6, 1.0)
+    ]
+    assert terms[1] < 0.2 * terms[0]
+
+
+def test_with_many_images_not_a_bit_changes(shared_tiny: Path, tmp_path: Path) -> None:
+    """Ten images with alpha are not few: a run is as one in which all is switched off, its random numbers too."""
+    runs = [{}, {"few_images": False}, {"unseen_loss_mult": 0.0, "open_levels_until": 0.0, "occlusion_loss_mult": 0.0}]
+    trainers = [tiny_trainer("instant-ngp", shared_tiny, tmp_path / str(i), **run) for i, run in enumerate(runs)]
+    for trainer in trainers:
+        stepped(trainer)
+    for other in trainers[1:]:
+        assert_same_bits(tensors(trainers[0]), tensors(other))
+
+
+def test_a_profile_says_it(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("nerfacto", shared_tiny, tmp_path / "run", max_train_images=3)
+    said = "\n".join(trainer.profile().lines())
+    assert "scene: 3 images" in said
+    assert "regularisers for few images: on, as there are 3 training images" in said

@@ -7,7 +7,6 @@ _PLUGIN = "it is a plugin of nerfstudio (pip install git+https://github.com/{rep
 _GAUSSIANS = "here it is called 'gaussian-splatting'"
 _SURFACES = "no method here learns surfaces yet"
 _LARGER = "here it is 'nerfacto' with larger settings:"
-_ZIP_NERF = "the authors' code is https://github.com/jonbarron/camp_zipnerf; 'nerfacto' comes closest here"
 _MIP_NERF = "the authors' code is https://github.com/google/mipnerf; 'vanilla-nerf' comes closest here"
 
 ELSEWHERE: dict[str, str] = {
@@ -24,8 +23,7 @@ ELSEWHERE: dict[str, str] = {
     "pynerf": _PLUGIN.format(repository="hturki/pynerf", name="pynerf"),
     "seathru-nerf": _PLUGIN.format(repository="AkerBP/seathru_nerf", name="seathru-nerf"),
     "tetra-nerf": "it is a plugin of nerfstudio; https://github.com/jkulhanek/tetra-nerf says how to install it",
-    "zip-nerf": _ZIP_NERF,
-    "zipnerf": _ZIP_NERF,
+    "zipnerf": "here it is called 'zip-nerf'",
     "mip-nerf": _MIP_NERF,
     "mipnerf": _MIP_NERF,
     "nerf": "here it is called 'vanilla-nerf'",

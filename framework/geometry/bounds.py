@@ -67,3 +67,20 @@ def contract(positions: Tensor) -> Tensor:
     scaled = finite / largest
     norm = (scaled * scaled).sum(-1, keepdim=True).clamp(min=1).sqrt()
     return scaled * ((2 - 1 / (largest * norm)) / norm)
+
+
+def contraction_scale(positions: Tensor) -> Tensor:
+    """Return the factor by which `contract` scales a small isotropic Gaussian at each position.
+
+    It is the cube root of the determinant of the contraction's Jacobian: Zip-NeRF (Barron et al. 2023), section 2. With
+    n = |x| > 1 the Jacobian's eigenvalues are 1 / n^2 along x and, twice, (2 - 1/n) / n across it.
+
+    Args:
+        positions: (..., 3).
+
+    Returns:
+        (...) factors in [0, 1], 1 inside the unit ball.
+    """
+    limit = torch.finfo(positions.dtype).max ** 0.45  # the norm's square stays finite
+    inverse = 1 / positions.clamp(-limit, limit).norm(dim=-1).clamp(min=1)
+    return (inverse * inverse * (2 - inverse)) ** (2 / 3)

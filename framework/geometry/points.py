@@ -10,8 +10,30 @@ from torch import Tensor
 
 from framework.geometry.rays import Rays, Samples
 
-Footprint = Literal["none", "radius", "gaussian"]
-"""Kind of a point's size that a field needs: none, radius of the pixel's cone, or mean and covariance of the cone."""
+Footprint = Literal["none", "radius", "gaussian", "frustum"]
+"""Kind of a point's size that a field needs: none, radius of the pixel's cone, mean and covariance of the cone's
+interval, or that interval itself."""
+
+
+@dataclass(frozen=True)
+class Frustums:
+    """N conical frustums: intervals of the cones around rays."""
+
+    origins: Tensor
+    """(N, 3) apex of each cone, scene coordinates."""
+    directions: Tensor
+    """(N, 3) unit direction of each cone's axis."""
+    t_starts: Tensor
+    """(N,) distance from the apex at which the frustum starts."""
+    t_ends: Tensor
+    """(N,) distance from the apex at which the frustum ends."""
+    radii: Tensor
+    """(N,) radius of the cone at distance 1."""
+    ranks: Tensor | None = None
+    """(N,) number of intervals in front of each on its ray, if known."""
+
+    def __len__(self) -> int:
+        return self.t_starts.shape[0]
 
 
 @dataclass(frozen=True)
@@ -26,6 +48,8 @@ class Points:
     """(N,) radius of the pixel's cone at each point, scene units; None if not computed."""
     covariances: Tensor | None = None
     """(N, 3) diagonal of the covariance of the cone's interval, squared scene units; None if not computed."""
+    frustums: Frustums | None = None
+    """The cones' intervals; None if not computed."""
 
     def __len__(self) -> int:
         return self.positions.shape[0]
@@ -58,11 +82,17 @@ def sample_points(rays: Rays, samples: Samples, footprint: Footprint = "none") -
     Raises:
         ValueError: if a footprint is to be computed and the rays have no `pixel_radii`.
     """
-    return interval_points(rays, samples.ray_indices, samples, samples.positions(rays), footprint)
+    ranks = samples.ranks if footprint == "frustum" else None
+    return interval_points(rays, samples.ray_indices, samples, samples.positions(rays), footprint, ranks)
 
 
 def interval_points(
-    rays: Rays, owners: Tensor, intervals: Intervals, positions: Tensor, footprint: Footprint
+    rays: Rays,
+    owners: Tensor,
+    intervals: Intervals,
+    positions: Tensor,
+    footprint: Footprint,
+    ranks: Tensor | None = None,
 ) -> Points:
     """Return the points at which a field is evaluated for intervals.
 
@@ -72,6 +102,7 @@ def interval_points(
         intervals: N intervals along the rays.
         positions: (N, 3) positions of the points; not used for Gaussians, whose positions are their means.
         footprint: kind of the points' size to compute.
+        ranks: (N,) number of intervals in front of each on its ray, for frustums; None if unknown.
 
     Raises:
         ValueError: if a footprint is to be computed and the rays have no `pixel_radii`.
@@ -84,6 +115,10 @@ def interval_points(
     radii = rays.pixel_radii.index_select(0, owners)
     if footprint == "radius":
         return Points(positions, times, intervals.t * radii)
+    if footprint == "frustum":
+        origins, directions = (x.index_select(0, owners) for x in (rays.origins, rays.directions))
+        frustums = Frustums(origins, directions, intervals.t_starts, intervals.t_ends, radii, ranks)
+        return Points(positions, times, intervals.t * radii, frustums=frustums)
     mean_t, along, across = conical_frustums(intervals.t_starts, intervals.t_ends, radii)
     squared = rays.directions.index_select(0, owners).square()
     covariances = along[:, None] * squared + across[:, None] * (1 - squared)

@@ -75,6 +75,16 @@ TINY: dict[str, dict[str, Any]] = {
         "num_nerf_samples": 8,
         "num_rays_per_batch": 256,
     },
+    "zip-nerf": {
+        "num_levels": 4,
+        "max_resolution": 64,
+        "log2_table_size": 12,
+        "num_proposal_levels": 3,
+        "proposal_resolutions": (32, 64),
+        "num_proposal_samples": (24, 12),
+        "num_nerf_samples": 8,
+        "num_rays_per_batch": 256,
+    },
     "dnerf": {
         "num_layers": 3,
         "hidden_width": 32,

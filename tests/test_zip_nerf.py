@@ -164,22 +164,19 @@ def test_exposures_change_each_sample_and_not_the_background() -> None:
 
 
 def test_images_of_other_exposure_get_transforms_of_their_own(shared_tiny: Path, tmp_path: Path) -> None:
-    """Trained on darker and lighter copies, the transforms of the darker ones darken."""
+    """With each second image darkened, the transforms of the darker ones darken."""
     still: Dataset = tiny_trainer("zip-nerf", shared_tiny, tmp_path / "still").train_set
-    factors = torch.linspace(0.2, 1.0, len(still))
+    dark = torch.arange(len(still)) % 2 == 0
     sizes = still.cameras.widths * still.cameras.heights
-    dimmed = still.pixels.clone()
-    dimmed[:, :3] = (still.pixels[:, :3] * factors.repeat_interleave(sizes)[:, None]).round().to(torch.uint8)
+    dimmed, factors = still.pixels.clone(), torch.where(dark, 0.4, 1.0).repeat_interleave(sizes)
+    dimmed[:, :3] = (still.pixels[:, :3] * factors[:, None]).round().to(torch.uint8)
     varied = dataclasses.replace(still, pixels=dimmed, scene=dataclasses.replace(still.scene, appearance_varies=True))
     (tmp_path / "run").mkdir()
-    run = tiny_run(
-        "zip-nerf", shared_tiny, tmp_path / "run", max_eval_images=0, max_num_iterations=120,
-        exposure_learning_rate=1e-2,
-    )  # fmt: skip
-    trainer = Trainer(run, varied, None)
+    settings = {"max_eval_images": 0, "max_num_iterations": 120, "exposure_learning_rate": 1e-2}
+    trainer = Trainer(tiny_run("zip-nerf", shared_tiny, tmp_path / "run", **settings), varied, None)
     trainer.train()
     grey = affine_of(trainer.model.appearance.vectors.detach())
-    assert torch.corrcoef(torch.stack([grey, factors]))[0, 1].item() > 0.8
+    assert grey[~dark].mean().item() - grey[dark].mean().item() > 0.1
 
 
 def affine_of(vectors: Tensor) -> Tensor:

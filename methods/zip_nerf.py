@@ -146,13 +146,12 @@ class ZipNeRF(RayModel[ZipNeRFConfig]):
         ConfigError: if poses are to be refined in normalised device coordinates or with another sampler than proposals.
     """
 
-    def __init__(
-        self, config: ZipNeRFConfig, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer
-    ) -> None:
+    def __init__(self, config: ZipNeRFConfig, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer) -> None:
         super().__init__(config, scene, field, sampler, renderer)
         self.appearance: Appearance | None = None
         if config.exposure:
-            self.appearance = Appearance(AFFINE, scene.num_cameras, Optimised("exposures", config.exposure_learning_rate))
+            rate = config.exposure_learning_rate
+            self.appearance = Appearance(AFFINE, scene.num_cameras, Optimised("exposures", rate))
         self.poses: PoseRefinement | None = None
         if config.camera_optimizer != "off":
             if scene.warped:

@@ -1,4 +1,4 @@
-"""The hash grid of Zip-NeRF (Barron et al. 2023): means over the points of conical frustums, with a normalised decay."""
+"""The hash grid of Zip-NeRF (Barron et al. 2023): means over points of conical frustums, with a normalised decay."""
 
 from __future__ import annotations
 

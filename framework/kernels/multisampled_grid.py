@@ -70,9 +70,7 @@ class _MultisampledGrid(torch.autograd.Function):
     """The compiled form of `multisampled_grid`."""
 
     @staticmethod
-    def forward(
-        ctx: Any, points: Tensor, table: Tensor, placeholder: Tensor | None, layout: HashGridLayout
-    ) -> Tensor:
+    def forward(ctx: Any, points: Tensor, table: Tensor, placeholder: Tensor | None, layout: HashGridLayout) -> Tensor:
         (count, each, _), features = points.shape, table.shape[1]
         where = native.pointer(points, "points", (count, each, 4))
         entries = native.pointer(table, "the hash table", (layout.num_entries, features))
@@ -139,9 +137,7 @@ def multisampled_grid(
     return MULTISAMPLED_GRID((points, table), points, table, layout, deferred)
 
 
-def _reference(
-    points: Tensor, table: Tensor, layout: HashGridLayout, deferred: MultisampleGradient | None
-) -> Tensor:
+def _reference(points: Tensor, table: Tensor, layout: HashGridLayout, deferred: MultisampleGradient | None) -> Tensor:
     return multisampled_grid_reference(points, table, layout)
 
 

@@ -60,7 +60,7 @@ def _compiled(frustums: Frustums, pattern: Pattern, box: Tensor, contracted: boo
     count, half = len(frustums), (box[1] - box[0]) / 2
     out = frustums.t_starts.new_empty(count, NUM_MULTISAMPLES, 4)
     # What is contracted is in half edges from the centre, everything else in edges from the corner.
-    corner, scale = (((box[0] + box[1]) / 2, 1 / half) if contracted else (box[0].clone(), 0.5 / half))
+    corner, scale = ((box[0] + box[1]) / 2, 1 / half) if contracted else (box[0].clone(), 0.5 / half)
     deviation = STD_SCALE / (half.prod() ** (1 / 3)).item() / (4 if contracted else 2)
     rows = [x.contiguous() for x in (frustums.origins, frustums.directions)]
     numbers = frustums.t_starts, frustums.t_ends, frustums.radii, pattern.turns.cos(), pattern.turns.sin()

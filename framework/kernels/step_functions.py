@@ -1,8 +1,8 @@
 """Blurred step functions, and the anti-aliased loss of proposals: Zip-NeRF (Barron et al. 2023), on z-aliasing.
 
 A histogram along a ray is a step function. The loss of mip-NeRF 360 jumps when an edge of one histogram passes an edge
-of the other, so that proposals learn where edges are, and lose thin things as the camera moves. Zip-NeRF first blurs the
-finer histogram with a box, which makes it piecewise linear, and then compares the weight in each proposed bin.
+of the other, so that proposals learn where edges are, and lose thin things as the camera moves. Zip-NeRF first blurs
+the finer histogram with a box, which makes it piecewise linear, and then compares the weight in each proposed bin.
 
 The paper sorts the edges of the blurred function. Here none are sorted: if D is the second integral of the step
 function, which is quadratic between its edges, the integral of the blurred function up to x is
@@ -65,9 +65,7 @@ def blurred_excess_reference(
     return (excess.square() / (proposed_weights + EPS)).sum(-1).to(proposed_weights.dtype)
 
 
-def blurred_excess(
-    edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor, radius: float
-) -> Tensor:
+def blurred_excess(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor, radius: float) -> Tensor:
     """Return the loss (R,) of proposed weights that are less than those of a blurred histogram: Zip-NeRF's loss.
 
     It is the sum over proposed bins of max(0, b - p)^2 / p, where b is the weight of the blurred histogram in a bin and

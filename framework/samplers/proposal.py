@@ -244,7 +244,7 @@ def from_disparity(s: Tensor) -> Tensor:
 def power_ladder(x: Tensor, power: float) -> Tensor:
     """Map distances `x` in [0, inf] by |p - 1| / p ((x / |p - 1| + 1)^p - 1), with a slope of 1 at 0: Zip-NeRF.
 
-    It is x for p = 1, log(1 + x) for p = 0, x / (1 + x) for p = -1, and is bounded for p < 0.
+    It is x for p = 1, log(1 + x) for p = 0, x / (1 + x / 2) for p = -1, and is bounded for p < 0.
 
     Args:
         x: distances, at least 0.

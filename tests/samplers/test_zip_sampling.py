@@ -23,7 +23,12 @@ DISTANCES = torch.logspace(-6, 3, 100, dtype=torch.float64)
 
 @pytest.mark.parametrize(
     ("power", "truth"),
-    [(1, lambda x: x), (0, torch.log1p), (-1, lambda x: 2 * (1 - 1 / (x / 2 + 1))), (0.5, lambda x: (2 * x + 1).sqrt() - 1)],
+    [
+        (1, lambda x: x),
+        (0, torch.log1p),
+        (-1, lambda x: 2 * (1 - 1 / (x / 2 + 1))),
+        (0.5, lambda x: (2 * x + 1).sqrt() - 1),
+    ],
 )
 def test_ladders_of_known_exponents_are_their_functions(power: float, truth) -> None:
     torch.testing.assert_close(power_ladder(DISTANCES, power), truth(DISTANCES), rtol=1e-9, atol=1e-12)

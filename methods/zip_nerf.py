@@ -153,7 +153,7 @@ class ZipNeRF(RayModel[ZipNeRFConfig]):
             rate = config.exposure_learning_rate
             self.appearance = Appearance(AFFINE, scene.num_cameras, Optimised("exposures", rate))
         self.poses: PoseRefinement | None = None
-        if config.camera_optimizer != "off":
+        if config.camera_optimizer in ("SO3xR3", "SE3"):
             if scene.warped:
                 raise ConfigError("--camera-optimizer: poses cannot be refined in normalised device coordinates")
             if config.sampler != "proposal":
@@ -181,7 +181,7 @@ class ZipNeRF(RayModel[ZipNeRFConfig]):
 
 
 def decide(config: ZipNeRFConfig, scene: Scene) -> tuple[ZipNeRFConfig, list[Decision]]:
-    """Fill in the settings that depend on the scene, as `Method.decide`."""
+    """Return `config` with the settings filled in that depend on the `scene`, and a record of each."""
     unbounded = scene.unbounded if config.contraction is None else config.contraction
     config, made = fill(config, sampler_choice(config, unbounded))
     contracted = unbounded and config.sampler == "proposal"
@@ -202,7 +202,7 @@ def decide(config: ZipNeRFConfig, scene: Scene) -> tuple[ZipNeRFConfig, list[Dec
 
 
 def make_field(config: ZipNeRFConfig, scene: Scene) -> MultisampledField:
-    """Return a field of one multisampled hash grid and two small networks."""
+    """Return a field of one multisampled hash grid and two small networks, by `config` and `scene`."""
     sizes = config.num_levels, config.features_per_level, config.base_resolution, config.max_resolution
     grid = MultisampledHashGrid(*sizes, config.log2_table_size, config.sparse_updates, config.hash_decay_mult)
     unbounded = config.contraction and config.sampler == "proposal"
@@ -210,7 +210,7 @@ def make_field(config: ZipNeRFConfig, scene: Scene) -> MultisampledField:
 
 
 def sampler(config: ZipNeRFConfig, scene: Scene) -> Sampler:
-    """Return two multisampled proposals with the anti-aliased loss, or the sampler that the settings select instead."""
+    """Return multisampled proposals with the anti-aliased loss for `scene`, or the sampler that `config` names."""
     scene = replace(scene, unbounded=config.contraction)
     if config.sampler != "proposal":
         return make_sampler(config, scene)
@@ -235,7 +235,7 @@ def sampler(config: ZipNeRFConfig, scene: Scene) -> Sampler:
 
 
 def renderer(config: ZipNeRFConfig, scene: Scene) -> Renderer:
-    """Return the renderer, with gradient scaling as configured."""
+    """Return the renderer, with gradient scaling at the size of the `scene` if `config` has it."""
     return NerfactoRenderer(half_edge(scene.box) if config.gradient_scaling else None, None)
 
 

@@ -25,7 +25,7 @@ STD_SCALE = 0.5
 
 
 class Pattern(NamedTuple):
-    """How the pattern of points lies in each of N frustums."""
+    """Rotations and mirrorings of the pattern of points in N frustums."""
 
     turns: Tensor
     """(N,) angle by which it is rotated around the axis."""

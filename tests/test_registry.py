@@ -13,7 +13,17 @@ from framework.base.elsewhere import ELSEWHERE
 from framework.base.errors import ConfigError, DataError
 from framework.data.data_folder import find_data
 
-BUILT_IN = {"dnerf", "gaussian-splatting", "instant-ngp", "kplanes", "nerfacto", "tensorf", "vanilla-nerf"}
+BUILT_IN = {
+    "dnerf",
+    "gaussian-splatting",
+    "instant-ngp",
+    "kplanes",
+    "mip-nerf",
+    "mip-nerf-360",
+    "nerfacto",
+    "tensorf",
+    "vanilla-nerf",
+}
 
 
 def test_the_built_in_methods_are_registered_like_anybodys() -> None:

@@ -108,9 +108,9 @@ class Evaluation:
     """Metrics of a set of images."""
 
     per_image: list[dict[str, Any]]
-    """Name, psnr, ssim, lpips and rendering seconds of each image."""
+    """Name, psnr, ssim, lpips and rendering seconds of each image, and its reduction if images have several sizes."""
     results: dict[str, Any]
-    """Means, standard deviations and rendering speed, with nerfstudio's keys."""
+    """Means, standard deviations and rendering speed, with nerfstudio's keys; by_size, those of images of each size."""
     lpips_note: str
     """Network of LPIPS, or the reason why it is absent."""
     eval_appearance: Literal["mean", "half"] | None = None
@@ -124,7 +124,9 @@ class Evaluation:
         ssim, lpips = ("absent" if r[name] is None else f"{r[name]:.4f}" for name in ("ssim", "lpips"))
         rays = r["num_rays_per_sec"]  # 0 of a method that casts none
         speed = f"{rays / 1e3:.1f}k rays/s  {1 / r['fps']:.2f} s/image" if rays else f"{r['fps']:.1f} images/s"
-        return f"PSNR {r['psnr']:.2f} dB  SSIM {ssim}  LPIPS {lpips}  {speed}  ({r['num_images']} images)"
+        sizes = ", ".join(f"{size}: {found['psnr']:.2f}" for size, found in r.get("by_size", {}).items())
+        sizes = f" ({sizes})" if sizes else ""
+        return f"PSNR {r['psnr']:.2f} dB{sizes}  SSIM {ssim}  LPIPS {lpips}  {speed}  ({r['num_images']} images)"
 
 
 def evaluate(
@@ -182,6 +184,8 @@ def evaluate(
                 "seconds": spent,
             }
         )
+        if dataset.reductions is not None:
+            rows[-1]["reduction"] = int(dataset.reductions[index])
         seconds += spent
         rays += picture.num_rays
         if pictures is not None and (max_pictures is None or len(rows) <= max_pictures):
@@ -191,6 +195,8 @@ def evaluate(
                 pictures, pictures_note = None, f"cannot write pictures to {pictures}: {error.strerror or error}"
     results = {**_statistics(rows), "num_rays_per_sec": rays / seconds, "fps": len(rows) / seconds}
     protocol: Literal["mean", "half"] | None = ("half" if half else "mean") if has_appearance else None
+    if dataset.reductions is not None:
+        results["by_size"] = _by_size(rows)
     return Evaluation(rows, {**results, "num_images": len(rows)}, lpips_note, protocol, pictures_note)
 
 
@@ -230,6 +236,15 @@ def spread(total: int, limit: int | None) -> list[int]:
     if limit is None or limit >= total:
         return list(range(total))
     return [index * total // limit for index in range(limit)]
+
+
+def _by_size(rows: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return the statistics of the images of each size, by "1", "1/2", "1/4", ..."""
+    sizes = sorted({row["reduction"] for row in rows})
+    return {
+        "1" if size == 1 else f"1/{size}": _statistics([row for row in rows if row["reduction"] == size])
+        for size in sizes
+    }
 
 
 def _statistics(rows: list[dict[str, Any]]) -> dict[str, float | None]:

@@ -24,7 +24,7 @@ from framework.encodings.hash_grid import HashGrid
 from framework.fields.base import DensityFunction, Field
 from framework.fields.encoded import DensityField
 from framework.geometry.bounds import intersect_box
-from framework.geometry.points import Points
+from framework.geometry.points import Points, sample_points
 from framework.geometry.rays import Histogram, Rays, Samples
 from framework.kernels.intervals import interval_weights, proposal_excess, resample
 from framework.samplers.base import Sampler
@@ -52,9 +52,11 @@ class ProposalSampler(Sampler):
         log2_table_size: maximum number of entries per level of the proposals' hash grids, as a power of two.
         num_levels: levels of the proposals' hash grids.
         anneal_steps: training steps over which the weights are annealed.
+        fields: other density fields in place of hash grids; the last one serves all further levels too.
+        learn_every: interval of steps at which the proposals learn, after the first `ALWAYS_LEARN_UNTIL`.
 
     Raises:
-        ValueError: if there is not one count more than there are resolutions.
+        ValueError: if there is not one count more than there are resolutions, or more fields than levels.
     """
 
     box: Tensor
@@ -70,44 +72,57 @@ class ProposalSampler(Sampler):
         log2_table_size: int = 16,
         num_levels: int = 5,
         anneal_steps: int = 1000,
+        fields: Sequence[Field] | None = None,
+        learn_every: int = LEARN_EVERY,
     ) -> None:
         super().__init__()
-        if len(counts) != len(resolutions) + 1:
+        if fields is None and len(counts) != len(resolutions) + 1:
             raise ValueError(f"{len(counts)} counts for {len(resolutions)} proposals: one more is needed")
-        self.endless = endless
+        if fields is not None and not 1 <= len(fields) < len(counts):
+            raise ValueError(f"{len(fields)} density fields for {len(counts) - 1} proposals")
+        self.endless, self.learn_every = endless, learn_every
         self.counts, self.unbounded, self.anneal_steps = counts, unbounded, anneal_steps
         self.scale = half_edge(box)
         self.register_buffer("box", box.clone())
-        grids = [HashGrid(num_levels, 2, 16, finest, log2_table_size) for finest in resolutions]
-        self.fields = nn.ModuleList(DensityField(box, grid, unbounded=unbounded) for grid in grids)
+        if fields is None:
+            grids = [HashGrid(num_levels, 2, 16, finest, log2_table_size) for finest in resolutions]
+            fields = [DensityField(box, grid, unbounded=unbounded) for grid in grids]
+        self.fields = nn.ModuleList(fields)
         self.power = 1.0
         self.learning = False
 
     @property
     def proposals(self) -> list[Field]:
         """The density fields, in the order in which they are evaluated."""
-        return [field for field in self.fields if isinstance(field, Field)]
+        fields = [field for field in self.fields if isinstance(field, Field)]
+        return fields + fields[-1:] * (len(self.counts) - 1 - len(fields))
 
     def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
         """Return the samples of the last level, with the proposals' gradients attached in steps in which they learn."""
         learning = self.learning and self.training and torch.is_grad_enabled()
         nears, fars = self._ends(rays)
-        return propose(
+        samples = propose(
             replace(rays, nears=nears, fars=fars),
-            [proposal.density for proposal in self.proposals],
+            self.proposals,
             self.counts,
             self.scale if self.unbounded else None,
             jitter=jitter,
             power=self.power if self.training else 1.0,
             learning=learning,
-            endless=self.endless,
         )
+        if not self.endless:
+            return samples
+        if field.footprint == "gaussian":  # before the last interval is endless: its mean would be at infinity
+            samples = samples.evaluated(*field.density(sample_points(rays, samples, field.footprint)))
+        ends = samples.padded(samples.t_ends).clone()
+        ends[:, -1] = FARTHEST
+        return replace(samples, t_ends=ends.view(-1))
 
     def update(self, step: int, density: DensityFunction) -> None:
         """Set the exponent of the annealing, and whether the proposals learn in this step."""
         x = min(step / max(self.anneal_steps, 1), 1.0)
         self.power = ANNEALING_SLOPE * x / ((ANNEALING_SLOPE - 1) * x + 1)
-        self.learning = step < ALWAYS_LEARN_UNTIL or step % LEARN_EVERY == 0
+        self.learning = step < ALWAYS_LEARN_UNTIL or step % self.learn_every == 0
 
     def losses(self, samples: Samples, weights: Tensor) -> dict[str, Tensor]:
         return {"interlevel": interlevel_loss(samples, weights)} if samples.proposals else {}
@@ -123,26 +138,24 @@ class ProposalSampler(Sampler):
 
 def propose(
     rays: Rays,
-    densities: Sequence[DensityFunction],
+    proposals: Sequence[Field],
     counts: Sequence[int],
     scale: float | None,
     *,
     jitter: bool,
     power: float,
     learning: bool,
-    endless: bool,
 ) -> Samples:
     """Return samples that are drawn in levels, each from the weights of the level before.
 
     Args:
         rays: R rays, sampled from the near to the far end.
-        densities: density of each level but the last.
-        counts: intervals per ray of each level, followed by the number of samples per ray: one more than densities.
+        proposals: density field of each level but the last, which is asked about points of the size that it needs.
+        counts: intervals per ray of each level, followed by the number of samples per ray: one more than fields.
         scale: the distance up to which normalised distance is linear, as in `spacing`.
         jitter: True for random positions, False for fixed ones.
         power: exponent of the weights that are drawn from; less than 1 flattens them.
         learning: whether to keep the proposals' weights, gradients attached, in `Samples.proposals`.
-        endless: whether the last interval ends at `FARTHEST`.
     """
     nears, fars = rays.nears, rays.fars
     count, device = len(rays), nears.device
@@ -150,28 +163,22 @@ def propose(
     if jitter:  # the inner edges move together by up to half an interval either way
         moved = edges + (torch.rand(count, 1, device=device) - 0.5) / counts[0]
         edges = torch.cat([edges[:, :1], moved[:, 1:-1], edges[:, -1:]], dim=-1)
-    proposals: list[Histogram] = []
+    histograms: list[Histogram] = []
     placed = spacing(nears, fars, scale)
-    for (num_intervals, num_next), density in zip(pairwise(counts), densities, strict=True):
+    for (num_intervals, num_next), proposal in zip(pairwise(counts), proposals, strict=True):
         t = placed(edges)
-        middles = (t[:, 1:] + t[:, :-1]) / 2
         with torch.set_grad_enabled(learning):
-            positions = _positions(rays, middles)
-            times = None if rays.times is None else rays.times.repeat_interleave(num_intervals)
-            sigma, _ = density(Points(positions, times))
-            weights = interval_weights(sigma.view(middles.shape), t)
-        proposals.append(Histogram(edges, weights))
+            sigma, _ = proposal.density(_points(rays, t, proposal))
+            weights = interval_weights(sigma.view(count, num_intervals), t)
+        histograms.append(Histogram(edges, weights))
         shift = torch.rand(count, device=device) if jitter else torch.full((count,), 0.5, device=device)
         edges = resample(edges, weights.detach(), shift, num_next, power, PADDING / num_intervals)
     t = placed(edges)
-    ends = t[:, 1:]
-    if endless:
-        ends = torch.cat([ends[:, :-1], torch.full_like(ends[:, :1], FARTHEST)], dim=-1)
     return replace(
-        Samples.regular(t[:, :-1], ends, (t[:, 1:] + t[:, :-1]) / 2),
+        Samples.regular(t[:, :-1], t[:, 1:], (t[:, 1:] + t[:, :-1]) / 2),
         owners=torch.arange(count, device=device).repeat_interleave(counts[-1]),
         edges=edges,
-        proposals=tuple(proposals) if learning else (),
+        proposals=tuple(histograms) if learning else (),
     )
 
 
@@ -221,7 +228,13 @@ def interlevel_loss(samples: Samples, weights: Tensor) -> Tensor:
     return torch.stack(losses).sum()
 
 
-def _positions(rays: Rays, t: Tensor) -> Tensor:
-    """Return positions (R * B, 3) at distances `t` (R, B), without a gradient for the rays."""
+def _points(rays: Rays, t: Tensor, field: Field) -> Points:
+    """Return the points of intervals with edges `t` (R, B + 1), as `field` needs them, without a gradient for rays."""
     origins, directions = rays.origins.detach(), rays.directions.detach()
-    return torch.addcmul(origins[:, None], directions[:, None], t[..., None]).view(-1, 3)
+    if field.footprint != "none":
+        detached = replace(rays, origins=origins, directions=directions)
+        return sample_points(detached, Samples.regular(t[:, :-1], t[:, 1:]), field.footprint)
+    middles = (t[:, 1:] + t[:, :-1]) / 2
+    positions = torch.addcmul(origins[:, None], directions[:, None], middles[..., None]).view(-1, 3)
+    times = None if rays.times is None else rays.times.repeat_interleave(middles.shape[1])
+    return Points(positions, times)

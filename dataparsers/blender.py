@@ -39,8 +39,8 @@ class Blender(DataParser):
     far: float = 6.0
     """Distance from a camera at which the scene ends, in the input's units."""
     multiscale: int = 1
-    """Number of sizes at which each image is used, 1, 1/2, 1/4, ..., in training and evaluation, with a loss weighted by
-    the area of pixels; 4 is Mip-NeRF's multiscale protocol."""
+    """Number of sizes at which each image is used, 1, 1/2, 1/4, ..., with a loss weighted by the area of pixels; 4 is
+    Mip-NeRF's multiscale protocol."""
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:

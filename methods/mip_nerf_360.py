@@ -166,7 +166,9 @@ def make_proposals(config: MipNeRF360Config, scene: Scene) -> Sequence[Field]:
     """
     if config.encoding == "integrated":
         network = IntegratedDensity(_encoding(config, scene), config.proposal_width, config.proposal_layers)
-        network.optimised = Optimised("proposals", config.learning_rate, (config.adam_beta1, config.adam_beta2), config.adam_eps)
+        network.optimised = Optimised(
+            "proposals", config.learning_rate, (config.adam_beta1, config.adam_beta2), config.adam_eps
+        )
         return [network]
     unbounded = contracted_box(config, scene) is not None
     fields = []

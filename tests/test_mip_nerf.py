@@ -120,7 +120,9 @@ def test_mip_nerfs_sampler_is_decided_by_the_scene(scene: Scene, asked: str, kin
 
 
 def test_the_coarse_level_of_mip_nerf_counts_a_tenth() -> None:
-    learner = Learner(mip_nerf.METHOD, dataclasses.replace(mip_nerf.METHOD.config, **TINY["mip-nerf"]), ball_in_a_box(), 0)
+    learner = Learner(
+        mip_nerf.METHOD, dataclasses.replace(mip_nerf.METHOD.config, **TINY["mip-nerf"]), ball_in_a_box(), 0
+    )
     batch = learner.batch()
     torch.manual_seed(1)
     terms = learner.loss(batch).terms

@@ -153,7 +153,7 @@ class Dataset:
 
     @cached_property
     def image_weights(self) -> Tensor | None:
-        """(M,) weight of each image's pixels in a loss, of images at several sizes: their area, with mean 1 over pixels.
+        """(M,) weight of each image's pixels in a loss, if images are at several sizes: with mean 1 over all pixels.
 
         A pixel of an image at 1/s of its size stands for s^2 pixels: Mip-NeRF (Barron et al. 2021), section 4.
         """

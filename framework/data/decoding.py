@@ -224,7 +224,9 @@ def _decode_one(
     images: list[_Image | DataError] = []
     try:
         whole = read_image(path)
-        reduced = [whole if files.factors[index] == 1 else reduce_image(whole, files.factors[index]) for index in indices]
+        reduced = [
+            whole if files.factors[index] == 1 else reduce_image(whole, files.factors[index]) for index in indices
+        ]
     except DataError as error:
         return [error] * len(indices)
     for index, image in zip(indices, reduced, strict=True):

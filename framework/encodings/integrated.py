@@ -1,4 +1,4 @@
-"""Integrated encoding of a box or of all of space: Mip-NeRF (Barron et al. 2021) and mip-NeRF 360 (Barron et al. 2022)."""
+"""Integrated encoding of a box or of all of space: Mip-NeRF (Barron et al. 2021), mip-NeRF 360 (Barron et al. 2022)."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ class IntegratedEncoding(nn.Module):
             return integrated_encoding(means, roots.square().sum(-1), self.num_frequencies)
         # Products and sums, because autocast would round a matrix product to bfloat16.
         along = (means[:, None] * self.directions).sum(-1)
-        spread = sum((roots[:, None, :, column] * self.directions).sum(-1).square() for column in range(3))
-        return integrated_encoding(along, spread, self.num_frequencies)
+        spreads = [(roots[:, None, :, column] * self.directions).sum(-1).square() for column in range(3)]
+        return integrated_encoding(along, torch.stack(spreads).sum(0), self.num_frequencies)
 
 
 def icosahedron_directions() -> Tensor:

@@ -183,9 +183,8 @@ def evaluate(
                 "lpips": None if lpips is None else lpips(*pair),
                 "seconds": spent,
             }
+            | ({} if dataset.reductions is None else {"reduction": int(dataset.reductions[index])})
         )
-        if dataset.reductions is not None:
-            rows[-1]["reduction"] = int(dataset.reductions[index])
         seconds += spent
         rays += picture.num_rays
         if pictures is not None and (max_pictures is None or len(rows) <= max_pictures):
@@ -193,10 +192,8 @@ def evaluate(
                 _write_pictures(pictures, f"{index:04d}_{_short_stem(dataset.names[index])}", rgb, target, picture)
             except OSError as error:  # metrics do not need the files
                 pictures, pictures_note = None, f"cannot write pictures to {pictures}: {error.strerror or error}"
-    results = {**_statistics(rows), "num_rays_per_sec": rays / seconds, "fps": len(rows) / seconds}
+    results = {**_statistics(rows), **_by_size(rows), "num_rays_per_sec": rays / seconds, "fps": len(rows) / seconds}
     protocol: Literal["mean", "half"] | None = ("half" if half else "mean") if has_appearance else None
-    if dataset.reductions is not None:
-        results["by_size"] = _by_size(rows)
     return Evaluation(rows, {**results, "num_images": len(rows)}, lpips_note, protocol, pictures_note)
 
 
@@ -238,13 +235,12 @@ def spread(total: int, limit: int | None) -> list[int]:
     return [index * total // limit for index in range(limit)]
 
 
-def _by_size(rows: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return the statistics of the images of each size, by "1", "1/2", "1/4", ..."""
-    sizes = sorted({row["reduction"] for row in rows})
-    return {
-        "1" if size == 1 else f"1/{size}": _statistics([row for row in rows if row["reduction"] == size])
-        for size in sizes
-    }
+def _by_size(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the statistics of the images of each size, "1", "1/2", ..., as `by_size`; nothing if all have one size."""
+    sizes = sorted({row["reduction"] for row in rows if "reduction" in row})
+    names = {size: "1" if size == 1 else f"1/{size}" for size in sizes}
+    found = {names[size]: _statistics([row for row in rows if row["reduction"] == size]) for size in sizes}
+    return {"by_size": found} if found else {}
 
 
 def _statistics(rows: list[dict[str, Any]]) -> dict[str, float | None]:

@@ -1,4 +1,4 @@
-"""Fields of large networks on the integrated encoding: Mip-NeRF (Barron et al. 2021) and mip-NeRF 360 (Barron et al. 2022)."""
+"""Networks on the integrated encoding, of Mip-NeRF (Barron et al. 2021) and mip-NeRF 360 (Barron et al. 2022)."""
 
 from __future__ import annotations
 

@@ -16,14 +16,10 @@ from framework.kernels.math import split_density, truncated_exp
 
 
 class SizedGrid(BoxField):
-    """A field on a hash grid whose features are weighted by the size of points: Zip-NeRF (Barron et al. 2023), section 3.1.
+    """A field on a hash grid whose features are weighted by the size of points.
 
-    Unlike there, a Gaussian is asked about at its mean alone, and its size is that of the ball with the same volume.
-
-    Args:
-        box: (2, 3) corners of the box, scene units.
-        encoding: encoding of positions in [0, 1]^3.
-        unbounded: whether the encoding covers all of space, contracted by `contract_to_unit`.
+    Zip-NeRF (Barron et al. 2023), section 3.1. Unlike there, a Gaussian is asked about at its mean alone, and its size
+    is that of the ball with the same volume. It is made like the class of fields that it is mixed with.
     """
 
     footprint: ClassVar[Footprint] = "gaussian"

@@ -24,9 +24,9 @@ def mean_squared_error(prediction: Tensor, target: Tensor, weights: Tensor | Non
 
 
 def charbonnier(prediction: Tensor, target: Tensor, weights: Tensor | None = None, scale: float = 1e-3) -> Tensor:
-    """Return the mean () of weight * sqrt((prediction - target)^2 + scale^2), a smooth absolute error; 0 for empty input.
+    """Return the mean () of weight * sqrt((prediction - target)^2 + scale^2) over all elements; 0 for empty input.
 
-    mip-NeRF 360 (Barron et al. 2022), section 5: outliers count less than they do squared.
+    mip-NeRF 360 (Barron et al. 2022), section 5: a smooth absolute error, to which outliers count less than squared.
 
     Args:
         prediction: (R, C) predicted values.

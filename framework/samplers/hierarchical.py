@@ -26,8 +26,8 @@ class HierarchicalSampler(Sampler):
 
     The coarse level is rendered and supervised too (`Samples.coarse`). It has one of two kinds:
 
-    - A coarse field of its own, which belongs to the sampler, at points: NeRF. The fine field is evaluated at the points
-      of both levels.
+    - A coarse field of its own, which belongs to the sampler, at points: NeRF. The fine field is evaluated at the
+      points of both levels.
     - The field itself, in intervals: Mip-NeRF, where one network is asked about cones of any length. The intervals of
       the fine level are drawn from the blurred weights of the coarse ones, and take their place.
 

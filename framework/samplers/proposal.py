@@ -24,7 +24,7 @@ from framework.encodings.hash_grid import HashGrid
 from framework.fields.base import DensityFunction, Field
 from framework.fields.encoded import DensityField
 from framework.geometry.bounds import intersect_box
-from framework.geometry.points import Points, sample_points
+from framework.geometry.points import Footprint, Points, sample_points
 from framework.geometry.rays import Histogram, Rays, Samples
 from framework.kernels.intervals import interval_weights, proposal_excess, resample
 from framework.samplers.base import Sampler
@@ -103,12 +103,13 @@ class ProposalSampler(Sampler):
         nears, fars = self._ends(rays)
         samples = propose(
             replace(rays, nears=nears, fars=fars),
-            self.proposals,
+            [proposal.density for proposal in self.proposals],
             self.counts,
             self.scale if self.unbounded else None,
             jitter=jitter,
             power=self.power if self.training else 1.0,
             learning=learning,
+            footprints=[proposal.footprint for proposal in self.proposals],
         )
         if not self.endless:
             return samples
@@ -138,24 +139,26 @@ class ProposalSampler(Sampler):
 
 def propose(
     rays: Rays,
-    proposals: Sequence[Field],
+    densities: Sequence[DensityFunction],
     counts: Sequence[int],
     scale: float | None,
     *,
     jitter: bool,
     power: float,
     learning: bool,
+    footprints: Sequence[Footprint] | None = None,
 ) -> Samples:
     """Return samples that are drawn in levels, each from the weights of the level before.
 
     Args:
         rays: R rays, sampled from the near to the far end.
-        proposals: density field of each level but the last, which is asked about points of the size that it needs.
-        counts: intervals per ray of each level, followed by the number of samples per ray: one more than fields.
+        densities: density of each level but the last.
+        counts: intervals per ray of each level, followed by the number of samples per ray: one more than densities.
         scale: the distance up to which normalised distance is linear, as in `spacing`.
         jitter: True for random positions, False for fixed ones.
         power: exponent of the weights that are drawn from; less than 1 flattens them.
         learning: whether to keep the proposals' weights, gradients attached, in `Samples.proposals`.
+        footprints: kind of the points' size that each density needs; none if not given.
     """
     nears, fars = rays.nears, rays.fars
     count, device = len(rays), nears.device
@@ -165,10 +168,11 @@ def propose(
         edges = torch.cat([edges[:, :1], moved[:, 1:-1], edges[:, -1:]], dim=-1)
     histograms: list[Histogram] = []
     placed = spacing(nears, fars, scale)
-    for (num_intervals, num_next), proposal in zip(pairwise(counts), proposals, strict=True):
+    kinds = footprints or ["none"] * len(densities)
+    for (num_intervals, num_next), density, kind in zip(pairwise(counts), densities, kinds, strict=True):
         t = placed(edges)
         with torch.set_grad_enabled(learning):
-            sigma, _ = proposal.density(_points(rays, t, proposal))
+            sigma, _ = density(_points(rays, t, kind))
             weights = interval_weights(sigma.view(count, num_intervals), t)
         histograms.append(Histogram(edges, weights))
         shift = torch.rand(count, device=device) if jitter else torch.full((count,), 0.5, device=device)
@@ -228,12 +232,12 @@ def interlevel_loss(samples: Samples, weights: Tensor) -> Tensor:
     return torch.stack(losses).sum()
 
 
-def _points(rays: Rays, t: Tensor, field: Field) -> Points:
-    """Return the points of intervals with edges `t` (R, B + 1), as `field` needs them, without a gradient for rays."""
+def _points(rays: Rays, t: Tensor, footprint: Footprint) -> Points:
+    """Return the points of intervals with edges `t` (R, B + 1), with a footprint, and without a gradient for rays."""
     origins, directions = rays.origins.detach(), rays.directions.detach()
-    if field.footprint != "none":
+    if footprint != "none":
         detached = replace(rays, origins=origins, directions=directions)
-        return sample_points(detached, Samples.regular(t[:, :-1], t[:, 1:]), field.footprint)
+        return sample_points(detached, Samples.regular(t[:, :-1], t[:, 1:]), footprint)
     middles = (t[:, 1:] + t[:, :-1]) / 2
     positions = torch.addcmul(origins[:, None], directions[:, None], middles[..., None]).view(-1, 3)
     times = None if rays.times is None else rays.times.repeat_interleave(middles.shape[1])

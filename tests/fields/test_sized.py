@@ -65,7 +65,7 @@ def test_an_unsized_grid_is_the_limit_of_points(unbounded: bool) -> None:
 
 @pytest.mark.parametrize("unbounded", [False, True])
 def test_sizes_in_a_grid_are_in_its_units(unbounded: bool) -> None:
-    """A ball of a tenth of the box's edge around its middle: a tenth of the grid, or a twentieth where space fits too."""
+    """A ball of a tenth of the box's edge in its middle: a tenth of the grid, or a twentieth where all space fits."""
     field = SizedField(BOX * 5, grid(), unbounded=unbounded)
     ball = Points(torch.zeros(1, 3)).sized(1.0)
     assert field.deviations(ball).item() == pytest.approx(0.05 if unbounded else 0.1)

@@ -202,7 +202,9 @@ def test_intervals_divide_the_ray_and_the_field_is_its_own_coarse_level(count: i
     (points,) = field.asked
     assert points.variances is not None
     assert points.times is not None
-    torch.testing.assert_close(points.positions[:, 0], level.samples.t, rtol=1e-3, atol=1e-3)
+    assert bool(
+        ((points.positions[:, 0] > level.samples.t_starts) & (points.positions[:, 0] < level.samples.t_ends)).all()
+    )
     assert level.samples.sigma is not None
     assert level.samples.sigma.requires_grad
     assert not samples.t.requires_grad
@@ -222,10 +224,7 @@ def test_the_blur_is_a_maximum_and_then_a_mean() -> None:
     weights = torch.rand(20, 9, dtype=torch.float64)
     padded = torch.nn.functional.pad(weights, (1, 1), mode="replicate")
     truth = torch.tensor(
-        [
-            [(max(row[i], row[i + 1]) + max(row[i + 1], row[i + 2])) / 2 for i in range(9)]
-            for row in padded.tolist()
-        ],
+        [[(max(row[i], row[i + 1]) + max(row[i + 1], row[i + 2])) / 2 for i in range(9)] for row in padded.tolist()],
         dtype=torch.float64,
     )
     torch.testing.assert_close(blurred(weights), truth)

@@ -1,4 +1,4 @@
-"""Integrals over cones: roots of covariances, their contraction and the integrated encoding, against draws in float64."""
+"""Integrals over cones: roots of covariances, their contraction and the integrated encoding, against float64 draws."""
 
 import math
 
@@ -42,7 +42,9 @@ def test_frames_are_rotations_whose_first_column_is_the_axis(dtype: torch.dtype)
     found = frames(axes)
     assert torch.equal(found[:, :, 0], axes)
     tolerance = 1e-6 if dtype == torch.float32 else 1e-12
-    torch.testing.assert_close(found.mT @ found, torch.eye(3, dtype=dtype).expand(len(axes), 3, 3), atol=tolerance, rtol=0)
+    torch.testing.assert_close(
+        found.mT @ found, torch.eye(3, dtype=dtype).expand(len(axes), 3, 3), atol=tolerance, rtol=0
+    )
     torch.testing.assert_close(torch.linalg.det(found), torch.ones(len(axes), dtype=dtype), atol=tolerance, rtol=0)
 
 
@@ -121,7 +123,9 @@ def test_far_gaussians_keep_their_precision_in_float32() -> None:
     samples = Samples.regular(torch.full((40, 1), 1e3, dtype=F64), torch.full((40, 1), FARTHEST, dtype=F64))
     outcome = []
     for dtype in (torch.float32, F64):
-        some = Rays(*(value.to(dtype) for value in (rays.origins, axes)), pixel_radii=torch.full((40,), 1e-3, dtype=dtype))
+        some = Rays(
+            *(value.to(dtype) for value in (rays.origins, axes)), pixel_radii=torch.full((40,), 1e-3, dtype=dtype)
+        )
         kept = Samples(samples.t_starts.to(dtype), samples.t_ends.to(dtype), samples.offsets, per_ray=1)
         points = sample_points(some, kept, "gaussian")
         mean, root = contract_gaussians(points.positions, points.roots())
@@ -137,20 +141,18 @@ def test_far_gaussians_keep_their_precision_in_float32() -> None:
 
 @pytest.mark.entry(10)
 def test_the_encoding_is_the_mean_over_draws_and_so_is_its_gradient() -> None:
-    """Means, variances and their gradients, by draws that the parameters move; 5 standard errors."""
+    """Means, variances and their gradients, each draw with parameters of its own; 5 standard errors."""
     means = torch.tensor([[0.3, -1.2, 4.0], [0.0, 2.5, -0.1]], dtype=F64, requires_grad=True)
     deviations = torch.tensor([[0.5, 0.01, 0.2], [1e-3, 0.1, 1.0]], dtype=F64, requires_grad=True)
     found = integrated_encoding(means, deviations.square(), 5)
-    noise = normal(DRAWS, 2, 3)
-    drawn = frequency_encoding_reference(means + deviations * noise, 5, include_input=False)
+    count = DRAWS // 4
+    each = [values.detach().expand(count, 2, 3).clone().requires_grad_() for values in (means, deviations)]
+    drawn = frequency_encoding_reference(each[0] + each[1] * normal(count, 2, 3), 5, include_input=False)
     assert_like(found, drawn, drawn.std(0) + 1e-12)
     seeds = torch.where(normal(*found.shape, seed=2) > 0, 1.0, -1.0).to(F64)
     exact = torch.autograd.grad((found * seeds).sum(), (means, deviations))
-    groups = [(drawn[part] * seeds).sum((1, 2)).sum() / 1000 for part in torch.arange(DRAWS).split(1000)]
-    sampled = [torch.autograd.grad(group, (means, deviations), retain_graph=True) for group in groups]
-    for index in range(2):
-        values = torch.stack([gradient[index] for gradient in sampled])
-        assert_like(exact[index], values, values.std(0) + 1e-12)
+    for gradient, sampled in zip(exact, torch.autograd.grad((drawn * seeds).sum(), each), strict=True):
+        assert_like(gradient, sampled, sampled.std(0) + 1e-12)
 
 
 @pytest.mark.entry(10)
@@ -184,12 +186,12 @@ def test_the_encoding_of_cones_is_the_mean_over_points_in_them(contracted: bool,
     """Over the frustums' own points, of which Gaussians are an approximation, for waves longer than they are."""
     radii, generator = torch.tensor([0.02, 0.01], dtype=F64), torch.Generator().manual_seed(1)
     rays, samples = two_rays(radii)
-    encoding = IntegratedEncoding(BOX, 3, 1e-3, contracted, along).double()
+    encoding = IntegratedEncoding(BOX, 2, 1e-3, contracted, along).double()
     found = encoding(sample_points(rays, samples, "gaussian"))
     assert found.shape == (5, encoding.num_features)
     for index, owner in enumerate([0, 0, 1, 1, 1]):
         start, end = samples.t_starts[index].item(), samples.t_ends[index].item()
-        if contracted and end - start > 0.6:  # the derivative at the mean stands for all of it
+        if end - start > (0.6 if contracted else 1.6):  # the derivative at the mean stands for all of it
             continue
         axis = rays.directions[owner]
         local = drawn_in_frustum(start, end, radii[owner].item(), generator)
@@ -197,8 +199,8 @@ def test_the_encoding_of_cones_is_the_mean_over_points_in_them(contracted: bool,
         drawn = rays.origins[owner] + across + local[:, 2:] * axis
         unit = (drawn - BOX.mean(0)) / (BOX[1] - BOX[0]) * 2
         unit = contract(unit) if contracted else unit
-        waves = frequency_encoding_reference(unit if along is None else unit @ along.mT, 3, include_input=False)
-        assert (waves.mean(0) - found[index]).abs().max() < 0.06
+        waves = frequency_encoding_reference(unit if along is None else unit @ along.mT, 2, include_input=False)
+        assert (waves.mean(0) - found[index]).abs().max() < 0.03
 
 
 @pytest.mark.entry(10)
@@ -210,7 +212,9 @@ def test_directions_between_the_axes_tell_needles_from_balls() -> None:
     box = torch.tensor([[-1.0] * 3, [1.0] * 3], dtype=F64)
     # The covariances along the axes are what `sample_points` computes for such an axis: a third of 0.3 each.
     needle = Points(needle.positions, axes=axis, variances=needle.variances, covariances=ball.covariances)
-    along_axes, between = (IntegratedEncoding(box, 3, 1.0, False, each).double() for each in (None, icosahedron_directions()))
+    along_axes, between = (
+        IntegratedEncoding(box, 3, 1.0, False, each).double() for each in (None, icosahedron_directions())
+    )
     torch.testing.assert_close(along_axes(needle), along_axes(ball), atol=1e-6, rtol=0)
     assert (between(needle) - between(ball)).abs().max() > 0.1
 
@@ -221,7 +225,7 @@ def test_the_directions_are_those_of_an_icosahedron_divided_once() -> None:
     assert found.shape == (21, 3)
     torch.testing.assert_close(found.norm(dim=-1), torch.ones(21, dtype=F64))
     cosines = (found @ found.mT).abs().fill_diagonal_(0)
-    # The nearest are a corner and the middle of its edge, half of the 63.43 degrees between corners; no two are opposite.
+    # The nearest are a corner and the middle of its edge, half of the 63.43 degrees between corners.
     assert math.degrees(math.acos(cosines.max().item())) == pytest.approx(math.degrees(math.atan(2)) / 2, abs=1e-4)
     torch.testing.assert_close(found.mT @ found, 7 * torch.eye(3, dtype=F64), atol=1e-6, rtol=0)  # the same in each
 

@@ -175,16 +175,7 @@ def evaluate(
             rgb = (rgb * 255).round() / 255
         pair, kept = _judged(rgb, target, dataset.kept_of(index), half)
         measured = measure(*pair, kept)
-        rows.append(
-            {
-                "name": dataset.names[index],
-                "psnr": measured.psnr,
-                "ssim": measured.ssim,
-                "lpips": None if lpips is None else lpips(*pair),
-                "seconds": spent,
-            }
-            | ({} if dataset.reductions is None else {"reduction": int(dataset.reductions[index])})
-        )
+        rows.append(_row(dataset, index, measured, None if lpips is None else lpips(*pair), spent))
         seconds += spent
         rays += picture.num_rays
         if pictures is not None and (max_pictures is None or len(rows) <= max_pictures):
@@ -233,6 +224,18 @@ def spread(total: int, limit: int | None) -> list[int]:
     if limit is None or limit >= total:
         return list(range(total))
     return [index * total // limit for index in range(limit)]
+
+
+def _row(dataset: Dataset, index: int, measured: Measured, lpips: float | None, seconds: float) -> dict[str, Any]:
+    """Return what is reported of an image."""
+    row: dict[str, Any] = {
+        "name": dataset.names[index],
+        "psnr": measured.psnr,
+        "ssim": measured.ssim,
+        "lpips": lpips,
+        "seconds": seconds,
+    }
+    return row if dataset.reductions is None else {**row, "reduction": int(dataset.reductions[index])}
 
 
 def _by_size(rows: list[dict[str, Any]]) -> dict[str, Any]:

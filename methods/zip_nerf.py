@@ -25,7 +25,6 @@ from framework import (
     Rendered,
     Renderer,
     Sampler,
-    Samples,
     Scene,
 )
 from framework.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
@@ -35,8 +34,8 @@ from framework.cameras.refinement import PoseRefinement
 from framework.encodings.multisampled import MultisampledHashGrid
 from framework.fields.appearance import AFFINE, Appearance, exposed
 from framework.fields.multisampled import MultisampledDensity, MultisampledField
-from framework.kernels.compositing import distortion
 from framework.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
+from framework.rendering.losses import normalised_distortion
 from framework.samplers.choice import SamplingConfig, make_sampler, sampler_choice
 from framework.samplers.proposal import ProposalSampler, half_edge
 from framework.scene.reasons import LIGHT_REASONS, POSE_REASONS
@@ -176,8 +175,7 @@ class ZipNeRF(RayModel[ZipNeRFConfig]):
         samples, weights, mult = rendered.samples, rendered.weights, self.config.distortion_loss_mult
         if mult == 0 or samples is None or weights is None or samples.edges is None or not samples.num_rays:
             return {}
-        normalised = Samples.regular(samples.edges[:, :-1], samples.edges[:, 1:])
-        return {"distortion": mult * distortion(weights, normalised).mean()}
+        return {"distortion": mult * normalised_distortion(weights, samples)}
 
 
 def decide(config: ZipNeRFConfig, scene: Scene) -> tuple[ZipNeRFConfig, list[Decision]]:
@@ -223,10 +221,9 @@ def sampler(config: ZipNeRFConfig, scene: Scene) -> Sampler:
     made = ProposalSampler(
         scene.box,
         (*config.num_proposal_samples, config.num_nerf_samples),
-        config.proposal_resolutions,
-        scene.unbounded,
+        unbounded=scene.unbounded,
         endless=scene.unbounded and not scene.has_alpha,
-        make_density=proposal,
+        fields=[proposal(finest) for finest in config.proposal_resolutions],
         ladder=config.power_ladder,
         blurs=config.interlevel_blurs,
     )

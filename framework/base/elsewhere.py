@@ -7,7 +7,6 @@ _PLUGIN = "it is a plugin of nerfstudio (pip install git+https://github.com/{rep
 _GAUSSIANS = "here it is called 'gaussian-splatting'"
 _SURFACES = "no method here learns surfaces yet"
 _LARGER = "here it is 'nerfacto' with larger settings:"
-_MIP_NERF = "the authors' code is https://github.com/google/mipnerf; 'vanilla-nerf' comes closest here"
 
 ELSEWHERE: dict[str, str] = {
     "splatfacto": _GAUSSIANS,
@@ -24,8 +23,8 @@ ELSEWHERE: dict[str, str] = {
     "seathru-nerf": _PLUGIN.format(repository="AkerBP/seathru_nerf", name="seathru-nerf"),
     "tetra-nerf": "it is a plugin of nerfstudio; https://github.com/jkulhanek/tetra-nerf says how to install it",
     "zipnerf": "here it is called 'zip-nerf'",
-    "mip-nerf": _MIP_NERF,
-    "mipnerf": _MIP_NERF,
+    "mipnerf": "here it is called 'mip-nerf'",
+    "mipnerf360": "here it is called 'mip-nerf-360'",
     "nerf": "here it is called 'vanilla-nerf'",
     "instant-ngp-bounded": "here it is called 'instant-ngp', and the scene's profile says whether it is bounded",
     "nerfacto-big": f"{_LARGER} --max-resolution 4096 --log2-table-size 21 --hidden-width 128",

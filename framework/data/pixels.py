@@ -42,7 +42,7 @@ class PixelBatch:
     distances: Tensor | None = None
     """(R,) measured distance along the pixel's ray, 0 where unknown; None without depth images."""
     weights: Tensor | None = None
-    """(R,) factors of the pixels' losses, with mean 1, if the pixels were not drawn uniformly."""
+    """(R,) factors of the pixels' losses, with mean 1, if the pixels were not drawn uniformly or differ in size."""
 
     def __len__(self) -> int:
         return self.pixels.shape[0]
@@ -145,7 +145,8 @@ def draw_batch(
         return gather_batch(dataset, flat, behind, subpixels, stored)
     selected, weights = errors.choose(flat, count)
     stored = None if stored is None else stored[selected]
-    return replace(gather_batch(dataset, flat[selected], behind, subpixels, stored), weights=weights)
+    batch = gather_batch(dataset, flat[selected], behind, subpixels, stored)
+    return replace(batch, weights=weights if batch.weights is None else weights * batch.weights)
 
 
 def gather_batch(
@@ -171,7 +172,10 @@ def gather_batch(
     if dataset.opaque is not None:
         opaque = dataset.opaque.contains(flat)
         rgb, alpha = torch.where(opaque[:, None], rgb, behind), opaque * (1.0 if alpha is None else alpha)
-    return PixelBatch(flat, rays, rgb, behind, alpha, known_distances(dataset, flat, rays))
+    weights = None
+    if dataset.image_weights is not None and rays.camera_indices is not None:
+        weights = dataset.image_weights[rays.camera_indices[:: len(subpixels)]]
+    return PixelBatch(flat, rays, rgb, behind, alpha, known_distances(dataset, flat, rays), weights)
 
 
 def known_distances(dataset: Dataset, flat: Tensor, rays: Rays) -> Tensor | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor, nn
 
 from framework.base.optimised import Optimised
@@ -26,6 +27,8 @@ class HashGrid(nn.Module):
     """
 
     dims = 3
+    resolutions: Tensor
+    """(L,) cells along an axis, for each level."""
 
     def __init__(
         self,
@@ -43,6 +46,7 @@ class HashGrid(nn.Module):
         self.optimised = Optimised("tables", sparse=True) if sparse else None
         self.deferred = TableGradient(self.layout) if sparse else None
         self.num_features = num_levels * features_per_level
+        self.register_buffer("resolutions", torch.tensor(self.layout.resolutions), persistent=False)
 
     def forward(self, positions: Tensor) -> Tensor:
         """Return the features (N, L * F) at `positions` (N, 3) in [0, 1]."""

@@ -55,14 +55,15 @@ class ProposalSampler(Sampler):
         log2_table_size: maximum number of entries per level of the proposals' hash grids, as a power of two.
         num_levels: levels of the proposals' hash grids.
         anneal_steps: training steps over which the weights are annealed.
-        make_density: returns a proposal for cells along an axis at its finest level; by default a `DensityField` on a
-            hash grid with two features per entry.
+        fields: other density fields in place of hash grids; the last one serves all further levels too.
+        learn_every: interval of steps at which the proposals learn, after the first `ALWAYS_LEARN_UNTIL`.
         ladder: exponent of the power ladder by which distances of an unbounded scene are spaced; None for disparity.
         blurs: for each proposal, the radius of the box with which the samples' histogram is blurred before it is
             compared (Zip-NeRF's loss), in normalised distance; empty for the loss of mip-NeRF 360.
 
     Raises:
-        ValueError: if there is not one count more than there are resolutions, or not one blur for each.
+        ValueError: if there is not one count more than there are resolutions, more fields than levels, or not one blur
+            for each proposal.
     """
 
     box: Tensor
@@ -78,38 +79,41 @@ class ProposalSampler(Sampler):
         log2_table_size: int = 16,
         num_levels: int = 5,
         anneal_steps: int = 1000,
-        make_density: Callable[[int], Field] | None = None,
+        fields: Sequence[Field] | None = None,
+        learn_every: int = LEARN_EVERY,
         ladder: float | None = None,
         blurs: tuple[float, ...] = (),
     ) -> None:
         super().__init__()
-        if len(counts) != len(resolutions) + 1:
+        if fields is None and len(counts) != len(resolutions) + 1:
             raise ValueError(f"{len(counts)} counts for {len(resolutions)} proposals: one more is needed")
-        if blurs and len(blurs) != len(resolutions):
-            raise ValueError(f"{len(blurs)} blurs for {len(resolutions)} proposals: one for each is needed")
-        self.endless = endless
+        if fields is not None and not 1 <= len(fields) < len(counts):
+            raise ValueError(f"{len(fields)} density fields for {len(counts) - 1} proposals")
+        if blurs and len(blurs) != len(counts) - 1:
+            raise ValueError(f"{len(blurs)} blurs for {len(counts) - 1} proposals: one for each is needed")
+        self.endless, self.learn_every = endless, learn_every
         self.counts, self.unbounded, self.anneal_steps = counts, unbounded, anneal_steps
         self.scale = half_edge(box)
         self.ladder, self.blurs = ladder, blurs
         self.register_buffer("box", box.clone())
-
-        def on_hash_grid(finest: int) -> Field:
-            return DensityField(box, HashGrid(num_levels, 2, 16, finest, log2_table_size), unbounded=unbounded)
-
-        self.fields = nn.ModuleList(map(make_density or on_hash_grid, resolutions))
+        if fields is None:
+            grids = [HashGrid(num_levels, 2, 16, finest, log2_table_size) for finest in resolutions]
+            fields = [DensityField(box, grid, unbounded=unbounded) for grid in grids]
+        self.fields = nn.ModuleList(fields)
         self.power = 1.0
         self.learning = False
 
     @property
     def proposals(self) -> list[Field]:
         """The density fields, in the order in which they are evaluated."""
-        return [field for field in self.fields if isinstance(field, Field)]
+        fields = [field for field in self.fields if isinstance(field, Field)]
+        return fields + fields[-1:] * (len(self.counts) - 1 - len(fields))
 
     def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
         """Return the samples of the last level, with the proposals' gradients attached in steps in which they learn."""
         learning = self.learning and self.training and torch.is_grad_enabled()
         nears, fars = self._ends(rays)
-        return propose(
+        samples = propose(
             replace(rays, nears=nears, fars=fars),
             [proposal.density for proposal in self.proposals],
             self.counts,
@@ -117,16 +121,22 @@ class ProposalSampler(Sampler):
             jitter=jitter,
             power=self.power if self.training else 1.0,
             learning=learning,
-            endless=self.endless,
             ladder=self.ladder,
             footprints=[proposal.footprint for proposal in self.proposals],
         )
+        if not self.endless:
+            return samples
+        if field.footprint in ("gaussian", "frustum"):  # before the last interval is endless: that would be at infinity
+            samples = samples.evaluated(*field.density(sample_points(rays, samples, field.footprint)))
+        ends = samples.padded(samples.t_ends).clone()
+        ends[:, -1] = FARTHEST
+        return replace(samples, t_ends=ends.view(-1))
 
     def update(self, step: int, density: DensityFunction) -> None:
         """Set the exponent of the annealing, and whether the proposals learn in this step."""
         x = min(step / max(self.anneal_steps, 1), 1.0)
         self.power = ANNEALING_SLOPE * x / ((ANNEALING_SLOPE - 1) * x + 1)
-        self.learning = step < ALWAYS_LEARN_UNTIL or step % LEARN_EVERY == 0
+        self.learning = step < ALWAYS_LEARN_UNTIL or step % self.learn_every == 0
 
     def losses(self, samples: Samples, weights: Tensor) -> dict[str, Tensor]:
         return {"interlevel": interlevel_loss(samples, weights, self.blurs)} if samples.proposals else {}
@@ -149,7 +159,6 @@ def propose(
     jitter: bool,
     power: float,
     learning: bool,
-    endless: bool,
     ladder: float | None = None,
     footprints: Sequence[Footprint] | None = None,
 ) -> Samples:
@@ -163,9 +172,8 @@ def propose(
         jitter: True for random positions, False for fixed ones.
         power: exponent of the weights that are drawn from; less than 1 flattens them.
         learning: whether to keep the proposals' weights, gradients attached, in `Samples.proposals`.
-        endless: whether the last interval ends at `FARTHEST`.
         ladder: exponent of the power ladder, as in `spacing`.
-        footprints: kind of the points' size that each density needs; None if none needs any.
+        footprints: kind of the points' size that each density needs; none if not given.
     """
     nears, fars = rays.nears, rays.fars
     count, device = len(rays), nears.device
@@ -173,33 +181,23 @@ def propose(
     if jitter:  # the inner edges move together by up to half an interval either way
         moved = edges + (torch.rand(count, 1, device=device) - 0.5) / counts[0]
         edges = torch.cat([edges[:, :1], moved[:, 1:-1], edges[:, -1:]], dim=-1)
-    proposals: list[Histogram] = []
+    histograms: list[Histogram] = []
     placed = spacing(nears, fars, scale, ladder)
     kinds = footprints or ["none"] * len(densities)
-    for (num_intervals, num_next), density, footprint in zip(pairwise(counts), densities, kinds, strict=True):
+    for (num_intervals, num_next), density, kind in zip(pairwise(counts), densities, kinds, strict=True):
         t = placed(edges)
-        middles = (t[:, 1:] + t[:, :-1]) / 2
         with torch.set_grad_enabled(learning):
-            if footprint == "none":
-                times = None if rays.times is None else rays.times.repeat_interleave(num_intervals)
-                points = Points(_positions(rays, middles), times)
-            else:
-                still = replace(rays, origins=rays.origins.detach(), directions=rays.directions.detach())
-                points = sample_points(still, Samples.regular(t[:, :-1], t[:, 1:], middles), footprint)
-            sigma, _ = density(points)
-            weights = interval_weights(sigma.view(middles.shape), t)
-        proposals.append(Histogram(edges, weights))
+            sigma, _ = density(_points(rays, t, kind))
+            weights = interval_weights(sigma.view(count, num_intervals), t)
+        histograms.append(Histogram(edges, weights))
         shift = torch.rand(count, device=device) if jitter else torch.full((count,), 0.5, device=device)
         edges = resample(edges, weights.detach(), shift, num_next, power, PADDING / num_intervals)
     t = placed(edges)
-    ends = t[:, 1:]
-    if endless:
-        ends = torch.cat([ends[:, :-1], torch.full_like(ends[:, :1], FARTHEST)], dim=-1)
     return replace(
-        Samples.regular(t[:, :-1], ends, (t[:, 1:] + t[:, :-1]) / 2),
+        Samples.regular(t[:, :-1], t[:, 1:], (t[:, 1:] + t[:, :-1]) / 2),
         owners=torch.arange(count, device=device).repeat_interleave(counts[-1]),
         edges=edges,
-        proposals=tuple(proposals) if learning else (),
+        proposals=tuple(histograms) if learning else (),
     )
 
 
@@ -298,7 +296,13 @@ def interlevel_loss(samples: Samples, weights: Tensor, blurs: Sequence[float] = 
     return torch.stack(losses).sum()
 
 
-def _positions(rays: Rays, t: Tensor) -> Tensor:
-    """Return positions (R * B, 3) at distances `t` (R, B), without a gradient for the rays."""
+def _points(rays: Rays, t: Tensor, footprint: Footprint) -> Points:
+    """Return the points of intervals with edges `t` (R, B + 1), with a footprint, and without a gradient for rays."""
     origins, directions = rays.origins.detach(), rays.directions.detach()
-    return torch.addcmul(origins[:, None], directions[:, None], t[..., None]).view(-1, 3)
+    if footprint != "none":
+        detached = replace(rays, origins=origins, directions=directions)
+        return sample_points(detached, Samples.regular(t[:, :-1], t[:, 1:]), footprint)
+    middles = (t[:, 1:] + t[:, :-1]) / 2
+    positions = torch.addcmul(origins[:, None], directions[:, None], middles[..., None]).view(-1, 3)
+    times = None if rays.times is None else rays.times.repeat_interleave(middles.shape[1])
+    return Points(positions, times)

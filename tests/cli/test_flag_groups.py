@@ -17,7 +17,9 @@ from framework.cli.train import run_of
 from framework.samplers.choice import SamplingConfig
 from tests.cli.helpers import called
 
-METHODS = ("dnerf", "instant-ngp", "kplanes", "nerfacto", "tensorf", "vanilla-nerf", "zip-nerf")
+METHODS = (
+    "dnerf", "instant-ngp", "kplanes", "mip-nerf", "mip-nerf-360", "nerfacto", "tensorf", "vanilla-nerf", "zip-nerf",
+)  # fmt: skip
 FORMATS = ("blender", "colmap", "dnerf", "llff", "nerfstudio", "phototourism", "polycam", "record3d")
 Capture = pytest.CaptureFixture[str]
 

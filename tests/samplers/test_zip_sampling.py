@@ -100,7 +100,7 @@ def test_a_density_gets_the_footprint_that_it_asks_for(footprint: str) -> None:
     """Of the intervals whose weights it makes, with their times, and without a gradient to the rays."""
     plain, sized = Fog("none"), Fog(footprint)
     samples = propose(
-        rays(5), [plain.density, sized.density], (8, 6, 4), 1.0, jitter=False, power=1.0, learning=True, endless=False,
+        rays(5), [plain.density, sized.density], (8, 6, 4), 1.0, jitter=False, power=1.0, learning=True,
         footprints=[plain.footprint, sized.footprint],
     )  # fmt: skip
     assert (plain.seen[0].radii, plain.seen[0].frustums) == (None, None)
@@ -134,15 +134,21 @@ def test_the_blurred_loss_is_the_mean_over_rays_of_all_proposals() -> None:
     assert interlevel_loss(samples, weights.flatten()).item() != pytest.approx(truth.item(), rel=1e-2)
 
 
-def test_a_sampler_makes_the_proposals_that_it_is_given() -> None:
-    made = []
-
-    def make(finest: int) -> Field:
-        made.append(finest)
-        return Fog("none")
-
-    sampler = ProposalSampler(BOX, (8, 6, 4), (32, 64), make_density=make, ladder=-1.5, blurs=(0.1, 0.2))
-    assert made == [32, 64]
-    assert all(isinstance(proposal, Fog) for proposal in sampler.proposals)
+def test_one_blur_for_each_proposal_is_needed() -> None:
+    fields = [Fog("none"), Fog("none")]
+    sampler = ProposalSampler(BOX, (8, 6, 4), fields=fields, ladder=-1.5, blurs=(0.1, 0.2))
+    assert (sampler.ladder, sampler.blurs) == (-1.5, (0.1, 0.2))
     with pytest.raises(ValueError, match="1 blurs for 2 proposals"):
-        ProposalSampler(BOX, (8, 6, 4), (32, 64), blurs=(0.1,))
+        ProposalSampler(BOX, (8, 6, 4), fields=fields, blurs=(0.1,))
+
+
+def test_frustums_end_before_an_endless_interval_does() -> None:
+    """They are evaluated where the ray's far end is, since at infinity they would have no place."""
+    field = Fog("frustum")
+    sampler = ProposalSampler(BOX, (8, 6, 4), fields=[Fog("none"), Fog("none")], unbounded=True, endless=True)
+    samples = sampler.sample(rays(5), field, jitter=False)
+    assert samples.sigma is not None
+    assert samples.padded(samples.t_ends)[:, -1].tolist() == [1e10] * 5
+    (points,) = field.seen
+    assert points.frustums is not None
+    assert points.frustums.t_ends.max().item() <= 4.001

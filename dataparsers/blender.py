@@ -20,6 +20,9 @@ TRANSFORMS = "transforms_train.json"
 SMALLEST_ANGLE = 1e-6
 """Minimum field of view, radians; for a smaller one the focal length exceeds the range of float32."""
 
+MOST_SCALES = 8
+"""Maximum number of sizes of an image; at the eighth, a pixel is the mean of 16,384."""
+
 
 @dataclass(frozen=True)
 class Blender(DataParser):
@@ -35,6 +38,9 @@ class Blender(DataParser):
     """Distance from a camera at which the scene starts, in the input's units."""
     far: float = 6.0
     """Distance from a camera at which the scene ends, in the input's units."""
+    multiscale: int = 1
+    """Number of sizes at which each image is used, 1, 1/2, 1/4, ..., with a loss weighted by the area of pixels; 4 is
+    Mip-NeRF's multiscale protocol."""
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
@@ -46,6 +52,8 @@ class Blender(DataParser):
             raise DataError("the blender format needs a folder: --data DIR")
         if self.downscale_factor < 1:
             raise DataError(f"--downscale-factor is {self.downscale_factor}; it must be an integer of at least 1")
+        if not 1 <= self.multiscale <= MOST_SCALES:
+            raise DataError(f"--multiscale is {self.multiscale}; it must be from 1 to {MOST_SCALES}")
         file = path / f"transforms_{split}.json"
         content = read_json(file)
         frames = content.get("frames")
@@ -65,6 +73,7 @@ class Blender(DataParser):
             times=read_times(frames, labels),
             scale=self.scale_factor,
             downscale_factor=self.downscale_factor,
+            num_scales=self.multiscale,
         )
         return scene[keep]
 

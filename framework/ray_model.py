@@ -54,6 +54,8 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
     """
 
     batches: ClassVar[Literal["pixels", "views"]] = "pixels"
+    coarse_weight: ClassVar[float] = 1.0
+    """Weight of the loss of a coarse level that is supervised too."""
 
     def __init__(self, config: RayConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer) -> None:
         super().__init__(config, scene)
@@ -70,7 +72,7 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
         return self.renderer.render(rays, samples, self.field, background)
 
     def loss(self, batch: PixelBatch, step: int) -> Loss:
-        """Return the mean squared error of the pixels' colours, that of depths, the sampler's, and `regularizers`.
+        """Return the error of the pixels' colours (`color_error`), that of depths, the sampler's, and `regularizers`.
 
         Args:
             batch: pixels with their true colours.
@@ -79,10 +81,10 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
         per_pixel = batch.rays_per_pixel
         rendered = self.render(batch.rays, batch.background.repeat_interleave(per_pixel, 0))
         pixels = rendered.to_pixels(per_pixel)
-        terms = {"rgb": mean_squared_error(pixels.rgb, batch.rgb, batch.weights)}
+        terms = {"rgb": self.color_error(pixels.rgb, batch)}
         if rendered.coarse is not None:
             coarse = rendered.coarse.to_pixels(per_pixel)
-            terms["rgb_coarse"] = mean_squared_error(coarse.rgb, batch.rgb, batch.weights)
+            terms["rgb_coarse"] = self.coarse_weight * self.color_error(coarse.rgb, batch)
         if rendered.samples is not None and rendered.weights is not None:
             terms |= self.sampler.losses(rendered.samples, rendered.weights)
         terms |= self._depth_terms(rendered, batch)
@@ -103,6 +105,15 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
             matter = matter_before(rendered.weights, rendered.samples, clear)
             terms["free_space"] = self.config.free_space_loss_mult * matter
         return terms
+
+    def color_error(self, rgb: Tensor, batch: PixelBatch) -> Tensor:
+        """Return the error () of colours; the mean of squares by default.
+
+        Args:
+            rgb: (R, 3) rendered colours of the batch's pixels.
+            batch: the pixels, with their colours and weights.
+        """
+        return mean_squared_error(rgb, batch.rgb, batch.weights)
 
     def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
         """Return further terms of the loss by name, each a scalar; none by default.

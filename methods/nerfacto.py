@@ -36,8 +36,9 @@ from framework.encodings.hash_grid import HashGrid
 from framework.fields.appearance import Appearance
 from framework.fields.encoded import NUM_FEATURES, EncodedField
 from framework.fields.normals import NormalHead, density_normals, normal_penalties
-from framework.kernels.compositing import distortion, ray_sum
+from framework.kernels.compositing import ray_sum
 from framework.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
+from framework.rendering.losses import normalised_distortion
 from framework.rendering.volume import VolumeRenderer, shade
 from framework.samplers.choice import SamplingConfig, make_sampler, sampler_choice
 from framework.samplers.proposal import half_edge
@@ -202,8 +203,7 @@ class Nerfacto(RayModel[NerfactoConfig]):
         if samples is None or weights is None or not samples.num_rays:
             return losses
         if config.distortion_loss_mult > 0 and samples.edges is not None:
-            normalised = Samples.regular(samples.edges[:, :-1], samples.edges[:, 1:])
-            losses["distortion"] = config.distortion_loss_mult * distortion(weights, normalised).mean()
+            losses["distortion"] = config.distortion_loss_mult * normalised_distortion(weights, samples)
         for name, penalty in rendered.penalties.items():
             losses[name] = (config.orientation_loss_mult if name == "orientation" else 1.0) * penalty.mean()
         return losses

@@ -112,7 +112,7 @@ def sample_proposals(
         _check_ends(rays)
     densities = [as_density(sigma_fn) for sigma_fn in sigma_fns]
     learning = torch.is_grad_enabled()
-    return propose(rays, densities, counts, scale, jitter=jitter, power=power, learning=learning, endless=False)
+    return propose(rays, densities, counts, scale, jitter=jitter, power=power, learning=learning)
 
 
 def _check_ends(rays: Rays) -> None:

@@ -41,9 +41,8 @@ def choose_device(machine: MachineConfig) -> torch.device:
         torch.set_num_threads(machine.num_threads)
     elif several.local_count > 1:  # torchrun has set it to 1
         torch.set_num_threads(max(num_cores() // several.local_count, 1))
-    available = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
-    kind = ("cuda" if available["cuda"] else "cpu") if machine.device_type == "auto" else machine.device_type
-    if not available[kind]:
+    kind = device_kind(machine)
+    if kind != "cpu" and not {"cuda": torch.cuda, "mps": torch.backends.mps}[kind].is_available():
         raise ConfigError(f"--machine.device-type {kind}: this machine or this torch has none")
     if kind != "cuda" or several.count == 1:
         return torch.device(kind)
@@ -52,6 +51,13 @@ def choose_device(machine: MachineConfig) -> torch.device:
         raise ConfigError(f"this machine has {found}; --nproc-per-node must not be more")
     torch.cuda.set_device(several.local_rank)
     return torch.device(kind, several.local_rank)
+
+
+def device_kind(machine: MachineConfig) -> str:
+    """Return the kind of device that `machine` asks for, whether or not there is one: "cpu", "cuda" or "mps"."""
+    if machine.device_type != "auto":
+        return machine.device_type
+    return "cuda" if torch.cuda.is_available() else "cpu"
 
 
 def num_cores() -> int:

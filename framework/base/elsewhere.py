@@ -7,8 +7,6 @@ _PLUGIN = "it is a plugin of nerfstudio (pip install git+https://github.com/{rep
 _GAUSSIANS = "here it is called 'gaussian-splatting'"
 _SURFACES = "no method here learns surfaces yet"
 _LARGER = "here it is 'nerfacto' with larger settings:"
-_ZIP_NERF = "the authors' code is https://github.com/jonbarron/camp_zipnerf; 'nerfacto' comes closest here"
-_MIP_NERF = "the authors' code is https://github.com/google/mipnerf; 'vanilla-nerf' comes closest here"
 
 ELSEWHERE: dict[str, str] = {
     "splatfacto": _GAUSSIANS,
@@ -24,10 +22,9 @@ ELSEWHERE: dict[str, str] = {
     "pynerf": _PLUGIN.format(repository="hturki/pynerf", name="pynerf"),
     "seathru-nerf": _PLUGIN.format(repository="AkerBP/seathru_nerf", name="seathru-nerf"),
     "tetra-nerf": "it is a plugin of nerfstudio; https://github.com/jkulhanek/tetra-nerf says how to install it",
-    "zip-nerf": _ZIP_NERF,
-    "zipnerf": _ZIP_NERF,
-    "mip-nerf": _MIP_NERF,
-    "mipnerf": _MIP_NERF,
+    "zipnerf": "here it is called 'zip-nerf'",
+    "mipnerf": "here it is called 'mip-nerf'",
+    "mipnerf360": "here it is called 'mip-nerf-360'",
     "nerf": "here it is called 'vanilla-nerf'",
     "instant-ngp-bounded": "here it is called 'instant-ngp', and the scene's profile says whether it is bounded",
     "nerfacto-big": f"{_LARGER} --max-resolution 4096 --log2-table-size 21 --hidden-width 128",

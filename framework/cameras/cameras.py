@@ -84,13 +84,13 @@ class Cameras:
         changed: dict[str, Any] = {name: change(value) for name, value in values.items() if isinstance(value, Tensor)}
         return replace(self, **changed)
 
-    def scaled(self, factor: float) -> Cameras:
+    def scaled(self, factor: float | Tensor) -> Cameras:
         """Return the cameras of resized images.
 
         Sizes are rounded down, as those of images reduced by an integer factor are.
 
         Args:
-            factor: new size over old size; 2.0 doubles the width.
+            factor: new size over old size, of all cameras or (M,) of each; 2.0 doubles the width.
         """
         intrinsics = {name: getattr(self, name) * factor for name in ("fx", "fy", "cx", "cy")}
         sizes = {name: (getattr(self, name) * factor + 1e-6).long() for name in ("widths", "heights")}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -59,6 +60,8 @@ class ParsedScene:
     """Scene units per unit of the input."""
     downscale_factor: int = 1
     """Integer factor by which images are reduced when they are loaded."""
+    num_scales: int = 1
+    """Number of sizes at which each image is used: the loaded one, and then 1/2, 1/4, ... of it."""
     mask_paths: tuple[Path | None, ...] | None = None
     """M mask files, white for pixels to train on and black for others; None for an image without mask."""
     points: Tensor | None = None
@@ -149,9 +152,23 @@ class Dataset:
     """(K, 3) sparse points on surfaces, scene coordinates; None if there are none."""
     sparse_depth: SparseDepth | None = None
     """Pixels in which images see sparse points, and their distances; None if there are none."""
+    reductions: Tensor | None = None
+    """(M,) int64 factor by which each image is smaller than it could be, if images are used at several sizes."""
 
     def __len__(self) -> int:
         return len(self.cameras)
+
+    @cached_property
+    def image_weights(self) -> Tensor | None:
+        """(M,) weight of each image's pixels in a loss, if images are at several sizes: with mean 1 over all pixels.
+
+        A pixel of an image at 1/s of its size stands for s^2 pixels: Mip-NeRF (Barron et al. 2021), section 4.
+        """
+        if self.reductions is None:
+            return None
+        areas = self.reductions.float().square()
+        counts = (self.cameras.widths * self.cameras.heights).to(areas)
+        return areas * (counts.sum() / (areas * counts).sum())
 
     @property
     def device(self) -> torch.device:
@@ -214,6 +231,7 @@ class Dataset:
             opaque=None if self.opaque is None else self.opaque.to(device),
             depths=None if self.depths is None else self.depths.to(device),
             sparse_depth=None if self.sparse_depth is None else self.sparse_depth.to(device),
+            reductions=None if self.reductions is None else self.reductions.to(device),
         )
 
 
@@ -254,14 +272,21 @@ def load_dataset(
     Raises:
         DataError: if an image's size differs from its camera's, or no image is readable.
     """
-    factor = parsed.downscale_factor
-    cameras = parsed.cameras if factor == 1 else parsed.cameras.scaled(1 / factor)
+    count = len(parsed.image_paths)
+    reductions = 2 ** torch.arange(parsed.num_scales).repeat_interleave(count)  # all images at one size, then the next
+    if parsed.num_scales > 1:
+        parsed = parsed[torch.arange(count).repeat(parsed.num_scales)]
+    factors = parsed.downscale_factor * reductions
+    cameras = parsed.cameras if int(factors.max()) == 1 else parsed.cameras.scaled(1 / factors)
     sizes = tuple(zip(cameras.widths.tolist(), cameras.heights.tolist(), strict=True))
     mask_paths = parsed.mask_paths or (None,) * len(parsed.image_paths)
-    files = ImageFiles(split, parsed.image_paths, mask_paths, sizes, factor)
+    files = ImageFiles(split, parsed.image_paths, mask_paths, sizes, tuple(factors.tolist()))
     decoded = decode(files, memory or PixelMemory.of())
-    parsed = replace(parsed, cameras=cameras, downscale_factor=1)
-    return assemble(parsed if len(decoded.left) == len(sizes) else parsed[decoded.left], decoded, split, masks)
+    several = parsed.num_scales > 1
+    parsed = replace(parsed, cameras=cameras, downscale_factor=1, num_scales=1)
+    parsed = parsed if len(decoded.left) == len(sizes) else parsed[decoded.left]
+    dataset = assemble(parsed, decoded, split, masks)
+    return replace(dataset, reductions=reductions[decoded.left]) if several else dataset
 
 
 def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "ignored") -> Dataset:

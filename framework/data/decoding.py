@@ -10,7 +10,7 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import accumulate
+from itertools import accumulate, chain
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from framework.base.console import say, track
 from framework.base.errors import DataError
-from framework.data.image_files import may_be_transparent, read_image
+from framework.data.image_files import may_be_transparent, read_image, reduce_image
 from framework.data.light import light_of
 from framework.data.mapped_pixels import MappedPixels
 from framework.data.masks import read_mask
@@ -46,8 +46,8 @@ class ImageFiles:
     """M paths of masks; None for an image without mask."""
     sizes: tuple[tuple[int, int], ...]
     """M widths and heights after reduction, pixels."""
-    factor: int
-    """Integer factor by which images are reduced."""
+    factors: tuple[int, ...]
+    """M integer factors by which images are reduced."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def decode(files: ImageFiles, memory: PixelMemory) -> Decoded:
         facts = _fill(files, store, channels)
         shape = int(facts["pixels"]), int(facts["channels"])
         return _decoded(files, facts, torch.from_numpy(store.finish(shape[0] * shape[1])).view(shape), None)
-    numbers = [files.factor, *(side for sides in files.sizes for side in sides)]
+    numbers = [*sorted(set(files.factors)), *(side for sides in files.sizes for side in sides)]
     path = cache_path(memory.folder, [*files.images, *files.masks], numbers)
     cached = unpack(path)
     if cached is None:
@@ -165,11 +165,16 @@ def _fill(files: ImageFiles, store: PixelStore, channels: int) -> dict[str, np.n
     counts = [width * height for width, height in files.sizes]
     starts = [0, *accumulate(counts)]
 
-    def put(index: int) -> _Image | DataError:
-        return _decode_one(files, index, store, starts[index], channels)
+    def put(indices: list[int]) -> list[_Image | DataError]:
+        return _decode_one(files, indices, store, starts, channels)
 
+    same: dict[Path, list[int]] = {}
+    for index, path in enumerate(files.images):
+        same.setdefault(path, []).append(index)
     with ThreadPoolExecutor(WORKERS) as pool:
-        images = list(track(pool.map(put, range(len(counts))), f"Loading {files.split} images", total=len(counts)))
+        groups = track(pool.map(put, same.values()), f"Loading {files.split} images", total=len(same))
+        found = dict(zip(chain(*same.values()), chain(*groups), strict=True))
+    images = [found[index] for index in range(len(counts))]
     failures = [image for image in images if isinstance(image, DataError)]
     if len(failures) == len(images):
         reason = f"has no readable image: {failures[0]}" if failures else "is empty"
@@ -211,22 +216,32 @@ def _kept_runs(files: ImageFiles, left: dict[int, _Image], total: int) -> dict[s
     return runs if used < total else {}
 
 
-def _decode_one(files: ImageFiles, index: int, store: PixelStore, start: int, channels: int) -> _Image | DataError:
-    """Decode an image to its position in the store; return the error if it is unreadable."""
-    path, mask_path, (width, height) = files.images[index], files.masks[index], files.sizes[index]
+def _decode_one(
+    files: ImageFiles, indices: list[int], store: PixelStore, starts: list[int], channels: int
+) -> list[_Image | DataError]:
+    """Decode a file to the positions of its images in the store; return its error for each if it is unreadable."""
+    path = files.images[indices[0]]
+    images: list[_Image | DataError] = []
     try:
-        image = read_image(path, files.factor)
+        whole = read_image(path)
+        reduced = [
+            whole if files.factors[index] == 1 else reduce_image(whole, files.factors[index]) for index in indices
+        ]
     except DataError as error:
-        return error
-    if image.shape[:2] != (height, width):
-        actual = f"{image.shape[1] * files.factor}x{image.shape[0] * files.factor}"
-        expected = f"{width * files.factor}x{height * files.factor}"
-        remedy = "resize it, or remove it from the data"
-        raise DataError(f"{path} is {actual} pixels, but its camera is for {expected}: {remedy}")
-    mask = None if mask_path is None else read_mask(mask_path, width, height)
-    store.write(start * channels, np.ascontiguousarray(image[..., :channels]).reshape(-1))
-    opaque = channels == 3 or bool((image[..., 3] == 255).all())
-    return _Image(opaque, light_of(image, mask), None if mask is None else PixelSet.of_mask(torch.from_numpy(mask)))
+        return [error] * len(indices)
+    for index, image in zip(indices, reduced, strict=True):
+        (width, height), factor, mask_path = files.sizes[index], files.factors[index], files.masks[index]
+        if image.shape[:2] != (height, width):
+            actual = f"{image.shape[1] * factor}x{image.shape[0] * factor}"
+            expected = f"{width * factor}x{height * factor}"
+            remedy = "resize it, or remove it from the data"
+            raise DataError(f"{path} is {actual} pixels, but its camera is for {expected}: {remedy}")
+        mask = None if mask_path is None else read_mask(mask_path, width, height)
+        store.write(starts[index] * channels, np.ascontiguousarray(image[..., :channels]).reshape(-1))
+        opaque = channels == 3 or bool((image[..., 3] == 255).all())
+        kept = None if mask is None else PixelSet.of_mask(torch.from_numpy(mask))
+        images.append(_Image(opaque, light_of(image, mask), kept))
+    return images
 
 
 def _decoded(files: ImageFiles, facts: dict[str, np.ndarray], pixels: Tensor, mapped: MappedPixels | None) -> Decoded:

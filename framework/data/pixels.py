@@ -47,7 +47,7 @@ class PixelBatch:
     clear: Tensor | None = None
     """(R,) distance before which the pixel's image shows nothing; None if that is not known."""
     weights: Tensor | None = None
-    """(R,) factors of the pixels' losses, with mean 1, if the pixels were not drawn uniformly."""
+    """(R,) factors of the pixels' losses, with mean 1, if the pixels were not drawn uniformly or differ in size."""
 
     def __len__(self) -> int:
         return self.pixels.shape[0]
@@ -157,13 +157,19 @@ def draw_batch(
         flat, stored = flat[selected], None if stored is None else stored[selected]
         weights = torch.cat([weights, weights.new_ones(keypoints)])
     if not keypoints or sparse is None:
-        return replace(gather_batch(dataset, flat, behind, subpixels, stored), weights=weights)
-    chosen = torch.randint(len(sparse), (keypoints,), device=dataset.device)
-    if dataset.mapped is not None and stored is not None:
-        stored = torch.cat([stored, dataset.mapped.look_up(sparse.pixels[chosen].cpu()).to(stored)])
-    batch = gather_batch(dataset, torch.cat([flat, sparse.pixels[chosen]]), behind, subpixels, stored)
-    known = [torch.cat([values.new_zeros(uniform), values[chosen]]) for values in (sparse.distances, sparse.deviations)]
-    return replace(batch, weights=weights, distances=known[0], deviations=known[1])
+        batch = gather_batch(dataset, flat, behind, subpixels, stored)
+    else:
+        chosen = torch.randint(len(sparse), (keypoints,), device=dataset.device)
+        if dataset.mapped is not None and stored is not None:
+            stored = torch.cat([stored, dataset.mapped.look_up(sparse.pixels[chosen].cpu()).to(stored)])
+        batch = gather_batch(dataset, torch.cat([flat, sparse.pixels[chosen]]), behind, subpixels, stored)
+        distances, deviations = (
+            torch.cat([values.new_zeros(uniform), values[chosen]]) for values in (sparse.distances, sparse.deviations)
+        )
+        batch = replace(batch, distances=distances, deviations=deviations)
+    if weights is None:
+        return batch
+    return replace(batch, weights=weights if batch.weights is None else weights * batch.weights)
 
 
 def gather_batch(
@@ -189,7 +195,10 @@ def gather_batch(
     if dataset.opaque is not None:
         opaque = dataset.opaque.contains(flat)
         rgb, alpha = torch.where(opaque[:, None], rgb, behind), opaque * (1.0 if alpha is None else alpha)
-    return PixelBatch(flat, rays, rgb, behind, alpha, known_distances(dataset, flat, rays))
+    weights = None
+    if dataset.image_weights is not None and rays.camera_indices is not None:
+        weights = dataset.image_weights[rays.camera_indices[:: len(subpixels)]]
+    return PixelBatch(flat, rays, rgb, behind, alpha, known_distances(dataset, flat, rays), weights)
 
 
 def known_distances(dataset: Dataset, flat: Tensor, rays: Rays) -> Tensor | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor, nn
 
 from framework.base.optimised import Optimised
@@ -31,6 +32,8 @@ class HashGrid(nn.Module):
     """
 
     dims = 3
+    resolutions: Tensor
+    """(L,) cells along an axis, for each level."""
 
     def __init__(
         self,
@@ -50,6 +53,7 @@ class HashGrid(nn.Module):
         self.deferred = TableGradient(self.layout) if sparse else None
         self.opening = Opening(num_levels, min(FIRST_LEVELS, num_levels)) if opening else None
         self.num_features = num_levels * features_per_level
+        self.register_buffer("resolutions", torch.tensor(self.layout.resolutions), persistent=False)
 
     def forward(self, positions: Tensor) -> Tensor:
         """Return the features (N, L * F) at `positions` (N, 3) in [0, 1]."""

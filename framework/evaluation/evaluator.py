@@ -137,9 +137,10 @@ class Evaluation:
     """Metrics of a set of images."""
 
     per_image: list[dict[str, Any]]
-    """Name, psnr, ssim, lpips, floaters and rendering seconds of each image."""
+    """Name, psnr, ssim, lpips, floaters and rendering seconds of each image, and its reduction if images have several
+    sizes."""
     results: dict[str, Any]
-    """Means, standard deviations and rendering speed, with nerfstudio's keys."""
+    """Means, standard deviations and rendering speed, with nerfstudio's keys; by_size, those of images of each size."""
     lpips_note: str
     """Network of LPIPS, or the reason why it is absent."""
     eval_appearance: Literal["mean", "half"] | None = None
@@ -154,7 +155,10 @@ class Evaluation:
         before = "" if r["floaters"] is None else f"  floaters {r['floaters']:.1f} %"
         rays = r["num_rays_per_sec"]  # 0 of a method that casts none
         speed = f"{rays / 1e3:.1f}k rays/s  {1 / r['fps']:.2f} s/image" if rays else f"{r['fps']:.1f} images/s"
-        return f"PSNR {r['psnr']:.2f} dB  SSIM {ssim}  LPIPS {lpips}{before}  {speed}  ({r['num_images']} images)"
+        sizes = ", ".join(f"{size}: {found['psnr']:.2f}" for size, found in r.get("by_size", {}).items())
+        sizes = f" ({sizes})" if sizes else ""
+        quality = f"PSNR {r['psnr']:.2f} dB{sizes}  SSIM {ssim}  LPIPS {lpips}{before}"
+        return f"{quality}  {speed}  ({r['num_images']} images)"
 
 
 def evaluate(
@@ -202,15 +206,8 @@ def evaluate(
         if round_to_uint8:
             rgb = (rgb * 255).round() / 255
         pair, kept = _judged(rgb, target, dataset.kept_of(index), half)
-        rows.append(
-            {
-                "name": dataset.names[index],
-                **vars(measure(*pair, kept)),
-                "lpips": None if lpips is None else lpips(*pair),
-                "floaters": floaters(picture, dataset, index),
-                "seconds": spent,
-            }
-        )
+        row = _row(dataset, index, measure(*pair, kept), None if lpips is None else lpips(*pair), spent)
+        rows.append(row | {"floaters": floaters(picture, dataset, index)})
         seconds += spent
         rays += picture.num_rays
         if pictures is not None and (max_pictures is None or len(rows) <= max_pictures):
@@ -218,7 +215,7 @@ def evaluate(
                 _write_pictures(pictures, f"{index:04d}_{_short_stem(dataset.names[index])}", rgb, target, picture)
             except OSError as error:  # metrics do not need the files
                 pictures, pictures_note = None, f"cannot write pictures to {pictures}: {error.strerror or error}"
-    results = {**_statistics(rows), "num_rays_per_sec": rays / seconds, "fps": len(rows) / seconds}
+    results = {**_statistics(rows), **_by_size(rows), "num_rays_per_sec": rays / seconds, "fps": len(rows) / seconds}
     protocol: Literal["mean", "half"] | None = ("half" if half else "mean") if has_appearance else None
     return Evaluation(rows, {**results, "num_images": len(rows)}, lpips_note, protocol, pictures_note)
 
@@ -259,6 +256,26 @@ def spread(total: int, limit: int | None) -> list[int]:
     if limit is None or limit >= total:
         return list(range(total))
     return [index * total // limit for index in range(limit)]
+
+
+def _row(dataset: Dataset, index: int, measured: Measured, lpips: float | None, seconds: float) -> dict[str, Any]:
+    """Return what is reported of an image."""
+    row: dict[str, Any] = {
+        "name": dataset.names[index],
+        "psnr": measured.psnr,
+        "ssim": measured.ssim,
+        "lpips": lpips,
+        "seconds": seconds,
+    }
+    return row if dataset.reductions is None else {**row, "reduction": int(dataset.reductions[index])}
+
+
+def _by_size(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the statistics of the images of each size, "1", "1/2", ..., as `by_size`; nothing if all have one size."""
+    sizes = sorted({row["reduction"] for row in rows if "reduction" in row})
+    names = {size: "1" if size == 1 else f"1/{size}" for size in sizes}
+    found = {names[size]: _statistics([row for row in rows if row["reduction"] == size]) for size in sizes}
+    return {"by_size": found} if found else {}
 
 
 def _statistics(rows: list[dict[str, Any]]) -> dict[str, float | None]:

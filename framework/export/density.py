@@ -126,9 +126,8 @@ class LatticeDensity:
             positions.to(device),
             torch.full((count,), self.time, device=device) if self._model.scene.moving else None,
             torch.full((count,), spacing / 2, device=device),
-            torch.full((count, 3), spacing**2 / 12, device=device),
         )
-        return self._density(points).float().cpu()
+        return self._density(points.sized(spacing / 12**0.5)).float().cpu()
 
     def _occupied_blocks(self) -> Iterator[Tensor]:
         """Yield the blocks that overlap an occupied cell of the grid, by sums over the cells of boxes."""

@@ -65,3 +65,22 @@ def affine_colors(rgb: Tensor, vector: Tensor) -> Tensor:
     """
     affine = vector.view(3, 4)
     return rgb + rgb @ affine[:, :3].T + affine[:, 3]
+
+
+def exposed(rgb: Tensor, opacity: Tensor, background: Tensor, vectors: Tensor) -> Tensor:
+    """Return the colours of rays as their images show them: `affine_colors` of the scene, but not of the background.
+
+    The transform is applied to what was composited, which equals transforming the colour of each sample.
+
+    Args:
+        rgb: (R, 3) composited colours over the background.
+        opacity: (R,) opacity of the scene.
+        background: (R, 3) or (3,) colour of the background.
+        vectors: (R, AFFINE) rows of the matrix [A, b] (3, 4) of each ray's image.
+
+    Returns:
+        (R, 3) colours.
+    """
+    affine, seen = vectors.view(-1, 3, 4), opacity[:, None]
+    scene = rgb - (1 - seen) * background
+    return rgb + (affine[..., :3] * scene[:, None]).sum(-1) + affine[..., 3] * seen

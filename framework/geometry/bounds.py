@@ -1,4 +1,4 @@
-"""Boxes: their intersection with rays, unit coordinates, and the contraction of unbounded space."""
+"""Boxes: their intersection with rays, unit coordinates, and the contraction of unbounded space and of Gaussians."""
 
 from __future__ import annotations
 
@@ -59,6 +59,42 @@ def contract(positions: Tensor) -> Tensor:
     Returns:
         (..., 3) with norm at most 2.
     """
+    unit, inverse = _inverted(positions)
+    return unit * (2 - inverse)
+
+
+def contract_gaussians(means: Tensor, roots: Tensor) -> tuple[Tensor, Tensor]:
+    """Contract Gaussians by the derivative of the contraction at their means: mip-NeRF 360, equations 8 and 9.
+
+    The derivative at x outside the unit ball is 1 / |x|^2 along x, and (2 - 1 / |x|) / |x| across it. It acts on roots
+    of covariances rather than on covariances: so no variance can become negative, and far Gaussians, whose variances
+    differ by 20 orders of magnitude, keep their precision.
+
+    Args:
+        means: (N, 3) means.
+        roots: (N, 3, K) roots F of the covariances F F^T.
+
+    Returns:
+        (N, 3) means with norm at most 2, and (N, 3, K) roots of the covariances there.
+    """
+    unit, inverse = _inverted(means)
+    across = (2 - inverse) * inverse
+    change = (inverse.square() - across) * (unit[:, :, None] * roots).sum(1)
+    return unit * (2 - inverse), across[:, :, None] * roots + unit[:, :, None] * change[:, None]
+
+
+def contraction_scale(positions: Tensor) -> Tensor:
+    """Return the factors (...) by which the contraction scales lengths in the mean over directions.
+
+    It is the cube root of the determinant of the derivative of `contract` at `positions` (..., 3): 1 inside the unit
+    ball, and falling with |x|^(-4/3) outside.
+    """
+    inverse = _inverted(positions)[1][..., 0]
+    return (2 - inverse) ** (2 / 3) * inverse ** (4 / 3)
+
+
+def _inverted(positions: Tensor) -> tuple[Tensor, Tensor]:
+    """Return x / max(1, |x|) and 1 / max(1, |x|) (..., 1), finite and with finite gradients for all `positions`."""
     limit = torch.finfo(positions.dtype).max
     finite = positions.clamp(-limit, limit)
     largest = (
@@ -66,4 +102,4 @@ def contract(positions: Tensor) -> Tensor:
     )  # detached: the result does not depend on the divisor
     scaled = finite / largest
     norm = (scaled * scaled).sum(-1, keepdim=True).clamp(min=1).sqrt()
-    return scaled * ((2 - 1 / (largest * norm)) / norm)
+    return scaled / norm, 1 / (largest * norm)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import torch
@@ -10,8 +10,30 @@ from torch import Tensor
 
 from framework.geometry.rays import Rays, Samples
 
-Footprint = Literal["none", "radius", "gaussian"]
-"""Kind of a point's size that a field needs: none, radius of the pixel's cone, or mean and covariance of the cone."""
+Footprint = Literal["none", "radius", "gaussian", "frustum"]
+"""Kind of a point's size that a field needs: none, radius of the pixel's cone, mean and covariance of the cone's
+interval, or that interval itself."""
+
+
+@dataclass(frozen=True)
+class Frustums:
+    """N conical frustums: intervals of the cones around rays."""
+
+    origins: Tensor
+    """(N, 3) apex of each cone, scene coordinates."""
+    directions: Tensor
+    """(N, 3) unit direction of each cone's axis."""
+    t_starts: Tensor
+    """(N,) distance from the apex at which the frustum starts."""
+    t_ends: Tensor
+    """(N,) distance from the apex at which the frustum ends."""
+    radii: Tensor
+    """(N,) radius of the cone at distance 1."""
+    ranks: Tensor | None = None
+    """(N,) number of intervals in front of each on its ray, if known."""
+
+    def __len__(self) -> int:
+        return self.t_starts.shape[0]
 
 
 @dataclass(frozen=True)
@@ -26,9 +48,39 @@ class Points:
     """(N,) radius of the pixel's cone at each point, scene units; None if not computed."""
     covariances: Tensor | None = None
     """(N, 3) diagonal of the covariance of the cone's interval, squared scene units; None if not computed."""
+    axes: Tensor | None = None
+    """(N, 3) unit direction of the cone's axis; None if not computed."""
+    variances: Tensor | None = None
+    """(N, 2) variance along the axis and across it, squared scene units; None if not computed."""
+    frustums: Frustums | None = None
+    """The cones' intervals; None if not computed."""
 
     def __len__(self) -> int:
         return self.positions.shape[0]
+
+    def roots(self) -> Tensor:
+        """Return roots F (N, 3, 3) of the whole covariances F F^T: columns along the axis and across it.
+
+        Raises:
+            ValueError: if the points have no Gaussians.
+        """
+        if self.axes is None or self.variances is None:
+            raise ValueError("these points have no Gaussians: sample_points() computes them for footprint 'gaussian'")
+        deviations = self.variances.clamp(min=torch.finfo(self.variances.dtype).tiny).sqrt()  # has a gradient at 0
+        return frames(self.axes) * deviations[:, None, [0, 1, 1]]
+
+    def sized(self, deviation: float) -> Points:
+        """Return points with Gaussians; points without get balls, as fields are also asked at mere positions.
+
+        Args:
+            deviation: standard deviation of the balls, scene units.
+        """
+        if self.variances is not None:
+            return self
+        axes = torch.zeros_like(self.positions)
+        axes[:, 2] = 1
+        variances = self.positions.new_full((len(self), 2), deviation**2)
+        return replace(self, axes=axes, variances=variances, covariances=variances[:, [1, 1, 0]])
 
 
 class Intervals(Protocol):
@@ -58,11 +110,17 @@ def sample_points(rays: Rays, samples: Samples, footprint: Footprint = "none") -
     Raises:
         ValueError: if a footprint is to be computed and the rays have no `pixel_radii`.
     """
-    return interval_points(rays, samples.ray_indices, samples, samples.positions(rays), footprint)
+    ranks = samples.ranks if footprint == "frustum" else None
+    return interval_points(rays, samples.ray_indices, samples, samples.positions(rays), footprint, ranks)
 
 
 def interval_points(
-    rays: Rays, owners: Tensor, intervals: Intervals, positions: Tensor, footprint: Footprint
+    rays: Rays,
+    owners: Tensor,
+    intervals: Intervals,
+    positions: Tensor,
+    footprint: Footprint,
+    ranks: Tensor | None = None,
 ) -> Points:
     """Return the points at which a field is evaluated for intervals.
 
@@ -72,6 +130,7 @@ def interval_points(
         intervals: N intervals along the rays.
         positions: (N, 3) positions of the points; not used for Gaussians, whose positions are their means.
         footprint: kind of the points' size to compute.
+        ranks: (N,) number of intervals in front of each on its ray, for frustums; None if unknown.
 
     Raises:
         ValueError: if a footprint is to be computed and the rays have no `pixel_radii`.
@@ -84,10 +143,16 @@ def interval_points(
     radii = rays.pixel_radii.index_select(0, owners)
     if footprint == "radius":
         return Points(positions, times, intervals.t * radii)
+    if footprint == "frustum":
+        origins, directions = (x.index_select(0, owners) for x in (rays.origins, rays.directions))
+        frustums = Frustums(origins, directions, intervals.t_starts, intervals.t_ends, radii, ranks)
+        return Points(positions, times, intervals.t * radii, frustums=frustums)
     mean_t, along, across = conical_frustums(intervals.t_starts, intervals.t_ends, radii)
-    squared = rays.directions.index_select(0, owners).square()
+    axes = rays.directions.index_select(0, owners)
+    squared = axes.square()
     covariances = along[:, None] * squared + across[:, None] * (1 - squared)
-    return Points(rays.points(owners, mean_t), times, mean_t * radii, covariances)
+    variances = torch.stack([along, across], dim=-1)
+    return Points(rays.points(owners, mean_t), times, mean_t * radii, covariances, axes, variances)
 
 
 def conical_frustums(t_starts: Tensor, t_ends: Tensor, radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -110,3 +175,18 @@ def conical_frustums(t_starts: Tensor, t_ends: Tensor, radii: Tensor) -> tuple[T
     along = half.square() * (1 / 3 - (4 / 15) * squared * (12 - squared) / total.square())
     across = (radii * middle).square() * (1 / 4 + (5 / 12) * squared - (4 / 15) * squared.square() / total)
     return mean_t, along, across
+
+
+def frames(axes: Tensor) -> Tensor:
+    """Return rotations (N, 3, 3) whose first columns are `axes` (N, 3), unit vectors.
+
+    Duff et al. 2017, "Building an orthonormal basis, revisited": the other columns are exact to rounding for all axes,
+    without square roots.
+    """
+    x, y, z = axes.unbind(-1)
+    sign = torch.where(z < 0, -1.0, 1.0).to(axes)
+    a = -1 / (sign + z)
+    b = x * y * a
+    first = torch.stack([1 + sign * x * x * a, sign * b, -sign * x], dim=-1)
+    second = torch.stack([b, sign + y * y * a, -y], dim=-1)
+    return torch.stack([axes, first, second], dim=-1)

@@ -167,6 +167,8 @@ class Samples:
     @cached_property
     def ranks(self) -> Tensor:
         """(N,) number of samples in front of each sample on its ray."""
+        if self.per_ray is not None:
+            return torch.arange(self.per_ray, device=self.offsets.device).repeat(self.num_rays)
         return torch.arange(len(self), device=self.offsets.device) - self.offsets[:-1][self.ray_indices]
 
     @property

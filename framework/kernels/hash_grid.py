@@ -98,6 +98,9 @@ class TableGradient:
         layout: resolutions and offsets of the levels that are looked up: all of the table's, or the first ones.
     """
 
+    _add, _adam = _backward_table, _adam
+    """The compiled functions that accumulate the gradient, and that apply it."""
+
     def __init__(self, layout: HashGridLayout) -> None:
         self.layout = layout
         self.parts: Parts = []
@@ -130,7 +133,7 @@ class TableGradient:
         """Add the gradient to `grad` (E, F), and discard it."""
         shape = (self.layout.num_entries, grad.shape[1])
         into = native.pointer(grad[: shape[0]], "the table's gradient", shape)
-        _backward_table(*self._arguments(shape[1]), into, native.threads())
+        self._add(*self._arguments(shape[1]), into, native.threads())
         self.parts.clear()
 
     def summed(self, table: Tensor) -> Tensor:
@@ -153,7 +156,7 @@ class TableGradient:
         """
         shape = (self.layout.num_entries, table.shape[1])
         table, mean, square, seen = (values[: shape[0]] for values in (table, mean, square, seen))
-        updated = _adam(
+        updated: int = self._adam(
             *self._arguments(shape[1]), native.pointer(table, "the table", shape), native.pointer(mean, "mean", shape),
             native.pointer(square, "square", shape), native.pointer(seen, "seen", shape[:1]), rate, *betas, eps,
             native.threads(),

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from framework.geometry.rays import Samples
-from framework.kernels.compositing import ray_sum
+from framework.kernels.compositing import distortion, ray_sum
 
 WIDTH = 3.0
 """Standard deviations from a known distance within which a ray is to end."""
@@ -28,6 +28,38 @@ def mean_squared_error(prediction: Tensor, target: Tensor, weights: Tensor | Non
         return prediction.sum()
     squares = (prediction - target).square()
     return squares.mean() if weights is None else (squares * weights[:, None]).mean()
+
+
+def charbonnier(prediction: Tensor, target: Tensor, weights: Tensor | None = None, scale: float = 1e-3) -> Tensor:
+    """Return the mean () of weight * sqrt((prediction - target)^2 + scale^2) over all elements; 0 for empty input.
+
+    mip-NeRF 360 (Barron et al. 2022), section 5: a smooth absolute error, to which outliers count less than squared.
+
+    Args:
+        prediction: (R, C) predicted values.
+        target: (R, C) true values.
+        weights: (R,) factor of each row; None for 1.
+        scale: difference below which the error is square rather than absolute.
+    """
+    if prediction.numel() == 0:
+        return prediction.sum()
+    errors = ((prediction - target).square() + scale**2).sqrt()
+    return errors.mean() if weights is None else (errors * weights[:, None]).mean()
+
+
+def normalised_distortion(weights: Tensor, samples: Samples) -> Tensor:
+    """Return the mean distortion () of rays in normalised distance: mip-NeRF 360 (Barron et al. 2022), equation 15.
+
+    Args:
+        weights: (N,) weights of the samples of R rays.
+        samples: N samples, with their edges in normalised distance, as a `ProposalSampler` returns them.
+
+    Raises:
+        ValueError: if the samples have no such edges.
+    """
+    if samples.edges is None:
+        raise ValueError("these samples have no edges in normalised distance: the sampler is no ProposalSampler")
+    return distortion(weights, Samples.regular(samples.edges[:, :-1], samples.edges[:, 1:])).mean()
 
 
 def depth_error(weights: Tensor, samples: Samples, known: Tensor) -> Tensor:

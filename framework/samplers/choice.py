@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal, TypeVar
 
@@ -16,7 +16,7 @@ from framework.fields.base import Field
 from framework.samplers.base import Sampler
 from framework.samplers.hierarchical import LEAST_COARSE, HierarchicalSampler
 from framework.samplers.occupancy import MAX_CELLS, OccupancySampler
-from framework.samplers.proposal import ProposalSampler
+from framework.samplers.proposal import LEARN_EVERY, ProposalSampler
 
 COARSEST_PROPOSAL = 128
 """Cells along an axis at the finest level of the first proposal; each further proposal has twice as many."""
@@ -120,23 +120,38 @@ def contracted_box(config: SamplingConfig, scene: Scene) -> Tensor | None:
     return scene.box if scene.unbounded and config.sampler == "proposal" else None
 
 
-def make_sampler(config: SamplingConfig, scene: Scene, make_coarse: Callable[[], Field] | None = None) -> Sampler:
+def make_sampler(
+    config: SamplingConfig,
+    scene: Scene,
+    make_coarse: Callable[[], Field | None] | None = None,
+    proposals: Sequence[Field] | None = None,
+    learn_every: int = LEARN_EVERY,
+) -> Sampler:
     """Return the sampler that the settings select.
 
     Args:
         config: the settings, decided.
         scene: properties of the scene.
-        make_coarse: creates the coarse field of `--sampler hierarchical`; None if the method has none.
+        make_coarse: creates the coarse field of `--sampler hierarchical`, or returns None if the field serves as its
+            own; None if the method has no such level.
+        proposals: density fields of `--sampler proposal`; hash grids if None.
+        learn_every: interval of steps at which proposals learn.
 
     Raises:
-        ConfigError: if the hierarchical sampler is selected and the method has no coarse field.
+        ConfigError: if the hierarchical sampler is selected and the method has no coarse level.
     """
-    sampler = _sampler(config, scene, make_coarse)
+    sampler = _sampler(config, scene, make_coarse, proposals, learn_every)
     sampler.samples_per_step = config.samples_per_batch
     return sampler
 
 
-def _sampler(config: SamplingConfig, scene: Scene, make_coarse: Callable[[], Field] | None) -> Sampler:
+def _sampler(
+    config: SamplingConfig,
+    scene: Scene,
+    make_coarse: Callable[[], Field | None] | None,
+    proposals: Sequence[Field] | None,
+    learn_every: int,
+) -> Sampler:
     if config.sampler == "proposal":
         resolutions = tuple(COARSEST_PROPOSAL << level for level in range(len(config.num_proposal_samples)))
         return ProposalSampler(
@@ -145,6 +160,8 @@ def _sampler(config: SamplingConfig, scene: Scene, make_coarse: Callable[[], Fie
             resolutions,
             scene.unbounded,
             endless=scene.unbounded and not scene.has_alpha,
+            fields=proposals,
+            learn_every=learn_every,
         )
     if isinstance(config, HierarchicalConfig) and str(config.sampler) == "hierarchical":
         if make_coarse is None:

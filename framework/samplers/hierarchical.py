@@ -1,45 +1,60 @@
-"""Hierarchical (coarse-to-fine) sampling: NeRF (Mildenhall et al. 2020), section 5.2."""
+"""Hierarchical (coarse-to-fine) sampling: NeRF (Mildenhall et al. 2020), section 5.2, and Mip-NeRF's, section 3.2."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
+from torch import Tensor
 
 from framework.fields.base import Field
 from framework.geometry.points import sample_points
 from framework.geometry.rays import CoarseLevel, Rays, Samples
-from framework.kernels.intervals import interval_weights
+from framework.kernels.intervals import interval_weights, resample
 from framework.samplers.base import Sampler
 from framework.samplers.inverse_cdf import inverse_cdf, uniform_variates
 from framework.samplers.uniform import samples_from_points, stratified_points
 
 LEAST_COARSE = 3
 """Minimum number of stratified samples per ray; fine samples are drawn from the weights between first and last."""
+PADDING = 0.01
+"""Added to the blurred weights of intervals, so that all can be drawn: Mip-NeRF, equation 18."""
 
 
 class HierarchicalSampler(Sampler):
     """Stratified samples, and further ones drawn from the weights that a coarse field has at the stratified ones.
 
-    The coarse field belongs to the sampler, and is rendered and supervised too (`Samples.coarse`).
+    The coarse level is rendered and supervised too (`Samples.coarse`). It has one of two kinds:
+
+    - A coarse field of its own, which belongs to the sampler, at points: NeRF. The fine field is evaluated at the
+      points of both levels.
+    - The field itself, in intervals: Mip-NeRF, where one network is asked about cones of any length. The intervals of
+      the fine level are drawn from the blurred weights of the coarse ones, and take their place.
 
     Args:
-        coarse: the coarse field.
+        coarse: the coarse field; None for the field itself.
         num_coarse: stratified samples per ray.
-        num_fine: samples per ray drawn from the weights; the fine field is evaluated at both kinds.
+        num_fine: samples per ray drawn from the weights.
 
     Raises:
         ValueError: if there are fewer than 3 stratified samples, which leave no weights between first and last.
     """
 
-    def __init__(self, coarse: Field, num_coarse: int = 64, num_fine: int = 128) -> None:
+    def __init__(self, coarse: Field | None, num_coarse: int = 64, num_fine: int = 128) -> None:
         super().__init__()
         if num_coarse < LEAST_COARSE:
             raise ValueError(f"{num_coarse} stratified samples cannot say where to look: at least {LEAST_COARSE} can")
         self.coarse, self.num_coarse, self.num_fine = coarse, num_coarse, num_fine
 
     def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
+        if self.coarse is None:
+            return self._of_intervals(rays, field, jitter)
+        return self._of_points(rays, self.coarse, jitter)
+
+    def _of_points(self, rays: Rays, coarse: Field, jitter: bool) -> Samples:
         t = stratified_points(rays, self.num_coarse, jitter)
         samples = samples_from_points(t)
-        samples = samples.evaluated(*self.coarse.density(sample_points(rays, samples, self.coarse.footprint)))
+        samples = samples.evaluated(*coarse.density(sample_points(rays, samples, coarse.footprint)))
         assert samples.sigma is not None
         edges = torch.cat([t, samples.padded(samples.t_ends)[:, -1:]], dim=-1)
         weights = interval_weights(samples.sigma.detach().view(t.shape), edges)
@@ -52,5 +67,44 @@ class HierarchicalSampler(Sampler):
             merged.offsets,
             merged.points,
             merged.per_ray,
-            coarse=CoarseLevel(self.coarse, samples),
+            coarse=CoarseLevel(coarse, samples),
         )
+
+    def _of_intervals(self, rays: Rays, field: Field, jitter: bool) -> Samples:
+        edges = stratified_edges(rays, self.num_coarse, jitter)
+        coarse = Samples.regular(edges[:, :-1], edges[:, 1:])
+        coarse = coarse.evaluated(*field.density(sample_points(rays, coarse, field.footprint)))
+        assert coarse.sigma is not None
+        weights = interval_weights(coarse.sigma.detach().view(-1, self.num_coarse), edges)
+        shift = torch.rand(len(rays), device=edges.device) if jitter else torch.full_like(edges[:, 0], 0.5)
+        drawn = resample(edges, blurred(weights), shift, self.num_fine, 1.0, PADDING)
+        return replace(Samples.regular(drawn[:, :-1], drawn[:, 1:]), coarse=CoarseLevel(field, coarse))
+
+
+def stratified_edges(rays: Rays, count: int, jitter: bool) -> Tensor:
+    """Return the edges (R, count + 1) of intervals that divide rays from their near to their far end.
+
+    Args:
+        rays: R rays with near and far ends.
+        count: number of intervals per ray.
+        jitter: True to move each inner edge by up to half an interval either way, False for equal lengths.
+    """
+    place = torch.arange(count + 1, device=rays.nears.device, dtype=rays.nears.dtype).expand(len(rays), -1)
+    if jitter:
+        moved = place[:, 1:-1] + torch.rand_like(place[:, 1:-1]) - 0.5
+        place = torch.cat([place[:, :1], moved, place[:, -1:]], dim=-1)
+    return torch.lerp(rays.nears[:, None], rays.fars[:, None], place / count)
+
+
+def blurred(weights: Tensor) -> Tensor:
+    """Return weights (R, B) that are no less than their own and half of what is beside them: Mip-NeRF, equation 18.
+
+    A maximum of two neighbours, then a mean of two: an envelope, so that samples are drawn around what intervals find
+    and not only in them. Mip-NeRF adds a constant besides (`PADDING`).
+
+    Args:
+        weights: (R, B) weights of intervals.
+    """
+    wide = torch.cat([weights[:, :1], weights, weights[:, -1:]], dim=-1)
+    highest = torch.maximum(wide[:, 1:], wide[:, :-1])
+    return (highest[:, 1:] + highest[:, :-1]) / 2

@@ -5,7 +5,7 @@ weights. The proposals are trained so that their weights bound those of the last
 
 Intervals are drawn in normalised distance s in [0, 1], from the near to the far end of a ray. In a bounded scene s is
 linear in the distance; in an unbounded scene it is linear up to half the edge of the box, and linear in disparity
-beyond.
+beyond, or follows Zip-NeRF's power ladder.
 """
 
 from __future__ import annotations
@@ -24,9 +24,10 @@ from framework.encodings.hash_grid import HashGrid
 from framework.fields.base import DensityFunction, Field
 from framework.fields.encoded import DensityField
 from framework.geometry.bounds import intersect_box
-from framework.geometry.points import Points
+from framework.geometry.points import Footprint, Points, sample_points
 from framework.geometry.rays import Histogram, Rays, Samples
 from framework.kernels.intervals import interval_weights, proposal_excess, resample
+from framework.kernels.step_functions import blurred_excess
 from framework.samplers.base import Sampler
 
 ANNEALING_SLOPE = 10.0
@@ -37,6 +38,8 @@ ALWAYS_LEARN_UNTIL, LEARN_EVERY = 256, 4
 """Step until which the proposals learn in every step, and the interval of steps at which they learn afterwards."""
 FARTHEST = 1e10
 """Far end of the last interval of an endless ray, scene units."""
+LADDER_PREMULTIPLIER = 2.0
+"""Factor of distances, in units of the scene's scale, before the power ladder: Zip-NeRF."""
 
 
 class ProposalSampler(Sampler):
@@ -52,9 +55,15 @@ class ProposalSampler(Sampler):
         log2_table_size: maximum number of entries per level of the proposals' hash grids, as a power of two.
         num_levels: levels of the proposals' hash grids.
         anneal_steps: training steps over which the weights are annealed.
+        fields: other density fields in place of hash grids; the last one serves all further levels too.
+        learn_every: interval of steps at which the proposals learn, after the first `ALWAYS_LEARN_UNTIL`.
+        ladder: exponent of the power ladder by which distances of an unbounded scene are spaced; None for disparity.
+        blurs: for each proposal, the radius of the box with which the samples' histogram is blurred before it is
+            compared (Zip-NeRF's loss), in normalised distance; empty for the loss of mip-NeRF 360.
 
     Raises:
-        ValueError: if there is not one count more than there are resolutions.
+        ValueError: if there is not one count more than there are resolutions, more fields than levels, or not one blur
+            for each proposal.
     """
 
     box: Tensor
@@ -70,29 +79,41 @@ class ProposalSampler(Sampler):
         log2_table_size: int = 16,
         num_levels: int = 5,
         anneal_steps: int = 1000,
+        fields: Sequence[Field] | None = None,
+        learn_every: int = LEARN_EVERY,
+        ladder: float | None = None,
+        blurs: tuple[float, ...] = (),
     ) -> None:
         super().__init__()
-        if len(counts) != len(resolutions) + 1:
+        if fields is None and len(counts) != len(resolutions) + 1:
             raise ValueError(f"{len(counts)} counts for {len(resolutions)} proposals: one more is needed")
-        self.endless = endless
+        if fields is not None and not 1 <= len(fields) < len(counts):
+            raise ValueError(f"{len(fields)} density fields for {len(counts) - 1} proposals")
+        if blurs and len(blurs) != len(counts) - 1:
+            raise ValueError(f"{len(blurs)} blurs for {len(counts) - 1} proposals: one for each is needed")
+        self.endless, self.learn_every = endless, learn_every
         self.counts, self.unbounded, self.anneal_steps = counts, unbounded, anneal_steps
         self.scale = half_edge(box)
+        self.ladder, self.blurs = ladder, blurs
         self.register_buffer("box", box.clone())
-        grids = [HashGrid(num_levels, 2, 16, finest, log2_table_size) for finest in resolutions]
-        self.fields = nn.ModuleList(DensityField(box, grid, unbounded=unbounded) for grid in grids)
+        if fields is None:
+            grids = [HashGrid(num_levels, 2, 16, finest, log2_table_size) for finest in resolutions]
+            fields = [DensityField(box, grid, unbounded=unbounded) for grid in grids]
+        self.fields = nn.ModuleList(fields)
         self.power = 1.0
         self.learning = False
 
     @property
     def proposals(self) -> list[Field]:
         """The density fields, in the order in which they are evaluated."""
-        return [field for field in self.fields if isinstance(field, Field)]
+        fields = [field for field in self.fields if isinstance(field, Field)]
+        return fields + fields[-1:] * (len(self.counts) - 1 - len(fields))
 
     def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
         """Return the samples of the last level, with the proposals' gradients attached in steps in which they learn."""
         learning = self.learning and self.training and torch.is_grad_enabled()
         nears, fars = self._ends(rays)
-        return propose(
+        samples = propose(
             replace(rays, nears=nears, fars=fars),
             [proposal.density for proposal in self.proposals],
             self.counts,
@@ -100,17 +121,25 @@ class ProposalSampler(Sampler):
             jitter=jitter,
             power=self.power if self.training else 1.0,
             learning=learning,
-            endless=self.endless,
+            ladder=self.ladder,
+            footprints=[proposal.footprint for proposal in self.proposals],
         )
+        if not self.endless:
+            return samples
+        if field.footprint in ("gaussian", "frustum"):  # before the last interval is endless: that would be at infinity
+            samples = samples.evaluated(*field.density(sample_points(rays, samples, field.footprint)))
+        ends = samples.padded(samples.t_ends).clone()
+        ends[:, -1] = FARTHEST
+        return replace(samples, t_ends=ends.view(-1))
 
     def update(self, step: int, density: DensityFunction) -> None:
         """Set the exponent of the annealing, and whether the proposals learn in this step."""
         x = min(step / max(self.anneal_steps, 1), 1.0)
         self.power = ANNEALING_SLOPE * x / ((ANNEALING_SLOPE - 1) * x + 1)
-        self.learning = step < ALWAYS_LEARN_UNTIL or step % LEARN_EVERY == 0
+        self.learning = step < ALWAYS_LEARN_UNTIL or step % self.learn_every == 0
 
     def losses(self, samples: Samples, weights: Tensor) -> dict[str, Tensor]:
-        return {"interlevel": interlevel_loss(samples, weights)} if samples.proposals else {}
+        return {"interlevel": interlevel_loss(samples, weights, self.blurs)} if samples.proposals else {}
 
     def _ends(self, rays: Rays) -> tuple[Tensor, Tensor]:
         """Return the distances (R,) at which sampling starts and ends; in a bounded scene those inside the box."""
@@ -130,7 +159,8 @@ def propose(
     jitter: bool,
     power: float,
     learning: bool,
-    endless: bool,
+    ladder: float | None = None,
+    footprints: Sequence[Footprint] | None = None,
 ) -> Samples:
     """Return samples that are drawn in levels, each from the weights of the level before.
 
@@ -138,11 +168,12 @@ def propose(
         rays: R rays, sampled from the near to the far end.
         densities: density of each level but the last.
         counts: intervals per ray of each level, followed by the number of samples per ray: one more than densities.
-        scale: the distance up to which normalised distance is linear, as in `spacing`.
+        scale: the distance up to which normalised distance is linear, or the unit of the ladder, as in `spacing`.
         jitter: True for random positions, False for fixed ones.
         power: exponent of the weights that are drawn from; less than 1 flattens them.
         learning: whether to keep the proposals' weights, gradients attached, in `Samples.proposals`.
-        endless: whether the last interval ends at `FARTHEST`.
+        ladder: exponent of the power ladder, as in `spacing`.
+        footprints: kind of the points' size that each density needs; none if not given.
     """
     nears, fars = rays.nears, rays.fars
     count, device = len(rays), nears.device
@@ -150,43 +181,46 @@ def propose(
     if jitter:  # the inner edges move together by up to half an interval either way
         moved = edges + (torch.rand(count, 1, device=device) - 0.5) / counts[0]
         edges = torch.cat([edges[:, :1], moved[:, 1:-1], edges[:, -1:]], dim=-1)
-    proposals: list[Histogram] = []
-    placed = spacing(nears, fars, scale)
-    for (num_intervals, num_next), density in zip(pairwise(counts), densities, strict=True):
+    histograms: list[Histogram] = []
+    placed = spacing(nears, fars, scale, ladder)
+    kinds = footprints or ["none"] * len(densities)
+    for (num_intervals, num_next), density, kind in zip(pairwise(counts), densities, kinds, strict=True):
         t = placed(edges)
-        middles = (t[:, 1:] + t[:, :-1]) / 2
         with torch.set_grad_enabled(learning):
-            positions = _positions(rays, middles)
-            times = None if rays.times is None else rays.times.repeat_interleave(num_intervals)
-            sigma, _ = density(Points(positions, times))
-            weights = interval_weights(sigma.view(middles.shape), t)
-        proposals.append(Histogram(edges, weights))
+            sigma, _ = density(_points(rays, t, kind))
+            weights = interval_weights(sigma.view(count, num_intervals), t)
+        histograms.append(Histogram(edges, weights))
         shift = torch.rand(count, device=device) if jitter else torch.full((count,), 0.5, device=device)
         edges = resample(edges, weights.detach(), shift, num_next, power, PADDING / num_intervals)
     t = placed(edges)
-    ends = t[:, 1:]
-    if endless:
-        ends = torch.cat([ends[:, :-1], torch.full_like(ends[:, :1], FARTHEST)], dim=-1)
     return replace(
-        Samples.regular(t[:, :-1], ends, (t[:, 1:] + t[:, :-1]) / 2),
+        Samples.regular(t[:, :-1], t[:, 1:], (t[:, 1:] + t[:, :-1]) / 2),
         owners=torch.arange(count, device=device).repeat_interleave(counts[-1]),
         edges=edges,
-        proposals=tuple(proposals) if learning else (),
+        proposals=tuple(histograms) if learning else (),
     )
 
 
-def spacing(nears: Tensor, fars: Tensor, scale: float | None) -> Callable[[Tensor], Tensor]:
+def spacing(
+    nears: Tensor, fars: Tensor, scale: float | None, ladder: float | None = None
+) -> Callable[[Tensor], Tensor]:
     """Return the function from normalised distances (R, B) in [0, 1] to distances (R, B) along rays, scene units.
 
     Args:
         nears, fars: (R,) distances of the rays' ends, which correspond to 0 and 1.
         scale: the distance up to which normalised distance is linear; beyond, it is linear in disparity. None if it is
             linear throughout.
+        ladder: exponent of the power ladder of twice the distance in units of `scale`, in place of disparity: Zip-NeRF
+            has -1.5. It is linear near the camera as well, and bends gradually.
     """
     if scale is None:
         return partial(torch.lerp, nears[:, None], fars[:, None])
-    near, far = (to_disparity(t / scale)[:, None] for t in (nears, fars))
-    return lambda edges: scale * from_disparity(torch.lerp(near, far, edges))
+    if ladder is None:
+        near, far = (to_disparity(t / scale)[:, None] for t in (nears, fars))
+        return lambda edges: scale * from_disparity(torch.lerp(near, far, edges))
+    unit, power = scale / LADDER_PREMULTIPLIER, ladder
+    near, far = (power_ladder(t / unit, power)[:, None] for t in (nears, fars))
+    return lambda edges: unit * inverse_power_ladder(torch.lerp(near, far, edges), power)
 
 
 def half_edge(box: Tensor) -> float:
@@ -205,23 +239,70 @@ def from_disparity(s: Tensor) -> Tensor:
     return torch.where(s < 0.5, 2 * s, 1 / (2 - 2 * s).clamp(min=tiny))
 
 
-def interlevel_loss(samples: Samples, weights: Tensor) -> Tensor:
+def power_ladder(x: Tensor, power: float) -> Tensor:
+    """Map distances `x` in [0, inf] by |p - 1| / p ((x / |p - 1| + 1)^p - 1), with a slope of 1 at 0: Zip-NeRF.
+
+    It is x for p = 1, log(1 + x) for p = 0, x / (1 + x / 2) for p = -1, and is bounded for p < 0.
+
+    Args:
+        x: distances, at least 0.
+        power: exponent p, at most 1.
+
+    Raises:
+        ValueError: if the exponent is above 1.
+    """
+    if power > 1:
+        raise ValueError(f"a power ladder's exponent is at most 1, not {power}")
+    if power in (0, 1):
+        return x if power else torch.log1p(x)
+    rest = 1 - power
+    return (rest / power) * torch.expm1(power * torch.log1p(x / rest))
+
+
+def inverse_power_ladder(y: Tensor, power: float) -> Tensor:
+    """Return the distances whose `power_ladder` is `y`, with a large, finite result where that is bounded.
+
+    Args:
+        y: values of the ladder.
+        power: exponent p, at most 1.
+    """
+    if power in (0, 1):
+        return y if power else torch.expm1(y)
+    rest = 1 - power
+    least = torch.finfo(y.dtype).eps - 1
+    return rest * torch.expm1(torch.log1p((y * (power / rest)).clamp(min=least)) / power)
+
+
+def interlevel_loss(samples: Samples, weights: Tensor, blurs: Sequence[float] = ()) -> Tensor:
     """Return the loss () of the proposals, whose weights should bound those of the last level from above.
 
-    mip-NeRF 360, equation 13: the mean over rays, summed over proposals. It is 0 if no proposal is learning.
+    mip-NeRF 360, equation 13, or Zip-NeRF's anti-aliased loss: the mean over rays, summed over proposals. It is 0 if no
+    proposal is learning.
 
     Args:
         samples: N samples of a `ProposalSampler`.
         weights: (N,) their weights when rendered; without a gradient.
+        blurs: radius of the box for each proposal, for the anti-aliased loss; empty for that of mip-NeRF 360.
     """
     if samples.edges is None or not samples.proposals or samples.num_rays == 0:
         return weights.new_zeros(())
     rendered = samples.padded(weights.detach())
-    losses = [proposal_excess(samples.edges, rendered, p.edges, p.weights).mean() for p in samples.proposals]
+    edges = samples.edges
+    if blurs:
+        pairs = zip(samples.proposals, blurs, strict=True)
+        losses = [blurred_excess(edges, rendered, p.edges, p.weights, blur).mean() for p, blur in pairs]
+    else:
+        losses = [proposal_excess(edges, rendered, p.edges, p.weights).mean() for p in samples.proposals]
     return torch.stack(losses).sum()
 
 
-def _positions(rays: Rays, t: Tensor) -> Tensor:
-    """Return positions (R * B, 3) at distances `t` (R, B), without a gradient for the rays."""
+def _points(rays: Rays, t: Tensor, footprint: Footprint) -> Points:
+    """Return the points of intervals with edges `t` (R, B + 1), with a footprint, and without a gradient for rays."""
     origins, directions = rays.origins.detach(), rays.directions.detach()
-    return torch.addcmul(origins[:, None], directions[:, None], t[..., None]).view(-1, 3)
+    if footprint != "none":
+        detached = replace(rays, origins=origins, directions=directions)
+        return sample_points(detached, Samples.regular(t[:, :-1], t[:, 1:]), footprint)
+    middles = (t[:, 1:] + t[:, :-1]) / 2
+    positions = torch.addcmul(origins[:, None], directions[:, None], middles[..., None]).view(-1, 3)
+    times = None if rays.times is None else rays.times.repeat_interleave(middles.shape[1])
+    return Points(positions, times)

@@ -63,6 +63,12 @@ class Silhouettes:
     def __len__(self) -> int:
         return len(self.sums)
 
+    @property
+    def at_full_size(self) -> list[int]:
+        """The images that are not reduced beside others: alpha that is rounded shows less of what is there."""
+        reductions = self.dataset.reductions
+        return [image for image in range(len(self)) if reductions is None or int(reductions[image]) == 1]
+
     def photograph(self, image: int) -> Photograph:
         """Return camera and sums of image `image`."""
         cameras = self.dataset.cameras
@@ -87,14 +93,14 @@ def visual_hull(silhouettes: Silhouettes, box: Tensor, resolution: int, moving: 
         (n^3,) bool; the index of a cell is (x n + y) n + z.
     """
     size = min(COARSEST, 1 << (resolution - 1).bit_length())
-    count = -(-resolution // size)
+    count, images = -(-resolution // size), silhouettes.at_full_size
     cubes = torch.cartesian_prod(*[torch.arange(count, device=box.device)] * 3) * size
     while True:
         low = box[0] + (box[1] - box[0]) * cubes / resolution
         edge = (box[1] - box[0]) * size / resolution
         centers, radius = (low + edge / 2).contiguous(), float(edge.norm()) / 2
         held = torch.full((len(cubes),), not moving, device=box.device)
-        for image in range(len(silhouettes)):
+        for image in images:
             hold_balls(silhouettes.photograph(image), centers, radius, held, every=not moving)
         cubes = cubes[held]
         if size == 1:

@@ -17,7 +17,11 @@ from framework.cli.train import run_of
 from framework.samplers.choice import SamplingConfig
 from tests.cli.helpers import called
 
-METHODS = ("dnerf", "instant-ngp", "kplanes", "nerfacto", "tensorf", "vanilla-nerf")
+METHODS = (
+    "dnerf", "instant-ngp", "kplanes", "mip-nerf", "mip-nerf-360", "nerfacto", "tensorf", "vanilla-nerf", "zip-nerf",
+)  # fmt: skip
+FOR_FEW_IMAGES = ("instant-ngp", "kplanes", "nerfacto", "tensorf", "vanilla-nerf")
+"""Methods with settings for few images."""
 FORMATS = ("blender", "colmap", "dnerf", "llff", "nerfstudio", "phototourism", "polycam", "record3d")
 Capture = pytest.CaptureFixture[str]
 
@@ -64,8 +68,9 @@ def test_every_flag_once_and_the_everyday_ones_first(method: str) -> None:
     assert sorted(flag for flags in found.values() for flag in flags) == sorted(known)
     assert list(found) == [
         "options", "everyday options", f"{method} options", "sampler options", "ray options",
-        *["appearance options"] * (method == "nerfacto"), *["few images options"] * (method != "dnerf"),
-        "optimisation options", "evaluation and saving options", "machine options", "viewer options", "procedural data options",
+        *["appearance options"] * (method in ("nerfacto", "zip-nerf")), *["few images options"] * (method in FOR_FEW_IMAGES),
+        "optimisation options", "evaluation and saving options", "machine options", "viewer options",
+        "procedural data options",
     ]  # fmt: skip
     first = ["--data", "--max-seconds", "--max-num-iterations", "--output-dir", "--experiment-name", "--rays-per-pixel"]
     assert found["everyday options"][:6] == first

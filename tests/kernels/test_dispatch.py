@@ -11,6 +11,8 @@ from torch import Tensor
 
 from framework.cameras.cameras import CAMERA_RAYS, Cameras, subpixels
 from framework.data.pixels import GATHER_COLORS
+from framework.geometry.multisamples import Pattern
+from framework.geometry.points import Frustums
 from framework.geometry.rays import Rays, Samples
 from framework.kernels import dispatch, native
 from framework.kernels.adam import ALL_FINITE, DENSE_ADAM, SPARSE_ADAM
@@ -22,6 +24,8 @@ from framework.kernels.hash_grid import HASH_GRID, HashGridLayout, hash_grid
 from framework.kernels.intervals import INTERVAL_WEIGHTS, PROPOSAL_EXCESS, RESAMPLE
 from framework.kernels.march import MARCH, SORT_BY_RAY, March
 from framework.kernels.mlp import NETWORK
+from framework.kernels.multisampled_grid import MULTISAMPLED_GRID
+from framework.kernels.multisamples import UNIT_MULTISAMPLES
 from framework.kernels.occupancy import REFRESH_OCCUPANCY, Occupancy
 from framework.kernels.planes import PLANE_BANDS, PLANES, PlanesGradient, PlanesLayout
 from framework.kernels.rows import GATHER_ROWS
@@ -41,6 +45,7 @@ from framework.kernels.splat_project import (
 )
 from framework.kernels.splat_tiles import TILES, tile_lists
 from framework.kernels.ssim import PHOTOMETRIC
+from framework.kernels.step_functions import BLURRED_EXCESS
 from tests.kernels.compiled import needs_kernels
 
 GRID = HashGridLayout.build(3, 4, 20, 8)
@@ -79,6 +84,11 @@ def cameras() -> Cameras:
     return Cameras(poses, 5 + rand(2), 5 + rand(2), 3 + rand(2), 3 + rand(2), six, six)
 
 
+def frustums() -> Frustums:
+    starts = rand(50)
+    return Frustums(torch.randn(50, 3), unit(50), starts, starts + rand(50), 0.1 * rand(50))
+
+
 def photograph() -> Photograph:
     pose = torch.cat([torch.eye(3), torch.tensor([[0.0], [0.0], [4.0]])], dim=-1)
     return Photograph(pose, 60.0, 55.0, 26.0, 19.0, opaque_sums(torch.rand(40, 50) > 0.97))
@@ -115,6 +125,8 @@ def adam(parameters: int) -> Arguments:
 RATES = 0.01, (0.9, 0.99), 1e-15
 CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     HASH_GRID: lambda: (torch.rand(50, 3), rand(GRID.num_entries, 2), GRID, None),
+    MULTISAMPLED_GRID: lambda: (rand(50, 6, 4), rand(GRID.num_entries, 2), GRID, None),
+    UNIT_MULTISAMPLES: lambda: (frustums(), Pattern(6 * rand(50), torch.ones(50)), BOX, True),
     PLANES: lambda: (torch.rand(50, 3), rand(LAYOUT.num_entries, 4), LAYOUT, None),
     PLANE_BANDS: lambda: (rand(LAYOUT.num_entries, 4), ((10, 30), (50, 55)), PlanesGradient(LAYOUT)),
     NETWORK: lambda: ([rand(9, 5), rand(9, 2)], [rand(8, 7), rand(3, 8)], "sigmoid", [rand(8), rand(3)]),
@@ -126,6 +138,7 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     INTERVAL_WEIGHTS: lambda: (rand(6, 9), edges(6, 9)),
     RESAMPLE: lambda: (edges(6, 9), rand(6, 9), torch.rand(6), 5, 0.7, 0.01),
     PROPOSAL_EXCESS: lambda: (edges(6, 9), rand(6, 9), edges(6, 4), rand(6, 4) / 10),
+    BLURRED_EXCESS: lambda: (edges(6, 9), rand(6, 9), edges(6, 4), rand(6, 4) / 10, 0.03),
     SPARSE_ADAM: lambda: (*(t for (t,) in adam(1)), torch.zeros(20), *RATES),
     DENSE_ADAM: lambda: (*adam(3), [torch.full((), float(step)) for step in (0, 3, 9)], *RATES),
     ALL_FINITE: lambda: ([torch.ones(2), torch.tensor([1.0, torch.inf])],),

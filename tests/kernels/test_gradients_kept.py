@@ -14,7 +14,8 @@ import framework
 from framework.cameras.cameras import Cameras, subpixels
 from framework.data.pixels import gather_colors, gather_colors_reference
 from framework.fields.base import Field
-from framework.geometry.points import Points
+from framework.geometry.multisamples import Pattern
+from framework.geometry.points import Frustums, Points
 from framework.geometry.rays import Rays, Samples
 from framework.kernels.compositing import composite, composite_reference, distortion, distortion_by_pairs
 from framework.kernels.contraction import contract_to_unit, contract_to_unit_reference
@@ -27,12 +28,15 @@ from framework.kernels.intervals import (
     proposal_excess_reference,
 )
 from framework.kernels.mlp import mlp, mlp_reference
+from framework.kernels.multisampled_grid import multisampled_grid, multisampled_grid_reference
+from framework.kernels.multisamples import unit_multisamples, unit_multisamples_reference
 from framework.kernels.planes import PlanesLayout, planes, planes_reference
 from framework.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
 from framework.kernels.splat_blend import blend, blend_reference
 from framework.kernels.splat_project import SplatCamera, project_gaussians, project_reference
 from framework.kernels.splat_tiles import tile_lists
 from framework.kernels.ssim import photometric_loss, photometric_reference
+from framework.kernels.step_functions import blurred_excess, blurred_excess_reference
 from framework.samplers.occupancy import OccupancySampler
 from tests.kernels.compiled import needs_kernels, relative_error
 
@@ -71,6 +75,16 @@ def composited(form: Function) -> Function:
     def run(sigma: Tensor, rgb: Tensor, starts: Tensor, lengths: Tensor, background: Tensor, fars: Tensor) -> Tensor:
         found = form(sampled(starts, starts + lengths), sigma, rgb, background, fars)
         return torch.cat([found.color.reshape(-1), found.opacity, found.weights])
+
+    return run
+
+
+def in_frustums(form: Callable[..., Tensor]) -> Function:
+    def run(
+        origins: Tensor, directions: Tensor, starts: Tensor, lengths: Tensor, radii: Tensor, turns: Tensor, box: Tensor
+    ) -> Tensor:
+        frustums = Frustums(origins, directions, starts, starts + lengths, radii)
+        return form(frustums, Pattern(turns, torch.ones_like(turns)), box, True)
 
     return run
 
@@ -138,6 +152,22 @@ OPERATIONS = {
         lambda: {"positions": torch.rand(20, 3), "table": rand(GRID.num_entries, 2)},
         ("hash_grid_forward", "hash_grid_backward_table", "hash_grid_backward_positions"),
     ),
+    "multisampled grid": Operation(
+        lambda points, table: multisampled_grid(points, table, GRID),
+        lambda points, table: multisampled_grid_reference(points, table, GRID),
+        lambda: {"points": torch.rand(20, 6, 4), "table": rand(GRID.num_entries, 2)},
+        ("multisampled_grid_forward", "multisampled_grid_backward_table", "multisampled_grid_backward_points"),
+    ),
+    "multisamples": Operation(
+        in_frustums(unit_multisamples),
+        in_frustums(unit_multisamples_reference),
+        lambda: {
+            "origins": torch.randn(20, 3), "directions": torch.nn.functional.normalize(torch.randn(20, 3), dim=-1),
+            "starts": rand(20), "lengths": rand(20), "radii": rand(20), "turns": rand(20),
+            "box": torch.tensor([[-1.0] * 3, [1.0, 2.0, 1.5]]),
+        },
+        ("multisamples",),
+    ),
     "planes": Operation(
         lambda positions, table: planes(positions, table, PLANES),
         lambda positions, table: planes_reference(positions, table, PLANES),
@@ -201,6 +231,17 @@ OPERATIONS = {
         ("proposal_excess",),
         frozenset({"edges", "weights", "proposed"}),
     ),
+    "proposals' excess over blurred weights": Operation(
+        partial(blurred_excess, radius=0.03),
+        lambda edges, weights, proposed, proposed_weights: blurred_excess_reference(
+            edges.detach(), weights.detach(), proposed.detach(), proposed_weights, 0.03
+        ),
+        lambda: {
+            "edges": edges(4, 6), "weights": 3 * rand(4, 6), "proposed": edges(4, 9), "proposed_weights": rand(4, 9),
+        },
+        ("blurred_excess",),
+        frozenset({"edges", "weights", "proposed"}),
+    ),
     "projected Gaussians": Operation(
         on_image(lambda *given: project_gaussians(*given[:-1], degree=1)),
         on_image(project_reference),
@@ -236,7 +277,7 @@ COLORS = torch.randint(256, (9, 4), generator=torch.Generator().manual_seed(0)).
 WITHOUT_A_GRADIENT = {
     "pack_occupancy", "refresh_occupancy", "march_begin", "march_wave", "march_advance",  # refused, as tested below
     "sort_by_ray", "gather_rows", "resample_intervals",  # documented to have none
-    "adam_sparse", "adam_dense", "all_finite", "hash_grid_adam",  # of the optimiser
+    "adam_sparse", "adam_dense", "all_finite", "hash_grid_adam", "multisampled_grid_adam",  # of the optimiser
     "opaque_sums", "hold_balls", "pixels_near_balls",  # whose results are counted or true and false
     "splat_sort", "splat_bound", "splat_bin",  # whose results are indices
     "splat_project_packed",  # for pictures alone, and refused where a gradient is asked for

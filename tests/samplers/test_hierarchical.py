@@ -9,7 +9,7 @@ from framework.fields.base import Field
 from framework.geometry.points import Points
 from framework.geometry.rays import CoarseLevel, Rays, Samples
 from framework.rendering.volume import VolumeRenderer
-from framework.samplers.hierarchical import HierarchicalSampler
+from framework.samplers.hierarchical import HierarchicalSampler, blurred
 from framework.samplers.uniform import LAST_INTERVAL, stratified_points
 from methods.vanilla_nerf import VanillaNeRFConfig
 
@@ -177,3 +177,55 @@ def test_three_stratified_samples_are_enough_and_fewer_are_refused() -> None:
         HierarchicalSampler(Slab(2.0, 3.0, 5.0), 2, 4)
     with pytest.raises(ConfigError, match="--num-coarse-samples"):
         VanillaNeRFConfig(num_coarse_samples=2)
+
+
+# -- the field as its own coarse level, in intervals ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("jitter", [True, False])
+@pytest.mark.parametrize("count", [0, 7])
+def test_intervals_divide_the_ray_and_the_field_is_its_own_coarse_level(count: int, jitter: bool) -> None:
+    field = Slab(2.0, 3.0, 5.0)
+    field.footprint = "gaussian"  # type: ignore[misc]
+    rays = rays_along_x(count, times=torch.full((count,), 0.5))
+    samples = HierarchicalSampler(None, COARSE, FINE).sample(rays, field, jitter)
+    level = coarse_of(samples)
+    assert level.field is field
+    assert (len(level.samples), len(samples)) == (count * COARSE, count * FINE)
+    for found in (level.samples, samples):
+        starts, ends = found.padded(found.t_starts), found.padded(found.t_ends)
+        torch.testing.assert_close(starts[:, 1:], ends[:, :-1], rtol=0, atol=0)
+        assert bool((ends >= starts).all())
+        assert bool(((starts >= 0) & (ends <= 8)).all())
+    assert bool((level.samples.padded(level.samples.t_starts)[:, :1] == 0).all())
+    assert bool((level.samples.padded(level.samples.t_ends)[:, -1:] == 8).all())
+    (points,) = field.asked
+    assert points.variances is not None
+    assert points.times is not None
+    assert bool(
+        ((points.positions[:, 0] > level.samples.t_starts) & (points.positions[:, 0] < level.samples.t_ends)).all()
+    )
+    assert level.samples.sigma is not None
+    assert level.samples.sigma.requires_grad
+    assert not samples.t.requires_grad
+
+
+def test_intervals_are_drawn_by_blurred_weights() -> None:
+    """By hand: a wall in the bin [4, 4.5] alone; half of its weight on each neighbour, and 0.01 for every bin."""
+    samples = HierarchicalSampler(None, COARSE, 4095).sample(rays_along_x(1), Slab(4.0, 4.5, 1e3), False)
+    expected = torch.full((COARSE,), 0.01)
+    expected[7:10] += torch.tensor([0.5, 1.0, 0.5])
+    edges = torch.cat([samples.t_starts, samples.t_ends[-1:]])
+    shares = torch.histogram(edges, COARSE, range=(0.0, 8.0)).hist / len(edges)
+    torch.testing.assert_close(shares, expected / expected.sum(), atol=1e-3, rtol=0)
+
+
+def test_the_blur_is_a_maximum_and_then_a_mean() -> None:
+    weights = torch.rand(20, 9, dtype=torch.float64)
+    padded = torch.nn.functional.pad(weights, (1, 1), mode="replicate")
+    truth = torch.tensor(
+        [[(max(row[i], row[i + 1]) + max(row[i + 1], row[i + 2])) / 2 for i in range(9)] for row in padded.tolist()],
+        dtype=torch.float64,
+    )
+    torch.testing.assert_close(blurred(weights), truth)
+    assert bool((blurred(weights) >= weights).all())

@@ -11,7 +11,7 @@ from framework.fields.base import Field
 from framework.geometry.points import Points
 from framework.geometry.rays import Rays
 from framework.rendering.volume import Rendered, VolumeRenderer
-from framework.samplers.proposal import ProposalSampler, from_disparity, interlevel_loss, to_disparity
+from framework.samplers.proposal import FARTHEST, ProposalSampler, from_disparity, interlevel_loss, to_disparity
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
 
@@ -134,3 +134,72 @@ def test_light_that_no_wall_stops_ends_in_the_last_interval_of_an_unbounded_ray(
     rendered = shown(Wall(0.3, 1e9), sampler, rays_along_x(5), 1.0, jitter=False)
     torch.testing.assert_close(rendered.accumulation, torch.ones(5))
     torch.testing.assert_close(rendered.rgb, torch.full((5, 3), 0.5))
+
+
+# -- other density fields than hash grids -----------------------------------------------------------------------------
+
+
+class Asked(Wall):
+    """A wall that remembers what it was asked about, and learns how dense it is."""
+
+    def __init__(self, footprint: str) -> None:
+        super().__init__(0.3, 0.5)
+        self.footprint = footprint  # type: ignore[misc, assignment]
+        self.factor = torch.nn.Parameter(torch.ones(()))
+        self.asked: list[Points] = []
+
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        self.asked.append(points)
+        sigma, features = super().density(points)
+        return self.factor * sigma, features
+
+
+def cones_along_x(count: int) -> Rays:
+    return replace(rays_along_x(count), pixel_radii=torch.full((count,), 0.01))
+
+
+@pytest.mark.parametrize("footprint", ["none", "radius", "gaussian"])
+def test_a_field_serves_all_levels_and_is_asked_about_the_size_it_needs(footprint: str) -> None:
+    field = Asked(footprint)
+    sampler = ProposalSampler(BOX, (24, 12, 8), unbounded=True, fields=[field])
+    assert sampler.proposals == [field, field]
+    assert [name for name, _ in sampler.named_parameters()] == ["fields.0.factor"]
+    sampler.update(0, field.density)
+    samples = sampler.sample(cones_along_x(5), Wall(0, 1), True)
+    assert [len(points) for points in field.asked] == [5 * 24, 5 * 12]
+    for points, histogram in zip(field.asked, samples.proposals, strict=True):
+        assert (points.radii is None, points.variances is None) == (footprint == "none", footprint != "gaussian")
+        assert points.positions.shape == (histogram.weights.numel(), 3)
+        assert histogram.weights.requires_grad
+    if footprint == "gaussian":  # the Gaussians of intervals that meet: lengths are sqrt(12) standard deviations
+        first = field.asked[0]
+        assert first.variances is not None
+        lengths = (12 * first.variances[:, 0]).sqrt().view(5, 24)[:, 3:9]
+        x = first.positions[:, 0].view(5, 24)[:, 3:9]
+        torch.testing.assert_close((lengths[:, 1:] + lengths[:, :-1]) / 2, x.diff(dim=-1), rtol=0.1, atol=1e-3)
+
+
+def test_the_gaussian_of_an_endless_interval_is_that_of_its_beginning() -> None:
+    """The sky is learnt as matter at the far end of rays, and not at the mean of an interval of 10^10."""
+    field = Asked("gaussian")
+    sampler = ProposalSampler(BOX, (16, 8, 4), unbounded=True, endless=True, fields=[Wall(0.3, 1e9)])
+    samples = sampler.sample(cones_along_x(5), field, False)
+    (points,) = field.asked
+    assert bool((samples.padded(samples.t_ends)[:, -1] == FARTHEST).all())
+    assert float(points.positions.abs().max()) < 1001
+    assert samples.sigma is not None
+    assert samples.sigma.requires_grad
+    plain = Asked("none")
+    assert sampler.sample(cones_along_x(5), plain, False).sigma is None
+    assert plain.asked == []
+
+
+def test_how_often_proposals_learn_and_how_many_there_are() -> None:
+    sampler = ProposalSampler(BOX, (8, 4), (64,), learn_every=1)
+    for step in (300, 301, 302):
+        sampler.update(step, Wall(0, 1).density)
+        assert sampler.learning
+    with pytest.raises(ValueError, match="2 density fields for 1 proposals"):
+        ProposalSampler(BOX, (8, 4), fields=[Wall(0, 1), Wall(0, 1)])
+    with pytest.raises(ValueError, match="one more is needed"):
+        ProposalSampler(BOX, (8, 4))

@@ -1,80 +1,13 @@
 // Multiresolution hash encoding, forward and backward (Instant-NGP, section 3). See ../hash_grid.py for the reference.
-#include "adam.h"
+#include "hash_grid.h"
 
-#include <atomic>
 #include <memory>
-#include <vector>
+
+using namespace grid;
 
 namespace {
 
-constexpr uint32_t PRIME_Y = 2654435761u, PRIME_Z = 805459861u;
-constexpr int CORNERS = 8;
 constexpr int64_t CHUNK = 1024;  // samples that go through all levels together: their features stay in cache
-
-struct Level {
-    int64_t offset;
-    uint32_t mask;  // entries - 1, of a hashed level
-    int32_t resolution;
-    bool dense;
-};
-
-Level level_of(const int64_t* resolutions, const int64_t* offsets, int level) {
-    // In floating point, for the product of large resolutions does not fit 64 bits.
-    const double vertices = double(resolutions[level]) + 1;
-    const int64_t entries = offsets[level + 1] - offsets[level];
-    return {offsets[level], uint32_t(entries - 1), int32_t(resolutions[level]),
-            vertices * vertices * vertices <= double(entries)};
-}
-
-typedef uint32_t Words __attribute__((vector_size(LANES * 4)));
-
-// The 8 corners around LANES positions: corner c is at (c >> 2 & 1, c >> 1 & 1, c & 1) along x, y, z.
-struct Cell {
-    alignas(64) uint32_t entry[CORNERS][LANES];
-    alignas(64) float weight[CORNERS][LANES];
-    Floats fraction[3];
-    Floats inside[3];  // the resolution where the position is inside the box, 0 where it was moved to the face
-};
-
-template <bool DENSE>
-inline void find_cell(const Level& level, Floats x, Floats y, Floats z, Cell& cell) {
-    const Floats resolution = splat(float(level.resolution));
-    const Floats position[3] = {x, y, z};
-    Words low[3];
-    for (int axis = 0; axis < 3; axis++) {
-        const Floats p = position[axis];
-        const Floats clamped = p < 0 ? splat(0) : p > 1 ? splat(1) : p;  // NaN stays
-        const Floats scaled = clamped * resolution;
-        const Floats safe = scaled == scaled ? scaled : splat(0);
-        const Ints corner = __builtin_convertvector(safe, Ints);
-        const Ints last = Ints{} + (level.resolution - 1);
-        const Ints kept = corner > last ? last : corner;
-        cell.fraction[axis] = scaled - __builtin_convertvector(kept, Floats);
-        cell.inside[axis] = (p < 0) | (p > 1) ? splat(0) : resolution;
-        low[axis] = (Words)kept;
-    }
-    Words ends[3][2];
-    if (DENSE) {
-        const uint32_t side = level.resolution + 1;
-        const Words ix = low[0] * (side * side), iy = low[1] * side;
-        ends[0][0] = ix, ends[0][1] = ix + side * side;
-        ends[1][0] = iy, ends[1][1] = iy + side;
-        ends[2][0] = low[2], ends[2][1] = low[2] + 1;
-    } else {
-        const Words iy = low[1] * PRIME_Y, iz = low[2] * PRIME_Z;
-        ends[0][0] = low[0], ends[0][1] = low[0] + 1;
-        ends[1][0] = iy, ends[1][1] = iy + PRIME_Y;
-        ends[2][0] = iz, ends[2][1] = iz + PRIME_Z;
-    }
-    const Floats* f = cell.fraction;
-    const Floats g[3] = {1 - f[0], 1 - f[1], 1 - f[2]};
-    for (int c = 0; c < CORNERS; c++) {
-        const Words a = ends[0][c >> 2 & 1], b = ends[1][c >> 1 & 1], d = ends[2][c & 1];
-        const Words entry = DENSE ? a + b + d : (a ^ b ^ d) & level.mask;
-        std::memcpy(cell.entry[c], &entry, sizeof entry);
-        store(cell.weight[c], (c >> 2 & 1 ? f[0] : g[0]) * (c >> 1 & 1 ? f[1] : g[1]) * (c & 1 ? f[2] : g[2]));
-    }
-}
 
 template <int F>
 inline void blend(const Cell& cell, const float* table, int count, float* out, int64_t stride) {
@@ -116,8 +49,6 @@ inline void load_positions(const float* positions, int64_t first, int count, Flo
         for (int axis = 0; axis < 3; axis++) lanes[axis][s] = positions[(first + s) * 3 + axis];
     for (int axis = 0; axis < 3; axis++) xyz[axis] = load(lanes[axis]);
 }
-
-inline int block(int64_t first, int64_t end) { return int(end - first < LANES ? end - first : LANES); }
 
 template <int F, bool DENSE>
 void forward_level(const Level& level, const Floats (*xyz)[3], const float* table, int64_t begin, int64_t end,
@@ -195,64 +126,6 @@ struct Gathered {
     }
 };
 
-// Levels are shared out over threads, so that no two write to the same entry and the order of sums never changes.
-template <int F>
-void backward_table(const float* const* positions, const float* const* grads, const int64_t* ends, int parts,
-                    const int64_t* resolutions, const int64_t* offsets, int levels, float* table, int threads) {
-    const Gathered<F> samples(positions, grads, ends, parts, levels, threads);
-    for_each(threads, levels, 1, [&](int64_t turn) {
-        const int l = levels - 1 - int(turn);  // the slowest first
-        samples.scatter_to(level_of(resolutions, offsets, l), l, table + offsets[l] * F);
-    });
-}
-
-// The same, and Adam on each level while its gradient is still in cache. Returns how many entries were updated.
-template <int F>
-int64_t adam_table(const float* const* positions, const float* const* grads, const int64_t* ends, int parts,
-                   const int64_t* resolutions, const int64_t* offsets, int levels, float* values, float* mean,
-                   float* square, float* seen, const adam::Settings& settings, int threads) {
-    const Gathered<F> samples(positions, grads, ends, parts, levels, threads);
-    // Of each thread, and zero between calls: the update clears what it has used.
-    static thread_local std::vector<std::vector<float>> kept;
-    std::vector<std::vector<float>>& grads_of = kept;
-    if (grads_of.size() < size_t(threads)) grads_of.resize(size_t(threads));
-    std::atomic<int64_t> touched{0};
-    for_chunks(threads, levels, [&](int64_t turn, int slot) {
-        const int l = levels - 1 - int(turn);
-        const int64_t first = offsets[l], entries = offsets[l + 1] - first, i = first * F;
-        std::vector<float>& grad = grads_of[size_t(slot)];
-        if (grad.size() < size_t(entries) * F) grad.resize(size_t(entries) * F, 0.0f);
-        samples.scatter_to(level_of(resolutions, offsets, l), l, grad.data());
-        touched += adam::update_range<F>(values + i, mean + i, square + i, grad.data(), seen + first, 0, entries, F,
-                                         settings);
-    });
-    return touched;
-}
-
-template <int F, bool DENSE>
-inline void add_position_gradient(const Level& level, const float* table, const Floats* xyz, int size,
-                                  const float* grad, int64_t stride, Floats* out) {
-    Cell cell;
-    find_cell<DENSE>(level, xyz[0], xyz[1], xyz[2], cell);
-    alignas(64) float value[CORNERS][LANES] = {};  // of the incoming gradient times each corner's entry
-    for (int c = 0; c < CORNERS; c++)
-        for (int s = 0; s < size; s++)
-            for (int f = 0; f < F; f++)
-                value[c][s] += table[(level.offset + cell.entry[c][s]) * F + f] * grad[s * stride + f];
-    const Floats* t = cell.fraction;
-    for (int axis = 0; axis < 3; axis++) {
-        const int one = 4 >> axis, p = axis == 0 ? 1 : 0, q = axis == 2 ? 1 : 2;  // p, q: the other two axes
-        const int bit_p = 4 >> p, bit_q = 4 >> q;
-        Floats sum = splat(0);
-        for (int side = 0; side < 4; side++) {
-            const int c = (side & 1 ? bit_p : 0) | (side & 2 ? bit_q : 0);
-            const Floats weight = (side & 1 ? t[p] : 1 - t[p]) * (side & 2 ? t[q] : 1 - t[q]);
-            sum += weight * (load(value[c | one]) - load(value[c]));
-        }
-        out[axis] += sum * cell.inside[axis];
-    }
-}
-
 template <int F>
 void backward_positions(const float* positions, int64_t count, const float* table, const float* grad,
                         const int64_t* resolutions, const int64_t* offsets, int levels, float* out, int threads) {
@@ -274,15 +147,6 @@ void backward_positions(const float* positions, int64_t count, const float* tabl
 
 }  // namespace
 
-#define FOR_FEATURES(features, call) \
-    switch (features) {              \
-        case 1: call(1); break;      \
-        case 2: call(2); break;      \
-        case 4: call(4); break;      \
-        case 8: call(8); break;      \
-        default: throw std::invalid_argument("hash grid: an entry has 1, 2, 4 or 8 features"); \
-    }
-
 EXPORT int hash_grid_forward(const float* positions, int64_t count, const float* table, int features,
                              const int64_t* resolutions, const int64_t* offsets, int levels, float* out, int threads) {
     return guarded([&] {
@@ -297,7 +161,9 @@ EXPORT int hash_grid_backward_table(const float* const* positions, const float* 
                                     int parts, int features, const int64_t* resolutions, const int64_t* offsets,
                                     int levels, float* table_grad, int threads) {
     return guarded([&] {
-#define CALL(F) backward_table<F>(positions, grads, ends, parts, resolutions, offsets, levels, table_grad, threads)
+#define CALL(F)                                                                      \
+    add_by_level<F>(Gathered<F>(positions, grads, ends, parts, levels, threads), resolutions, offsets, levels, \
+                    table_grad, threads)
         FOR_FEATURES(features, CALL)
 #undef CALL
     });
@@ -310,9 +176,9 @@ EXPORT int hash_grid_adam(const float* const* positions, const float* const* gra
                           int threads, int64_t* touched) {
     return guarded([&] {
         const adam::Settings settings(rate, beta1, beta2, eps);
-#define CALL(F)                                                                                                   \
-    *touched = adam_table<F>(positions, grads, ends, parts, resolutions, offsets, levels, values, mean, square, seen, \
-                             settings, threads)
+#define CALL(F)                                                                                          \
+    *touched = adam_by_level<F>(Gathered<F>(positions, grads, ends, parts, levels, threads), resolutions, \
+                                offsets, levels, values, mean, square, seen, settings, threads)
         FOR_FEATURES(features, CALL)
 #undef CALL
     });

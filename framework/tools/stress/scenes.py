@@ -141,7 +141,7 @@ def data_views(parser: DataParser, data: Path | None) -> Views:
 def _few(parser: DataParser, data: Path | None, split: Split, count: int) -> Dataset:
     parsed = parser.parse(data, split)
     few = parsed[torch.tensor(spread(len(parsed.image_paths), count))]
-    return reduced(load_dataset(few, split), LONGER_SIDE)
+    return reduced(load_dataset(replace(few, num_scales=1), split), LONGER_SIDE)
 
 
 def reduced(dataset: Dataset, side: int) -> Dataset:

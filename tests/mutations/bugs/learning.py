@@ -207,8 +207,8 @@ BUGS = (
         "coarse-not-taught",
         "losses",
         "framework/ray_model.py",
-        "mean_squared_error(coarse.rgb, batch.rgb, batch.weights)",
-        "mean_squared_error(coarse.rgb.detach(), batch.rgb, batch.weights)",
+        "self.color_error(coarse.rgb, batch)",
+        "self.color_error(coarse.rgb.detach(), batch)",
         "the coarse network learns nothing, and the fine one is sampled at random",
     ),
     Bug(
@@ -238,10 +238,18 @@ BUGS = (
     Bug(
         "distortion-in-distance",
         "losses",
-        "methods/nerfacto.py",
-        "config.distortion_loss_mult * distortion(weights, normalised).mean()",
-        "config.distortion_loss_mult * distortion(weights, samples).mean()",
+        "framework/rendering/losses.py",
+        "distortion(weights, Samples.regular(samples.edges[:, :-1], samples.edges[:, 1:])).mean()",
+        "distortion(weights, samples).mean()",
         "far away light is punished a thousand times more than near light",
+    ),
+    Bug(
+        "small-pictures-count-less",
+        "losses",
+        "framework/data/dataset.py",
+        "areas = self.reductions.float().square()",
+        "areas = self.reductions.float().square().reciprocal()",
+        "with --multiscale the small pictures are hardly learnt from",
     ),
     Bug(
         "gradient-scaling-inverted",

@@ -1,0 +1,82 @@
+"""Integrated encoding of a box or of all of space: Mip-NeRF (Barron et al. 2021), mip-NeRF 360 (Barron et al. 2022)."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import normalize
+
+from framework.geometry.bounds import contract_gaussians
+from framework.geometry.points import Points
+from framework.kernels.integrated import integrated_encoding
+
+
+class IntegratedEncoding(nn.Module):
+    """Expected sines and cosines of the Gaussians of points, in units of a box.
+
+    The middle of the box is at the origin, and its faces are at -1 and 1. Along the axes alone, a Gaussian that is long
+    in a direction between them looks like a ball; further directions tell them apart (mip-NeRF 360, section 2).
+
+    Args:
+        box: (2, 3) corners of the box, scene units.
+        num_frequencies: number L of frequencies.
+        deviation: standard deviation of points that are asked about without a size, scene units.
+        contracted: whether all of space is contracted into the ball of radius 2 around the box.
+        directions: (K, 3) unit directions along which waves run; the three axes if None.
+    """
+
+    box: Tensor
+    directions: Tensor | None
+
+    def __init__(
+        self,
+        box: Tensor,
+        num_frequencies: int,
+        deviation: float,
+        contracted: bool = False,
+        directions: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        self.register_buffer("box", box.clone())
+        self.register_buffer("directions", directions, persistent=False)
+        self.num_frequencies, self.deviation, self.contracted = num_frequencies, deviation, contracted
+        self.num_features = 2 * num_frequencies * (3 if directions is None else len(directions))
+
+    def forward(self, points: Points) -> Tensor:
+        """Return the encoding (N, 2 K L) of `points`."""
+        points = points.sized(self.deviation)
+        middle, half = (self.box[0] + self.box[1]) / 2, (self.box[1] - self.box[0]) / 2
+        means = (points.positions - middle) / half
+        if self.directions is None and not self.contracted:
+            assert points.covariances is not None
+            return integrated_encoding(means, points.covariances / half.square(), self.num_frequencies)
+        roots = points.roots() / half[:, None]
+        if self.contracted:
+            means, roots = contract_gaussians(means, roots)
+        if self.directions is None:
+            return integrated_encoding(means, roots.square().sum(-1), self.num_frequencies)
+        # Products and sums, because autocast would round a matrix product to bfloat16.
+        along = (means[:, None] * self.directions).sum(-1)
+        spreads = [(roots[:, None, :, column] * self.directions).sum(-1).square() for column in range(3)]
+        return integrated_encoding(along, torch.stack(spreads).sum(0), self.num_frequencies)
+
+
+def icosahedron_directions() -> Tensor:
+    """Return the directions (21, 3) of mip-NeRF 360: corners and edge middles of an icosahedron, one of each antipodes.
+
+    They are those of an icosahedron whose faces are each divided into four, appendix A of the paper.
+    """
+    golden = (1 + 5**0.5) / 2
+    pairs = [(1.0, golden), (1.0, -golden), (-1.0, golden), (-1.0, -golden)]
+    corners = torch.tensor([corner for a, b in pairs for corner in ((0.0, a, b), (a, b, 0.0), (b, 0.0, a))])
+    edges = [(a, b) for a, b in combinations(corners.double(), 2) if (a - b).norm() < 2.1]  # the shortest are 2 long
+    middles = torch.stack([(a + b) / 2 for a, b in edges])
+    every = normalize(torch.cat([corners.double(), middles]), dim=-1)
+    return torch.stack([each for each in every if _is_first(each)]).float()
+
+
+def _is_first(direction: Tensor) -> bool:
+    """Return whether the first coordinate that is not 0 is positive, which holds for one of two antipodes."""
+    return next(value > 0 for value in direction.tolist() if abs(value) > 1e-6)

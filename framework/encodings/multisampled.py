@@ -1,0 +1,69 @@
+"""The hash grid of Zip-NeRF (Barron et al. 2023): means over points of conical frustums, with a normalised decay."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from framework.encodings.hash_grid import HashGrid
+from framework.kernels.multisampled_grid import MultisampleGradient, multisampled_grid
+
+
+class MultisampledHashGrid(HashGrid):
+    """A multiresolution hash grid over [0, 1]^3 that is looked up at multisamples (`framework.kernels.multisamples`).
+
+    Decay: the paper adds the mean of squares of each level's entries to the loss, so that the few entries of coarse
+    levels decay as fast as the many of fine ones. Its gradient touches the whole table in each step. Here it is the
+    mean of squares of each level's features at the frustums of a step, whose gradient goes through the look-up's and
+    reaches the entries that the step uses. An entry that is never used stays at its first value of 1e-4 or less.
+
+    Args:
+        num_levels: number L of levels.
+        features_per_level: number F of features of an entry.
+        base_resolution: cells along an axis at the first level.
+        max_resolution: cells along an axis at the last level.
+        log2_table_size: maximum number of entries of one level, as a power of two.
+        sparse: whether the optimiser updates only the entries that a step has used, as in `HashGrid`.
+        decay: weight of the mean of squares of each level's features, whose gradient is added in training mode.
+
+    Raises:
+        ConfigError: if a number is out of range, or the table needs more memory than the machine has.
+    """
+
+    def __init__(
+        self,
+        num_levels: int = 10,
+        features_per_level: int = 4,
+        base_resolution: int = 16,
+        max_resolution: int = 8192,
+        log2_table_size: int = 21,
+        sparse: bool = False,
+        decay: float = 0.0,
+    ) -> None:
+        super().__init__(num_levels, features_per_level, base_resolution, max_resolution, log2_table_size, sparse)
+        self.deferred: MultisampleGradient | None = MultisampleGradient(self.layout) if sparse else None
+        self.decay = decay
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Return the features (N, L * F) of N sets of `points` (N, J, 4): positions in [0, 1] and deviations."""
+        features = multisampled_grid(points, self.table, self.layout, self.deferred)
+        if not (self.training and self.decay and torch.is_grad_enabled() and len(features)):
+            return features
+        return _Decayed.apply(features, 2 * self.decay * self.layout.num_levels / features.numel())
+
+
+class _Decayed(torch.autograd.Function):
+    """Values as they are, whose gradient is that of the loss and of half the sum of their squares times a rate."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, rate: float) -> Tensor:
+        ctx.save_for_backward(values)
+        ctx.rate = rate
+        return values.view_as(values)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        (values,) = ctx.saved_tensors
+        return torch.add(grad, values, alpha=ctx.rate), None

@@ -1,0 +1,50 @@
+"""Fields that are looked up at several points of each conical frustum: Zip-NeRF (Barron et al. 2023), section 3."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from framework.encodings.multisampled import MultisampledHashGrid
+from framework.fields.encoded import BoxField, DensityField, EncodedField
+from framework.geometry.multisamples import fixed_pattern, random_pattern
+from framework.geometry.points import Points
+from framework.kernels.math import split_density, truncated_exp
+from framework.kernels.multisamples import unit_multisamples
+
+
+class MultisampledDensity(DensityField):
+    """A `DensityField` of conical frustums, for proposals; its encoding is a `MultisampledHashGrid`."""
+
+    footprint = "frustum"
+
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        features = encode_frustums(self, points)
+        return truncated_exp(self.head(features)[:, 0]), features
+
+
+class MultisampledField(EncodedField):
+    """An `EncodedField` of conical frustums; its encoding is a `MultisampledHashGrid`."""
+
+    footprint = "frustum"
+
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        return split_density(self.density_head(encode_frustums(self, points)))
+
+
+def encode_frustums(field: BoxField, points: Points) -> Tensor:
+    """Return the features (N, E) of the frustums of points; points without one are taken to have no size.
+
+    The pattern of a frustum's points is turned at random in training mode, and fixed otherwise.
+
+    Args:
+        field: a field on a `MultisampledHashGrid`.
+        points: N points.
+    """
+    assert isinstance(field.encoding, MultisampledHashGrid)
+    cones = points.frustums
+    if cones is None:
+        unit = field.unit(points.positions)
+        return field.encoding(torch.cat([unit, torch.zeros_like(unit[:, :1])], dim=-1)[:, None])
+    pattern = random_pattern(cones.radii) if field.training else fixed_pattern(cones)
+    return field.encoding(unit_multisamples(cones, pattern, field.box, field.unbounded))

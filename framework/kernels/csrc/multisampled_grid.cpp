@@ -1,0 +1,273 @@
+// A hash grid at the multisamples of conical frustums: means of features, weighted by scale (Zip-NeRF). See
+// ../multisampled_grid.py for the reference.
+//
+// The points of a sample lie close together, and at most levels some of them, or all, have the same corners. Weights of
+// such a run are added up before an entry is touched: where all 6 points share a cell, 8 entries are read or written
+// instead of 48. Lanes are samples, so that the weights of a run are added up by vectors.
+#include "hash_grid.h"
+
+#include <memory>
+
+using namespace grid;
+
+namespace {
+
+constexpr int64_t CHUNK = 256;      // samples that go through all levels together: their points stay in cache
+constexpr float SMALLEST = 0.05f;   // deviation, in cells, below which a weight is 1 in float32
+
+// One point of each of LANES samples.
+struct Point {
+    Floats xyz[3], deviation;
+};
+
+// Fills `out` with the points of samples [first, first + size), `points` being (count, per_sample, 4).
+inline void load_points(const float* points, int per_sample, int64_t first, int size, Point* out) {
+    for (int j = 0; j < per_sample; j++) {
+        alignas(64) float lanes[4][LANES] = {};
+        for (int s = 0; s < size; s++) {
+            const float* from = points + ((first + s) * per_sample + j) * 4;
+            for (int i = 0; i < 4; i++) lanes[i][s] = from[i];
+        }
+        for (int axis = 0; axis < 3; axis++) out[j].xyz[axis] = load(lanes[axis]);
+        out[j].deviation = load(lanes[3]);
+    }
+}
+
+// erf of x >= 0: Abramowitz and Stegun 1964, 7.1.26, whose error is at most 1.5e-7, and the series for small x.
+inline Floats error_function(Floats x) {
+    const Floats squared = x * x, t = 1.0f / (1.0f + 0.3275911f * x);
+    const Floats sum = (((1.061405429f * t - 1.453152027f) * t + 1.421413741f) * t - 0.284496736f) * t + 0.254829592f;
+    const Floats series = 1.128379167f * x * (1.0f - squared * (1.0f / 3 - squared * 0.1f));
+    return x < 0.1f ? series : 1.0f - sum * t * exponential(-squared);
+}
+
+// A point's share in the mean over its sample: the weight of the level, over the number of points.
+inline Floats share_of(const Level& level, Floats deviation, int per_sample) {
+    const Floats cells = deviation * float(level.resolution);
+    return error_function(0.353553391f / (cells < SMALLEST ? splat(SMALLEST) : cells)) * (1.0f / float(per_sample));
+}
+
+template <bool DENSE>
+inline void find_weighted(const Level& level, const Point& point, int per_sample, Cell& cell) {
+    find_cell<DENSE>(level, point.xyz[0], point.xyz[1], point.xyz[2], cell);
+    const Floats share = share_of(level, point.deviation, per_sample);
+    for (int c = 0; c < CORNERS; c++) store(cell.weight[c], load(cell.weight[c]) * share);
+}
+
+inline Words entries_of(const Cell& cell, int corner) {
+    Words out;
+    std::memcpy(&out, cell.entry[corner], sizeof out);
+    return out;
+}
+
+template <int F>
+inline void prefetch(const Cell& cell, int s, const float* entries) {
+    for (int c = 0; c < CORNERS; c++) __builtin_prefetch(entries + int64_t(cell.entry[c][s]) * F);
+}
+
+// Calls visit(cell, s) for each run of consecutive points of sample s that have the same corners, whose weights in
+// `cell` are those of the run.
+template <int F, bool DENSE, typename Visit>
+inline void for_runs(const Level& level, const Point* points, int per_sample, int size, const float* entries,
+                     const Visit& visit) {
+    Cell cells[2];
+    find_weighted<DENSE>(level, points[0], per_sample, cells[0]);
+    for (int s = 0; s < size; s++) prefetch<F>(cells[0], s, entries);
+    for (int j = 1; j < per_sample; j++) {
+        Cell &before = cells[~j & 1], &here = cells[j & 1];
+        find_weighted<DENSE>(level, points[j], per_sample, here);
+        Ints moved = {};
+        for (int c = 0; c < CORNERS; c++) moved |= entries_of(here, c) != entries_of(before, c);
+        alignas(64) int32_t lanes[LANES];
+        std::memcpy(lanes, &moved, sizeof moved);
+        for (int s = 0; s < size; s++)
+            if (lanes[s]) {
+                prefetch<F>(here, s, entries);
+                visit(before, s);
+            }
+        for (int c = 0; c < CORNERS; c++) {
+            const Floats weight = load(here.weight[c]);
+            store(here.weight[c], moved ? weight : weight + load(before.weight[c]));
+        }
+    }
+    for (int s = 0; s < size; s++) visit(cells[(per_sample - 1) & 1], s);
+}
+
+template <int F, bool DENSE>
+void forward_level(const Level& level, const Point* points, int per_sample, const float* table, int64_t begin,
+                   int64_t end, float* out, int64_t stride) {
+    const float* entries = table + level.offset * F;
+    for (int64_t n = begin; n < end; n += LANES, points += per_sample) {
+        const int size = block(n, end);
+        float sum[LANES][F] = {};
+        for_runs<F, DENSE>(level, points, per_sample, size, entries, [&](const Cell& cell, int s) {
+            for (int c = 0; c < CORNERS; c++) {
+                const float* entry = entries + int64_t(cell.entry[c][s]) * F;
+                for (int f = 0; f < F; f++) sum[s][f] += cell.weight[c][s] * entry[f];
+            }
+        });
+        for (int s = 0; s < size; s++) std::memcpy(out + (n + s) * stride, sum[s], sizeof sum[s]);
+    }
+}
+
+template <int F>
+void forward(const float* positions, int64_t count, int per_sample, const float* table, const int64_t* resolutions,
+             const int64_t* offsets, int levels, float* out, int threads) {
+    const int64_t stride = int64_t(levels) * F;
+    for_ranges(threads, count, CHUNK, [&](int64_t begin, int64_t end) {
+        const std::unique_ptr<Point[]> points(new Point[size_t((end - begin + LANES - 1) / LANES * per_sample)]);
+        for (int64_t n = begin; n < end; n += LANES)
+            load_points(positions, per_sample, n, block(n, end), points.get() + (n - begin) / LANES * per_sample);
+        for (int l = 0; l < levels; l++) {
+            const Level level = level_of(resolutions, offsets, l);
+            const auto run = level.dense ? forward_level<F, true> : forward_level<F, false>;
+            run(level, points.get(), per_sample, table, begin, end, out + l * F, stride);
+        }
+    });
+}
+
+template <int F, bool DENSE>
+void scatter_level(const Level& level, const Point* points, int per_sample, int64_t count, const float* grad,
+                   float* table) {
+    for (int64_t n = 0; n < count; n += LANES, points += per_sample) {
+        const int size = block(n, count);
+        bool zero[LANES], all_zero = true;
+        for (int s = 0; s < size; s++) {
+            zero[s] = true;
+            for (int f = 0; f < F; f++) zero[s] &= grad[(n + s) * F + f] == 0;
+            all_zero &= zero[s];
+        }
+        if (all_zero) continue;
+        for_runs<F, DENSE>(level, points, per_sample, size, table, [&](const Cell& cell, int s) {
+            if (zero[s]) return;
+            float g[F];
+            std::memcpy(g, grad + (n + s) * F, sizeof g);
+            for (int c = 0; c < CORNERS; c++) {
+                float* entry = table + int64_t(cell.entry[c][s]) * F;
+                for (int f = 0; f < F; f++) entry[f] += cell.weight[c][s] * g[f];
+            }
+        });
+    }
+}
+
+// Samples that come in parts, each with its own number of points a sample: points in blocks of LANES samples, and the
+// incoming gradient level by level.
+template <int F>
+struct Gathered {
+    struct Part {
+        int64_t count;
+        int per_sample;
+        std::unique_ptr<Point[]> points;
+        std::unique_ptr<float[]> by_level;
+    };
+    std::vector<Part> parts;
+
+    // `ends` holds the number of samples up to the end of each part.
+    Gathered(const float* const* points, const float* const* grads, const int64_t* ends, const int64_t* per_sample,
+             int count, int levels, int threads) {
+        const int64_t stride = int64_t(levels) * F;
+        for (int i = 0; i < count; i++) {
+            const int64_t size = ends[i] - (i ? ends[i - 1] : 0);
+            const int own = int(per_sample[i]);
+            Part part{size, own, std::unique_ptr<Point[]>(new Point[size_t((size + LANES - 1) / LANES * own)]),
+                      std::unique_ptr<float[]>(new float[size_t(size * stride)])};
+            for_ranges(threads, size, CHUNK, [&](int64_t begin, int64_t end) {
+                for (int64_t n = begin; n < end; n += LANES)
+                    load_points(points[i], own, n, block(n, end), part.points.get() + n / LANES * own);
+                for (int64_t n = begin; n < end; n++)
+                    for (int l = 0; l < levels; l++)
+                        std::memcpy(part.by_level.get() + (l * size + n) * F, grads[i] + n * stride + l * F,
+                                    sizeof(float) * F);
+            });
+            parts.push_back(std::move(part));
+        }
+    }
+    // Adds a level's gradient to `table`, where that level's first entry stands.
+    void scatter_to(const Level& level, int l, float* table) const {
+        const auto run = level.dense ? scatter_level<F, true> : scatter_level<F, false>;
+        for (const Part& part : parts)
+            run(level, part.points.get(), part.per_sample, part.count, part.by_level.get() + l * part.count * F, table);
+    }
+};
+
+template <int F>
+void backward_points(const float* points, int64_t count, int per_sample, const float* table, const float* grad,
+                     const int64_t* resolutions, const int64_t* offsets, int levels, float* out, int threads) {
+    const int64_t stride = int64_t(levels) * F, blocks = (count + LANES - 1) / LANES;
+    for_each(threads, blocks, 256 / LANES, [&](int64_t b) {
+        const int64_t n = b * LANES;
+        const int size = block(n, count);
+        const std::unique_ptr<Point[]> loaded(new Point[size_t(per_sample)]);
+        load_points(points, per_sample, n, size, loaded.get());
+        for (int j = 0; j < per_sample; j++) {
+            const Point& point = loaded[size_t(j)];
+            Floats sum[3] = {splat(0), splat(0), splat(0)};
+            for (int l = 0; l < levels; l++) {
+                const Level level = level_of(resolutions, offsets, l);
+                const auto run = level.dense ? add_position_gradient<F, true> : add_position_gradient<F, false>;
+                Floats own[3] = {splat(0), splat(0), splat(0)};
+                run(level, table, point.xyz, size, grad + n * stride + l * F, stride, own);
+                const Floats share = share_of(level, point.deviation, per_sample);
+                for (int axis = 0; axis < 3; axis++) sum[axis] += share * own[axis];
+            }
+            for (int s = 0; s < size; s++) {
+                float* to = out + ((n + s) * per_sample + j) * 4;
+                for (int axis = 0; axis < 3; axis++) to[axis] = sum[axis][s];
+                to[3] = 0;
+            }
+        }
+    });
+}
+
+}  // namespace
+
+EXPORT int multisampled_grid_forward(const float* points, int64_t count, int per_sample, const float* table,
+                                     int features, const int64_t* resolutions, const int64_t* offsets, int levels,
+                                     float* out, int threads) {
+    return guarded([&] {
+#define CALL(F) forward<F>(points, count, per_sample, table, resolutions, offsets, levels, out, threads)
+        FOR_FEATURES(features, CALL)
+#undef CALL
+    });
+}
+
+// Adds to `table_grad`.
+EXPORT int multisampled_grid_backward_table(const float* const* points, const float* const* grads,
+                                            const int64_t* ends, const int64_t* per_sample, int parts, int features,
+                                            const int64_t* resolutions, const int64_t* offsets, int levels,
+                                            float* table_grad, int threads) {
+    return guarded([&] {
+#define CALL(F)                                                                                               \
+    add_by_level<F>(Gathered<F>(points, grads, ends, per_sample, parts, levels, threads), resolutions, offsets, \
+                    levels, table_grad, threads)
+        FOR_FEATURES(features, CALL)
+#undef CALL
+    });
+}
+
+// Adam on what multisampled_grid_backward_table would add. `touched`: how many entries were updated.
+EXPORT int multisampled_grid_adam(const float* const* points, const float* const* grads, const int64_t* ends,
+                                  const int64_t* per_sample, int parts, int features, const int64_t* resolutions,
+                                  const int64_t* offsets, int levels, float* values, float* mean, float* square,
+                                  float* seen, float rate, double beta1, double beta2, float eps, int threads,
+                                  int64_t* touched) {
+    return guarded([&] {
+        const adam::Settings settings(rate, beta1, beta2, eps);
+#define CALL(F)                                                                                                \
+    *touched = adam_by_level<F>(Gathered<F>(points, grads, ends, per_sample, parts, levels, threads), resolutions, \
+                                offsets, levels, values, mean, square, seen, settings, threads)
+        FOR_FEATURES(features, CALL)
+#undef CALL
+    });
+}
+
+EXPORT int multisampled_grid_backward_points(const float* points, int64_t count, int per_sample, const float* table,
+                                             const float* grad, int features, const int64_t* resolutions,
+                                             const int64_t* offsets, int levels, float* points_grad, int threads) {
+    return guarded([&] {
+#define CALL(F) \
+    backward_points<F>(points, count, per_sample, table, grad, resolutions, offsets, levels, points_grad, threads)
+        FOR_FEATURES(features, CALL)
+#undef CALL
+    });
+}

@@ -1,0 +1,122 @@
+"""Blurred step functions, and the anti-aliased loss of proposals: Zip-NeRF (Barron et al. 2023), on z-aliasing.
+
+A histogram along a ray is a step function. The loss of mip-NeRF 360 jumps when an edge of one histogram passes an edge
+of the other, so that proposals learn where edges are, and lose thin things as the camera moves. Zip-NeRF first blurs
+the finer histogram with a box, which makes it piecewise linear, and then compares the weight in each proposed bin.
+
+The paper sorts the edges of the blurred function. Here none are sorted: if D is the second integral of the step
+function, which is quadratic between its edges, the integral of the blurred function up to x is
+(D(x + r) - D(x - r)) / (2 r), and walking along both histograms takes linear time.
+
+Letters: R rays, B bins of a histogram, which has B + 1 sorted edges on every ray, P bins of a proposed one.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from framework.kernels import native
+from framework.kernels.dispatch import CPP, Operation
+
+EPS = 1e-5
+"""Added to proposed weights in a denominator. The paper's code has 1.2e-7 and clips gradients, which we do not: what a
+bin with little weight adds to the gradient of its density is at most its excess squared, divided by 4 EPS."""
+
+
+def blurred_weights(edges: Tensor, weights: Tensor, proposed: Tensor, radius: float) -> Tensor:
+    """Return the weights (R, P) of other bins in a histogram that is blurred with a box.
+
+    Computed in float64, since differences of integrals are divided by the width of the box.
+
+    Args:
+        edges: (R, B + 1) sorted edges of the histogram.
+        weights: (R, B) weights of its bins.
+        proposed: (R, P + 1) sorted edges of the other bins.
+        radius: half the width of the box, in the units of the edges; more than 0.
+    """
+    edge, weight, x = edges.double(), weights.double(), proposed.double()
+    width, zero = edge.diff(dim=-1), torch.zeros_like(edge[:, :1])
+    mass = torch.cat([zero, weight.cumsum(-1)], dim=-1)
+    area = torch.cat([zero, ((mass[:, 1:] + mass[:, :-1]) / 2 * width).cumsum(-1)], dim=-1)
+    some = width > 0
+    slope = torch.cat([torch.where(some, weight / torch.where(some, width, 1.0), 0.0), zero], dim=-1)  # none at the end
+
+    def second_integral(x: Tensor) -> Tensor:
+        bins = (torch.searchsorted(edge, x, right=True) - 1).clamp(min=0)
+        past = (x - edge.gather(-1, bins)).clamp(min=0)
+        return area.gather(-1, bins) + past * (mass.gather(-1, bins) + slope.gather(-1, bins) * past / 2)
+
+    integral = (second_integral(x + radius) - second_integral(x - radius)) / (2 * radius)
+    return integral.diff(dim=-1)
+
+
+def blurred_excess_reference(
+    edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor, radius: float
+) -> Tensor:
+    """Compute `blurred_excess` in PyTorch, on any device that has float64.
+
+    `edges`, `weights`, `proposed`, `proposed_weights` and `radius` are as in `blurred_excess`.
+    """
+    target = blurred_weights(edges, weights, proposed, radius)
+    excess = (target - proposed_weights).clamp(min=0)
+    return (excess.square() / (proposed_weights + EPS)).sum(-1).to(proposed_weights.dtype)
+
+
+def blurred_excess(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor, radius: float) -> Tensor:
+    """Return the loss (R,) of proposed weights that are less than those of a blurred histogram: Zip-NeRF's loss.
+
+    It is the sum over proposed bins of max(0, b - p)^2 / p, where b is the weight of the blurred histogram in a bin and
+    p the proposed one.
+
+    Args:
+        edges: (R, B + 1) sorted edges of the histogram; without a gradient.
+        weights: (R, B) weights of its bins; without a gradient.
+        proposed: (R, P + 1) sorted edges of the proposed histogram; without a gradient.
+        proposed_weights: (R, P) weights of its bins.
+        radius: half the width of the box, in the units of the edges.
+
+    Raises:
+        ValueError: if the radius is not more than 0.
+    """
+    if not radius > 0:
+        raise ValueError(f"a histogram is blurred with a box of a radius above 0, not {radius}")
+    edges, weights, proposed = edges.detach(), weights.detach(), proposed.detach()
+    tensors = edges, weights, proposed, proposed_weights
+    return BLURRED_EXCESS(tensors, *tensors, radius)
+
+
+BLURRED_EXCESS = Operation("blurred_excess", blurred_excess_reference)
+
+
+@BLURRED_EXCESS.implementation(CPP)
+def _compiled(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor, radius: float) -> Tensor:
+    return _Excess.apply(*(tensor.contiguous() for tensor in (edges, weights, proposed, proposed_weights)), radius)
+
+
+_excess = native.Function("blurred_excess", "ppqppqqdfppi")
+
+
+class _Excess(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor, radius: float
+    ) -> Tensor:
+        (rays, bins), proposed_bins = weights.shape, proposed_weights.shape[1]
+        loss, grad = weights.new_empty(rays), torch.empty_like(proposed_weights)
+        _excess(
+            native.pointer(edges, "edges", (rays, bins + 1)), native.pointer(weights, "weights", (rays, bins)), bins,
+            native.pointer(proposed, "proposed edges", (rays, proposed_bins + 1)),
+            native.pointer(proposed_weights, "proposed weights", (rays, proposed_bins)), proposed_bins, rays, radius,
+            EPS, loss.data_ptr(), grad.data_ptr(), native.threads(),
+        )  # fmt: skip
+        ctx.save_for_backward(grad)
+        return loss
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[None, None, None, Tensor, None]:
+        (grad_weights,) = ctx.saved_tensors
+        return None, None, None, grad_weights * grad[:, None], None

@@ -1,0 +1,121 @@
+"""Mip-NeRF: one network that is asked about cones instead of points, against aliasing between scales.
+
+Barron et al., "Mip-NeRF: A Multiscale Representation for Anti-Aliasing Neural Radiance Fields", ICCV 2021. Its
+multiscale Blender images are made by `ns-train mip-nerf ... blender --multiscale 4`. With `--sampler occupancy`, space
+that is empty or hidden is skipped, as vanilla-nerf does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from framework import Decision, Field, Method, RayModel, Sampler, Scene
+from framework.base.config import Range
+from framework.base.decisions import Choice, fill
+from framework.base.optimised import Optimised
+from framework.encodings.integrated import IntegratedEncoding
+from framework.fields.integrated import IntegratedField
+from framework.kernels.frequency import MAX_FREQUENCIES
+from framework.samplers.choice import HierarchicalConfig, contracted_box, make_sampler, sampler_choice
+from framework.samplers.proposal import half_edge
+
+OCCUPANCY_SAMPLES_PER_BATCH = 2**12
+"""Samples of a training step with the occupancy grid, where the number of samples per ray varies a hundredfold."""
+OCCUPANCY_RATE = 2.0
+"""Factor of the learning rate with the occupancy grid, as for vanilla-nerf, whose steps have as many samples."""
+
+
+@dataclass(frozen=True)
+class MipNeRFConfig(
+    HierarchicalConfig,
+    max_num_iterations=1_000_000,
+    num_rays_per_batch=4_096,
+    learning_rate=5e-4,
+    lr_final=0.01,
+    background="white",
+    num_coarse_samples=128,
+    num_fine_samples=128,
+    num_steps=192,
+):
+    """Settings of mip-nerf; the defaults are the paper's, without its warm-up of 2500 steps."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        "num_layers": (3, 64),
+        "hidden_width": (2, 2**14),
+        "position_frequencies": (1, MAX_FREQUENCIES),
+        "direction_frequencies": (0, MAX_FREQUENCIES),
+    }
+    """Allowed range of each numeric setting."""
+    num_layers: int = 8
+    """Layers before the density output."""
+    hidden_width: int = 256
+    """Features per layer."""
+    position_frequencies: int = 16
+    """Number of frequencies in the integrated encoding of positions; those finer than a cone average to 0."""
+    direction_frequencies: int = 4
+    """Number of frequencies in the encoding of directions."""
+
+
+class MipNeRF(RayModel[MipNeRFConfig]):
+    """A model whose coarse level, the same network on the same rays, counts a tenth (section 3.3)."""
+
+    coarse_weight = 0.1
+
+
+def decide(config: MipNeRFConfig, scene: Scene) -> tuple[MipNeRFConfig, list[Decision]]:
+    """Fill in the settings that depend on the scene.
+
+    Args:
+        config: the method's settings; those left open are filled in.
+        scene: properties of the data.
+
+    Returns:
+        Settings without open ones, and a record of each that was filled in.
+    """
+    config, made = fill(config, sampler_choice(config, scene.unbounded))
+    if config.sampler != "occupancy":
+        return config, made
+    reason = "the number of samples on a ray varies a hundredfold"
+    config, more = fill(config, Choice("samples_per_batch", OCCUPANCY_SAMPLES_PER_BATCH, reason, "samples a step"))
+    return config, made + more
+
+
+def make_field(config: MipNeRFConfig, scene: Scene) -> Field:
+    """Return the network, of NeRF's shape, on the integrated encoding.
+
+    Args:
+        config: the method's settings, none left open.
+        scene: properties of the data.
+    """
+    encoding = IntegratedEncoding(
+        scene.box,
+        config.position_frequencies,
+        deviation=half_edge(scene.box) / scene.image_size,
+        contracted=contracted_box(config, scene) is not None,
+    )
+    field = IntegratedField(
+        encoding,
+        config.hidden_width,
+        config.num_layers,
+        skip=config.num_layers // 2 + 1,
+        direction_frequencies=config.direction_frequencies,
+    )
+    if config.sampler == "occupancy":
+        field.optimised = Optimised(learning_rate=OCCUPANCY_RATE * config.learning_rate)
+    return field
+
+
+def sampler(config: MipNeRFConfig, scene: Scene) -> Sampler:
+    """Return the configured sampler; the coarse level of hierarchical sampling is the field itself.
+
+    Args:
+        config: the method's settings, none left open.
+        scene: properties of the data.
+    """
+    return make_sampler(config, scene, make_coarse=lambda: None)
+
+
+METHOD = Method(
+    MipNeRFConfig(), paper="arXiv:2103.13415", field=make_field, sampler=sampler, model=MipNeRF, decide=decide
+)

@@ -1,0 +1,210 @@
+"""Mip-NeRF 360: Gaussians in contracted space and an online proposal network, for scenes without bounds.
+
+Barron et al., "Mip-NeRF 360: Unbounded Anti-Aliased Neural Radiance Fields", CVPR 2022. `--encoding integrated` has the
+paper's networks, for a GPU. `--encoding hash-grid` puts the same ideas on hash grids (Mueller et al. 2022), for a
+processor: a grid's levels count less for Gaussians that are larger than their cells (Zip-NeRF, Barron et al. 2023).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+from torch import Tensor
+
+from framework import Decision, Field, Method, PixelBatch, RayModel, Rendered, Sampler, Scene
+from framework.base.config import AT_LEAST_0, Range
+from framework.base.decisions import Choice, fill
+from framework.base.device import device_kind
+from framework.base.optimised import Optimised
+from framework.encodings.hash_grid import HashGrid
+from framework.encodings.integrated import IntegratedEncoding, icosahedron_directions
+from framework.fields.integrated import IntegratedDensity, IntegratedField
+from framework.fields.sized import SizedDensity, SizedField
+from framework.kernels.frequency import MAX_FREQUENCIES
+from framework.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
+from framework.rendering.losses import charbonnier, normalised_distortion
+from framework.samplers.choice import COARSEST_PROPOSAL, SamplingConfig, contracted_box, make_sampler, sampler_choice
+from framework.samplers.proposal import LEARN_EVERY, half_edge
+
+PROPOSAL_LEVELS, PROPOSAL_BASE, PROPOSAL_TABLE = 5, 16, 16
+"""Levels of the proposals' hash grids, cells per axis of the first, and entries of each at most, as a power of two."""
+
+
+@dataclass(frozen=True)
+class MipNeRF360Config(
+    SamplingConfig,
+    max_num_iterations=250_000,
+    num_rays_per_batch=2_048,
+    learning_rate=2e-3,
+    lr_final=0.01,
+    lr_warmup_steps=128,
+    adam_eps=1e-6,
+    eval_num_rays_per_chunk=4_096,
+    sampler="proposal",
+    num_proposal_samples=(64, 64),
+    num_nerf_samples=32,
+):
+    """Settings of mip-nerf-360; the defaults are the paper's, but for 16,384 rays a step and a warm-up of 512 steps."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        "num_layers": (3, 64),
+        "hidden_width": (2, 2**14),
+        "proposal_layers": (1, 64),
+        "proposal_width": (2, 2**14),
+        "position_frequencies": (1, MAX_FREQUENCIES),
+        "direction_frequencies": (0, MAX_FREQUENCIES),
+        "distortion_loss_mult": AT_LEAST_0,
+        "grid_learning_rate": AT_LEAST_0,
+        "num_levels": (1, MAX_LEVELS),
+        "features_per_level": (1, 64),
+        "base_resolution": (1, MAX_RESOLUTION),
+        "max_resolution": (1, MAX_RESOLUTION),
+        "log2_table_size": (1, MAX_LOG2_TABLE_SIZE),
+        "grid_width": (1, 2**14),
+    }
+    """Allowed range of each numeric setting."""
+    encoding: Literal["auto", "integrated", "hash-grid"] = "auto"
+    """integrated: the paper's networks. hash-grid: hash grids with small networks. auto: hash-grid on a CPU."""
+    distortion_loss_mult: float = 0.01
+    """Weight of the distortion loss."""
+    num_layers: int = 8
+    """Layers of the network before its density output (integrated)."""
+    hidden_width: int = 1_024
+    """Features per layer of the network (integrated)."""
+    proposal_layers: int = 4
+    """Hidden layers of the proposal network (integrated)."""
+    proposal_width: int = 256
+    """Features per layer of the proposal network (integrated)."""
+    position_frequencies: int = 12
+    """Number of frequencies in the integrated encoding of positions (integrated)."""
+    direction_frequencies: int = 4
+    """Number of frequencies in the encoding of directions (integrated)."""
+    grid_learning_rate: float = 1e-2
+    """Initial learning rate of the hash grids and of the networks that read them (hash-grid)."""
+    num_levels: int = 16
+    """Number of levels of the hash grid (hash-grid)."""
+    features_per_level: int = 2
+    """Features per grid vertex (hash-grid)."""
+    base_resolution: int = 16
+    """Cells per axis at the coarsest level (hash-grid)."""
+    max_resolution: int = 4_096
+    """Cells per axis at the finest level (hash-grid)."""
+    log2_table_size: int = 18
+    """Maximum number of table entries per level, log2 (hash-grid)."""
+    grid_width: int = 64
+    """Features per hidden layer of the networks that read the grid (hash-grid)."""
+    sparse_updates: bool = True
+    """Whether Adam updates only the table entries that a step used (hash-grid)."""
+
+
+class MipNeRF360(RayModel[MipNeRF360Config]):
+    """A model with a smooth absolute error of colours and the distortion of rays."""
+
+    def color_error(self, rgb: Tensor, batch: PixelBatch) -> Tensor:
+        return charbonnier(rgb, batch.rgb, batch.weights)
+
+    def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
+        weight, samples, weights = self.config.distortion_loss_mult, rendered.samples, rendered.weights
+        if not weight or samples is None or weights is None or samples.edges is None or not samples.num_rays:
+            return {}
+        return {"distortion": weight * normalised_distortion(weights, samples)}
+
+
+def decide(config: MipNeRF360Config, scene: Scene) -> tuple[MipNeRF360Config, list[Decision]]:
+    """Fill in the settings that depend on the scene and on the machine.
+
+    Args:
+        config: the method's settings; those left open are filled in.
+        scene: properties of the data.
+
+    Returns:
+        Settings without open ones, and a record of each that was filled in.
+    """
+    processor = device_kind(config.machine) == "cpu"
+    encoding, reason = "integrated", "a GPU runs the paper's networks"
+    if processor:
+        encoding, reason = "hash-grid", "the paper's networks take days on a processor (else: --encoding integrated)"
+    return fill(config, sampler_choice(config, scene.unbounded), Choice("encoding", encoding, reason))
+
+
+def make_field(config: MipNeRF360Config, scene: Scene) -> Field:
+    """Return the network on the integrated encoding, or the hash grid with its networks.
+
+    Args:
+        config: the method's settings, none left open.
+        scene: properties of the data.
+    """
+    if config.encoding == "integrated":
+        return IntegratedField(
+            _encoding(config, scene),
+            config.hidden_width,
+            config.num_layers,
+            skip=config.num_layers // 2 + 1,
+            direction_frequencies=config.direction_frequencies,
+        )
+    grid = HashGrid(
+        config.num_levels,
+        config.features_per_level,
+        config.base_resolution,
+        config.max_resolution,
+        config.log2_table_size,
+        sparse=config.sparse_updates,
+    )
+    field = SizedField(scene.box, grid, config.grid_width, unbounded=contracted_box(config, scene) is not None)
+    field.optimised = _grid_optimiser(config, "grid")
+    return field
+
+
+def make_proposals(config: MipNeRF360Config, scene: Scene) -> Sequence[Field]:
+    """Return the density fields of the proposals: one network for all levels, or a hash grid for each.
+
+    Args:
+        config: the method's settings, none left open.
+        scene: properties of the data.
+    """
+    if config.encoding == "integrated":
+        network = IntegratedDensity(_encoding(config, scene), config.proposal_width, config.proposal_layers)
+        network.optimised = Optimised(
+            "proposals", config.learning_rate, (config.adam_beta1, config.adam_beta2), config.adam_eps
+        )
+        return [network]
+    unbounded = contracted_box(config, scene) is not None
+    fields = []
+    for level in range(len(config.num_proposal_samples)):
+        grid = HashGrid(PROPOSAL_LEVELS, 2, PROPOSAL_BASE, COARSEST_PROPOSAL << level, PROPOSAL_TABLE)
+        fields.append(SizedDensity(scene.box, grid, unbounded=unbounded))
+        fields[-1].optimised = _grid_optimiser(config, "proposals")
+    return fields
+
+
+def _encoding(config: MipNeRF360Config, scene: Scene) -> IntegratedEncoding:
+    return IntegratedEncoding(
+        scene.box,
+        config.position_frequencies,
+        deviation=half_edge(scene.box) / scene.image_size,
+        contracted=contracted_box(config, scene) is not None,
+        directions=icosahedron_directions(),
+    )
+
+
+def _grid_optimiser(config: MipNeRF360Config, name: str) -> Optimised:
+    return Optimised(name, config.grid_learning_rate, betas=(0.9, 0.99), eps=1e-15, schedule="hold-exponential")
+
+
+def sampler(config: MipNeRF360Config, scene: Scene) -> Sampler:
+    """Return the configured sampler. The proposal network learns in every step, hash grids less often.
+
+    Args:
+        config: the method's settings, none left open.
+        scene: properties of the data.
+    """
+    learn_every = 1 if config.encoding == "integrated" else LEARN_EVERY
+    proposals = make_proposals(config, scene) if config.sampler == "proposal" else None
+    return make_sampler(config, scene, proposals=proposals, learn_every=learn_every)
+
+
+METHOD = Method(
+    MipNeRF360Config(), paper="arXiv:2111.12077", field=make_field, sampler=sampler, model=MipNeRF360, decide=decide
+)

@@ -1,0 +1,184 @@
+"""Zip-NeRF: what the scene decides, and that each part does what it says."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from framework.base.errors import ConfigError
+from framework.data.dataset import Dataset
+from framework.fields.appearance import affine_colors, exposed
+from framework.fields.multisampled import MultisampledField
+from framework.geometry.multisamples import Pattern
+from framework.geometry.points import Frustums, Points
+from framework.kernels.multisampled_grid import multisampled_grid_reference
+from framework.kernels.multisamples import unit_multisamples_reference
+from framework.tools.testing.check import check_method
+from framework.training.trainer import Trainer
+from methods.nerfacto import NerfactoRenderer
+from methods.zip_nerf import METHOD, ZipNeRFConfig
+from tests.training.helpers import TINY, tiny_run, tiny_trainer
+
+SMALL = dataclasses.replace(ZipNeRFConfig(), **TINY["zip-nerf"])
+
+
+def captured(data: Path, folder: Path, facts: dict[str, object], **settings: object) -> Trainer:
+    """A trainer on the tiny data set, of whose scene other things are said."""
+    still = tiny_trainer("zip-nerf", data, folder / "still").train_set
+    (folder / "run").mkdir()
+    changed = dataclasses.replace(still, scene=dataclasses.replace(still.scene, **facts))
+    return Trainer(tiny_run("zip-nerf", data, folder / "run", max_eval_images=0, **settings), changed, None)
+
+
+def chosen(trainer: Trainer) -> dict[str, str]:
+    return {d.option: d.choice for d in trainer.profile().decisions}
+
+
+def test_an_object_before_no_background_needs_little(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = captured(shared_tiny, tmp_path, {})
+    found = chosen(trainer)
+    assert found["contraction"] == found["gradient scaling near cameras"] == found["affine exposures"] == "off"
+    assert found["pose refinement"] == "off"
+    assert (found["distortion loss"], found["decay of the grids"]) == ("0", "10")
+    model = trainer.model
+    assert (model.poses, model.appearance) == (None, None)
+    assert not model.field.unbounded
+    assert not model.sampler.unbounded
+    assert model.field.encoding.decay == 10
+
+
+def test_a_capture_gets_what_it_needs(shared_tiny: Path, tmp_path: Path) -> None:
+    facts = {"unbounded": True, "poses": "device", "appearance_varies": True, "has_alpha": False}
+    trainer = captured(shared_tiny, tmp_path, facts, max_num_iterations=4)
+    found = chosen(trainer)
+    assert found["contraction"] == found["gradient scaling near cameras"] == found["affine exposures"] == "on"
+    assert (found["pose refinement"], found["decay of the grids"]) == ("SO3xR3", "0.1")
+    trainer.train()
+    model = trainer.model
+    assert isinstance(model.renderer, NerfactoRenderer)
+    assert model.renderer.unit_length is not None
+    assert bool((model.poses.tangents != 0).any())
+    assert bool((model.appearance.vectors != 0).any())
+    assert (model.sampler.ladder, model.sampler.blurs) == (-1.5, (0.03, 0.003))
+    report = trainer.train_step()
+    assert {"rgb", "interlevel", "distortion"} <= report.losses.keys()
+
+
+def test_what_is_asked_for_is_done_and_not_called_a_decision(shared_tiny: Path, tmp_path: Path) -> None:
+    asked = {"contraction": False, "hash_decay_mult": 0.0, "exposure": False, "camera_optimizer": "off"}
+    facts = {"unbounded": True, "poses": "device", "appearance_varies": True}
+    trainer = captured(shared_tiny, tmp_path, facts, **asked)
+    assert not {"contraction", "decay of the grids", "affine exposures", "pose refinement"} & chosen(trainer).keys()
+    assert not trainer.model.field.unbounded
+
+
+@pytest.mark.parametrize("unbounded", [True, False])
+def test_it_learns(unbounded: bool, shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = captured(shared_tiny, tmp_path, {"unbounded": unbounded}, max_num_iterations=60)
+    first = trainer.train_step().losses["rgb"]
+    trainer.train()
+    assert trainer.state.skipped == 0
+    assert trainer.train_step().losses["rgb"] < first / 3
+
+
+def test_it_fulfils_what_is_asked_of_methods() -> None:
+    findings = check_method(METHOD, "zip-nerf", SMALL)
+    assert [finding for finding in findings if not finding.ok] == []
+    assert len(findings) > 15
+
+
+def test_a_number_for_each_proposal_is_needed() -> None:
+    with pytest.raises(ConfigError, match="need one number a proposal each"):
+        dataclasses.replace(ZipNeRFConfig(), interlevel_blurs=(0.03,))
+
+
+def test_poses_are_refined_along_rays_of_proposals_only(shared_tiny: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="needs --sampler proposal"):
+        captured(shared_tiny, tmp_path, {"poses": "device"}, sampler="occupancy")
+
+
+# -- the field of frustums ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def field(shared_tiny: Path, tmp_path: Path) -> MultisampledField:
+    field = tiny_trainer("zip-nerf", shared_tiny, tmp_path / "run").model.field
+    torch.nn.init.normal_(field.encoding.table, std=0.1)
+    return field.eval()
+
+
+def cones(count: int) -> Frustums:
+    directions = torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
+    starts = torch.rand(count)
+    return Frustums(
+        torch.rand(count, 3) - 0.5, directions, starts, starts + 0.1, torch.full((count,), 0.05), torch.arange(count)
+    )
+
+
+def test_the_density_of_a_frustum_is_that_of_its_mean_features(field: MultisampledField) -> None:
+    torch.manual_seed(0)
+    frustums = cones(40)
+    found, _ = field.density(Points(frustums.origins, frustums=frustums))
+    turned = torch.pi / 6 * (torch.arange(40) % 2), 1.0 - 2 * (torch.arange(40) % 2)
+    points = unit_multisamples_reference(frustums, Pattern(*turned), field.box, field.unbounded)
+    features = multisampled_grid_reference(points, field.encoding.table, field.encoding.layout)
+    truth = field.density_head(features)[:, 0].float().exp()
+    torch.testing.assert_close(found, truth, rtol=1e-3, atol=1e-3)
+
+
+def test_frustums_that_shrink_to_a_point_are_points_without_size(field: MultisampledField) -> None:
+    torch.manual_seed(0)
+    wide = cones(40)
+    thin = dataclasses.replace(wide, t_ends=wide.t_starts, radii=torch.zeros(40))
+    positions = wide.origins + wide.t_starts[:, None] * wide.directions
+    found, features = field.density(Points(positions, frustums=thin))
+    truth, _ = field.density(Points(positions))
+    torch.testing.assert_close(found, truth, rtol=1e-3, atol=1e-3)
+    assert features.shape == (40, 16)
+
+
+def test_patterns_are_random_in_training_only(field: MultisampledField) -> None:
+    frustums = cones(40)
+    points = Points(frustums.origins, frustums=frustums)
+    assert torch.equal(field.density(points)[0], field.density(points)[0])
+    field.train()
+    assert not torch.equal(field.density(points)[0], field.density(points)[0])
+
+
+# -- exposures ----------------------------------------------------------------------------------------------------
+
+
+def test_exposures_change_each_sample_and_not_the_background() -> None:
+    """Against the transform of each of three samples before they are composited."""
+    torch.manual_seed(0)
+    weights, colors, background = 0.3 * torch.rand(5, 3), torch.rand(5, 3, 3), torch.rand(5, 3)
+    vectors = 0.2 * torch.randn(5, 12)
+    opacity = weights.sum(1)
+    rgb = (weights[..., None] * colors).sum(1) + (1 - opacity)[:, None] * background
+    changed = torch.stack([affine_colors(c, v) for c, v in zip(colors, vectors, strict=True)])
+    truth = (weights[..., None] * changed).sum(1) + (1 - opacity)[:, None] * background
+    torch.testing.assert_close(exposed(rgb, opacity, background, vectors), truth)
+    assert torch.equal(exposed(rgb, opacity, background, torch.zeros(5, 12)), rgb)
+
+
+def test_images_of_other_exposure_get_transforms_of_their_own(shared_tiny: Path, tmp_path: Path) -> None:
+    """With each second image darkened, the transforms of the darker ones darken."""
+    still: Dataset = tiny_trainer("zip-nerf", shared_tiny, tmp_path / "still").train_set
+    dark = torch.arange(len(still)) % 2 == 0
+    sizes = still.cameras.widths * still.cameras.heights
+    dimmed, factors = still.pixels.clone(), torch.where(dark, 0.4, 1.0).repeat_interleave(sizes)
+    dimmed[:, :3] = (still.pixels[:, :3] * factors[:, None]).round().to(torch.uint8)
+    varied = dataclasses.replace(still, pixels=dimmed, scene=dataclasses.replace(still.scene, appearance_varies=True))
+    (tmp_path / "run").mkdir()
+    settings = {"max_eval_images": 0, "max_num_iterations": 120, "exposure_learning_rate": 1e-2}
+    trainer = Trainer(tiny_run("zip-nerf", shared_tiny, tmp_path / "run", **settings), varied, None)
+    trainer.train()
+    grey = affine_of(trainer.model.appearance.vectors.detach())
+    assert grey[~dark].mean().item() - grey[dark].mean().item() > 0.1
+
+
+def affine_of(vectors: Tensor) -> Tensor:
+    """The brightness that each transform makes of mid grey."""
+    return torch.stack([affine_colors(torch.full((3,), 0.5), vector).mean() for vector in vectors])

@@ -68,9 +68,9 @@ def test_every_flag_once_and_the_everyday_ones_first(method: str) -> None:
     assert sorted(flag for flags in found.values() for flag in flags) == sorted(known)
     assert list(found) == [
         "options", "everyday options", f"{method} options", "sampler options", "ray options",
-        *["appearance options"] * (method in ("nerfacto", "zip-nerf")), *["few images options"] * (method in FOR_FEW_IMAGES),
-        "optimisation options", "evaluation and saving options", "machine options", "viewer options",
-        "procedural data options",
+        *["appearance options"] * (method in ("nerfacto", "zip-nerf")),
+        *["few images options"] * (method in FOR_FEW_IMAGES), "optimisation options", "evaluation and saving options",
+        "machine options", "viewer options", "procedural data options",
     ]  # fmt: skip
     first = ["--data", "--max-seconds", "--max-num-iterations", "--output-dir", "--experiment-name", "--rays-per-pixel"]
     assert found["everyday options"][:6] == first

@@ -1,11 +1,12 @@
 """What is in the two distributions: all that is needed, nothing else, and not too much of it."""
 
 import ast
-import email
 import re
 import subprocess
 import tarfile
 import zipfile
+from email import message_from_bytes
+from email.message import Message
 from pathlib import Path
 
 from tests.release.problem import Problem
@@ -32,7 +33,7 @@ def check_wheel(wheel: Path) -> str:
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
         folder = f"nerfloom-{version()}.dist-info"
-        metadata = email.message_from_bytes(archive.read(f"{folder}/METADATA"))
+        metadata = message_from_bytes(archive.read(f"{folder}/METADATA"))
     if missing := sorted(set(tracked()) - set(names)):
         raise Problem(f"the wheel lacks {', '.join(missing[:5])} ({len(missing)} files)")
     strange = [name for name in names if name.split("/")[0] not in (*PACKAGES, folder)]
@@ -52,7 +53,7 @@ def check_wheel(wheel: Path) -> str:
     return f"wheel: {len(names)} files, {wheel.stat().st_size / 1e6:.2f} MB, kernels {kinds}; no data, licence included"
 
 
-def check_declared(metadata: email.message.Message) -> None:
+def check_declared(metadata: Message) -> None:
     """Check that the metadata is that of pyproject.toml."""
     pyproject = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     required = {re.sub(r"\s", "", line) for line in metadata.get_all("Requires-Dist", []) if "extra ==" not in line}

@@ -79,6 +79,8 @@ def unpack(archive: Path, folder: Path, place: Place) -> int:
 def _opened(archive: Path) -> zipfile.ZipFile:
     try:
         return zipfile.ZipFile(archive)
+    except OSError as error:
+        raise DataError(f"cannot read {archive}: {error.strerror or error}") from error
     except (zipfile.BadZipFile, NotImplementedError, ValueError) as error:
         raise DataError(f"{archive} is no zip file, or damaged: {error}") from error
 
@@ -94,7 +96,7 @@ def _files(opened: zipfile.ZipFile, archive: Path) -> list[zipfile.ZipInfo]:
             raise DataError(f"{archive}: {shown(entry.filename)} is a link or a device; nothing was unpacked")
         if entry.flag_bits & 1:
             raise DataError(f"{archive}: {shown(entry.filename)} is encrypted; nothing was unpacked")
-    return [entry for entry in entries if not entry.is_dir()]
+    return [entry for entry in entries if not entry.filename.endswith("/")]
 
 
 def _parts(entry: zipfile.ZipInfo, archive: Path) -> tuple[str, ...]:
@@ -136,7 +138,7 @@ def _write(
             while chunk := content.read(CHUNK):
                 file.write(chunk)
                 advance(len(chunk))
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, RuntimeError) as error:
         raise DataError(f"{archive}: {shown(entry.filename)} is damaged: {error}; download it anew") from error
     except OSError as error:
         raise DataError(f"cannot write {path}: {error.strerror or error}; the archive {archive} is kept") from error

@@ -25,9 +25,9 @@ def release_check(folder: Path, data: Path | None, seconds: int) -> None:
     print(check_metadata(sdist, wheel), flush=True)
     print(check_sdist(sdist), flush=True)
     print(check_wheel(wheel), flush=True)
-    used = Environment(folder / "wheel", wheel).use(data, seconds)
+    used = Environment(folder / "wheel", wheel).use(data, f"--max-seconds {seconds}")
     print(f"the wheel, installed and used without a compiler: {used}", flush=True)
-    used = Environment(folder / "sdist", sdist).use(None, 3)
+    used = Environment(folder / "sdist", sdist).use(None, "--max-num-iterations 200")
     print(f"the sdist, with a compiler: {used}", flush=True)
     print(f"the sdist, without one: {check_without_compiler(folder / 'without', sdist)}", flush=True)
 

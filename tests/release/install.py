@@ -47,14 +47,14 @@ class Environment:
         (modules / "dependencies.pth").write_text("\n".join(paths) + "\n")
         return run([*words, self.distribution], self.folder, **variables)
 
-    def use(self, data: Path | None, seconds: int) -> str:
+    def use(self, data: Path | None, limit: str) -> str:
         """Install and train; a wheel needs no compiler."""
         is_wheel = self.distribution.suffix == ".whl"
         self.install(**(NO_COMPILER if is_wheel else {}))
         kernels = self.kernels()
         if kernels == "reference":
             raise Problem(f"{self.distribution.name}: its kernels are not used")
-        return f"{kernels} kernels, {self.train(data, seconds)}"
+        return f"{kernels} kernels, {self.train(data, limit)}"
 
     def kernels(self) -> str:
         """The variant of the kernels that the installed package uses."""
@@ -67,17 +67,17 @@ class Environment:
             raise Problem(f"ns-train --version --environment does not say which kernels run:\n{said}")
         return found[1]
 
-    def train(self, data: Path | None, seconds: int) -> str:
-        """Train instant-ngp; the PSNR of a few held-out images."""
-        words = ["instant-ngp", *(["--data", data] if data else []), "--max-seconds", seconds, "--max-eval-images", 4]
+    def train(self, data: Path | None, limit: str) -> str:
+        """Train instant-ngp for as long as the flag `limit` says; the PSNR of a few held-out images."""
+        words = ["instant-ngp", *(["--data", data] if data else []), *limit.split(), "--max-eval-images", 4]
         words += ["--vis", "none", "--timestamp", "t", "--output-dir", self.folder / "outputs"]
         own = {"NERFLOOM_CACHE": str(self.folder / "cache"), **NO_COMPILER}
         run([self.folder / BIN / "ns-train", *words], self.folder, **own)
         (result,) = (self.folder / "outputs").rglob("eval.json")
         psnr = json.loads(result.read_text())["results"]["psnr"]
         if not psnr > 15:
-            raise Problem(f"{self.distribution.name}: after {seconds} s of training the PSNR is {psnr:.2f} dB")
-        return f"instant-ngp {psnr:.2f} dB after {seconds} s on {data.name if data else 'the embedded scene'}"
+            raise Problem(f"{self.distribution.name}: trained with {limit}, the PSNR is {psnr:.2f} dB")
+        return f"instant-ngp {psnr:.2f} dB on {data.name if data else 'the embedded scene'} with {limit}"
 
 
 def check_without_compiler(folder: Path, sdist: Path) -> str:

@@ -1,13 +1,15 @@
 # make demo   train on the embedded scene for a minute, and leave pictures
 # make test   the fast tests
 # make sanitize   the kernels' tests, on kernels that watch every read, write and sum
-# Both make .venv first. Running them again is quick: the installation is redone only when its inputs change.
+# make release-check   build both distributions, look into them, install and use them
+# make test-versions   the fast tests under every Python and torch that can be had here
+# All make .venv first. Running them again is quick: the installation is redone only when its inputs change.
 
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-all lint sanitize clean
+.PHONY: demo test test-all lint sanitize release-check test-versions clean
 
 demo: .venv/installed
 	@run=outputs/demo/instant-ngp/$$(date +%Y-%m-%d_%H%M%S); \
@@ -29,6 +31,12 @@ lint: .venv/installed-test
 sanitize: .venv/installed-test
 	$(BIN)/python -m tests.sanitize
 
+release-check: .venv/installed-release
+	$(BIN)/python -m tests.release
+
+test-versions: .venv/installed-release
+	$(BIN)/nox --no-error-on-missing-interpreters
+
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
 
@@ -40,6 +48,11 @@ sanitize: .venv/installed-test
 .venv/installed-test: .venv/installed
 	@echo "installing the test extra into .venv"
 	$(PIP) -e '.[test]'
+	@touch $@
+
+.venv/installed-release: .venv/installed-test
+	@echo "installing the release extra into .venv"
+	$(PIP) -e '.[release]'
 	@touch $@
 
 clean:

@@ -63,8 +63,10 @@ class BuildKernels(build_ext):
             extra_postargs=ext.extra_compile_args,
             depends=ext.depends,
         )
+        # Without MinGW's own libraries, which no other Windows has.
+        static = ["-static"] if self.compiler.compiler_type == "mingw32" else []
         self.compiler.link_shared_object(
-            objects, self.get_ext_fullpath(ext.name), extra_postargs=ext.extra_link_args, target_lang="c++"
+            objects, self.get_ext_fullpath(ext.name), extra_postargs=[*ext.extra_link_args, *static], target_lang="c++"
         )
 
     def get_outputs(self) -> list[str]:

@@ -129,7 +129,8 @@ def run_command(command: Callable[[list[str]], None]) -> None:
     """Run a command on the arguments of the process, and exit with its status.
 
     Errors that a user can act on are printed on one line, and the exit status is 1; with `--debug` among the arguments,
-    the traceback is shown. After a signal the status is 128 plus the signal's number.
+    the traceback is shown. After a signal the status is 128 plus the signal's number. `--version` prints the version
+    and, with `--environment`, all that a report of an error needs.
 
     Args:
         command: function of the list of arguments, without `--debug`.
@@ -137,7 +138,7 @@ def run_command(command: Callable[[list[str]], None]) -> None:
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     debug = len(arguments) < len(sys.argv) - 1
     if "--version" in (*arguments[:1], *arguments[-1:]):
-        print(version())
+        print(_environment() if "--environment" in arguments else version())
         return
     try:
         with orderly_end():
@@ -165,6 +166,12 @@ def version() -> str:
     """Return the line that --version prints: the package's version, its folder, and the version of Python."""
     folder = Path(framework.__file__).parent
     return f"nerfloom {framework.__version__} from {folder} (Python {platform.python_version()})"
+
+
+def _environment() -> str:
+    from framework.tools.environment import environment  # it loads torch, for which --version alone need not wait
+
+    return environment()
 
 
 def in_our_words(error: Exception) -> str:

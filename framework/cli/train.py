@@ -21,6 +21,7 @@ USAGE = """\
 usage: ns-train METHOD [--data DIR] [flags] [FORMAT [format flags]]
        ns-train --load-config FILE [flags]     train with the settings of a recipe or an earlier run
        ns-train --resume RUN_FOLDER [flags]    continue a run that was stopped
+       ns-train --version --environment        print what a report of an error needs
 """
 
 

@@ -4,6 +4,7 @@ import json
 import math
 import os
 import shutil
+import zipfile
 from collections.abc import Callable
 from dataclasses import is_dataclass, replace
 from functools import cache, partial
@@ -33,6 +34,7 @@ from framework.data.pixel_cache import PixelMemory, pack, unpack
 from framework.data.ply import read_points
 from framework.splats.files import SUFFIXES, read_gaussians, write_gaussians
 from framework.splats.gaussians import Gaussians
+from framework.tools.downloads import unpack as downloads
 from framework.tools.processing import polycam, record3d
 from framework.tools.processing.images import find_images, prepare_all
 from framework.training.checkpoint import FOLDER, load_newest
@@ -327,6 +329,24 @@ def read_pixel_cache(folder: Path, scratch: Path) -> None:
         require(len(pixels.look_up(torch.tensor([5, 3, 299]))) == 3, "pixels that are not there")
 
 
+def write_archive(folder: Path) -> None:
+    """Text, an image, and an entry that is stored as it is."""
+    with zipfile.ZipFile(folder / "scenes.zip", "w") as archive:
+        for name, how in (("a/b.txt", zipfile.ZIP_DEFLATED), ("a/c/d.bin", zipfile.ZIP_STORED), ("e/", 0)):
+            entry = zipfile.ZipInfo(name, (2020, 1, 1, 0, 0, 0))
+            archive.writestr(entry, b"" if name.endswith("/") else noise(20, 15, 0).tobytes(), how)
+
+
+def unpack_archive(folder: Path, scratch: Path) -> None:
+    before = {path for path in scratch.parent.rglob("*") if not path.is_relative_to(scratch)}
+    try:
+        downloads.unpack(folder / "scenes.zip", scratch / "out", lambda parts: parts)
+    finally:
+        written = {path for path in scratch.parent.rglob("*") if not path.is_relative_to(scratch)}
+        require(written == before, "a file outside the folder")
+        require(sum(path.stat().st_size for path in scratch.rglob("*") if path.is_file()) < 4e6, "too much")
+
+
 READERS: dict[str, Reader] = {
     "blender": Reader(write_blender, partial(parse, Blender()), ("transforms_train.json",), ("camera_angle_x", "time")),
     "dnerf": Reader(write_dnerf, partial(parse, DNeRF()), ("transforms_train.json",), ("camera_angle_x", "time")),
@@ -354,6 +374,7 @@ READERS: dict[str, Reader] = {
     "comparison": Reader(write_recipe, read_recipe, ("recipe.yml",), ("methods", "data", "repeats", "target_psnr")),
     "checkpoint": Reader(write_run, read_checkpoints, ("run/nerfstudio_models/*.ckpt",)),
     "run": Reader(write_run, restore, ("run/nerfstudio_models/*.ckpt",)),
+    "archive": Reader(write_archive, unpack_archive, ("scenes.zip",)),
     "pixel-cache": Reader(write_pixel_cache, read_pixel_cache, ("pixels.bin",)),
 }
 """By name."""

@@ -1,0 +1,80 @@
+"""The command `ns-download-data`: public data sets by name, into folders that ns-train recognises."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+
+from framework.base.errors import ConfigError
+from framework.cli.common import chosen_kind, run_command
+from framework.tools.downloads.catalogue import DATASETS
+from framework.training.signals import Stopped, signal_of
+
+USAGE = """\
+usage: ns-download-data NAME [--scenes SCENE ...] [--save-dir DIR] [flags]
+
+data sets:
+{table}
+
+Scenes are put into DIR/NAME/SCENE, data/blender/lego for example. Those that are there are not downloaded again, and a
+download that was interrupted goes on where it stopped. ns-download-data NAME --help shows the flags and the scenes.
+"""
+
+
+@dataclass(frozen=True)
+class DownloadFlags:
+    """Download a public data set."""
+
+    scenes: tuple[str, ...] = ()
+    """Scenes to put in place; all if not given. An archive that holds several is downloaded as a whole."""
+    save_dir: Path = Path("data")
+    """Folder of the data sets."""
+    archive: Path | None = None
+    """Zip file that was downloaded by hand, instead of downloading it."""
+    keep_archives: bool = False
+    """Keep the archives, in the folder .downloads of the save-dir, after they are unpacked."""
+
+
+def main() -> None:
+    """Run ns-download-data on the arguments of the process."""
+    run_command(_command)
+
+
+def _command(arguments: list[str]) -> None:
+    if (chosen := chosen_kind(arguments, DATASETS, _usage(), "unknown data set")) is None:
+        return
+    import tyro
+
+    name, dataset, rest = chosen
+    if any(word.partition("=")[0].replace("_", "-") == "--capture-name" for word in rest):
+        raise ConfigError("--capture-name is nerfstudio's; here it is --scenes")
+    description = f"{dataset.title}\nscenes: {', '.join(dataset.scenes)}\nlicence: {dataset.licence}"
+    options = (tyro.conf.FlagConversionOff,)
+    prog = f"ns-download-data {name}"
+    flags = tyro.cli(DownloadFlags, prog=prog, description=description, args=rest, config=options)
+    from framework.tools.downloads.install import announce, install
+
+    announce(name, dataset, flags.save_dir, flags.scenes)
+    try:
+        folders = install(name, dataset, flags.save_dir, flags.scenes, flags.archive, flags.keep_archives)
+    except KeyboardInterrupt as stop:
+        note = "interrupted; the same command goes on where it stopped"
+        raise Stopped(signal_of(stop), note) from None
+    for folder in folders:
+        print(folder)
+    print(f"Next: ns-train instant-ngp --data {shlex.quote(str(folders[0]))}")
+
+
+def _usage() -> str:
+    rows = []
+    for name, dataset in DATASETS.items():
+        sizes = [archive.gigabytes for archive in dataset.archives]
+        known = sum(size for size in sizes if size is not None)
+        size = (f"{known:g} GB" if known else "") + (" and more" if known and None in sizes else "")
+        rows += [f"  {name:<18} {dataset.title}; {size or 'size unknown'}", f"  {'':<18} licence: {dataset.licence}"]
+    return USAGE.format(table="\n".join(rows))
+
+
+if __name__ == "__main__":
+    main()

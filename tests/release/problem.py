@@ -1,0 +1,5 @@
+"""What stands against a release."""
+
+
+class Problem(Exception):
+    """Something that must be put right before a release; the message says what."""

@@ -28,6 +28,9 @@ OCCUPANCY_RATE = 2.0
 """Factor of the learning rate with the occupancy grid. On Lego after 90 s on two cores, smaller batches and longer
 marching steps (`num_steps`) at twice the rate reached 22.5 dB; 2^13 samples, 512 steps and the paper's rate, 17 dB."""
 
+OPEN_UNTIL = 0.5
+"""Share of the budget in which frequencies open if there are few images, as in FreeNeRF's shorter Blender settings."""
+
 
 @dataclass(frozen=True)
 class VanillaNeRFConfig(
@@ -71,7 +74,7 @@ def decide(config: VanillaNeRFConfig, scene: Scene) -> tuple[VanillaNeRFConfig, 
         Settings without open ones, and a record of each that was filled in.
     """
     config, made = fill(config, sampler_choice(config, scene.unbounded))
-    config, few = decide_few_images(config, scene)
+    config, few = decide_few_images(config, scene, OPEN_UNTIL)
     made += few
     if config.sampler != "occupancy":
         return config, made

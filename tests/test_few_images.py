@@ -1,6 +1,7 @@
 """Few images: when their regularisers are used, what a run says of it, and that they are the terms they should be."""
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
@@ -47,8 +48,7 @@ def test_few_images_of_a_capture_are_recognised(method: str) -> None:
     many, said = decided(method, FEW + 1)
     assert not many.few_images
     assert parts(many) == (0, 0, 0)
-    assert f"regularisers for few images: off, as there are {FEW + 1} training images" in said
-    assert "unseen" not in said
+    assert not re.search("few images|unseen|occlusion|levels", said)
 
 
 def test_a_flag_turns_them_off_and_on() -> None:

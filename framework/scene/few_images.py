@@ -7,7 +7,7 @@ cameras is kept empty (FreeNeRF).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, TypeVar
 
 from framework.base.config import AT_LEAST_0, AUTO, Auto, Range, RayConfig
@@ -16,8 +16,6 @@ from framework.data.scene import Scene
 
 FEW, FEW_WITH_ALPHA = 12, 8
 """Number of training images up to which there are few: of a capture, and of images whose alpha shows what is empty."""
-OPEN_UNTIL = 0.5
-"""Share of the budget in which the levels of the encoding open."""
 SMOOTHNESS = 0.1
 """Weight of the depth's roughness in unseen views, as in RegNeRF's settings once it is annealed."""
 OCCLUSION = 0.01
@@ -42,13 +40,14 @@ class FewImagesConfig(RayConfig):
     """Whether the parts below that are not set are used. If not given: for up to 12 training images of a still scene,
     or 8 with an alpha channel."""
     open_levels_until: Auto[float] = AUTO
-    """Share of the budget in which the levels of the encoding open, from coarse to fine; 0 if all are open at once."""
+    """Share of the budget in which the levels of the encoding open, from coarse to fine; 0 if all are open at once. If
+    not given: 0.5 with few images for vanilla-nerf, else 0."""
     unseen_loss_mult: Auto[float] = AUTO
-    """Weight of the roughness of depth in views between the training cameras."""
+    """Weight of the roughness of depth in views between the training cameras. If not given: 0.1 with few images."""
     unseen_patches: int = 8
     """Number of patches of 8 x 8 rays through such views in each step."""
     occlusion_loss_mult: Auto[float] = AUTO
-    """Weight of the optical depth right before cameras."""
+    """Weight of the optical depth right before cameras. If not given: 0.01 with few images without alpha."""
     occlusion_range: float = 1.2
     """Distance up to which that is, in units of the distance at which the scene starts."""
 
@@ -56,35 +55,31 @@ class FewImagesConfig(RayConfig):
 ConfigT = TypeVar("ConfigT", bound=FewImagesConfig)
 
 
-def decide_few_images(config: ConfigT, scene: Scene) -> tuple[ConfigT, list[Decision]]:
+def decide_few_images(config: ConfigT, scene: Scene, open_until: float = 0.0) -> tuple[ConfigT, list[Decision]]:
     """Decide which regularisers for few images are used.
 
     Args:
         config: the method's settings; those left open are filled in.
         scene: properties of the scene.
+        open_until: share of the budget in which the levels of the method's encoding open if there are few images.
 
     Returns:
-        the settings, and the decisions that were made.
+        the settings, and the decisions that were made; none where there are many images.
     """
     count, most = scene.num_cameras, FEW_WITH_ALPHA if scene.has_alpha else FEW
-    few = count <= most and not scene.moving
-    reason = f"there are {count} training images" if not scene.moving else "the scene moves"
-    if few:
-        reason += ", few of which contradict what fits them (else: --few-images False)"
-    config, made = fill(config, Choice("few_images", few, reason, "regularisers for few images"))
-    used = bool(config.few_images)
-    between = used and not scene.warped and scene.camera_to_worlds is not None
-    config, parts = fill(
-        config,
-        Choice("open_levels_until", OPEN_UNTIL if used else 0.0, "few images are explained by coarse shapes first"),
-        Choice("unseen_loss_mult", SMOOTHNESS if between else 0.0, "views between the images have smooth depth"),
-        Choice(
-            "occlusion_loss_mult",
-            OCCLUSION if used and not scene.has_alpha else 0.0,
-            "nothing is right before a camera",
-        ),
+    reason = f"there are {count} training images, of which few contradict what fits them (else: --few-images False)"
+    few = Choice("few_images", count <= most and not scene.moving, reason, "regularisers for few images")
+    config, made = fill(config, few)
+    between = not scene.warped and scene.camera_to_worlds is not None
+    choices = (
+        Choice("open_levels_until", open_until, "few images are explained by coarse shapes first"),
+        Choice("unseen_loss_mult", SMOOTHNESS * between, "depth is smooth in views between the images"),
+        Choice("occlusion_loss_mult", OCCLUSION * (not scene.has_alpha), "nothing is right before a camera"),
     )
-    return config, made + (parts if used else [])
+    if not config.few_images:
+        return fill(config, *(replace(choice, value=0.0) for choice in choices))[0], []
+    config, parts = fill(config, *choices)
+    return config, made + [part for part in parts if part.choice != "0"]
 
 
 def unseen_weight(config: FewImagesConfig, step: int) -> float:

@@ -184,9 +184,7 @@ def test_what_the_data_decide_is_not_called_none() -> None:
     config = load_method("instant-ngp").config
     hints = get_type_hints(type(config), include_extras=True)
     is_open = [
-        name
-        for name in hints
-        if hints[name] in (Auto[int], Auto[float], Auto[bool]) and getattr(config, name) is None
+        name for name in hints if hints[name] in (Auto[int], Auto[float], Auto[bool]) and getattr(config, name) is None
     ]
     assert {"max_resolution", "log2_table_size", "num_steps"} <= set(is_open)
     assert said.count(DECIDED) == len(is_open)

@@ -1,5 +1,6 @@
 # make demo   train on the embedded scene for a minute, and leave pictures
 # make test   the fast tests
+# make docs   the documentation, into site/
 # make sanitize   the kernels' tests, on kernels that watch every read, write and sum
 # Both make .venv first. Running them again is quick: the installation is redone only when its inputs change.
 
@@ -7,7 +8,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-all lint sanitize clean
+.PHONY: demo test test-all lint docs sanitize clean
 
 demo: .venv/installed
 	@run=outputs/demo/instant-ngp/$$(date +%Y-%m-%d_%H%M%S); \
@@ -26,6 +27,10 @@ lint: .venv/installed-test
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
+docs: .venv/installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	$(BIN)/python docs/building/check_links.py site
+
 sanitize: .venv/installed-test
 	$(BIN)/python -m tests.sanitize
 
@@ -42,5 +47,10 @@ sanitize: .venv/installed-test
 	$(PIP) -e '.[test]'
 	@touch $@
 
+.venv/installed-docs: .venv/installed
+	@echo "installing the docs extra into .venv"
+	$(PIP) -e '.[docs]'
+	@touch $@
+
 clean:
-	rm -rf .venv outputs
+	rm -rf .venv outputs site

@@ -80,7 +80,8 @@ def main() -> None:
     pages = len(list(site.rglob("*.html")))
     count, wrong = check(site)
     print(f"{site}: {pages} pages, {count:,} links, {len(wrong)} wrong")
-    print("\n".join(wrong))
+    for line in wrong:
+        print(line)
     sys.exit(bool(wrong) or not pages)
 
 

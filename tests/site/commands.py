@@ -75,7 +75,7 @@ class Checker:
             if "ns-train" in words:
                 self.check(words[words.index("ns-train") :])
         elif name.startswith("ns-"):
-            self._ours(name, ["instant-ngp" if word in EXAMPLES and name != "ns-new-method" else word for word in rest])
+            self._ours(name, ["tensorf" if word in EXAMPLES and name != "ns-new-method" else word for word in rest])
         elif name == "make":
             targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
             assert rest[0] in targets, f"make has no target {rest[0]}"

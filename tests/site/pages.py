@@ -10,7 +10,9 @@ PAGES = sorted([*(ROOT / "docs").rglob("*.md"), ROOT / "README.md", ROOT / "CONT
 FENCE = re.compile(r"^```([\w-]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`(ns-[a-z-]+ [^`]*--[^`]*)`")
 COMMANDS = re.compile(r"^(ns-[\w-]+|make|pip|pytest|python3?|torchrun|export|nerfbaselines|[A-Z_]+=\S+ .+)( |$)")
-UNFINISHED = re.compile(r"\.\.\.|[{<]|\b(METHOD|PATH|RUN|FILE|DATA|WHAT|NAME)\b|--help$")
+UNFINISHED = re.compile(
+    r"\.\.\.|[{<]|\b(METHOD|PATH|RUN|FILE|DATA|WHAT|NAME)\b|--help$|--data DIR|--[a-z-]+$|^ns-train --"
+)
 """Marks of a command in a sentence that stands for many."""
 
 

@@ -42,4 +42,6 @@ def on_page_content(content: str, **_: Any) -> str:
 
 def _mathml(text: str, block: bool) -> str:
     tex = text.strip().removeprefix(r"\[" if block else r"\(").removesuffix(r"\]" if block else r"\)")
-    return convert(tex.strip(), display="block" if block else "inline")
+    if block:
+        return f'<div class="equation">{convert(tex.strip(), display="block")}</div>'
+    return convert(tex.strip(), display="inline")

@@ -14,7 +14,7 @@ from types import UnionType
 from typing import Any, Literal, Union
 
 from framework.base.config import LEFT_TO_DATA, TrainConfig
-from framework.cli.flag_groups import grouped_settings
+from framework.cli.flag_groups import groups_of
 
 
 def flag_tables(name: str, config: TrainConfig) -> str:
@@ -27,7 +27,7 @@ def flag_tables(name: str, config: TrainConfig) -> str:
     kind = type(config)
     helps, ranges, hints = help_texts(kind), ranges_of(kind), typing.get_type_hints(kind, include_extras=True)
     parts = []
-    for title, members in grouped_settings(kind):
+    for title, members in groups_of(kind):
         if not members:
             continue
         rows = ["| flag | default | allowed | |", "|---|---|---|---|"]

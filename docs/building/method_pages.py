@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 import re
 import sys
+import typing
+from typing import Any
 
-from flags import flag_tables
+from flags import flag_tables, help_texts
 
 from framework.base.config import LEFT_TO_DATA
 from framework.base.registry import Entry, load_method, registered
@@ -53,22 +54,21 @@ def paper_link(paper: str) -> str:
 
 def decided(method: Method) -> str:
     """Return the section on settings that are left to the data."""
-    from flags import choices, help_texts
-
-    kind = type(method.config)
-    helps = help_texts(kind)
-    open_ones = []
-    for field in dataclasses.fields(kind):
-        value = getattr(method.config, field.name)
-        hint = inspect.get_annotations(kind, eval_str=False).get(field.name, field.type)
-        is_auto = "Auto" in str(hint) or LEFT_TO_DATA in str(hint)
-        if (value is None and is_auto) or (value == "auto" and field.name not in ("background", "masks")):
-            open_ones.append(f"- `--{field.name.replace('_', '-')}`: {' '.join(helps.get(field.name, '').split())}")
-    assert choices
+    kind, config = type(method.config), method.config
+    helps, hints = help_texts(kind), typing.get_type_hints(kind, include_extras=True)
+    open_ones = [name for name in hints if hasattr(config, name) and is_open(name, getattr(config, name), hints[name])]
     if not open_ones:
         return "## Left to the data\n\nNothing: every setting has a value by default."
     lead = "The run decides these when it has seen the data, and prints each with its reason."
-    return f"## Left to the data\n\n{lead}\n\n" + "\n".join(open_ones)
+    lines = [f"- `--{name.replace('_', '-')}`: {' '.join(helps.get(name, '').split())}" for name in open_ones]
+    return f"## Left to the data\n\n{lead}\n\n" + "\n".join(lines)
+
+
+def is_open(name: str, value: Any, hint: Any) -> bool:
+    """Return whether the method's `decide` fills in a setting with this default."""
+    if value is None:
+        return LEFT_TO_DATA in getattr(hint, "__metadata__", ())
+    return value == "auto" and name not in ("background", "masks")  # which the trainer decides
 
 
 def flags(name: str, method: Method) -> str:

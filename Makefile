@@ -20,7 +20,7 @@ demo: .venv/installed
 test: .venv/installed-test
 	$(BIN)/python -m pytest -n auto -m "not slow"
 
-test-all: .venv/installed-test
+test-all: .venv/installed-test .venv/installed-docs
 	$(BIN)/python -m pytest
 
 lint: .venv/installed-test

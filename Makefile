@@ -1,5 +1,6 @@
 # make demo   train on the embedded scene for a minute, and leave pictures
 # make test   the fast tests
+# make docs   the documentation, into site/
 # make sanitize   the kernels' tests, on kernels that watch every read, write and sum
 # make release-check   build both distributions, look into them, install and use them
 # make test-versions   the fast tests under every Python and torch that can be had here
@@ -9,7 +10,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-all lint sanitize release-check test-versions clean
+.PHONY: demo test test-all lint docs sanitize release-check test-versions clean
 
 demo: .venv/installed
 	@run=outputs/demo/instant-ngp/$$(date +%Y-%m-%d_%H%M%S); \
@@ -21,12 +22,16 @@ demo: .venv/installed
 test: .venv/installed-test
 	$(BIN)/python -m pytest -n auto -m "not slow"
 
-test-all: .venv/installed-test
+test-all: .venv/installed-test .venv/installed-docs
 	$(BIN)/python -m pytest
 
 lint: .venv/installed-test
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+
+docs: .venv/installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	$(BIN)/python docs/building/check_links.py site
 
 sanitize: .venv/installed-test
 	$(BIN)/python -m tests.sanitize
@@ -55,5 +60,10 @@ test-versions: .venv/installed-release
 	$(PIP) -e '.[release]'
 	@touch $@
 
+.venv/installed-docs: .venv/installed
+	@echo "installing the docs extra into .venv"
+	$(PIP) -e '.[docs]'
+	@touch $@
+
 clean:
-	rm -rf .venv outputs
+	rm -rf .venv outputs site

@@ -59,11 +59,12 @@ def test_every_built_in_method_passes(name: str) -> None:
 
 
 @pytest.mark.slow
-def test_the_method_in_the_readme_passes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (source,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
-    (tmp_path / "method_in_the_readme.py").write_text(source, encoding="utf-8")
+def test_the_method_in_the_guide_passes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    guide = (ROOT / "docs" / "guides" / "add-a-method.md").read_text(encoding="utf-8")
+    source = re.findall(r"```python\n(.*?)```", guide, re.DOTALL)[0]
+    (tmp_path / "method_in_the_guide.py").write_text(source, encoding="utf-8")
     monkeypatch.syspath_prepend(str(tmp_path))
-    assert_method(importlib.import_module("method_in_the_readme").METHOD, "voxels")
+    assert_method(importlib.import_module("method_in_the_guide").METHOD, "voxels")
 
 
 # -- a small method of each kind --------------------------------------------------------------------------------------

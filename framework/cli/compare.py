@@ -26,7 +26,7 @@ class CompareFlags:
     data: Path | None = None
     """Folder of the data set; the embedded scene if not given."""
     data_flags: str = ""
-    """Flags of the data format, for all methods, in quotes: "--downscale-factor 2"."""
+    """Flags of the data format, for all methods, in quotes after an "=": --data-flags="--downscale-factor 2"."""
     max_seconds: float | None = None
     """Seconds of training of each method, without evaluation and saving."""
     max_num_iterations: int | None = None

@@ -60,7 +60,7 @@ def grouped_flags(method: str, config: TrainConfig, data_format: str, parser: Da
         parser: the data format with its settings.
     """
     rules: dict[type, StructConstructorSpec] = {}
-    _divide(rules, config, [(method if title == OWN else title, names) for title, names in _grouped(type(config))])
+    _divide(rules, config, [(method if title == OWN else title, names) for title, names in groups_of(type(config))])
     of_format = [field.name for field in dataclasses.fields(parser)]  # type: ignore[arg-type]
     _divide(rules, parser, [(f"{data_format} data", of_format)])
     registry = ConstructorRegistry()
@@ -68,8 +68,12 @@ def grouped_flags(method: str, config: TrainConfig, data_format: str, parser: Da
     return registry
 
 
-def _grouped(kind: type[TrainConfig]) -> Iterator[tuple[str, list[str]]]:
-    """Yield the title and the settings of each group; a setting belongs to the first class that declares it."""
+def groups_of(kind: type[TrainConfig]) -> Iterator[tuple[str, list[str]]]:
+    """Yield the title and the settings of each group; a setting belongs to the first class that declares it.
+
+    Args:
+        kind: the class of a method's settings.
+    """
     declared = {
         field.name: next(base for base in reversed(kind.__mro__) if field.name in inspect.get_annotations(base))
         for field in dataclasses.fields(kind)

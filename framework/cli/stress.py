@@ -45,7 +45,7 @@ class StressFlags:
     data: Path | None = None
     """Folder of a data set, of which a few images are used, reduced; a ball rendered in memory if not given."""
     data_flags: str = ""
-    """Flags of the data format, in quotes: "--downscale-factor 2"."""
+    """Flags of the data format, in quotes after an "=": --data-flags="--downscale-factor 2"."""
     only: tuple[str, ...] = ()
     """Conditions, as listed by ns-stress --help; all if not given. The plain run is always made."""
     max_num_iterations: int = 300

@@ -1,0 +1,80 @@
+"""The generated part of each method's page: paper, parts, what is left to the data, and every flag."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import sys
+import typing
+from typing import Any
+
+from flags import flag_tables, help_texts
+
+from framework.base.config import LEFT_TO_DATA
+from framework.base.registry import Entry, load_method, registered
+from framework.method import Method
+
+
+def methods() -> dict[str, Entry]:
+    """Return the methods of this repository, sorted by name; plugins that are installed besides are no part of it."""
+    return {name: entry for name, entry in registered("methods").items() if entry.module.startswith("methods.")}
+
+
+def page(name: str, text: str | None) -> str:
+    """Return the page of a method.
+
+    Args:
+        name: the method's name.
+        text: the part that is written by hand; None if there is none yet.
+    """
+    method = load_method(name)
+    module = sys.modules[registered("methods")[name].module]
+    documentation = inspect.getdoc(module) or ""
+    start = text if text is not None else f"# {name}\n\n{documentation}"
+    facts = [
+        "## In short",
+        "",
+        "| | |",
+        "|---|---|",
+        f"| paper | {paper_link(method.paper)} |",
+        f"| file | `{module.__name__.replace('.', '/')}.py` |",
+        f"| model | `{method.model.__name__}` |",
+        f"| draws | {'whole images' if method.model.batches == 'views' else 'rays through pixels'} |",
+        f"| summary | {documentation.splitlines()[0] if documentation else ''} |",
+    ]
+    head, _, rest = start.partition("\n\n")
+    return "\n\n".join([head, rest.strip(), "\n".join(facts), decided(method), flags(name, method)]) + "\n"
+
+
+def paper_link(paper: str) -> str:
+    """Return a link to a paper that is on arXiv, and the text itself otherwise."""
+    found = re.fullmatch(r"arXiv:(\d{4}\.\d{4,5})", paper)
+    return f"[{paper}](https://arxiv.org/abs/{found[1]})" if found else paper
+
+
+def decided(method: Method) -> str:
+    """Return the section on settings that are left to the data."""
+    kind, config = type(method.config), method.config
+    helps, hints = help_texts(kind), typing.get_type_hints(kind, include_extras=True)
+    open_ones = [name for name in hints if hasattr(config, name) and is_open(name, getattr(config, name), hints[name])]
+    if not open_ones:
+        return "## Left to the data\n\nNothing: every setting has a value by default."
+    lead = "The run decides these when it has seen the data, and prints each with its reason."
+    lines = [f"- `--{name.replace('_', '-')}`: {' '.join(helps.get(name, '').split())}" for name in open_ones]
+    return f"## Left to the data\n\n{lead}\n\n" + "\n".join(lines)
+
+
+def is_open(name: str, value: Any, hint: Any) -> bool:
+    """Return whether the method's `decide` fills in a setting with this default."""
+    if value is None:
+        return LEFT_TO_DATA in getattr(hint, "__metadata__", ())
+    return value == "auto" and name not in ("background", "masks")  # which the trainer decides
+
+
+def flags(name: str, method: Method) -> str:
+    """Return the section with every flag."""
+    lead = (
+        f"As `ns-train {name} --help` shows them, with the defaults of this method. Flags of the data format come "
+        "after them."
+    )
+    return f"## Flags\n\n{lead}\n\n{flag_tables(name, method.config)}"

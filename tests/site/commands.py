@@ -1,0 +1,141 @@
+"""Whether a command of the documents is one: its flags are parsed by the command itself, up to where work begins."""
+
+import re
+import shutil
+from collections.abc import Callable
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from framework.base.registry import load_dataparser, registered
+from framework.training.run import Run
+from tests.site.pages import ROOT
+
+EXAMPLES = ("my-method", "voxels")
+"""Methods that the documents let their readers write."""
+UNCHECKED = ("nerfbaselines", "export", ".", "source", "pytest")
+"""Commands of others, and those that no parser here knows."""
+FORMATS = {"lego": "blender", "balls": "dnerf", "ring": "blender"}
+"""Name of a folder in the documents -> its format; of any other, nerfstudio."""
+
+
+class Begun(Exception):
+    """The command has understood its flags and begins to work."""
+
+
+def begin(*_: Any, **__: Any) -> None:
+    raise Begun
+
+
+def found(path: Path | None, named: str | None = None) -> tuple[Path | None, str]:
+    """Stands for find_data, since the folders of the documents are not there."""
+    return path, named or ("procedural" if path is None else FORMATS.get(path.name, "nerfstudio"))
+
+
+class Checker:
+    """Runs commands up to where they would begin to work, in an empty folder.
+
+    Args:
+        monkeypatch: what is exchanged for the checks, and put back after them.
+        folder: working folder.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+        monkeypatch.chdir(folder)
+        shutil.copytree(ROOT / "configs", folder / "configs")
+        (folder / "path" / "to" / "masks").mkdir(parents=True)
+        exchanged: dict[str, Callable[..., Any]] = {
+            "framework.data.data_folder.find_data": found,
+            "framework.cli.session.start": begin,
+            "framework.cli.session.resume": begin,
+            "framework.training.splat_files.load_run_or_splats": begin,
+            "framework.training.trained.load_trained": begin,
+            "framework.cli.process_data._process": begin,
+            "framework.cli.compare.compare": begin,
+            "framework.cli.stress.stress": stress,
+        }
+        for name, replacement in exchanged.items():
+            module, _, attribute = name.rpartition(".")
+            monkeypatch.setattr(import_module(module), attribute, replacement)
+        train = import_module("framework.cli.train")
+        read = train._read_run
+        monkeypatch.setattr(train, "_read_run", lambda path: read(path) if path.is_file() else run_at(path))
+        bench = import_module("framework.cli.bench")
+        for name, (flags, _) in bench.KINDS.items():
+            monkeypatch.setitem(bench.KINDS, name, (flags, begin))
+
+    def check(self, words: list[str]) -> None:
+        """Raise an error if a command does not exist, or does not understand its flags."""
+        name, *rest = words
+        if name == "torchrun":
+            if "ns-train" in words:
+                self.check(words[words.index("ns-train") :])
+        elif name.startswith("ns-"):
+            self._ours(name, ["tensorf" if word in EXAMPLES and name != "ns-new-method" else word for word in rest])
+        elif name == "make":
+            targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+            assert rest[0] in targets, f"make has no target {rest[0]}"
+        elif name == "pip":
+            check_extras(rest)
+        elif name in ("python", "python3"):
+            check_python(rest)
+        else:
+            assert name in UNCHECKED, f"{name} is no command that is known here"
+
+    def _ours(self, name: str, rest: list[str]) -> None:
+        scripts = dict(re.findall(r'^(ns-[\w-]+) = "(.+):main"$', (ROOT / "pyproject.toml").read_text(), re.MULTILINE))
+        assert name in scripts, f"pyproject.toml has no command {name}"
+        if rest == ["--version"]:
+            return
+        status = status_of(import_module(scripts[name])._command, rest)
+        assert status in (0, None), "it does not understand its flags"
+        begun_without_working = status is None or rest[-1] == "--help" or name in ("ns-new-method", "ns-stress")
+        assert begun_without_working, "it ended without beginning"
+
+
+def status_of(command: Callable[[list[str]], None], words: list[str]) -> Any:
+    """The exit status of a command; None if it has begun to work."""
+    try:
+        command(words)
+    except Begun:
+        return None
+    except SystemExit as end:
+        return end.code or 0
+    return 0
+
+
+def run_at(path: Path) -> Run:
+    """The run that a path of the documents stands for: its method with its defaults."""
+    (method,) = [part for part in path.parts if part in registered("methods")]
+    return import_module("framework.cli.train")._default_run(method)
+
+
+def stress(methods: list[str], flags: Any) -> list[Any]:
+    module = import_module("framework.cli.stress")
+    for method in methods:
+        module._run(method, flags)
+    module._conditions(flags)
+    return []
+
+
+def check_extras(words: list[str]) -> None:
+    assert words[0] == "install"
+    text = (ROOT / "pyproject.toml").read_text()
+    for extra in re.findall(r"\.\[([\w,]+)\]", " ".join(words)):
+        for name in extra.split(","):
+            assert re.search(rf"^{name} = \[", text, re.MULTILINE), f"there is no extra {name}"
+
+
+def check_python(words: list[str]) -> None:
+    if words[0] == "-m":
+        assert find_spec(words[1]) is not None, f"there is no module {words[1]}"
+    elif words[0] != "-c":
+        assert (ROOT / words[0]).is_file(), f"there is no file {words[0]}"
+
+
+def formats() -> list[str]:
+    """The data formats whose names the documents use; each can be loaded."""
+    return [load_dataparser(name).__name__ for name in {*FORMATS.values(), "nerfstudio"}]

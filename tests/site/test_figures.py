@@ -1,0 +1,71 @@
+"""Figures in the documents are those of the evaluations that they name, and tables of names those of the code."""
+
+import json
+import re
+from pathlib import Path
+
+from framework.base import from_nerfstudio
+from framework.base.registry import registered
+from tests.site.pages import ROOT
+
+DOCS = ROOT / "docs"
+
+
+def rows(page: Path) -> list[list[str]]:
+    lines = page.read_text(encoding="utf-8").splitlines()
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
+
+
+def results(name: str) -> dict[str, float]:
+    return json.loads((DOCS / "results" / name).read_text())["results"]
+
+
+def test_figures_are_those_of_their_files() -> None:
+    measured = [row for row in rows(DOCS / "figures.md") if row[-1].endswith(".json`")]
+    assert len(measured) >= 26
+    for row in measured:
+        found = results(row[-1].strip("`"))
+        assert row[1:3] == [f"{found['psnr']:.2f} dB", f"{found['ssim']:.3f}"], row
+
+
+def test_the_table_of_budgets_is_that_of_its_files() -> None:
+    head, *body = [row for row in rows(DOCS / "guides" / "choosing.md") if len(row) == 8]
+    seconds = [int(cell.removesuffix(" s")) for cell in head[1:]]
+    compared = {row["label"]: row for row in json.loads((DOCS / "results" / "methods-lego.json").read_text())["runs"]}
+    checked = 0
+    for row in body[1:]:
+        label = row[0].strip("`")
+        for budget, cell in zip(seconds, row[1:], strict=True):
+            if not cell:
+                continue
+            file = DOCS / "results" / f"lego-{label.split()[0]}-{budget}s.json"
+            psnr = results(file.name)["psnr"] if file.exists() else compared[label]["psnr"]
+            assert cell == f"{psnr:.2f}", (label, budget)
+            checked += 1
+    assert checked >= 15
+
+
+def test_sentences_repeat_the_table() -> None:
+    """PSNRs that other pages quote stand in the table of figures or in the notes and benchmarks, perhaps rounded."""
+    sources = [DOCS / f"{name}.md" for name in ("figures", "benchmarks", "stability", "plug-and-play")]
+    sources += [*(DOCS / "notes").glob("*.md"), *(ROOT / "methods").glob("*.py")]
+    numbers = set(re.findall(r"\d+\.\d+", "\n".join(source.read_text() for source in sources)))
+    numbers |= {f"{float(number):.1f}" for number in numbers}
+    pages = [page for part in ("methods", "guides", "start") for page in (DOCS / part).glob("*.md")]
+    pages.append(ROOT / "README.md")
+    for page in pages:
+        text = re.sub(r"```text.*?```", "", page.read_text(), flags=re.DOTALL)
+        assert [number for number in re.findall(r"(\d+\.\d+) dB", text) if number not in numbers] == [], page.name
+
+
+def test_flags_of_nerfstudio_are_those_that_are_answered() -> None:
+    table = {row[0].strip("`"): row[1].strip("`") for row in rows(DOCS / "from-nerfstudio.md") if len(row) == 2}
+    assert from_nerfstudio.SETTINGS.items() <= table.items()
+    text = (DOCS / "from-nerfstudio.md").read_text()
+    assert [name for name in from_nerfstudio.NO_FORMATS if f"`{name}`" not in text] == []
+
+
+def test_every_data_format_is_named() -> None:
+    text = (DOCS / "guides" / "poses.md").read_text()
+    built_in = [name for name, entry in registered("dataparsers").items() if entry.module.startswith("dataparsers.")]
+    assert [name for name in built_in if f"`{name}`" not in text] == []

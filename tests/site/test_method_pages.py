@@ -1,0 +1,77 @@
+"""The page of each method says of every flag what the command line does."""
+
+import dataclasses
+import re
+from types import ModuleType
+
+import pytest
+
+from framework.base.config import ConfigError
+from framework.base.registry import load_method, registered
+from framework.cli.train import _flag_names
+from tests.site.pages import ROOT
+
+BUILT_IN = [name for name, entry in registered("methods").items() if entry.module.startswith("methods.")]
+ROW = re.compile(r"^\| `--([\w.-]+)` \| (.*?) \| (.*?) \| (.*) \|$", re.MULTILINE)
+
+
+@pytest.fixture
+def method_pages(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(ROOT / "docs" / "building"))
+    import method_pages as module
+
+    return module
+
+
+def table(page: str) -> dict[str, tuple[str, str, str]]:
+    return {found[1]: (found[2], found[3], found[4]) for found in ROW.finditer(page)}
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_every_flag_has_a_row(method_pages: ModuleType, name: str) -> None:
+    config = load_method(name).config
+    found = table(method_pages.page(name, None))
+    assert {f"--{flag}" for flag in found} == set(_flag_names(config))
+    for flag, (default, _, text) in found.items():
+        value = config
+        for part in flag.replace("-", "_").split("."):
+            value = getattr(value, part)
+        assert len(text) > 10, f"--{flag} has no help"
+        if value is not None and not isinstance(value, tuple):
+            assert default == f"`{value}`"
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_values_beyond_what_is_allowed_are_refused(method_pages: ModuleType, name: str) -> None:
+    config, tried = load_method(name).config, 0
+    for flag, (_, allowed, _) in table(method_pages.page(name, None)).items():
+        field = flag.replace("-", "_")
+        if not re.match(r"(at least )?[\d.]", allowed) or isinstance(getattr(config, field), tuple):
+            continue
+        ends = [float(number.replace(",", "")) for number in re.findall(r"\d[\d,.e-]*", allowed)]
+        beyond = [ends[0] - 1, *(end + 1 for end in ends[1:])]
+        for value in beyond:
+            with pytest.raises(ConfigError, match=flag):
+                dataclasses.replace(config, **{field: value})
+        tried += len(beyond)
+    assert tried >= 15
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_what_is_open_is_listed(method_pages: ModuleType, name: str) -> None:
+    method = load_method(name)
+    listed = set(re.findall(r"^- `--([\w-]+)`", method_pages.decided(method), re.MULTILINE))
+    rows = table(method_pages.page(name, None))
+    assert {flag for flag, (default, _, _) in rows.items() if default == "*decided by the data*"} <= listed
+    assert all(rows[flag][0] in ("*decided by the data*", "`auto`") for flag in listed)
+
+
+def test_a_method_without_a_text_of_its_own_has_a_page(method_pages: ModuleType) -> None:
+    page = method_pages.page("instant-ngp", None)
+    assert page.startswith("# instant-ngp\n\nInstant-NGP: a multiresolution hash grid")
+    assert "[arXiv:2201.05989](https://arxiv.org/abs/2201.05989)" in page
+
+
+def test_a_text_of_its_own_comes_first(method_pages: ModuleType) -> None:
+    page = method_pages.page("kplanes", "# kplanes\n\nSix planes.\n")
+    assert page.index("Six planes.") < page.index("## In short") < page.index("## Flags")

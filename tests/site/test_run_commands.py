@@ -1,0 +1,101 @@
+"""Commands of the documents that take a run or make one do so, from end to end, on a tiny scene and in few steps."""
+
+import os
+import re
+import shutil
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from tests.site.pages import PAGES, ROOT, commands, words_of
+from tests.training.helpers import TINY
+
+pytestmark = pytest.mark.slow
+RUN = re.compile(r"outputs/\w+/([\w-]+)/TIME")
+LEFT_OUT = re.compile(
+    r"camera-path|ns-render time|--resume|--load-config|--vis|--help|--version|my-method|voxels|path/to/ring"
+    r"| (nerfstudio|colmap|blender) --|eval-appearance half"
+)
+"""Commands that need more than a tiny still scene: tests of their own have them."""
+SMALL = {
+    "--num-frames": "2", "--resolution": "16", "--texture-size": "64", "--target-num-faces": "200",
+    "--fit-seconds": "1", "--max-images": "1", "--max-seconds": "20",
+}  # fmt: skip
+"""Flags whose values are exchanged, so that a command takes seconds."""
+ADDED = {
+    "ns-train": ["--max-num-iterations", "2", "--vis", "none", "--max-eval-images", "1"],
+    "orbit": ["--num-frames", "2"],
+    "interpolate": ["--num-frames", "2"],
+    "spiral": ["--num-frames", "2"],
+    "pointcloud": ["--num-points", "500"],
+    "marching-cubes": ["--resolution", "16", "--isosurface-threshold", "0.3"],
+    "tsdf": ["--resolution", "16"],
+    "web": ["--fit-seconds", "1"],
+}
+"""Flags that are added to a command, or to one of its kinds, where they are not given."""
+
+
+def shown() -> list[str]:
+    """The commands to run, each once."""
+    names = ("ns-train ", "ns-eval ", "ns-render ", "ns-export ")
+    pages = [page for page in PAGES if page.is_relative_to(ROOT / "docs") and page.stem != "figures"]
+    found = {command.split("  ")[0] for page in pages for _, command in commands(page)}
+    return sorted(c for c in found if c.startswith(names) and not LEFT_OUT.search(c) and "--data DIR" not in c)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, shared_tiny: Path) -> Path:
+    """A working folder with the data sets and the runs that the documents name."""
+    import nerfloom
+
+    folder = tmp_path_factory.mktemp("site")
+    for name in ("path/to/lego", "path/to/fox", "data/mine", "data/room"):
+        shutil.copytree(shared_tiny, folder / name)
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        for method in ("instant-ngp", "nerfacto", "gaussian-splatting"):
+            settings = {"max_num_iterations": 60, **TINY.get(method, {})}
+            nerfloom.train(method, data="path/to/lego", vis="none", experiment_name="all", timestamp="TIME", **settings)
+        execute(["ns-export", "gaussian-splat", "outputs/all/gaussian-splatting/TIME", "--output-dir", "exports"])
+    finally:
+        os.chdir(before)
+    return folder
+
+
+def execute(words: list[str]) -> None:
+    scripts = dict(re.findall(r'^(ns-[\w-]+) = "(.+):main"$', (ROOT / "pyproject.toml").read_text(), re.MULTILINE))
+    import_module(scripts[words[0]])._command(words[1:])
+
+
+def in_small(command: str) -> list[str]:
+    """The words of a command with smaller values."""
+    words = words_of(RUN.sub(r"outputs/all/\1/TIME", command))
+    words = [SMALL.get(before, word) for before, word in zip(["", *words], words, strict=False)]
+    for key in (words[0], words[1]):
+        if (extra := ADDED.get(key)) and extra[0] not in words:
+            words += extra
+    return words
+
+
+@pytest.mark.parametrize("command", shown())
+def test_it_runs_to_its_end(command: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    words = in_small(command)
+    output = next((words[i + 1] for i, word in enumerate(words) if word in ("--output-path", "--output-dir")), None)
+    before = set(folder.rglob("*"))
+    if output is not None and output != "exports":
+        shutil.rmtree(folder / output, ignore_errors=True)
+        (folder / output).unlink(missing_ok=True)
+    execute(words)
+    if output is not None:
+        assert (folder / output).exists()
+    elif words[0] == "ns-train":
+        assert any(path.suffix == ".ckpt" for path in set(folder.rglob("*")) - before)
+    else:
+        assert (folder / "outputs/all").exists()
+
+
+def test_enough_is_run() -> None:
+    assert len(shown()) > 35

@@ -31,8 +31,8 @@ BUGS = (
         "wrong-download-is-kept",
         "downloads",
         "framework/tools/downloads/fetch.py",
-        "            part.unlink()\n            raise SourceError(f\"{source.url}: the file has",
-        "            raise SourceError(f\"{source.url}: the file has",
+        '            part.unlink()\n            raise SourceError(f"{source.url}: the file has',
+        '            raise SourceError(f"{source.url}: the file has',
         "a file with a wrong checksum is there at the next call, which finds it complete, and fails again for ever",
     ),
     Bug(

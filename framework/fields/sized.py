@@ -46,8 +46,8 @@ class SizedGrid(BoxField):
         if points.variances is None:
             assert isinstance(self.encoding, HashGrid)
             return points.positions.new_full((len(points),), 0.5 / self.encoding.layout.resolutions[-1])
-        along, across = points.variances.unbind(-1)
-        deviations = along ** (1 / 6) * across ** (1 / 3) * self.scale.prod() ** (1 / 3)
+        along, across = points.variances.log().unbind(-1)  # their product would be too small for float32
+        deviations = torch.exp((along + 2 * across) / 6) * self.scale.prod() ** (1 / 3)
         if not self.unbounded:
             return deviations
         middle, half = (self.box[0] + self.box[1]) / 2, (self.box[1] - self.box[0]) / 2

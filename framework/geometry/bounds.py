@@ -90,7 +90,8 @@ def contraction_scale(positions: Tensor) -> Tensor:
     ball, and falling with |x|^(-4/3) outside.
     """
     inverse = _inverted(positions)[1][..., 0]
-    return (2 - inverse) ** (2 / 3) * inverse ** (4 / 3)
+    volume = (2 - inverse) * inverse.square()
+    return volume.clamp(min=torch.finfo(volume.dtype).tiny) ** (2 / 3)  # at infinity it has a gradient too
 
 
 def _inverted(positions: Tensor) -> tuple[Tensor, Tensor]:

@@ -14,6 +14,7 @@ namespace {
 
 constexpr int64_t CHUNK = 256;      // samples that go through all levels together: their points stay in cache
 constexpr float SMALLEST = 0.05f;   // deviation, in cells, below which a weight is 1 in float32
+constexpr size_t NEAR = 1 << 15;    // floats of a level that stay in a near cache, where fetching ahead only takes time
 
 // One point of each of LANES samples.
 struct Point {
@@ -41,17 +42,21 @@ inline Floats error_function(Floats x) {
     return x < 0.1f ? series : 1.0f - sum * t * exponential(-squared);
 }
 
+// One bit for each lane that is true.
+inline uint32_t bits_of(Ints lanes) {
+    alignas(64) int32_t each[LANES];
+    std::memcpy(each, &lanes, sizeof lanes);
+    int32_t bits = 0;
+    for (int s = 0; s < LANES; s++) bits |= each[s] & 1 << s;
+    return uint32_t(bits);
+}
+
 // A point's share in the mean over its sample: the weight of the level, over the number of points.
 inline Floats share_of(const Level& level, Floats deviation, int per_sample) {
     const Floats cells = deviation * float(level.resolution);
-    return error_function(0.353553391f / (cells < SMALLEST ? splat(SMALLEST) : cells)) * (1.0f / float(per_sample));
-}
-
-template <bool DENSE>
-inline void find_weighted(const Level& level, const Point& point, int per_sample, Cell& cell) {
-    find_cell<DENSE>(level, point.xyz[0], point.xyz[1], point.xyz[2], cell);
-    const Floats share = share_of(level, point.deviation, per_sample);
-    for (int c = 0; c < CORNERS; c++) store(cell.weight[c], load(cell.weight[c]) * share);
+    const Floats equal = splat(1.0f / float(per_sample));
+    const Ints sized = ~(cells < SMALLEST);  // NaN counts, and stays
+    return bits_of(sized) ? error_function(0.353553391f / (sized ? cells : splat(SMALLEST))) * equal : equal;
 }
 
 inline Words entries_of(const Cell& cell, int corner) {
@@ -70,23 +75,27 @@ inline void prefetch(const Cell& cell, int s, const float* entries) {
 template <int F, bool DENSE, typename Visit>
 inline void for_runs(const Level& level, const Point* points, int per_sample, int size, const float* entries,
                      const Visit& visit) {
+    const bool far = (size_t(level.mask) + 1) * F > NEAR;
+    const uint32_t all = uint32_t((uint64_t(1) << size) - 1);
     Cell cells[2];
-    find_weighted<DENSE>(level, points[0], per_sample, cells[0]);
-    for (int s = 0; s < size; s++) prefetch<F>(cells[0], s, entries);
-    for (int j = 1; j < per_sample; j++) {
+    for (int j = 0; j < per_sample; j++) {
         Cell &before = cells[~j & 1], &here = cells[j & 1];
-        find_weighted<DENSE>(level, points[j], per_sample, here);
+        const Floats* xyz = points[j].xyz;
+        find_cell<DENSE>(level, xyz[0], xyz[1], xyz[2], here);
+        const Floats share = share_of(level, points[j].deviation, per_sample);
         Ints moved = {};
-        for (int c = 0; c < CORNERS; c++) moved |= entries_of(here, c) != entries_of(before, c);
-        alignas(64) int32_t lanes[LANES];
-        std::memcpy(lanes, &moved, sizeof moved);
-        for (int s = 0; s < size; s++)
-            if (lanes[s]) {
-                prefetch<F>(here, s, entries);
-                visit(before, s);
-            }
+        if (j)
+            for (int c = 0; c < CORNERS; c++) moved |= entries_of(here, c) != entries_of(before, c);
+        const uint32_t fresh = j ? bits_of(moved) & all : all;
+        if (far)
+            for (uint32_t left = fresh; left; left &= left - 1) prefetch<F>(here, __builtin_ctz(left), entries);
+        if (j == 0) {
+            for (int c = 0; c < CORNERS; c++) store(here.weight[c], load(here.weight[c]) * share);
+            continue;
+        }
+        for (uint32_t left = fresh; left; left &= left - 1) visit(before, __builtin_ctz(left));
         for (int c = 0; c < CORNERS; c++) {
-            const Floats weight = load(here.weight[c]);
+            const Floats weight = load(here.weight[c]) * share;
             store(here.weight[c], moved ? weight : weight + load(before.weight[c]));
         }
     }

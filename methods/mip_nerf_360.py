@@ -14,7 +14,7 @@ from typing import ClassVar, Literal
 from torch import Tensor
 
 from framework import Decision, Field, Method, PixelBatch, RayModel, Rendered, Sampler, Scene
-from framework.base.config import AT_LEAST_0, Range
+from framework.base.config import AT_LEAST_0, AUTO, Auto, Range
 from framework.base.decisions import Choice, fill
 from framework.base.device import device_kind
 from framework.base.optimised import Optimised
@@ -28,6 +28,8 @@ from framework.rendering.losses import charbonnier, normalised_distortion
 from framework.samplers.choice import COARSEST_PROPOSAL, SamplingConfig, contracted_box, make_sampler, sampler_choice
 from framework.samplers.proposal import LEARN_EVERY, half_edge
 
+DISTORTION = 0.01
+"""Default weight of the distortion loss in unbounded scenes, the paper's."""
 PROPOSAL_LEVELS, PROPOSAL_BASE, PROPOSAL_TABLE = 5, 16, 16
 """Levels of the proposals' hash grids, cells per axis of the first, and entries of each at most, as a power of two."""
 
@@ -67,8 +69,8 @@ class MipNeRF360Config(
     """Allowed range of each numeric setting."""
     encoding: Literal["auto", "integrated", "hash-grid"] = "auto"
     """integrated: the paper's networks. hash-grid: hash grids with small networks. auto: hash-grid on a CPU."""
-    distortion_loss_mult: float = 0.01
-    """Weight of the distortion loss."""
+    distortion_loss_mult: Auto[float] = AUTO
+    """Weight of the distortion loss. If not given: 0.01 in unbounded scenes, else 0."""
     num_layers: int = 8
     """Layers of the network before its density output (integrated)."""
     hidden_width: int = 1_024
@@ -100,9 +102,15 @@ class MipNeRF360Config(
 
 
 class MipNeRF360(RayModel[MipNeRF360Config]):
-    """A model with a smooth absolute error of colours and the distortion of rays."""
+    """A model with a smooth absolute error of colours and the distortion of rays, where scenes have no bounds.
+
+    In a box the error is the mean of squares: absolute errors are least in empty space if most of a picture is
+    background, and from there nothing is learnt any more.
+    """
 
     def color_error(self, rgb: Tensor, batch: PixelBatch) -> Tensor:
+        if not self.scene.unbounded:
+            return super().color_error(rgb, batch)
         return charbonnier(rgb, batch.rgb, batch.weights)
 
     def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
@@ -126,7 +134,13 @@ def decide(config: MipNeRF360Config, scene: Scene) -> tuple[MipNeRF360Config, li
     encoding, reason = "integrated", "a GPU runs the paper's networks"
     if processor:
         encoding, reason = "hash-grid", "the paper's networks take days on a processor (else: --encoding integrated)"
-    return fill(config, sampler_choice(config, scene.unbounded), Choice("encoding", encoding, reason))
+    around = "there may be something outside the box" if scene.unbounded else "the scene ends at its box"
+    return fill(
+        config,
+        sampler_choice(config, scene.unbounded),
+        Choice("encoding", encoding, reason),
+        Choice("distortion_loss_mult", DISTORTION if scene.unbounded else 0.0, around, "distortion loss"),
+    )
 
 
 def make_field(config: MipNeRF360Config, scene: Scene) -> Field:

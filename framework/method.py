@@ -20,7 +20,7 @@ from framework.scene.reasons import DEPTH_REASONS, SPARSE_DEPTH_REASON
 
 DEPTH = 0.1
 """Default weight of the depth loss if there are depth images."""
-SPARSE_DEPTH = 0.01
+SPARSE_DEPTH = 0.001
 """Default weight of the depth loss if there are points of a reconstruction."""
 
 

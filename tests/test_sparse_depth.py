@@ -226,7 +226,7 @@ def test_every_method_that_casts_rays_learns_from_them(
     trainer = Trainer(run, dataset, None)
     said = [decision.line() for decision in trainer.decisions]
     count = dataset.scene.num_sparse_depths
-    assert f"  depth loss: 0.01, as the reconstruction's points are seen in {count:,} pixels" in said
+    assert f"  depth loss: 0.001, as the reconstruction's points are seen in {count:,} pixels" in said
     report = trainer.train_step()
     assert report.losses["depth"] > 0
     assert ("depth_coarse" in report.losses) == (kind in ("vanilla-nerf", "dnerf"))

@@ -228,7 +228,7 @@ class RayConfig(TrainConfig):
     draw_by_error: bool = False
     """Draw half of the pixels in proportion to their recent error, with weights that keep the mean loss unbiased."""
     depth_loss_mult: Auto[float] = AUTO
-    """Weight of the depth loss; 0 for none. If not given: 0.1 if there are depth images, 0.01 if there are points of a
+    """Weight of the depth loss; 0 for none. If not given: 0.1 if there are depth images, 0.001 if there are points of a
     reconstruction, which some pixels are known to show, else 0."""
     free_space_loss_mult: float = 0.0
     """Weight of the penalty on matter right before cameras: nearer than most of the points that a camera sees, or than

@@ -65,7 +65,8 @@ def test_every_flag_once_and_the_everyday_ones_first(method: str) -> None:
     assert list(found) == [
         "options", "everyday options", f"{method} options", "sampler options", "ray options",
         *["appearance options"] * (method == "nerfacto"), *["few images options"] * (method != "dnerf"),
-        "optimisation options", "evaluation and saving options", "machine options", "viewer options", "procedural data options",
+        "optimisation options", "evaluation and saving options", "machine options", "viewer options",
+        "procedural data options",
     ]  # fmt: skip
     first = ["--data", "--max-seconds", "--max-num-iterations", "--output-dir", "--experiment-name", "--rays-per-pixel"]
     assert found["everyday options"][:6] == first

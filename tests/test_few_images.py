@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 
+from framework.base.errors import ConfigError
 from framework.base.registry import load_method
 from framework.scene.few_images import (
     FEW,
@@ -67,14 +68,17 @@ def test_each_part_has_a_flag() -> None:
 
 
 def test_alpha_shows_what_is_empty_so_that_fewer_images_are_few() -> None:
+    """And grids, which open no levels, then have nothing to switch on."""
     for count, few in ((FEW_WITH_ALPHA, True), (FEW_WITH_ALPHA + 1, False)):
-        config, _ = decided("instant-ngp", count, dataclasses.replace(SCENE, has_alpha=True))
+        config, _ = decided("vanilla-nerf", count, dataclasses.replace(SCENE, has_alpha=True))
         assert config.few_images == few
-        assert config.occlusion_loss_mult == 0
+        assert parts(config) == (0.5 * few, 0, 0)
+    assert not decided("instant-ngp", 3, dataclasses.replace(SCENE, has_alpha=True))[0].few_images
 
 
 def test_no_view_between_cameras_in_normalised_device_coordinates_or_in_motion() -> None:
-    assert decided("nerfacto", 3, dataclasses.replace(CAPTURE, warped=True, unbounded=False))[0].unseen_loss_mult == 0
+    with pytest.raises(ConfigError, match="no rays in normalised device coordinates"):
+        decided("nerfacto", 3, dataclasses.replace(CAPTURE, warped=True, unbounded=False), unseen_loss_mult=0.1)
     assert not decided("kplanes", 3, dataclasses.replace(CAPTURE, moving=True))[0].few_images
 
 
@@ -135,7 +139,8 @@ def test_with_many_images_not_a_bit_changes(shared_tiny: Path, tmp_path: Path) -
 
 
 def test_a_profile_says_it(shared_tiny: Path, tmp_path: Path) -> None:
-    trainer = tiny_trainer("nerfacto", shared_tiny, tmp_path / "run", max_train_images=3)
+    trainer = tiny_trainer("vanilla-nerf", shared_tiny, tmp_path / "run", max_train_images=3)
     said = "\n".join(trainer.profile().lines())
     assert "scene: 3 images" in said
     assert "regularisers for few images: on, as there are 3 training images" in said
+    assert "open levels until: 0.5, as few images are explained by coarse shapes first" in said

@@ -12,12 +12,11 @@ from typing import ClassVar, TypeVar
 
 from framework.base.config import AT_LEAST_0, AUTO, Auto, Range, RayConfig
 from framework.base.decisions import Choice, Decision, fill
+from framework.base.errors import ConfigError
 from framework.data.scene import Scene
 
 FEW, FEW_WITH_ALPHA = 12, 8
 """Number of training images up to which there are few: of a capture, and of images whose alpha shows what is empty."""
-SMOOTHNESS = 0.1
-"""Weight of the depth's roughness in unseen views, as in RegNeRF's settings once it is annealed."""
 OCCLUSION = 0.01
 """Weight of the optical depth near cameras, as in FreeNeRF's settings."""
 UNSEEN_START, UNSEEN_STEPS = 10.0, 512
@@ -37,13 +36,13 @@ class FewImagesConfig(RayConfig):
     }
     """Allowed ranges."""
     few_images: Auto[bool] = AUTO
-    """Whether the parts below that are not set are used. If not given: for up to 12 training images of a still scene,
-    or 8 with an alpha channel."""
+    """Whether there are few images, by which the settings below that are not given are chosen. If not given: up to 12
+    training images of a still scene, or 8 with an alpha channel."""
     open_levels_until: Auto[float] = AUTO
     """Share of the budget in which the levels of the encoding open, from coarse to fine; 0 if all are open at once. If
     not given: 0.5 with few images for vanilla-nerf, else 0."""
-    unseen_loss_mult: Auto[float] = AUTO
-    """Weight of the roughness of depth in views between the training cameras. If not given: 0.1 with few images."""
+    unseen_loss_mult: float = 0.0
+    """Weight of the roughness of depth in views between the training cameras, such as 0.1; 0 for no such views."""
     unseen_patches: int = 8
     """Number of patches of 8 x 8 rays through such views in each step."""
     occlusion_loss_mult: Auto[float] = AUTO
@@ -65,17 +64,20 @@ def decide_few_images(config: ConfigT, scene: Scene, open_until: float = 0.0) ->
 
     Returns:
         the settings, and the decisions that were made; none where there are many images.
+
+    Raises:
+        ConfigError: if unseen views are asked for in normalised device coordinates.
     """
-    count, most = scene.num_cameras, FEW_WITH_ALPHA if scene.has_alpha else FEW
-    reason = f"there are {count} training images, of which few contradict what fits them (else: --few-images False)"
-    few = Choice("few_images", count <= most and not scene.moving, reason, "regularisers for few images")
-    config, made = fill(config, few)
-    between = not scene.warped and scene.camera_to_worlds is not None
+    if config.unseen_loss_mult and scene.warped:
+        raise ConfigError("--unseen-loss-mult: unseen views have no rays in normalised device coordinates")
     choices = (
         Choice("open_levels_until", open_until, "few images are explained by coarse shapes first"),
-        Choice("unseen_loss_mult", SMOOTHNESS * between, "depth is smooth in views between the images"),
         Choice("occlusion_loss_mult", OCCLUSION * (not scene.has_alpha), "nothing is right before a camera"),
     )
+    count, most = scene.num_cameras, FEW_WITH_ALPHA if scene.has_alpha else FEW
+    few = count <= most and not scene.moving and any(choice.value for choice in choices)
+    reason = f"there are {count} training images, of which few contradict what fits them (else: --few-images False)"
+    config, made = fill(config, Choice("few_images", few, reason, "regularisers for few images"))
     if not config.few_images:
         return fill(config, *(replace(choice, value=0.0) for choice in choices))[0], []
     config, parts = fill(config, *choices)

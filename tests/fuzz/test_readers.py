@@ -20,7 +20,7 @@ FEW, MANY = 10, 200
 READERS = (
     "blender", "dnerf", "nerfstudio", "colmap-binary", "colmap-text", "llff", "llff-ndc", "record3d", "polycam",
     "phototourism", "ply", "splats", "camera-path", "images", "images-to-a-file", "masks", "depths", "photographs",
-    "polycam-raw", "record3d-raw", "config", "comparison", "checkpoint", "run", "pixel-cache",
+    "polycam-raw", "record3d-raw", "config", "comparison", "checkpoint", "run", "archive", "pixel-cache",
 )  # fmt: skip
 """Their names here too, so that tests are collected without reading anything."""
 HALVES = {"one half": READERS[::2], "the other half": READERS[1::2]}

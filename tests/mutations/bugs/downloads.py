@@ -39,8 +39,8 @@ BUGS = (
         "archive-leaves-its-folder",
         "downloads",
         "framework/tools/downloads/unpack.py",
-        'if part in ("", ".", "..") or',
-        'if part in ("", ".") or',
+        'if part in ("", ".", "..") or UNSAFE.search(part) or len',
+        "if len",
         "an archive writes files outside the folder",
     ),
     Bug(

@@ -1,4 +1,4 @@
-"""Hooks of MkDocs: a page for each method, made from the code, new notes in the menu, and equations as MathML, which needs no script."""
+"""Hooks of MkDocs: a page for each method, made from the code, and equations as MathML, which needs no script."""
 
 from __future__ import annotations
 

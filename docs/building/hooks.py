@@ -16,10 +16,14 @@ EQUATION = re.compile(r'<(span|div) class="arithmatex">(.*?)</\1>', re.DOTALL)
 
 
 def on_config(config: Any) -> Any:
-    """Add every method to the menu, in alphabetical order."""
+    """Add every method to the menu, in alphabetical order, and every note that has no place in it yet."""
+    notes = [f"notes/{file.name}" for file in sorted(Path(config.docs_dir, "notes").glob("*.md"))]
     for entry in config.nav:
         if "Methods" in entry:
             entry["Methods"] += [{name: f"methods/{name}.md"} for name in method_pages.methods()]
+        if "How it works" in entry:
+            placed = {path for page in entry["How it works"] for path in page.values()}
+            entry["How it works"] += [note for note in notes if note not in placed]
     return config
 
 

@@ -149,29 +149,35 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
         """Render `view` over `background` (3,) in chunks of `eval_num_rays_per_chunk` rays, in evaluation mode."""
         was_training, per_pixel = self.training, view.rays_per_pixel or self.rays_per_pixel
         offsets, grid, times = subpixels(per_pixel), view.pixels(), view.times()
-        chunk = max(self.config.eval_num_rays_per_chunk // per_pixel, 1)
+        chunk, count = max(self.config.eval_num_rays_per_chunk // per_pixel, 1), grid.numel()
+        pixels = grid.reshape(-1)
         self.eval()
-        columns: list[tuple[Tensor, ...]] = []
-        normals: list[Tensor] = []
+        # Written into as they come: small results kept between a chunk's large ones would break up the heap.
+        rgb, normals = torch.empty(count, 3, device=self.device), None
+        depth, median, accumulation = torch.empty(3, count, device=self.device)
         with (
             torch_on_one_thread(self.runs_on_kernels),
             torch.autocast(self.device.type, torch.bfloat16, enabled=self.uses_bfloat16),
         ):
-            for pixels in grid.reshape(-1).split(chunk):
-                rays = view.camera.pixel_rays(pixels, self.scene.near, self.scene.far, times, offsets)
+            for start in range(0, count, chunk):
+                part = slice(start, start + chunk)
+                rays = view.camera.pixel_rays(pixels[part], self.scene.near, self.scene.far, times, offsets)
                 # Index 0 of the view's one camera must not be taken for the index of a training camera.
                 rendered = self.render(replace(rays, camera_indices=None), background).to_pixels(per_pixel)
-                columns.append((rendered.rgb, rendered.depth, rendered.median_depth, rendered.accumulation))
-                normals += [] if rendered.normals is None else [safe_normalize(rendered.normals.float())]
+                rgb[part], depth[part], median[part] = rendered.rgb, rendered.depth, rendered.median_depth
+                accumulation[part] = rendered.accumulation
+                if rendered.normals is not None:
+                    normals = torch.empty_like(rgb) if normals is None else normals
+                    normals[part] = safe_normalize(rendered.normals.float())
         self.train(was_training)
-        rgb, depth, median, accumulation = (torch.cat(column).float() for column in zip(*columns, strict=True))
+        size = tuple(grid.shape)
         return Picture(
-            rgb.view(*grid.shape, 3),
-            depth.view(grid.shape),
-            median.view(grid.shape),
-            accumulation.view(grid.shape),
-            torch.cat(normals).view(*grid.shape, 3) if normals else None,
-            num_rays=grid.numel() * per_pixel,
+            rgb.view(*size, 3),
+            depth.view(size),
+            median.view(size),
+            accumulation.view(size),
+            None if normals is None else normals.view(*size, 3),
+            num_rays=count * per_pixel,
         )
 
     def before_step(self, step: int, progress: float) -> None:

@@ -96,7 +96,7 @@ class Method:
         if not isinstance(config, RayConfig):
             return config, made
         config, more = fill(config, depth_choice(scene))
-        return config, made + more
+        return config, made + more * bool(config.depth_loss_mult)  # nothing to learn from needs no words
 
     def build(self, config: TrainConfig, scene: Scene) -> Model[Any]:
         """Return the model, with newly initialised parameters.

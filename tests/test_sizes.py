@@ -50,7 +50,7 @@ def numbers(config: TrainConfig) -> Iterator[tuple[str, Any]]:
                 inner = typing.get_args(kind)[0]
                 yield from ((name, (value,)) for value in WRONG[inner])
                 yield name, ()
-                yield name, (getattr(config, name)[0],) * 100
+                yield name, ((*getattr(config, name), inner(1))[0],) * 100
 
 
 def tiny_config(method: str) -> TrainConfig:

@@ -91,6 +91,11 @@ class HostValue:
             self._state, self._value = state, float(scalar)
         return self._value
 
+    def change(self, scalar: Tensor, value: float) -> None:
+        """Set `scalar` to a `value` that float32 holds exactly, without a wait for the device."""
+        scalar.fill_(value)
+        self._state, self._value = (scalar.data_ptr(), scalar._version), value
+
 
 @cache
 def cpu_features() -> frozenset[str]:

@@ -198,7 +198,7 @@ def gather_batch(
     weights = None
     if dataset.image_weights is not None and rays.camera_indices is not None:
         weights = dataset.image_weights[rays.camera_indices[:: len(subpixels)]]
-    return PixelBatch(flat, rays, rgb, behind, alpha, known_distances(dataset, flat, rays), weights)
+    return PixelBatch(flat, rays, rgb, behind, alpha, known_distances(dataset, flat, rays), weights=weights)
 
 
 def known_distances(dataset: Dataset, flat: Tensor, rays: Rays) -> Tensor | None:

@@ -15,6 +15,9 @@ from torch.nn.functional import pad
 
 from framework.base.device import HostValue
 
+STEPS_PER_LEVEL = 2**10
+"""Steps in which a level opens: each is a number that float32 holds exactly."""
+
 
 def opened_levels(num_levels: int, first: float, progress: float) -> float:
     """Return how many levels are open: FreeNeRF, equation 5, with `first` open levels at the start.
@@ -52,9 +55,9 @@ class Opening(nn.Module):
 
     def open(self, progress: float) -> None:
         """Open levels up to `progress`, a fraction of the time in which they open."""
-        opened = opened_levels(self.num_levels, self.first, progress)
+        opened = round(opened_levels(self.num_levels, self.first, progress) * STEPS_PER_LEVEL) / STEPS_PER_LEVEL
         if opened != self._opened.of(self.opened):
-            self.opened.fill_(opened)
+            self._opened.change(self.opened, opened)
 
     @property
     def count(self) -> int:

@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from framework.base.device import to_float64
 from framework.kernels import native
 from framework.kernels.dispatch import CPP, Operation
 
@@ -37,7 +38,7 @@ def blurred_weights(edges: Tensor, weights: Tensor, proposed: Tensor, radius: fl
         proposed: (R, P + 1) sorted edges of the other bins.
         radius: half the width of the box, in the units of the edges; more than 0.
     """
-    edge, weight, x = edges.double(), weights.double(), proposed.double()
+    edge, weight, x = (to_float64(values) for values in (edges, weights, proposed))
     width, zero = edge.diff(dim=-1), torch.zeros_like(edge[:, :1])
     mass = torch.cat([zero, weight.cumsum(-1)], dim=-1)
     area = torch.cat([zero, ((mass[:, 1:] + mass[:, :-1]) / 2 * width).cumsum(-1)], dim=-1)
@@ -56,13 +57,13 @@ def blurred_weights(edges: Tensor, weights: Tensor, proposed: Tensor, radius: fl
 def blurred_excess_reference(
     edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor, radius: float
 ) -> Tensor:
-    """Compute `blurred_excess` in PyTorch, on any device that has float64.
+    """Compute `blurred_excess` in PyTorch, on any device.
 
     `edges`, `weights`, `proposed`, `proposed_weights` and `radius` are as in `blurred_excess`.
     """
-    target = blurred_weights(edges, weights, proposed, radius)
+    target = blurred_weights(edges, weights, proposed, radius).to(proposed_weights)
     excess = (target - proposed_weights).clamp(min=0)
-    return (excess.square() / (proposed_weights + EPS)).sum(-1).to(proposed_weights.dtype)
+    return (excess.square() / (proposed_weights + EPS)).sum(-1)
 
 
 def blurred_excess(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor, radius: float) -> Tensor:

@@ -50,8 +50,11 @@ SMALLER: dict[str, Any] = {
     "num_gaussians": 600,
     "start_gaussians": 400,
     "start": "silhouettes",
+    "few_images": False,
+    "mixed_precision": False,
 }
-"""Settings that do not change the number of operations, but the time that they take on the CPU."""
+"""Settings that do not change the number of operations, but the time that they take on the CPU; and those that other
+machines and data would decide otherwise."""
 STARTS_NOTHING = {"empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided", "_unsafe_view"}
 """Operations other than views for which a device has nothing to do."""
 FACTORIES = {

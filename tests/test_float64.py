@@ -47,7 +47,7 @@ def taken_away(values: Tensor) -> Tensor:
 def alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Torch alone, as on a device that the kernels do not know."""
     monkeypatch.setattr(native, "available", lambda: False)
-    for name in ("framework.data.error_map", "framework.evaluation.metrics"):
+    for name in ("framework.data.error_map", "framework.evaluation.metrics", "framework.kernels.step_functions"):
         monkeypatch.setattr(importlib.import_module(name), "to_float64", taken_away)
 
 

@@ -50,7 +50,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, shared_tiny: Path) -> Path:
     import nerfloom
 
     folder = tmp_path_factory.mktemp("site")
-    for name in ("path/to/lego", "path/to/fox", "data/mine", "data/room"):
+    for name in ("path/to/lego", "path/to/fox", "data/mine", "data/room", "data/blender/lego"):
         shutil.copytree(shared_tiny, folder / name)
     before = Path.cwd()
     os.chdir(folder)

@@ -42,8 +42,8 @@ def blurred_weights(edges: Tensor, weights: Tensor, proposed: Tensor, radius: fl
     width, zero = edge.diff(dim=-1), torch.zeros_like(edge[:, :1])
     mass = torch.cat([zero, weight.cumsum(-1)], dim=-1)
     area = torch.cat([zero, ((mass[:, 1:] + mass[:, :-1]) / 2 * width).cumsum(-1)], dim=-1)
-    some = width > 0
-    slope = torch.cat([torch.where(some, weight / torch.where(some, width, 1.0), 0.0), zero], dim=-1)  # none at the end
+    none = width <= 0
+    slope = torch.cat([(weight / width.masked_fill(none, 1)).masked_fill(none, 0), zero], dim=-1)  # none at the end
 
     def second_integral(x: Tensor) -> Tensor:
         bins = (torch.searchsorted(edge, x, right=True) - 1).clamp(min=0)

@@ -47,7 +47,7 @@ class _Broken(Exception):
 
 @dataclass(frozen=True)
 class _Answered:
-    """What an earlier answer said of the file, kept beside the part that is there.
+    """Facts that an earlier answer gave of the file, kept beside the part that is there.
 
     Args:
         url: address that was asked.

@@ -75,7 +75,8 @@ class ViewBatch:
     kept: Tensor | None = None
     """(H, W) bool, pixels that count; None for all."""
     distances: Tensor | None = None
-    """(H, W) measured distance along each pixel's ray, 0 where unknown; None without depth images."""
+    """(H, W) distance along each pixel's ray, 0 where unknown: measured, or that of a reconstruction's point; None if
+    none is known."""
 
     def __len__(self) -> int:
         return self.rgb.shape[0] * self.rgb.shape[1]

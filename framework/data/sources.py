@@ -29,6 +29,7 @@ from framework.data.pixels import (
     known_distances,
     training_background,
 )
+from framework.data.sparse_depth import SparseDepth
 
 
 @dataclass(frozen=True)
@@ -165,6 +166,8 @@ class ViewSource(BatchSource):
         self._order: tuple[int, list[int]] | None = None
         self._views: dict[int, View] = {}
         """Views of images that have been drawn, whose sizes and lenses are read from the device once."""
+        self._sparse_ends: list[int] | None = None
+        """Where the sparse depths of each image begin, and where the last one's end."""
 
     def draw(self, request: Request) -> ViewBatch:
         dataset = self.dataset
@@ -184,11 +187,20 @@ class ViewSource(BatchSource):
     def _distances(self, index: int) -> Tensor | None:
         dataset = self.dataset
         if dataset.depths is None:
-            return None
+            return None if dataset.sparse_depth is None else self._sparse_distances(index, dataset.sparse_depth)
         pixels = dataset.cameras.image_pixels(index)
         rays = dataset.cameras.pixel_rays(pixels, dataset.scene.near, dataset.scene.far, dataset.times)
         found = known_distances(dataset, pixels, rays)
         return None if found is None else found.view(dataset.cameras.sizes[index][0], -1)
+
+    def _sparse_distances(self, index: int, known: SparseDepth) -> Tensor:
+        cameras = self.dataset.cameras
+        if self._sparse_ends is None:
+            self._sparse_ends = torch.searchsorted(known.pixels, cameras.offsets.to(known.pixels)).tolist()
+        (first, last), here = cameras.ends[index : index + 2], slice(*self._sparse_ends[index : index + 2])
+        distances = known.distances.new_zeros(last - first)
+        distances[known.pixels[here] - first] = known.distances[here]
+        return distances.view(cameras.sizes[index][0], -1)
 
     def _index(self, step: int) -> int:
         """Return the image of a training step, a function of seed, step and process alone."""

@@ -47,6 +47,14 @@ def test_what_the_framework_does_not_offer_is_refused(tmp_path: Path) -> None:
     assert verdict.error == "float16: 'mixed_precision' is 'float16'; it must be bool"
 
 
+def test_rays_a_step_say_nothing_of_what_draws_images(tmp_path: Path) -> None:
+    run = tiny_run("gaussian-splatting", Path("none"), tmp_path)
+    one, many = list(verdicts(run, BALL, select(["1-ray", "8192-rays"]), Budget(1, None)))[1:]
+    assert one.outcome == many.outcome == "not applicable"
+    assert one.cell() == "not applicable"
+    assert one.reason == "a step draws a whole image"
+
+
 def test_the_same_run_twice_is_the_same(tmp_path: Path) -> None:
     run = tiny_run("instant-ngp", Path("none"), tmp_path)
     first, second = (attempt(PLAIN, run, BALL, Budget(20, None)) for _ in range(2))

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from framework.base.errors import ConfigError
+from framework.base.errors import ConfigError, DataError
 from framework.cli.train import _default_run, _parse_flags
 from tests.cli.helpers import TINY_NGP, called, command, run
 
@@ -20,9 +20,9 @@ def test_help_is_quick_and_lists_every_method() -> None:
         done = subprocess.run([command("ns-train"), "--help"], capture_output=True, text=True, check=True)
         return time.perf_counter() - start, done.stdout
 
-    runs = [once() for _ in range(5)]
+    runs = [once() for _ in range(3)]
     best = min(seconds for seconds, _ in runs)
-    print(f"ns-train --help: {best:.2f} s at best of 5")
+    print(f"ns-train --help: {best:.2f} s at best of 3")
     assert best < 0.5
     lines = runs[0][1].splitlines()
     for name in ("instant-ngp", "vanilla-nerf", "blender", "procedural"):
@@ -81,7 +81,8 @@ def test_damaged_data_is_one_line_and_debug_shows_more(tiny: Path, tmp_path: Pat
     assert done.returncode == 1
     assert "transforms_train.json is not JSON" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
-    assert "Traceback" in run("ns-train", *arguments, "--debug").stderr
+    with pytest.raises(DataError, match="is not JSON"):  # of which Python shows the traceback
+        called("ns-train", *arguments, "--debug")
     assert not (tmp_path / "out").exists()
 
 

@@ -93,10 +93,10 @@ def test_gradients_that_wait_move_the_table_as_those_that_do_not(features: int) 
 
 
 def test_tensorf_grows_shrinks_and_resumes(shared_tiny: Path, tmp_path: Path) -> None:
-    settings = {"max_num_iterations": 300, "upsample_at": (0.01, 0.02, 0.03, 0.85, 0.9)}
+    settings = {"max_num_iterations": 100, "upsample_at": (0.03, 0.06, 0.09, 0.85, 0.9)}
     trainer = tiny_trainer("tensorf", shared_tiny, tmp_path / "whole", **settings)
     model, sizes, boxes = trainer.model, [], []
-    for _ in range(300):
+    for _ in range(100):
         trainer.train_step()
         sizes.append(model.size())
         boxes.append(model.field.box.clone())
@@ -108,6 +108,6 @@ def test_tensorf_grows_shrinks_and_resumes(shared_tiny: Path, tmp_path: Path) ->
     assert bool((boxes[-1][1] - boxes[-1][0] < boxes[0][1] - boxes[0][0]).all())
     again = tiny_trainer("tensorf", shared_tiny, tmp_path / "again", **settings)
     again.restore(load_checkpoint(saved))
-    while again.state.step < 300:
+    while again.state.step < 100:
         again.train_step()
     assert_same_bits(tensors(trainer), tensors(again))

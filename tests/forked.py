@@ -68,8 +68,8 @@ def _serve() -> None:
 
 
 def _begun(code: str, arguments: list[str], environment: dict[str, str]) -> tuple[int, list[IO[bytes]]]:
-    """The number of a new process that runs the code, and the files in which it writes what it says."""
-    files: list[IO[bytes]] = [tempfile.TemporaryFile() for _ in range(2)]  # noqa: SIM115: `_ended` closes them
+    """A new process that runs the code: its number, and the files in which it says something, which `_ended` closes."""
+    files: list[IO[bytes]] = [tempfile.TemporaryFile() for _ in range(2)]  # noqa: SIM115
     process = os.fork()
     if process == 0:
         _become(code, arguments, environment, files)

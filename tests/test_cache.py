@@ -4,8 +4,6 @@ import errno
 import io
 import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -251,16 +249,14 @@ print(loading, training)
 
 
 @pytest.mark.parametrize(("limit", "least", "most"), [(10e6, 0, 30), (1e9, 60, 90)])
-def test_memory_stays_bounded(tmp_path: Path, limit: float, least: float, most: float) -> None:
+def test_memory_stays_bounded(tmp_path: Path, limit: float, least: float, most: float, forks: Forks) -> None:
     """60 MB of pixels, read at random for 150 batches: under a limit of 10 MB, and all in memory."""
     try:
         Path("/proc/self/clear_refs").write_text("5")
     except OSError:
         pytest.skip("this system does not tell the peak of a process's memory")
     write_noise(tmp_path / "images", [(500, 500)] * 80)
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-c", MEASURE, str(tmp_path / "images"), str(tmp_path / "cache"), str(limit)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    done = forks.run(MEASURE, tmp_path / "images", tmp_path / "cache", limit)
     assert done.returncode == 0, done.stderr
     loading, training = map(float, done.stdout.split())
     print(f"limit {limit / 1e6:.0f} MB: loading took {loading:.1f} MB more, training {training:.1f}")

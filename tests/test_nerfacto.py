@@ -106,7 +106,7 @@ def test_half_of_a_held_out_photograph_tells_the_others_appearance(shared_tiny: 
     dimmed[:, :3] = (still.pixels[:, :3] * factors.repeat_interleave(sizes)[:, None]).round().to(torch.uint8)
     varied = dataclasses.replace(still, pixels=dimmed, scene=dataclasses.replace(still.scene, appearance_varies=True))
     (tmp_path / "run").mkdir()
-    run = tiny_run("nerfacto", shared_tiny, tmp_path / "run", max_eval_images=0, max_num_iterations=80)
+    run = tiny_run("nerfacto", shared_tiny, tmp_path / "run", max_eval_images=0, max_num_iterations=150)
     trainer = Trainer(run, varied, None)
     trainer.train()
     model = trainer.model

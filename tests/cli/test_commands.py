@@ -20,9 +20,9 @@ def test_help_is_quick_and_lists_every_method() -> None:
         done = subprocess.run([command("ns-train"), "--help"], capture_output=True, text=True, check=True)
         return time.perf_counter() - start, done.stdout
 
-    runs = [once() for _ in range(3)]
+    runs = [once() for _ in range(5)]
     best = min(seconds for seconds, _ in runs)
-    print(f"ns-train --help: {best:.2f} s at best of 3")
+    print(f"ns-train --help: {best:.2f} s at best of 5")
     assert best < 0.5
     lines = runs[0][1].splitlines()
     for name in ("instant-ngp", "vanilla-nerf", "blender", "procedural"):

@@ -23,6 +23,8 @@ METHODS = (
 FOR_FEW_IMAGES = ("instant-ngp", "kplanes", "nerfacto", "tensorf", "vanilla-nerf")
 """Methods with settings for few images."""
 FORMATS = ("blender", "colmap", "dnerf", "llff", "nerfstudio", "phototourism", "polycam", "record3d")
+QUICK = ("instant-ngp", "nerfacto", "vanilla-nerf", "blender", "nerfstudio")
+"""Of which help is read in the fast set: they have every box, and a format few flags or many."""
 Capture = pytest.CaptureFixture[str]
 
 
@@ -61,7 +63,7 @@ def flags_of(settings: Any) -> list[str]:
     return flags
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", [pytest.param(m, marks=() if m in QUICK else pytest.mark.slow) for m in METHODS])
 def test_every_flag_once_and_the_everyday_ones_first(method: str) -> None:
     found = help_of(method)
     known = flags_of(load_method(method).config) + flags_of(load_dataparser("procedural")())
@@ -76,7 +78,7 @@ def test_every_flag_once_and_the_everyday_ones_first(method: str) -> None:
     assert found["everyday options"][:6] == first
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in FORMATS])
 def test_the_data_formats_flags_stand_last(name: str) -> None:
     found = help_of("dnerf", name)
     assert list(found)[-1] == f"{name} data options"

@@ -20,7 +20,7 @@ from tests.conftest import Refused
 from tests.training.helpers import TINY, tiny_run, tiny_trainer
 
 BALL = ball_views()
-BUDGET = Budget(steps=150, seconds=None)
+BUDGET = Budget(steps=75, seconds=None)
 SICK = " ".join(["sick", *TINY_NGP])
 
 
@@ -34,8 +34,8 @@ def test_a_small_method_in_easy_hard_scenes(tmp_path: Path) -> None:
     assert found["plain"].lost == 0
     assert {v.outcome for v in found.values()} <= {"pass", "degraded"}
     assert all(v.psnr is not None and v.psnr > 10 for v in found.values())
-    assert all(v.steps == 150 for v in found.values())
-    assert found["nan-pixels"].skipped == 50
+    assert all(v.steps == 75 for v in found.values())
+    assert found["nan-pixels"].skipped == 25
     assert found["duplicate-cameras"].skipped == 0
     assert list(tmp_path.iterdir()) == []  # the run's own folder is not used
 

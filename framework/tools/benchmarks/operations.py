@@ -39,7 +39,7 @@ SCENES: dict[str, Callable[[int], Dataset]] = {"nerfacto": ball_under_a_sky, "dn
 SIZE, IMAGE_SIZE = 64, 800
 """Width and height of the images, and those for which methods decide their settings, pixels."""
 SMALLER: dict[str, Any] = {
-    "num_rays_per_batch": 64,
+    "num_rays_per_batch": 16,
     "samples_per_batch": 2**11,
     "log2_table_size": 12,
     "grid_resolution": 32,

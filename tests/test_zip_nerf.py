@@ -17,7 +17,7 @@ from framework.kernels.multisampled_grid import multisampled_grid_reference
 from framework.kernels.multisamples import unit_multisamples_reference
 from framework.tools.testing.check import check_method
 from framework.training.trainer import Trainer
-from methods.nerfacto import NerfactoRenderer
+from methods.captures import CaptureRenderer
 from methods.zip_nerf import METHOD, ZipNeRFConfig
 from tests.training.helpers import TINY, tiny_run, tiny_trainer
 
@@ -57,7 +57,7 @@ def test_a_capture_gets_what_it_needs(shared_tiny: Path, tmp_path: Path) -> None
     assert (found["pose refinement"], found["decay of the grids"]) == ("SO3xR3", "0.1")
     trainer.train()
     model = trainer.model
-    assert isinstance(model.renderer, NerfactoRenderer)
+    assert isinstance(model.renderer, CaptureRenderer)
     assert model.renderer.unit_length is not None
     assert bool((model.poses.tangents != 0).any())
     assert bool((model.appearance.vectors != 0).any())

@@ -62,9 +62,7 @@ class LookUp:
         """Return the address of `points` (N, ..., D), checked."""
         return native.pointer(points, self.points, (*points.shape[:-1], int(self.shape[-1])))
 
-    def compiled(
-        self, points: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None
-    ) -> Tensor:
+    def compiled(self, points: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> Tensor:
         """Return the features (N, L * F) by compiled code, with first derivatives.
 
         Args:
@@ -88,9 +86,7 @@ class LookUp:
             reference: computes the features of points and table by layout.
         """
 
-        def undeferred(
-            points: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None
-        ) -> Tensor:
+        def undeferred(points: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> Tensor:
             return reference(points, table, layout)
 
         made = Operation(self.name, undeferred)

@@ -1,0 +1,80 @@
+"""Sampling of the part of rays that is inside of a sphere; what is outside belongs to a background."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from framework.data.scene import Scene
+from framework.fields.base import DensityFunction, Field
+from framework.geometry.rays import Rays, Samples
+from framework.geometry.spheres import intersect_sphere
+from framework.samplers.background import BackgroundConfig, foreground, foreground_sphere
+from framework.samplers.base import Sampler
+from framework.samplers.choice import make_sampler
+
+
+class InsideSphere(Sampler):
+    """Samples of another sampler, up to where rays leave a sphere.
+
+    Args:
+        sampler: chooses the samples between the near and the far end of each ray.
+        sphere: (4,) centre and radius, scene units.
+    """
+
+    sphere: Tensor
+
+    def __init__(self, sampler: Sampler, sphere: Tensor) -> None:
+        super().__init__()
+        self.sampler, self.samples_per_step = sampler, sampler.samples_per_step
+        self.register_buffer("sphere", sphere.clone())
+
+    def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
+        enter, leave = intersect_sphere(rays.origins.detach(), rays.directions.detach(), self.sphere)
+        nears = torch.maximum(rays.nears, enter)
+        fars = torch.maximum(torch.minimum(rays.fars, leave), nears)
+        samples = ending_at(self.sampler.sample(replace(rays, nears=nears, fars=fars), field, jitter), fars)
+        if samples.coarse is None:
+            return samples
+        return replace(samples, coarse=replace(samples.coarse, samples=ending_at(samples.coarse.samples, fars)))
+
+    def update(self, step: int, density: DensityFunction) -> None:
+        """Update the other sampler."""
+        self.sampler.update(step, density)
+
+    def losses(self, samples: Samples, weights: Tensor) -> dict[str, Tensor]:
+        return self.sampler.losses(samples, weights)
+
+
+def make_foreground_sampler(
+    config: BackgroundConfig, scene: Scene, make_coarse: Callable[[], Field | None] | None = None
+) -> Sampler:
+    """Return the sampler that the settings select, for the scene's foreground.
+
+    Args:
+        config: the settings, decided.
+        scene: properties of the scene; not of its foreground.
+        make_coarse: creates the coarse field of `--sampler hierarchical`, as in `make_sampler`.
+    """
+    sampler = make_sampler(config, foreground(config, scene), make_coarse)
+    return InsideSphere(sampler, foreground_sphere(scene)) if config.background_model == "sphere" else sampler
+
+
+def ending_at(samples: Samples, ends: Tensor) -> Samples:
+    """Return samples whose last interval on each ray ends at a distance, if all rays have the same number of samples.
+
+    Samplers of scenes without background make the last interval endless. Marched samples, whose numbers differ, end
+    within their box.
+
+    Args:
+        samples: N samples of R rays.
+        ends: (R,) distances.
+    """
+    if not samples.per_ray:
+        return samples
+    changed = samples.padded(samples.t_ends).clone()
+    changed[:, -1] = torch.maximum(ends, samples.padded(samples.t_starts)[:, -1])
+    return replace(samples, t_ends=changed.view(-1), points=samples.t)

@@ -27,7 +27,7 @@ from framework.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, 
 from framework.rendering.losses import charbonnier
 from framework.samplers.choice import COARSEST_PROPOSAL, SamplingConfig, contracted_box, make_sampler, sampler_choice
 from framework.samplers.proposal import LEARN_EVERY, half_edge
-from methods.captures import distortion_term
+from methods._captures import distortion_term
 
 DISTORTION = 0.01
 """Default weight of the distortion loss in unbounded scenes, the paper's."""

@@ -24,7 +24,7 @@ from framework.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, 
 from framework.samplers.choice import make_sampler
 from framework.scene.few_images import FewImagesConfig, decide_few_images
 from framework.scene.reasons import LIGHT_REASONS
-from methods.captures import CaptureConfig, CaptureModel, CaptureRenderer, decide_capture, scaled_up_to
+from methods._captures import CaptureConfig, CaptureModel, CaptureRenderer, decide_capture, scaled_up_to
 
 APPEARANCE_SIZE = 16
 """Default length of appearance vectors where the appearance varies."""

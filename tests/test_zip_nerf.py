@@ -17,7 +17,7 @@ from framework.kernels.multisampled_grid import multisampled_grid_reference
 from framework.kernels.multisamples import unit_multisamples_reference
 from framework.tools.testing.check import check_method
 from framework.training.trainer import Trainer
-from methods.captures import CaptureRenderer
+from methods._captures import CaptureRenderer
 from methods.zip_nerf import METHOD, ZipNeRFConfig
 from tests.training.helpers import TINY, tiny_run, tiny_trainer
 

@@ -86,7 +86,7 @@ def inverted(positions: Tensor, sphere: Tensor) -> Tensor:
 @pytest.mark.parametrize("u", [0.0, 0.1, 0.5, 0.99, 1 - 1e-6])
 def test_points_are_those_of_the_ray_at_their_distance(sphere: Tensor, u: float) -> None:
     rays = random_rays(sphere)
-    places = torch.full((200,), u).double()
+    places = torch.full((200,), u, dtype=torch.float64)
     behind = InvertedRays.of(rays, sphere)
     found = behind.points(torch.arange(200), places)
     t = distances_behind(places, rays, sphere)
@@ -105,7 +105,7 @@ def test_points_are_those_of_the_papers_rotation(inverse: float) -> None:
     axes = normalize(torch.linalg.cross(exits, rays.directions), dim=-1)
     angle = (distance.asin() - (distance * inverse).asin())[:, None]
     turned = exits * angle.cos() + torch.linalg.cross(axes, exits) * angle.sin()  # Rodrigues; the axis is across
-    found = InvertedRays.of(rays, UNIT).points(torch.arange(200), torch.full((200,), 1 - inverse).double())
+    found = InvertedRays.of(rays, UNIT).points(torch.arange(200), torch.full((200,), 1 - inverse, dtype=torch.float64))
     torch.testing.assert_close(found[:, :3], turned, rtol=1e-9, atol=1e-9)
     assert bool((found[:, 3] - inverse).abs().max() < 1e-12)
 

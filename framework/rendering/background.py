@@ -20,7 +20,6 @@ from framework.samplers.background import BackgroundConfig, foreground_sphere
 from framework.samplers.base import Sampler
 from framework.samplers.choice import HierarchicalConfig
 from framework.samplers.hierarchical import HierarchicalSampler
-from framework.samplers.inside import ending_at
 from framework.samplers.uniform import LAST_INTERVAL, UniformSampler
 
 
@@ -58,8 +57,8 @@ class SphereRenderer(Renderer):
         samples = self.sampler.sample(rays, self.field, self.training)
         ends = torch.where(rays.fars > rays.nears, LAST_INTERVAL, rays.nears) if self.endless else rays.fars
         if samples.coarse is not None:
-            samples = replace(samples, coarse=replace(samples.coarse, samples=ending_at(samples.coarse.samples, ends)))
-        return ending_at(samples, ends)
+            samples = replace(samples, coarse=replace(samples.coarse, samples=_ending_at(samples.coarse.samples, ends)))
+        return _ending_at(samples, ends)
 
 
 def over_background(inside: Rendered, outside: Rendered, distances: Callable[[Tensor], Tensor]) -> Rendered:
@@ -134,3 +133,10 @@ def background_renderer(
         sampler = HierarchicalSampler(coarse, config.num_coarse_samples, config.num_fine_samples)
     field = make_field(config, scene)
     return SphereRenderer(renderer, foreground_sphere(scene), field, sampler, endless=not scene.has_alpha)
+
+
+def _ending_at(samples: Samples, ends: Tensor) -> Samples:
+    """Return samples, the same number on each ray, whose last intervals end at `ends` (R,)."""
+    changed = samples.padded(samples.t_ends).clone()
+    changed[:, -1] = ends
+    return replace(samples, t_ends=changed.view(-1), points=samples.t)

@@ -36,10 +36,10 @@ class InsideSphere(Sampler):
         enter, leave = intersect_sphere(rays.origins.detach(), rays.directions.detach(), self.sphere)
         nears = torch.maximum(rays.nears, enter)
         fars = torch.maximum(torch.minimum(rays.fars, leave), nears)
-        samples = ending_at(self.sampler.sample(replace(rays, nears=nears, fars=fars), field, jitter), fars)
+        samples = clipped(self.sampler.sample(replace(rays, nears=nears, fars=fars), field, jitter), fars)
         if samples.coarse is None:
             return samples
-        return replace(samples, coarse=replace(samples.coarse, samples=ending_at(samples.coarse.samples, fars)))
+        return replace(samples, coarse=replace(samples.coarse, samples=clipped(samples.coarse.samples, fars)))
 
     def update(self, step: int, density: DensityFunction) -> None:
         """Update the other sampler."""
@@ -63,18 +63,14 @@ def make_foreground_sampler(
     return InsideSphere(sampler, foreground_sphere(scene)) if config.background_model == "sphere" else sampler
 
 
-def ending_at(samples: Samples, ends: Tensor) -> Samples:
-    """Return samples whose last interval on each ray ends at a distance, if all rays have the same number of samples.
+def clipped(samples: Samples, ends: Tensor) -> Samples:
+    """Return samples none of whose intervals reaches beyond a distance.
 
-    Samplers of scenes without background make the last interval endless. Marched samples, whose numbers differ, end
-    within their box.
+    Samplers make the last interval of a ray endless, or march a step too far.
 
     Args:
         samples: N samples of R rays.
         ends: (R,) distances.
     """
-    if not samples.per_ray:
-        return samples
-    changed = samples.padded(samples.t_ends).clone()
-    changed[:, -1] = torch.maximum(ends, samples.padded(samples.t_starts)[:, -1])
-    return replace(samples, t_ends=changed.view(-1), points=samples.t)
+    ends = torch.minimum(samples.t_ends, ends.index_select(0, samples.ray_indices))
+    return replace(samples, t_ends=ends, t_starts=torch.minimum(samples.t_starts, ends), points=samples.t)

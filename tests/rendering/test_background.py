@@ -10,12 +10,15 @@ from torch.nn.functional import normalize
 
 from framework.base.errors import ConfigError
 from framework.data.scene import Scene
+from framework.encodings.hash_grid import HashGrid
 from framework.fields.base import Field
 from framework.fields.encoded import EncodedField
 from framework.fields.inverted import InvertedField
 from framework.fields.nerf import NeRFField
 from framework.geometry.points import Points
 from framework.geometry.rays import Rays, Samples
+from framework.geometry.spheres import InvertedRays, distances_behind
+from framework.kernels.contraction import contract_to_unit_reference
 from framework.method import Method
 from framework.ray_model import RayModel
 from framework.rendering.background import SphereRenderer, over_background
@@ -254,6 +257,17 @@ def test_the_sphere_contains_box_and_cameras() -> None:
     inner = foreground(config, UNBOUNDED)
     assert not inner.unbounded
     assert inner.box.flatten().tolist() == pytest.approx([-3.3] * 3 + [3.3] * 3)
+
+
+def test_a_grid_outside_is_laid_out_as_contraction_does() -> None:
+    rays = dataclasses.replace(rays_of(50), origins=0.3 * rays_of(50).origins)
+    unit = torch.tensor([0.0, 0.0, 0.0, 1.0]).double()
+    u = torch.rand(50, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    points = InvertedRays.of(rays, unit).points(torch.arange(50), u)
+    truth = contract_to_unit_reference(rays.points(torch.arange(50), distances_behind(u, rays, unit)), BOX.double())
+    found = InvertedField(HashGrid(2, 2, 4, 8, 8)).unit(points)
+    assert 1.1 < float(1 / points[:, 3].min()) < 50
+    torch.testing.assert_close(found, truth)
 
 
 def test_a_background_is_made_of_the_methods_own_parts() -> None:

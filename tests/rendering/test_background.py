@@ -266,7 +266,7 @@ def test_a_grid_outside_is_laid_out_as_contraction_does() -> None:
     points = InvertedRays.of(rays, unit).points(torch.arange(50), u)
     truth = contract_to_unit_reference(rays.points(torch.arange(50), distances_behind(u, rays, unit)), BOX.double())
     found = InvertedField(HashGrid(2, 2, 4, 8, 8)).unit(points)
-    assert 1.1 < float(1 / points[:, 3].min()) < 50
+    assert 5 < float(1 / points[:, 3].min()) < 1e4
     torch.testing.assert_close(found, truth)
 
 

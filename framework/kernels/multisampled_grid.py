@@ -9,6 +9,8 @@ Letters: N frustums, J points in each, L levels, F features of an entry.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import torch
 from torch import Tensor
 
@@ -30,13 +32,19 @@ def multisampled_grid_reference(points: Tensor, table: Tensor, layout: HashGridL
         (N, L * F) features, level by level.
     """
     positions, deviations = points[..., :3].flatten(0, 1), points[..., 3].detach().flatten()
-    shares = level_weights(deviations, points.new_tensor(layout.resolutions)).to(table.dtype)
+    shares = level_weights(deviations, _resolutions(layout, points.dtype, points.device)).to(table.dtype)
     features = []
     for level, offset in enumerate(layout.offsets[:-1]):
         entries, weights, _ = corners(positions, layout, level)
         found = (table[entries.long() + offset] * (weights * shares[:, level])[..., None]).sum(0)
         features.append(found.view(*points.shape[:2], -1).mean(1))
     return torch.cat(features, dim=-1)
+
+
+@lru_cache(maxsize=64)
+def _resolutions(layout: HashGridLayout, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return cells along an axis (L,); they are kept, since bringing them to a device means to wait for it."""
+    return torch.tensor(layout.resolutions, dtype=dtype, device=device)
 
 
 _forward = native.Function("multisampled_grid_forward", "pqipippipi")

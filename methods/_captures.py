@@ -1,7 +1,7 @@
-"""What methods for captures have in common: settings, what the scene decides, refined poses and two regularisers.
+"""Settings, decisions, poses and regularisers that methods for captures have in common.
 
-The regularisers are the distortion of rays (Barron et al. 2022) and gradients that are scaled down near cameras (Philip
-and Deschaintre 2023).
+The two regularisers are the distortion of rays (Barron et al. 2022) and gradients that are scaled down near cameras
+(Philip and Deschaintre 2023).
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class CaptureConfig(SamplingConfig):
 
     @property
     def covers_space(self) -> bool:
-        """Whether the field covers all of space, contracted; of settings that are decided."""
+        """True if the field covers all of space, contracted; of settings that are decided."""
         return bool(self.contraction) and self.sampler == "proposal"
 
 

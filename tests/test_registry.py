@@ -20,6 +20,7 @@ BUILT_IN = {
     "kplanes",
     "mip-nerf",
     "mip-nerf-360",
+    "nerf-plus-plus",
     "nerfacto",
     "tensorf",
     "vanilla-nerf",

@@ -12,7 +12,7 @@ from torch import Tensor
 from framework.base.config import TrainConfig
 from framework.base.optimised import DefersGradient, ParameterGroup, RowChange
 from framework.kernels.adam import all_finite, dense_adam, sparse_adam
-from framework.kernels.hash_grid import TableGradient
+from framework.kernels.hash_grid_lookup import TableGradient
 from framework.kernels.memory import require, table
 from framework.kernels.planes import PlanesGradient
 from framework.model import Model, parts

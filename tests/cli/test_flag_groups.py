@@ -18,10 +18,13 @@ from framework.samplers.choice import SamplingConfig
 from tests.cli.helpers import called
 
 METHODS = (
-    "dnerf", "instant-ngp", "kplanes", "mip-nerf", "mip-nerf-360", "nerfacto", "tensorf", "vanilla-nerf", "zip-nerf",
+    "dnerf", "instant-ngp", "kplanes", "mip-nerf", "mip-nerf-360", "nerf-plus-plus", "nerfacto", "tensorf",
+    "vanilla-nerf", "zip-nerf",
 )  # fmt: skip
-FOR_FEW_IMAGES = ("instant-ngp", "kplanes", "nerfacto", "tensorf", "vanilla-nerf")
+FOR_FEW_IMAGES = ("instant-ngp", "kplanes", "nerf-plus-plus", "nerfacto", "tensorf", "vanilla-nerf")
 """Methods with settings for few images."""
+WITH_BACKGROUND = ("instant-ngp", "nerf-plus-plus", "vanilla-nerf")
+"""Methods with settings of a background."""
 FORMATS = ("blender", "colmap", "dnerf", "llff", "nerfstudio", "phototourism", "polycam", "record3d")
 QUICK = ("instant-ngp", "nerfacto", "vanilla-nerf", "blender", "nerfstudio")
 """Of which help is read in the fast set: they have every box, and a format few flags or many."""
@@ -69,7 +72,8 @@ def test_every_flag_once_and_the_everyday_ones_first(method: str) -> None:
     known = flags_of(load_method(method).config) + flags_of(load_dataparser("procedural")())
     assert sorted(flag for flags in found.values() for flag in flags) == sorted(known)
     assert list(found) == [
-        "options", "everyday options", f"{method} options", "sampler options", "ray options",
+        "options", "everyday options", f"{method} options", "sampler options",
+        *["background options"] * (method in WITH_BACKGROUND), "ray options",
         *["appearance options"] * (method in ("nerfacto", "zip-nerf")),
         *["few images options"] * (method in FOR_FEW_IMAGES), "optimisation options", "evaluation and saving options",
         "machine options", "viewer options", "procedural data options",

@@ -21,6 +21,7 @@ BUILT_IN = {
     "mip-nerf",
     "mip-nerf-360",
     "nerfacto",
+    "pixel-nerf",
     "tensorf",
     "vanilla-nerf",
     "zip-nerf",

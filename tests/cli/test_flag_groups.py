@@ -18,7 +18,8 @@ from framework.samplers.choice import SamplingConfig
 from tests.cli.helpers import called
 
 METHODS = (
-    "dnerf", "instant-ngp", "kplanes", "mip-nerf", "mip-nerf-360", "nerfacto", "tensorf", "vanilla-nerf", "zip-nerf",
+    "dnerf", "instant-ngp", "kplanes", "mip-nerf", "mip-nerf-360", "nerfacto", "pixel-nerf", "tensorf", "vanilla-nerf",
+    "zip-nerf",
 )  # fmt: skip
 FOR_FEW_IMAGES = ("instant-ngp", "kplanes", "nerfacto", "tensorf", "vanilla-nerf")
 """Methods with settings for few images."""
@@ -67,7 +68,8 @@ def test_every_flag_once_and_the_everyday_ones_first(method: str) -> None:
     known = flags_of(load_method(method).config) + flags_of(load_dataparser("procedural")())
     assert sorted(flag for flags in found.values() for flag in flags) == sorted(known)
     assert list(found) == [
-        "options", "everyday options", f"{method} options", "sampler options", "ray options",
+        "options", "everyday options", f"{method} options", *["sampler options"] * (method != "pixel-nerf"),
+        "ray options",
         *["appearance options"] * (method in ("nerfacto", "zip-nerf")),
         *["few images options"] * (method in FOR_FEW_IMAGES), "optimisation options", "evaluation and saving options",
         "machine options", "viewer options", "procedural data options",

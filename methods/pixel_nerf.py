@@ -53,6 +53,7 @@ class PixelNeRFConfig(
     num_rays_per_batch=512,
     learning_rate=1e-3,
     background="white",
+    eval_num_rays_per_chunk=1_024,
 ):
     """Settings of pixel-nerf: the paper's structure, with networks that a processor can train."""
 

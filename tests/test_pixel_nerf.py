@@ -216,10 +216,10 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("registered")
 def test_a_run_learns_is_loaded_and_renders_unseen_scenes(tmp_path: Path) -> None:
     parser = Procedural(size=16, num_scenes=3, views_per_scene=6)
-    config = dataclasses.replace(SMALL, max_num_iterations=40, steps_per_eval_all_images=20)
+    config = dataclasses.replace(SMALL, max_num_iterations=60, steps_per_eval_all_images=30, learning_rate=1e-2)
     trainer, test = trained_on_many(tmp_path / "run", parser, config)
-    errors = [float(trainer.train_step().terms["rgb"]) for _ in range(40)]
-    assert fmean(errors[-10:]) < 0.7 * fmean(errors[:5])
+    errors = [float(trainer.train_step().terms["rgb"]) for _ in range(60)]
+    assert fmean(errors[-20:]) < 0.75 * fmean(errors[:10])
     trainer.save()
     loaded = load_trained(tmp_path / "run", device_type="cpu")
     before, after = (evaluate(model, test, max_images=2).results["psnr"] for model in (trainer.model, loaded.model))

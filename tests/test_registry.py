@@ -22,6 +22,7 @@ BUILT_IN = {
     "mip-nerf-360",
     "nerf-plus-plus",
     "nerfacto",
+    "pixel-nerf",
     "tensorf",
     "vanilla-nerf",
     "zip-nerf",

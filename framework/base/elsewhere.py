@@ -28,6 +28,7 @@ ELSEWHERE: dict[str, str] = {
     "nerf": "here it is called 'vanilla-nerf'",
     "nerf++": "here it is called 'nerf-plus-plus'",
     "nerfplusplus": "here it is called 'nerf-plus-plus'",
+    "pixelnerf": "here it is called 'pixel-nerf'",
     "instant-ngp-bounded": "here it is called 'instant-ngp', and the scene's profile says whether it is bounded",
     "nerfacto-big": f"{_LARGER} --max-resolution 4096 --log2-table-size 21 --hidden-width 128",
     "nerfacto-huge": f"{_LARGER} --max-resolution 8192 --log2-table-size 21 --hidden-width 256",

@@ -116,6 +116,12 @@ class PixelSet:
         runs = np.searchsorted(before, ranks, side="right") - 1
         return starts[runs] + (ranks - before[runs])
 
+    def ranks(self, pixels: Tensor) -> Tensor:
+        """Return how many pixels of the set come before each of the `pixels` (R,) int64, (R,) int64."""
+        runs = (torch.searchsorted(self.starts, pixels, right=True) - 1).clamp(min=0)
+        into = (pixels - self.starts[runs]).clamp(min=0)
+        return torch.minimum(self.before[runs] + into, self.before[runs + 1])
+
     def contains(self, pixels: Tensor) -> Tensor:
         """Return which of the `pixels` (R,) int64 are in the set, (R,) bool."""
         return pixels < self._ends[torch.searchsorted(self.starts, pixels, right=True)]

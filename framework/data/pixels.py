@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -51,6 +51,12 @@ class PixelBatch:
 
     def __len__(self) -> int:
         return self.pixels.shape[0]
+
+    def __getitem__(self, chosen: Tensor) -> PixelBatch:
+        """Return the pixels of a mask (R,) bool, with their rays."""
+        of_pixels = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rays"}
+        some: dict[str, Any] = {name: value[chosen] for name, value in of_pixels.items() if value is not None}
+        return replace(self, rays=self.rays[chosen.repeat_interleave(self.rays_per_pixel)], **some)
 
     @property
     def rays_per_pixel(self) -> int:
@@ -122,6 +128,25 @@ def draw_pixels(dataset: Dataset, count: int) -> Tensor:
     return dataset.drawn.at(torch.randint(len(dataset.drawn), (count,), device=device))
 
 
+def draw_from_images(dataset: Dataset, count: int, num_images: int) -> Tensor:
+    """Draw `count` pixels of `num_images` images only, which are drawn too, by PyTorch's generator.
+
+    Args:
+        dataset: the images.
+        count: number of pixels.
+        num_images: number of images, each of which has about as many of the pixels; one may be drawn twice.
+    """
+    drawn, ends = dataset.drawn, dataset.cameras.offsets.to(dataset.pixels.device)
+    ranks = ends if drawn is None else drawn.ranks(ends)
+    sizes = ranks.diff()
+    some = sizes.nonzero()[:, 0]
+    images = some[torch.randint(len(some), (min(num_images, count),), device=some.device)]
+    images = images.repeat(-(-count // len(images)))[:count].sort().values
+    place = torch.rand(count, device=some.device, dtype=torch.float64)  # float32 could round up to the next image
+    chosen = ranks[images] + (place * sizes[images]).long()
+    return chosen if drawn is None else drawn.at(chosen)
+
+
 def draw_batch(
     dataset: Dataset,
     count: int,
@@ -130,6 +155,7 @@ def draw_batch(
     subpixels: Tensor = CENTER,
     look_up: LookUp | None = None,
     keypoints: int = 0,
+    num_images: int | None = None,
 ) -> PixelBatch:
     """Draw a batch of pixels.
 
@@ -145,10 +171,13 @@ def draw_batch(
         look_up: for pixels in a file, returns the stored colours of all drawn pixels, in the order of drawing
             (`PixelStream.look_up`).
         keypoints: number of these pixels that are drawn from `dataset.sparse_depth`; they stand last.
+        num_images: number of images of which the other pixels are; None for all.
     """
     uniform, sparse = count - keypoints, dataset.sparse_depth
     # Pixels are drawn before any other random number, so that `PixelStream` can predict them from the seed.
-    flat, stored = draw_pixels(dataset, uniform if errors is None else 2 * uniform), None
+    drawn = uniform if errors is None else 2 * uniform
+    flat = draw_pixels(dataset, drawn) if num_images is None else draw_from_images(dataset, drawn, num_images)
+    stored = None
     if dataset.mapped is not None:
         stored = (look_up or dataset.mapped.look_up)(flat).to(dataset.device)
         flat = flat.to(dataset.device)

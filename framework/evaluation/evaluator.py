@@ -24,7 +24,7 @@ from framework.evaluation.appearance import appearance_of, fitted_appearance, ri
 from framework.evaluation.images import write_image
 from framework.evaluation.metrics import load_lpips, psnr, ssim
 from framework.evaluation.panels import composed, view_panels
-from framework.model import Model
+from framework.model import Model, RendersFromImages
 from framework.rendering.rendered import Picture
 
 BEFORE = 0.9
@@ -82,13 +82,15 @@ def measure_view(model: Model, dataset: Dataset, index: int, background: Tensor,
 
 
 def views_to_judge(dataset: Dataset, half: bool = False) -> list[int]:
-    """Return the indices of the images of which masks keep some pixels.
+    """Return the indices of the images of which masks keep some pixels, and that are not given to a method.
 
     Args:
         dataset: the images.
         half: whether only the right half counts.
     """
-    return [index for index in range(len(dataset)) if _has_kept_pixels(dataset, index, half)]
+    given = dataset.source_images
+    judged = range(len(dataset)) if given is None else (~given).nonzero()[:, 0].tolist()
+    return [index for index in judged if _has_kept_pixels(dataset, index, half)]
 
 
 def timed_view(model: Model, view: View, background: Tensor) -> tuple[Picture, float]:
@@ -173,8 +175,9 @@ def evaluate(
 ) -> Evaluation:
     """Render views and compute their metrics.
 
-    Masked-out pixels do not count: PSNR omits them; for SSIM and LPIPS they are copied from the true image. Images
-    without other pixels are skipped. If appearance is fitted to left halves (`eval_appearance`), right halves count.
+    Images that are given to the method (`Dataset.source_images`) are shown to it and not judged. Masked-out pixels do
+    not count: PSNR omits them; for SSIM and LPIPS they are copied from the true image. Images without other pixels are
+    skipped. If appearance is fitted to left halves (`eval_appearance`), right halves count.
 
     Args:
         model: the trained model.
@@ -194,6 +197,8 @@ def evaluate(
     chosen = [views[rank] for rank in spread(len(views), max_images)]
     if not chosen:
         raise DataError(f"there is no image to evaluate: masks leave nothing of the {len(dataset)} that there are")
+    if isinstance(model, RendersFromImages) and dataset.source_images is not None:
+        model.show_images(dataset)
     lpips, lpips_note = load_lpips()
     background = evaluation_background(model)
     rows, seconds, rays = [], 0.0, 0

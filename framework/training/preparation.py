@@ -12,7 +12,7 @@ from framework.cameras.ndc import NdcCameras
 from framework.data.dataset import Dataset
 from framework.data.pixel_set import PixelSet
 from framework.data.pixels import training_background
-from framework.model import HasAppearance, LearnsMotion, Model, RefinesPoses, parts
+from framework.model import HasAppearance, LearnsMotion, Model, RefinesPoses, RendersFromImages, parts
 from framework.samplers.base import SkipsCells
 from framework.samplers.choice import SamplingConfig
 from framework.scene.profile import SceneProfile
@@ -50,6 +50,20 @@ def profile_of(
     if scene.poses == "device" and not isinstance(model, RefinesPoses):
         decisions.append(Decision("the device's poses", "not refined", f"{method} takes poses as they are"))
     return SceneProfile.of(dataset, [*decisions, *decided])
+
+
+def show_images(model: Model[Any], train_set: Dataset, eval_set: Dataset | None) -> None:
+    """Show a model that renders from images those of training, and those of held-out scenes that are given to it.
+
+    Args:
+        model: any model.
+        train_set: the training images.
+        eval_set: the held-out images; None without.
+    """
+    if isinstance(model, RendersFromImages):
+        model.show_images(train_set)
+        if eval_set is not None and eval_set.source_images is not None:
+            model.show_images(eval_set)
 
 
 def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: bool) -> Dataset:

@@ -16,7 +16,7 @@ from framework.samplers.proposal import ProposalSampler
 from framework.samplers.uniform import UniformSampler
 from framework.tools.benchmarks import curves, quadrature, sampling
 from framework.tools.benchmarks.closed_forms import Block, ClosedForm, Medium, Solids, scenes
-from framework.tools.benchmarks.curves import Curve, evaluations_needed
+from framework.tools.benchmarks.error_curves import Curve, evaluations_needed
 from framework.tools.benchmarks.quadrature import Row, Sizes, measured, skipping
 from framework.tools.benchmarks.sampling import (
     WHITE,

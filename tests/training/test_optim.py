@@ -1,5 +1,6 @@
 """Learning-rate schedules: values by hand. The optimiser's state: beside PyTorch's Adam."""
 
+import copy
 import math
 from typing import Any
 
@@ -58,7 +59,7 @@ def test_it_goes_on_from_a_state_of_pytorchs_adam_and_from_its_own(loads: str) -
         ours.step()
     second, other_groups = two_groups(1)
     resumed = Adam(other_groups, {}, 1.0, (0.1, 0.2), 1e-1)
-    resumed.load_state_dict((peer if loads == "theirs" else ours).state_dict())
+    resumed.load_state_dict(copy.deepcopy((peer if loads == "theirs" else ours).state_dict()))  # which peer changes on
     assert [group["lr"] for group in resumed.param_groups] == [0.1, 0.01]
     assert [group["betas"] for group in resumed.param_groups] == [(0.8, 0.9)] * 2
     with torch.no_grad():

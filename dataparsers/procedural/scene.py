@@ -219,14 +219,10 @@ def _first_hits(poses: list[_Pose], origins: Tensor, directions: Tensor) -> tupl
     depth = torch.full_like(directions[0], math.inf)
     part_index = torch.full_like(depth, -1, dtype=torch.int64)
     for index, (part, pose) in enumerate(zip(PARTS.values(), poses, strict=True)):
-        relative = origins - pose.centre
-        nearest = -dot(relative, directions)
-        # Some more than come close enough, for rounding; the solid itself decides.
-        close = dot(relative, relative) - nearest * nearest < (1.001 * part.shape.bound) ** 2
-        near = (close & (nearest > -part.shape.bound)).nonzero()[:, 0]
-        local, nearest, along = pose.pick(near), nearest[near], directions[:, near]
-        offset = (relative if relative.shape[1] == 1 else relative[:, near]) + nearest * along
-        offset, direction = local.to_local(offset), local.to_local(along)
+        offset, nearest = _lines(pose, origins, directions)
+        near = ((dot(offset, offset) < part.shape.bound**2) & (nearest > -part.shape.bound)).nonzero()[:, 0]
+        local, nearest = pose.pick(near), nearest[near]
+        offset, direction = local.to_local(offset[:, near]), local.to_local(directions[:, near])
         entry = part.shape.enter(offset, direction, -nearest) + nearest
         better = entry < depth[near]
         depth[near] = torch.where(better, entry, depth[near])
@@ -240,20 +236,6 @@ def _distance(poses: list[_Pose], p: Tensor) -> Tensor:
         part.shape.distance(pose.to_local(p - pose.centre)) for part, pose in zip(PARTS.values(), poses, strict=True)
     )
     return functools.reduce(torch.minimum, distances)
-
-
-def _room(poses: list[_Pose], p: Tensor, most: float) -> Tensor:
-    """Return the signed distance (R,) of points (3, R) to the scene where it is less than `most`, and `most` elsewhere.
-
-    Only the solids within that distance are asked, which few are.
-    """
-    room = torch.full_like(p[0], most)
-    for part, pose in zip(PARTS.values(), poses, strict=True):
-        offset = p - pose.centre
-        near = (dot(offset, offset) < (1.001 * (part.shape.bound + most)) ** 2).nonzero()[:, 0]
-        distance = part.shape.distance(pose.pick(near).to_local(offset[:, near]))
-        room[near] = torch.minimum(room[near], distance)
-    return room
 
 
 def _sunlight(poses: list[_Pose], p: Tensor) -> Tensor:
@@ -297,7 +279,7 @@ def _shade(poses: list[_Pose], p: Tensor, normal: Tensor, view: Tensor, part_ind
     sun = _sunlight(poses, outside)
     facing = dot(normal, p.new_tensor(LIGHT)[:, None]).clamp(min=0.0)
     # Ambient occlusion: free distance along the normal, relative to that above a plane.
-    rooms = [(_room(poses, p + h * normal, h) / h).clamp(0.0, 1.0) for h in (0.06, 0.2)]
+    rooms = [(_distance(poses, p + h * normal) / h).clamp(0.0, 1.0) for h in (0.06, 0.2)]
     room = rooms[0] + rooms[1]
     ambient = _blend(_GROUND, _SKY, 0.5 + 0.5 * normal[2]) * (0.15 + 0.425 * room)
     light = albedo * (p.new_tensor(_SUN)[:, None] * (facing * sun) + ambient)

@@ -41,8 +41,9 @@ class Adam:
         betas: tuple[float, float],
         eps: float,
     ) -> None:
-        defaults = {"lr": lr, "betas": betas, "eps": eps, "sparse": False}
+        defaults: dict[str, Any] = {"lr": lr, "betas": betas, "eps": eps, "sparse": False}
         self.param_groups = [defaults | group | {"params": list(group["params"])} for group in groups]
+        """Settings of each group, which may be changed between steps, and its parameters as `params`."""
         self.state: dict[Tensor, dict[str, Tensor]] = {}
         """Moments and counts of each parameter."""
         self.deferred = deferred

@@ -66,7 +66,7 @@ def test_commands_say_all_that_is_the_same_and_the_contenders_flags_count_last(t
     assert given["--data"] == "/data/lego"
     assert given["--max-seconds"] == "120.0"
     assert given["--machine.num-threads"] == "2"
-    assert float(given["--seconds-per-eval-all-images"]) == 10
+    assert float(given["--seconds-per-eval-all-images"]) == 15
     assert "--max-num-iterations" not in given
     folder = Path(given["--output-dir"]) / given["--experiment-name"] / "vanilla-nerf" / given["--timestamp"]
     assert folder == job.folder
@@ -75,7 +75,7 @@ def test_commands_say_all_that_is_the_same_and_the_contenders_flags_count_last(t
     assert job.train_command(CONDITIONS)[3:] == ["--resume", str(job.folder)]
     steps = replace(CONDITIONS, max_seconds=None, max_num_iterations=100)
     command = Job(Contender.of("kplanes"), 43, tmp_path / "runs").train_command(steps)
-    assert command[command.index("--steps-per-eval-all-images") + 1] == "8"
+    assert command[command.index("--steps-per-eval-all-images") + 1] == "12"
     assert job.eval_command(replace(CONDITIONS, max_eval_images=5))[-2:] == ["--max-images", "5"]
 
 

@@ -17,7 +17,7 @@ from framework.training.run import write_json
 
 FIRST_SEED = 42
 """Seed of the first run of each contender; the others follow it."""
-CURVE_POINTS = 12
+CURVE_POINTS = 8
 """Number of evaluations during a run, the points of its learning curve."""
 LEAST_VIEWS = 25
 """Minimum number of held-out views of a final evaluation whose number follows the budget."""

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from dataparsers.procedural.scene import PARTS, Parts, trace_rows
+from framework.kernels.native import torch_on_one_thread
 
 CAMERA_ANGLE = 0.6911
 """Horizontal field of view, radians, as in NeRF-Synthetic."""
@@ -26,8 +27,7 @@ RADIUS = 4.0
 """Distance of the cameras from the origin, scene units."""
 SUPERSAMPLE = 3
 """Rays along each side of a pixel."""
-# Below PyTorch's threshold for splitting an operation over threads, as views are rendered in parallel.
-_CHUNK_RAYS = 32_000
+_CHUNK_RAYS = 128_000  # fewer at once take longer to start operations, more leave the cache
 
 
 def _camera_rays(
@@ -189,7 +189,7 @@ def write_dataset(
     counts = counts or {"train": 80, "val": 8, "test": 16}
     with complete_folder(folder) as temporary:
         jobs = [job for split, count in counts.items() for job in _lay_out(temporary, split, count, moving, seed)]
-        with ThreadPoolExecutor() as pool:
+        with torch_on_one_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:  # a view on each core
             done = pool.map(lambda job: _write_view(*job, size=size), jobs)
             for _ in progress(done, "Rendering the embedded scene", len(jobs)):
                 pass

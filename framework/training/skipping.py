@@ -20,8 +20,8 @@ from framework.samplers.base import SkipsCells
 if TYPE_CHECKING:
     from framework.training.trainer import Trainer
 
-PROBE_RAYS = 1024
-"""Number of random training rays on which the savings are measured."""
+PROBE_RAYS, WARM_UP_RAYS = 1024, 64
+"""Number of random training rays on which the savings are measured, and of those that are rendered before."""
 LEAST_TOLD = 0.005
 """Minimum skipped fraction that is printed."""
 
@@ -114,7 +114,7 @@ def _probe(model: RayModel[Any], rays: Rays) -> tuple[float, int]:
     was_training = model.training
     model.eval()
     background = torch.zeros(3, device=model.device)
-    model.render(rays, background)  # once to warm up
+    model.render(rays[:WARM_UP_RAYS], background)
     wait_for(model.device)
     start = time.perf_counter()
     rendered = model.render(rays, background)

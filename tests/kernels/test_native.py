@@ -1,13 +1,16 @@
 """Finding the compiled library, and what is checked before an address leaves Python."""
 
+import platform
 from pathlib import Path
 
 import pytest
 import torch
 
+from framework.base.device import cpu_features
 from framework.kernels import native
 from tests.forked import Forks
 from tests.kernels.compiled import needs_kernels
+from tests.sanitize.build import extensions
 
 GOOD = torch.zeros(4, 3)
 
@@ -86,3 +89,14 @@ def test_every_variant_that_fits_this_processor_gives_the_same_answer(variant: s
     )
     done = forks.run(code, NERFLOOM_KERNELS=variant)
     assert done.stdout.split() == [variant, "True", "True"], done.stderr
+
+
+def test_setup_builds_every_variant_or_the_one_that_this_processor_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    def built() -> list[str]:
+        return [extension.name.rsplit(".", 1)[-1] for extension in extensions()]
+
+    monkeypatch.delenv("NERFLOOM_VARIANTS", raising=False)
+    assert set(built()) == (set(native.NEEDS) if platform.machine() in ("x86_64", "AMD64") else {"baseline"})
+    monkeypatch.setenv("NERFLOOM_VARIANTS", "native")
+    best = next(name for name, needs in native.NEEDS.items() if cpu_features().issuperset(needs))
+    assert built() == [best] or platform.system() != "Linux"

@@ -98,7 +98,7 @@ inline Ints with_gradient(const float* grad) {
             uint64_t bits[F / 2], all = 0;
             std::memcpy(bits, grad + e * F, sizeof bits);
             for (int i = 0; i < F / 2; i++) all |= bits[i];
-            any[e] = all & 0x7fffffff7fffffff ? ~uint64_t(0) : 0;
+            any[e] = 0 - uint64_t((all & 0x7fffffff7fffffff) != 0);
         }
         return same_bits<Ints>(each<Longs>(std::make_index_sequence<PAIRS>(), [&](size_t i) { return any[i * 2 / F]; }));
     }
@@ -126,8 +126,7 @@ inline void count(Ints any, float* seen, Floats& unbias1, Floats& unbias2, const
             both = each<Longs>(std::make_index_sequence<PAIRS>(), [&](size_t i) { return s.unbias[size_t(k[i])]; });
         } else {
             uint64_t found[LANES / F];
-            for (int e = 0; e < LANES / F; e++)
-                found[e] = s.unbias[s.index(seen[e] += used[e * F / 2] ? 1.0f : 0.0f)];
+            for (int e = 0; e < LANES / F; e++) found[e] = s.unbias[s.index(seen[e] += float(int(used[e * F / 2] & 1)))];
             both = each<Longs>(std::make_index_sequence<PAIRS>(), [&](size_t i) { return found[i * 2 / F]; });
         }
         const Longs low = both & 0xffffffff, high = both ^ low;

@@ -105,7 +105,7 @@ class PixelSet:
     def at(self, ranks: Tensor) -> Tensor:
         """Return the pixels (R,) int64 of given `ranks` (R,) in the set, counted from 0."""
         if self.every is not None:
-            return self.every[ranks].long()
+            return self.every.index_select(0, ranks).long()
         if ranks.device.type == "cpu":  # numpy takes one thread; a background thread must not start PyTorch's
             return torch.from_numpy(self._at(ranks.numpy()))
         runs = torch.searchsorted(self.before, ranks, right=True) - 1

@@ -121,9 +121,9 @@ def test_what_no_kernel_can_do_is_refused_by_name() -> None:
     forward = native.Function("hash_grid_forward", "pqpippipi")
     with pytest.raises(ValueError, match="hash_grid_forward: hash grid: an entry has 1, 2, 4 or 8 features"):
         forward(None, 0, None, 3, None, None, 1, None, 1)
-    network = native.Function("mlp_forward", "ppiqpippipi")
+    network = native.Function("mlp_forward", "ppiqpippippi")
     with pytest.raises(ValueError, match="a layer has 1 to 384 features"):
-        network(None, None, 1, 0, native.integers((385, 4)), 1, None, None, 0, None, 1)
+        network(None, None, 1, 0, native.integers((385, 4)), 1, None, None, 0, None, None, 1)
 
 
 def test_results_are_finite(here: Measured) -> None:

@@ -173,7 +173,8 @@ def _require_change(change: Tensor, accumulation: Tensor, what: str) -> None:
 
 def _ends_at_the_box(model: Model) -> bool:
     """Return whether the model's samplers place no sample outside the box."""
-    return bool(parts(model, SkipsCells)) or any(not sampler.unbounded for sampler in parts(model, ProposalSampler))
+    grids, proposals = parts(model, SkipsCells), parts(model, ProposalSampler)
+    return any(grid.levels == 1 for grid in grids) or any(not sampler.unbounded for sampler in proposals)
 
 
 def check_evaluation(subject: Subject) -> str:

@@ -289,7 +289,7 @@ def march(rays: Rays, occupancy: Occupancy, step: float, cone: float, shift: Ten
 
 MARCH: Operation[..., March] = Operation("march", ReferenceMarch)
 MARCH.implementation(CPP)(CompiledMarch)
-MARCH.implementation(TRITON, fits=lambda rays, occupancy, *_: occupancy.levels == 1)(later("march", "TritonMarch"))
+MARCH.implementation(TRITON)(later("march", "TritonMarch"))
 
 
 def step_start(first: Tensor, k: Tensor, step: float, cone: float) -> Tensor:

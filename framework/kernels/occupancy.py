@@ -80,8 +80,9 @@ class Occupancy:
 
     @cached_property
     def distances(self) -> Tensor:
-        """(ceil(n / 4)^3,) uint8 distances of blocks, as in `packed`, but at most 16, for the march on a GPU."""
-        return later("march", "block_distances")(self.occupied, self.resolution)
+        """(L ceil(n / 4)^3,) uint8 distances of blocks, as in `packed`, but at most 16, for the march on a GPU."""
+        find = later("march", "block_distances")
+        return torch.cat([find(cells.flatten(), self.resolution) for cells in self.filled])
 
     @cached_property
     def edge(self) -> float:
@@ -166,7 +167,7 @@ def own_cells(levels: int, resolution: int) -> Tensor:
 
 
 def dilated(occupancy: Occupancy, radius: int) -> Tensor:
-    """Return the cells (n^3,) bool of `occupancy`, of one box, with an occupied one within `radius` along every axis."""
+    """Return the cells (n^3,) bool of one box, `occupancy`, with an occupied one within `radius` along every axis."""
     n = occupancy.resolution
     grid = occupancy.occupied.view(n, n, n)
     for axis in range(3):

@@ -48,10 +48,10 @@ from framework.scene.reasons import LIGHT_REASONS, POSE_REASONS
 APPEARANCE_SIZE = 16
 """Default length of appearance vectors where the appearance varies."""
 DISTORTION = 2e-3
-"""Default weight of the distortion loss in unbounded scenes, with proposals."""
+"""Default weight of the distortion loss in unbounded scenes."""
 MARCHED_SAMPLES = 2**16
 """Samples a training step with an occupancy grid: as many as 2,048 rays have with proposals."""
-A_RAY, SPREAD = "the number of samples on a ray varies a hundredfold", "it is of proposals' samples"
+A_RAY = "the number of samples on a ray varies a hundredfold"
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class NerfactoConfig(
     contraction: Auto[bool] = AUTO
     """Whether space outside the box is contracted. If not given: in unbounded scenes."""
     distortion_loss_mult: Auto[float] = AUTO
-    """Weight of the distortion loss (proposal). If not given: 0.002 in unbounded scenes, else 0."""
+    """Weight of the distortion loss. If not given: 0.002 in unbounded scenes, else 0."""
     appearance_embedding_dim: Auto[int] = AUTO
     """Length of each image's appearance vector. If not given: 16 if light or exposure differ between images, else 0."""
     camera_optimizer: Literal["auto", "off", "SO3xR3", "SE3"] = "auto"
@@ -205,8 +205,9 @@ class Nerfacto(RayModel[NerfactoConfig]):
         losses: dict[str, Tensor] = {}
         if samples is None or weights is None or not samples.num_rays:
             return losses
-        if config.distortion_loss_mult > 0 and samples.edges is not None:
-            losses["distortion"] = config.distortion_loss_mult * normalised_distortion(weights, samples)
+        if config.distortion_loss_mult > 0 and (samples.edges is not None or config.contraction):
+            scale = None if samples.edges is not None else half_edge(self.scene.box)
+            losses["distortion"] = config.distortion_loss_mult * normalised_distortion(weights, samples, scale)
         for name, penalty in rendered.penalties.items():
             losses[name] = (config.orientation_loss_mult if name == "orientation" else 1.0) * penalty.mean()
         return losses
@@ -222,17 +223,15 @@ def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[D
     Returns:
         Settings without open ones, and a record of each that was filled in.
     """
-    unbounded = scene.unbounded if config.contraction is None else config.contraction
-    config, made = fill(config, sampler_choice(config, unbounded))
-    contracted, marched = unbounded, config.sampler == "occupancy"
-    spread = contracted and not marched
+    contracted = scene.unbounded if config.contraction is None else config.contraction
+    config, made = fill(config, sampler_choice(config, contracted))
     reason = f"contraction is {'on' if contracted else 'off'}"
     refined = "SO3xR3" if scene.poses == "device" and not scene.warped else "off"
     around = "there may be something outside the box" if contracted else "the scene ends at its box"
     config, more = fill(
         config,
         Choice("contraction", contracted, around),
-        Choice("distortion_loss_mult", DISTORTION if spread else 0.0, SPREAD if marched else reason, "distortion loss"),
+        Choice("distortion_loss_mult", DISTORTION if contracted else 0.0, reason, "distortion loss"),
         Choice("gradient_scaling", contracted, reason, "gradient scaling near cameras"),
         Choice(
             "appearance_embedding_dim",
@@ -242,7 +241,7 @@ def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[D
         ),
         Choice("camera_optimizer", refined, POSE_REASONS[scene.poses], "pose refinement"),
     )
-    if marched and contracted:
+    if contracted and config.sampler == "occupancy":
         config, count = fill(config, Choice("samples_per_batch", MARCHED_SAMPLES, A_RAY, "samples a step"))
         more += count
     config, few = decide_few_images(config, scene)

@@ -33,7 +33,7 @@ def grid(share: float, seed: int = 0, levels: int = LEVELS) -> Occupancy:
     return Occupancy(occupied & own_cells(levels, RESOLUTION), BOX, RESOLUTION, levels)
 
 
-def rays_of(kind: str, count: int = 120) -> Rays:
+def rays_of(kind: str, count: int = 40) -> Rays:
     """Rays that start in the smallest box, in a larger one, outside all, or are parallel to the axes."""
     random = np.random.default_rng(3)
     center, half = np.array([0.0, -0.5, 0.5]), 1.0
@@ -57,10 +57,10 @@ def steps_by_brute_force(rays: Rays, cells: Occupancy, index: int) -> tuple[np.n
     half, levels = 2.0 ** (cells.levels - 1), cells.levels
     center = np.array([0.0, -0.5, 0.5])
     origin, direction = (part[index].double().numpy() for part in (rays.origins, rays.directions))
-    with np.errstate(divide="ignore"):
-        faces = (center + half * np.array([[-1.0], [1.0]]) - origin) / np.where(direction == 0, np.nan, direction)
-    enter, leave = np.nanmax(np.nanmin(faces, 0)), np.nanmin(np.nanmax(faces, 0))
-    if np.any((direction == 0) & (np.abs(origin - center) > half)) or leave <= max(enter, 0.05):
+    moving = direction != 0
+    faces = (center + half * np.array([[-1.0], [1.0]]) - origin)[:, moving] / direction[moving]
+    enter, leave = faces.min(0).max(), faces.max(0).min()
+    if np.any(~moving & (np.abs(origin - center) > half)) or leave <= max(enter, 0.05):
         return np.zeros((0, 2)), np.zeros(0, bool)
     t, found, sure = max(enter, 0.05), [], []
     while t < leave:
@@ -105,7 +105,7 @@ def test_the_steps_are_those_of_brute_force(form: type[March], share: float, kin
         extra = (close < apart.T).all(1) if len(truth) else np.ones(len(mine), bool)
         assert not missed.any(), (index, truth[missed])
         expected, total = expected + int(sure.sum()), total + int(extra.sum())
-    assert expected > (15 if share < 0.01 else 900)
+    assert expected > (3 if share < 0.01 else 300)
     assert total <= 0.02 * len(ends) + 2  # steps on faces alone
 
 

@@ -116,8 +116,9 @@ int march_ray(const Ray& smallest, const Steps& steps, const Grid& first, int le
     Ray ray = smallest;
     Grid grid = first;
     float face = std::numeric_limits<float>::infinity();  // where the ray leaves the box, if there are larger ones
+    float start = steps.start(k);
     while (found < limit) {
-        const float start = steps.start(k), end = steps.start(k + 1), middle = (start + end) / 2;
+        const float end = steps.start(k + 1), middle = (start + end) / 2;
         if (!(middle < leave)) break;
         if (levels > 1) {
             const int here = smallest.level(middle, first.resolution, levels);
@@ -134,10 +135,12 @@ int march_ray(const Ray& smallest, const Steps& steps, const Grid& first, int le
                 ends.push_back(end);
                 found++;
             }
-            k++;
+            k++, start = end;
         } else {
             const float clear = distance == 0 ? ray.leave(c, 1, 0) : ray.leave(c, BLOCK, (distance - 1) * BLOCK);
-            k = std::max(k + 1, steps.before(std::min(clear, face)));
+            const int32_t on = steps.before(std::min(clear, face));
+            start = on > k + 1 ? steps.start(on) : end;
+            k = std::max(k + 1, on);
         }
     }
     next = k;

@@ -132,7 +132,7 @@ def _samplers(flags: SamplersFlags) -> None:
 
     path = flags.output_dir / f"samplers-{flags.data.resolve().name}.json"
     make_room(path)
-    write_results(path, measure(flags.data, flags.methods, flags.seconds, flags.seed, flags.flags))
+    write_results(path, measure(flags.data, flags.methods, flags.seconds, flags.seed, tuple(flags.flags.split())))
 
 
 def _starts(flags: StartsFlags) -> None:

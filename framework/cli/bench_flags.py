@@ -115,8 +115,8 @@ class SamplersFlags:
     """Seconds of training of the runs."""
     seed: int = 0
     """Random seed."""
-    flags: tuple[str, ...] = ()
-    """Further flags of ns-train, each as --NAME=VALUE."""
+    flags: str = ""
+    """Further flags of ns-train, as in --flags="--downscale-factor 4 --num-steps 256"."""
     output_dir: Path = RESULTS
     """Folder of samplers-DATA.json."""
 

@@ -118,16 +118,21 @@ class Occupancy:
         return ((level * n + x) * n + y) * n + z
 
 
-def refresh_occupancy_reference(density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float) -> None:
-    """Compute `refresh_occupancy` of `density`, `occupied`, `decay`, `step` and `threshold` in PyTorch."""
+def refresh_occupancy_reference(
+    density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float, elsewhere: float = 0.0
+) -> None:
+    """Compute `refresh_occupancy` of `density`, `occupied`, `decay`, `step`, `threshold` and `elsewhere` in PyTorch."""
     density *= decay
     alpha = -torch.expm1(-density * step)
-    least = (alpha.nanmean() * (1 - ROUNDING)).nan_to_num(nan=threshold).clamp(max=threshold)  # NaN if all are
+    mean = (alpha.nanmean() * (1 - ROUNDING)).nan_to_num(nan=threshold)  # NaN if all are
+    least = mean.clamp(min=elsewhere).clamp(max=threshold)
     occupied.copy_(~(alpha < least))
 
 
 @torch.no_grad()
-def refresh_occupancy(density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float) -> None:
+def refresh_occupancy(
+    density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float, elsewhere: float = 0.0
+) -> None:
     """Mark, in place, the cells whose opacity over one step is at least a threshold.
 
     Args:
@@ -137,18 +142,21 @@ def refresh_occupancy(density: Tensor, occupied: Tensor, decay: float, step: flo
         decay: factor of the densities.
         step: length of a step, scene units.
         threshold: minimum opacity, or the mean opacity over all cells if that is less.
+        elsewhere: an opacity that counts for the mean if it is larger, so that a box with nothing in it is emptied.
     """
-    REFRESH_OCCUPANCY((density,), density, occupied, decay, step, threshold)
+    REFRESH_OCCUPANCY((density,), density, occupied, decay, step, threshold, elsewhere)
 
 
 REFRESH_OCCUPANCY = Operation("refresh_occupancy", refresh_occupancy_reference)
 
 
 @REFRESH_OCCUPANCY.implementation(CPP)
-def _refresh_compiled(density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float) -> None:
+def _refresh_compiled(
+    density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float, elsewhere: float = 0.0
+) -> None:
     cells = len(density)
     _refresh(
-        native.pointer(density, "density", (cells,)), cells, decay, step, threshold,
+        native.pointer(density, "density", (cells,)), cells, decay, step, threshold, elsewhere,
         native.pointer(occupied, "the occupancy", (cells,), torch.bool), native.threads(),
     )  # fmt: skip
 
@@ -180,4 +188,4 @@ def dilated(occupancy: Occupancy, radius: int) -> Tensor:
 
 
 _pack: Callable[..., None] = native.Function("pack_occupancy", "pipp")
-_refresh: Callable[..., None] = native.Function("refresh_occupancy", "pqfffpi")
+_refresh: Callable[..., None] = native.Function("refresh_occupancy", "pqffffpi")

@@ -59,7 +59,7 @@ class OccupancySampler(Sampler):
         train_early_stop: the same threshold during training, where less exact colours are sufficient; `early_stop` if
             None.
         alpha_threshold: a cell is occupied if the opacity of one step through it is at least this, or at least the mean
-            over its box if that is less.
+            over its box, or over the smallest one, if both are less.
         cone: growth of the step per unit of distance, beyond the distance where it exceeds the even step; 0 for even
             steps throughout.
         moving: whether the scene changes with time; a cell is then occupied if it is at any time.
@@ -226,9 +226,12 @@ class OccupancySampler(Sampler):
         before *= WARM_UP_DECAY if warming_up else MOVING_DECAY if self.moving else DECAY
         evaluated = torch.isfinite(before)
         self.density_grid.index_copy_(0, cells, torch.where(evaluated, torch.maximum(before, sigma), sigma))
-        boxes = self.density_grid.view(self.levels, -1), self.occupied.view(self.levels, -1)
-        for densities, occupied, step_size in zip(*boxes, self._step_sizes(), strict=True):
-            refresh_occupancy(densities, occupied, 1.0, step_size, self.alpha_threshold)
+        densities, occupied = self.density_grid.view(self.levels, -1), self.occupied.view(self.levels, -1)
+        middle = 0.0  # mean opacity in the smallest of several boxes
+        for level, step_size in enumerate(self._step_sizes()):
+            refresh_occupancy(densities[level], occupied[level], 1.0, step_size, self.alpha_threshold, middle)
+            if level == 0 and self.levels > 1:
+                middle = float(-torch.expm1(-densities[0] * step_size).nanmean().nan_to_num())
         self.occupied.logical_and_(~self.carved)
         self.forget()
 

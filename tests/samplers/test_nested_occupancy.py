@@ -81,7 +81,9 @@ def test_fog_at_all_distances_is_the_closed_form(jitter: bool) -> None:
     last = samples.offsets[1:] - 1
     assert bool((samples.t_ends[last] == FARTHEST).all())
     assert bool((samples.t[last] > 500).all())
-    torch.testing.assert_close(samples.t_ends[:-1][samples.ranks[1:] > 0], samples.t_starts[1:][samples.ranks[1:] > 0])
+    inner = samples.ranks[1:] > 0
+    inner[last - 1] = False  # the last starts where the box ends, and the step before may not
+    torch.testing.assert_close(samples.t_ends[:-1][inner], samples.t_starts[1:][inner])
 
 
 def test_without_an_end_rays_that_meet_nothing_have_one_sample() -> None:
@@ -134,7 +136,7 @@ def test_the_grid_learns_matter_in_every_box() -> None:
 
     def density(points: Points):
         asked.append(points.positions)
-        near, far = points.positions.norm(dim=-1) < 0.5, (points.positions - center).norm(dim=-1) < 1.6
+        near, far = points.positions.norm(dim=-1) < 0.5, (points.positions - center).norm(dim=-1) < 1.9
         return 50.0 * near + 10.0 * far, points.positions
 
     for step in range(WARM_UP_STEPS + 33):
@@ -147,12 +149,12 @@ def test_the_grid_learns_matter_in_every_box() -> None:
     assert not bool((occupied & ~own).any())
     for level, (low, high) in enumerate(boxes):
         centers, diagonal = torch.lerp(low, high, cells), float((high - low).norm()) / RESOLUTION / 2
-        to_near, to_far = centers.norm(dim=-1) - 0.5, (centers - center).norm(dim=-1) - 1.6
+        to_near, to_far = centers.norm(dim=-1) - 0.5, (centers - center).norm(dim=-1) - 1.9
         inside = (to_near.minimum(to_far) < -diagonal) & own[level]
         outside = to_near.minimum(to_far) > diagonal
         assert bool(occupied[level][inside].all()), level
         assert not bool(occupied[level][outside].any()), level
-        assert bool(inside.any()) == (level in (0, 2, 3)) or level == 4
+        assert bool(inside.any()) == (level in (0, 3))
     places = torch.cat(asked).abs().amax(-1)
     assert float(places.max()) > 8
     assert len(places) < 5 * made.occupied.numel()
@@ -214,13 +216,13 @@ def test_cells_that_no_camera_shows() -> None:
     size = torch.tensor([40])
     cameras = Cameras(pose, *[torch.tensor([v]) for v in (20.0, 20.0, 20.0, 20.0)], size, size)
     centers = (torch.cartesian_prod(*[torch.arange(64)] * 3) + 0.5) / 32 - 1
-    seen = seen_cells(cameras, torch.tensor([0.4]), BOX, 64)
+    seen = seen_cells(cameras, torch.tensor([0.6]), BOX, 64)
     x, y, z = centers.unbind(-1)
     shown = (z < 0) & (x.abs() < -z) & (y.abs() < -z)
     far = centers.norm(dim=-1)
-    assert bool(seen[shown & (far > 0.4)].all())
-    assert not bool(seen[(z > 0.3)].any())
-    assert not bool(seen[far < 0.15].any())
+    assert bool(seen[shown & (far > 0.6)].all())
+    assert not bool(seen[z > 0.2].any())
+    assert not bool(seen[far < 0.35].any())
     assert not bool(seen[(x.abs() > -z + 0.7) & (far > 0.6)].any())
 
 

@@ -182,10 +182,11 @@ EXPORT int pack_occupancy(const uint8_t* occupied, int resolution, uint8_t* bits
     return DONE;
 }
 
-// Marks the cells whose opacity over one step is at least `threshold`, or the mean opacity if that is less. The grid of
-// densities is multiplied by `decay` first. NaN is marked and left out of the mean.
+// Marks the cells whose opacity over one step is at least `threshold`, or the mean opacity if that is less, for
+// which `elsewhere` stands in if it is larger. The grid of densities is multiplied by `decay` first. NaN is marked and left
+// out of the mean.
 EXPORT int refresh_occupancy(float* density, int64_t cells, float decay, float step, float threshold,
-                             uint8_t* occupied, int threads) {
+                             float elsewhere, uint8_t* occupied, int threads) {
     return guarded([&] {
         constexpr int64_t RUN = 32768;
         const int64_t runs = (cells + RUN - 1) / RUN;
@@ -218,7 +219,8 @@ EXPORT int refresh_occupancy(float* density, int64_t cells, float decay, float s
         for (double part : opacity) total += part;
         for (int64_t part : known) count += double(part);
         constexpr double ROUNDING = 1e-5;  // see ../march.py
-        const float least = std::min(threshold, float(total / count * (1 - ROUNDING)));  // the threshold if all are NaN
+        const float mean = float(total / count * (1 - ROUNDING));
+        const float least = std::min(threshold, std::max(mean, elsewhere));  // the threshold if all are NaN
         const float density_threshold = -std::log1p(-std::min(least, 1 - 1e-7f)) / step;
         for_ranges(threads, cells, 4 * RUN, [&](int64_t begin, int64_t end) {
             const float limit = density_threshold;

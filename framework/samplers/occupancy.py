@@ -203,7 +203,8 @@ class OccupancySampler(Sampler):
     def update(self, step: int, density: DensityFunction) -> None:
         """Evaluate the density in some cells and update `occupied`, every 8 steps during warm-up and every 16 later.
 
-        During warm-up the cells are taken in the order of a fixed shuffle, so that all are evaluated soon. Afterwards
+        During warm-up the cells are taken in the order of a fixed shuffle, so that all are evaluated soon; those of
+        nested boxes are all occupied until then. Afterwards
         one third is drawn from all cells, so that an empty cell can become occupied again, one third from the occupied
         cells, and one third from the neighbours of occupied cells.
 
@@ -226,6 +227,8 @@ class OccupancySampler(Sampler):
         before *= WARM_UP_DECAY if warming_up else MOVING_DECAY if self.moving else DECAY
         evaluated = torch.isfinite(before)
         self.density_grid.index_copy_(0, cells, torch.where(evaluated, torch.maximum(before, sigma), sigma))
+        if self.levels > 1 and step < WARM_UP_STEPS // 4:
+            return  # cells that are not known yet would raise the mean, and empty all that are
         densities, occupied = self.density_grid.view(self.levels, -1), self.occupied.view(self.levels, -1)
         middle = 0.0  # mean opacity in the smallest of several boxes
         for level, step_size in enumerate(self._step_sizes()):

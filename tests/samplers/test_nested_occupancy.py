@@ -167,7 +167,7 @@ def test_a_cell_counts_by_the_step_that_crosses_it() -> None:
     made.density_grid.fill_(0.5)
     made.density_grid[:100] = 1e4  # so that the mean is above the threshold
     density = lambda points: (torch.full((len(points),), 0.5), points.positions)  # noqa: E731
-    made.update(8, density)
+    made.update(WARM_UP_STEPS, density)
     occupied, own = made.occupied.view(LEVELS, -1), own_cells(LEVELS, RESOLUTION).view(LEVELS, -1)
     steps = made._step_sizes()
     assert steps[-1] == pytest.approx(2.0 ** (LEVELS - 1) / 64)

@@ -191,7 +191,7 @@ def _sampler(
         cone=config.cone_angle if scene.unbounded else 0.0,
         moving=scene.moving,
         levels=_levels(config, scene) if scene.unbounded else 1,
-        endless=scene.unbounded and not scene.has_alpha,
+        endless=not scene.has_alpha and scene.unbounded,
     )
 
 

@@ -204,9 +204,9 @@ class OccupancySampler(Sampler):
         """Evaluate the density in some cells and update `occupied`, every 8 steps during warm-up and every 16 later.
 
         During warm-up the cells are taken in the order of a fixed shuffle, so that all are evaluated soon; those of
-        nested boxes are all occupied until then. Afterwards
-        one third is drawn from all cells, so that an empty cell can become occupied again, one third from the occupied
-        cells, and one third from the neighbours of occupied cells.
+        nested boxes are all occupied until then. Afterwards one third is drawn from all cells, so that an empty cell
+        can become occupied again, one third from the occupied cells, and one third from the neighbours of occupied
+        cells.
 
         Args:
             step: number of training steps done.
@@ -231,9 +231,9 @@ class OccupancySampler(Sampler):
             return  # cells that are not known yet would raise the mean, and empty all that are
         densities, occupied = self.density_grid.view(self.levels, -1), self.occupied.view(self.levels, -1)
         middle = 0.0  # mean opacity in the smallest of several boxes
-        for level, step_size in enumerate(self._step_sizes()):
-            refresh_occupancy(densities[level], occupied[level], 1.0, step_size, self.alpha_threshold, middle)
-            if level == 0 and self.levels > 1:
+        for number, step_size in enumerate(self._step_sizes()):
+            refresh_occupancy(densities[number], occupied[number], 1.0, step_size, self.alpha_threshold, middle)
+            if number == 0 and self.levels > 1:
                 middle = float(-torch.expm1(-densities[0] * step_size).nanmean().nan_to_num())
         self.occupied.logical_and_(~self.carved)
         self.forget()

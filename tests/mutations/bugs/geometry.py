@@ -255,8 +255,8 @@ BUGS = (
         "grid-cells-transposed",
         "occupancy",
         "framework/samplers/occupancy.py",
-        "        corner = torch.stack([cells // n**2, cells // n % n, cells % n], dim=-1)\n        unit =",
-        "        corner = torch.stack([cells % n, cells // n % n, cells // n**2], dim=-1)\n        unit =",
+        "        corner = torch.stack([cell // n**2, cell // n % n, cell % n], dim=-1)\n        unit =",
+        "        corner = torch.stack([cell % n, cell // n % n, cell // n**2], dim=-1)\n        unit =",
         "density is looked at in the cell that is mirrored: parts of the scene vanish",
     ),
     Bug(

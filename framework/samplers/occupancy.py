@@ -43,6 +43,9 @@ WARM_UP_DECAY, DECAY = 0.7, 0.8
 TIMES_PER_VISIT, MOVING_DECAY = 4, 0.95
 """Number of times at which a cell of a moving scene is evaluated at each update, and the factor of its density, which
 is larger because a cell may be occupied for a short time only."""
+COARSE_STEPS = (WARM_UP_STEPS // 4, 4.0), (WARM_UP_STEPS, 2.0)
+"""Training steps until which the march through nested boxes takes longer steps, and how much longer these are. While
+nothing is known to be empty, few rays would take all samples."""
 SHUFFLE_STRIDE = 2654435761
 """A prime number, whose multiples modulo the number of cells visit every cell once per pass, in scattered order."""
 
@@ -107,6 +110,7 @@ class OccupancySampler(Sampler):
         self.alpha_threshold = alpha_threshold
         self.cone = cone
         self.moving = moving
+        self._stride = 1.0
         self.register_buffer("box", box.clone())
         self.register_buffer("occupied", own_cells(levels, resolution).to(box.device))
         self.register_buffer("carved", ~self.occupied)
@@ -154,7 +158,8 @@ class OccupancySampler(Sampler):
         shift = torch.rand(len(rays), device=rays.origins.device) if jitter else None
         own = self.train_early_stop if self.training else self.early_stop
         stop = own if early_stop is None else early_stop
-        marched = march(rays, self.occupancy, self.step_size, self.cone, shift, stop)
+        stride = self._stride if self.training else 1.0
+        marched = march(rays, self.occupancy, stride * self.step_size, stride * self.cone, shift, stop)
 
         def evaluate(wave: Wave) -> tuple[Tensor, Tensor]:
             points = interval_points(rays, wave.owners, wave, wave.positions, field.footprint)
@@ -213,6 +218,8 @@ class OccupancySampler(Sampler):
             density: density of the field.
         """
         warming_up = step < WARM_UP_STEPS
+        if self.levels > 1:
+            self._stride = next((longer for until, longer in COARSE_STEPS if step < until), 1.0)
         if step == 0 or step % (8 if warming_up else 16):
             return
         cells = self._shuffled(step // 8 - 1) if warming_up else self._drawn()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -52,16 +53,14 @@ def write_grid(file: Path, grid: SkipsCells, placement: Placement) -> None:
         OSError: if the file cannot be written.
     """
     n = grid.resolution
-    write_atomically(
-        file,
-        lambda stream: np.savez_compressed(
-            stream,
-            occupied=innermost(grid).numpy(),
-            cube_to_input=box_frame(grid, placement).numpy(),
-            box=grid.box.cpu().numpy(),
-            **({"larger": grid.occupied[n**3 :].cpu().view(-1, n, n, n).numpy()} if grid.levels > 1 else {}),
-        ),
-    )
+    arrays: dict[str, Any] = {
+        "occupied": innermost(grid).numpy(),
+        "cube_to_input": box_frame(grid, placement).numpy(),
+        "box": grid.box.cpu().numpy(),
+    }
+    if grid.levels > 1:
+        arrays["larger"] = grid.occupied[n**3 :].cpu().view(-1, n, n, n).numpy()
+    write_atomically(file, lambda stream: np.savez_compressed(stream, **arrays))
 
 
 def innermost(grid: SkipsCells) -> Tensor:

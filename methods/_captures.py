@@ -60,27 +60,30 @@ class CaptureConfig(SamplingConfig):
 
     @property
     def covers_space(self) -> bool:
-        """True if the field covers all of space, contracted; of settings that are decided."""
+        """True if the field covers all of space, contracted, and its sampler does; of settings that are decided."""
         return bool(self.contraction) and self.sampler == "proposal"
 
 
 CaptureConfigT = TypeVar("CaptureConfigT", bound=CaptureConfig)
 
 
-def decide_capture(config: CaptureConfigT, scene: Scene, *own: Choice) -> tuple[CaptureConfigT, list[Decision]]:
+def decide_capture(
+    config: CaptureConfigT, scene: Scene, *own: Choice, nested: bool = False
+) -> tuple[CaptureConfigT, list[Decision]]:
     """Decide the settings that methods for captures share, and a method's own.
 
     Args:
         config: the method's settings; those left open are filled in.
         scene: properties of the data.
         own: choices of the method's own.
+        nested: whether the method can march through contracted space, in nested boxes.
 
     Returns:
         The settings, and a record of each that was filled in.
     """
     unbounded = scene.unbounded if config.contraction is None else config.contraction
     config, made = fill(config, sampler_choice(config, unbounded))
-    contracted = unbounded and config.sampler == "proposal"
+    contracted = unbounded and (nested or config.sampler == "proposal")
     around = "there may be something outside the box" if contracted else "the scene ends at its box"
     reason = f"contraction is {'on' if contracted else 'off'}"
     refined = "SO3xR3" if scene.poses == "device" and not scene.warped else "off"
@@ -95,17 +98,21 @@ def decide_capture(config: CaptureConfigT, scene: Scene, *own: Choice) -> tuple[
     return config, made + more
 
 
-def distortion_term(rendered: Rendered, weight: float) -> dict[str, Tensor]:
-    """Return the distortion of rays as a term of the loss; none without a weight, or if the sampler is no proposal.
+def distortion_term(rendered: Rendered, weight: float, scale: float | None = None) -> dict[str, Tensor]:
+    """Return the distortion of rays as a term of the loss; none without a weight.
 
     Args:
         rendered: the rays of a batch.
         weight: weight of the term.
+        scale: distance from which on disparity is measured, of samples that a grid chose, scene units; if None, those
+            have no distortion.
     """
     samples, weights = rendered.samples, rendered.weights
-    if not weight or samples is None or weights is None or samples.edges is None or not samples.num_rays:
+    if not weight or samples is None or weights is None or not samples.num_rays:
         return {}
-    return {"distortion": weight * normalised_distortion(weights, samples)}
+    if samples.edges is not None:
+        return {"distortion": weight * normalised_distortion(weights, samples)}
+    return {} if scale is None else {"distortion": weight * normalised_distortion(weights, samples, scale)}
 
 
 class CaptureModel(RayModel[CaptureConfigT], Generic[CaptureConfigT]):
@@ -149,7 +156,8 @@ class CaptureModel(RayModel[CaptureConfigT], Generic[CaptureConfigT]):
         return super().render(rays if self.poses is None else self.poses(rays), background)
 
     def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
-        return distortion_term(rendered, self.config.distortion_loss_mult)
+        scale = half_edge(self.scene.box) if self.config.contraction else None
+        return distortion_term(rendered, self.config.distortion_loss_mult, scale)
 
 
 class CaptureRenderer(VolumeRenderer):

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from framework import Decision, Field, Method, PixelBatch, Points, Rays, Rendered, Renderer, Sampler, Samples, Scene
 from framework.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
-from framework.base.decisions import Choice
+from framework.base.decisions import Choice, fill
 from framework.encodings.hash_grid import HashGrid
 from framework.fields.appearance import Appearance
 from framework.fields.encoded import NUM_FEATURES, EncodedField
@@ -28,6 +28,9 @@ from methods._captures import CaptureConfig, CaptureModel, CaptureRenderer, deci
 
 APPEARANCE_SIZE = 16
 """Default length of appearance vectors where the appearance varies."""
+MARCHED_SAMPLES = 2**16
+"""Samples a training step with an occupancy grid: as many as 2,048 rays have with proposals."""
+A_RAY = "the number of samples on a ray varies a hundredfold"
 
 
 @dataclass(frozen=True)
@@ -144,7 +147,10 @@ def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[D
     varies = scene.appearance_varies
     size = APPEARANCE_SIZE if varies else 0
     appearance = Choice("appearance_embedding_dim", size, LIGHT_REASONS[varies], "appearance features")
-    config, made = decide_capture(config, scene, appearance)
+    config, made = decide_capture(config, scene, appearance, nested=True)
+    if config.contraction and config.sampler == "occupancy":
+        config, count = fill(config, Choice("samples_per_batch", MARCHED_SAMPLES, A_RAY, "samples a step"))
+        made += count
     config, few = decide_few_images(config, scene)
     return config, made + few
 
@@ -170,7 +176,7 @@ def make_field(config: NerfactoConfig, scene: Scene) -> EncodedField:
         scene.box,
         grid,
         config.hidden_width,
-        unbounded=config.covers_space,
+        unbounded=config.contraction,
         appearance=(size, scene.num_cameras) if size else None,
         opening=config.open_levels_until > 0,
     )

@@ -26,6 +26,7 @@ from framework.cli.bench_flags import (
     PosesFlags,
     ProfileFlags,
     QuadratureFlags,
+    SamplersFlags,
     StartsFlags,
     ViewerBenchFlags,
 )
@@ -43,6 +44,7 @@ usage: ns-bench WHAT [flags]
   methods          time to each PSNR of every built-in method, on the embedded scene or on --data
   curves           PSNR against seconds of every method: a run for each of several budgets and seeds, in one picture
   ablation         effect of each part of instant-ngp: training with one part switched off, or on, in turn
+  samplers         an occupancy grid in nested boxes against proposals, on a capture, after the same times
   starts           where Gaussians start: time to a PSNR from points, a field's surfaces, silhouettes, or anywhere
   processes        time to each PSNR with one process and with several, started by torchrun, on the same cores
   profile-step     time of a training step: of each compiled kernel, and of Python and torch
@@ -149,6 +151,14 @@ def _ablation(flags: AblationFlags) -> None:
     path = flags.output_dir / f"ablation-{flags.data.resolve().name}.json"
     make_room(path)
     write_results(path, measure(flags.data, flags.seconds, flags.seeds, flags.target))
+
+
+def _samplers(flags: SamplersFlags) -> None:
+    from framework.tools.benchmarks.samplers import measure
+
+    path = flags.output_dir / f"samplers-{flags.data.resolve().name}.json"
+    make_room(path)
+    write_results(path, measure(flags.data, flags.methods, flags.seconds, flags.seed, tuple(flags.flags.split())))
 
 
 def _starts(flags: StartsFlags) -> None:
@@ -265,6 +275,7 @@ KINDS: dict[str, tuple[type, Any]] = {
     "methods": (MethodFlags, _methods),
     "curves": (CurvesFlags, _curves),
     "ablation": (AblationFlags, _ablation),
+    "samplers": (SamplersFlags, _samplers),
     "starts": (StartsFlags, _starts),
     "processes": (ProcessesFlags, measure_processes),
     "profile-step": (ProfileFlags, _profile),

@@ -62,21 +62,24 @@ class StopsEarly(Protocol):
 
 @runtime_checkable
 class SkipsCells(Protocol):
-    """A sampler that skips the empty cells of a grid over a box."""
+    """A sampler that skips the empty cells of a grid over a box, or over L nested boxes (`Occupancy`)."""
 
     box: Tensor
-    """(2, 3) corners of the grid, scene units."""
+    """(2, 3) corners of the grid, of the smallest box if there are several, scene units."""
     resolution: int
-    """Number n of cells along each axis."""
+    """Number n of cells along each axis of a box."""
+    levels: int
+    """Number L of boxes."""
     occupied: Tensor
-    """(n^3,) bool, True for cells that are sampled; the index of cell (x, y, z) is (x n + y) n + z."""
+    """(L n^3,) bool, True for cells that are sampled; cell (x, y, z) of box l has the index ((l n + x) n + y) n + z."""
     carved: Tensor
-    """(n^3,) bool, True for cells that stay empty."""
+    """(L n^3,) bool, True for cells that stay empty; also for those in the middle of a box, in the place of which a
+    smaller box is looked at."""
     early_stop: float
     """Transmittance below which the rest of a ray is dropped, as in `StopsEarly`."""
 
     def carve(self, hull: Tensor) -> None:
-        """Mark all cells outside `hull` (n^3,) bool as empty, permanently."""
+        """Mark all cells outside `hull` (L n^3,) bool as empty, permanently."""
 
     def forget(self) -> None:
         """Discard what was computed from `occupied`; to be called after `occupied` has changed."""

@@ -5,17 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import torch
+
 from framework.base.config import TrainConfig
 from framework.base.console import say
 from framework.base.decisions import Decision
 from framework.cameras.ndc import NdcCameras
 from framework.data.dataset import Dataset
+from framework.data.free_space import before_points
 from framework.data.pixel_set import PixelSet
 from framework.data.pixels import training_background
+from framework.geometry.bounds import nested_boxes
 from framework.model import HasAppearance, LearnsMotion, Model, RefinesPoses, RendersFromImages, parts
 from framework.samplers.base import SkipsCells
 from framework.samplers.choice import SamplingConfig
 from framework.scene.profile import SceneProfile
+from framework.scene.seen_cells import seen_cells
 from framework.scene.silhouettes import Silhouettes, pixels_near, visual_hull
 
 
@@ -66,6 +71,27 @@ def show_images(model: Model[Any], train_set: Dataset, eval_set: Dataset | None)
             model.show_images(eval_set)
 
 
+def skip_unseen(config: TrainConfig, model: Model[Any], dataset: Dataset) -> None:
+    """Empty the cells of nested boxes that no training image shows, or only from nearer than all that it shows.
+
+    Args:
+        config: the run's settings.
+        model: the model, whose samplers hold the grids.
+        dataset: the training images.
+    """
+    nested = [sampler for sampler in parts(model, SkipsCells) if sampler.levels > 1]
+    if not nested or not isinstance(config, SamplingConfig) or not config.seen_cells:
+        return
+    cameras, known = dataset.cameras, dataset.sparse_depth
+    nearest = torch.full_like(cameras.fx, dataset.scene.near)
+    if known is not None:
+        nearest = nearest.maximum(before_points(cameras, known))
+    for sampler in nested:
+        boxes = nested_boxes(sampler.box, sampler.levels)
+        seen = torch.cat([seen_cells(cameras, nearest, box, sampler.resolution) for box in boxes])
+        sampler.carve(seen & ~sampler.carved)
+
+
 def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: bool) -> Dataset:
     """Empty the cells of the occupancy grids that are outside the images' silhouettes.
 
@@ -85,7 +111,8 @@ def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset
         return dataset
     silhouettes, moving = Silhouettes.of(dataset), model.scene.moving
     if fresh:
-        hulls = [visual_hull(silhouettes, sampler.box, sampler.resolution, moving) for sampler in samplers]
+        boxes = [(sampler, nested_boxes(sampler.box, sampler.levels)) for sampler in samplers]
+        hulls = [torch.cat([visual_hull(silhouettes, box, s.resolution, moving) for box in all_]) for s, all_ in boxes]
         if not all(bool(hull.any()) for hull in hulls):
             say("warning: the photographs' alpha leaves no part of the box; it is not used to skip anything")
             return dataset
@@ -94,7 +121,11 @@ def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset
     # In a moving scene, a pixel that is empty at its time supervises cells that are occupied at other times.
     if not config.silhouette_pixels or moving or not all(bool(sampler.carved.any()) for sampler in samplers):
         return dataset
-    near = [pixels_near(silhouettes, ~s.carved, s.box, s.resolution) for s in samplers]
+    near = [
+        pixels_near(silhouettes, kept, box, s.resolution)
+        for s in samplers
+        for kept, box in zip((~s.carved).view(s.levels, -1), nested_boxes(s.box, s.levels), strict=True)
+    ]
     return dataset.drawing(PixelSet.shared(near, 1))
 
 

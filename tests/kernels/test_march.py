@@ -16,6 +16,7 @@ from framework.kernels.march import (
     sort_by_ray,
     step_start,
 )
+from framework.kernels.occupancy import refresh_occupancy_reference
 from tests.kernels.compiled import needs_kernels
 
 BOX = torch.tensor([[-1.0, -1.5, -1.0], [1.0, 1.0, 2.0]])
@@ -187,3 +188,15 @@ def test_refreshing_marks_cells_by_opacity(mean_is_less: bool) -> None:
     clear = (alpha / threshold - 1).abs() > 1e-3
     assert torch.equal(occupied[clear], (alpha >= threshold)[clear])
     assert 0 < int(occupied.sum()) < 20**3
+
+
+@pytest.mark.parametrize("refresh", [refresh_occupancy, refresh_occupancy_reference])
+def test_a_mean_of_other_cells_empties_what_is_thinner(refresh) -> None:
+    """Fog of opacity 1e-4 stays by its own mean, and goes by a larger one, up to the threshold; NaN always stays."""
+    for elsewhere, kept in ((0.0, 999), (5e-5, 999), (2e-4, 10), (0.5, 5)):
+        density, occupied = torch.full((999,), 1e-3), torch.zeros(999, dtype=torch.bool)
+        density[:10], density[:5], density[0] = 0.05, 0.2, math.nan
+        if elsewhere < 1e-4:
+            density.fill_(1e-3)
+        refresh(density, occupied, 1.0, 0.1, 0.01, elsewhere)
+        assert int(occupied.sum()) == kept

@@ -1,7 +1,8 @@
 """Marching through an occupancy grid, in Triton. `framework.kernels.march` says what is computed.
 
-Each thread takes a ray, and crosses empty blocks of cells by their distance to an occupied one. Rays that have ended
-stay in their places, so that the host waits once a wave: for the number of its samples, which has to be known.
+Each thread takes a ray, and crosses empty blocks of cells by their distance to an occupied one, up to the faces of the
+smallest of nested boxes that holds the place. Rays that have ended stay in their places, so that the host waits once a
+wave: for the number of its samples, which has to be known.
 """
 
 from __future__ import annotations
@@ -98,18 +99,32 @@ def _cell(position, last):
 
 
 @triton.jit
-def _leave(position, direction, cell, size, more):
-    """Return the distance at which rays leave the cube of `size` cells of a cell, and `more` around it, by an axis."""
+def _level(x, y, z, half, levels):
+    """Return the number of the smallest nested box that holds a place, in cells of the smallest of all."""
+    far = tl.maximum(tl.maximum(tl.abs(x - half), tl.abs(y - half)), tl.abs(z - half)) / half
+    level = (far.to(tl.int32, bitcast=True) >> 23) - 126  # far < 2^level, and not less than half of it
+    return tl.minimum(tl.maximum(level, 0), levels - 1)
+
+
+@triton.jit
+def _shrunk(position, size, half):
+    """Return a position in cells of a larger box, where those of the smallest have this size; unchanged if it is 1."""
+    return tl.where(size == 1, position, (position - half) * size + half)
+
+
+@triton.jit
+def _leave(position, direction, cell, size, more, resolution):
+    """Return where rays leave the cube of `size` cells of a cell, and `more` around it, or the box, by an axis."""
     corner = cell - cell % size
-    face = tl.where(direction > 0, corner + size + more, corner - more)
+    face = tl.where(direction > 0, tl.minimum(corner + size + more, resolution), tl.maximum(corner - more, 0))
     distance = (face.to(tl.float32) - position) / tl.where(direction == 0, 1.0, direction)
     return tl.where(direction == 0, INFINITY, distance)
 
 
-@triton.jit(do_not_specialize=["rays"])
+@triton.jit(do_not_specialize=["rays", "levels"])
 def _wave(
     origins, directions, box, enters, leaves, firsts, alive, nexts, occupied, distances, counts, starts, ends, rays,
-    limit, resolution, step, growth, turn, BLOCK: tl.constexpr,
+    limit, resolution, levels, step, growth, turn, BLOCK: tl.constexpr,
 ):  # fmt: skip
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = r < rays
@@ -128,25 +143,29 @@ def _wave(
     dy = tl.load(directions + r * 3 + 1, mask=here, other=0.0) * scale_y
     dz = tl.load(directions + r * 3 + 2, mask=here, other=0.0) * scale_z
     k, found = tl.load(nexts + r, mask=here, other=0), tl.zeros([BLOCK], tl.int32)
-    side = (resolution + EDGE - 1) // EDGE
+    side, half = (resolution + EDGE - 1) // EDGE, resolution / 2
     going = here & (tl.load(alive + r, mask=here, other=0) != 0)
     while tl.max(going.to(tl.int32), 0) > 0:
         start, end = _start(first, k, step, even, growth), _start(first, k + 1, step, even, growth)
         middle = (start + end) / 2
         going = going & (middle < leave)
-        i, j = _cell(x + middle * dx, resolution - 1), _cell(y + middle * dy, resolution - 1)
-        m = _cell(z + middle * dz, resolution - 1)
-        block = (i // EDGE * side + j // EDGE) * side + m // EDGE
+        level = _level(x + middle * dx, y + middle * dy, z + middle * dz, half, levels)
+        size = ((127 - level) << 23).to(tl.float32, bitcast=True)
+        px, py, pz = _shrunk(x, size, half), _shrunk(y, size, half), _shrunk(z, size, half)
+        i, j = _cell(px + middle * dx * size, resolution - 1), _cell(py + middle * dy * size, resolution - 1)
+        m = _cell(pz + middle * dz * size, resolution - 1)
+        block = ((level * side + i // EDGE) * side + j // EDGE) * side + m // EDGE
         distance = tl.load(distances + block, mask=going, other=0).to(tl.int32)
-        cell = (i.to(tl.int64) * resolution + j) * resolution + m
+        cell = ((level.to(tl.int64) * resolution + i) * resolution + j) * resolution + m
         full = going & (distance == 0) & (tl.load(occupied + cell, mask=going, other=0) != 0)
         taken = full & (middle >= enter)
         tl.store(starts + r * limit + found, start, mask=taken)
         tl.store(ends + r * limit + found, end, mask=taken)
         found += taken.to(tl.int32)
-        size, more = tl.where(distance == 0, 1, EDGE), tl.maximum(distance - 1, 0) * EDGE
-        clear = tl.minimum(_leave(x, dx, i, size, more), _leave(y, dy, j, size, more))
-        clear = tl.minimum(clear, _leave(z, dz, m, size, more))
+        cube, more = tl.where(distance == 0, 1, EDGE), tl.maximum(distance - 1, 0) * EDGE
+        clear = _leave(px, dx * size, i, cube, more, resolution)
+        clear = tl.minimum(clear, _leave(py, dy * size, j, cube, more, resolution))
+        clear = tl.minimum(clear, _leave(pz, dz * size, m, cube, more, resolution))
         # The last step that certainly ends before that.
         steps = (clear - first) / step
         if growth > 0:
@@ -208,6 +227,7 @@ class TritonMarch(March):
         self.occupied, self.distances = occupancy.occupied, occupancy.distances
         self.origins, self.directions = rays.origins.contiguous(), rays.directions.contiguous()
         self.box, self.resolution, self.step = occupancy.box.contiguous(), occupancy.resolution, float(step)
+        self.levels, outer = occupancy.levels, occupancy.outer.contiguous()
         self.growth, self.turn = (math.log2(1 + cone), step / cone) if cone else (0.0, math.inf)
         nears, count = rays.nears.contiguous(), len(rays)
         self.enter, self.leave, self.first = (torch.empty_like(nears) for _ in range(3))
@@ -216,7 +236,7 @@ class TritonMarch(March):
         self.spent = torch.zeros_like(nears)
         launch(
             _begin, (blocks(count, SAMPLES),), self.origins, self.directions, nears, rays.fars.contiguous(),
-            None if shift is None else shift.contiguous(), self.box, self.step, self.enter, self.leave, self.first,
+            None if shift is None else shift.contiguous(), outer, self.step, self.enter, self.leave, self.first,
             self.alive, count, BLOCK=SAMPLES,
         )  # fmt: skip
 
@@ -227,7 +247,7 @@ class TritonMarch(March):
         launch(
             _wave, (blocks(rays, RAYS),), self.origins, self.directions, self.box, self.enter, self.leave, self.first,
             self.alive, self.next, self.occupied, self.distances, counts, padded_starts, padded_ends, rays, limit,
-            self.resolution, self.step, self.growth, self.turn, BLOCK=RAYS, num_warps=1,
+            self.resolution, self.levels, self.step, self.growth, self.turn, BLOCK=RAYS, num_warps=1,
         )  # fmt: skip
         offsets = functional.pad(counts.cumsum(0), (1, 0))
         count = int(offsets[-1])

@@ -176,7 +176,8 @@ def _ends_at_the_box(model: Model) -> bool:
     """Return whether the model places no sample outside the box."""
     if parts(model, SphereRenderer):
         return False
-    return bool(parts(model, SkipsCells)) or any(not sampler.unbounded for sampler in parts(model, ProposalSampler))
+    grids, proposals = parts(model, SkipsCells), parts(model, ProposalSampler)
+    return any(grid.levels == 1 for grid in grids) or any(not sampler.unbounded for sampler in proposals)
 
 
 def check_evaluation(subject: Subject) -> str:

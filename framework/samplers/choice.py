@@ -56,8 +56,9 @@ class SamplingConfig(RayConfig):
     grid_levels: int = 8
     """Most nested boxes, each twice as large as the one before; fewer if these reach the far end of the scene
     (occupancy, beyond the box)."""
-    cone_angle: float = 1 / 256
-    """Growth of a step per unit of distance from the camera (occupancy, beyond the box)."""
+    cone_angle: float = 1 / 64
+    """Growth of a step per unit of distance from the camera: about a cell of the nested boxes; 1/256 in the paper
+    (occupancy, beyond the box)."""
     seen_cells: bool = True
     """Never sample cells of nested boxes that no training image shows, or only from nearer than the points that it is
     known to show (occupancy, beyond the box)."""

@@ -71,6 +71,24 @@ def show_images(model: Model[Any], train_set: Dataset, eval_set: Dataset | None)
             model.show_images(eval_set)
 
 
+def skip_empty(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: bool) -> Dataset:
+    """Empty the cells of the occupancy grids by what the training images show, and by what they do not show.
+
+    Args:
+        config: the run's settings.
+        model: the model, whose samplers hold the grids.
+        dataset: the training images.
+        fresh: whether training starts; if not, the grids come from a checkpoint and are not changed.
+
+    Returns:
+        The data set, without pixels whose rays meet emptied cells only.
+    """
+    dataset = skip_by_silhouettes(config, model, dataset, fresh)
+    if fresh:
+        skip_unseen(config, model, dataset)
+    return dataset
+
+
 def skip_unseen(config: TrainConfig, model: Model[Any], dataset: Dataset) -> None:
     """Empty the cells of nested boxes that no training image shows, or only from nearer than all that it shows.
 

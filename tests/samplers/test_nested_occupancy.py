@@ -199,7 +199,7 @@ def test_the_choice_for_a_capture() -> None:
     config = SamplingConfig(sampler="occupancy", nested_resolution=16, grid_levels=12, num_steps=100)
     made = make_sampler(config, CAPTURE)
     assert isinstance(made, OccupancySampler)
-    assert (made.levels, made.resolution, made.endless, made.cone) == (11, 16, True, 1 / 256)  # 2^10 > 1000
+    assert (made.levels, made.resolution, made.endless, made.cone) == (11, 16, True, 1 / 64)  # 2^10 > 1000
     assert torch.equal(contracted_box(config, CAPTURE), BOX)
     boxed = dataclasses.replace(CAPTURE, unbounded=False)
     made = make_sampler(config, boxed)

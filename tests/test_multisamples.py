@@ -10,12 +10,11 @@ from framework.geometry.bounds import contract, contraction_scale
 from framework.geometry.multisamples import (
     NUM_MULTISAMPLES,
     Pattern,
-    across,
     fixed_pattern,
     multisamples,
     random_pattern,
 )
-from framework.geometry.points import Frustums, conical_frustums, sample_points
+from framework.geometry.points import Frustums, conical_frustums, frames, sample_points
 from framework.geometry.rays import Rays, Samples
 
 F64 = torch.float64
@@ -111,7 +110,7 @@ def test_in_evaluation_each_second_pattern_is_the_mirror_image_turned_by_30_degr
         *(torch.stack([x[3], x[3]]) for x in vars(one).values() if x is not None), ranks=torch.tensor([4, 5])
     )
     positions, _ = multisamples(twice, fixed_pattern(twice))
-    first, second = across(twice.directions)
+    _, first, second = frames(twice.directions).unbind(-1)
     apart = positions - twice.origins[:, None]
     angles = torch.atan2((apart * second[:, None]).sum(-1), (apart * first[:, None]).sum(-1)).rad2deg() % 360
     for found, truth in zip(angles, ([0, 120, 240, 180, 300, 60], [330, 210, 90, 150, 30, 270]), strict=True):
@@ -130,9 +129,10 @@ def test_random_patterns_are_evenly_turned_and_half_of_them_mirrored() -> None:
     assert counts.max().item() < 2800
 
 
-def test_across_completes_a_direction_to_an_orthonormal_basis() -> None:
+def test_frames_complete_a_direction_to_an_orthonormal_basis() -> None:
     axes = torch.cat([torch.eye(3, dtype=F64), -torch.eye(3, dtype=F64), unit(50)])
-    basis = torch.stack([axes, *across(axes)], dim=1)
+    basis = frames(axes).mT
+    assert torch.equal(basis[:, 0], axes)
     torch.testing.assert_close(basis @ basis.mT, torch.eye(3, dtype=F64).expand(len(axes), 3, 3), rtol=0, atol=1e-14)
 
 

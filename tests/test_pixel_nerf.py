@@ -272,13 +272,14 @@ def baselines(dataset: Dataset) -> tuple[float, float]:
 @pytest.mark.usefixtures("registered")
 def test_unseen_scenes_are_rendered_better_than_without_their_images(tmp_path: Path) -> None:
     """Above the mean colour, above the nearest image, and above the same network that does not see the images."""
-    parser = Procedural(size=32, num_scenes=100, views_per_scene=12)
-    steps: dict[str, Any] = {"max_num_iterations": 1500, "num_rays_per_batch": 256, "images_per_batch": 4}
-    samples: dict[str, Any] = {"num_coarse_samples": 24, "num_fine_samples": 24, "max_eval_images": 0}
-    config = dataclasses.replace(SMALL, **{**steps, **samples, "hidden_width": 48, "encoder_widths": (24, 24, 48)})
+    parser = Procedural(size=32, num_scenes=200, views_per_scene=12)
+    steps: dict[str, Any] = {"max_num_iterations": 400, "num_rays_per_batch": 256, "images_per_batch": 4}
+    samples: dict[str, Any] = {"num_coarse_samples": 20, "num_fine_samples": 20, "max_eval_images": 0}
+    sizes: dict[str, Any] = {"hidden_width": 48, "encoder_widths": (24, 24, 48), "learning_rate": 2e-3}
+    config = dataclasses.replace(SMALL, **steps, **samples, **sizes)
     found = {}
     for name in ("seeing", "blind"):
-        trainer, test = trained_on_many(tmp_path / name, parser, dataclasses.replace(config, learning_rate=1e-3))
+        trainer, test = trained_on_many(tmp_path / name, parser, config)
         if name == "blind":
             trainer.model.encoder = Blind(96)  # type: ignore[assignment]
         for _ in range(config.max_num_iterations):

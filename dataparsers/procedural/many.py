@@ -115,7 +115,7 @@ def write_scenes(
             (temporary / split, scene) for split in ("train", *UNSEEN) for scene in scene_numbers(split, num_scenes)
         ]
         with ThreadPoolExecutor() as pool:
-            done = pool.map(lambda job: _write_scene(*job, size, views, seed), jobs)
+            done = pool.map(lambda job: _write_scene(job[0], job[1], size, views, seed), jobs)
             frames: dict[str, list[dict[str, Any]]] = {}
             for (place, _), written in zip(jobs, progress(done, "Rendering many scenes", len(jobs)), strict=True):
                 frames.setdefault(place.name, []).extend(written)

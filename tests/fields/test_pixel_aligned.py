@@ -21,8 +21,8 @@ def cameras(model: str = "pinhole", lens: Tensor | None = None) -> Cameras:
     up, middle = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
     places = torch.tensor([[3.0, 0.5, 1.0], [-1.0, 2.5, 2.0], [0.5, -3.0, -0.5]], dtype=torch.float64)
     poses = torch.stack([look_at(place, middle, up) for place in places])
-    numbers = torch.tensor([[21.0, 23.0, 11.5, 8.25]] * 3, dtype=torch.float64).T
-    return Cameras(poses[:, :3], *numbers, SIZES[:, 0], SIZES[:, 1], model, lens)
+    fx, fy, cx, cy = torch.tensor([[21.0, 23.0, 11.5, 8.25]] * 3, dtype=torch.float64).T
+    return Cameras(poses[:, :3], fx, fy, cx, cy, SIZES[:, 0], SIZES[:, 1], model, lens)
 
 
 def points(count: int = 200, seed: int = 0) -> Tensor:
@@ -102,10 +102,10 @@ def test_features_stay_in_the_middle_of_what_they_are_of(size: tuple[int, int]) 
     """An encoder whose convolutions copy their middle returns colours, or at coarser levels means, where they were."""
     encoder = ImageEncoder((3, 3, 3))
     with torch.no_grad():
-        for layer in (*encoder.first, *encoder.second):
-            layer.weight.zero_()
-        for layer in encoder.first:
-            layer.weight[:, :, 1, 1] = torch.eye(3)
+        for name, parameter in encoder.named_parameters():
+            parameter.zero_()
+            if name.startswith("first") and name.endswith("weight"):
+                parameter[:, :, 1, 1] = torch.eye(3)
     rows, columns = torch.meshgrid(torch.arange(size[0]), torch.arange(size[1]), indexing="ij")
     image = 0.5 + 0.01 * torch.stack([rows + columns, rows, columns])[None].float()  # so that ReLU keeps it
     found = encoder(image).view(3, 3, *size)

@@ -28,11 +28,13 @@ from framework.rendering.losses import (
     distance_likelihood,
     matter_before,
     mean_squared_error,
+    opacity_of_transparent,
 )
 from framework.rendering.rendered import Picture, Rendered
 from framework.rendering.renderer import Renderer
 from framework.samplers.base import Sampler
 from framework.scene.few_images import FewImagesConfig, unseen_weight
+from framework.scene.motion import MotionConfig
 
 RayConfigT = TypeVar("RayConfigT", bound=RayConfig)
 PATCH = 8
@@ -91,6 +93,9 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
         terms |= self.regularizers(rendered, batch, step)
         if isinstance(self.config, FewImagesConfig):
             terms |= self._for_few_images(self.config, rendered, batch, step)
+        if isinstance(self.config, MotionConfig) and self.scene.moving and batch.alpha is not None:
+            wrong = opacity_of_transparent(pixels.accumulation, batch.alpha, batch.weights)
+            terms |= {"empty": self.config.empty_loss_mult * wrong} if self.config.empty_loss_mult else {}
         return Loss(terms, pixels.rgb.detach(), rendered.num_samples)
 
     def _depth_terms(self, rendered: Rendered, batch: PixelBatch) -> dict[str, Tensor]:

@@ -56,6 +56,8 @@ class Scene:
     """Mean number of pixels of a training image; None if unknown."""
     num_sparse_depths: int = 0
     """Number of pixels of the images whose distance is known from a reconstruction's points."""
+    num_times: int = 0
+    """Number of different times of the training images; 0 if they have none."""
 
     @classmethod
     def of(cls, facts: Any) -> Scene:

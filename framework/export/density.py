@@ -110,7 +110,7 @@ class LatticeDensity:
         cells = (unit * n).long().clamp(0, n - 1)
         # The far faces of the box belong to its last cells.
         inside = ((unit >= 0) & (unit <= 1)).all(-1)
-        occupied = self.grid.occupied.cpu()
+        occupied = self.grid.occupied_when(self.time).cpu()
         return inside & occupied[(cells[:, 0] * n + cells[:, 1]) * n + cells[:, 2]]
 
     @torch.no_grad()
@@ -134,7 +134,7 @@ class LatticeDensity:
         assert self.grid is not None
         n, box = self.grid.resolution, self.grid.box.cpu().double()
         sums = torch.zeros(n + 1, n + 1, n + 1, dtype=torch.int32)
-        counts = self.grid.occupied.cpu().view(n, n, n).to(torch.int32)
+        counts = self.grid.occupied_when(self.time).cpu().view(n, n, n).to(torch.int32)
         sums[1:, 1:, 1:] = counts.cumsum(0, dtype=torch.int32).cumsum(1, dtype=torch.int32).cumsum(2, dtype=torch.int32)
         offsets = torch.cartesian_prod(*[torch.tensor([0, BLOCK])] * 3)
         for block in self.lattice.all_blocks(BLOCK):

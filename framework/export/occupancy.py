@@ -55,7 +55,7 @@ def write_grid(file: Path, grid: SkipsCells, placement: Placement) -> None:
         file,
         lambda stream: np.savez_compressed(
             stream,
-            occupied=grid.occupied.cpu().view(n, n, n).numpy(),
+            occupied=grid.occupied_when().cpu().view(n, n, n).numpy(),
             cube_to_input=box_frame(grid, placement).numpy(),
             box=grid.box.cpu().numpy(),
         ),
@@ -65,7 +65,7 @@ def write_grid(file: Path, grid: SkipsCells, placement: Placement) -> None:
 def cell_centers(grid: SkipsCells, placement: Placement) -> Tensor:
     """Return the centres (K, 3) float64 of the occupied cells of `grid`, in the frame of the input of `placement`."""
     n, matrix = grid.resolution, box_frame(grid, placement)
-    cells = grid.occupied.cpu().view(n, n, n).nonzero()
+    cells = grid.occupied_when().cpu().view(n, n, n).nonzero()
     return (cells.double() + 0.5) / n @ matrix[:3, :3].T + matrix[:3, 3]
 
 
@@ -98,7 +98,7 @@ def write_cells(file: Path, grid: SkipsCells, placement: Placement, boxes: bool)
 def boxes_mesh(grid: SkipsCells) -> Mesh:
     """Return the surface of the occupied cells of `grid`, in its unit cube."""
     n = grid.resolution
-    padded = torch.nn.functional.pad(grid.occupied.cpu().view(n, n, n), (1,) * 6)
+    padded = torch.nn.functional.pad(grid.occupied_when().cpu().view(n, n, n), (1,) * 6)
     inner = padded[1:-1, 1:-1, 1:-1]
     quads = []
     for axis in range(3):

@@ -68,15 +68,21 @@ class SkipsCells(Protocol):
     """(2, 3) corners of the grid, scene units."""
     resolution: int
     """Number n of cells along each axis."""
+    slices: int
+    """Number T of equal parts of the time from 0 to 1, each of which has cells of its own; 1 for a still scene."""
     occupied: Tensor
-    """(n^3,) bool, True for cells that are sampled; the index of cell (x, y, z) is (x n + y) n + z."""
+    """(T n^3,) bool, True for cells that are sampled; the index of cell (x, y, z) of slice s is
+    ((s n + x) n + y) n + z."""
     carved: Tensor
-    """(n^3,) bool, True for cells that stay empty."""
+    """(T n^3,) bool, True for cells that stay empty."""
     early_stop: float
     """Transmittance below which the rest of a ray is dropped, as in `StopsEarly`."""
 
+    def occupied_when(self, time: float | None = None) -> Tensor:
+        """Return the cells (n^3,) that are occupied in the slice of `time`, or at any time if it is None."""
+
     def carve(self, hull: Tensor) -> None:
-        """Mark all cells outside `hull` (n^3,) bool as empty, permanently."""
+        """Mark all cells outside `hull`, (T n^3,) bool or (n^3,) for all slices, as empty, permanently."""
 
     def forget(self) -> None:
         """Discard what was computed from `occupied`; to be called after `occupied` has changed."""

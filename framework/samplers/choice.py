@@ -12,16 +12,22 @@ from framework.base.config import Auto, Range, RayConfig
 from framework.base.decisions import Choice, Decision, fill
 from framework.base.errors import ConfigError
 from framework.data.scene import Scene
+from framework.encodings.planes import FeaturePlanes
 from framework.fields.base import Field
+from framework.fields.encoded import DensityField
 from framework.samplers.base import Sampler
 from framework.samplers.hierarchical import LEAST_COARSE, HierarchicalSampler
 from framework.samplers.occupancy import MAX_CELLS, OccupancySampler
 from framework.samplers.proposal import LEARN_EVERY, ProposalSampler
+from framework.scene.motion import MotionConfig, half_the_times
 
 COARSEST_PROPOSAL = 128
 """Cells along an axis at the finest level of the first proposal; each further proposal has twice as many."""
 MOST_PROPOSALS = 8
 """Maximum number of proposals."""
+COARSEST_MOVING, MOVING_FEATURES = 64, 8
+"""Vertices per axis of space of the first proposal of a scene that moves, each further one having twice as many, and
+features of a vertex: those of K-Planes, whose proposals are planes in space and time."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +140,8 @@ def make_sampler(
         scene: properties of the scene.
         make_coarse: creates the coarse field of `--sampler hierarchical`, or returns None if the field serves as its
             own; None if the method has no such level.
-        proposals: density fields of `--sampler proposal`; hash grids if None.
+        proposals: density fields of `--sampler proposal`; if None, hash grids, or planes in space and time for a method
+            that learns motion.
         learn_every: interval of steps at which proposals learn.
 
     Raises:
@@ -152,8 +159,12 @@ def _sampler(
     proposals: Sequence[Field] | None,
     learn_every: int,
 ) -> Sampler:
+    sees_time = scene.moving and isinstance(config, MotionConfig)
     if config.sampler == "proposal":
-        resolutions = tuple(COARSEST_PROPOSAL << level for level in range(len(config.num_proposal_samples)))
+        levels = range(len(config.num_proposal_samples))
+        resolutions = tuple(COARSEST_PROPOSAL << level for level in levels)
+        if proposals is None and sees_time:
+            proposals = [_moving_proposal(scene, COARSEST_MOVING << level) for level in levels]
         return ProposalSampler(
             scene.box,
             (*config.num_proposal_samples, config.num_nerf_samples),
@@ -174,4 +185,11 @@ def _sampler(
         config.early_stop,
         config.train_early_stop,
         moving=scene.moving,
+        slices=config.time_slices if isinstance(config, MotionConfig) and sees_time else 1,
     )
+
+
+def _moving_proposal(scene: Scene, resolution: int) -> DensityField:
+    """Return a density on planes in space and time, of `resolution` vertices per axis of space."""
+    vertices = (resolution,) * 3 + (half_the_times(scene),)
+    return DensityField(scene.box, FeaturePlanes((vertices,), MOVING_FEATURES), unbounded=scene.unbounded)

@@ -1,7 +1,8 @@
 """Sampling with an occupancy grid, which skips empty space, in waves, which skip hidden space.
 
 The grid is that of Instant-NGP (Mueller et al. 2022, appendix E.2): it holds a decaying maximum of the density in each
-cell, and a cell is skipped while a step through it is nearly transparent.
+cell, and a cell is skipped while a step through it is nearly transparent. The grid of a moving scene may have slices of
+time, so that a ray skips what is empty at its own time.
 """
 
 from __future__ import annotations
@@ -32,8 +33,11 @@ WARM_UP_STEPS = 256
 WARM_UP_DECAY, DECAY = 0.7, 0.8
 """Factors of a cell's density at each update, during warm-up and afterwards."""
 TIMES_PER_VISIT, MOVING_DECAY = 4, 0.95
-"""Number of times at which a cell of a moving scene is evaluated at each update, and the factor of its density, which
-is larger because a cell may be occupied for a short time only."""
+"""Number of times at which a cell of a moving scene is evaluated at each update if there is one slice of time, and the
+factor of its density, which is larger because a cell may be occupied for a short time only."""
+SHARE, SHARE_OF_SLICES = 64, 256
+"""Numbers of cells for each one that is drawn from all cells at an update after warm-up, without and with slices of
+time. With them there are more cells, of which fewer are occupied."""
 SHUFFLE_STRIDE = 2654435761
 """A prime number, whose multiples modulo the number of cells visit every cell once per pass, in scattered order."""
 
@@ -53,10 +57,11 @@ class OccupancySampler(Sampler):
             over the grid if that is less.
         cone: growth of the step per unit of distance, beyond the distance where it exceeds the even step; 0 for even
             steps throughout.
-        moving: whether the scene changes with time; a cell is then occupied if it is at any time.
+        moving: whether the scene changes with time; a cell is then occupied if it is at any time of its slice.
+        slices: number T of equal parts of the time from 0 to 1, each of which has cells of its own.
 
     Raises:
-        ConfigError: if the number of cells or steps is out of range.
+        ConfigError: if the number of cells, steps or slices is out of range.
     """
 
     box: Tensor
@@ -74,6 +79,7 @@ class OccupancySampler(Sampler):
         alpha_threshold: float = 0.01,
         cone: float = 0.0,
         moving: bool = False,
+        slices: int = 1,
     ) -> None:
         super().__init__()
         if not 1 <= resolution <= MAX_CELLS or not num_steps >= 1:
@@ -81,7 +87,12 @@ class OccupancySampler(Sampler):
                 f"an occupancy grid has 1 to {MAX_CELLS} cells along an axis and 1 step or more, "
                 f"not {shown(resolution)} and {shown(num_steps)}"
             )
-        self.resolution = resolution
+        if not (1 <= slices and slices * resolution**3 <= MAX_CELLS**3) or (slices > 1 and not moving):
+            raise ConfigError(
+                f"{shown(slices)} slices of time: there is 1, or more if the scene moves, and cells in all of them "
+                f"together are at most {MAX_CELLS}^3"
+            )
+        self.resolution, self.slices = resolution, slices
         self.step_size = (box[1] - box[0]).norm().item() / num_steps
         self.early_stop = early_stop
         self.train_early_stop = early_stop if train_early_stop is None else train_early_stop
@@ -89,9 +100,9 @@ class OccupancySampler(Sampler):
         self.cone = cone
         self.moving = moving
         self.register_buffer("box", box.clone())
-        self.register_buffer("density_grid", torch.full((resolution**3,), torch.inf))
-        self.register_buffer("occupied", torch.ones(resolution**3, dtype=torch.bool))
-        self.register_buffer("carved", torch.zeros(resolution**3, dtype=torch.bool))
+        self.register_buffer("density_grid", torch.full((slices * resolution**3,), torch.inf))
+        self.register_buffer("occupied", torch.ones(slices * resolution**3, dtype=torch.bool))
+        self.register_buffer("carved", torch.zeros(slices * resolution**3, dtype=torch.bool))
         self._packed: Occupancy | None = None
         self.register_load_state_dict_post_hook(lambda module, _: module.forget())
 
@@ -104,8 +115,15 @@ class OccupancySampler(Sampler):
     def occupancy(self) -> Occupancy:
         """The grid in the form that `march` needs."""
         if self._packed is None or self._packed.occupied is not self.occupied:
-            self._packed = Occupancy(self.occupied, self.box, self.resolution)
+            self._packed = Occupancy(self.occupied, self.box, self.resolution, self.slices)
         return self._packed
+
+    def occupied_when(self, time: float | None = None) -> Tensor:
+        """Return the cells (n^3,) that are occupied in the slice of `time`, or at any time if it is None."""
+        of_slices = self.occupied.view(self.slices, -1)
+        if time is None:
+            return of_slices.any(0)
+        return of_slices[min(max(int(time * self.slices), 0), self.slices - 1)]
 
     def forget(self) -> None:
         """Discard `occupancy`, which is computed again on demand; to be called after `occupied` has changed."""
@@ -167,10 +185,14 @@ class OccupancySampler(Sampler):
     # -- updating the grid ------------------------------------------------------------------------------------
 
     def carve(self, hull: Tensor) -> None:
-        """Mark all cells outside `hull` (n^3,) bool (`framework.scene.silhouettes`) as empty, permanently."""
-        self.carved.copy_(~hull)
+        """Mark cells as empty, permanently.
+
+        Args:
+            hull: (T n^3,) bool (`framework.scene.silhouettes`), False for these cells; or (n^3,) for all slices.
+        """
+        self.carved.view(self.slices, -1).copy_(~hull.view(-1, self.resolution**3))
         self.density_grid.masked_fill_(self.carved, 0)
-        self.occupied.logical_and_(hull)
+        self.occupied.masked_fill_(self.carved, False)
         self.forget()
 
     @torch.no_grad()
@@ -189,11 +211,10 @@ class OccupancySampler(Sampler):
         if step == 0 or step % (8 if warming_up else 16):
             return
         cells = self._shuffled(step // 8 - 1) if warming_up else self._drawn()
-        n = self.resolution
-        corner = torch.stack([cells // n**2, cells // n % n, cells % n], dim=-1)
-        unit = (corner + torch.rand(len(cells), 3, device=cells.device)) / n
+        place = self._places(cells)
+        unit = (place[:, 1:] + torch.rand(len(cells), 3, device=cells.device)) / self.resolution
         positions = torch.lerp(self.box[0], self.box[1], unit)
-        sigma = _in_chunks(density, positions, None) if not self.moving else _over_time(density, positions)
+        sigma = self._over_time(density, positions, place[:, 0]) if self.moving else _in_chunks(density, positions)
         before = self.density_grid.index_select(0, cells)
         before *= WARM_UP_DECAY if warming_up else MOVING_DECAY if self.moving else DECAY
         evaluated = torch.isfinite(before)
@@ -207,7 +228,7 @@ class OccupancySampler(Sampler):
 
         Only one in eight of the empty cells is returned, because few of them become occupied again.
         """
-        num_cells = self.resolution**3
+        num_cells = len(self.occupied)
         count = math.ceil(4 * num_cells * 8 / WARM_UP_STEPS)
         ranks = torch.arange(turn * count, (turn + 1) * count, device=self.occupied.device)
         cells = ranks * SHUFFLE_STRIDE % num_cells
@@ -221,8 +242,8 @@ class OccupancySampler(Sampler):
         is 30 times smaller with the neighbours than without (`ns-bench quadrature`). A cell that is drawn twice is
         evaluated twice, which does no harm.
         """
-        num_cells = self.resolution**3
-        third = max(num_cells // 64, 1)
+        num_cells = len(self.occupied)
+        third = max(num_cells // (SHARE if self.slices == 1 else SHARE_OF_SLICES), 1)
         device = self.occupied.device
         occupied = self.occupied.nonzero().squeeze(-1)
         anywhere = torch.randint(num_cells, (third,), device=device)
@@ -233,12 +254,25 @@ class OccupancySampler(Sampler):
         neighbours = self._beside(centers)
         return torch.cat([anywhere, drawn, neighbours[~self.carved[neighbours]]])
 
-    def _beside(self, cells: Tensor) -> Tensor:
-        """Return a random neighbour of each of `cells`, or the cell itself."""
+    def _places(self, cells: Tensor) -> Tensor:
+        """Return the slice and the place along x, y and z (N, 4) of each of `cells` (N,)."""
         n = self.resolution
-        corner = torch.stack([cells // n**2, cells // n % n, cells % n], dim=-1)
-        corner = (corner + torch.randint(-1, 2, corner.shape, device=cells.device)).clamp(0, n - 1)
-        return (corner[:, 0] * n + corner[:, 1]) * n + corner[:, 2]
+        return torch.stack([cells // n**3, cells // n**2 % n, cells // n % n, cells % n], dim=-1)
+
+    def _beside(self, cells: Tensor) -> Tensor:
+        """Return a random neighbour, in space and in time, of each of `cells`, or the cell itself."""
+        n, place = self.resolution, self._places(cells)
+        last = torch.tensor([self.slices - 1, n - 1, n - 1, n - 1], device=cells.device)
+        place = (place + torch.randint(-1, 2, place.shape, device=cells.device)).clamp(min=0).minimum(last)
+        return ((place[:, 0] * n + place[:, 1]) * n + place[:, 2]) * n + place[:, 3]
+
+    def _over_time(self, density: DensityFunction, positions: Tensor, slices: Tensor) -> Tensor:
+        """Return the maximum density (N,) over random times, one in each of a few equal parts of a position's slice."""
+        densities, parts = [], max(TIMES_PER_VISIT // self.slices, 1)
+        for part in range(parts):
+            shares = (part + torch.rand(len(positions), device=positions.device)) / parts
+            densities.append(_in_chunks(density, positions, (slices + shares) / self.slices))
+        return torch.stack(densities).amax(0)
 
 
 def _attached(samples: Samples, surface: HasAlpha | None, stopping: Tensor, features: Tensor) -> Samples:
@@ -246,16 +280,7 @@ def _attached(samples: Samples, surface: HasAlpha | None, stopping: Tensor, feat
     return samples.evaluated(stopping, features) if surface is None else samples.with_alpha(stopping, features)
 
 
-def _over_time(density: DensityFunction, positions: Tensor) -> Tensor:
-    """Return the maximum density (N,) over random times, one in each of `TIMES_PER_VISIT` equal parts of [0, 1]."""
-    densities = []
-    for part in range(TIMES_PER_VISIT):
-        times = (part + torch.rand(len(positions), device=positions.device)) / TIMES_PER_VISIT
-        densities.append(_in_chunks(density, positions, times))
-    return torch.stack(densities).amax(0)
-
-
-def _in_chunks(density: DensityFunction, positions: Tensor, times: Tensor | None) -> Tensor:
+def _in_chunks(density: DensityFunction, positions: Tensor, times: Tensor | None = None) -> Tensor:
     """Return the density (N,) at positions (N, 3), in chunks: allocating large results costs more than the work."""
     parts = positions.split(CHUNK)
     part_times = [None] * len(parts) if times is None else times.split(CHUNK)

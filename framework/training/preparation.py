@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from torch import Tensor
+
 from framework.base.config import TrainConfig
 from framework.base.console import say
 from framework.base.decisions import Decision
@@ -16,7 +18,7 @@ from framework.model import HasAppearance, LearnsMotion, Model, RefinesPoses, pa
 from framework.samplers.base import SkipsCells
 from framework.samplers.choice import SamplingConfig
 from framework.scene.profile import SceneProfile
-from framework.scene.silhouettes import Silhouettes, pixels_near, visual_hull
+from framework.scene.silhouettes import Silhouettes, moving_hulls, pixels_near, visual_hull
 
 
 def profile_of(
@@ -40,7 +42,7 @@ def profile_of(
         decisions.append(Decision("background", training_background(config.background, scene.has_alpha), reason))
     if isinstance(config, SamplingConfig) and config.silhouette_cells and parts(model, SkipsCells):
         obstacle = _no_silhouettes(dataset)
-        outside = "what is outside all of them" if scene.moving else "space outside them"
+        outside = "what is outside all of them at its time" if scene.moving else "space outside them"
         choice = "not used" if obstacle else f"{outside} is skipped from the start"
         decisions.append(Decision("silhouettes", choice, obstacle or "alpha shows them"))
     if scene.moving and not isinstance(model, LearnsMotion):
@@ -71,7 +73,7 @@ def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset
         return dataset
     silhouettes, moving = Silhouettes.of(dataset), model.scene.moving
     if fresh:
-        hulls = [visual_hull(silhouettes, sampler.box, sampler.resolution, moving) for sampler in samplers]
+        hulls = [_hull(silhouettes, sampler, dataset.times) for sampler in samplers]
         if not all(bool(hull.any()) for hull in hulls):
             say("warning: the photographs' alpha leaves no part of the box; it is not used to skip anything")
             return dataset
@@ -82,6 +84,13 @@ def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset
         return dataset
     near = [pixels_near(silhouettes, ~s.carved, s.box, s.resolution) for s in samplers]
     return dataset.drawing(PixelSet.shared(near, 1))
+
+
+def _hull(silhouettes: Silhouettes, sampler: SkipsCells, times: Tensor | None) -> Tensor:
+    """Return the cells of `sampler` that `silhouettes`, taken at `times` if the scene moves, do not show to be empty."""
+    if times is None:
+        return visual_hull(silhouettes, sampler.box, sampler.resolution)
+    return moving_hulls(silhouettes, sampler.box, sampler.resolution, times, sampler.slices)
 
 
 def _no_silhouettes(dataset: Dataset) -> str | None:

@@ -112,10 +112,10 @@ int march_ray(const Ray& ray, const Steps& steps, const Grid& grid, float enter,
 
 }  // namespace
 
-// One bit a cell, and for each block of 4^3 cells its distance (the largest over the axes, in blocks, at most 255) to a
-// block that holds an occupied cell; from one byte a cell.
-EXPORT int pack_occupancy(const uint8_t* occupied, int resolution, uint8_t* bits, uint8_t* blocks) {
-    const int64_t cells = int64_t(resolution) * resolution * resolution, side = (resolution + BLOCK - 1) / BLOCK;
+namespace {
+
+void pack_slice(const uint8_t* occupied, int64_t resolution, int64_t cells, int64_t side, uint8_t* bits,
+                uint8_t* blocks) {
     std::memset(bits, 0, size_t((cells + 7) / 8));
     std::memset(blocks, 0, size_t(side * side * side));
     for (int64_t cell = 0; cell < cells; cell++) {
@@ -142,7 +142,20 @@ EXPORT int pack_occupancy(const uint8_t* occupied, int resolution, uint8_t* bits
             }
             blocks[b] = uint8_t(std::min<int>(blocks[b], nearest));
         }
-    return DONE;
+}
+
+}  // namespace
+
+// Of each slice: one bit a cell, and for each block of 4^3 cells its distance (the largest over the axes, in blocks, at
+// most 255) to a block that holds an occupied cell; from one byte a cell. A slice's bits begin with a byte of their own.
+EXPORT int pack_occupancy(const uint8_t* occupied, int resolution, int slices, uint8_t* bits, uint8_t* blocks,
+                          int threads) {
+    return guarded([&] {
+        const int64_t n = resolution, cells = n * n * n, side = (n + BLOCK - 1) / BLOCK;
+        for_chunks(threads, slices, [&](int64_t s, int) {
+            pack_slice(occupied + s * cells, n, cells, side, bits + s * ((cells + 7) / 8), blocks + s * side * side * side);
+        });
+    });
 }
 
 // Marks the cells whose opacity over one step is at least `threshold`, or the mean opacity if that is less. The grid of
@@ -220,11 +233,12 @@ EXPORT int march_begin(const float* origins, const float* directions, const floa
 }
 
 // The next samples of each living ray, packed ray by ray. `total`: their number N.
+// slices (R): which of the grid's slices of time each ray marches through, or null if there is one.
 // next (R): the step to go on from, kept up here; counts (A): samples of each living ray.
 // starts, ends (N), owners (N), positions (N, 3) have room for A * limit.
 EXPORT int march_wave(const float* origins, const float* directions, const float* enter, const float* leave,
-                      const float* first, int32_t* next, const int64_t* alive, int64_t living, int limit,
-                      const float* box, float step, float cone, const uint8_t* bits, const uint8_t* blocks,
+                      const float* first, const int64_t* slices, int32_t* next, const int64_t* alive, int64_t living,
+                      int limit, const float* box, float step, float cone, const uint8_t* bits, const uint8_t* blocks,
                       int resolution, int32_t* counts, float* starts, float* ends, int64_t* owners, float* positions,
                       int threads, int64_t* total) {
     struct Found {
@@ -236,7 +250,8 @@ EXPORT int march_wave(const float* origins, const float* directions, const float
     };
     return guarded([&] {
         constexpr int64_t RAYS = 512;
-        const Grid grid{bits, blocks, resolution, (resolution + BLOCK - 1) / BLOCK};
+        const int side = (resolution + BLOCK - 1) / BLOCK;
+        const int64_t bytes = (int64_t(resolution) * resolution * resolution + 7) / 8;  // of a slice's bits
         static thread_local std::vector<Found> kept;  // for fresh memory costs page faults
         std::vector<Found>& found = kept;             // the caller's, whichever thread looks
         if (found.size() < size_t(threads)) found.resize(size_t(threads));
@@ -246,7 +261,8 @@ EXPORT int march_wave(const float* origins, const float* directions, const float
             Found& mine = found[size_t(slot)];
             const int64_t before = int64_t(mine.starts.size()), last = std::min(living, (c + 1) * RAYS);
             for (int64_t i = c * RAYS; i < last; i++) {
-                const int64_t r = alive[i];
+                const int64_t r = alive[i], slice = slices ? slices[r] : 0;
+                const Grid grid{bits + slice * bytes, blocks + slice * side * side * side, resolution, side};
                 const Ray ray(origins + r * 3, directions + r * 3, box, resolution);
                 const Steps steps(first[r], step, cone);
                 counts[i] = march_ray(ray, steps, grid, enter[r], leave[r], limit, next[r], mine.starts, mine.ends);

@@ -28,24 +28,25 @@ EDGE = tl.constexpr(CELLS)
 INFINITY = tl.constexpr(math.inf)
 
 
-def block_distances(occupied: Tensor, resolution: int) -> Tensor:
+def block_distances(occupied: Tensor, resolution: int, slices: int = 1) -> Tensor:
     """Return the distance in blocks, at most FARTHEST, from each block of cells to one with an occupied cell.
 
     Args:
-        occupied: (n^3,) bool, as in `Occupancy`.
+        occupied: (T n^3,) bool, as in `Occupancy`.
         resolution: number n of cells along each axis.
+        slices: number T of slices of time.
 
     Returns:
-        (ceil(n / 4)^3,) uint8, the largest of the distances along the axes.
+        (T, ceil(n / 4)^3) uint8, the largest of the distances along the axes.
     """
     short = -resolution % CELLS
-    grid = functional.pad(occupied.view(1, 1, *[resolution] * 3).float(), (0, short) * 3)
+    grid = functional.pad(occupied.view(slices, 1, *[resolution] * 3).float(), (0, short) * 3)
     near = functional.max_pool3d(grid, CELLS)
     distances = 1 - near
     for _ in range(FARTHEST - 1):
         near = functional.max_pool3d(near, 3, stride=1, padding=1)
         distances += 1 - near
-    return distances.to(torch.uint8).flatten()
+    return distances.to(torch.uint8).view(slices, -1)
 
 
 @triton.jit
@@ -108,8 +109,8 @@ def _leave(position, direction, cell, size, more):
 
 @triton.jit(do_not_specialize=["rays"])
 def _wave(
-    origins, directions, box, enters, leaves, firsts, alive, nexts, occupied, distances, counts, starts, ends, rays,
-    limit, resolution, step, growth, turn, BLOCK: tl.constexpr,
+    origins, directions, box, enters, leaves, firsts, slices, alive, nexts, occupied, distances, counts, starts, ends,
+    rays, limit, resolution, step, growth, turn, BLOCK: tl.constexpr,
 ):  # fmt: skip
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = r < rays
@@ -129,6 +130,9 @@ def _wave(
     dz = tl.load(directions + r * 3 + 2, mask=here, other=0.0) * scale_z
     k, found = tl.load(nexts + r, mask=here, other=0), tl.zeros([BLOCK], tl.int32)
     side = (resolution + EDGE - 1) // EDGE
+    before = tl.zeros([BLOCK], tl.int64)  # slices of time before the ray's
+    if slices is not None:
+        before = tl.load(slices + r, mask=here, other=0)
     going = here & (tl.load(alive + r, mask=here, other=0) != 0)
     while tl.max(going.to(tl.int32), 0) > 0:
         start, end = _start(first, k, step, even, growth), _start(first, k + 1, step, even, growth)
@@ -136,9 +140,9 @@ def _wave(
         going = going & (middle < leave)
         i, j = _cell(x + middle * dx, resolution - 1), _cell(y + middle * dy, resolution - 1)
         m = _cell(z + middle * dz, resolution - 1)
-        block = (i // EDGE * side + j // EDGE) * side + m // EDGE
+        block = ((before * side + i // EDGE) * side + j // EDGE) * side + m // EDGE
         distance = tl.load(distances + block, mask=going, other=0).to(tl.int32)
-        cell = (i.to(tl.int64) * resolution + j) * resolution + m
+        cell = ((before * resolution + i) * resolution + j) * resolution + m
         full = going & (distance == 0) & (tl.load(occupied + cell, mask=going, other=0) != 0)
         taken = full & (middle >= enter)
         tl.store(starts + r * limit + found, start, mask=taken)
@@ -206,6 +210,7 @@ class TritonMarch(March):
     ) -> None:
         super().__init__(rays, early_stop)
         self.occupied, self.distances = occupancy.occupied, occupancy.distances
+        self.slices = occupancy.slices_of(rays.times)
         self.origins, self.directions = rays.origins.contiguous(), rays.directions.contiguous()
         self.box, self.resolution, self.step = occupancy.box.contiguous(), occupancy.resolution, float(step)
         self.growth, self.turn = (math.log2(1 + cone), step / cone) if cone else (0.0, math.inf)
@@ -226,8 +231,8 @@ class TritonMarch(March):
         padded_starts, padded_ends = like.new_empty(rays, limit), like.new_empty(rays, limit)
         launch(
             _wave, (blocks(rays, RAYS),), self.origins, self.directions, self.box, self.enter, self.leave, self.first,
-            self.alive, self.next, self.occupied, self.distances, counts, padded_starts, padded_ends, rays, limit,
-            self.resolution, self.step, self.growth, self.turn, BLOCK=RAYS, num_warps=1,
+            self.slices, self.alive, self.next, self.occupied, self.distances, counts, padded_starts, padded_ends, rays,
+            limit, self.resolution, self.step, self.growth, self.turn, BLOCK=RAYS, num_warps=1,
         )  # fmt: skip
         offsets = functional.pad(counts.cumsum(0), (1, 0))
         count = int(offsets[-1])

@@ -43,6 +43,19 @@ def test_samples(resolution: int, share: float, cone: float) -> None:
     assert (len(found[1]) > 5) == (share > 0)
 
 
+def test_each_ray_marches_through_the_slice_of_its_time() -> None:
+    """The even slices are full and the odd ones empty."""
+    rays, full = random_rays(33), occupancy(5, 1.0)
+    times = torch.rand(33, generator=torch.Generator().manual_seed(2))
+    parts = [full.occupied, ~full.occupied] * 2
+    grid = replace(full, occupied=torch.cat(parts), slices=4)
+    _, _, _, found = walk(march(*on_device(replace(rays, times=times), grid), 0.2, 0.0, None, 0.0), limit=40)
+    _, _, _, alone = walk(march(*on_device(rays, full), 0.2, 0.0, None, 0.0), limit=40)
+    truth = torch.where((times * 4).long() % 2 == 0, alone.cpu().diff(), 0)
+    assert torch.equal(found.cpu().diff(), truth)
+    assert int(truth.sum()) > 50
+
+
 @pytest.mark.parametrize("sigma", [0.0, 3.0, math.nan, math.inf])
 def test_light_ends_rays_at_the_same_sample(sigma: float) -> None:
     """Everything is occupied, so that a sample's place does not depend on rounding."""
@@ -79,7 +92,7 @@ def test_distances_of_blocks(share: float) -> None:
     blocks = torch.stack(torch.meshgrid(*[torch.arange(side)] * 3, indexing="ij"), -1).view(-1, 1, 3)
     truth = (blocks - full).abs().amax(-1).amin(-1).clamp(max=16) if len(full) else torch.full((side**3,), 16)
     found = replace(grid, occupied=grid.occupied.to(DEVICE), box=BOX.to(DEVICE)).distances
-    assert torch.equal(found.cpu().long(), truth.long())
+    assert torch.equal(found[0].cpu().long(), truth.long())
 
 
 @pytest.mark.parametrize(("count", "rays"), [(0, 3), (0, 0), (50, 7)])

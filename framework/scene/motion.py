@@ -1,0 +1,54 @@
+"""Settings of ray methods that learn motion, and what the number of the images' times decides about them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, TypeVar
+
+from framework.base.config import AT_LEAST_0, AUTO, Auto, Range, RayConfig
+from framework.base.decisions import Choice, Decision, fill
+from framework.data.scene import Scene
+
+LEAST_VERTICES, MOST_VERTICES = 3, 2**10
+"""Vertices along an axis of time: second differences need 3; and more would take memory without being told apart."""
+TIMES_A_SLICE, MOST_SLICES = 4, 32
+"""Times of images in a slice of the occupancy grid, and maximum number of slices, whose cells take memory."""
+
+
+@dataclass(frozen=True)
+class MotionConfig(RayConfig):
+    """Settings of a method that learns motion."""
+
+    RANGES: ClassVar[dict[str, Range]] = {"time_slices": (1, 2**10), "empty_loss_mult": AT_LEAST_0}
+    """Allowed ranges."""
+    time_slices: Auto[int] = AUTO
+    """Equal parts of time with cells of their own in the occupancy grid, so that a ray skips what is empty at its own
+    time (occupancy). If not given: one for each four times of the images, at most 32."""
+    empty_loss_mult: float = 0.01
+    """Weight of the opacity of rays through transparent pixels, which are empty at the time of their image; 0 for
+    none."""
+
+
+ConfigT = TypeVar("ConfigT", bound=MotionConfig)
+
+
+def half_the_times(scene: Scene) -> int:
+    """Return the number of vertices along an axis of time, by the images of `scene`: K-Planes has half their times."""
+    return min(max(scene.num_times // 2, LEAST_VERTICES), MOST_VERTICES)
+
+
+def decide_motion(config: ConfigT, scene: Scene, sampler: str) -> tuple[ConfigT, list[Decision]]:
+    """Decide the number of slices of time of the occupancy grid.
+
+    Args:
+        config: the method's settings; those left open are filled in.
+        scene: properties of the scene.
+        sampler: the method's sampler, decided.
+
+    Returns:
+        the settings, and the decisions that were made; none for a still scene, or without an occupancy grid.
+    """
+    slices = min(max(scene.num_times // TIMES_A_SLICE, 1), MOST_SLICES)
+    reason = f"the images have {scene.num_times} times"
+    config, made = fill(config, Choice("time_slices", slices, reason, "slices of time in the occupancy grid"))
+    return config, made * (scene.moving and sampler == "occupancy")

@@ -96,8 +96,9 @@ def moving_hulls(silhouettes: Silhouettes, box: Tensor, resolution: int, times: 
     """Return the cells of a box that may be occupied in each slice of time, of a scene that moves.
 
     A transparent pixel says that its ray is empty at the moment of its image, and nothing of other moments. So a cell
-    is dropped from a slice if every image of that time, and the nearest before and after, shows it and its neighbours
-    to be empty; the margin of one cell allows for motion between the times of the images.
+    is dropped from a slice if, of the images of that time and the nearest before and after, one shows it and its
+    neighbours to be empty, and none shows matter in their direction. The margin of one cell allows for motion between
+    the times of the images.
 
     Args:
         silhouettes: silhouettes of the M training images.
@@ -114,7 +115,9 @@ def moving_hulls(silhouettes: Silhouettes, box: Tensor, resolution: int, times: 
     hulls = []
     for each in range(slices):
         within = _around(moments, each / slices, (each + 1) / slices)
-        held = _held(silhouettes, [images[i] for i in within], box, resolution, every=False)
+        chosen = [images[i] for i in within]
+        held = _held(silhouettes, chosen, box, resolution, every=False)
+        held |= _held(silhouettes, chosen, box, resolution, every=True)
         grid = held.view(1, 1, resolution, resolution, resolution).float()
         hulls.append(functional.max_pool3d(grid, 3, stride=1, padding=1).view(-1) > 0)
     return torch.cat(hulls)
@@ -129,7 +132,7 @@ def _around(times: Tensor, start: float, end: float) -> list[int]:
 
 
 def _held(silhouettes: Silhouettes, images: Sequence[int], box: Tensor, resolution: int, every: bool) -> Tensor:
-    """Return the cells (n^3,) bool that each of `images` (if `every`), or one of them, does not show to be empty.
+    """Return the cells (n^3,) bool that none of `images` shows to be empty, or where one shows matter (not `every`).
 
     `silhouettes`, `box` and `resolution` are as in `visual_hull`.
     """

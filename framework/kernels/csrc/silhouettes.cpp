@@ -69,19 +69,19 @@ EXPORT int opaque_sums(const uint8_t* opaque, int64_t height, int64_t width, int
     return DONE;
 }
 
-// held (count): of balls whose entry is `from`, sets it to its opposite where the photograph shows the ball whole and
-// empty (from = 1), or does not (from = 0).
+// held (count): clears it for balls that the photograph shows whole and empty (every = 1), or sets it for balls in whose
+// direction it shows matter, and for balls around the camera's plane (every = 0).
 EXPORT int hold_balls(const float* centers, int64_t count, float radius, const float* pose, float fx, float fy,
-                      float cx, float cy, const int32_t* sums, int64_t height, int64_t width, int from, uint8_t* held,
+                      float cx, float cy, const int32_t* sums, int64_t height, int64_t width, int every, uint8_t* held,
                       int threads) {
     return guarded([&] {
         const Photograph photograph{pose, fx, fy, cx, cy, sums, height, width};
         for_ranges(threads, count, 4096, [&](int64_t begin, int64_t end) {
             for (int64_t n = begin; n < end; n++) {
-                if (held[n] != from) continue;
+                if (held[n] != every) continue;
                 const Footprint f(photograph, centers + n * 3, radius);
-                const bool empty = f.whole && photograph.opaque_pixels(f.x0, f.x1, f.y0, f.y1) <= 0;
-                if (empty == (from == 1)) held[n] = uint8_t(1 - from);
+                const bool clear = photograph.opaque_pixels(f.x0, f.x1, f.y0, f.y1) <= 0;
+                if (every ? f.whole && clear : f.depth > radius ? !clear : f.depth > -radius) held[n] = uint8_t(!every);
             }
         });
     });

@@ -7,12 +7,12 @@ from typing import Any
 import pytest
 import torch
 
+from framework.base.registry import load_method
 from framework.cameras.view import View
 from framework.data.pixels import composite
+from framework.data.scene import Scene
 from framework.fields.deformed import DeformedField
 from framework.fields.nerf import NeRFField
-from framework.base.registry import load_method
-from framework.data.scene import Scene
 from framework.geometry.points import Points
 from framework.geometry.rays import Rays
 from framework.samplers.proposal import ProposalSampler

@@ -127,7 +127,7 @@ def _refresh_compiled(density: Tensor, occupied: Tensor, decay: float, step: flo
 
 
 def dilated(occupancy: Occupancy, radius: int) -> Tensor:
-    """Return the cells (T n^3,) bool of `occupancy` that have an occupied cell within `radius` cells along each axis."""
+    """Return the cells (T n^3,) bool of `occupancy` with an occupied cell within `radius` cells along each axis."""
     n = occupancy.resolution
     grid = occupancy.occupied.view(-1, n, n, n)
     for axis in range(1, 4):

@@ -87,7 +87,7 @@ class OccupancySampler(Sampler):
                 f"an occupancy grid has 1 to {MAX_CELLS} cells along an axis and 1 step or more, "
                 f"not {shown(resolution)} and {shown(num_steps)}"
             )
-        if not (1 <= slices and slices * resolution**3 <= MAX_CELLS**3) or (slices > 1 and not moving):
+        if not (slices >= 1 and slices * resolution**3 <= MAX_CELLS**3) or (slices > 1 and not moving):
             raise ConfigError(
                 f"{shown(slices)} slices of time: there is 1, or more if the scene moves, and cells in all of them "
                 f"together are at most {MAX_CELLS}^3"

@@ -87,7 +87,7 @@ def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset
 
 
 def _hull(silhouettes: Silhouettes, sampler: SkipsCells, times: Tensor | None) -> Tensor:
-    """Return the cells of `sampler` that `silhouettes`, taken at `times` if the scene moves, do not show to be empty."""
+    """Return the cells of `sampler` that `silhouettes`, taken at `times` if it moves, do not show to be empty."""
     if times is None:
         return visual_hull(silhouettes, sampler.box, sampler.resolution)
     return moving_hulls(silhouettes, sampler.box, sampler.resolution, times, sampler.slices)

@@ -12,7 +12,7 @@ from framework.base.config import RayConfig
 from framework.cameras.cameras import subpixels
 from framework.cameras.unseen import unseen_patches
 from framework.cameras.view import View
-from framework.data.pixels import PixelBatch
+from framework.data.pixels import PixelBatch, thinned
 from framework.data.scene import Scene
 from framework.encodings.opening import Opening
 from framework.fields.base import Field
@@ -80,6 +80,10 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
             batch: pixels with their true colours.
             step: number of training steps done.
         """
+        drawn, config = batch, self.config
+        moves = isinstance(config, MotionConfig) and self.scene.moving and batch.alpha is not None
+        if isinstance(config, MotionConfig) and moves and config.transparent_share < 1:
+            batch, kept = thinned(batch, config.transparent_share)
         per_pixel = batch.rays_per_pixel
         rendered = self.render(batch.rays, batch.background.repeat_interleave(per_pixel, 0))
         pixels = rendered.to_pixels(per_pixel)
@@ -93,10 +97,13 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
         terms |= self.regularizers(rendered, batch, step)
         if isinstance(self.config, FewImagesConfig):
             terms |= self._for_few_images(self.config, rendered, batch, step)
-        if isinstance(self.config, MotionConfig) and self.scene.moving and batch.alpha is not None:
+        if isinstance(config, MotionConfig) and moves and config.empty_loss_mult and batch.alpha is not None:
             wrong = opacity_of_transparent(pixels.accumulation, batch.alpha, batch.weights)
-            terms |= {"empty": self.config.empty_loss_mult * wrong} if self.config.empty_loss_mult else {}
-        return Loss(terms, pixels.rgb.detach(), rendered.num_samples)
+            terms["empty"] = config.empty_loss_mult * wrong
+        rgb = pixels.rgb.detach()
+        if batch is not drawn:  # of what was left out it is known that nothing is before the background
+            rgb = drawn.rgb.index_copy(0, kept, rgb.to(drawn.rgb))
+        return Loss(terms, rgb, rendered.num_samples)
 
     def _depth_terms(self, rendered: Rendered, batch: PixelBatch) -> dict[str, Tensor]:
         """Return the losses of what is known of distances, of both levels, and of space that is known to be empty."""

@@ -109,7 +109,7 @@ class KPlanes(RayModel[KPlanesConfig], LearnsMotion):
     """A model of feature planes in space and, if the scene moves, in time, with the paper's regularisers."""
 
     def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
-        turn = int(torch.randint(2**31, ()))  # which plane of time
+        turn = int(torch.randint(2**31, ())) if self.scene.moving else 0  # which plane of time
         variation, roughness, activity = self._regularisers(rendered.rgb.new_zeros(()), turn)
         losses = {"space_tv": self.config.space_tv * variation}
         if self.scene.moving:

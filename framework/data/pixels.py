@@ -52,10 +52,35 @@ class PixelBatch:
     def __len__(self) -> int:
         return self.pixels.shape[0]
 
+    def __getitem__(self, index: Tensor) -> PixelBatch:
+        """Return the pixels selected by an index tensor (Q,) int64."""
+        per_pixel = self.rays_per_pixel
+        rays = (index[:, None] * per_pixel + torch.arange(per_pixel, device=index.device)).view(-1)
+        others = (self.alpha, self.distances, self.deviations, self.clear, self.weights)
+        chosen = [None if values is None else values[index] for values in others]
+        return PixelBatch(self.pixels[index], self.rays[rays], self.rgb[index], self.background[index], *chosen)
+
     @property
     def rays_per_pixel(self) -> int:
         """K, rays of a pixel."""
         return max(len(self.rays) // max(len(self), 1), 1)
+
+
+def thinned(batch: PixelBatch, share: float) -> tuple[PixelBatch, Tensor]:
+    """Return a batch without some of its transparent pixels, and which pixels (Q,) int64 are left.
+
+    Those that are left count as many times more as there were, so that the mean of a loss has the same expectation.
+
+    Args:
+        batch: pixels with alpha.
+        share: probability with which a pixel of alpha 0 is kept.
+    """
+    assert batch.alpha is not None
+    transparent = batch.alpha == 0
+    kept = (~transparent | (torch.rand(len(batch), device=transparent.device) < share)).nonzero().squeeze(-1)
+    left = batch[kept]
+    weights = torch.where(transparent[kept], 1 / share, 1.0) * (len(kept) / max(len(batch), 1))
+    return replace(left, weights=weights if left.weights is None else weights * left.weights), kept
 
 
 @dataclass(frozen=True)

@@ -122,7 +122,7 @@ def _may_hold(photograph: Photograph, centers: Tensor, radius: float, every: boo
     if every:
         return ~whole | (count > 0)
     depth = photograph.depth(centers)
-    return torch.where(depth > radius, count > 0, depth > -radius)
+    return torch.where(depth > radius, count > 0, ~(depth <= -radius))
 
 
 def hold_balls_reference(photograph: Photograph, centers: Tensor, radius: float, held: Tensor, every: bool) -> None:

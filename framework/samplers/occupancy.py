@@ -33,9 +33,9 @@ WARM_UP_STEPS = 256
 WARM_UP_DECAY, DECAY = 0.7, 0.8
 """Factors of a cell's density at each update, during warm-up and afterwards."""
 TIMES_PER_VISIT, MOVING_DECAY = 4, 0.95
-"""Number of times at which a cell of a moving scene is evaluated at each update if there is one slice of time, and the
-factor of its density, which is larger because a cell may be occupied for a short time only."""
-SHARE, SHARE_OF_SLICES = 64, 256
+"""Number of times at which a cell of a moving scene is evaluated at each update, and the factor of its density, which
+is larger because a cell may be occupied for a short time only. Both are for a grid with one slice of time."""
+SHARE, SHARE_OF_SLICES = 64, 128
 """Numbers of cells for each one that is drawn from all cells at an update after warm-up, without and with slices of
 time. With them there are more cells, of which fewer are occupied."""
 SHUFFLE_STRIDE = 2654435761
@@ -216,7 +216,7 @@ class OccupancySampler(Sampler):
         positions = torch.lerp(self.box[0], self.box[1], unit)
         sigma = self._over_time(density, positions, place[:, 0]) if self.moving else _in_chunks(density, positions)
         before = self.density_grid.index_select(0, cells)
-        before *= WARM_UP_DECAY if warming_up else MOVING_DECAY if self.moving else DECAY
+        before *= WARM_UP_DECAY if warming_up else MOVING_DECAY if self.moving and self.slices == 1 else DECAY
         evaluated = torch.isfinite(before)
         self.density_grid.index_copy_(0, cells, torch.where(evaluated, torch.maximum(before, sigma), sigma))
         refresh_occupancy(self.density_grid, self.occupied, 1.0, self.step_size, self.alpha_threshold)
@@ -262,8 +262,10 @@ class OccupancySampler(Sampler):
     def _beside(self, cells: Tensor) -> Tensor:
         """Return a random neighbour, in space and in time, of each of `cells`, or the cell itself."""
         n, place = self.resolution, self._places(cells)
-        last = torch.tensor([self.slices - 1, n - 1, n - 1, n - 1], device=cells.device)
-        place = (place + torch.randint(-1, 2, place.shape, device=cells.device)).clamp(min=0).minimum(last)
+        moved = place[:, 1:] if self.slices == 1 else place
+        moved += torch.randint(-1, 2, moved.shape, device=cells.device)
+        place[:, 0].clamp_(0, self.slices - 1)
+        place[:, 1:].clamp_(0, n - 1)
         return ((place[:, 0] * n + place[:, 1]) * n + place[:, 2]) * n + place[:, 3]
 
     def _over_time(self, density: DensityFunction, positions: Tensor, slices: Tensor) -> Tensor:

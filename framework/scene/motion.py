@@ -11,7 +11,7 @@ from framework.data.scene import Scene
 
 LEAST_VERTICES, MOST_VERTICES = 3, 2**10
 """Vertices along an axis of time: second differences need 3; and more would take memory without being told apart."""
-TIMES_A_SLICE, MOST_SLICES = 4, 32
+TIMES_A_SLICE, MOST_SLICES = 4, 16
 """Times of images in a slice of the occupancy grid, and maximum number of slices, whose cells take memory."""
 
 
@@ -19,14 +19,20 @@ TIMES_A_SLICE, MOST_SLICES = 4, 32
 class MotionConfig(RayConfig):
     """Settings of a method that learns motion."""
 
-    RANGES: ClassVar[dict[str, Range]] = {"time_slices": (1, 2**10), "empty_loss_mult": AT_LEAST_0}
+    RANGES: ClassVar[dict[str, Range]] = {
+        "time_slices": (1, 2**10),
+        "empty_loss_mult": AT_LEAST_0,
+        "transparent_share": (0.001, 1),
+    }
     """Allowed ranges."""
     time_slices: Auto[int] = AUTO
     """Equal parts of time with cells of their own in the occupancy grid, so that a ray skips what is empty at its own
-    time (occupancy). If not given: one for each four times of the images, at most 32."""
+    time (occupancy). If not given: one for each four times of the images, at most 16."""
     empty_loss_mult: float = 0.01
     """Weight of the opacity of rays through transparent pixels, which are empty at the time of their image; 0 for
     none."""
+    transparent_share: float = 0.25
+    """Share of the drawn transparent pixels that are rendered, at random, and count as many times more; 1 for all."""
 
 
 ConfigT = TypeVar("ConfigT", bound=MotionConfig)

@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 
+from framework.data.pixels import PixelBatch, thinned
 from framework.geometry.rays import Rays, Samples
-from framework.rendering.losses import opacity_of_transparent
+from framework.rendering.losses import mean_squared_error, opacity_of_transparent
 from framework.rendering.volume import volume_render
 
 
@@ -35,3 +36,45 @@ def test_thin_fog_is_pushed_as_hard_as_thick(fog: float) -> None:
     assert loss.item() == pytest.approx(-math.expm1(-fog), rel=1e-4)
     loss.backward()
     torch.testing.assert_close(sigma.grad, samples.deltas * math.exp(-fog))
+
+
+def batch_of(alpha: torch.Tensor, per_pixel: int) -> PixelBatch:
+    """A batch whose rays begin at (pixel, ray of the pixel, 0), with weights."""
+    count = len(alpha)
+    origins = torch.cartesian_prod(torch.arange(count).float(), torch.arange(per_pixel).float(), torch.zeros(1))
+    rays = Rays(origins.view(-1, 3), torch.eye(3)[:1].expand(count * per_pixel, -1))
+    weights = torch.linspace(0.5, 1.5, count)
+    return PixelBatch(torch.arange(count), rays, torch.rand(count, 3), torch.rand(count, 3), alpha, weights=weights)
+
+
+@pytest.mark.parametrize("per_pixel", [1, 4])
+def test_thinning_keeps_what_is_opaque_and_all_of_a_pixel(per_pixel: int) -> None:
+    torch.manual_seed(0)
+    alpha = torch.tensor([0.0, 1.0, 0.0, 0.5] * 50)
+    batch = batch_of(alpha, per_pixel)
+    left, kept = thinned(batch, 0.25)
+    assert set(kept.tolist()) >= set((alpha > 0).nonzero().squeeze(-1).tolist())
+    assert 5 < int((alpha[kept] == 0).sum()) < 50
+    assert torch.equal(left.pixels, batch.pixels[kept])
+    assert torch.equal(left.rgb, batch.rgb[kept])
+    assert left.rays_per_pixel == per_pixel
+    assert torch.equal(left.rays.origins[:, 0].long(), kept.repeat_interleave(per_pixel))
+    assert torch.equal(left.rays.origins[:, 1].long(), torch.arange(per_pixel).repeat(len(kept)))
+
+
+def test_a_thinned_loss_has_the_same_mean() -> None:
+    """Over 4,000 draws, to four standard errors; and to the bit if nothing is left out."""
+    torch.manual_seed(0)
+    batch = batch_of((torch.rand(60) > 0.8).float(), 1)
+    assert batch.weights is not None
+    rendered = torch.rand(60, 3)
+    truth = mean_squared_error(rendered, batch.rgb, batch.weights)
+    found = []
+    for _ in range(4000):
+        left, kept = thinned(batch, 0.25)
+        found.append(mean_squared_error(rendered[kept], left.rgb, left.weights))
+    losses = torch.stack(found)
+    assert losses.std() > 0.01
+    assert (losses.mean() - truth).abs() < 4 * losses.std() / 4000**0.5
+    left, kept = thinned(batch, 1.0)
+    assert torch.equal(mean_squared_error(rendered[kept], left.rgb, left.weights), truth)

@@ -81,7 +81,7 @@ EXPORT int hold_balls(const float* centers, int64_t count, float radius, const f
                 if (held[n] != every) continue;
                 const Footprint f(photograph, centers + n * 3, radius);
                 const bool clear = photograph.opaque_pixels(f.x0, f.x1, f.y0, f.y1) <= 0;
-                if (every ? f.whole && clear : f.depth > radius ? !clear : f.depth > -radius) held[n] = uint8_t(!every);
+                if (every ? f.whole && clear : f.depth > radius ? !clear : !(f.depth <= -radius)) held[n] = uint8_t(!every);
             }
         });
     });

@@ -263,8 +263,8 @@ BUGS = (
         "grid-decay-of-still",
         "occupancy",
         "framework/samplers/occupancy.py",
-        "before *= WARM_UP_DECAY if warming_up else MOVING_DECAY if self.moving else DECAY",
-        "before *= WARM_UP_DECAY if warming_up else DECAY if self.moving else MOVING_DECAY",
+        "MOVING_DECAY if self.moving and self.slices == 1 else DECAY",
+        "DECAY if self.moving and self.slices == 1 else MOVING_DECAY",
         "cells of scenes that move are forgotten too soon",
     ),
     Bug(

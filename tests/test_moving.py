@@ -128,11 +128,11 @@ def times_decided(method: str, count: int, **settings: Any) -> dict[str, str]:
 
 
 def test_the_number_of_times_decides_about_time() -> None:
-    """Half as many vertices, as in K-Planes' settings of D-NeRF's scenes; a slice for four, at most 16."""
+    """A sixth as many vertices, three at least; a slice for four, at most 16."""
     many, few = times_decided("kplanes", 150), times_decided("kplanes", 8)
-    assert many["vertices along time"] == "75"
+    assert many["vertices along time"] == "25"
     assert many["slices of time in the occupancy grid"] == "16"
-    assert few["vertices along time"] == "4"
+    assert few["vertices along time"] == "3"
     assert few["slices of time in the occupancy grid"] == "2"
     assert "slices of time in the occupancy grid" not in times_decided("kplanes", 8, sampler="proposal")
     assert "slices of time in the occupancy grid" not in times_decided("dnerf", 8)

@@ -19,7 +19,7 @@ from framework.samplers.base import Sampler
 from framework.samplers.hierarchical import LEAST_COARSE, HierarchicalSampler
 from framework.samplers.occupancy import MAX_CELLS, OccupancySampler
 from framework.samplers.proposal import LEARN_EVERY, ProposalSampler
-from framework.scene.motion import MotionConfig, half_the_times
+from framework.scene.motion import MotionConfig, vertices_in_time
 
 COARSEST_PROPOSAL = 128
 """Cells along an axis at the finest level of the first proposal; each further proposal has twice as many."""
@@ -191,5 +191,5 @@ def _sampler(
 
 def _moving_proposal(scene: Scene, resolution: int) -> DensityField:
     """Return a density on planes in space and time, of `resolution` vertices per axis of space."""
-    vertices = (resolution,) * 3 + (half_the_times(scene),)
+    vertices = (resolution,) * 3 + (vertices_in_time(scene),)
     return DensityField(scene.box, FeaturePlanes((vertices,), MOVING_FEATURES), unbounded=scene.unbounded)

@@ -224,12 +224,12 @@ class OccupancySampler(Sampler):
         self.forget()
 
     def _shuffled(self, turn: int) -> Tensor:
-        """Return the cells of update number `turn` during warm-up, which makes four passes over the grid.
+        """Return the cells of update number `turn` during warm-up, which makes four passes over the grid, or two.
 
         Only one in eight of the empty cells is returned, because few of them become occupied again.
         """
-        num_cells = len(self.occupied)
-        count = math.ceil(4 * num_cells * 8 / WARM_UP_STEPS)
+        num_cells, passes = len(self.occupied), 4 if self.slices == 1 else 2
+        count = math.ceil(passes * num_cells * 8 / WARM_UP_STEPS)
         ranks = torch.arange(turn * count, (turn + 1) * count, device=self.occupied.device)
         cells = ranks * SHUFFLE_STRIDE % num_cells
         selected = self.occupied.index_select(0, cells) | (torch.rand(count, device=cells.device) < 1 / 8)

@@ -9,8 +9,9 @@ from framework.base.config import AT_LEAST_0, AUTO, Auto, Range, RayConfig
 from framework.base.decisions import Choice, Decision, fill
 from framework.data.scene import Scene
 
-LEAST_VERTICES, MOST_VERTICES = 3, 2**10
-"""Vertices along an axis of time: second differences need 3; and more would take memory without being told apart."""
+TIMES_A_VERTEX, LEAST_VERTICES, MOST_VERTICES = 6, 3, 2**10
+"""Times of images for each vertex along an axis of time, and the minimum and maximum number of vertices. The paper's
+settings have 2, for training fifty times as long as minutes on a processor are: docs/notes/motion.md."""
 TIMES_A_SLICE, MOST_SLICES = 4, 16
 """Times of images in a slice of the occupancy grid, and maximum number of slices, whose cells take memory."""
 
@@ -38,9 +39,9 @@ class MotionConfig(RayConfig):
 ConfigT = TypeVar("ConfigT", bound=MotionConfig)
 
 
-def half_the_times(scene: Scene) -> int:
-    """Return the number of vertices along an axis of time, by the images of `scene`: K-Planes has half their times."""
-    return min(max(scene.num_times // 2, LEAST_VERTICES), MOST_VERTICES)
+def vertices_in_time(scene: Scene) -> int:
+    """Return the number of vertices along an axis of time, by the number of times of the images of `scene`."""
+    return min(max(scene.num_times // TIMES_A_VERTEX, LEAST_VERTICES), MOST_VERTICES)
 
 
 def decide_motion(config: ConfigT, scene: Scene, sampler: str) -> tuple[ConfigT, list[Decision]]:

@@ -1,4 +1,4 @@
-# make demo   train on the embedded scene for a minute, and leave pictures
+# make demo   train on the embedded scene for 20 seconds, and leave pictures
 # make test   the fast tests
 # make docs   the documentation, into site/
 # make sanitize   the kernels' tests, on kernels that watch every read, write and sum
@@ -14,7 +14,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c const
 
 demo: .venv/installed
 	@run=outputs/demo/instant-ngp/$$(date +%Y-%m-%d_%H%M%S); \
-	$(BIN)/ns-train instant-ngp --max-seconds 60 --experiment-name demo --timestamp $$(basename $$run) && \
+	$(BIN)/ns-train instant-ngp --max-seconds 20 --experiment-name demo --timestamp $$(basename $$run) && \
 	$(BIN)/ns-render orbit --load-config $$run/config.yml --output-path $$run/orbit.gif && \
 	echo "held-out views (photograph, render, error, depth, opacity):" && ls $$run/pictures/*_comparison.png && \
 	echo "turntable:" && ls $$run/orbit.gif
@@ -45,9 +45,10 @@ test-versions: .venv/installed-release
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
 
+# For what follows at once: without the kernels of other processors, and without compiling modules that nobody imports.
 .venv/installed: .venv/bin/python pyproject.toml constraints.txt
 	@echo "installing nerfloom into .venv"
-	$(PIP) -e .
+	NERFLOOM_VARIANTS=native $(PIP) --no-compile -e .
 	@touch $@
 
 .venv/installed-test: .venv/installed

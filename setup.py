@@ -1,7 +1,8 @@
 """Builds the CPU kernels: plain shared libraries with a C interface, one for each instruction set.
 
 They know nothing of Python or torch, so one wheel a platform serves every Python and every torch version. Where no
-compiler is at hand the installation goes on without them.
+compiler is at hand the installation goes on without them. With NERFLOOM_VARIANTS=native only the one that this
+machine would choose is built, in a quarter of the time.
 """
 
 from __future__ import annotations
@@ -31,6 +32,25 @@ if platform.machine().lower() in ("x86_64", "amd64"):
         "avx512": [*AVX2, *AVX512],
         "avx512_bf16": [*AVX2, *AVX512, "-mavx512bf16"],
     }
+
+
+def native_only(variants: dict[str, list[str]]) -> dict[str, list[str]]:
+    """Return the last of `variants` for whose flags -mNAME Linux lists this processor's NAME; all, if it lists none."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return variants
+    known = next((line.split(":", 1)[1].replace("_", "").split() for line in lines if line.startswith("flags")), [])
+    fitting = [
+        name
+        for name, flags in variants.items()
+        if all(flag[2:] in known for flag in flags if not flag.startswith("-mprefer"))
+    ]
+    return {name: variants[name] for name in fitting[-1:]} if known else variants
+
+
+if os.environ.get("NERFLOOM_VARIANTS") == "native":
+    VARIANTS = native_only(VARIANTS)
 # GCC for Windows aligns the stack to 16 bytes, and stores wider vectors there as if it were to more (GCC bug 54412).
 MINGW_FLAGS = ["-Wa,-muse-unaligned-vector-move"]
 FLAGS = ["-std=c++17", "-O3", "-g0", "-fno-math-errno", "-fno-trapping-math", "-fvisibility=hidden", "-pthread"]
@@ -52,22 +72,28 @@ class BuildKernels(build_ext):
             return
         try:
             with ThreadPoolExecutor(os.cpu_count()) as pool:
-                list(pool.map(self.build_extension, self.extensions))
+                jobs = [(ext, source) for ext in self.extensions for source in ext.sources]
+                paths = list(pool.map(lambda job: self.compile_source(*job), jobs))
+            for ext in self.extensions:
+                self.link([path for (owner, _), path in zip(jobs, paths, strict=True) if owner is ext], ext)
         except Exception as error:  # whatever the compiler's wrapper raises
             self.warn(f"the CPU kernels could not be built ({error}): nerfloom will train much slower on a processor")
             for extension in self.extensions:
                 Path(self.get_ext_fullpath(extension.name)).unlink(missing_ok=True)
 
-    def build_extension(self, ext: Extension) -> None:
+    def compile_source(self, ext: Extension, source: str) -> str:
         mingw = self.compiler.compiler_type == "mingw32"
-        objects = self.compiler.compile(
-            ext.sources,
+        (path,) = self.compiler.compile(
+            [source],
             output_dir=os.path.join(self.build_temp, ext.name),  # the variants share their sources
             extra_postargs=[*ext.extra_compile_args, *(MINGW_FLAGS if mingw else [])],
             depends=ext.depends,
         )
+        return path
+
+    def link(self, objects: list[str], ext: Extension) -> None:
         # Without MinGW's own libraries, which no other Windows has.
-        static = ["-static"] if mingw else []
+        static = ["-static"] if self.compiler.compiler_type == "mingw32" else []
         self.compiler.link_shared_object(
             objects, self.get_ext_fullpath(ext.name), extra_postargs=[*ext.extra_link_args, *static], target_lang="c++"
         )

@@ -159,6 +159,22 @@ class StartsFromImages(Protocol):
 
 
 @runtime_checkable
+class RendersFromImages(Protocol):
+    """A model that renders a scene from images of it, which it is shown: scenes that it never learnt from, too.
+
+    It may learn from images of several scenes (`Scene.num_scenes`), which other models may not.
+    """
+
+    def show_images(self, dataset: Dataset) -> None:
+        """Show the model images, before its first step and its first picture; its parameters stay as they are.
+
+        Args:
+            dataset: images on the model's device. Without `source_images`, those that it learns from: each may be
+                rendered from the others. Otherwise further scenes, which are rendered from their source images.
+        """
+
+
+@runtime_checkable
 class HasAppearance(Protocol):
     """A model that can learn an appearance vector for each image."""
 

@@ -32,7 +32,7 @@ from framework.splats.drawing import draw, draw_view, on_image, splat_camera
 from framework.splats.gaussians import MAX_DEGREE, Gaussians
 from framework.splats.mcmc import moved, shaken
 from framework.splats.redrawn import Redrawn
-from framework.splats.resolution import doubled, halved
+from framework.splats.resolution import doubled, halved, halved_distances
 from framework.splats.start import PLACES, first_points, from_points, scene_size, seen_colors
 from framework.splats.table import Table
 from framework.tools.surfaces import found_surfaces
@@ -47,6 +47,12 @@ NOISE, OPACITY_PENALTY, SCALE_PENALTY = 5e5, 0.002, 0.01
 penalty, which at a few hundred steps of a higher rate left too few of them."""
 LARGE_IMAGE = 250_000
 """Pixels from which training begins with images of half the size."""
+LONG_RUN, NEVER = 15_000, 10**9
+"""Steps of a run in which opacity is reset, which it takes a thousand steps to recover from."""
+RESET_WORDS = {
+    True: ("the run is long", "resets of opacity", "every 3,000 steps"),
+    False: ("the run is too short to recover from one", "resets of opacity", "none"),
+}
 WITHOUT_IMAGES = 1_000
 """Maximum number of Gaussians of a model that has seen no images yet."""
 FIELD_SHARE = 0.2
@@ -110,8 +116,8 @@ class GaussianSplattingConfig(
     """Share of the budget after which no Gaussian is added or moved."""
     steps_per_move: int = 100
     """Steps between two changes of the Gaussians' number."""
-    steps_per_reset: int = 3_000
-    """Steps after which strategy adc makes all Gaussians nearly transparent."""
+    steps_per_reset: Auto[int] = AUTO
+    """Steps after which strategy adc makes all Gaussians nearly transparent; by the budget if not given."""
     noise: float | None = None
     """Noise of nearly transparent Gaussians, times the learning rate of centres; by the start if not given."""
     opacity_penalty: float | None = None
@@ -148,25 +154,18 @@ def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplat
     large = PIXELS_PER_SECOND / speed > LARGE_IMAGE
     detail = "large images can wait" if large else "the images are small"
     first, most = max(config.num_gaussians * 2 // 3, 1), 800 if scene.unbounded else 400
+    resets, varies = speed * seconds >= LONG_RUN, scene.appearance_varies
+    poses = "SO3xR3" if scene.poses == "device" else "off"
     config, more = fill(
         config,
         Choice("start_gaussians", first, "the others are added", "Gaussians at the start", f"{first:,}"),
         Choice("field_steps", int(min(max(2 * seconds, 120), most)), why, "steps of a field to start from"),
         Choice("reduced_until", 0.4 if large else 0.0, detail, "share of the budget with images of half the size"),
+        Choice("steps_per_reset", 3_000 if resets else NEVER, *RESET_WORDS[resets]),
         Choice("rate_factor", round(factor, 2), "fewer steps have to go farther", "factor of learning rates"),
-        Choice(
-            "appearance",
-            scene.appearance_varies,
-            LIGHT_REASONS[scene.appearance_varies],
-            "colour transforms of images",
-        ),
+        Choice("appearance", varies, LIGHT_REASONS[varies], "colour transforms of images"),
         Choice("depth_loss_mult", 0.1 if scene.has_depth else 0.0, DEPTH_REASONS[scene.has_depth], "depth loss"),
-        Choice(
-            "camera_optimizer",
-            "SO3xR3" if scene.poses == "device" else "off",
-            POSE_REASONS[scene.poses],
-            "pose refinement",
-        ),
+        Choice("camera_optimizer", poses, POSE_REASONS[scene.poses], "pose refinement"),
     )
     return config, made + more
 
@@ -269,7 +268,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         if kind != "field":
             points = first_points(kind, dataset, count)
             first = from_points(points, seen_colors(points, dataset), self.config.degree)
-        self.extent.fill_(scene_size(self.scene, first.means))
+        self.extent.fill_(scene_size(self.scene, first.means, dataset.cameras))
         self.set_gaussians(first)
         self.found.fill_(kind == "field")
         say(f"  {len(first):,} Gaussians start {PLACES[kind]}")
@@ -311,11 +310,11 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
             target = torch.where(kept[..., None], target, rgb.detach())
         terms = {"rgb": photometric_loss(rgb, target, config.ssim_weight)}
         if known is not None:
-            known = known if reduced == 1 else known[::2, ::2][: rgb.shape[0], : rgb.shape[1]]
+            known = known if reduced == 1 else halved_distances(known)
             terms["depth"] = config.depth_loss_mult * mean_depth_error(drawn.image[..., 3], drawn.transmittance, known)
-        if (weight := self._chosen(config.opacity_penalty, OPACITY_PENALTY)) > 0:
+        if (weight := self._chosen(config.opacity_penalty, OPACITY_PENALTY)) > 0 and len(gaussians):
             terms["opacity"] = weight * torch.sigmoid(gaussians.logits).mean()
-        if (weight := self._chosen(config.scale_penalty, SCALE_PENALTY)) > 0:
+        if (weight := self._chosen(config.scale_penalty, SCALE_PENALTY)) > 0 and len(gaussians):
             terms["scale"] = weight / self.extent * gaussians.log_scales.exp().mean()
         return Loss(terms, rgb.detach() if reduced == 1 else doubled(rgb.detach(), batch.rgb))
 
@@ -357,8 +356,8 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
 
     def _changed(self, kept: Tensor, fresh: Gaussians) -> list[RowChange]:
         fresh = replace(fresh, means=fresh.means / self.extent)
-        rows = (values.reshape(len(fresh), -1) for values in vars(fresh).values())
-        return [RowChange(p, kept, values) for p, values in zip(self.parameters_of_gaussians(), rows, strict=True)]
+        rows = zip(self.parameters_of_gaussians(), vars(fresh).values(), strict=True)
+        return [RowChange(p, kept, values.reshape(len(fresh), p.shape[1])) for p, values in rows]
 
     def _densify(self, step: int, most: int) -> list[RowChange]:
         mean = self.gradients.take(len(self.means.values))

@@ -1,12 +1,14 @@
 """Instant-NGP: a multiresolution hash grid, two small networks and an occupancy grid.
 
-Mueller et al., "Instant Neural Graphics Primitives with a Multiresolution Hash Encoding", SIGGRAPH 2022.
+Mueller et al., "Instant Neural Graphics Primitives with a Multiresolution Hash Encoding", SIGGRAPH 2022. With
+`--background-model sphere` a second grid shows what is outside of a sphere, as in NeRF++ (Zhang et al. 2020).
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 from framework import Decision, Method, Scene
@@ -14,8 +16,12 @@ from framework.base.config import AUTO, Auto, Range
 from framework.base.decisions import Choice, fill
 from framework.encodings.hash_grid import HashGrid
 from framework.fields.encoded import EncodedField
+from framework.fields.inverted import InvertedField
 from framework.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
-from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_choice
+from framework.rendering.background import background_renderer
+from framework.samplers.background import BackgroundConfig, decide_background, foreground
+from framework.samplers.choice import contracted_box
+from framework.samplers.inside import make_foreground_sampler
 from framework.scene.few_images import FewImagesConfig, decide_few_images
 
 PLANS = (
@@ -35,7 +41,7 @@ updates were 0.21 dB better."""
 
 @dataclass(frozen=True)
 class InstantNGPConfig(
-    SamplingConfig,
+    BackgroundConfig,
     FewImagesConfig,
     max_num_iterations=20_000,
     num_rays_per_batch=8_192,
@@ -93,9 +99,9 @@ def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, li
     seconds = math.inf if config.max_seconds is None else config.max_seconds
     limit, log2_table_size, num_steps, samples, detail = next(plan for plan in PLANS if seconds <= plan[0])
     suits = "that suits the time" if limit < math.inf else "there is time for it"
-    config, made = fill(
+    config, made = decide_background(config, scene)
+    config, sizes = fill(
         config,
-        sampler_choice(config, scene.unbounded),
         Choice("log2_table_size", log2_table_size, suits),
         Choice("num_steps", num_steps, suits, "steps along the box's diagonal"),
         Choice("samples_per_batch", samples, suits, "samples a step"),
@@ -114,7 +120,7 @@ def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, li
         Choice("sparse_updates", pays, f"tables have 2^{config.log2_table_size} entries a level"),
     )
     config, few = decide_few_images(config, scene)
-    return config, made + more + few
+    return config, made + sizes + more + few
 
 
 def make_field(config: InstantNGPConfig, scene: Scene) -> EncodedField:
@@ -124,7 +130,29 @@ def make_field(config: InstantNGPConfig, scene: Scene) -> EncodedField:
         config: the method's settings, none left open.
         scene: properties of the data.
     """
-    grid = HashGrid(
+    scene = foreground(config, scene)
+    return EncodedField(
+        scene.box,
+        _grid(config),
+        config.hidden_width,
+        direction_levels=4 if config.view_dependence else 0,
+        unbounded=contracted_box(config, scene) is not None,
+        opening=config.open_levels_until > 0,
+    )
+
+
+def make_background(config: InstantNGPConfig, scene: Scene) -> InvertedField:
+    """Return a field of the same sizes for what is outside of the sphere.
+
+    Args:
+        config: the method's settings, none left open.
+        scene: properties of the data; not used.
+    """
+    return InvertedField(_grid(config), config.hidden_width, 4 if config.view_dependence else 0)
+
+
+def _grid(config: InstantNGPConfig) -> HashGrid:
+    return HashGrid(
         config.num_levels,
         config.features_per_level,
         config.base_resolution,
@@ -133,14 +161,13 @@ def make_field(config: InstantNGPConfig, scene: Scene) -> EncodedField:
         config.sparse_updates,
         opening=config.open_levels_until > 0,
     )
-    return EncodedField(
-        scene.box,
-        grid,
-        config.hidden_width,
-        direction_levels=4 if config.view_dependence else 0,
-        unbounded=contracted_box(config, scene) is not None,
-        opening=config.open_levels_until > 0,
-    )
 
 
-METHOD = Method(InstantNGPConfig(), paper="arXiv:2201.05989", field=make_field, sampler=make_sampler, decide=decide)
+METHOD = Method(
+    InstantNGPConfig(),
+    paper="arXiv:2201.05989",
+    field=make_field,
+    sampler=make_foreground_sampler,
+    renderer=partial(background_renderer, make_field=make_background),
+    decide=decide,
+)

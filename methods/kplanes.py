@@ -169,7 +169,7 @@ def decide(config: KPlanesConfig, scene: Scene) -> tuple[KPlanesConfig, list[Dec
     )
     config, few = decide_few_images(config, scene)
     config, motion = decide_motion(config, scene, config.sampler)
-    sliced = scene.moving and config.time_slices > 1
+    sliced = scene.moving and config.time_slices > 1 and not scene.unbounded  # nested boxes have no slices
     cells = Choice("grid_resolution", 64 if sliced else 128, "each slice of time has cells of its own")
     times = f"the images have {scene.num_times} times"
     axis = Choice("time_resolution", vertices_in_time(scene), times, "vertices along time")

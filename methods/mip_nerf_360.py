@@ -24,9 +24,10 @@ from framework.fields.integrated import IntegratedDensity, IntegratedField
 from framework.fields.sized import SizedDensity, SizedField
 from framework.kernels.frequency import MAX_FREQUENCIES
 from framework.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
-from framework.rendering.losses import charbonnier, normalised_distortion
+from framework.rendering.losses import charbonnier
 from framework.samplers.choice import COARSEST_PROPOSAL, SamplingConfig, contracted_box, make_sampler, sampler_choice
 from framework.samplers.proposal import LEARN_EVERY, half_edge
+from methods._captures import distortion_term
 
 DISTORTION = 0.01
 """Default weight of the distortion loss in unbounded scenes, the paper's."""
@@ -114,10 +115,7 @@ class MipNeRF360(RayModel[MipNeRF360Config]):
         return charbonnier(rgb, batch.rgb, batch.weights)
 
     def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
-        weight, samples, weights = self.config.distortion_loss_mult, rendered.samples, rendered.weights
-        if not weight or samples is None or weights is None or samples.edges is None or not samples.num_rays:
-            return {}
-        return {"distortion": weight * normalised_distortion(weights, samples)}
+        return distortion_term(rendered, self.config.distortion_loss_mult)
 
 
 def decide(config: MipNeRF360Config, scene: Scene) -> tuple[MipNeRF360Config, list[Decision]]:

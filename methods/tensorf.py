@@ -210,9 +210,12 @@ class TensoRF(RayModel[TensoRFConfig]):
         field.box.copy_(box)
 
     def _occupied_box(self) -> Tensor:
-        """Return corners (2, 3) around all occupied cells and a margin; the field's box if no cell is occupied."""
+        """Return corners (2, 3) around all occupied cells and a margin; the field's box if no cell is occupied.
+
+        Around nested boxes the field contracts space, and keeps its box.
+        """
         sampler, box = self.sampler, self.factors.box
-        if not isinstance(sampler, SkipsCells):
+        if not isinstance(sampler, SkipsCells) or self.factors.unbounded:
             return box.clone()
         n = sampler.resolution
         cells = sampler.occupied.nonzero().squeeze(-1)

@@ -2,7 +2,8 @@
 
 Mildenhall et al., "NeRF: Representing Scenes as Neural Radiance Fields for View Synthesis", ECCV 2020. With
 `--sampler occupancy`, one network of the same shape is sampled with an occupancy grid instead, which skips empty and
-hidden space (as in NerfAcc, Li et al. 2023).
+hidden space (as in NerfAcc, Li et al. 2023). With `--background-model sphere` a second network shows what is outside
+of a sphere, as in NeRF++ (Zhang et al. 2020).
 """
 
 from __future__ import annotations
@@ -11,13 +12,18 @@ from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
 
+from torch import Tensor
+
 from framework import Decision, Method, Sampler, Scene
 from framework.base.config import Range
 from framework.base.decisions import Choice, fill
 from framework.base.optimised import Optimised
 from framework.fields.nerf import NeRFField
 from framework.kernels.frequency import MAX_FREQUENCIES
-from framework.samplers.choice import HierarchicalConfig, contracted_box, make_sampler, sampler_choice
+from framework.rendering.background import background_renderer
+from framework.samplers.background import BackgroundConfig, decide_background, foreground
+from framework.samplers.choice import HierarchicalConfig, contracted_box
+from framework.samplers.inside import make_foreground_sampler
 from framework.scene.few_images import FewImagesConfig, decide_few_images
 
 OCCUPANCY_SAMPLES_PER_BATCH = 2**12
@@ -35,6 +41,7 @@ OPEN_UNTIL = 0.5
 @dataclass(frozen=True)
 class VanillaNeRFConfig(
     HierarchicalConfig,
+    BackgroundConfig,
     FewImagesConfig,
     max_num_iterations=200_000,
     num_rays_per_batch=4_096,
@@ -73,7 +80,7 @@ def decide(config: VanillaNeRFConfig, scene: Scene) -> tuple[VanillaNeRFConfig, 
     Returns:
         Settings without open ones, and a record of each that was filled in.
     """
-    config, made = fill(config, sampler_choice(config, scene.unbounded))
+    config, made = decide_background(config, scene)
     config, few = decide_few_images(config, scene, OPEN_UNTIL)
     made += few
     if config.sampler != "occupancy":
@@ -89,14 +96,29 @@ def make_field(config: VanillaNeRFConfig, scene: Scene) -> NeRFField:
         config: the method's settings, none left open.
         scene: properties of the data.
     """
+    return _network(config, contracted=contracted_box(config, foreground(config, scene)))
+
+
+def make_background(config: VanillaNeRFConfig, scene: Scene) -> NeRFField:
+    """Return the network of what is outside of the sphere, at points of the inverted sphere.
+
+    Args:
+        config: the method's settings, none left open.
+        scene: properties of the data; not used.
+    """
+    return _network(config, dims=4)
+
+
+def _network(config: VanillaNeRFConfig, contracted: Tensor | None = None, dims: int = 3) -> NeRFField:
     field = NeRFField(
         config.hidden_width,
         config.num_layers,
         skip=config.num_layers // 2 + 1,
         position_frequencies=config.position_frequencies,
         direction_frequencies=config.direction_frequencies,
-        contracted=contracted_box(config, scene),
+        contracted=contracted,
         opening=config.open_levels_until > 0,
+        dims=dims,
     )
     if config.sampler == "occupancy":
         field.optimised = Optimised(learning_rate=OCCUPANCY_RATE * config.learning_rate)
@@ -110,7 +132,14 @@ def sampler(config: VanillaNeRFConfig, scene: Scene) -> Sampler:
         config: the method's settings, none left open.
         scene: properties of the data.
     """
-    return make_sampler(config, scene, partial(make_field, config, scene))
+    return make_foreground_sampler(config, scene, partial(make_field, config, scene))
 
 
-METHOD = Method(VanillaNeRFConfig(), paper="arXiv:2003.08934", field=make_field, sampler=sampler, decide=decide)
+METHOD = Method(
+    VanillaNeRFConfig(),
+    paper="arXiv:2003.08934",
+    field=make_field,
+    sampler=sampler,
+    renderer=partial(background_renderer, make_field=make_background),
+    decide=decide,
+)

@@ -9,37 +9,22 @@ and Deschaintre 2023), and an image's exposure is an affine transform of its col
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 from torch import Tensor
 
-from framework import (
-    Cameras,
-    ConfigError,
-    Decision,
-    Field,
-    Method,
-    PixelBatch,
-    RayModel,
-    Rays,
-    Rendered,
-    Renderer,
-    Sampler,
-    Scene,
-)
+from framework import ConfigError, Decision, Field, Method, Rays, Rendered, Renderer, Sampler, Scene
 from framework.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
-from framework.base.decisions import Choice, fill
+from framework.base.decisions import Choice
 from framework.base.optimised import Optimised
-from framework.cameras.refinement import PoseRefinement
 from framework.encodings.multisampled import MultisampledHashGrid
 from framework.fields.appearance import AFFINE, Appearance, exposed
 from framework.fields.multisampled import MultisampledDensity, MultisampledField
 from framework.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
-from framework.rendering.losses import normalised_distortion
-from framework.samplers.choice import SamplingConfig, make_sampler, sampler_choice
-from framework.samplers.proposal import ProposalSampler, half_edge
-from framework.scene.reasons import LIGHT_REASONS, POSE_REASONS
-from methods.nerfacto import DISTORTION, NerfactoRenderer
+from framework.samplers.choice import make_sampler
+from framework.samplers.proposal import ProposalSampler
+from framework.scene.reasons import LIGHT_REASONS
+from methods._captures import CaptureConfig, CaptureModel, capture_renderer, decide_capture
 
 DECAY, DECAY_OF_OBJECTS = 0.1, 10.0
 """Default weight of the grids' decay, of captures and of objects before no background: the paper's."""
@@ -47,7 +32,7 @@ DECAY, DECAY_OF_OBJECTS = 0.1, 10.0
 
 @dataclass(frozen=True)
 class ZipNeRFConfig(
-    SamplingConfig,
+    CaptureConfig,
     AppearanceConfig,
     max_num_iterations=25_000,
     num_rays_per_batch=2_048,
@@ -65,9 +50,7 @@ class ZipNeRFConfig(
     RANGES: ClassVar[dict[str, Range]] = {
         "power_ladder": (-1e3, 1),
         "interlevel_blurs": (1e-6, 1),
-        "distortion_loss_mult": AT_LEAST_0,
         "hash_decay_mult": AT_LEAST_0,
-        "camera_learning_rate": AT_LEAST_0,
         "exposure_learning_rate": AT_LEAST_0,
         "num_levels": (1, MAX_LEVELS),
         "features_per_level": (1, 64),
@@ -80,27 +63,16 @@ class ZipNeRFConfig(
         "hidden_width": (1, 2**14),
     }
     """Allowed range of each numeric setting."""
-    contraction: Auto[bool] = AUTO
-    """Whether space outside the box is contracted. If not given: in unbounded scenes."""
     power_ladder: float = -1.5
     """Exponent of the power ladder by which distances are spaced where space is contracted."""
     interlevel_blurs: tuple[float, ...] = (0.03, 0.003)
     """Radius of the box that blurs the samples' histogram in the loss of each proposal, in normalised distance."""
-    distortion_loss_mult: Auto[float] = AUTO
-    """Weight of the distortion loss. If not given: nerfacto's 0.002 in unbounded scenes, else 0."""
     hash_decay_mult: Auto[float] = AUTO
     """Weight of the mean square of each level's features. If not given: 0.1, or 10 for objects without background."""
     exposure: Auto[bool] = AUTO
     """Whether each image has an affine transform of colours. If not given: if light or exposure differ between them."""
     exposure_learning_rate: float = 1e-3
     """Initial learning rate of these transforms."""
-    camera_optimizer: Literal["auto", "off", "SO3xR3", "SE3"] = "auto"
-    """Refinement of the training cameras' poses; auto: SO3xR3 if a device tracked them, else off."""
-    camera_learning_rate: float = 1e-3
-    """Initial learning rate of the poses."""
-    gradient_scaling: Auto[bool] = AUTO
-    """Whether gradients near cameras are scaled down, by squared distance up to half of the box's edge, against
-    floaters. If not given: in unbounded scenes."""
     num_levels: int = 8
     """Number of levels of the hash grid."""
     features_per_level: int = 4
@@ -131,7 +103,7 @@ class ZipNeRFConfig(
             )
 
 
-class ZipNeRF(RayModel[ZipNeRFConfig]):
+class ZipNeRF(CaptureModel[ZipNeRFConfig]):
     """A model with exposures of images, refined poses and the distortion loss.
 
     Args:
@@ -140,9 +112,6 @@ class ZipNeRF(RayModel[ZipNeRFConfig]):
         field: density and colour.
         sampler: chooses the samples along rays.
         renderer: turns samples into colours and depths.
-
-    Raises:
-        ConfigError: if poses are to be refined in normalised device coordinates or with another sampler than proposals.
     """
 
     def __init__(self, config: ZipNeRFConfig, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer) -> None:
@@ -151,60 +120,32 @@ class ZipNeRF(RayModel[ZipNeRFConfig]):
         if config.exposure:
             rate = config.exposure_learning_rate
             self.appearance = Appearance(AFFINE, scene.num_cameras, Optimised("exposures", rate))
-        self.poses: PoseRefinement | None = None
-        if config.camera_optimizer in ("SO3xR3", "SE3"):
-            if scene.warped:
-                raise ConfigError("--camera-optimizer: poses cannot be refined in normalised device coordinates")
-            if config.sampler != "proposal":
-                raise ConfigError("--camera-optimizer needs --sampler proposal: other samples have no gradient to rays")
-            self.poses = PoseRefinement(scene.num_cameras, config.camera_optimizer, scene.camera_to_worlds)
-            self.poses.optimised = Optimised("poses", config.camera_learning_rate, schedule="exponential")
-
-    def refined_cameras(self, cameras: Cameras) -> Cameras:
-        """Return the training cameras with refined poses, of M `cameras` with the poses of the data."""
-        return cameras if self.poses is None else self.poses.refined(cameras)
 
     def render(self, rays: Rays, background: Tensor) -> Rendered:
-        rendered = super().render(rays if self.poses is None else self.poses(rays), background)
+        rendered = super().render(rays, background)
         if self.appearance is None:
             return rendered
         vectors = self.appearance(rays.camera_indices, len(rays))
         return replace(rendered, rgb=exposed(rendered.rgb, rendered.accumulation, background, vectors))
 
-    def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
-        samples, weights, mult = rendered.samples, rendered.weights, self.config.distortion_loss_mult
-        if mult == 0 or samples is None or weights is None or samples.edges is None or not samples.num_rays:
-            return {}
-        return {"distortion": mult * normalised_distortion(weights, samples)}
-
 
 def decide(config: ZipNeRFConfig, scene: Scene) -> tuple[ZipNeRFConfig, list[Decision]]:
     """Return `config` with the settings filled in that depend on the `scene`, and a record of each."""
-    unbounded = scene.unbounded if config.contraction is None else config.contraction
-    config, made = fill(config, sampler_choice(config, unbounded))
-    contracted = unbounded and config.sampler == "proposal"
-    around = "there may be something outside the box" if contracted else "the scene ends at its box"
-    reason = f"contraction is {'on' if contracted else 'off'}"
     behind = "the images tell what is background" if scene.has_alpha else "the images show a background"
-    varies, refined = scene.appearance_varies, "SO3xR3" if scene.poses == "device" and not scene.warped else "off"
-    config, more = fill(
+    varies = scene.appearance_varies
+    return decide_capture(
         config,
-        Choice("contraction", contracted, around),
-        Choice("distortion_loss_mult", DISTORTION if contracted else 0.0, reason, "distortion loss"),
-        Choice("gradient_scaling", contracted, reason, "gradient scaling near cameras"),
+        scene,
         Choice("hash_decay_mult", DECAY_OF_OBJECTS if scene.has_alpha else DECAY, behind, "decay of the grids"),
         Choice("exposure", varies, LIGHT_REASONS[varies], "affine exposures"),
-        Choice("camera_optimizer", refined, POSE_REASONS[scene.poses], "pose refinement"),
     )
-    return config, made + more
 
 
 def make_field(config: ZipNeRFConfig, scene: Scene) -> MultisampledField:
     """Return a field of one multisampled hash grid and two small networks, by `config` and `scene`."""
     sizes = config.num_levels, config.features_per_level, config.base_resolution, config.max_resolution
     grid = MultisampledHashGrid(*sizes, config.log2_table_size, config.sparse_updates, config.hash_decay_mult)
-    unbounded = config.contraction and config.sampler == "proposal"
-    return MultisampledField(scene.box, grid, config.hidden_width, unbounded=unbounded)
+    return MultisampledField(scene.box, grid, config.hidden_width, unbounded=config.covers_space)
 
 
 def sampler(config: ZipNeRFConfig, scene: Scene) -> Sampler:
@@ -231,17 +172,12 @@ def sampler(config: ZipNeRFConfig, scene: Scene) -> Sampler:
     return made
 
 
-def renderer(config: ZipNeRFConfig, scene: Scene) -> Renderer:
-    """Return the renderer, with gradient scaling at the size of the `scene` if `config` has it."""
-    return NerfactoRenderer(half_edge(scene.box) if config.gradient_scaling else None, None)
-
-
 METHOD = Method(
     ZipNeRFConfig(),
     paper="arXiv:2304.06706",
     field=make_field,
     sampler=sampler,
-    renderer=renderer,
+    renderer=capture_renderer,
     model=ZipNeRF,
     decide=decide,
 )

@@ -17,6 +17,8 @@ import numpy as np
 import pytest
 import torch
 
+from tests.forked import Forks
+
 # Processes of tests share the cores (pytest -n auto), and small tensors gain nothing by a second thread. Tests that are
 # about threads ask for them.
 torch.set_num_threads(1)
@@ -82,6 +84,14 @@ def tiny(tmp_path: Path) -> Path:
 def shared_tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tiny data set that tests only read."""
     return write_tiny(tmp_path_factory.mktemp("data") / "ball")
+
+
+@pytest.fixture(scope="session")
+def forks() -> Iterator[Forks]:
+    """Runs programs in processes of their own, in which torch is imported already."""
+    found = Forks()
+    yield found
+    found.close()
 
 
 EditJson = Callable[[Callable[[dict[str, Any]], Any]], None]

@@ -4,8 +4,6 @@ import errno
 import io
 import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -19,6 +17,7 @@ from framework.base.errors import ConfigError, DataError
 from framework.data.dataset import Dataset, ParsedScene, load_dataset, read_image
 from framework.data.pixel_cache import MAGIC, PixelMemory, unpack
 from framework.data.pixel_store import FileStore
+from tests.forked import Forks, Program
 from tests.images import noise, parsed, write_noise
 
 SIZES = [(40, 30), (17, 23), (64, 48), (31, 31)]
@@ -153,23 +152,25 @@ load_dataset(parsed(paths, [(40, 30), (17, 23), (64, 48), (31, 31)]), "train", P
 """
 
 
-def other_process(scene: ParsedScene, folder: Path, kind: str) -> subprocess.Popen[bytes]:
-    arguments = [str(scene.image_paths[0].parent), str(folder), kind]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
-    return subprocess.Popen([sys.executable, "-c", KILLED, *arguments], env=environment, stderr=subprocess.DEVNULL)
+def other_process(scene: ParsedScene, folder: Path, kind: str) -> Program:
+    """A program that decodes the scene into the folder."""
+    return KILLED, [scene.image_paths[0].parent, folder, kind], {}
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
-def test_a_killed_run_leaves_nothing_that_is_used_and_is_cleaned_up_after(scene: ParsedScene, folder: Path) -> None:
-    assert other_process(scene, folder, "killed").wait() == -signal.SIGKILL
+def test_a_killed_run_leaves_nothing_that_is_used_and_is_cleaned_up_after(
+    scene: ParsedScene, folder: Path, forks: Forks
+) -> None:
+    (killed,) = forks.together(other_process(scene, folder, "killed"))
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert [name[:8] for name in files(folder)] == [".pixels-"]
     assert torch.equal(cached(scene, folder).pixels, load_dataset(scene, "train").pixels)
     assert [name[:7] for name in files(folder)] == ["pixels-"]
 
 
-def test_two_processes_may_write_at_once(scene: ParsedScene, folder: Path) -> None:
-    both = [other_process(scene, folder, "whole") for _ in range(2)]
-    assert [process.wait() for process in both] == [0, 0]
+def test_two_processes_may_write_at_once(scene: ParsedScene, folder: Path, forks: Forks) -> None:
+    both = forks.together(*[other_process(scene, folder, "whole")] * 2)
+    assert [process.returncode for process in both] == [0, 0], both
     assert len(files(folder)) == 1
     assert torch.equal(cached(scene, folder).pixels, load_dataset(scene, "train").pixels)
 
@@ -248,16 +249,14 @@ print(loading, training)
 
 
 @pytest.mark.parametrize(("limit", "least", "most"), [(10e6, 0, 30), (1e9, 60, 90)])
-def test_memory_stays_bounded(tmp_path: Path, limit: float, least: float, most: float) -> None:
+def test_memory_stays_bounded(tmp_path: Path, limit: float, least: float, most: float, forks: Forks) -> None:
     """60 MB of pixels, read at random for 150 batches: under a limit of 10 MB, and all in memory."""
     try:
         Path("/proc/self/clear_refs").write_text("5")
     except OSError:
         pytest.skip("this system does not tell the peak of a process's memory")
     write_noise(tmp_path / "images", [(500, 500)] * 80)
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-c", MEASURE, str(tmp_path / "images"), str(tmp_path / "cache"), str(limit)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    done = forks.run(MEASURE, tmp_path / "images", tmp_path / "cache", limit)
     assert done.returncode == 0, done.stderr
     loading, training = map(float, done.stdout.split())
     print(f"limit {limit / 1e6:.0f} MB: loading took {loading:.1f} MB more, training {training:.1f}")

@@ -49,7 +49,7 @@ def moving_trainer(name: str, data: Path, folder: Path, **changes: Any) -> Train
         scene=dataclasses.replace(still.scene, moving=True, num_cameras=2 * count),
     )
     (folder / "run").mkdir()
-    settings = {"max_num_iterations": 150, "max_eval_images": 0, **settings, **changes}
+    settings = {"max_num_iterations": 80, "max_eval_images": 0, **settings, **changes}
     return Trainer(tiny_run(method, data, folder / "run", **settings), moving, None)
 
 

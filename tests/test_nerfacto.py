@@ -122,7 +122,7 @@ def test_half_of_a_held_out_photograph_tells_the_others_appearance(shared_tiny: 
 
 def test_normals_are_learnt_and_shown(shared_tiny: Path, tmp_path: Path) -> None:
     """Of the ball, whose colours are its normals: pictures of the two agree."""
-    trainer = captured(shared_tiny, tmp_path, {}, predict_normals=True, max_num_iterations=150)
+    trainer = captured(shared_tiny, tmp_path, {}, predict_normals=True, max_num_iterations=90)
     trainer.train()
     assert {"normals", "orientation"} <= trainer.train_step().losses.keys()
     image = trainer.model.render_view(trainer.train_set.view(0), torch.ones(3))

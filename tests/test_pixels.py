@@ -8,9 +8,10 @@ import torch
 from scipy import stats
 
 from dataparsers.blender import Blender
+from framework.cameras.cameras import subpixels
 from framework.data.dataset import Dataset, load_dataset
 from framework.data.pixel_set import PixelSet
-from framework.data.pixels import composite, draw_batch, gather_colors, gather_colors_reference
+from framework.data.pixels import composite, draw_batch, draw_from_images, gather_colors, gather_colors_reference
 from tests.kernels.compiled import needs_kernels
 
 
@@ -67,6 +68,37 @@ def test_images_of_different_sizes_share_one_buffer() -> None:
     assert batch.rays.camera_indices is not None
     expected = torch.tensor([10.0, 200.0])[batch.rays.camera_indices] / 255
     torch.testing.assert_close(batch.rgb[:, 0], expected)
+
+
+def test_pixels_of_few_images_are_drawn_evenly(dataset: Dataset) -> None:
+    """Each image as often as any other, and each of its pixels: of all pixels, and of some that are to be drawn."""
+    some = PixelSet.of_pixels(torch.cat([torch.arange(5, 300), torch.arange(1203, 1210)]))  # of images 0 and 3 only
+    for data, images in ((dataset, 10), (replace(dataset, drawn=some), 2), (replace(dataset, drawn=some.listed()), 2)):
+        torch.manual_seed(0)
+        drawn = [draw_from_images(data, 100, 2) for _ in range(1000)]
+        owners = [torch.unique(pixels // 400, return_counts=True) for pixels in drawn]
+        assert {tuple(counts.tolist()) for _, counts in owners} == {(50, 50), (100,)}
+        counts = torch.bincount(torch.cat([numbers.repeat(3 - len(numbers)) for numbers, _ in owners]), minlength=10)
+        assert int((counts > 0).sum()) == images
+        assert stats.chisquare(counts[counts > 0].numpy()).pvalue > 1e-3
+        of_first = torch.bincount(torch.cat(drawn), minlength=4000)[:400]
+        possible = torch.arange(400) if data.drawn is None else torch.arange(5, 300)
+        assert int(of_first.sum() - of_first[possible].sum()) == 0
+        assert stats.chisquare(of_first[possible].numpy()).pvalue > 1e-3
+
+
+def test_some_pixels_of_a_batch_keep_what_belongs_to_them(dataset: Dataset) -> None:
+    torch.manual_seed(0)
+    batch = replace(draw_batch(dataset, 60, "random", subpixels=subpixels(4)), weights=torch.rand(60))
+    assert batch.rays.camera_indices is not None
+    chosen = batch.rays.camera_indices[::4] == 3
+    part = batch[chosen]
+    assert 0 < len(part) < 60
+    assert part.rays_per_pixel == 4
+    assert part.distances is None
+    for name in ("pixels", "rgb", "background", "alpha", "weights"):
+        assert torch.equal(getattr(part, name), getattr(batch, name)[chosen])
+    assert torch.equal(part.rays.directions, batch.rays.directions.view(60, 4, 3)[chosen].view(-1, 3))
 
 
 def test_compositing_of_opaque_images_changes_nothing() -> None:

@@ -1,5 +1,7 @@
 """Where batches come from: whole images, and what a source carries over to a changed data set."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -8,6 +10,7 @@ from framework.base.registry import load_method
 from framework.data.dataset import Dataset, load_dataset
 from framework.data.pixel_set import PixelSet
 from framework.data.sources import PixelSource, Request, ViewSource, make_source
+from framework.data.sparse_depth import SparseDepth
 from tests.images import write_noise
 
 SIZES = [(20, 10), (7, 30), (16, 16)]
@@ -86,3 +89,18 @@ def test_what_was_learnt_of_errors_goes_along_to_a_changed_data_set(images: Data
     other = PixelSource(images, "black", 0, by_error=True)
     other.restore(learnt)
     assert torch.equal(other.state(), learnt)
+
+
+def test_a_view_has_the_distances_of_its_sparse_points(images: Dataset) -> None:
+    ends = images.cameras.ends
+    pixels = torch.tensor([ends[0] + 3, ends[1], ends[1] + 7, ends[2] - 1, ends[2] + 5])
+    distances = torch.tensor([1.0, 2.0, 3.0, 4.0, 5.0])
+    known = replace(images, sparse_depth=SparseDepth(pixels, distances, torch.ones(5)))
+    source = ViewSource(known, "white", 7)
+    found = {batch.index: batch.distances for batch in (source.draw(Request(step, 0)) for step in range(len(images)))}
+    for index in range(len(images)):
+        expected = torch.zeros(ends[-1])
+        expected[pixels] = distances
+        shape = images.cameras.sizes[index]
+        assert torch.equal(found[index], expected[ends[index] : ends[index + 1]].view(*shape)), index  # type: ignore[arg-type]
+    assert ViewSource(images, "white", 7).draw(Request(0, 0)).distances is None

@@ -241,11 +241,11 @@ def test_points_teach_where_the_surface_is_and_that_space_before_it_is_empty(
     blind = dataclasses.replace(dataset, pixels=torch.full_like(dataset.pixels, 255))
     found = []
     for mult in (0.0, 0.05):
-        changes = {"max_num_iterations": 150, "max_eval_images": 0, "depth_loss_mult": mult}
+        changes = {"max_num_iterations": 80, "max_eval_images": 0, "depth_loss_mult": mult}
         run = tiny_run("nerfacto", shared_tiny, tmp_path, **changes)
         run = dataclasses.replace(run, folder=tmp_path / f"{mult}")
         trainer = Trainer(run, blind, None)
-        for _ in range(150):
+        for _ in range(80):
             trainer.train_step()
         known = dataset.sparse_depth
         batch = gather_batch(blind, known.pixels, torch.ones(len(known), 3))

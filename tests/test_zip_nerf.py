@@ -15,13 +15,10 @@ from framework.geometry.multisamples import Pattern
 from framework.geometry.points import Frustums, Points
 from framework.kernels.multisampled_grid import multisampled_grid_reference
 from framework.kernels.multisamples import unit_multisamples_reference
-from framework.tools.testing.check import check_method
 from framework.training.trainer import Trainer
-from methods.nerfacto import NerfactoRenderer
-from methods.zip_nerf import METHOD, ZipNeRFConfig
-from tests.training.helpers import TINY, tiny_run, tiny_trainer
-
-SMALL = dataclasses.replace(ZipNeRFConfig(), **TINY["zip-nerf"])
+from methods._captures import CaptureRenderer
+from methods.zip_nerf import ZipNeRFConfig
+from tests.training.helpers import tiny_run, tiny_trainer
 
 
 def captured(data: Path, folder: Path, facts: dict[str, object], **settings: object) -> Trainer:
@@ -57,7 +54,7 @@ def test_a_capture_gets_what_it_needs(shared_tiny: Path, tmp_path: Path) -> None
     assert (found["pose refinement"], found["decay of the grids"]) == ("SO3xR3", "0.1")
     trainer.train()
     model = trainer.model
-    assert isinstance(model.renderer, NerfactoRenderer)
+    assert isinstance(model.renderer, CaptureRenderer)
     assert model.renderer.unit_length is not None
     assert bool((model.poses.tangents != 0).any())
     assert bool((model.appearance.vectors != 0).any())
@@ -81,12 +78,6 @@ def test_it_learns(unbounded: bool, shared_tiny: Path, tmp_path: Path) -> None:
     trainer.train()
     assert trainer.state.skipped == 0
     assert trainer.train_step().losses["rgb"] < first / 3
-
-
-def test_it_fulfils_what_is_asked_of_methods() -> None:
-    findings = check_method(METHOD, "zip-nerf", SMALL)
-    assert [finding for finding in findings if not finding.ok] == []
-    assert len(findings) > 15
 
 
 def test_a_number_for_each_proposal_is_needed() -> None:
@@ -172,7 +163,7 @@ def test_images_of_other_exposure_get_transforms_of_their_own(shared_tiny: Path,
     dimmed[:, :3] = (still.pixels[:, :3] * factors[:, None]).round().to(torch.uint8)
     varied = dataclasses.replace(still, pixels=dimmed, scene=dataclasses.replace(still.scene, appearance_varies=True))
     (tmp_path / "run").mkdir()
-    settings = {"max_eval_images": 0, "max_num_iterations": 120, "exposure_learning_rate": 1e-2}
+    settings = {"max_eval_images": 0, "max_num_iterations": 70, "exposure_learning_rate": 1e-2}
     trainer = Trainer(tiny_run("zip-nerf", shared_tiny, tmp_path / "run", **settings), varied, None)
     trainer.train()
     grey = affine_of(trainer.model.appearance.vectors.detach())

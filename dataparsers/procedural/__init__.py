@@ -1,12 +1,13 @@
 """The embedded scene: solids with exact depth and normals, rendered in seconds, used if no data is given.
 
 It is rendered once, in the blender format, to the user's cache folder (NERFLOOM_CACHE, else XDG_CACHE_HOME, else
-~/.cache), and read from there.
+~/.cache), and read from there. With `--num-scenes` there are many random scenes instead, for methods that learn from
+scenes.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from torch import Tensor
@@ -28,11 +29,16 @@ class Procedural(DataParser):
     size: int = 200
     """Width and height of the images, pixels."""
     num_train: int = 80
-    """Number of training images."""
+    """Number of training images of the embedded scene."""
     moving: bool = False
     """Use the moving variant of the scene."""
     scene_seed: int = 0
-    """Seed of the camera positions."""
+    """Seed of the camera positions, and of random scenes."""
+    num_scenes: int = 1
+    """Number of scenes to learn from; with more than one, each is another random arrangement of balls and boxes, and
+    the held-out images are of further ones."""
+    views_per_scene: int = 12
+    """Images of each of many scenes. Of a held-out scene every fourth is judged, and the others are given."""
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
@@ -43,7 +49,12 @@ class Procedural(DataParser):
             raise DataError(f"the embedded scene reads no data; leave out --data {path}")
         if self.size < 1 or self.num_train < 1:
             raise DataError("--size and --num-train must be at least 1")
-        return Blender().parse(self._rendered_folder(), split)
+        if self.num_scenes < 1 or self.views_per_scene < 4:
+            raise DataError("--num-scenes must be at least 1, and --views-per-scene at least 4")
+        if self.num_scenes > 1 and self.moving:
+            raise DataError("--moving is a variant of the embedded scene: leave out --num-scenes or --moving")
+        parsed = Blender().parse(self._rendered_folder(), split)
+        return parsed if self.num_scenes == 1 else _of_many(parsed, split)
 
     def signed_distance(self, points: Tensor) -> Tensor:
         """Return the distance (N,) from `points` (N, 3) to the nearest surface of the scene at time 0."""
@@ -53,19 +64,38 @@ class Procedural(DataParser):
 
     def _rendered_folder(self) -> Path:
         """Return the scene's folder; render the scene first if it is not in the cache."""
-        from dataparsers.procedural.views import write_dataset  # only if it must be rendered
-
-        kind = "moving" if self.moving else "static"
-        folder = cache_folder() / f"procedural-v{VERSION}-{kind}-{self.size}px-{self.num_train}-seed{self.scene_seed}"
+        kind, count = "moving" if self.moving else "static", str(self.num_train)
+        if self.num_scenes > 1:
+            kind, count = f"{self.num_scenes}-scenes", str(self.views_per_scene)
+        folder = cache_folder() / f"procedural-v{VERSION}-{kind}-{self.size}px-{count}-seed{self.scene_seed}"
         if not folder.is_dir():
-            say(f"rendering the embedded scene into {folder}")
-            counts = {"train": self.num_train, "val": 8, "test": 16}
+            say(f"rendering {'the embedded scene' if self.num_scenes == 1 else 'random scenes'} into {folder}")
             try:
-                write_dataset(
-                    folder, size=self.size, counts=counts, moving=self.moving, seed=self.scene_seed, progress=track
-                )
+                self._render(folder)
             except OSError as error:
                 raise DataError(
                     f"cannot write {folder}: {error.strerror}; set NERFLOOM_CACHE to a writable folder"
                 ) from error
         return folder
+
+    def _render(self, folder: Path) -> None:
+        if self.num_scenes > 1:
+            from dataparsers.procedural.many import write_scenes  # only if something must be rendered
+
+            views = self.views_per_scene
+            write_scenes(
+                folder, size=self.size, num_scenes=self.num_scenes, views=views, seed=self.scene_seed, progress=track
+            )
+            return
+        from dataparsers.procedural.views import write_dataset
+
+        counts = {"train": self.num_train, "val": 8, "test": 16}
+        write_dataset(folder, size=self.size, counts=counts, moving=self.moving, seed=self.scene_seed, progress=track)
+
+
+def _of_many(parsed: ParsedScene, split: Split) -> ParsedScene:
+    """Return parsed images with the scenes that they show."""
+    from dataparsers.procedural.many import what_is_shown
+
+    numbers, given = what_is_shown(parsed.image_paths, split)
+    return replace(parsed, scene_indices=numbers, source_images=given)

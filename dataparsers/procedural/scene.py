@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -120,6 +120,7 @@ class Part(NamedTuple):
         yaw: rotation about z, radians.
         texture: function from positions (3, R) around its origin to albedo (3, R).
         gloss: strength of the specular reflection; 0 is matte, with the same colour from every direction.
+        shadow: whether it casts a shadow on the other solids.
     """
 
     shape: Shape
@@ -127,15 +128,20 @@ class Part(NamedTuple):
     yaw: float
     texture: Callable[[Tensor], Tensor]
     gloss: float
+    shadow: bool = True
 
 
+Parts = Mapping[str, Part]
+"""The solids of a scene by name."""
 _TOP = -0.45  # height of the plinth's upper face
 _BALL_ORBIT, _BALL_ANGLE = 0.56, math.radians(197.0)
 _BALL, _CUBE, _RING = Sphere(0.36), Box(0.26), Torus(0.27, 0.085)
 _BALL_CENTRE = (_BALL_ORBIT * math.cos(_BALL_ANGLE), _BALL_ORBIT * math.sin(_BALL_ANGLE), _TOP + _BALL.radius)
 
 PARTS: dict[str, Part] = {
-    "plinth": Part(Cylinder(1.15, 0.08), (0.0, 0.0, _TOP - 0.08), 0.0, _plinth_texture, 0.0),
+    "plinth": Part(  # all other parts are above it
+        Cylinder(1.15, 0.08), (0.0, 0.0, _TOP - 0.08), 0.0, _plinth_texture, 0.0, shadow=False
+    ),
     "ball": Part(_BALL, _BALL_CENTRE, 0.0, lambda p: _blend(_RED, _RED, p[0]), 1.0),
     "box": Part(_CUBE, (0.60, -0.10, _TOP + 0.26), 0.45, lambda p: _box_texture(p, _CUBE.half), 0.0),
     "ring": Part(_RING, (0.08, 0.62, _TOP + 0.355), -0.35, lambda p: _ring_texture(p, _RING.major), 0.0),
@@ -145,7 +151,7 @@ PARTS: dict[str, Part] = {
     "string": Part(Cylinder(0.015, 0.11), (0.0, 0.0, 0.39), 0.0, lambda p: _blend(_BRASS, _BRASS, p[0]), 0.0),
     "bob": Part(Sphere(0.13), (0.0, 0.0, 0.16), 0.0, _bob_texture, 0.0),
 }
-_NAMES = tuple(PARTS)
+"""The solids of the embedded scene by name; the ball and the box are those that can move."""
 _LIGHT_AZIMUTH, _LIGHT_HEIGHT = math.radians(-118.0), math.radians(54.0)
 LIGHT: Colour = (  # unit vector towards the sun
     math.cos(_LIGHT_HEIGHT) * math.cos(_LIGHT_AZIMUTH),
@@ -164,7 +170,7 @@ class Hit(NamedTuple):
         normals: (R, 3) outward unit normals in world axes, zero without hit.
         rgb: (R, 3) display colour in [0, 1], zero without hit.
         hit: (R,) bool, the alpha of a single ray.
-        part: (R,) int64 index into `PARTS`, -1 without hit.
+        part: (R,) int64 index of the solid, -1 without hit.
     """
 
     depth: Tensor
@@ -175,14 +181,15 @@ class Hit(NamedTuple):
 
 
 class _Pose(NamedTuple):
-    """Pose of a part at some time: centre (3, 1 or R), cosine and sine of the yaw (1 or R,)."""
+    """A part with its pose at some time: centre (3, 1 or R), cosine and sine of the yaw (1 or R,)."""
 
+    part: Part
     centre: Tensor
     cosine: Tensor
     sine: Tensor
 
     def pick(self, index: Tensor) -> _Pose:
-        return self if self.cosine.numel() == 1 else _Pose(*(value[..., index] for value in self))
+        return self if self.cosine.numel() == 1 else _Pose(self.part, *(value[..., index] for value in self[1:]))
 
     def to_local(self, v: Tensor) -> Tensor:
         return torch.stack([self.cosine * v[0] + self.sine * v[1], self.cosine * v[1] - self.sine * v[0], v[2]])
@@ -191,11 +198,11 @@ class _Pose(NamedTuple):
         return torch.stack([self.cosine * v[0] - self.sine * v[1], self.cosine * v[1] + self.sine * v[0], v[2]])
 
 
-def _poses(time: float | Tensor, like: Tensor) -> list[_Pose]:
-    """Return the pose of every part. The ball moves along an arc in two bounces, and the box rotates."""
+def _poses(time: float | Tensor, like: Tensor, parts: Parts = PARTS) -> list[_Pose]:
+    """Return every part with its pose. The ball moves along an arc in two bounces, and the box rotates."""
     t = torch.as_tensor(time, dtype=like.dtype, device=like.device).reshape(-1)
     poses = []
-    for name, part in PARTS.items():
+    for name, part in parts.items():
         centre, yaw = like.new_tensor(part.centre)[:, None], like.new_tensor([part.yaw])
         if name == "ball":
             angle = _BALL_ANGLE + math.radians(76.0) * t
@@ -203,7 +210,7 @@ def _poses(time: float | Tensor, like: Tensor) -> list[_Pose]:
             centre = torch.stack([_BALL_ORBIT * angle.cos(), _BALL_ORBIT * angle.sin(), height])
         elif name == "box":
             yaw = yaw + math.radians(120.0) * t
-        poses.append(_Pose(centre, yaw.cos(), yaw.sin()))
+        poses.append(_Pose(part, centre, yaw.cos(), yaw.sin()))
     return poses
 
 
@@ -218,8 +225,8 @@ def _first_hits(poses: list[_Pose], origins: Tensor, directions: Tensor) -> tupl
     """Return depth (R,) and index of the part (R,) for origins (3, 1 or R) and directions (3, R)."""
     depth = torch.full_like(directions[0], math.inf)
     part_index = torch.full_like(depth, -1, dtype=torch.int64)
-    for index, (part, pose) in enumerate(zip(PARTS.values(), poses, strict=True)):
-        offset, nearest = _lines(pose, origins, directions)
+    for index, pose in enumerate(poses):
+        part, (offset, nearest) = pose.part, _lines(pose, origins, directions)
         near = ((dot(offset, offset) < part.shape.bound**2) & (nearest > -part.shape.bound)).nonzero()[:, 0]
         local, nearest = pose.pick(near), nearest[near]
         offset, direction = local.to_local(offset[:, near]), local.to_local(directions[:, near])
@@ -232,9 +239,7 @@ def _first_hits(poses: list[_Pose], origins: Tensor, directions: Tensor) -> tupl
 
 def _distance(poses: list[_Pose], p: Tensor) -> Tensor:
     """Return the signed distance (R,) of points (3, R) to the scene, negative inside a solid."""
-    distances = (
-        part.shape.distance(pose.to_local(p - pose.centre)) for part, pose in zip(PARTS.values(), poses, strict=True)
-    )
+    distances = (pose.part.shape.distance(pose.to_local(p - pose.centre)) for pose in poses)
     return functools.reduce(torch.minimum, distances)
 
 
@@ -242,8 +247,9 @@ def _sunlight(poses: list[_Pose], p: Tensor) -> Tensor:
     """Return the visible fraction (R,) of the sun at points (3, R), from the distance of the ray to each part."""
     visible = torch.ones_like(p[0])
     light = p.new_tensor(LIGHT)[:, None].expand_as(p)
-    for (name, part), pose in zip(PARTS.items(), poses, strict=True):
-        if name == "plinth":  # it casts no shadow on the other parts, which are above it
+    for pose in poses:
+        part = pose.part
+        if not part.shadow:
             continue
         offset, nearest = _lines(pose, p, light)
         reach = part.shape.bound + _LIGHT_SPREAD * nearest.clamp(min=0.0)
@@ -270,11 +276,11 @@ def _surroundings(d: Tensor) -> Tensor:
 def _shade(poses: list[_Pose], p: Tensor, normal: Tensor, view: Tensor, part_index: Tensor) -> Tensor:
     """Return display colours (3, R) of surface points (3, R) seen along unit `view` directions (3, R)."""
     albedo, gloss = torch.zeros_like(p), torch.zeros_like(p[0])
-    for index, (part, pose) in enumerate(zip(PARTS.values(), poses, strict=True)):
+    for index, pose in enumerate(poses):
         selected = (part_index == index).nonzero()[:, 0]
         local = pose.pick(selected)
-        albedo[:, selected] = part.texture(local.to_local(p[:, selected] - local.centre))
-        gloss[selected] = part.gloss
+        albedo[:, selected] = pose.part.texture(local.to_local(p[:, selected] - local.centre))
+        gloss[selected] = pose.part.gloss
     outside = p + 1e-3 * normal
     sun = _sunlight(poses, outside)
     facing = dot(normal, p.new_tensor(LIGHT)[:, None]).clamp(min=0.0)
@@ -295,7 +301,9 @@ def _shade(poses: list[_Pose], p: Tensor, normal: Tensor, view: Tensor, part_ind
     return (1.0 - (-1.35 * light).exp()).sqrt()  # compression of highlights, then display gamma
 
 
-def trace_rows(origins: Tensor, directions: Tensor, time: float | Tensor, colour: bool = True) -> Hit:
+def trace_rows(
+    origins: Tensor, directions: Tensor, time: float | Tensor, colour: bool = True, parts: Parts = PARTS
+) -> Hit:
     """Compute `trace` with vectors stored as rows.
 
     Args:
@@ -303,11 +311,12 @@ def trace_rows(origins: Tensor, directions: Tensor, time: float | Tensor, colour
         directions: (3, R) unit vectors.
         time: in [0, 1], a number or (R,).
         colour: whether to compute colours; otherwise they are zero.
+        parts: the solids of the scene.
 
     Returns:
         As `trace`, but normals and rgb as (3, R).
     """
-    poses = _poses(time, directions)
+    poses = _poses(time, directions, parts)
     depth, part_index = _first_hits(poses, origins, directions)
     normals, rgb = torch.zeros_like(directions), torch.zeros_like(directions)
     rays = (part_index >= 0).nonzero()[:, 0]
@@ -315,10 +324,10 @@ def trace_rows(origins: Tensor, directions: Tensor, time: float | Tensor, colour
     view, part = directions[:, rays], part_index[rays]
     p = (origins if origins.shape[1] == 1 else origins[:, rays]) + depth[rays] * view
     n = torch.zeros_like(p)
-    for index, (solid, pose) in enumerate(zip(PARTS.values(), poses, strict=True)):
+    for index, pose in enumerate(poses):
         selected = (part == index).nonzero()[:, 0]
         local = pose.pick(selected)
-        n[:, selected] = local.to_world(solid.shape.normal(local.to_local(p[:, selected] - local.centre)))
+        n[:, selected] = local.to_world(pose.part.shape.normal(local.to_local(p[:, selected] - local.centre)))
     normals[:, rays] = n
     if colour:
         rgb[:, rays] = _shade(poses, p, n, view, part)

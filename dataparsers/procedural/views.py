@@ -6,8 +6,9 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from dataparsers.procedural.scene import trace_rows
+from dataparsers.procedural.scene import PARTS, Parts, trace_rows
+from framework.kernels.native import torch_on_one_thread
 
 CAMERA_ANGLE = 0.6911
 """Horizontal field of view, radians, as in NeRF-Synthetic."""
@@ -25,8 +27,7 @@ RADIUS = 4.0
 """Distance of the cameras from the origin, scene units."""
 SUPERSAMPLE = 3
 """Rays along each side of a pixel."""
-# Below PyTorch's threshold for splitting an operation over threads, as views are rendered in parallel.
-_CHUNK_RAYS = 32_000
+_CHUNK_RAYS = 128_000  # fewer at once take longer to start operations, more leave the cache
 
 
 def _camera_rays(
@@ -65,7 +66,12 @@ def _render_geometry(
 
 
 def _render_rgba(
-    camera_to_world: npt.ArrayLike, camera_angle_x: float, size: tuple[int, int], time: float, supersample: int
+    camera_to_world: npt.ArrayLike,
+    camera_angle_x: float,
+    size: tuple[int, int],
+    time: float,
+    supersample: int,
+    parts: Parts,
 ) -> npt.NDArray[np.uint8]:
     """Return straight colour and coverage (H, W, 4) from supersample^2 float32 rays on a grid in every pixel."""
     column, row = (c.float() for c in _pixel_grid(size))
@@ -74,7 +80,7 @@ def _render_rgba(
     dy, dx = (c.flatten() for c in torch.meshgrid(steps, steps, indexing="ij"))
     for pixels in torch.arange(column.numel()).split(max(1, _CHUNK_RAYS // supersample**2)):
         x, y = ((c[pixels, None] + d).flatten() for c, d in ((column, dx), (row, dy)))
-        hit = trace_rows(*_camera_rays(camera_to_world, camera_angle_x, size, x, y), time)
+        hit = trace_rows(*_camera_rays(camera_to_world, camera_angle_x, size, x, y), time, parts=parts)
         samples = torch.cat([hit.rgb, hit.hit[None]]).reshape(4, -1, supersample**2)
         image[:, pixels] = samples.mean(2)
     image[:3] /= image[3].clamp(min=1e-6)
@@ -90,6 +96,7 @@ def render_view(
     time: float = 0.0,
     supersample: int = SUPERSAMPLE,
     geometry: bool = True,
+    parts: Parts = PARTS,
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32] | None, npt.NDArray[np.float32] | None]:
     """Render one view of the scene.
 
@@ -100,7 +107,8 @@ def render_view(
         width, height: size of the image, pixels.
         time: in [0, 1].
         supersample: rays along each side of a pixel.
-        geometry: whether to compute depth and normals.
+        geometry: whether to compute depth and normals; of the embedded scene only.
+        parts: the solids of the scene.
 
     Returns:
         rgba (H, W, 4) uint8, straight colour and covered fraction of the pixel; depth (H, W) float32 along the rays
@@ -108,7 +116,7 @@ def render_view(
         None without `geometry`.
     """
     size = (width, height)
-    rgba = _render_rgba(camera_to_world, camera_angle_x, size, time, supersample)
+    rgba = _render_rgba(camera_to_world, camera_angle_x, size, time, supersample, parts)
     if not geometry:
         return rgba, None, None
     return rgba, *_render_geometry(camera_to_world, camera_angle_x, size, time)
@@ -179,14 +187,28 @@ def write_dataset(
         OSError: if the folder cannot be written.
     """
     counts = counts or {"train": 80, "val": 8, "test": 16}
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
-    try:
+    with complete_folder(folder) as temporary:
         jobs = [job for split, count in counts.items() for job in _lay_out(temporary, split, count, moving, seed)]
-        with ThreadPoolExecutor() as pool:
+        with torch_on_one_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:  # a view on each core
             done = pool.map(lambda job: _write_view(*job, size=size), jobs)
             for _ in progress(done, "Rendering the embedded scene", len(jobs)):
                 pass
+
+
+@contextmanager
+def complete_folder(folder: Path) -> Iterator[Path]:
+    """Give the temporary name of a folder, which is renamed to `folder` when all is written, or removed if it fails.
+
+    Args:
+        folder: folder to create. If another process creates it meanwhile, its content is kept.
+
+    Raises:
+        OSError: if the folder cannot be written.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
+    try:
+        yield temporary
         try:
             temporary.rename(folder)
         except OSError:

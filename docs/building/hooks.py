@@ -1,4 +1,4 @@
-"""Hooks of MkDocs: a page for each method, made from the code, and equations as MathML, which needs no script."""
+"""Hooks of MkDocs: pages made from the code and from the notebooks, and equations as MathML, which needs no script."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import method_pages
+import notebook_pages
 from latex2mathml.converter import convert
 from mkdocs.structure.files import File, Files
 
@@ -16,11 +17,15 @@ EQUATION = re.compile(r'<(span|div) class="arithmatex">(.*?)</\1>', re.DOTALL)
 
 
 def on_config(config: Any) -> Any:
-    """Add every method to the menu, in alphabetical order, and every note that has no place in it yet."""
+    """Add every method to the menu, in alphabetical order, every notebook, and every note without a place in it yet."""
     notes = [f"notes/{file.name}" for file in sorted(Path(config.docs_dir, "notes").glob("*.md"))]
     for entry in config.nav:
         if "Methods" in entry:
             entry["Methods"] += [{name: f"methods/{name}.md"} for name in method_pages.methods()]
+        if "Python" in entry:
+            found = notebook_pages.notebooks(Path(config.docs_dir, "notebooks"))
+            pages = [{title: f"notebooks/{file.stem}.md"} for title, file in found.items()]
+            entry["Python"].append({"Notebooks": pages})
         if "How it works" in entry:
             placed = {path for page in entry["How it works"] for path in page.values()}
             entry["How it works"] += [note for note in notes if note not in placed]
@@ -28,7 +33,7 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Give every method a page: its hand-written text, if there is one, with what is known from its code."""
+    """Give a page to every notebook, and to every method: its own text, if any, with what is known from its code."""
     for name in method_pages.methods():
         path = f"methods/{name}.md"
         written = Path(config.docs_dir, path)
@@ -36,6 +41,8 @@ def on_files(files: Files, config: Any) -> Files:
         if (existing := files.get_file_from_path(path)) is not None:
             files.remove(existing)
         files.append(File.generated(config, path, content=method_pages.page(name, text)))
+    for file in notebook_pages.notebooks(Path(config.docs_dir, "notebooks")).values():
+        files.append(File.generated(config, f"notebooks/{file.stem}.md", content=notebook_pages.page(file)))
     return files
 
 

@@ -238,6 +238,18 @@ class RayConfig(TrainConfig):
 
 
 @dataclass(frozen=True)
+class SourceViewsConfig(RayConfig):
+    """Settings of a method that renders from images of the scene."""
+
+    RANGES: ClassVar[dict[str, Range]] = {"num_source_views": (1, 64), "images_per_batch": (1, 1024)}
+    """Allowed ranges."""
+    num_source_views: int = 3
+    """Images of the scene from which a view is rendered."""
+    images_per_batch: int = 4
+    """Images of which the pixels of a training step are; each is rendered from other images of its scene."""
+
+
+@dataclass(frozen=True)
 class AppearanceConfig(TrainConfig):
     """Settings of a method that learns an appearance for each image."""
 

@@ -23,6 +23,8 @@ class View:
     """Number of rays that are averaged for each pixel; that of the method's settings if None."""
     stride: int = 1
     """Distance in pixels between the rows and columns that are rendered, the first of which is at `stride // 2`."""
+    scene: int | None = None
+    """Number of the scene, where images show several; None for the only one, or the first."""
 
     @classmethod
     def of(cls, cameras: Cameras, index: int, times: Tensor | None = None, stride: int = 1) -> View:

@@ -16,6 +16,7 @@ from framework.cli.bench_flags import (
     AblationFlags,
     CacheFlags,
     ContentionFlags,
+    CurvesFlags,
     FramesFlags,
     KernelFlags,
     MeshFlags,
@@ -25,6 +26,7 @@ from framework.cli.bench_flags import (
     PosesFlags,
     ProfileFlags,
     QuadratureFlags,
+    SamplersFlags,
     StartsFlags,
     ViewerBenchFlags,
 )
@@ -40,7 +42,9 @@ usage: ns-bench WHAT [flags]
   gpu              the same on a GPU, and PSNR after 2 to 60 seconds of training, in less than eight minutes
   quadrature       error of every sampler against field evaluations per ray, on scenes with a known integral
   methods          time to each PSNR of every built-in method, on the embedded scene or on --data
+  curves           PSNR against seconds of every method: a run for each of several budgets and seeds, in one picture
   ablation         effect of each part of instant-ngp: training with one part switched off, or on, in turn
+  samplers         an occupancy grid in nested boxes against proposals, on a capture, after the same times
   starts           where Gaussians start: time to a PSNR from points, a field's surfaces, silhouettes, or anywhere
   processes        time to each PSNR with one process and with several, started by torchrun, on the same cores
   profile-step     time of a training step: of each compiled kernel, and of Python and torch
@@ -117,12 +121,44 @@ def _methods(flags: MethodFlags) -> None:
         raise ConfigError(f"these methods failed: {', '.join(failed)}; {folder / 'report.html'} says why")
 
 
+def _curves(flags: CurvesFlags) -> None:
+    from framework.base.console import console
+    from framework.tools.benchmarks import curves
+    from framework.tools.comparison import plots
+
+    name = "procedural" if flags.data is None else flags.data.resolve().name
+    folder = flags.run_dir or Path("outputs") / f"curves-{name}"
+    path, picture = flags.output_dir / f"curves-{name}.json", flags.plot_dir / f"curves-{name}.svg"
+    plans = curves.plans(flags.methods, flags.data, flags.budgets, flags.seeds, flags.views, folder)
+    make_room(path)
+    make_room(picture)
+    found: list[curves.Budget] = []
+    for plan in plans:  # results and picture after every budget, so that there is something to look at early
+        found.append(curves.run(plan))
+        write_results(path, curves.published(plan, found))
+        if plots.available():
+            picture.write_text(curves.draw(plan, found), encoding="utf-8")
+        console.print(curves.table(plan, found))
+    say(f"picture: {picture}" if plots.available() else plots.MISSING)
+    failed = sorted({row.label for budget in found for row in budget.rows if row.failures})
+    if failed:
+        raise ConfigError(f"runs of these methods failed: {', '.join(failed)}; {path} says why")
+
+
 def _ablation(flags: AblationFlags) -> None:
     from framework.tools.benchmarks.ablation import measure
 
     path = flags.output_dir / f"ablation-{flags.data.resolve().name}.json"
     make_room(path)
     write_results(path, measure(flags.data, flags.seconds, flags.seeds, flags.target))
+
+
+def _samplers(flags: SamplersFlags) -> None:
+    from framework.tools.benchmarks.samplers import measure
+
+    path = flags.output_dir / f"samplers-{flags.data.resolve().name}.json"
+    make_room(path)
+    write_results(path, measure(flags.data, flags.methods, flags.seconds, flags.seed, tuple(flags.flags.split())))
 
 
 def _starts(flags: StartsFlags) -> None:
@@ -237,7 +273,9 @@ KINDS: dict[str, tuple[type, Any]] = {
     "gpu": (GpuFlags, measure_gpu),
     "quadrature": (QuadratureFlags, _quadrature),
     "methods": (MethodFlags, _methods),
+    "curves": (CurvesFlags, _curves),
     "ablation": (AblationFlags, _ablation),
+    "samplers": (SamplersFlags, _samplers),
     "starts": (StartsFlags, _starts),
     "processes": (ProcessesFlags, measure_processes),
     "profile-step": (ProfileFlags, _profile),

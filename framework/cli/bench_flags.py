@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from framework.cli.bench_results import RESULTS
+from framework.cli.bench_results import PICTURES, RESULTS
 
 
 @dataclass(frozen=True)
@@ -87,6 +87,32 @@ class MethodFlags:
     """Folder of a plot of PSNR over time; no plot if not given."""
 
 
+@dataclass(frozen=True)
+class CurvesFlags:
+    """Train methods from the start for each of several budgets, with several seeds; report PSNR against seconds.
+
+    Results and picture are written after each budget. What is in --run-dir is kept: the same command goes on where it
+    was stopped, and one with further methods, budgets or seeds trains these alone."""
+
+    data: Path | None = None
+    """Folder of the data set; the embedded scene if not given."""
+    methods: tuple[str, ...] = ()
+    """Methods, in quotes if with flags of their own: instant-ngp "vanilla-nerf --sampler occupancy". All installed ones
+    if not given."""
+    budgets: tuple[float, ...] = (10.0, 20.0, 45.0, 150.0, 300.0, 600.0)
+    """Seconds of training, each for runs of its own."""
+    seeds: int = 3
+    """Number of runs of each method with each budget."""
+    views: int = 50
+    """Maximum number of held-out views on which PSNR is measured, evenly spaced."""
+    run_dir: Path | None = None
+    """Folder of the runs; outputs/curves-DATA if not given."""
+    output_dir: Path = RESULTS
+    """Folder of curves-DATA.json."""
+    plot_dir: Path = PICTURES
+    """Folder of the picture, curves-DATA.svg."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class AblationFlags:
     """Train instant-ngp with one part switched off, or on, in turn; report the time to a PSNR and the final PSNR."""
@@ -101,6 +127,24 @@ class AblationFlags:
     """PSNR of the validation views, dB, to which the time is reported."""
     output_dir: Path = RESULTS
     """Folder of ablation-DATA.json."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SamplersFlags:
+    """Train methods on a capture with proposals and with an occupancy grid in nested boxes, for the same time."""
+
+    data: Path
+    """Folder of the data set."""
+    methods: tuple[str, ...] = ("nerfacto", "instant-ngp")
+    """Names of the methods."""
+    seconds: tuple[float, ...] = (60.0, 150.0, 600.0)
+    """Seconds of training of the runs."""
+    seed: int = 0
+    """Random seed."""
+    flags: str = ""
+    """Further flags of ns-train, as in --flags="--downscale-factor 4 --num-steps 256"."""
+    output_dir: Path = RESULTS
+    """Folder of samplers-DATA.json."""
 
 
 @dataclass(frozen=True, kw_only=True)

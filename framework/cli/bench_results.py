@@ -9,6 +9,8 @@ from framework.base.console import say
 
 RESULTS = Path("docs/results")
 """Default folder of the results."""
+PICTURES = Path("docs/pictures")
+"""Default folder of pictures."""
 
 
 def write_results(path: Path, content: dict[str, Any]) -> None:

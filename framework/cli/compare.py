@@ -38,9 +38,10 @@ class CompareFlags:
     output_dir: Path | None = None
     """Folder of runs and report; outputs/compare-DATA if not given."""
     max_eval_images: int | None = None
-    """Maximum number of held-out views of the final evaluation, evenly spaced; all if not given."""
+    """Maximum number of held-out views of the final evaluation, evenly spaced. If not given: one for each second of
+    training, at least 25; all without --max-seconds. The report says how many they are."""
     curve_images: int = 4
-    """Number of views of the evaluations during training."""
+    """Number of views of the evaluations during training; 0 for none."""
     num_threads: int | None = None
     """CPU threads of each run; all cores if not given."""
     device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
@@ -90,7 +91,7 @@ def plan_of(flags: CompareFlags) -> Plan:
         ConfigError: if a flag's value is invalid, or flags contradict each other.
     """
     from framework.data.data_folder import find_data
-    from framework.tools.comparison.plan import Conditions, Contender, Plan, split_words
+    from framework.tools.comparison.plan import Conditions, Contender, Plan, split_words, views_for
 
     if flags.data is not None and not os.path.isdir(flags.data):
         flags = replace(flags, data=find_data(flags.data)[0])
@@ -103,7 +104,7 @@ def plan_of(flags: CompareFlags) -> Plan:
         num_threads=flags.num_threads,
         device_type=flags.device_type,
         curve_images=flags.curve_images,
-        max_eval_images=flags.max_eval_images,
+        max_eval_images=views_for(flags.max_seconds) if flags.max_eval_images is None else flags.max_eval_images,
     )
     name = "procedural" if flags.data is None else flags.data.resolve().name
     folder = flags.output_dir or Path("outputs") / f"compare-{name}"

@@ -21,6 +21,8 @@ class EvalFlags:
     """JSON file to write. If not given: eval.json beside config.yml, or NAME.eval.json beside a file of Gaussians."""
     render_output_path: Path | None = None
     """Folder for each view's render, true image, and comparison (image, render, error, depth, opacity)."""
+    max_pictures: int | None = None
+    """Maximum number of views of which pictures are written to that folder, evenly spaced; all if not given."""
     load_checkpoint: Path | None = None
     """Checkpoint to load; the newest if not given."""
     data: Path | None = None
@@ -54,6 +56,8 @@ def _command(arguments: list[str]) -> None:
     flags = tyro.cli(EvalFlags, prog="ns-eval", args=words, config=(tyro.conf.FlagConversionOff,))
     if flags.max_images is not None and flags.max_images < 1:
         raise ConfigError(f"--max-images is {flags.max_images}; it must be at least 1")
+    if flags.max_pictures is not None and flags.max_pictures < 0:
+        raise ConfigError(f"--max-pictures is {flags.max_pictures}; it must be at least 0")
     from contextlib import nullcontext
 
     from framework.base.console import say
@@ -80,6 +84,7 @@ def _command(arguments: list[str]) -> None:
             dataset,
             max_images=flags.max_images,
             pictures=flags.render_output_path,
+            max_pictures=flags.max_pictures,
             round_to_uint8=flags.round_to_uint8,
         )
     say(f"{flags.split}: {evaluation.line()}")

@@ -24,6 +24,7 @@ from tyro.constructors import (
 
 from framework.base.config import LEFT_TO_DATA, AppearanceConfig, RayConfig, TrainConfig
 from framework.data.dataset import DataParser
+from framework.samplers.background import BackgroundConfig
 from framework.samplers.choice import HierarchicalConfig, SamplingConfig
 from framework.scene.few_images import FewImagesConfig
 from framework.scene.motion import MotionConfig
@@ -37,6 +38,7 @@ GROUPS: dict[str, tuple[str | type, ...]] = {
     ),
     OWN: (),
     "sampler": (SamplingConfig, HierarchicalConfig),
+    "background": (BackgroundConfig,),
     "ray": (RayConfig,),
     "appearance": (AppearanceConfig,),
     "few images": (FewImagesConfig,),

@@ -81,7 +81,7 @@ def _prepare(run: Run) -> Trainer:
     device = choose_device(run.config.machine)
     train_set = load_split(run, "train").to(device)
     eval_set = first_split(run, ("val", "test")) if processes().first else None
-    source = run.config.data or "the embedded scene"
+    source = run.config.data or ("the embedded scene" if train_set.scene.num_scenes == 1 else "random scenes")
     say(f"{run.method} on {source} ({run.dataparser}), on {device.type}, kernels: {kernels(device)}")
     if processes().count > 1:
         threads = torch.get_num_threads()

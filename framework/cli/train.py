@@ -106,7 +106,7 @@ def _read_run(path: Path) -> Run:
 def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
     """Return `run` with the settings of the method and the data format changed by flags, in any order.
 
-    Flags are parsed twice: first for --data and the format's name, then with the flags of both.
+    Flags are parsed with those of the data format, so that --data and the format's name must be found before.
     """
     import tyro
 
@@ -118,21 +118,26 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
     if (answer := vis_answer(_take(flags, "--vis")[0] or "")) is not None:
         raise ConfigError(answer)
     options = (tyro.conf.FlagConversionOff, tyro.conf.ConsolidateSubcommandArgs)
-    initial, unknown = tyro.cli(
-        type(run.config),
-        prog=f"ns-train {run.method}",
-        args=[flag for flag in flags if flag not in ("-h", "--help")],
-        default=run.config,
-        config=options,
-        return_unknown_args=True,
-    )
-    if (word := _stray_word(unknown)) is not None:
+    if _are_pairs(flags):
+        given, word = _take(flags, "--data")[0], None
+        asked = run.config.data if given is None else None if given == "None" else Path(given)
+    else:  # a word may belong to the flag before it or be a format's name: only the flags' types tell
+        initial, unknown = tyro.cli(
+            type(run.config),
+            prog=f"ns-train {run.method}",
+            args=[flag for flag in flags if flag not in ("-h", "--help")],
+            default=run.config,
+            config=options,
+            return_unknown_args=True,
+        )
+        asked, word = initial.data, _stray_word(unknown)
+    if word is not None:
         _check_format(word, run.method)
-        (data, named), flags = find_data(initial.data, word), _without(flags, word)
-    elif not run.dataparser or initial.data != run.config.data:
-        data, named = find_data(initial.data)
+        (data, named), flags = find_data(asked, word), _without(flags, word)
+    elif not run.dataparser or asked != run.config.data:
+        data, named = find_data(asked)
     else:
-        data, named = initial.data, run.dataparser
+        data, named = asked, run.dataparser
     parser = run.parser if named == run.dataparser else load_dataparser(named)()
 
     # One flat set of the flags of both, so that their order does not matter.
@@ -154,6 +159,20 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
     config = dataclasses.replace(parsed.method, data=data)
     folder = run_folder(run.method, config) if fresh else run.folder
     return dataclasses.replace(run, config=config, dataparser=named, parser=parsed.format, folder=folder)
+
+
+def _are_pairs(flags: list[str]) -> bool:
+    """Return whether the flags are `--name value` or `--name=value` and nothing else, and name --data at most once."""
+    index = 0
+    while index < len(flags):
+        has_value = "=" in flags[index]
+        if not flags[index].startswith("--") or flags[index] == "--help":
+            return False
+        if not has_value and (index + 1 == len(flags) or flags[index + 1].startswith("-")):
+            return False
+        index += 1 if has_value else 2
+    data = [flag for flag in flags if flag.partition("=")[0] == "--data"]
+    return len(data) <= 1 and not any(word in registered("dataparsers") for word in flags)
 
 
 def _check_format(word: str, method: str) -> None:

@@ -78,6 +78,10 @@ class ParsedScene:
     """M files of depth along the camera's axis, 0 where unknown; None for an image without depth."""
     depth_unit: float = 0.001
     """Units of the input per unit of a stored depth: 0.001 for an input in metres and depths in millimetres."""
+    scene_indices: Tensor | None = None
+    """(M,) int64 number of the scene that each image shows; None if all show the same."""
+    source_images: Tensor | None = None
+    """(M,) bool, images that a method may render the others from, and is not judged by; None if there are none."""
 
     def __getitem__(self, index: Tensor) -> ParsedScene:
         """Return the images selected by an index tensor."""
@@ -90,6 +94,8 @@ class ParsedScene:
             mask_paths=None if self.mask_paths is None else tuple(self.mask_paths[i] for i in chosen),
             depth_paths=None if self.depth_paths is None else tuple(self.depth_paths[i] for i in chosen),
             sightings=None if self.sightings is None else self.sightings.of_images(index),
+            scene_indices=None if self.scene_indices is None else self.scene_indices[index],
+            source_images=None if self.source_images is None else self.source_images[index],
         )
 
 
@@ -154,6 +160,10 @@ class Dataset:
     """Pixels in which images see sparse points, and their distances; None if there are none."""
     reductions: Tensor | None = None
     """(M,) int64 factor by which each image is smaller than it could be, if images are used at several sizes."""
+    scene_indices: Tensor | None = None
+    """(M,) int64 on the CPU, number of the scene that each image shows; None if all show the same."""
+    source_images: Tensor | None = None
+    """(M,) bool on the CPU, images that a method may render the others from, and is not judged by; None without."""
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -191,13 +201,14 @@ class Dataset:
         return pixels.view(height, width, -1)
 
     def view(self, index: int, stride: int = 1) -> View:
-        """Return the camera of image `index`, at its time.
+        """Return the camera of image `index`, at its time and in its scene.
 
         Args:
             index: which image.
             stride: only every so many-th row and column of its pixels.
         """
-        return View.of(self.cameras, index, self.times, stride)
+        view = View.of(self.cameras, index, self.times, stride)
+        return view if self.scene_indices is None else replace(view, scene=int(self.scene_indices[index]))
 
     def kept_of(self, index: int) -> Tensor | None:
         """Return which pixels of image `index` are kept, (H, W) bool, or None if all pixels of the data set are."""
@@ -331,6 +342,7 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         image_pixels=int(cameras.offsets[-1]) // len(cameras),
         num_sparse_depths=0 if sparse is None else len(sparse),
         num_times=0 if parsed.times is None else len(parsed.times.unique()),
+        num_scenes=1 if parsed.scene_indices is None else len(parsed.scene_indices.unique()),
     )
     return Dataset(
         pixels=decoded.pixels,
@@ -348,6 +360,8 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         mapped=decoded.mapped,
         points=parsed.points,
         sparse_depth=sparse,
+        scene_indices=parsed.scene_indices,
+        source_images=parsed.source_images,
     )
 
 

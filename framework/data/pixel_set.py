@@ -105,7 +105,7 @@ class PixelSet:
     def at(self, ranks: Tensor) -> Tensor:
         """Return the pixels (R,) int64 of given `ranks` (R,) in the set, counted from 0."""
         if self.every is not None:
-            return self.every[ranks].long()
+            return self.every.index_select(0, ranks).long()
         if ranks.device.type == "cpu":  # numpy takes one thread; a background thread must not start PyTorch's
             return torch.from_numpy(self._at(ranks.numpy()))
         runs = torch.searchsorted(self.before, ranks, right=True) - 1
@@ -115,6 +115,12 @@ class PixelSet:
         starts, before = self.starts.numpy(), self.before.numpy()
         runs = np.searchsorted(before, ranks, side="right") - 1
         return starts[runs] + (ranks - before[runs])
+
+    def ranks(self, pixels: Tensor) -> Tensor:
+        """Return how many pixels of the set come before each of the `pixels` (R,) int64, (R,) int64."""
+        runs = (torch.searchsorted(self.starts, pixels, right=True) - 1).clamp(min=0)
+        into = (pixels - self.starts[runs]).clamp(min=0)
+        return torch.minimum(self.before[runs] + into, self.before[runs + 1])
 
     def contains(self, pixels: Tensor) -> Tensor:
         """Return which of the `pixels` (R,) int64 are in the set, (R,) bool."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -52,13 +52,11 @@ class PixelBatch:
     def __len__(self) -> int:
         return self.pixels.shape[0]
 
-    def __getitem__(self, index: Tensor) -> PixelBatch:
-        """Return the pixels selected by an index tensor (Q,) int64."""
-        per_pixel = self.rays_per_pixel
-        rays = (index[:, None] * per_pixel + torch.arange(per_pixel, device=index.device)).view(-1)
-        others = (self.alpha, self.distances, self.deviations, self.clear, self.weights)
-        chosen = [None if values is None else values[index] for values in others]
-        return PixelBatch(self.pixels[index], self.rays[rays], self.rgb[index], self.background[index], *chosen)
+    def __getitem__(self, chosen: Tensor) -> PixelBatch:
+        """Return the pixels of a mask (R,) bool, with their rays."""
+        of_pixels = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rays"}
+        some: dict[str, Any] = {name: value[chosen] for name, value in of_pixels.items() if value is not None}
+        return replace(self, rays=self.rays[chosen.repeat_interleave(self.rays_per_pixel)], **some)
 
     @property
     def rays_per_pixel(self) -> int:
@@ -67,7 +65,7 @@ class PixelBatch:
 
 
 def thinned(batch: PixelBatch, share: float) -> tuple[PixelBatch, Tensor]:
-    """Return a batch without some of its transparent pixels, and which pixels (Q,) int64 are left.
+    """Return a batch without some of its transparent pixels, and which pixels (R,) bool are left.
 
     Those that are left count as many times more as there were, so that the mean of a loss has the same expectation.
 
@@ -77,9 +75,9 @@ def thinned(batch: PixelBatch, share: float) -> tuple[PixelBatch, Tensor]:
     """
     assert batch.alpha is not None
     transparent = batch.alpha == 0
-    kept = (~transparent | (torch.rand(len(batch), device=transparent.device) < share)).nonzero().squeeze(-1)
+    kept = ~transparent | (torch.rand(len(batch), device=transparent.device) < share)
     left = batch[kept]
-    weights = torch.where(transparent[kept], 1 / share, 1.0) * (len(kept) / max(len(batch), 1))
+    weights = torch.where(transparent[kept], 1 / share, 1.0) * (len(left) / max(len(batch), 1))
     return replace(left, weights=weights if left.weights is None else weights * left.weights), kept
 
 
@@ -100,7 +98,8 @@ class ViewBatch:
     kept: Tensor | None = None
     """(H, W) bool, pixels that count; None for all."""
     distances: Tensor | None = None
-    """(H, W) measured distance along each pixel's ray, 0 where unknown; None without depth images."""
+    """(H, W) distance along each pixel's ray, 0 where unknown: measured, or that of a reconstruction's point; None if
+    none is known."""
 
     def __len__(self) -> int:
         return self.rgb.shape[0] * self.rgb.shape[1]
@@ -146,6 +145,25 @@ def draw_pixels(dataset: Dataset, count: int) -> Tensor:
     return dataset.drawn.at(torch.randint(len(dataset.drawn), (count,), device=device))
 
 
+def draw_from_images(dataset: Dataset, count: int, num_images: int) -> Tensor:
+    """Draw `count` pixels of `num_images` images only, which are drawn too, by PyTorch's generator.
+
+    Args:
+        dataset: the images.
+        count: number of pixels.
+        num_images: number of images, each of which has about as many of the pixels; one may be drawn twice.
+    """
+    drawn, ends = dataset.drawn, dataset.cameras.offsets.to(dataset.pixels.device)
+    ranks = ends if drawn is None else drawn.ranks(ends)
+    sizes = ranks.diff()
+    some = sizes.nonzero()[:, 0]
+    images = some[torch.randint(len(some), (min(num_images, count),), device=some.device)]
+    images = images.repeat(-(-count // len(images)))[:count].sort().values
+    place = torch.rand(count, device=some.device, dtype=torch.float64)  # float32 could round up to the next image
+    chosen = ranks[images] + (place * sizes[images]).long()
+    return chosen if drawn is None else drawn.at(chosen)
+
+
 def draw_batch(
     dataset: Dataset,
     count: int,
@@ -154,6 +172,7 @@ def draw_batch(
     subpixels: Tensor = CENTER,
     look_up: LookUp | None = None,
     keypoints: int = 0,
+    num_images: int | None = None,
 ) -> PixelBatch:
     """Draw a batch of pixels.
 
@@ -169,10 +188,13 @@ def draw_batch(
         look_up: for pixels in a file, returns the stored colours of all drawn pixels, in the order of drawing
             (`PixelStream.look_up`).
         keypoints: number of these pixels that are drawn from `dataset.sparse_depth`; they stand last.
+        num_images: number of images of which the other pixels are; None for all.
     """
     uniform, sparse = count - keypoints, dataset.sparse_depth
     # Pixels are drawn before any other random number, so that `PixelStream` can predict them from the seed.
-    flat, stored = draw_pixels(dataset, uniform if errors is None else 2 * uniform), None
+    drawn = uniform if errors is None else 2 * uniform
+    flat = draw_pixels(dataset, drawn) if num_images is None else draw_from_images(dataset, drawn, num_images)
+    stored = None
     if dataset.mapped is not None:
         stored = (look_up or dataset.mapped.look_up)(flat).to(dataset.device)
         flat = flat.to(dataset.device)

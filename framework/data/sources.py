@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.base.config import RayConfig, TrainConfig
+from framework.base.config import RayConfig, SourceViewsConfig, TrainConfig
 from framework.base.processes import processes
 from framework.cameras.cameras import CENTER, subpixels
 from framework.cameras.view import View
@@ -29,6 +29,7 @@ from framework.data.pixels import (
     known_distances,
     training_background,
 )
+from framework.data.sparse_depth import SparseDepth
 
 
 @dataclass(frozen=True)
@@ -99,6 +100,7 @@ class PixelSource(BatchSource):
         by_error: whether half of the pixels are drawn with a probability proportional to their recent error.
         keypoints: share of the pixels that are drawn from those with a sparse depth, if there are any.
         clear: (M,) distances before which images show nothing; None if they are not to be learned from.
+        num_images: number of images of which the pixels of a step are; None for all.
     """
 
     def __init__(
@@ -109,8 +111,9 @@ class PixelSource(BatchSource):
         by_error: bool = False,
         keypoints: float = 0.0,
         clear: Tensor | None = None,
+        num_images: int | None = None,
     ) -> None:
-        self.clear = clear
+        self.clear, self.num_images = clear, num_images
         self.dataset, self.background, self.seed = dataset, background, seed
         self.keypoints = keypoints if dataset.sparse_depth is not None else 0.0
         self.errors = ErrorMap(dataset) if by_error else None
@@ -120,20 +123,24 @@ class PixelSource(BatchSource):
         offsets = CENTER if request.rays_per_pixel == 1 else subpixels(request.rays_per_pixel)
         look_up, keypoints = self._look_up(request.step), round(self.keypoints * request.num_pixels)
         count = request.num_pixels
-        batch = draw_batch(self.dataset, count, self.background, self.errors, offsets, look_up, keypoints)
+        batch = draw_batch(
+            self.dataset, count, self.background, self.errors, offsets, look_up, keypoints, self.num_images
+        )
         if self.clear is None or batch.rays.camera_indices is None:
             return batch
         return replace(batch, clear=self.clear[batch.rays.camera_indices[:: batch.rays_per_pixel]])
 
     def _look_up(self, step: int) -> LookUp | None:
-        """Return the function that looks up the colours of a step's pixels in a file; None if they are in memory."""
-        if self.dataset.mapped is None:
+        """Return the function that looks up a step's colours ahead in a file; None from memory, or of few images."""
+        if self.dataset.mapped is None or self.num_images is not None:
             return None
         self.stream = self.stream or PixelStream(self.dataset, self.seed)
         return partial(self.stream.look_up, step)
 
     def drawing_from(self, dataset: Dataset) -> PixelSource:
-        source = PixelSource(dataset, self.background, self.seed, keypoints=self.keypoints, clear=self.clear)
+        source = PixelSource(
+            dataset, self.background, self.seed, keypoints=self.keypoints, clear=self.clear, num_images=self.num_images
+        )
         source.errors = self.errors
         return source
 
@@ -165,6 +172,8 @@ class ViewSource(BatchSource):
         self._order: tuple[int, list[int]] | None = None
         self._views: dict[int, View] = {}
         """Views of images that have been drawn, whose sizes and lenses are read from the device once."""
+        self._sparse_ends: list[int] | None = None
+        """Where the sparse depths of each image begin, and where the last one's end."""
 
     def draw(self, request: Request) -> ViewBatch:
         dataset = self.dataset
@@ -184,11 +193,20 @@ class ViewSource(BatchSource):
     def _distances(self, index: int) -> Tensor | None:
         dataset = self.dataset
         if dataset.depths is None:
-            return None
+            return None if dataset.sparse_depth is None else self._sparse_distances(index, dataset.sparse_depth)
         pixels = dataset.cameras.image_pixels(index)
         rays = dataset.cameras.pixel_rays(pixels, dataset.scene.near, dataset.scene.far, dataset.times)
         found = known_distances(dataset, pixels, rays)
         return None if found is None else found.view(dataset.cameras.sizes[index][0], -1)
+
+    def _sparse_distances(self, index: int, known: SparseDepth) -> Tensor:
+        cameras = self.dataset.cameras
+        if self._sparse_ends is None:
+            self._sparse_ends = torch.searchsorted(known.pixels, cameras.offsets.to(known.pixels)).tolist()
+        (first, last), here = cameras.ends[index : index + 2], slice(*self._sparse_ends[index : index + 2])
+        distances = known.distances.new_zeros(last - first)
+        distances[known.pixels[here] - first] = known.distances[here]
+        return distances.view(cameras.sizes[index][0], -1)
 
     def _index(self, step: int) -> int:
         """Return the image of a training step, a function of seed, step and process alone."""
@@ -216,8 +234,9 @@ def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource
         return ViewSource(dataset, background, config.machine.seed)
     if not isinstance(config, RayConfig):
         return PixelSource(dataset, background, config.machine.seed)
-    keypoints = KEYPOINTS if config.depth_loss_mult and not dataset.scene.has_depth else 0.0
+    num_images = config.images_per_batch if isinstance(config, SourceViewsConfig) else None
+    keypoints = KEYPOINTS if num_images is None and config.depth_loss_mult and not dataset.scene.has_depth else 0.0
     clear = None
     if config.free_space_loss_mult > 0 and not dataset.scene.warped:
         clear = clear_distances(dataset.cameras, dataset.sparse_depth, dataset.scene.near, dataset.scene.far)
-    return PixelSource(dataset, background, config.machine.seed, config.draw_by_error, keypoints, clear)
+    return PixelSource(dataset, background, config.machine.seed, config.draw_by_error, keypoints, clear, num_images)

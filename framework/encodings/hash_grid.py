@@ -7,7 +7,8 @@ from torch import Tensor, nn
 
 from framework.base.optimised import Optimised
 from framework.encodings.opening import Opening
-from framework.kernels.hash_grid import HashGridLayout, TableGradient, hash_grid
+from framework.kernels.hash_grid import LOOK_UP, HashGridLayout, hash_grid
+from framework.kernels.hash_grid_lookup import TableGradient
 from framework.kernels.memory import table
 
 FIRST_LEVELS = 4
@@ -50,7 +51,7 @@ class HashGrid(nn.Module):
         # Small random values, as in section 4 of the paper: features start near zero, but not equal.
         self.table = nn.Parameter(table(self.layout.num_entries, features_per_level).uniform_(-1e-4, 1e-4))
         self.optimised = Optimised("tables", sparse=True) if sparse else None
-        self.deferred = TableGradient(self.layout) if sparse else None
+        self.deferred = TableGradient(LOOK_UP, self.layout) if sparse else None
         self.opening = Opening(num_levels, min(FIRST_LEVELS, num_levels)) if opening else None
         self.num_features = num_levels * features_per_level
         self.register_buffer("resolutions", torch.tensor(self.layout.resolutions), persistent=False)

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from framework.encodings.hash_grid import HashGrid
-from framework.kernels.multisampled_grid import MultisampleGradient, multisampled_grid
+from framework.kernels.hash_grid_lookup import TableGradient
+from framework.kernels.multisampled_grid import LOOK_UP, multisampled_grid
 
 
 class MultisampledHashGrid(HashGrid):
@@ -43,7 +44,7 @@ class MultisampledHashGrid(HashGrid):
         decay: float = 0.0,
     ) -> None:
         super().__init__(num_levels, features_per_level, base_resolution, max_resolution, log2_table_size, sparse)
-        self.deferred: MultisampleGradient | None = MultisampleGradient(self.layout) if sparse else None
+        self.deferred = TableGradient(LOOK_UP, self.layout) if sparse else None
         self.decay = decay
 
     def forward(self, points: Tensor) -> Tensor:

@@ -22,9 +22,9 @@ from framework.data.dataset import Dataset
 from framework.data.pixels import composite
 from framework.evaluation.appearance import appearance_of, fitted_appearance, right_half
 from framework.evaluation.images import write_image
-from framework.evaluation.metrics import load_lpips, psnr, ssim
+from framework.evaluation.metrics import load_lpips, psnr, quick_ssim
 from framework.evaluation.panels import composed, view_panels
-from framework.model import Model
+from framework.model import Model, RendersFromImages
 from framework.rendering.rendered import Picture
 
 BEFORE = 0.9
@@ -61,7 +61,7 @@ def measure(rgb: Tensor, target: Tensor, kept: Tensor | None) -> Measured:
         kept: (H, W) bool, pixels that count; all if None.
     """
     judged = (rgb, target) if kept is None else (rgb[kept], target[kept])
-    return Measured(psnr(*judged), ssim(rgb, target) if min(rgb.shape[:2]) >= 11 else None)
+    return Measured(psnr(*judged), quick_ssim(rgb, target) if min(rgb.shape[:2]) >= 11 else None)
 
 
 def measure_view(model: Model, dataset: Dataset, index: int, background: Tensor, stride: int = 1) -> Measured:
@@ -82,13 +82,15 @@ def measure_view(model: Model, dataset: Dataset, index: int, background: Tensor,
 
 
 def views_to_judge(dataset: Dataset, half: bool = False) -> list[int]:
-    """Return the indices of the images of which masks keep some pixels.
+    """Return the indices of the images of which masks keep some pixels, and that are not given to a method.
 
     Args:
         dataset: the images.
         half: whether only the right half counts.
     """
-    return [index for index in range(len(dataset)) if _has_kept_pixels(dataset, index, half)]
+    given = dataset.source_images
+    judged = range(len(dataset)) if given is None else (~given).nonzero()[:, 0].tolist()
+    return [index for index in judged if _has_kept_pixels(dataset, index, half)]
 
 
 def timed_view(model: Model, view: View, background: Tensor) -> tuple[Picture, float]:
@@ -173,15 +175,16 @@ def evaluate(
 ) -> Evaluation:
     """Render views and compute their metrics.
 
-    Masked-out pixels do not count: PSNR omits them; for SSIM and LPIPS they are copied from the true image. Images
-    without other pixels are skipped. If appearance is fitted to left halves (`eval_appearance`), right halves count.
+    Images that are given to the method (`Dataset.source_images`) are shown to it and not judged. Masked-out pixels do
+    not count: PSNR omits them; for SSIM and LPIPS they are copied from the true image. Images without other pixels are
+    skipped. If appearance is fitted to left halves (`eval_appearance`), right halves count.
 
     Args:
         model: the trained model.
         dataset: views with images, on the model's device.
         max_images: maximum number of views, evenly spaced; all if None.
         pictures: folder for renders, true images, `view_panels` and normals (x, y, z as RGB); no files if None.
-        max_pictures: maximum number of views of which files are written; all if None.
+        max_pictures: maximum number of views of which files are written, evenly spaced; all if None.
         round_to_uint8: whether colours are rounded to 8 bits before they are measured.
         title: text of the progress bar.
 
@@ -194,10 +197,13 @@ def evaluate(
     chosen = [views[rank] for rank in spread(len(views), max_images)]
     if not chosen:
         raise DataError(f"there is no image to evaluate: masks leave nothing of the {len(dataset)} that there are")
+    if isinstance(model, RendersFromImages) and dataset.source_images is not None:
+        model.show_images(dataset)
     lpips, lpips_note = load_lpips()
     background = evaluation_background(model)
     rows, seconds, rays = [], 0.0, 0
     pictures_note: str | None = None
+    shown = {chosen[rank] for rank in spread(len(chosen), max_pictures)}
     for index in track(chosen, title, total=len(chosen)):
         target = composite(dataset.image(index).float() / 255, background)
         with fitted_appearance(model, dataset, index, background) if half else nullcontext():
@@ -210,7 +216,7 @@ def evaluate(
         rows.append(row | {"floaters": floaters(picture, dataset, index)})
         seconds += spent
         rays += picture.num_rays
-        if pictures is not None and (max_pictures is None or len(rows) <= max_pictures):
+        if pictures is not None and index in shown:
             try:
                 _write_pictures(pictures, f"{index:04d}_{_short_stem(dataset.names[index])}", rgb, target, picture)
             except OSError as error:  # metrics do not need the files

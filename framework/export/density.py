@@ -13,8 +13,10 @@ from torch import Tensor
 
 from framework.base.errors import ConfigError
 from framework.export.lattice import Lattice
+from framework.geometry.bounds import nested_boxes
 from framework.geometry.points import Points
 from framework.kernels.native import torch_on_one_thread
+from framework.kernels.occupancy import Occupancy
 from framework.model import HasDensity, Model, parts
 from framework.samplers.base import SkipsCells
 
@@ -104,14 +106,18 @@ class LatticeDensity:
 
     def _kept(self, positions: Tensor) -> Tensor:
         """Return whether the renderer samples at positions (N, 3), (N,) bool."""
-        assert self.grid is not None
-        n, box = self.grid.resolution, self.grid.box.cpu()
-        unit = (positions - box[0]) / (box[1] - box[0])
-        cells = (unit * n).long().clamp(0, n - 1)
+        cells = self._occupancy()
         # The far faces of the box belong to its last cells.
-        inside = ((unit >= 0) & (unit <= 1)).all(-1)
-        occupied = self.grid.occupied_when(self.time).cpu()
-        return inside & occupied[(cells[:, 0] * n + cells[:, 1]) * n + cells[:, 2]]
+        low, high = cells.outer
+        inside = ((positions >= low) & (positions <= high)).all(-1)
+        occupied = cells.occupied
+        return inside & occupied[cells.cells(positions)]
+
+    def _occupancy(self) -> Occupancy:
+        """Return the grid on the CPU, at the time of the density."""
+        assert self.grid is not None
+        occupied = self.grid.occupied_when(self.time)
+        return Occupancy(occupied.cpu(), self.grid.box.cpu(), self.grid.resolution, self.grid.levels)
 
     @torch.no_grad()
     def _evaluated(self, positions: Tensor) -> Tensor:
@@ -130,11 +136,17 @@ class LatticeDensity:
         return self._density(points.sized(spacing / 12**0.5)).float().cpu()
 
     def _occupied_blocks(self) -> Iterator[Tensor]:
-        """Yield the blocks that overlap an occupied cell of the grid, by sums over the cells of boxes."""
-        assert self.grid is not None
-        n, box = self.grid.resolution, self.grid.box.cpu().double()
+        """Yield the blocks that overlap an occupied cell of the grid, by sums over the cells of boxes.
+
+        Of nested boxes, the cells are those of the smallest that the whole lattice lies in.
+        """
+        cells = self._occupancy()
+        n, boxes = cells.resolution, nested_boxes(cells.box.double(), cells.levels)
+        ends = self.lattice.positions(torch.cartesian_prod(*[torch.tensor([0, count]) for count in self.lattice.cells]))
+        holds = [bool(((ends >= low) & (ends <= high)).all()) for low, high in boxes[:-1]]
+        level = holds.index(True) if any(holds) else cells.levels - 1
+        box, counts = boxes[level], cells.filled[level].to(torch.int32)
         sums = torch.zeros(n + 1, n + 1, n + 1, dtype=torch.int32)
-        counts = self.grid.occupied_when(self.time).cpu().view(n, n, n).to(torch.int32)
         sums[1:, 1:, 1:] = counts.cumsum(0, dtype=torch.int32).cumsum(1, dtype=torch.int32).cumsum(2, dtype=torch.int32)
         offsets = torch.cartesian_prod(*[torch.tensor([0, BLOCK])] * 3)
         for block in self.lattice.all_blocks(BLOCK):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -40,7 +41,8 @@ def write_grid(file: Path, grid: SkipsCells, placement: Placement) -> None:
 
     It holds `occupied` (n, n, n) bool, whose index is that of the cell along x, y and z of the scene; `cube_to_input`
     (4, 4), from the unit cube of the grid to the frame of the input; and `box` (2, 3), the corners of the grid in the
-    scene's frame.
+    scene's frame. Of nested boxes, these are of the smallest; `larger` (L - 1, n, n, n) has the cells of the others,
+    each of twice the size, and is empty where a smaller box says what is there.
 
     Args:
         file: path of the file.
@@ -51,26 +53,33 @@ def write_grid(file: Path, grid: SkipsCells, placement: Placement) -> None:
         OSError: if the file cannot be written.
     """
     n = grid.resolution
-    write_atomically(
-        file,
-        lambda stream: np.savez_compressed(
-            stream,
-            occupied=grid.occupied_when().cpu().view(n, n, n).numpy(),
-            cube_to_input=box_frame(grid, placement).numpy(),
-            box=grid.box.cpu().numpy(),
-        ),
-    )
+    arrays: dict[str, Any] = {
+        "occupied": innermost(grid).numpy(),
+        "cube_to_input": box_frame(grid, placement).numpy(),
+        "box": grid.box.cpu().numpy(),
+    }
+    if grid.levels > 1:
+        arrays["larger"] = grid.occupied[n**3 :].cpu().view(-1, n, n, n).numpy()
+    write_atomically(file, lambda stream: np.savez_compressed(stream, **arrays))
+
+
+def innermost(grid: SkipsCells) -> Tensor:
+    """Return the cells (n, n, n) bool of the smallest box of `grid` that are occupied at any time, on the CPU."""
+    n = grid.resolution
+    return grid.occupied_when()[: n**3].cpu().view(n, n, n)
 
 
 def cell_centers(grid: SkipsCells, placement: Placement) -> Tensor:
-    """Return the centres (K, 3) float64 of the occupied cells of `grid`, in the frame of the input of `placement`."""
-    n, matrix = grid.resolution, box_frame(grid, placement)
-    cells = grid.occupied_when().cpu().view(n, n, n).nonzero()
-    return (cells.double() + 0.5) / n @ matrix[:3, :3].T + matrix[:3, 3]
+    """Return the centres (K, 3) float64 of the occupied cells of `grid`, in the frame of the input of `placement`.
+
+    Of nested boxes, these are the cells of the smallest.
+    """
+    cells, matrix = innermost(grid).nonzero(), box_frame(grid, placement)
+    return (cells.double() + 0.5) / grid.resolution @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def write_cells(file: Path, grid: SkipsCells, placement: Placement, boxes: bool) -> None:
-    """Write the occupied cells to a PLY file.
+    """Write the occupied cells, of nested boxes those of the smallest, to a PLY file.
 
     Args:
         file: path of the file.
@@ -96,9 +105,9 @@ def write_cells(file: Path, grid: SkipsCells, placement: Placement, boxes: bool)
 
 
 def boxes_mesh(grid: SkipsCells) -> Mesh:
-    """Return the surface of the occupied cells of `grid`, in its unit cube."""
+    """Return the surface of the occupied cells of `grid`, in its (smallest) box as the unit cube."""
     n = grid.resolution
-    padded = torch.nn.functional.pad(grid.occupied_when().cpu().view(n, n, n), (1,) * 6)
+    padded = torch.nn.functional.pad(innermost(grid), (1,) * 6)
     inner = padded[1:-1, 1:-1, 1:-1]
     quads = []
     for axis in range(3):

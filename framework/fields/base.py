@@ -13,7 +13,7 @@ from framework.base.errors import ConfigError, shown
 from framework.base.optimised import Optimised
 from framework.geometry.points import Footprint, Points
 from framework.kernels.memory import require
-from framework.kernels.mlp import Activation, mlp
+from framework.kernels.mlp import Activation, density_mlp, mlp
 
 DensityFunction = Callable[[Points], tuple[Tensor, Tensor]]
 """Function from N points to density (N,), 1/length, and features (N, F); samplers are called with it."""
@@ -110,6 +110,20 @@ class MLP(nn.Sequential):
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Return the output (N, D_out) for `inputs`, parts (N, D_i) that are concatenated along their features."""
+        weights, biases = self._parameters_by_layer()
+        return mlp(inputs, weights, self.activation, biases)
+
+    def density(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the density (N,), and the output (N, D_out), whose first feature is the log-density.
+
+        The network must have no activation function at its output.
+
+        Args:
+            inputs: parts (N, D_i) that are concatenated along their features.
+        """
+        return density_mlp(inputs, *self._parameters_by_layer())
+
+    def _parameters_by_layer(self) -> tuple[list[Tensor], list[Tensor] | None]:
+        """Return the weights of each layer, and the biases if there are any."""
         layers = [layer for layer in self if isinstance(layer, nn.Linear)]
-        biases = [layer.bias for layer in layers] if self.bias else None
-        return mlp(inputs, [layer.weight for layer in layers], self.activation, biases)
+        return [layer.weight for layer in layers], [layer.bias for layer in layers] if self.bias else None

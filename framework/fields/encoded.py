@@ -12,7 +12,6 @@ from framework.fields.appearance import Appearance
 from framework.fields.base import MLP, Field
 from framework.geometry.points import Points
 from framework.kernels.contraction import contract_to_unit
-from framework.kernels.math import split_density, truncated_exp
 from framework.kernels.spherical_harmonics import spherical_harmonics
 
 NUM_FEATURES = 16
@@ -84,7 +83,7 @@ class DensityField(BoxField):
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
         features = self.encode(points.positions, points.times)
-        return truncated_exp(self.head(features)[:, 0]), features
+        return self.head.density(features)[0], features
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         raise NotImplementedError("a density field has no colours")
@@ -130,7 +129,7 @@ class EncodedField(BoxField):
         self.color_head = MLP(inputs, width, width, 3, bias=False, activation="sigmoid")
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
-        return split_density(self.density_head(self.encode(points.positions, points.times)))
+        return self.density_head.density(self.encode(points.positions, points.times))
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         inputs = [features]

@@ -9,7 +9,6 @@ from framework.encodings.multisampled import MultisampledHashGrid
 from framework.fields.encoded import BoxField, DensityField, EncodedField
 from framework.geometry.multisamples import fixed_pattern, random_pattern
 from framework.geometry.points import Points
-from framework.kernels.math import split_density, truncated_exp
 from framework.kernels.multisamples import unit_multisamples
 
 
@@ -20,7 +19,7 @@ class MultisampledDensity(DensityField):
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
         features = encode_frustums(self, points)
-        return truncated_exp(self.head(features)[:, 0]), features
+        return self.head.density(features)[0], features
 
 
 class MultisampledField(EncodedField):
@@ -29,7 +28,7 @@ class MultisampledField(EncodedField):
     footprint = "frustum"
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
-        return split_density(self.density_head(encode_frustums(self, points)))
+        return self.density_head.density(encode_frustums(self, points))
 
 
 def encode_frustums(field: BoxField, points: Points) -> Tensor:

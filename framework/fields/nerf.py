@@ -28,6 +28,7 @@ class NeRFField(Field):
         contracted: (2, 3) box around which all of space is contracted into [-1, 1]^3, the range that the frequencies
             are made for; None to encode scene coordinates.
         opening: whether the frequencies of positions and directions open one after the other (`Opening`).
+        dims: numbers of a position: 3, or 4 for points of the inverted sphere (NeRF++, Zhang et al. 2020).
     """
 
     contracted: Tensor | None
@@ -43,6 +44,7 @@ class NeRFField(Field):
         time_frequencies: int | None = None,
         contracted: Tensor | None = None,
         opening: bool = False,
+        dims: int = 3,
     ) -> None:
         super().__init__()
         self.register_buffer("contracted", None if contracted is None else contracted.clone())
@@ -51,7 +53,7 @@ class NeRFField(Field):
         self.time_frequencies = time_frequencies
         self.opening = Opening(position_frequencies, 0) if opening else None
         self.direction_opening = Opening(direction_frequencies, 0) if opening else None
-        encoded = 3 + 6 * position_frequencies + (0 if time_frequencies is None else 1 + 2 * time_frequencies)
+        encoded = dims * (1 + 2 * position_frequencies) + (0 if time_frequencies is None else 1 + 2 * time_frequencies)
         self.before_skip = MLP(encoded, *[width] * skip, activation="relu")
         self.after_skip = MLP(width + encoded, *[width] * (depth - skip), activation="relu")
         self.sigma_head = MLP(width, 1, activation="relu")
@@ -88,16 +90,17 @@ class NeRFField(Field):
 
 
 def opened_frequencies(x: Tensor, num_frequencies: int, opening: Opening | None) -> Tensor:
-    """Return the frequency encoding (N, 3 + 6 L) of vectors, with only the open frequencies other than 0.
+    """Return the frequency encoding (N, D + 2 D L) of vectors, with only the open frequencies other than 0.
 
     Args:
-        x: (N, 3) vectors, which are always encoded themselves too.
+        x: (N, D) vectors, which are always encoded themselves too.
         num_frequencies: number L of frequencies.
         opening: the open frequencies; None if all are.
     """
     if opening is None or opening.complete:
         return frequency_encoding(x, num_frequencies)
-    return opening.completed(frequency_encoding(x, opening.count), 3 + 6 * num_frequencies, 6)
+    dims = x.shape[1]
+    return opening.completed(frequency_encoding(x, opening.count), dims * (1 + 2 * num_frequencies), 2 * dims)
 
 
 def encoded_times(times: Tensor | None, num_frequencies: int) -> Tensor:

@@ -12,7 +12,6 @@ from framework.fields.encoded import BoxField, DensityField, EncodedField
 from framework.geometry.bounds import contraction_scale
 from framework.geometry.points import Footprint, Points
 from framework.kernels.downweighting import level_weights
-from framework.kernels.math import split_density, truncated_exp
 
 
 class SizedGrid(BoxField):
@@ -59,11 +58,11 @@ class SizedDensity(SizedGrid, DensityField):
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
         features = self.encode_points(points)
-        return truncated_exp(self.head(features)[:, 0]), features
+        return self.head.density(features)[0], features
 
 
 class SizedField(SizedGrid, EncodedField):
     """A field of density and colour on a hash grid that knows the size of points."""
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
-        return split_density(self.density_head(self.encode_points(points)))
+        return self.density_head.density(self.encode_points(points))

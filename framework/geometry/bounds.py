@@ -1,4 +1,4 @@
-"""Boxes: their intersection with rays, unit coordinates, and the contraction of unbounded space and of Gaussians."""
+"""Boxes, their intersection with rays and unit coordinates; contraction of unbounded space and of Gaussians."""
 
 from __future__ import annotations
 
@@ -31,6 +31,21 @@ def intersect_box(origins: Tensor, directions: Tensor, box: Tensor) -> tuple[Ten
     hit = leave > enter
     zero = torch.zeros_like(enter)
     return torch.where(hit, enter, zero), torch.where(hit, leave, zero)
+
+
+def nested_boxes(box: Tensor, levels: int) -> Tensor:
+    """Return boxes of the same centre, each with twice the edges of the one before: Instant-NGP, appendix E.2.
+
+    Args:
+        box: (2, 3) minimum and maximum corner of the smallest one, which is returned as it is.
+        levels: number L of boxes.
+
+    Returns:
+        (L, 2, 3) corners.
+    """
+    half = (box[1] - box[0]) / 2
+    grown = torch.tensor([2.0**level - 1 for level in range(levels)], dtype=box.dtype, device=box.device)
+    return box + grown[:, None, None] * torch.stack([-half, half])
 
 
 def to_unit_box(positions: Tensor, box: Tensor) -> Tensor:

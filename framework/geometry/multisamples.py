@@ -9,6 +9,7 @@ beyond its end, by at most 3.4 % of its length.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -76,13 +77,19 @@ def multisamples(frustums: Frustums, pattern: Pattern) -> tuple[Tensor, Tensor]:
     along = torch.linspace(-1, 1, NUM_MULTISAMPLES, dtype=start.dtype, device=start.device)
     spread = (3 / math.sqrt(7)) * along * ((squared - 1).square() + 4).sqrt()
     t = start + half * ((1 + share).square() + 2 + spread) / (squared + 3)
-    angles = along.new_tensor(THIRDS_OF_PI) * (math.pi / 3) + pattern.turns[:, None]
+    angles = _angles(along.dtype, along.device) + pattern.turns[:, None]
     away = frustums.radii[:, None] * t / math.sqrt(2)
     first, second = across(frustums.directions)
     positions = torch.addcmul(frustums.origins[:, None], t[..., None], frustums.directions[:, None])
     positions = torch.addcmul(positions, (away * angles.cos())[..., None], first[:, None])
     positions = torch.addcmul(positions, (away * angles.sin() * pattern.mirrors[:, None])[..., None], second[:, None])
     return positions, STD_SCALE * away
+
+
+@lru_cache(maxsize=8)
+def _angles(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return the angles (6,) of the points; they are kept, since bringing them to a device means to wait for it."""
+    return torch.tensor(THIRDS_OF_PI, dtype=dtype, device=device) * (math.pi / 3)
 
 
 def across(directions: Tensor) -> tuple[Tensor, Tensor]:

@@ -41,7 +41,7 @@ class Points:
     """N points at which a field is evaluated."""
 
     positions: Tensor
-    """(N, 3) scene coordinates."""
+    """(N, 3) scene coordinates, or (N, 4) points of an inverted sphere (`framework.geometry.spheres`)."""
     times: Tensor | None = None
     """(N,) times in [0, 1]; None for a static scene."""
     radii: Tensor | None = None

@@ -8,16 +8,16 @@ cell.
 from __future__ import annotations
 
 from functools import lru_cache
-from itertools import accumulate, pairwise
-from typing import Any, NamedTuple
+from itertools import pairwise
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from framework.kernels import kept, memory, native
-from framework.kernels.deferred import Parts, waiting
-from framework.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
+from framework.kernels import native
+from framework.kernels.dispatch import FEW_OPERATIONS, TRITON
 from framework.kernels.hash_grid_layout import HashGridLayout as HashGridLayout
+from framework.kernels.hash_grid_lookup import LookUp, TableGradient, fits
 from framework.kernels.triton_kernels import later
 
 PRIMES = (1, 2654435761, 805459861)
@@ -86,131 +86,8 @@ _forward = native.Function("hash_grid_forward", "pqpippipi")
 _backward_table = native.Function("hash_grid_backward_table", "pppiippipi")
 _backward_positions = native.Function("hash_grid_backward_positions", "pqppippipi")
 _adam = native.Function("hash_grid_adam", "pppiippippppfddfi", "q")
-
-
-class TableGradient:
-    """The deferred gradient of a table: gradients of encodings, collected in backward passes and not yet accumulated.
-
-    A step uses few entries. Accumulating the gradient level by level, each followed by Adam, takes one pass over the
-    table, while autograd's dense gradient takes many.
-
-    Args:
-        layout: resolutions and offsets of the levels that are looked up: all of the table's, or the first ones.
-    """
-
-    _add, _adam = _backward_table, _adam
-    """The compiled functions that accumulate the gradient, and that apply it."""
-
-    def __init__(self, layout: HashGridLayout) -> None:
-        self.layout = layout
-        self.parts: Parts = []
-        """Positions (N, 3) of each encoding, and gradient (N, L * F) of its result."""
-        self._sum: Tensor | None = None
-
-    @property
-    def pending(self) -> bool:
-        """True if there is a gradient."""
-        return bool(self.parts)
-
-    def clear(self) -> None:
-        """Discard the gradient."""
-        self.parts.clear()
-
-    @property
-    def gradients(self) -> list[Tensor]:
-        """The collected gradients (N, L * F) of encodings."""
-        return [grad for _, grad in self.parts]
-
-    def _arguments(self, features: int) -> tuple[Any, ...]:
-        ends = tuple(accumulate(len(positions) for positions, _ in self.parts))
-        positions = [native.pointer(x, "positions", (len(x), 3)) for x, _ in self.parts]
-        width = self.layout.num_levels * features
-        grads = [native.pointer(g, "the gradient", (len(x), width)) for x, g in self.parts]
-        layout = (*self.layout.arrays, self.layout.num_levels)
-        return native.pointers(positions), native.pointers(grads), native.integers(ends), len(ends), features, *layout
-
-    def add_to(self, grad: Tensor) -> None:
-        """Add the gradient to `grad` (E, F), and discard it."""
-        shape = (self.layout.num_entries, grad.shape[1])
-        into = native.pointer(grad[: shape[0]], "the table's gradient", shape)
-        self._add(*self._arguments(shape[1]), into, native.threads())
-        self.parts.clear()
-
-    def summed(self, table: Tensor) -> Tensor:
-        """Return the accumulated gradient (E, F) of `table`, and discard it.
-
-        The result's memory is used again: its entries must be zero before the next call, as Adam leaves them.
-        """
-        if self._sum is None:
-            self._sum = memory.table(*table.shape)
-        self.add_to(self._sum)
-        return self._sum
-
-    def adam(
-        self, table: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
-        rate: float, betas: tuple[float, float], eps: float,
-    ) -> int:  # fmt: skip
-        """Update `table` (E, F) by `framework.kernels.adam.sparse_adam` with this gradient, and discard the gradient.
-
-        `mean`, `square`, `seen`, `rate`, `betas`, `eps` and the result are as in `sparse_adam`.
-        """
-        shape = (self.layout.num_entries, table.shape[1])
-        table, mean, square, seen = (values[: shape[0]] for values in (table, mean, square, seen))
-        updated: int = self._adam(
-            *self._arguments(shape[1]), native.pointer(table, "the table", shape), native.pointer(mean, "mean", shape),
-            native.pointer(square, "square", shape), native.pointer(seen, "seen", shape[:1]), rate, *betas, eps,
-            native.threads(),
-        )  # fmt: skip
-        self.parts.clear()
-        return updated
-
-
-class _HashGrid(torch.autograd.Function):
-    """The compiled form of `hash_grid`."""
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        positions: Tensor,
-        table: Tensor,
-        placeholder: Tensor | None,
-        layout: HashGridLayout,
-    ) -> Tensor:
-        count, features = len(positions), table.shape[1]
-        points = native.pointer(positions, "positions", (count, 3))
-        entries = native.pointer(table, "the hash table", (layout.num_entries, features))
-
-        def compute() -> Tensor:
-            out = positions.new_empty(count, layout.num_levels * features)
-            _forward(
-                points, count, entries, features, *layout.arrays, layout.num_levels, out.data_ptr(), native.threads()
-            )
-            return out
-
-        ctx.save_for_backward(positions, table)
-        ctx.layout = layout
-        return kept.result(("hash_grid", layout), (positions,), (table,), compute)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        positions, table = ctx.saved_tensors
-        layout, count, features = ctx.layout, len(positions), table.shape[1]
-        grad = grad.contiguous()
-        incoming = native.pointer(grad, "the gradient", (count, layout.num_levels * features))
-        grad_positions = grad_table = None
-        if ctx.needs_input_grad[1]:
-            grad_table = torch.zeros_like(table)
-            gradient = TableGradient(layout)
-            gradient.parts.append((positions, grad))
-            gradient.add_to(grad_table)
-        if ctx.needs_input_grad[0]:
-            grad_positions = torch.empty_like(positions)
-            _backward_positions(
-                positions.data_ptr(), count, table.data_ptr(), incoming, features, *layout.arrays,
-                layout.num_levels, grad_positions.data_ptr(), native.threads(),
-            )  # fmt: skip
-        return grad_positions, grad_table, grad if ctx.needs_input_grad[2] else None, None
+LOOK_UP = LookUp("hash_grid", "positions", ("N", 3), _forward, _backward_table, _backward_positions, _adam)
+"""The look-up of positions."""
 
 
 def hash_grid(
@@ -235,35 +112,13 @@ def hash_grid(
     Raises:
         ValueError: if a shape does not fit the layout.
     """
-    if positions.ndim != 2 or positions.shape[1] != 3:
-        raise ValueError(f"hash_grid: positions have shape {tuple(positions.shape)}, not (N, 3)")
-    if table.ndim != 2 or table.shape[0] != layout.num_entries:
-        raise ValueError(f"hash_grid: the table has shape {tuple(table.shape)}, not ({layout.num_entries}, F)")
+    LOOK_UP.check(positions, table, layout)
     positions = positions.to(table.dtype)
     return HASH_GRID((positions, table), positions, table, layout, deferred)
 
 
-def _reference(positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> Tensor:
-    return hash_grid_reference(positions, table, layout)
-
-
-HASH_GRID = Operation("hash_grid", _reference)
-
-
-def _fits(positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> bool:
-    return table.shape[1] in (1, 2, 4, 8)
-
-
-@HASH_GRID.implementation(CPP, fits=_fits)
-def _compiled(positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> Tensor:
-    positions, table, placeholder = positions.contiguous(), table.contiguous(), None
-    if deferred is not None and table.requires_grad:
-        placeholder = waiting(table, positions, layout.num_levels * table.shape[1], deferred.parts)
-        table = table.detach()
-    return _HashGrid.apply(positions, table, placeholder, layout)
-
-
-HASH_GRID.implementation(TRITON, fits=_fits)(later("hash_grid", "hash_grid"))
+HASH_GRID = LOOK_UP.operation(hash_grid_reference)
+HASH_GRID.implementation(TRITON, fits=fits)(later("hash_grid", "hash_grid"))
 
 
 class _Levels(NamedTuple):

@@ -3,8 +3,9 @@
 The candidates of a ray are the steps first + k * step, which grow with distance beyond step / cone (Instant-NGP,
 Mueller et al. 2022, appendix E.1). Candidates whose middle lies in an occupied cell are samples. A wave consists of the
 next few samples of every ray that has not ended. When their density is known, `advance` ends rays whose transmittance
-is low, so that hidden samples are never evaluated, and no sample is evaluated twice. On other devices than the CPU a
-wave costs more than samples that are evaluated in vain: the form in PyTorch takes all in one wave if they are not many.
+is low, so that hidden samples are never evaluated, and no sample is evaluated twice. In the end, `rest` adds a sample
+for all that is behind the grid. On other devices than the CPU a wave costs more than samples that are evaluated in
+vain: the form in PyTorch takes all in one wave if they are not many.
 """
 
 from __future__ import annotations
@@ -22,10 +23,12 @@ from framework.geometry.bounds import intersect_box
 from framework.geometry.rays import Rays
 from framework.kernels import native
 from framework.kernels.compositing import bounded_sum, optical_depth
-from framework.kernels.dispatch import CPP, INT64, TRITON, Operation
-from framework.kernels.given import check_indices
+from framework.kernels.dispatch import CPP, TRITON, Operation
 from framework.kernels.occupancy import Occupancy as Occupancy
 from framework.kernels.occupancy import refresh_occupancy as refresh_occupancy
+from framework.kernels.ray_order import SORT_BY_RAY as SORT_BY_RAY
+from framework.kernels.ray_order import sort_by_ray as sort_by_ray
+from framework.kernels.ray_order import sort_by_ray_reference as sort_by_ray_reference
 from framework.kernels.triton_kernels import later
 
 RUN = 8
@@ -72,6 +75,10 @@ class March(ABC):
         """(N,) uint8 for each wave: 1 for samples in front of which the transmittance is not below `early_stop`."""
         self.longest: int | None = None
         """Upper bound of the number of samples on a ray; None if finding it would take a pass over them."""
+        self.spent: Tensor
+        """(R,) optical depth of the samples so far."""
+        self.rested = False
+        """Whether `rest` has added samples."""
 
     @property
     def next_limit(self) -> int:
@@ -85,6 +92,27 @@ class March(ABC):
     @abstractmethod
     def advance(self, sigma: Tensor) -> None:
         """End rays whose transmittance is low or that have left the box, by the density `sigma` (N,) of the wave."""
+
+    @torch.no_grad()
+    def rest(self, box: Tensor) -> Wave | None:
+        """Return a last sample on each ray that has light left: all that is behind `box` (2, 3); None if there is none.
+
+        It starts where the ray leaves the box, or where it starts if it misses the box, and ends at the ray's far end,
+        or at three times that distance if this is farther. It is to be called when `wave` has returned None.
+        """
+        owners = (~(self.spent >= self.budget)).nonzero().squeeze(-1)
+        if len(owners) == 0:
+            return None
+        rays = self.rays[owners]
+        leave = intersect_box(rays.origins, rays.directions, box)[1]
+        starts = torch.minimum(torch.maximum(leave, rays.nears), rays.fars)
+        far = torch.where(rays.fars.isfinite(), rays.fars, starts)
+        ends = torch.maximum(far, 3 * starts)
+        wave = Wave(starts, ends, owners, self.rays.points(owners, (starts + ends) / 2))
+        self.waves.append(wave)
+        self.reached.append(torch.ones_like(owners, dtype=torch.uint8))
+        self.rested, self.longest = True, None if self.longest is None else self.longest + 1
+        return wave
 
     def finish(self) -> tuple[Tensor, Tensor]:
         """Return the order (M,) that sorts the reached samples of all waves by ray, and the rays' offsets (R + 1,)."""
@@ -106,12 +134,12 @@ class CompiledMarch(March):
     ) -> None:
         super().__init__(rays, early_stop)
         count = len(rays)
-        self.step, self.cone, self.resolution = step, cone, occupancy.resolution
+        self.step, self.cone, self.resolution, self.levels = step, cone, occupancy.resolution, occupancy.levels
         self.bits, self.blocks = occupancy.packed
         self.slices = occupancy.slices_of(rays.times)
         self.origins, self.directions = rays.origins.contiguous(), rays.directions.contiguous()
         self.enter, self.leave, self.first = (torch.empty(count) for _ in range(3))
-        self.box = occupancy.box.contiguous()
+        self.box, outer = occupancy.box.contiguous(), occupancy.outer.contiguous()
         alive = torch.empty(count, dtype=torch.int64)
         nears, fars = rays.nears.contiguous(), rays.fars.contiguous()
         shift = None if shift is None else shift.contiguous()
@@ -120,7 +148,7 @@ class CompiledMarch(March):
             native.pointer(self.directions, "ray directions", (count, 3)),
             native.pointer(nears, "nears", (count,)), native.pointer(fars, "fars", (count,)),
             None if shift is None else native.pointer(shift, "the shift", (count,)), count,
-            native.pointer(self.box, "the box", (2, 3)), step, self.enter.data_ptr(), self.leave.data_ptr(),
+            native.pointer(outer, "the box", (2, 3)), step, self.enter.data_ptr(), self.leave.data_ptr(),
             self.first.data_ptr(), alive.data_ptr(), native.threads(),
         )  # fmt: skip
         self.alive = alive[:hits]
@@ -138,8 +166,8 @@ class CompiledMarch(March):
             self.origins.data_ptr(), self.directions.data_ptr(), self.enter.data_ptr(), self.leave.data_ptr(),
             self.first.data_ptr(), None if self.slices is None else self.slices.data_ptr(), self.next.data_ptr(),
             self.alive.data_ptr(), living, limit, self.box.data_ptr(), self.step, self.cone, self.bits.data_ptr(),
-            self.blocks.data_ptr(), self.resolution, self.counts.data_ptr(), starts.data_ptr(), ends.data_ptr(),
-            owners.data_ptr(), positions.data_ptr(), native.threads(),
+            self.blocks.data_ptr(), self.resolution, self.levels, self.counts.data_ptr(), starts.data_ptr(),
+            ends.data_ptr(), owners.data_ptr(), positions.data_ptr(), native.threads(),
         )  # fmt: skip
         wave = Wave(starts[:count], ends[:count], owners[:count], positions[:count])
         self.waves.append(wave)
@@ -158,34 +186,6 @@ class CompiledMarch(March):
         self.reached.append(reached)
 
 
-def sort_by_ray(owners: Tensor, reached: Tensor, num_rays: int) -> tuple[Tensor, Tensor]:
-    """Return the order (M,) that sorts the reached samples by ray, stably, and the offsets (R + 1,) of the rays.
-
-    Args:
-        owners: (N,) int64 index of the ray of each sample.
-        reached: (N,) uint8, not 0 for samples that are kept.
-        num_rays: number R of rays.
-
-    Raises:
-        IndexError: if an index of a ray is out of range.
-    """
-    return SORT_BY_RAY((owners,), owners, reached, num_rays)
-
-
-def sort_by_ray_reference(owners: Tensor, reached: Tensor, num_rays: int) -> tuple[Tensor, Tensor]:
-    """Compute `sort_by_ray` of `owners`, `reached` and `num_rays` in PyTorch, on any device."""
-    check_indices(owners, num_rays, "rays")
-    chosen = reached.nonzero().squeeze(-1)
-    owners = owners.index_select(0, chosen)
-    return chosen.index_select(0, owners.argsort(stable=True)), _offsets(owners, num_rays)
-
-
-def _offsets(owners: Tensor, num_rays: int) -> Tensor:
-    """Return the offsets (R + 1,) of rays from the owners (N,) of samples."""
-    counts = owners.new_zeros(num_rays).index_add_(0, owners, torch.ones_like(owners))
-    return functional.pad(counts.cumsum(0), (1, 0))
-
-
 def _chosen(mask: Tensor, owners: Tensor, num_rays: int) -> tuple[Tensor, Tensor, int]:
     """Return indices (M,) of samples, offsets (R + 1,) of their rays, and the maximum number on a ray.
 
@@ -201,21 +201,6 @@ def _chosen(mask: Tensor, owners: Tensor, num_rays: int) -> tuple[Tensor, Tensor
     places = torch.where(mask, mask.cumsum(0) - 1, total)  # the others are written behind the end
     indices = owners.new_empty(total + 1).scatter_(0, places, torch.arange(len(mask), device=mask.device))[:total]
     return indices, functional.pad(counts.cumsum(0), (1, 0)), longest
-
-
-SORT_BY_RAY = Operation("sort_by_ray", sort_by_ray_reference)
-
-
-@SORT_BY_RAY.implementation(CPP, types=INT64)
-def _sort_by_ray(owners: Tensor, reached: Tensor, num_rays: int) -> tuple[Tensor, Tensor]:
-    order, offsets = torch.empty_like(owners), torch.empty(num_rays + 1, dtype=torch.int64)
-    count = len(owners)
-    kept = _sort(
-        native.pointer(owners, "owners", (count,), torch.int64),
-        native.pointer(reached, "reached", (count,), torch.uint8), count, num_rays, order.data_ptr(),
-        offsets.data_ptr(),
-    )  # fmt: skip
-    return order[:kept], offsets
 
 
 class ReferenceMarch(March):
@@ -271,6 +256,7 @@ class ReferenceMarch(March):
         before = bounded_sum(tau, wave.owners, self.ranks, len(self.rays), self._in_wave)
         if self.alive is None:
             self.reached.append((~(before >= self.budget)).to(torch.uint8))
+            self.spent.index_add_(0, wave.owners, tau)
             return
         before = self.spent.index_select(0, wave.owners) + before
         self.reached.append((~(before >= self.budget)).to(torch.uint8))
@@ -280,7 +266,7 @@ class ReferenceMarch(March):
         self.alive = self.alive.index_select(0, going_on.nonzero().squeeze(-1))
 
     def finish(self) -> tuple[Tensor, Tensor]:
-        if self.alive is not None or not self.waves:
+        if self.alive is not None or self.rested or not self.waves:
             return super().finish()
         # The samples of a single wave are sorted already.
         order, offsets, self.longest = _chosen(self.reached[0] > 0, self.owners, len(self.rays))
@@ -291,8 +277,8 @@ def march(rays: Rays, occupancy: Occupancy, step: float, cone: float, shift: Ten
     """Start a march of rays through the occupied cells of a grid.
 
     Args:
-        rays: R rays, with times if the grid has slices of time.
-        occupancy: the grid.
+        rays: R rays.
+        occupancy: the grid, of one box or of several, or with slices of time, for which rays need times.
         step: length of a step near the camera, scene units.
         cone: growth of a step per unit of distance; 0 for even steps.
         shift: (R,) fraction of a step by which the first step starts in front of the box; None for 0.
@@ -305,7 +291,6 @@ def march(rays: Rays, occupancy: Occupancy, step: float, cone: float, shift: Ten
 MARCH: Operation[..., March] = Operation("march", ReferenceMarch)
 MARCH.implementation(CPP)(CompiledMarch)
 MARCH.implementation(TRITON)(later("march", "TritonMarch"))
-SORT_BY_RAY.implementation(TRITON, types=INT64)(later("march", "sort_by_ray"))
 
 
 def step_start(first: Tensor, k: Tensor, step: float, cone: float) -> Tensor:
@@ -333,7 +318,7 @@ def candidates(
         Starts (N,), ends (N,) and rays (N,) of the steps, sorted by ray; offsets (R + 1,) of the rays; and the maximum
         number of steps on a ray.
     """
-    enter, leave = intersect_box(rays.origins, rays.directions, occupancy.box)
+    enter, leave = intersect_box(rays.origins, rays.directions, occupancy.outer)
     enter, leave = torch.maximum(enter, rays.nears), torch.minimum(leave, rays.fars)
     first = enter if shift is None else enter - shift * step
     counts = ((leave - first) / step).ceil()
@@ -343,11 +328,12 @@ def candidates(
         grown = turn + ((leave / base).clamp(min=1).log() / math.log1p(cone)).ceil() + 1
         counts = torch.where(counts > turn, torch.minimum(counts, grown), counts)
     counts = torch.where(leave > enter, counts.clamp(min=0), torch.zeros_like(counts)).long()
-    run = RUN if cone == 0 else 1
+    runs_together = cone == 0 and occupancy.levels == 1
+    run = RUN if runs_together else 1
     # The device is waited for three times: for the number of runs, of those near an occupied cell, and of candidates.
     runs = (counts + run - 1) // run
     owners, k = ranges(runs)
-    if cone == 0:
+    if runs_together:
         owners, k = _near_occupied(rays, occupancy, step, first, owners, k)
     starts, ends = (step_start(first.index_select(0, owners), k + after, step, cone) for after in (0, 1))
     middle = (starts + ends) / 2
@@ -387,6 +373,5 @@ def ranges(counts: Tensor) -> tuple[Tensor, Tensor]:
 
 
 _begin: Callable[..., int] = native.Function("march_begin", "pppppqpfppppi", "q")
-_wave: Callable[..., int] = native.Function("march_wave", "ppppppppqipffppipppppi", "q")
+_wave: Callable[..., int] = native.Function("march_wave", "ppppppppqipffppiipppppi", "q")
 _advance: Callable[..., int] = native.Function("march_advance", "pqpipppfppp", "q")
-_sort: Callable[..., int] = native.Function("sort_by_ray", "ppqqpp", "q")

@@ -17,6 +17,7 @@ from torch.nn.functional import linear
 
 from framework.kernels import kept, native
 from framework.kernels.dispatch import CPP, Operation
+from framework.kernels.math import split_density
 
 T = TypeVar("T")
 Activation = Literal["none", "relu", "sigmoid"]
@@ -47,35 +48,60 @@ def mlp_reference(
     return torch.sigmoid(x) if activation == "sigmoid" else x
 
 
-_forward = native.Function("mlp_forward", "ppiqpippipi")
-_backward = native.Function("mlp_backward", "ppiqpippippppi")
-_forward_bf16 = native.Function("mlp_forward_bf16", "ppiqpippipi")
-_backward_bf16 = native.Function("mlp_backward_bf16", "ppiqpippippppi")
+def density_mlp_reference(
+    inputs: Sequence[Tensor], weights: Sequence[Tensor], biases: Sequence[Tensor] | None = None
+) -> tuple[Tensor, Tensor]:
+    """Compute `density_mlp` of `inputs`, `weights` and `biases` in PyTorch, on any device and for any float type."""
+    return split_density(mlp_reference(inputs, weights, biases=biases))
+
+
+_forward = native.Function("mlp_forward", "ppiqpippippi")
+_backward = native.Function("mlp_backward", "ppiqpippippppppi")
+_forward_bf16 = native.Function("mlp_forward_bf16", "ppiqpippippi")
+_backward_bf16 = native.Function("mlp_backward_bf16", "ppiqpippippppppi")
 
 
 class _MLP(torch.autograd.Function):
-    """The compiled form of `mlp`; backward computes hidden layers again, and skips samples whose gradient is 0."""
+    """The compiled form of `mlp`, or of `density_mlp` if the plan says so, whose results it returns.
+
+    Backward computes hidden layers again, and skips samples whose gradient is 0.
+    """
 
     @staticmethod
-    def forward(ctx: Any, plan: _Plan, *tensors: Tensor) -> Tensor:
+    def forward(ctx: Any, plan: _Plan, *tensors: Tensor) -> Tensor | tuple[Tensor, Tensor]:
         call = _Call(plan, tensors)
+        density: Tensor | None = None
 
         def compute() -> Tensor:
+            nonlocal density
             out = tensors[0].new_empty(call.count, call.outputs)
+            density = out.new_empty(call.count) if plan.density else None
             run = _forward_bf16 if plan.bf16 else _forward
-            run(*call.arguments, CODES[plan.activation], out.data_ptr(), native.threads())
+            place = None if density is None else density.data_ptr()
+            run(*call.arguments, CODES[plan.activation], out.data_ptr(), place, native.threads())
             return out
 
-        ctx.save_for_backward(*tensors)
         ctx.plan = plan
-        return kept.result(("mlp", plan), tensors[: plan.inputs], tensors[plan.inputs :], compute)
+        out = kept.result(("mlp", plan), tensors[: plan.inputs], tensors[plan.inputs :], compute)
+        if not plan.density:
+            ctx.save_for_backward(*tensors)
+            return out
+        # Where the output was taken from a recorded call, so is the density.
+        found = kept.result(("density",), (out,), (), lambda: split_density(out)[0] if density is None else density)
+        ctx.save_for_backward(*tensors, found)
+        ctx.set_materialize_grads(False)
+        return found, out
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        plan, tensors = ctx.plan, ctx.saved_tensors
+    def backward(ctx: Any, *incoming: Tensor | None) -> tuple[Tensor | None, ...]:
+        plan, tensors, density, of_density = ctx.plan, ctx.saved_tensors, None, None
+        if plan.density:
+            (*tensors, density), (of_density, grad) = tensors, incoming
+        else:
+            (grad,) = incoming
         call = _Call(plan, tensors)
-        grad = grad.contiguous()
+        of_density, grad = (None if each is None else each.contiguous() for each in (of_density, grad))
         grads = [
             torch.empty_like(tensor) if wanted or index >= plan.inputs else None
             for index, (tensor, wanted) in enumerate(zip(tensors, ctx.needs_input_grad[1:], strict=True))
@@ -84,7 +110,10 @@ class _MLP(torch.autograd.Function):
         grad_inputs, grad_weights, grad_biases = plan.split(addresses)
         run = _backward_bf16 if plan.bf16 else _backward
         run(
-            *call.arguments, CODES[plan.activation], native.pointer(grad, "the gradient", (call.count, call.outputs)),
+            *call.arguments, CODES[plan.activation],
+            None if grad is None else native.pointer(grad, "the gradient", (call.count, call.outputs)),
+            None if density is None else native.pointer(density, "the density", (call.count,)),
+            None if of_density is None else native.pointer(of_density, "the density's gradient", (call.count,)),
             native.pointers(grad_inputs), native.pointers(grad_weights),
             native.pointers(grad_biases or [None] * plan.layers), native.threads(),
         )  # fmt: skip
@@ -99,6 +128,7 @@ class _Plan:
     layers: int
     activation: Activation
     bf16: bool
+    density: bool = False
 
     def split(self, values: Sequence[T]) -> tuple[Sequence[T], Sequence[T], Sequence[T]]:
         """Return the inputs, the weights, and the biases, of which there is none or one per layer."""
@@ -152,11 +182,15 @@ def mlp(
     Raises:
         ValueError: if the widths of inputs and layers do not fit.
     """
+    _check_widths(inputs, weights)
+    return NETWORK((*inputs, *weights, *(biases or ())), inputs, weights, activation, biases)
+
+
+def _check_widths(inputs: Sequence[Tensor], weights: Sequence[Tensor]) -> None:
     widths = [sum(part.shape[1] for part in inputs), *(weight.shape[0] for weight in weights)]
     if [weight.shape[1] for weight in weights] != widths[:-1]:
         shapes = ", ".join(str(tuple(weight.shape)) for weight in weights)
         raise ValueError(f"mlp: weights of shapes {shapes} do not fit inputs of {widths[0]} features")
-    return NETWORK((*inputs, *weights, *(biases or ())), inputs, weights, activation, biases)
 
 
 NETWORK = Operation("mlp", mlp_reference)
@@ -178,6 +212,52 @@ def _compiled(
     activation: Activation = "none",
     biases: Sequence[Tensor] | None = None,
 ) -> Tensor:
-    tensors = [x.contiguous() for x in (*inputs, *weights, *(biases or ()))]
-    bf16 = torch.is_autocast_enabled("cpu") and native.has("mlp_forward_bf16")
-    return _MLP.apply(_Plan(len(inputs), len(weights), activation, bf16), *tensors)
+    return _apply(_Plan(len(inputs), len(weights), activation, _multiplies_bf16()), inputs, weights, biases)
+
+
+def _multiplies_bf16() -> bool:
+    return torch.is_autocast_enabled("cpu") and native.has("mlp_forward_bf16")
+
+
+def _apply(
+    plan: _Plan, inputs: Sequence[Tensor], weights: Sequence[Tensor], biases: Sequence[Tensor] | None
+) -> Any:  # fmt: skip
+    return _MLP.apply(plan, *(x.contiguous() for x in (*inputs, *weights, *(biases or ()))))
+
+
+def density_mlp(
+    inputs: Sequence[Tensor], weights: Sequence[Tensor], biases: Sequence[Tensor] | None = None
+) -> tuple[Tensor, Tensor]:
+    """Return the density (N,) and the outputs (N, D_out) of a network whose first output is the log-density.
+
+    It is `framework.kernels.math.split_density` of `mlp`, without passes of its own over the outputs and their
+    gradient.
+
+    Args:
+        inputs: parts (N, D_i) of the input, as in `mlp`.
+        weights: (D_out, D_in) weights of each layer.
+        biases: (D_out,) biases of each layer; None for no biases.
+
+    Raises:
+        ValueError: if the widths of inputs and layers do not fit.
+    """
+    _check_widths(inputs, weights)
+    return DENSITY_NETWORK((*inputs, *weights, *(biases or ())), inputs, weights, biases)
+
+
+DENSITY_NETWORK: Operation[..., tuple[Tensor, Tensor]] = Operation("density_mlp", density_mlp_reference)
+
+
+def _is_small_density(
+    inputs: Sequence[Tensor], weights: Sequence[Tensor], biases: Sequence[Tensor] | None = None
+) -> bool:
+    return _is_small(inputs, weights)
+
+
+@DENSITY_NETWORK.implementation(CPP, fits=_is_small_density)
+def _compiled_density(
+    inputs: Sequence[Tensor], weights: Sequence[Tensor], biases: Sequence[Tensor] | None = None
+) -> tuple[Tensor, Tensor]:
+    plan = _Plan(len(inputs), len(weights), "none", _multiplies_bf16(), density=True)
+    density, out = _apply(plan, inputs, weights, biases)
+    return density, out

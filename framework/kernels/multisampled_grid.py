@@ -9,22 +9,15 @@ Letters: N frustums, J points in each, L levels, F features of an entry.
 
 from __future__ import annotations
 
-from itertools import accumulate
-from typing import Any
+from functools import lru_cache
 
 import torch
 from torch import Tensor
 
-from framework.kernels import kept, native
-from framework.kernels.deferred import waiting
-from framework.kernels.dispatch import CPP, Operation
+from framework.kernels import native
 from framework.kernels.downweighting import level_weights
-from framework.kernels.hash_grid import HashGridLayout, TableGradient, corners
-
-_forward = native.Function("multisampled_grid_forward", "pqipippipi")
-_backward_table = native.Function("multisampled_grid_backward_table", "ppppiippipi")
-_backward_points = native.Function("multisampled_grid_backward_points", "pqippippipi")
-_adam = native.Function("multisampled_grid_adam", "ppppiippippppfddfi", "q")
+from framework.kernels.hash_grid import HashGridLayout, corners
+from framework.kernels.hash_grid_lookup import LookUp, TableGradient
 
 
 def multisampled_grid_reference(points: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
@@ -39,7 +32,7 @@ def multisampled_grid_reference(points: Tensor, table: Tensor, layout: HashGridL
         (N, L * F) features, level by level.
     """
     positions, deviations = points[..., :3].flatten(0, 1), points[..., 3].detach().flatten()
-    shares = level_weights(deviations, points.new_tensor(layout.resolutions)).to(table.dtype)
+    shares = level_weights(deviations, _resolutions(layout, points.dtype, points.device)).to(table.dtype)
     features = []
     for level, offset in enumerate(layout.offsets[:-1]):
         entries, weights, _ = corners(positions, layout, level)
@@ -48,69 +41,22 @@ def multisampled_grid_reference(points: Tensor, table: Tensor, layout: HashGridL
     return torch.cat(features, dim=-1)
 
 
-class MultisampleGradient(TableGradient):
-    """The deferred gradient of a table that frustums are looked up in: see `TableGradient`.
-
-    Its `parts` hold the points (N, J, 4) of each encoding, and the gradient (N, L * F) of its result.
-    """
-
-    _add, _adam = _backward_table, _adam
-
-    def _arguments(self, features: int) -> tuple[Any, ...]:
-        width, layout = self.layout.num_levels * features, (*self.layout.arrays, self.layout.num_levels)
-        ends = tuple(accumulate(len(points) for points, _ in self.parts))
-        each = tuple(points.shape[1] for points, _ in self.parts)
-        points = [native.pointer(x, "points", (len(x), x.shape[1], 4)) for x, _ in self.parts]
-        grads = [native.pointer(g, "the gradient", (len(x), width)) for x, g in self.parts]
-        lists = native.pointers(points), native.pointers(grads), native.integers(ends), native.integers(each)
-        return *lists, len(ends), features, *layout
+@lru_cache(maxsize=64)
+def _resolutions(layout: HashGridLayout, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return cells along an axis (L,); they are kept, since bringing them to a device means to wait for it."""
+    return torch.tensor(layout.resolutions, dtype=dtype, device=device)
 
 
-class _MultisampledGrid(torch.autograd.Function):
-    """The compiled form of `multisampled_grid`."""
-
-    @staticmethod
-    def forward(ctx: Any, points: Tensor, table: Tensor, placeholder: Tensor | None, layout: HashGridLayout) -> Tensor:
-        (count, each, _), features = points.shape, table.shape[1]
-        where = native.pointer(points, "points", (count, each, 4))
-        entries = native.pointer(table, "the hash table", (layout.num_entries, features))
-
-        def compute() -> Tensor:
-            out = points.new_empty(count, layout.num_levels * features)
-            _forward(
-                where, count, each, entries, features, *layout.arrays, layout.num_levels, out.data_ptr(),
-                native.threads(),
-            )  # fmt: skip
-            return out
-
-        ctx.save_for_backward(points, table)
-        ctx.layout = layout
-        return kept.result(("multisampled_grid", layout), (points,), (table,), compute)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        points, table = ctx.saved_tensors
-        layout, (count, each, _), features = ctx.layout, points.shape, table.shape[1]
-        grad = grad.contiguous()
-        incoming = native.pointer(grad, "the gradient", (count, layout.num_levels * features))
-        grad_points = grad_table = None
-        if ctx.needs_input_grad[1]:
-            grad_table = torch.zeros_like(table)
-            gradient = MultisampleGradient(layout)
-            gradient.parts.append((points, grad))
-            gradient.add_to(grad_table)
-        if ctx.needs_input_grad[0]:
-            grad_points = torch.empty_like(points)
-            _backward_points(
-                points.data_ptr(), count, each, table.data_ptr(), incoming, features, *layout.arrays,
-                layout.num_levels, grad_points.data_ptr(), native.threads(),
-            )  # fmt: skip
-        return grad_points, grad_table, grad if ctx.needs_input_grad[2] else None, None
+_forward = native.Function("multisampled_grid_forward", "pqipippipi")
+_backward_table = native.Function("multisampled_grid_backward_table", "ppppiippipi")
+_backward_points = native.Function("multisampled_grid_backward_points", "pqippippipi")
+_adam = native.Function("multisampled_grid_adam", "ppppiippippppfddfi", "q")
+LOOK_UP = LookUp("multisampled_grid", "points", ("N", "J", 4), _forward, _backward_table, _backward_points, _adam)
+"""The look-up of frustums."""
 
 
 def multisampled_grid(
-    points: Tensor, table: Tensor, layout: HashGridLayout, deferred: MultisampleGradient | None = None
+    points: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None = None
 ) -> Tensor:
     """Return the hash encoding of frustums: the mean over their points of features that are weighted by scale.
 
@@ -129,29 +75,9 @@ def multisampled_grid(
     Raises:
         ValueError: if a shape does not fit the layout.
     """
-    if points.ndim != 3 or points.shape[1] < 1 or points.shape[2] != 4:
-        raise ValueError(f"multisampled_grid: points have shape {tuple(points.shape)}, not (N, J, 4)")
-    if table.ndim != 2 or table.shape[0] != layout.num_entries:
-        raise ValueError(f"multisampled_grid: the table has shape {tuple(table.shape)}, not ({layout.num_entries}, F)")
+    LOOK_UP.check(points, table, layout)
     points = points.to(table.dtype)
     return MULTISAMPLED_GRID((points, table), points, table, layout, deferred)
 
 
-def _reference(points: Tensor, table: Tensor, layout: HashGridLayout, deferred: MultisampleGradient | None) -> Tensor:
-    return multisampled_grid_reference(points, table, layout)
-
-
-MULTISAMPLED_GRID = Operation("multisampled_grid", _reference)
-
-
-def _fits(points: Tensor, table: Tensor, layout: HashGridLayout, deferred: MultisampleGradient | None) -> bool:
-    return table.shape[1] in (1, 2, 4, 8)
-
-
-@MULTISAMPLED_GRID.implementation(CPP, fits=_fits)
-def _compiled(points: Tensor, table: Tensor, layout: HashGridLayout, deferred: MultisampleGradient | None) -> Tensor:
-    points, table, placeholder = points.contiguous(), table.contiguous(), None
-    if deferred is not None and table.requires_grad:
-        placeholder = waiting(table, points, layout.num_levels * table.shape[1], deferred.parts)
-        table = table.detach()
-    return _MultisampledGrid.apply(points, table, placeholder, layout)
+MULTISAMPLED_GRID = LOOK_UP.operation(multisampled_grid_reference)

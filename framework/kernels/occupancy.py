@@ -1,4 +1,9 @@
-"""The occupancy grid of a march: its cells, in the forms in which they are looked up, and when they are occupied."""
+"""The occupancy grid of a march: its cells, in the forms in which they are looked up, and when they are occupied.
+
+A grid has one box, or several that are nested, each of twice the size and with as many cells (Instant-NGP, Mueller et
+al. 2022, appendix E.2). A position belongs to the smallest box that it lies in, so the cells in the middle of a larger
+box are never looked up. A grid of one box may have slices of time, each with cells of its own.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +11,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import torch
 from torch import Tensor
 
+from framework.geometry.bounds import nested_boxes
 from framework.kernels import native
 from framework.kernels.dispatch import CPP, Operation
 from framework.kernels.triton_kernels import later
@@ -22,35 +29,62 @@ ROUNDING = 1e-5
 
 @dataclass(frozen=True)
 class Occupancy:
-    """The occupied cells of a grid over a box."""
+    """The occupied cells of a grid over a box, over L nested boxes, or over a box in T slices of time."""
 
     occupied: Tensor
-    """(T n^3,) bool; the index of cell (x, y, z) of slice s is ((s n + x) n + y) n + z."""
+    """(L n^3,) or (T n^3,) bool; the index of cell (x, y, z) of box or slice l is ((l n + x) n + y) n + z."""
     box: Tensor
-    """(2, 3) minimum and maximum corner, scene units."""
+    """(2, 3) minimum and maximum corner of the smallest box, scene units."""
     resolution: int
-    """Number n of cells along each axis."""
+    """Number n of cells along each axis of a box; a multiple of 4 if there are several."""
+    levels: int = 1
+    """Number L of boxes."""
     slices: int = 1
-    """Number T of equal parts of the time from 0 to 1, each of which has cells of its own."""
+    """Number T of equal parts of the time from 0 to 1; 1 if there are several boxes."""
+
+    @cached_property
+    def outer(self) -> Tensor:
+        """(2, 3) corners of the largest box."""
+        return nested_boxes(self.box, self.levels)[-1]
+
+    @cached_property
+    def filled(self) -> Tensor:
+        """(L, n, n, n) or (T, n, n, n) `occupied`, where the middle of a larger box says what the smaller one holds.
+
+        A cell there is occupied if one of the eight is that it consists of, so that a box can be crossed by what its
+        own cells say.
+        """
+        n = self.resolution
+        boxes = self.occupied.view(self.levels * self.slices, n, n, n)
+        if self.levels == 1:
+            return boxes
+        boxes, middle = boxes.clone(), slice(n // 4, n - n // 4)
+        for smaller, larger in pairwise(boxes):
+            any_x = smaller[0::2] | smaller[1::2]
+            any_y = any_x[:, 0::2] | any_x[:, 1::2]
+            larger[middle, middle, middle] = any_y[..., 0::2] | any_y[..., 1::2]
+        return boxes
 
     @cached_property
     def packed(self) -> tuple[Tensor, Tensor]:
-        """(T, ceil(n^3 / 8)) uint8 with one bit per cell, and (T, ceil(n / 4)^3) uint8, for the compiled march.
+        """(L or T, ceil(n^3 / 8)) uint8 with one bit per cell, (L or T, ceil(n / 4)^3) uint8, for the compiled march.
 
-        The second tensor has, for each block of 4^3 cells, the distance in blocks to the nearest block with an occupied
-        cell.
+        The second tensor has, for each block of 4^3 cells, the distance in blocks to the nearest block of its box with
+        an occupied cell.
         """
-        count, n = self.slices, self.resolution
+        n, count = self.resolution, self.levels * self.slices
         bits = torch.empty(count, (n**3 + 7) // 8, dtype=torch.uint8)
         blocks = torch.empty(count, math.ceil(n / BLOCK) ** 3, dtype=torch.uint8)
-        address = native.pointer(self.occupied, "the occupancy", (count * n**3,), torch.bool)
-        _pack(address, n, count, bits.data_ptr(), blocks.data_ptr(), native.threads())
+        for cells, its_bits, its_blocks in zip(self.filled, bits, blocks, strict=True):
+            address = native.pointer(cells, "the occupancy", (n, n, n), torch.bool)
+            _pack(address, n, its_bits.data_ptr(), its_blocks.data_ptr())
         return bits, blocks
 
     @cached_property
     def distances(self) -> Tensor:
-        """(T, ceil(n / 4)^3) uint8 distances of blocks, as in `packed`, but at most 16, for the march on a GPU."""
-        return later("march", "block_distances")(self.occupied, self.resolution, self.slices)
+        """(L or T times ceil(n / 4)^3,) uint8 distances of blocks, as in `packed`, up to 16, for the march on a GPU."""
+        find = later("march", "block_distances")
+        return torch.cat([find(cells.flatten(), self.resolution) for cells in self.filled])
 
     def slices_of(self, times: Tensor | None) -> Tensor | None:
         """Return the slice (R,) int64 of each of `times` (R,); None if there is only one.
@@ -66,7 +100,7 @@ class Occupancy:
 
     @cached_property
     def edge(self) -> float:
-        """Length of the shortest edge of a cell, scene units."""
+        """Length of the shortest edge of a cell of the smallest box, scene units."""
         return ((self.box[1] - self.box[0]) / self.resolution).min().item()
 
     def near(self, radius: int) -> Tensor:
@@ -84,50 +118,84 @@ class Occupancy:
 
         Args:
             positions: (N, 3) scene coordinates.
-            slices: (N,) slice of each; None for the first.
+            slices: (N,) slice of time of each; None for the first.
         """
+        scale = self.resolution / (self.box[1] - self.box[0])
+        places = (positions - self.box[0]) * scale
+        if self.levels > 1:
+            return self._nested_cells(places)
+        x, y, z = places.long().clamp(0, self.resolution - 1).unbind(-1)
+        x = x if slices is None else slices * self.resolution + x
+        return (x * self.resolution + y) * self.resolution + z
+
+    def _nested_cells(self, places: Tensor) -> Tensor:
+        """Return the index (N,) of the cell at each of `places` (N, 3), in cells of the smallest box."""
         n = self.resolution
-        x, y, z = ((positions - self.box[0]) * (n / (self.box[1] - self.box[0]))).long().clamp(0, n - 1).unbind(-1)
-        return ((x if slices is None else slices * n + x) * n + y) * n + z
+        across = places - n / 2
+        level = torch.frexp(across.abs().amax(-1) / (n / 2)).exponent.long().clamp(0, self.levels - 1)
+        size = torch.tensor([0.5**box for box in range(self.levels)], dtype=places.dtype, device=places.device)
+        x, y, z = (across * size[level][:, None] + n / 2).long().clamp(0, n - 1).unbind(-1)
+        return ((level * n + x) * n + y) * n + z
 
 
-def refresh_occupancy_reference(density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float) -> None:
-    """Compute `refresh_occupancy` of `density`, `occupied`, `decay`, `step` and `threshold` in PyTorch."""
+def refresh_occupancy_reference(
+    density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float, elsewhere: float = 0.0
+) -> None:
+    """Compute `refresh_occupancy` of `density`, `occupied`, `decay`, `step`, `threshold` and `elsewhere` in PyTorch."""
     density *= decay
     alpha = -torch.expm1(-density * step)
-    least = (alpha.nanmean() * (1 - ROUNDING)).nan_to_num(nan=threshold).clamp(max=threshold)  # NaN if all are
+    mean = (alpha.nanmean() * (1 - ROUNDING)).nan_to_num(nan=threshold)  # NaN if all are
+    least = mean.clamp(min=elsewhere).clamp(max=threshold)
     occupied.copy_(~(alpha < least))
 
 
 @torch.no_grad()
-def refresh_occupancy(density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float) -> None:
+def refresh_occupancy(
+    density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float, elsewhere: float = 0.0
+) -> None:
     """Mark, in place, the cells whose opacity over one step is at least a threshold.
 
     Args:
-        density: (N,) density of each cell, 1/length, which is multiplied by `decay` in place; infinite if unknown.
+        density: (n^3,) density of each cell, 1/length, which is multiplied by `decay` in place; infinite if unknown.
             Cells of NaN are marked, so that a broken field is noticed, and left out of the mean.
-        occupied: (N,) bool, to be written.
+        occupied: (n^3,) bool, to be written.
         decay: factor of the densities.
         step: length of a step, scene units.
         threshold: minimum opacity, or the mean opacity over all cells if that is less.
+        elsewhere: an opacity that counts for the mean if it is larger, so that a box with nothing in it is emptied.
     """
-    REFRESH_OCCUPANCY((density,), density, occupied, decay, step, threshold)
+    REFRESH_OCCUPANCY((density,), density, occupied, decay, step, threshold, elsewhere)
 
 
 REFRESH_OCCUPANCY = Operation("refresh_occupancy", refresh_occupancy_reference)
 
 
 @REFRESH_OCCUPANCY.implementation(CPP)
-def _refresh_compiled(density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float) -> None:
+def _refresh_compiled(
+    density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float, elsewhere: float = 0.0
+) -> None:
     cells = len(density)
     _refresh(
-        native.pointer(density, "density", (cells,)), cells, decay, step, threshold,
+        native.pointer(density, "density", (cells,)), cells, decay, step, threshold, elsewhere,
         native.pointer(occupied, "the occupancy", (cells,), torch.bool), native.threads(),
     )  # fmt: skip
 
 
+def own_cells(levels: int, resolution: int) -> Tensor:
+    """Return the cells (L n^3,) bool of L nested boxes of n^3 cells that are not in the middle, in a smaller box.
+
+    Args:
+        levels: number L of boxes.
+        resolution: number n of cells along each axis of a box; a multiple of 4 if there are several.
+    """
+    own = torch.ones(levels, resolution, resolution, resolution, dtype=torch.bool)
+    middle = slice(resolution // 4, resolution - resolution // 4)
+    own[1:, middle, middle, middle] = False
+    return own.view(-1)
+
+
 def dilated(occupancy: Occupancy, radius: int) -> Tensor:
-    """Return the cells (T n^3,) bool of `occupancy` with an occupied cell within `radius` cells along each axis."""
+    """Return the cells (T n^3,) bool of one box, `occupancy`, with an occupied one within `radius` along every axis."""
     n = occupancy.resolution
     grid = occupancy.occupied.view(-1, n, n, n)
     for axis in range(1, 4):
@@ -139,5 +207,5 @@ def dilated(occupancy: Occupancy, radius: int) -> Tensor:
     return grid.reshape(-1)
 
 
-_pack: Callable[..., None] = native.Function("pack_occupancy", "piippi")
-_refresh: Callable[..., None] = native.Function("refresh_occupancy", "pqfffpi")
+_pack: Callable[..., None] = native.Function("pack_occupancy", "pipp")
+_refresh: Callable[..., None] = native.Function("refresh_occupancy", "pqffffpi")

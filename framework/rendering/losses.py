@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from framework.geometry.rays import Samples
 from framework.kernels.compositing import distortion, ray_sum
+from framework.samplers.proposal import to_disparity
 
 WIDTH = 3.0
 """Standard deviations from a known distance within which a ray is to end."""
@@ -63,19 +66,24 @@ def opacity_of_transparent(accumulation: Tensor, alpha: Tensor, weights: Tensor 
     return (wrong if weights is None else wrong * weights).mean()
 
 
-def normalised_distortion(weights: Tensor, samples: Samples) -> Tensor:
+def normalised_distortion(weights: Tensor, samples: Samples, scale: float | None = None) -> Tensor:
     """Return the mean distortion () of rays in normalised distance: mip-NeRF 360 (Barron et al. 2022), equation 15.
 
     Args:
         weights: (N,) weights of the samples of R rays.
         samples: N samples, with their edges in normalised distance, as a `ProposalSampler` returns them.
+        scale: for samples without such edges, the distance up to which normalised distance is half of the distance in
+            this unit; it is disparity beyond (`to_disparity`).
 
     Raises:
-        ValueError: if the samples have no such edges.
+        ValueError: if the samples have no such edges, and there is no scale.
     """
-    if samples.edges is None:
+    if samples.edges is not None:
+        return distortion(weights, Samples.regular(samples.edges[:, :-1], samples.edges[:, 1:])).mean()
+    if scale is None:
         raise ValueError("these samples have no edges in normalised distance: the sampler is no ProposalSampler")
-    return distortion(weights, Samples.regular(samples.edges[:, :-1], samples.edges[:, 1:])).mean()
+    starts, ends = (to_disparity(t / scale) for t in (samples.t_starts, samples.t_ends))
+    return distortion(weights, replace(samples, t_starts=starts, t_ends=ends)).mean()
 
 
 def depth_error(weights: Tensor, samples: Samples, known: Tensor) -> Tensor:

@@ -80,7 +80,7 @@ def shade(
     if stopping is None or samples.features is None:
         raise ValueError("shade() needs samples whose density and features are attached")
     owners = samples.ray_indices
-    cameras = None if rays.camera_indices is None else rays.camera_indices[owners]
+    cameras = None if rays.camera_indices is None else rays.camera_indices.index_select(0, owners)
     rgb = field.color(samples.features, rays.directions.index_select(0, owners), cameras)
     if gradient_factors is not None:
         stopping, rgb = scale_gradient(stopping, gradient_factors), scale_gradient(rgb, gradient_factors)

@@ -62,27 +62,31 @@ class StopsEarly(Protocol):
 
 @runtime_checkable
 class SkipsCells(Protocol):
-    """A sampler that skips the empty cells of a grid over a box."""
+    """A sampler that skips the empty cells of a grid over a box, or over L nested boxes (`Occupancy`)."""
 
     box: Tensor
-    """(2, 3) corners of the grid, scene units."""
+    """(2, 3) corners of the grid, of the smallest box if there are several, scene units."""
     resolution: int
-    """Number n of cells along each axis."""
+    """Number n of cells along each axis of a box."""
+    levels: int
+    """Number L of boxes."""
     slices: int
-    """Number T of equal parts of the time from 0 to 1, each of which has cells of its own; 1 for a still scene."""
+    """Number T of equal parts of the time from 0 to 1, each of which has cells of its own; 1 for a still scene, or if
+    there are several boxes."""
     occupied: Tensor
-    """(T n^3,) bool, True for cells that are sampled; the index of cell (x, y, z) of slice s is
-    ((s n + x) n + y) n + z."""
+    """(L n^3,) or (T n^3,) bool, True for cells that are sampled; cell (x, y, z) of box or slice l has the index
+    ((l n + x) n + y) n + z."""
     carved: Tensor
-    """(T n^3,) bool, True for cells that stay empty."""
+    """(L n^3,) or (T n^3,) bool, True for cells that stay empty; also for those in the middle of a box, in the place of
+    which a smaller box is looked at."""
     early_stop: float
     """Transmittance below which the rest of a ray is dropped, as in `StopsEarly`."""
 
     def occupied_when(self, time: float | None = None) -> Tensor:
-        """Return the cells (n^3,) that are occupied in the slice of `time`, or at any time if it is None."""
+        """Return the cells (L n^3,) that are occupied in the slice of `time`, or at any time if it is None."""
 
     def carve(self, hull: Tensor) -> None:
-        """Mark all cells outside `hull`, (T n^3,) bool or (n^3,) for all slices, as empty, permanently."""
+        """Mark all cells outside `hull`, (L n^3,) or (T n^3,) bool, as empty, permanently."""
 
     def forget(self) -> None:
         """Discard what was computed from `occupied`; to be called after `occupied` has changed."""

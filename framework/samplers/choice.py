@@ -1,7 +1,8 @@
-"""Choice of a method's sampler: an occupancy grid for a scene in a box, proposals for an unbounded scene."""
+"""Choice of a method's sampler: an occupancy grid, or proposals."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal, TypeVar
@@ -17,8 +18,8 @@ from framework.fields.base import Field
 from framework.fields.encoded import DensityField
 from framework.samplers.base import Sampler
 from framework.samplers.hierarchical import LEAST_COARSE, HierarchicalSampler
-from framework.samplers.occupancy import MAX_CELLS, OccupancySampler
-from framework.samplers.proposal import LEARN_EVERY, ProposalSampler
+from framework.samplers.occupancy import MAX_CELLS, MAX_LEVELS, OccupancySampler
+from framework.samplers.proposal import LEARN_EVERY, ProposalSampler, half_edge
 from framework.scene.motion import MotionConfig, vertices_in_time
 
 COARSEST_PROPOSAL = 128
@@ -36,6 +37,9 @@ class SamplingConfig(RayConfig):
 
     RANGES: ClassVar[dict[str, Range]] = {
         "grid_resolution": (1, MAX_CELLS),
+        "nested_resolution": (4, MAX_CELLS),
+        "grid_levels": (1, MAX_LEVELS),
+        "cone_angle": (0, 1),
         "num_steps": (1, 2**20),
         "early_stop": (0, 1),
         "train_early_stop": (0, 1),
@@ -44,14 +48,25 @@ class SamplingConfig(RayConfig):
     }
     """Minimum and maximum of these settings."""
     sampler: Literal["auto", "occupancy", "proposal"] = "auto"
-    """occupancy: march through the occupied cells of the box. proposal: small density fields choose the samples, in all
-    of space, contracted. auto: proposal if the scene may extend beyond the box, otherwise occupancy."""
+    """occupancy: march through the occupied cells of the box, or, if the scene may extend beyond it, of nested boxes
+    around it. proposal: small density fields choose the samples. auto: proposal if the scene may extend beyond the box,
+    otherwise occupancy. Of a scene that may, both see all of space, contracted."""
     silhouette_cells: bool = True
     """Never sample cells of the occupancy grid that an image with an alpha channel shows to be empty (occupancy)."""
     silhouette_pixels: bool = True
     """Never draw pixels whose ray passes only through such empty cells (occupancy)."""
     grid_resolution: int = 128
-    """Cells along each axis of the occupancy grid (occupancy)."""
+    """Cells along each axis of the occupancy grid (occupancy, in a box)."""
+    nested_resolution: int = 64
+    """Cells along each axis of each of the nested boxes, a multiple of 4 (occupancy, beyond the box)."""
+    grid_levels: int = 8
+    """Most nested boxes, each twice as large as the one before; fewer if these reach the far end of the scene
+    (occupancy, beyond the box)."""
+    cone_angle: float = 1 / 256
+    """Growth of a step per unit of distance from the camera (occupancy, beyond the box)."""
+    seen_cells: bool = True
+    """Never sample cells of nested boxes that no training image shows, or only from nearer than the points that it is
+    known to show (occupancy, beyond the box)."""
     num_steps: Auto[int] = 512
     """Steps along the diagonal of the box (occupancy)."""
     early_stop: float = 1e-4
@@ -123,7 +138,7 @@ def contracted_box(config: SamplingConfig, scene: Scene) -> Tensor | None:
         config: the settings, decided.
         scene: properties of the scene.
     """
-    return scene.box if scene.unbounded and config.sampler == "proposal" else None
+    return scene.box if scene.unbounded and config.sampler in ("occupancy", "proposal") else None
 
 
 def make_sampler(
@@ -161,10 +176,10 @@ def _sampler(
 ) -> Sampler:
     sees_time = scene.moving and isinstance(config, MotionConfig)
     if config.sampler == "proposal":
-        levels = range(len(config.num_proposal_samples))
-        resolutions = tuple(COARSEST_PROPOSAL << level for level in levels)
+        count = range(len(config.num_proposal_samples))
+        resolutions = tuple(COARSEST_PROPOSAL << level for level in count)
         if proposals is None and sees_time:
-            proposals = [_moving_proposal(scene, COARSEST_MOVING << level) for level in levels]
+            proposals = [_moving_proposal(scene, COARSEST_MOVING << level) for level in count]
         return ProposalSampler(
             scene.box,
             (*config.num_proposal_samples, config.num_nerf_samples),
@@ -178,14 +193,18 @@ def _sampler(
         if make_coarse is None:
             raise ConfigError("--sampler hierarchical: this method has no coarse field")
         return HierarchicalSampler(make_coarse(), config.num_coarse_samples, config.num_fine_samples)
+    levels = _levels(config, scene) if scene.unbounded else 1
     return OccupancySampler(
         scene.box,
-        config.grid_resolution,
+        config.nested_resolution if scene.unbounded else config.grid_resolution,
         config.num_steps,
         config.early_stop,
         config.train_early_stop,
+        cone=config.cone_angle if scene.unbounded else 0.0,
         moving=scene.moving,
-        slices=config.time_slices if isinstance(config, MotionConfig) and sees_time else 1,
+        levels=levels,
+        endless=not scene.has_alpha and scene.unbounded,
+        slices=config.time_slices if isinstance(config, MotionConfig) and sees_time and levels == 1 else 1,
     )
 
 
@@ -193,3 +212,9 @@ def _moving_proposal(scene: Scene, resolution: int) -> DensityField:
     """Return a density on planes in space and time, of `resolution` vertices per axis of space."""
     vertices = (resolution,) * 3 + (vertices_in_time(scene),)
     return DensityField(scene.box, FeaturePlanes((vertices,), MOVING_FEATURES), unbounded=scene.unbounded)
+
+
+def _levels(config: SamplingConfig, scene: Scene) -> int:
+    """Return the number of nested boxes: enough to reach the far end, but no more than `config` allows."""
+    reach = math.ceil(math.log2(max(scene.far / half_edge(scene.box), 1.0)))
+    return min(1 + reach, config.grid_levels)

@@ -1,13 +1,16 @@
 """Sampling with an occupancy grid, which skips empty space, in waves, which skip hidden space.
 
 The grid is that of Instant-NGP (Mueller et al. 2022, appendix E.2): it holds a decaying maximum of the density in each
-cell, and a cell is skipped while a step through it is nearly transparent. The grid of a moving scene may have slices of
-time, so that a ray skips what is empty at its own time.
+cell, and a cell is skipped while a step through it is nearly transparent. A scene without bounds has several nested
+boxes, each twice as large as the one before, through which steps grow with distance; all that is behind the largest is
+one last sample, as long as it takes to be opaque. The grid of a moving scene in one box may have slices of time, so
+that a ray skips what is empty at its own time.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -15,17 +18,23 @@ from torch import Tensor
 
 from framework.base.errors import ConfigError, shown
 from framework.fields.base import DensityFunction, Field, HasAlpha
+from framework.geometry.bounds import nested_boxes
 from framework.geometry.points import Points, interval_points
 from framework.geometry.rays import Rays, Samples
 from framework.kernels.alpha import alpha_depth
 from framework.kernels.given import is_followed
 from framework.kernels.kept import Waves
 from framework.kernels.march import Occupancy, Wave, march, refresh_occupancy
+from framework.kernels.occupancy import own_cells
 from framework.kernels.rows import gather_rows
 from framework.samplers.base import Sampler
 
 MAX_CELLS = 512
 """Maximum number of cells along an axis; the state of 512^3 cells takes 0.8 GB."""
+MAX_LEVELS = 16
+"""Maximum number of nested boxes."""
+FARTHEST = 1e10
+"""Far end of the last sample of an endless ray, scene units."""
 CHUNK = 2**15
 """Number of cells that are evaluated at once."""
 WARM_UP_STEPS = 256
@@ -38,30 +47,36 @@ is larger because a cell may be occupied for a short time only. Both are for a g
 SHARE, SHARE_OF_SLICES = 64, 128
 """Numbers of cells for each one that is drawn from all cells at an update after warm-up, without and with slices of
 time. With them there are more cells, of which fewer are occupied."""
+COARSE_STEPS = (WARM_UP_STEPS // 4, 4.0), (WARM_UP_STEPS, 2.0)
+"""Training steps until which the march through nested boxes takes longer steps, and how much longer these are. While
+nothing is known to be empty, few rays would take all samples."""
 SHUFFLE_STRIDE = 2654435761
 """A prime number, whose multiples modulo the number of cells visit every cell once per pass, in scattered order."""
 
 
 class OccupancySampler(Sampler):
-    """Samples at steps through the occupied cells of a box.
+    """Samples at steps through the occupied cells of a box, or of nested boxes.
 
     Args:
-        box: (2, 3) corners of the box, scene units.
-        resolution: cells along each axis.
+        box: (2, 3) corners of the box, the smallest if there are several, scene units.
+        resolution: cells along each axis of a box.
         num_steps: steps along the diagonal of the box.
         early_stop: transmittance below which the rest of a ray is dropped: the maximum error of a colour channel. 0
             drops nothing.
         train_early_stop: the same threshold during training, where less exact colours are sufficient; `early_stop` if
             None.
         alpha_threshold: a cell is occupied if the opacity of one step through it is at least this, or at least the mean
-            over the grid if that is less.
+            over its box, or over the smallest one, if both are less.
         cone: growth of the step per unit of distance, beyond the distance where it exceeds the even step; 0 for even
             steps throughout.
         moving: whether the scene changes with time; a cell is then occupied if it is at any time of its slice.
+        levels: number of nested boxes, each of twice the size and with as many cells.
+        endless: whether rays have a last sample for all that is behind the largest box, which any density makes opaque:
+            for images without an alpha channel.
         slices: number T of equal parts of the time from 0 to 1, each of which has cells of its own.
 
     Raises:
-        ConfigError: if the number of cells, steps or slices is out of range.
+        ConfigError: if the number of cells, boxes, slices or steps is out of range.
     """
 
     box: Tensor
@@ -79,6 +94,8 @@ class OccupancySampler(Sampler):
         alpha_threshold: float = 0.01,
         cone: float = 0.0,
         moving: bool = False,
+        levels: int = 1,
+        endless: bool = False,
         slices: int = 1,
     ) -> None:
         super().__init__()
@@ -87,39 +104,45 @@ class OccupancySampler(Sampler):
                 f"an occupancy grid has 1 to {MAX_CELLS} cells along an axis and 1 step or more, "
                 f"not {shown(resolution)} and {shown(num_steps)}"
             )
-        if not (slices >= 1 and slices * resolution**3 <= MAX_CELLS**3) or (slices > 1 and not moving):
+        if not 1 <= levels <= MAX_LEVELS or (levels > 1 and resolution % 4):
             raise ConfigError(
-                f"{shown(slices)} slices of time: there is 1, or more if the scene moves, and cells in all of them "
-                f"together are at most {MAX_CELLS}^3"
+                f"1 to {MAX_LEVELS} boxes are nested, with a multiple of 4 cells along an axis, "
+                f"not {shown(levels)} with {resolution}"
             )
-        self.resolution, self.slices = resolution, slices
+        if slices != 1 and not (1 < slices * resolution**3 <= MAX_CELLS**3 and slices > 0 and moving and levels == 1):
+            raise ConfigError(
+                f"{shown(slices)} slices of time: there is 1, or more in one box of a scene that moves, with at most "
+                f"{MAX_CELLS}^3 cells in all"
+            )
+        self.resolution, self.levels, self.endless, self.slices = resolution, levels, endless, slices
         self.step_size = (box[1] - box[0]).norm().item() / num_steps
         self.early_stop = early_stop
         self.train_early_stop = early_stop if train_early_stop is None else train_early_stop
         self.alpha_threshold = alpha_threshold
         self.cone = cone
         self.moving = moving
+        self._stride = 1.0
         self.register_buffer("box", box.clone())
-        self.register_buffer("density_grid", torch.full((slices * resolution**3,), torch.inf))
-        self.register_buffer("occupied", torch.ones(slices * resolution**3, dtype=torch.bool))
-        self.register_buffer("carved", torch.zeros(slices * resolution**3, dtype=torch.bool))
+        self.register_buffer("occupied", own_cells(levels, resolution).repeat(slices).to(box.device))
+        self.register_buffer("carved", ~self.occupied)
+        self.register_buffer("density_grid", torch.where(self.occupied, torch.inf, 0.0))
         self._packed: Occupancy | None = None
         self.register_load_state_dict_post_hook(lambda module, _: module.forget())
 
     @property
     def occupied_share(self) -> float:
-        """Fraction of the cells that are occupied."""
-        return self.occupied.float().mean().item()
+        """Fraction of the cells that are occupied, of those that are not in a smaller box."""
+        return int(self.occupied.sum()) / (self.slices * int(own_cells(self.levels, self.resolution).sum()))
 
     @property
     def occupancy(self) -> Occupancy:
         """The grid in the form that `march` needs."""
         if self._packed is None or self._packed.occupied is not self.occupied:
-            self._packed = Occupancy(self.occupied, self.box, self.resolution, self.slices)
+            self._packed = Occupancy(self.occupied, self.box, self.resolution, self.levels, self.slices)
         return self._packed
 
     def occupied_when(self, time: float | None = None) -> Tensor:
-        """Return the cells (n^3,) that are occupied in the slice of `time`, or at any time if it is None."""
+        """Return the cells (L n^3,) that are occupied in the slice of `time`, or at any time if it is None."""
         of_slices = self.occupied.view(self.slices, -1)
         if time is None:
             return of_slices.any(0)
@@ -133,6 +156,8 @@ class OccupancySampler(Sampler):
 
     def sample(self, rays: Rays, field: Field, jitter: bool, early_stop: float | None = None) -> Samples:
         """Return samples in occupied cells, up to the early stop, with densities and features attached.
+
+        A ray whose light reaches past the largest box of an endless grid has one sample more.
 
         The samples that are dropped could have changed a colour channel by at most the threshold of the early stop.
 
@@ -151,7 +176,8 @@ class OccupancySampler(Sampler):
         shift = torch.rand(len(rays), device=rays.origins.device) if jitter else None
         own = self.train_early_stop if self.training else self.early_stop
         stop = own if early_stop is None else early_stop
-        marched = march(rays, self.occupancy, self.step_size, self.cone, shift, stop)
+        stride = self._stride if self.training else 1.0
+        marched = march(rays, self.occupancy, stride * self.step_size, stride * self.cone, shift, stop)
 
         def evaluate(wave: Wave) -> tuple[Tensor, Tensor]:
             points = interval_points(rays, wave.owners, wave, wave.positions, field.footprint)
@@ -166,6 +192,9 @@ class OccupancySampler(Sampler):
             if surface is not None:  # the march needs the density with the same opacity in each interval
                 stopping = alpha_depth(stopping.detach()) / (wave.t_ends - wave.t_starts)
             marched.advance(stopping)
+        rest = marched.rest(self.occupancy.outer) if self.endless else None
+        if rest is not None:
+            evaluated.evaluate(len(rest.owners), partial(evaluate, rest))
         order, offsets = marched.finish()
         if not marched.waves:  # no occupied cell on any ray: empty tensors with the field's shapes and types
             empty = rays.nears[:0]
@@ -180,6 +209,8 @@ class OccupancySampler(Sampler):
             return evaluate(Wave(starts, ends, owners, positions))
 
         samples = Samples(starts, ends, offsets, owners=owners, longest=marched.longest, early_stop=stop)
+        if rest is not None:
+            samples = _opened(samples, rest.owners)
         return _attached(samples, surface, *evaluated.choose(order, chosen))
 
     # -- updating the grid ------------------------------------------------------------------------------------
@@ -188,9 +219,11 @@ class OccupancySampler(Sampler):
         """Mark cells as empty, permanently.
 
         Args:
-            hull: (T n^3,) bool (`framework.scene.silhouettes`), False for these cells; or (n^3,) for all slices.
+            hull: (L n^3,) or (T n^3,) bool (`framework.scene.silhouettes`), False for these cells; or, with slices of
+                time, (n^3,) for all of them.
         """
-        self.carved.view(self.slices, -1).copy_(~hull.view(-1, self.resolution**3))
+        own = own_cells(self.levels, self.resolution).to(hull.device)
+        self.carved.view(self.slices, -1).copy_(~(hull.view(-1, len(own)) & own))
         self.density_grid.masked_fill_(self.carved, 0)
         self.occupied.masked_fill_(self.carved, False)
         self.forget()
@@ -199,37 +232,55 @@ class OccupancySampler(Sampler):
     def update(self, step: int, density: DensityFunction) -> None:
         """Evaluate the density in some cells and update `occupied`, every 8 steps during warm-up and every 16 later.
 
-        During warm-up the cells are taken in the order of a fixed shuffle, so that all are evaluated soon. Afterwards
-        one third is drawn from all cells, so that an empty cell can become occupied again, one third from the occupied
-        cells, and one third from the neighbours of occupied cells.
+        During warm-up the cells are taken in the order of a fixed shuffle, so that all are evaluated soon; those of
+        nested boxes are all occupied until then. Afterwards one third is drawn from all cells, so that an empty cell
+        can become occupied again, one third from the occupied cells, and one third from the neighbours of occupied
+        cells.
 
         Args:
             step: number of training steps done.
             density: density of the field.
         """
         warming_up = step < WARM_UP_STEPS
+        if self.levels > 1:
+            self._stride = next((longer for until, longer in COARSE_STEPS if step < until), 1.0)
         if step == 0 or step % (8 if warming_up else 16):
             return
         cells = self._shuffled(step // 8 - 1) if warming_up else self._drawn()
         place = self._places(cells)
         unit = (place[:, 1:] + torch.rand(len(cells), 3, device=cells.device)) / self.resolution
-        positions = torch.lerp(self.box[0], self.box[1], unit)
+        low, high = self.box if self.levels == 1 else nested_boxes(self.box, self.levels)[place[:, 0]].unbind(1)
+        positions = torch.lerp(low, high, unit)
         sigma = self._over_time(density, positions, place[:, 0]) if self.moving else _in_chunks(density, positions)
         before = self.density_grid.index_select(0, cells)
         before *= WARM_UP_DECAY if warming_up else MOVING_DECAY if self.moving and self.slices == 1 else DECAY
         evaluated = torch.isfinite(before)
         self.density_grid.index_copy_(0, cells, torch.where(evaluated, torch.maximum(before, sigma), sigma))
-        refresh_occupancy(self.density_grid, self.occupied, 1.0, self.step_size, self.alpha_threshold)
+        if self.levels > 1 and step < WARM_UP_STEPS // 4:
+            return  # cells that are not known yet would raise the mean, and empty all that are
+        densities, occupied = self.density_grid.view(self.levels, -1), self.occupied.view(self.levels, -1)
+        middle = 0.0  # mean opacity in the smallest of several boxes
+        for number, step_size in enumerate(self._step_sizes()):
+            refresh_occupancy(densities[number], occupied[number], 1.0, step_size, self.alpha_threshold, middle)
+            if number == 0 and self.levels > 1:
+                middle = float(-torch.expm1(-densities[0] * step_size).nanmean().nan_to_num())
         self.occupied.logical_and_(~self.carved)
         self.forget()
 
+    def _step_sizes(self) -> list[float]:
+        """Return the length of a step in each box: near the faces, of a ray from the middle, if steps grow."""
+        if self.levels == 1:
+            return [self.step_size]
+        half = float((self.box[1] - self.box[0]).min()) / 2
+        return [max(self.step_size, self.cone * half * 2**level) for level in range(self.levels)]
+
     def _shuffled(self, turn: int) -> Tensor:
-        """Return the cells of update number `turn` during warm-up, which makes four passes over the grid, or two.
+        """Return the cells of update number `turn` during warm-up, which makes four passes over the grid.
 
         Only one in eight of the empty cells is returned, because few of them become occupied again.
         """
-        num_cells, passes = len(self.occupied), 4 if self.slices == 1 else 2
-        count = math.ceil(passes * num_cells * 8 / WARM_UP_STEPS)
+        num_cells = len(self.occupied)
+        count = math.ceil(4 * num_cells * 8 / WARM_UP_STEPS)
         ranks = torch.arange(turn * count, (turn + 1) * count, device=self.occupied.device)
         cells = ranks * SHUFFLE_STRIDE % num_cells
         selected = self.occupied.index_select(0, cells) | (torch.rand(count, device=cells.device) < 1 / 8)
@@ -255,26 +306,34 @@ class OccupancySampler(Sampler):
         return torch.cat([anywhere, drawn, neighbours[~self.carved[neighbours]]])
 
     def _places(self, cells: Tensor) -> Tensor:
-        """Return the slice and the place along x, y and z (N, 4) of each of `cells` (N,)."""
+        """Return the box or slice, and the place along x, y and z, (N, 4) of each of `cells` (N,)."""
         n = self.resolution
         return torch.stack([cells // n**3, cells // n**2 % n, cells // n % n, cells % n], dim=-1)
 
     def _beside(self, cells: Tensor) -> Tensor:
-        """Return a random neighbour, in space and in time, of each of `cells`, or the cell itself."""
+        """Return a random neighbour, in the box and in time, of each of `cells`, or the cell itself."""
         n, place = self.resolution, self._places(cells)
         moved = place[:, 1:] if self.slices == 1 else place
         moved += torch.randint(-1, 2, moved.shape, device=cells.device)
-        place[:, 0].clamp_(0, self.slices - 1)
+        place[:, 0].clamp_(0, self.levels * self.slices - 1)
         place[:, 1:].clamp_(0, n - 1)
         return ((place[:, 0] * n + place[:, 1]) * n + place[:, 2]) * n + place[:, 3]
 
     def _over_time(self, density: DensityFunction, positions: Tensor, slices: Tensor) -> Tensor:
         """Return the maximum density (N,) over random times, one in each of a few equal parts of a position's slice."""
         densities, parts = [], max(TIMES_PER_VISIT // self.slices, 1)
+        first = slices if self.slices > 1 else torch.zeros_like(slices)  # of several boxes there is one slice
         for part in range(parts):
             shares = (part + torch.rand(len(positions), device=positions.device)) / parts
-            densities.append(_in_chunks(density, positions, (slices + shares) / self.slices))
+            densities.append(_in_chunks(density, positions, (first + shares) / self.slices))
         return torch.stack(densities).amax(0)
+
+
+def _opened(samples: Samples, rays: Tensor) -> Samples:
+    """Return samples that are evaluated where they were, the last one of each of `rays` (K,) ending at `FARTHEST`."""
+    ends = samples.t_ends.clone()
+    ends[samples.offsets[rays + 1] - 1] = FARTHEST
+    return replace(samples, t_ends=ends, points=samples.t)
 
 
 def _attached(samples: Samples, surface: HasAlpha | None, stopping: Tensor, features: Tensor) -> Samples:

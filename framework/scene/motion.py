@@ -53,9 +53,9 @@ def decide_motion(config: ConfigT, scene: Scene, sampler: str) -> tuple[ConfigT,
         sampler: the method's sampler, decided.
 
     Returns:
-        the settings, and the decisions that were made; none for a still scene, or without an occupancy grid.
+        the settings, and the decisions that were made; none for a still scene, or without an occupancy grid of one box.
     """
     slices = min(max(scene.num_times // TIMES_A_SLICE, 1), MOST_SLICES)
     reason = f"the images have {scene.num_times} times"
     config, made = fill(config, Choice("time_slices", slices, reason, "slices of time in the occupancy grid"))
-    return config, made * (scene.moving and sampler == "occupancy")
+    return config, made * (scene.moving and not scene.unbounded and sampler == "occupancy")

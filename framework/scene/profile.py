@@ -32,6 +32,8 @@ class SceneProfile:
     """Model of the cameras."""
     decisions: tuple[Decision, ...]
     """Decisions on options that were left open."""
+    scenes: int = 1
+    """Number of scenes that the images show."""
 
     @classmethod
     def of(cls, dataset: Dataset, decisions: list[Decision]) -> SceneProfile:
@@ -54,6 +56,7 @@ class SceneProfile:
             light=None if dataset.light is None else light_spread(dataset.light),
             camera=cameras.model,
             decisions=tuple(decisions),
+            scenes=dataset.scene.num_scenes,
         )
 
     def lines(self) -> list[str]:
@@ -61,6 +64,8 @@ class SceneProfile:
         alpha = "no alpha" if self.transparent is None else f"alpha ({self.transparent:.0%} of pixels transparent)"
         motion = "moving" if self.moving else "still"
         facts = f"scene: {self.images} images of {self.width} x {self.height}, {self.camera} camera, {alpha}, {motion}"
+        if self.scenes > 1:
+            facts += f", {self.scenes} scenes"
         if self.ignored is not None:
             facts += f", {self.ignored:.0%} of pixels ignored (masks, or no ray)"
         if self.light is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 
@@ -13,6 +14,19 @@ def halved(image: Tensor) -> Tensor:
     """
     height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
     return image[:height, :width].reshape(height // 2, 2, width // 2, 2, -1).mean((1, 3))
+
+
+def halved_distances(distances: Tensor) -> Tensor:
+    """Return distances at half the size, the least of four that are known, 0 where none is.
+
+    A mean would lie between what is in front and what is behind; where few pixels are known, none is lost.
+
+    Args:
+        distances: (H, W), 0 where unknown; an odd last row or column is left out.
+    """
+    unknown_far = torch.where(distances > 0, distances, torch.inf)
+    least = -torch.nn.functional.max_pool2d(-unknown_far[None], 2)[0]
+    return torch.where(least.isfinite(), least, 0)
 
 
 def doubled(image: Tensor, whole: Tensor) -> Tensor:

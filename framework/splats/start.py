@@ -9,6 +9,7 @@ from torch import Tensor
 
 from framework.base.console import say
 from framework.base.errors import ConfigError
+from framework.cameras.cameras import Cameras
 from framework.data.dataset import Dataset
 from framework.data.scene import Scene
 from framework.kernels.splat_project import DC
@@ -21,6 +22,8 @@ HULL_CELLS = 128
 """Cells of the visual hull along an axis."""
 FEW = 1_000
 """Maximum number of Gaussians whose distances to the cameras are looked at."""
+NARROW = 0.5
+"""Width of images in distances from the camera, 28 degrees, below which a lens is long."""
 PLACES = {
     "points": "at the points of a reconstruction",
     "field": "on the surfaces of a field",
@@ -148,22 +151,25 @@ def hull_points(hull: Tensor, box: Tensor, resolution: int, count: int) -> Tenso
     return box[0] + at * (box[1] - box[0])
 
 
-def scene_size(scene: Scene, means: Tensor | None = None) -> float:
+def scene_size(scene: Scene, means: Tensor | None = None, cameras: Cameras | None = None) -> float:
     """Return the size of a scene, scene units: 1.3 times the median distance of Gaussians from the cameras.
 
     That is what 3D Gaussian Splatting takes of cameras all around: 1.1 times the largest distance of one from their
     middle, here where no Gaussians are given. Of cameras side by side it would be less than what they see is away.
+    Through long lenses a scene is smaller than its distance says, by as much as their images are narrow.
 
     Args:
         scene: facts about the data.
         means: (N, 3) centres of Gaussians, scene units; None if there are none yet.
+        cameras: M training cameras, for the width of what their images show; as wide as usual if None.
     """
     if scene.camera_to_worlds is None:
         return float((scene.box[1] - scene.box[0]).norm()) / 2
     centers = scene.camera_to_worlds[:, :, 3]
     if means is not None and len(means):
         some = means[:: -(-len(means) // FEW)]
-        return 1.3 * float(torch.cdist(some, centers.to(some)).median()) or 1.0
+        width = 1.0 if cameras is None else min(float((cameras.widths / cameras.fx).median()) / NARROW, 1.0)
+        return 1.3 * width * float(torch.cdist(some, centers.to(some)).median()) or 1.0
     return 1.1 * float((centers - centers.mean(0)).norm(dim=-1).max()) or 1.0
 
 

@@ -37,7 +37,7 @@ def mean_gradients(optimizer: Adam, finite: bool) -> bool:
     count = processes().count
     if count == 1:
         return finite
-    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    parameters = optimizer.parameters
     own = [parameter.numel() * optimizer.has_gradient(parameter) for parameter in parameters]
     finite_there, *sizes = zip(*gathered([finite, *own]), strict=True)
     if not all(finite_there):

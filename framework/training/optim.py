@@ -12,17 +12,20 @@ from torch import Tensor
 from framework.base.config import TrainConfig
 from framework.base.optimised import DefersGradient, ParameterGroup, RowChange
 from framework.kernels.adam import all_finite, dense_adam, sparse_adam
-from framework.kernels.hash_grid import TableGradient
+from framework.kernels.hash_grid_lookup import TableGradient
 from framework.kernels.memory import require, table
 from framework.kernels.planes import PlanesGradient
 from framework.model import Model, parts
 
 
-class Adam(torch.optim.Optimizer):
-    """Adam (Kingma and Ba 2015): PyTorch's fused one, and a sparse one for groups with `sparse` set.
+class Adam:
+    """Adam (Kingma and Ba 2015), and a sparse one for groups with `sparse` set.
 
     A sparse group holds tables (E, F) of which a step uses few entries (`framework.kernels.adam`). The gradient of a
     table is the one that the backward pass left in `deferred`, or else `grad`.
+
+    Groups and states have the form of PyTorch's optimisers, but this is none of them: making one imports PyTorch's
+    compiler, which takes longer than all else before the first step.
 
     Args:
         groups: parameter groups.
@@ -38,7 +41,11 @@ class Adam(torch.optim.Optimizer):
         betas: tuple[float, float],
         eps: float,
     ) -> None:
-        super().__init__(groups, {"lr": lr, "betas": betas, "eps": eps, "sparse": False})
+        defaults: dict[str, Any] = {"lr": lr, "betas": betas, "eps": eps, "sparse": False}
+        self.param_groups = [defaults | group | {"params": list(group["params"])} for group in groups]
+        """Settings of each group, which may be changed between steps, and its parameters as `params`."""
+        self.state: dict[Tensor, dict[str, Tensor]] = {}
+        """Moments and counts of each parameter."""
         self.deferred = deferred
         self.entries_updated: int | Tensor = 0
         """Number of entries of sparse groups that were updated, summed over all steps, possibly on the device."""
@@ -49,25 +56,54 @@ class Adam(torch.optim.Optimizer):
                 self._begin(parameter, group["sparse"])
 
     def _begin(self, parameter: Tensor, sparse: bool) -> None:
-        state = self.state[parameter]
+        state: dict[str, Tensor] = {}
+        self.state[parameter] = state
         state["exp_avg"], state["exp_avg_sq"] = (table(*parameter.shape, like=parameter) for _ in range(2))
         if sparse:
             state["seen"] = parameter.new_zeros(len(parameter))
         else:
             state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
 
-    def zero_grad(self, set_to_none: bool = True) -> None:
-        """Clear all gradients, deferred ones included; they become None, whatever `set_to_none` is."""
-        super().zero_grad(set_to_none=True)
+    @property
+    def parameters(self) -> list[Tensor]:
+        """The parameters of all groups, in order."""
+        return [parameter for group in self.param_groups for parameter in group["params"]]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return groups and states for a checkpoint, as PyTorch's optimisers do: parameters are their numbers."""
+        numbers = {parameter: number for number, parameter in enumerate(self.parameters)}
+        groups = [group | {"params": [numbers[p] for p in group["params"]]} for group in self.param_groups]
+        return {"state": {numbers[p]: dict(state) for p, state in self.state.items()}, "param_groups": groups}
+
+    def load_state_dict(self, saved: Mapping[str, Any]) -> None:
+        """Continue with groups and states from `state_dict`, or from one of PyTorch's optimisers of the same groups.
+
+        Args:
+            saved: content of a checkpoint; its tensors are not copied, and are changed by later steps.
+
+        Raises:
+            ValueError: if the number of groups, or of parameters in a group, differs.
+        """
+        own, groups = self.param_groups, saved["param_groups"]
+        if [len(group["params"]) for group in groups] != [len(group["params"]) for group in own]:
+            raise ValueError("its groups of parameters are others")
+        numbers = [number for group in groups for number in group["params"]]
+        self.state = {
+            parameter: {name: value.to(parameter.device) for name, value in saved["state"][number].items()}
+            for parameter, number in zip(self.parameters, numbers, strict=True)
+        }
+        self.param_groups = [a | b | {"params": a["params"]} for a, b in zip(own, groups, strict=True)]
+
+    def zero_grad(self) -> None:
+        """Clear all gradients, deferred ones included; they become None."""
+        for parameter in self.parameters:
+            parameter.grad = None
         for gradient in self.deferred.values():
             gradient.clear()
 
     def first_bad(self) -> Tensor | None:
         """Return the first parameter whose gradient is not finite; None if all are finite."""
-        for parameter in (p for group in self.param_groups for p in group["params"]):
-            if not all_finite(self._gradients(parameter)):
-                return parameter
-        return None
+        return next((p for p in self.parameters if not all_finite(self._gradients(p))), None)
 
     def has_gradient(self, parameter: Tensor) -> bool:
         """Return whether a `parameter` has a gradient for the next step, deferred or not."""
@@ -91,8 +127,7 @@ class Adam(torch.optim.Optimizer):
         Args:
             loss: a scalar.
         """
-        parameters = (p for group in self.param_groups for p in group["params"])
-        return all_finite([loss.detach(), *(grad for p in parameters for grad in self._gradients(p))])
+        return all_finite([loss.detach(), *(grad for p in self.parameters for grad in self._gradients(p))])
 
     def _gradients(self, parameter: Tensor) -> list[Tensor]:
         """Return the gradient of a parameter, and what is deferred of it; empty if it has none."""
@@ -101,8 +136,8 @@ class Adam(torch.optim.Optimizer):
         return own if deferred is None else own + deferred.gradients
 
     @torch.no_grad()
-    def step(self, closure: None = None) -> None:  # type: ignore[override]
-        """Update every parameter that has a gradient; `closure` is not used.
+    def step(self) -> None:
+        """Update every parameter that has a gradient.
 
         The state of a parameter whose shape has changed starts from zero.
         """
@@ -206,7 +241,7 @@ def _decay(schedule: str, final: float, progress: float) -> float:
     return final + (1 - final) * 0.5 * (1 + float(torch.tensor(progress * torch.pi).cos()))
 
 
-def set_learning_rate(optimizer: torch.optim.Optimizer, config: TrainConfig, step: int, progress: float) -> None:
+def set_learning_rate(optimizer: Adam, config: TrainConfig, step: int, progress: float) -> None:
     """Set each group's learning rate for a step, by the run's schedule or the group's own.
 
     Args:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from framework.base.config import TrainConfig
@@ -12,12 +13,15 @@ from framework.base.console import say
 from framework.base.decisions import Decision
 from framework.cameras.ndc import NdcCameras
 from framework.data.dataset import Dataset
+from framework.data.free_space import before_points
 from framework.data.pixel_set import PixelSet
 from framework.data.pixels import training_background
-from framework.model import HasAppearance, LearnsMotion, Model, RefinesPoses, parts
+from framework.geometry.bounds import nested_boxes
+from framework.model import HasAppearance, LearnsMotion, Model, RefinesPoses, RendersFromImages, parts
 from framework.samplers.base import SkipsCells
 from framework.samplers.choice import SamplingConfig
 from framework.scene.profile import SceneProfile
+from framework.scene.seen_cells import seen_cells
 from framework.scene.silhouettes import Silhouettes, moving_hulls, pixels_near, visual_hull
 
 
@@ -42,7 +46,7 @@ def profile_of(
         decisions.append(Decision("background", training_background(config.background, scene.has_alpha), reason))
     if isinstance(config, SamplingConfig) and config.silhouette_cells and parts(model, SkipsCells):
         obstacle = _no_silhouettes(dataset)
-        outside = "what is outside all of them at its time" if scene.moving else "space outside them"
+        outside = "what is outside all of them" if scene.moving else "space outside them"
         choice = "not used" if obstacle else f"{outside} is skipped from the start"
         decisions.append(Decision("silhouettes", choice, obstacle or "alpha shows them"))
     if scene.moving and not isinstance(model, LearnsMotion):
@@ -52,6 +56,41 @@ def profile_of(
     if scene.poses == "device" and not isinstance(model, RefinesPoses):
         decisions.append(Decision("the device's poses", "not refined", f"{method} takes poses as they are"))
     return SceneProfile.of(dataset, [*decisions, *decided])
+
+
+def show_images(model: Model[Any], train_set: Dataset, eval_set: Dataset | None) -> None:
+    """Show a model that renders from images those of training, and those of held-out scenes that are given to it.
+
+    Args:
+        model: any model.
+        train_set: the training images.
+        eval_set: the held-out images; None without.
+    """
+    if isinstance(model, RendersFromImages):
+        model.show_images(train_set)
+        if eval_set is not None and eval_set.source_images is not None:
+            model.show_images(eval_set)
+
+
+def skip_unseen(config: TrainConfig, model: Model[Any], dataset: Dataset) -> None:
+    """Empty the cells of nested boxes that no training image shows, or only from nearer than all that it shows.
+
+    Args:
+        config: the run's settings.
+        model: the model, whose samplers hold the grids.
+        dataset: the training images.
+    """
+    nested = [sampler for sampler in parts(model, SkipsCells) if sampler.levels > 1]
+    if not nested or not isinstance(config, SamplingConfig) or not config.seen_cells:
+        return
+    cameras, known = dataset.cameras, dataset.sparse_depth
+    nearest = torch.full_like(cameras.fx, dataset.scene.near)
+    if known is not None:
+        nearest = nearest.maximum(before_points(cameras, known))
+    for sampler in nested:
+        boxes = nested_boxes(sampler.box, sampler.levels)
+        seen = torch.cat([seen_cells(cameras, nearest, box, sampler.resolution) for box in boxes])
+        sampler.carve(seen & ~sampler.carved)
 
 
 def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: bool) -> Dataset:
@@ -82,15 +121,20 @@ def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset
     # In a moving scene, a pixel that is empty at its time supervises cells that are occupied at other times.
     if not config.silhouette_pixels or moving or not all(bool(sampler.carved.any()) for sampler in samplers):
         return dataset
-    near = [pixels_near(silhouettes, ~s.carved, s.box, s.resolution) for s in samplers]
+    near = [
+        pixels_near(silhouettes, kept, box, s.resolution)
+        for s in samplers
+        for kept, box in zip((~s.carved).view(s.levels, -1), nested_boxes(s.box, s.levels), strict=True)
+    ]
     return dataset.drawing(PixelSet.shared(near, 1))
 
 
 def _hull(silhouettes: Silhouettes, sampler: SkipsCells, times: Tensor | None) -> Tensor:
     """Return the cells of `sampler` that `silhouettes`, taken at `times` if it moves, do not show to be empty."""
+    boxes, n = nested_boxes(sampler.box, sampler.levels), sampler.resolution
     if times is None:
-        return visual_hull(silhouettes, sampler.box, sampler.resolution)
-    return moving_hulls(silhouettes, sampler.box, sampler.resolution, times, sampler.slices)
+        return torch.cat([visual_hull(silhouettes, box, n) for box in boxes])
+    return torch.cat([moving_hulls(silhouettes, box, n, times, sampler.slices) for box in boxes])
 
 
 def _no_silhouettes(dataset: Dataset) -> str | None:

@@ -99,15 +99,17 @@ class TensorBoard:
     """
 
     def __init__(self, folder: Path, enabled: bool) -> None:
-        self._writer: Any = None
-        if enabled:
-            from torch.utils.tensorboard import SummaryWriter  # slow to import, so only on use
+        self._folder, self._enabled = folder, enabled
 
-            self._writer = SummaryWriter(str(folder))
+    @cached_property
+    def _writer(self) -> Any:
+        from torch.utils.tensorboard import SummaryWriter  # slow to import, so not before there is something to write
+
+        return SummaryWriter(str(self._folder))
 
     def scalars(self, values: dict[str, float], step: int) -> None:
         """Write `values` by name, for a training `step`."""
-        if self._writer is not None:
+        if self._enabled:
             for name, value in values.items():
                 self._writer.add_scalar(name, value, step)
 
@@ -119,10 +121,10 @@ class TensorBoard:
             image: (H, W, 3) colours in [0, 1].
             step: number of training steps done.
         """
-        if self._writer is not None:
+        if self._enabled:
             self._writer.add_image(name, image.clamp(0, 1), step, dataformats="HWC")
 
     def close(self) -> None:
         """Close the event files."""
-        if self._writer is not None:
+        if "_writer" in vars(self):
             self._writer.close()

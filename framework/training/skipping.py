@@ -13,6 +13,7 @@ import torch
 from framework.base.device import wait_for
 from framework.data.pixels import draw_batch
 from framework.geometry.rays import Rays
+from framework.kernels.occupancy import own_cells
 from framework.model import parts
 from framework.ray_model import RayModel
 from framework.samplers.base import SkipsCells
@@ -20,8 +21,8 @@ from framework.samplers.base import SkipsCells
 if TYPE_CHECKING:
     from framework.training.trainer import Trainer
 
-PROBE_RAYS = 1024
-"""Number of random training rays on which the savings are measured."""
+PROBE_RAYS, WARM_UP_RAYS = 1024, 64
+"""Number of random training rays on which the savings are measured, and of those that are rendered before."""
 LEAST_TOLD = 0.005
 """Minimum skipped fraction that is printed."""
 
@@ -63,9 +64,10 @@ def skip_report(trainer: Trainer) -> list[Rung]:
 
 
 def _sampling_rungs(trainer: Trainer, model: RayModel[Any], samplers: list[SkipsCells]) -> list[Rung]:
-    cells = sum(s.occupied.numel() for s in samplers)
+    own = [own_cells(s.levels, s.resolution).to(s.carved.device) for s in samplers]
+    cells = sum(int(mask.sum()) for mask in own)
     kept, drawn = trainer.train_set.kept, trainer.train_set.drawn
-    carved = sum(int(s.carved.sum()) for s in samplers) / cells
+    carved = sum(int((s.carved & mask).sum()) for s, mask in zip(samplers, own, strict=True)) / cells
     empty = 1 - sum(int(s.occupied.sum()) for s in samplers) / cells
     rays = draw_batch(trainer.train_set, PROBE_RAYS, "black").rays
     usual, count = _probe(model, rays)
@@ -73,10 +75,13 @@ def _sampling_rungs(trainer: Trainer, model: RayModel[Any], samplers: list[Skips
         unhidden, visible_count = _probe(model, rays)
         with _changed(samplers, occupied=True):
             everywhere, all_count = _probe(model, rays)
-    rungs = [Rung("cells, empty", empty, None, "no switch", f"empty space: {empty:.0%} of the box is never sampled")]
+    nested = any(s.levels > 1 for s in samplers)
+    where = "all cells" if nested else "the box"
+    rungs = [Rung("cells, empty", empty, None, "no switch", f"empty space: {empty:.0%} of {where} is never sampled")]
     if carved:
-        says = f"{carved:.0%} of the box from the first step on, for the photographs show nothing there"
-        rungs.append(Rung("cells, outside the visual hull", carved, None, "--silhouette-cells False", says))
+        says = f"{carved:.0%} of {where} from the first step on, for the photographs show nothing there"
+        switch = "--seen-cells False" if nested else "--silhouette-cells False"
+        rungs.append(Rung("cells, outside the visual hull", carved, None, switch, says))
     rungs += [
         Rung(
             "steps along a ray, in empty cells",
@@ -114,7 +119,7 @@ def _probe(model: RayModel[Any], rays: Rays) -> tuple[float, int]:
     was_training = model.training
     model.eval()
     background = torch.zeros(3, device=model.device)
-    model.render(rays, background)  # once to warm up
+    model.render(rays[:WARM_UP_RAYS], background)
     wait_for(model.device)
     start = time.perf_counter()
     rendered = model.render(rays, background)

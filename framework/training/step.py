@@ -79,7 +79,7 @@ def backward(loss: Tensor, optimizer: Adam) -> bool:
     Returns:
         Whether the loss and all gradients are finite.
     """
-    optimizer.zero_grad(set_to_none=True)
+    optimizer.zero_grad()
     if is_bad_here(loss):
         return False
     if loss.requires_grad:

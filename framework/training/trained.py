@@ -16,8 +16,9 @@ from framework.base.errors import CheckpointError, ConfigError, NerfloomError, i
 from framework.base.registry import load_method
 from framework.data.data_folder import find_data
 from framework.data.scene import Scene
-from framework.model import Model
+from framework.model import Model, RendersFromImages
 from framework.training.checkpoint import FOLDER, find_newest, load_checkpoint
+from framework.training.datasets import load_split
 from framework.training.run import Run, read_run
 
 
@@ -76,6 +77,8 @@ def load_trained(
     else:
         path, content = checkpoint, load_checkpoint(checkpoint, device)
     model = restored_model(run.method, config, content, device)
+    if isinstance(model, RendersFromImages):
+        model.show_images(load_split(run, "train").to(device))
     return Trained(run, model, path, content)
 
 
@@ -97,9 +100,15 @@ def build_model(method: str, config: TrainConfig, scene: Scene) -> Model[Any]:
         scene: properties of the data.
 
     Raises:
-        ConfigError: if the model needs more memory than the machine has.
+        ConfigError: if the model needs more memory than the machine has, or the data shows several scenes, and the
+            method learns one.
     """
     declared = load_method(method)
+    if scene.num_scenes > 1 and not issubclass(declared.model, RendersFromImages):
+        raise ConfigError(
+            f"the data shows {scene.num_scenes} scenes, and {method} learns one: choose a method that learns from "
+            "many, such as pixel-nerf, or data of one scene"
+        )
     try:
         return declared.build(config, scene)
     except (MemoryError, RuntimeError) as error:

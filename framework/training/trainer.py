@@ -34,7 +34,7 @@ from framework.training.checkpoint import FOLDER, checkpoint_path, load_checkpoi
 from framework.training.curve import FewImages, Point, in_order, rows
 from framework.training.optim import first_non_finite, make_optimizer
 from framework.training.outcome import Outcome
-from framework.training.preparation import profile_of, skip_by_silhouettes
+from framework.training.preparation import profile_of, show_images, skip_by_silhouettes, skip_unseen
 from framework.training.progress import ProgressBar, StepReport, TensorBoard
 from framework.training.run import Run, write_report
 from framework.training.signals import stop_signals
@@ -225,7 +225,7 @@ class Trainer:
         return profile_of(self.run.method, self.config, self.model, self.train_set, self.decisions)
 
     def prepare(self) -> None:
-        """Mark space outside the images' silhouettes as empty, and start from the images, once, before the first step.
+        """Mark space as empty by what the images show, and start from the images, once, before the first step.
 
         Its time counts as training time.
         """
@@ -233,8 +233,11 @@ class Trainer:
             return
         self._prepared = True
         self._join_first()
+        show_images(self.model, self.train_set, self.eval_set)
         start, fresh = time.perf_counter(), self.state.step == 0
         self.train_set = skip_by_silhouettes(self.config, self.model, self.train_set, fresh)
+        if fresh:
+            skip_unseen(self.config, self.model, self.train_set)
         self.source = self.source.drawing_from(self.train_set)
         if fresh and isinstance(self.model, StartsFromImages):
             seed_step(self.config.machine.seed, -1)  # before all steps, whatever was drawn since the model was made

@@ -15,7 +15,8 @@ MOST_CELLS = 40_000
 def shown_cells(model: Model, most: int = MOST_CELLS) -> tuple[Tensor, float] | None:
     """Return the centres (N, 3) of occupied cells that have an empty neighbour, and the mean edge of a cell.
 
-    What is inside would not be seen. Of more than `most` cells, evenly spaced ones are returned.
+    What is inside would not be seen. Of nested boxes, the cells of the smallest are shown. Of more than `most` cells,
+    evenly spaced ones are returned.
 
     Args:
         model: the model.
@@ -29,7 +30,7 @@ def shown_cells(model: Model, most: int = MOST_CELLS) -> tuple[Tensor, float] | 
         return None
     sampler = samplers[0]
     n, box = sampler.resolution, sampler.box.cpu()
-    grid = sampler.occupied_when().cpu().view(n, n, n)
+    grid = sampler.occupied_when()[: n**3].cpu().view(n, n, n)
     padded = torch.nn.functional.pad(grid, (1, 1, 1, 1, 1, 1))
     inside = grid.clone()
     for axis in range(3):

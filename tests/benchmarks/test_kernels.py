@@ -58,7 +58,8 @@ def test_every_kernel_is_measured_and_right(tmp_path: Path) -> None:
     names = {row.kernel for row in rows}
     assert len(rows) == len(names) * len({1, threads})
     for start in ("hash grid", "network", "compositing", "frequency", "spherical", "K-Planes", "TensoRF", "marching",
-                  "sparse Adam", "SSIM", "projection of Gaussians", "sorting Gaussians", "blending of Gaussians",
+                  "sparse Adam", "multisampled grid", "loss of proposals", "loss with SSIM", "projection of Gaussians",
+                  "sorting Gaussians", "blending of Gaussians",
                   "rays of opencv"):  # fmt: skip
         assert any(name.startswith(start) for name in names), start
     for row in rows:

@@ -14,9 +14,9 @@ from framework.geometry.points import Points
 from framework.geometry.rays import Rays
 from framework.samplers.proposal import ProposalSampler
 from framework.samplers.uniform import UniformSampler
-from framework.tools.benchmarks import curves, quadrature, sampling
+from framework.tools.benchmarks import error_curves, quadrature, sampling
 from framework.tools.benchmarks.closed_forms import Block, ClosedForm, Medium, Solids, scenes
-from framework.tools.benchmarks.curves import Curve, evaluations_needed
+from framework.tools.benchmarks.error_curves import Curve, evaluations_needed
 from framework.tools.benchmarks.quadrature import Row, Sizes, measured, skipping
 from framework.tools.benchmarks.sampling import (
     WHITE,
@@ -188,7 +188,7 @@ def test_pictures(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     errors = [1e-1, 1e-2, 0.0]
     found = {"fog": {"proposal": Curve([8.0, 16.0, 32.0], [56.0, 112.0, 224.0], errors, [1e-3, 1e-3, 0.0])}}
-    (path,) = curves.draw(found, tmp_path / "plots")
+    (path,) = error_curves.draw(found, tmp_path / "plots")
     assert path.stat().st_size > 1000
 
 

@@ -18,11 +18,16 @@ from framework.samplers.choice import SamplingConfig
 from tests.cli.helpers import called
 
 METHODS = (
-    "dnerf", "instant-ngp", "kplanes", "mip-nerf", "mip-nerf-360", "nerfacto", "tensorf", "vanilla-nerf", "zip-nerf",
+    "dnerf", "instant-ngp", "kplanes", "mip-nerf", "mip-nerf-360", "nerf-plus-plus", "nerfacto", "pixel-nerf",
+    "tensorf", "vanilla-nerf", "zip-nerf",
 )  # fmt: skip
-FOR_FEW_IMAGES = ("instant-ngp", "kplanes", "nerfacto", "tensorf", "vanilla-nerf")
+FOR_FEW_IMAGES = ("instant-ngp", "kplanes", "nerf-plus-plus", "nerfacto", "tensorf", "vanilla-nerf")
 """Methods with settings for few images."""
+WITH_BACKGROUND = ("instant-ngp", "nerf-plus-plus", "vanilla-nerf")
+"""Methods with settings of a background."""
 FORMATS = ("blender", "colmap", "dnerf", "llff", "nerfstudio", "phototourism", "polycam", "record3d")
+QUICK = ("instant-ngp", "nerfacto", "vanilla-nerf", "blender", "nerfstudio")
+"""Of which help is read in the fast set: they have every box, and a format few flags or many."""
 Capture = pytest.CaptureFixture[str]
 
 
@@ -61,13 +66,14 @@ def flags_of(settings: Any) -> list[str]:
     return flags
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", [pytest.param(m, marks=() if m in QUICK else pytest.mark.slow) for m in METHODS])
 def test_every_flag_once_and_the_everyday_ones_first(method: str) -> None:
     found = help_of(method)
     known = flags_of(load_method(method).config) + flags_of(load_dataparser("procedural")())
     assert sorted(flag for flags in found.values() for flag in flags) == sorted(known)
     assert list(found) == [
-        "options", "everyday options", f"{method} options", "sampler options", "ray options",
+        "options", "everyday options", f"{method} options", *["sampler options"] * (method != "pixel-nerf"),
+        *["background options"] * (method in WITH_BACKGROUND), "ray options",
         *["appearance options"] * (method in ("nerfacto", "zip-nerf")),
         *["few images options"] * (method in FOR_FEW_IMAGES), *["motion options"] * (method in ("kplanes", "dnerf")),
         "optimisation options", "evaluation and saving options",
@@ -77,7 +83,7 @@ def test_every_flag_once_and_the_everyday_ones_first(method: str) -> None:
     assert found["everyday options"][:6] == first
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in FORMATS])
 def test_the_data_formats_flags_stand_last(name: str) -> None:
     found = help_of("dnerf", name)
     assert list(found)[-1] == f"{name} data options"
@@ -221,7 +227,7 @@ def test_nested_flags_and_those_of_the_format_in_any_order() -> None:
     words = "--machine.seed 7 --size 32 --early-stop 0.1 --moving True --machine.device-type cpu --num-train 5"
     run = run_of("vanilla-nerf", words.split())
     assert (run.config.machine.seed, run.config.machine.device_type, run.config.early_stop) == (7, "cpu", 0.1)  # type: ignore[attr-defined]
-    assert dataclasses.asdict(run.parser) == {"size": 32, "num_train": 5, "moving": True, "scene_seed": 0}  # type: ignore[call-overload]
+    assert run.parser == load_dataparser("procedural")(size=32, num_train=5, moving=True)  # type: ignore[call-arg]
 
 
 @pytest.mark.parametrize(

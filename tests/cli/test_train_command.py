@@ -240,3 +240,19 @@ def test_without_data_the_embedded_scene_is_trained(tmp_path: Path) -> None:
     config = yaml.safe_load((tmp_path / "procedural" / "instant-ngp" / "t" / "config.yml").read_text())
     assert config["dataparser"]["size"] == 16
     assert config["data"] is None
+
+
+def test_flags_in_pairs_mean_the_same_as_beside_a_formats_name(
+    shared_tiny: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flags = ("--max-seconds", 5, "--downscale-factor=2", "--machine.seed", 3)
+    runs = [
+        started(monkeypatch, "instant-ngp", "--data", shared_tiny, *flags),
+        started(monkeypatch, "instant-ngp", *flags, f"--data={shared_tiny}"),
+        started(monkeypatch, "instant-ngp", "--data", shared_tiny, *flags, "blender"),
+        started(monkeypatch, "instant-ngp", "--data", shared_tiny, *flags, "--train-image-indices", 0, 1),
+    ]
+    assert len({(run.config.data, run.dataparser, run.parser, run.config.max_seconds) for run in runs}) == 1
+    assert runs[0].config == runs[1].config == runs[2].config
+    assert runs[3].config.train_image_indices == (0, 1)
+    assert started(monkeypatch, "instant-ngp", "--data", "None").dataparser == "procedural"

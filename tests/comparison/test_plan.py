@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 from framework.base.errors import ConfigError
-from framework.tools.comparison.plan import Conditions, Contender, Job, Plan, split_words
+from framework.cli.compare import CompareFlags, plan_of
+from framework.tools.comparison.crops import VIEWS
+from framework.tools.comparison.plan import Conditions, Contender, Job, Plan, split_words, views_for
 
 CONDITIONS = Conditions("/data/lego", ("--downscale-factor", "2"), 120.0, None, None, 2, "cpu", 4, None)
 
@@ -64,7 +66,7 @@ def test_commands_say_all_that_is_the_same_and_the_contenders_flags_count_last(t
     assert given["--data"] == "/data/lego"
     assert given["--max-seconds"] == "120.0"
     assert given["--machine.num-threads"] == "2"
-    assert float(given["--seconds-per-eval-all-images"]) == 10
+    assert float(given["--seconds-per-eval-all-images"]) == 15
     assert "--max-num-iterations" not in given
     folder = Path(given["--output-dir"]) / given["--experiment-name"] / "vanilla-nerf" / given["--timestamp"]
     assert folder == job.folder
@@ -73,7 +75,7 @@ def test_commands_say_all_that_is_the_same_and_the_contenders_flags_count_last(t
     assert job.train_command(CONDITIONS)[3:] == ["--resume", str(job.folder)]
     steps = replace(CONDITIONS, max_seconds=None, max_num_iterations=100)
     command = Job(Contender.of("kplanes"), 43, tmp_path / "runs").train_command(steps)
-    assert command[command.index("--steps-per-eval-all-images") + 1] == "8"
+    assert command[command.index("--steps-per-eval-all-images") + 1] == "12"
     assert job.eval_command(replace(CONDITIONS, max_eval_images=5))[-2:] == ["--max-images", "5"]
 
 
@@ -108,3 +110,25 @@ def test_a_folder_belongs_to_its_conditions(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="cannot write"):
         replace(plan, folder=tmp_path / "file" / "below").claim_folder()
+
+
+def test_the_final_evaluation_is_over_a_view_a_second_unless_the_user_says_how_many(tmp_path: Path) -> None:
+    assert [views_for(seconds) for seconds in (5.0, 30.0, 120.4, None)] == [25, 30, 120, None]
+    flags = CompareFlags(methods=("kplanes",), max_seconds=40.0, output_dir=tmp_path)
+    assert plan_of(flags).conditions.max_eval_images == 40
+    assert plan_of(replace(flags, max_eval_images=200)).conditions.max_eval_images == 200
+    assert plan_of(replace(flags, max_seconds=None, target_psnr=30.0)).conditions.max_eval_images is None
+
+
+def test_without_curve_images_nothing_is_evaluated_during_training(tmp_path: Path) -> None:
+    for conditions in (CONDITIONS, replace(CONDITIONS, max_seconds=None, max_num_iterations=100)):
+        words = Job(Contender.of("kplanes"), 42, tmp_path).train_command(replace(conditions, curve_images=0))
+        assert words[words.index("--max-eval-images") + 1] == "0"
+        assert not [word for word in words if "per-eval-all-images" in word]
+    with pytest.raises(ConfigError, match="--curve-images must be at least 0"):
+        replace(CONDITIONS, curve_images=-1)
+
+
+def test_only_the_pictures_that_a_report_shows_are_written(tmp_path: Path) -> None:
+    command = Job(Contender.of("kplanes"), 42, tmp_path).eval_command(CONDITIONS)
+    assert command[command.index("--max-pictures") + 1] == str(VIEWS)

@@ -11,8 +11,12 @@ import pytest
 import torch
 
 from dataparsers.procedural import Procedural
-from dataparsers.procedural.scene import LIGHT, PARTS, inside, trace
+from dataparsers.procedural.many import REACH, random_parts, scene_numbers, write_scenes
+from dataparsers.procedural.scene import LIGHT, PARTS, inside, trace, trace_rows
 from dataparsers.procedural.views import CAMERA_ANGLE, camera_poses, render_view, write_dataset
+from framework.base.errors import DataError
+from framework.data.dataset import load_dataset
+from framework.evaluation.evaluator import views_to_judge
 
 
 def camera_rays(count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -146,3 +150,112 @@ def test_the_parser_renders_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     again = Procedural(size=8, num_train=2).parse(None, "train")
     assert again.image_paths[0].stat().st_mtime_ns == stamp
     assert math.isclose(again.cameras.fx[0].item(), 4 / math.tan(CAMERA_ANGLE / 2), rel_tol=1e-6)
+
+
+# -- many scenes -------------------------------------------------------------------------------------------------------
+
+
+def test_random_solids_fit_into_the_box_and_differ_between_scenes() -> None:
+    found = [random_parts(0, scene) for scene in range(200)]
+    assert {len(parts) for parts in found} == {2, 3, 4, 5}
+    solids = [part for parts in found for part in parts.values()]
+    assert {type(part.shape).__name__ for part in solids} == {"Sphere", "Box"}
+    assert max(math.hypot(*part.centre) + part.shape.bound for part in solids) <= REACH
+    centres = torch.tensor([part.centre for part in solids])
+    assert len(centres.unique(dim=0)) == len(centres)
+    assert centres.mean(0).abs().max() < 0.1
+    assert [part.centre for part in random_parts(0, 7).values()] == [part.centre for part in found[7].values()]
+    assert [part.centre for part in random_parts(1, 7).values()] != [part.centre for part in found[7].values()]
+
+
+def test_a_random_solid_has_its_own_colour_and_no_other() -> None:
+    """In the middle of an image, before the nearest solid on the axis: its albedo's hue, shaded."""
+    parts = random_parts(0, 3)
+    origins, directions = camera_rays(4000, seed=2)
+    found = trace_rows(origins.T.contiguous(), directions.T.contiguous(), 0.0, parts=parts)
+    hit = found.depth.isfinite()
+    places = origins[hit] + found.depth[hit][:, None] * directions[hit]
+    distances = torch.stack(
+        [
+            p.shape.distance(turned(places - torch.tensor(p.centre, dtype=torch.float64), -p.yaw).T)
+            for p in parts.values()
+        ]
+    )
+    assert 0.05 < hit.double().mean() < 0.9
+    assert distances.abs().amin(0).max() < 1e-9  # a hit lies on the surface of a solid
+    assert distances.min() > -1e-9  # and in none
+    assert torch.equal(distances.abs().argmin(0), found.part[hit])
+
+
+def turned(points: torch.Tensor, yaw: float) -> torch.Tensor:
+    """Points (N, 3), turned around z."""
+    turn = torch.tensor(
+        [[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]], dtype=torch.float64
+    )
+    return points @ turn.T
+
+
+def test_no_scene_is_in_two_splits() -> None:
+    numbers = [number for split in ("train", "val", "test") for number in scene_numbers(split, 5)]
+    assert sorted(numbers) == list(range(5 + 4 + 8))
+
+
+def test_many_scenes_are_kept_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each image shows what tracing the solids of its scene along its own rays shows."""
+    monkeypatch.setenv("NERFLOOM_CACHE", str(tmp_path))
+    parser = Procedural(size=16, num_scenes=3, views_per_scene=4)
+    train, test = (load_dataset(parser.parse(None, split), split) for split in ("train", "test"))
+    assert train.scene_indices is not None
+    assert test.scene_indices is not None
+    assert train.scene_indices.tolist() == [0] * 4 + [1] * 4 + [2] * 4
+    assert test.scene_indices.tolist() == [number for number in range(7, 15) for _ in range(4)]
+    assert (train.scene.num_scenes, test.scene.num_scenes) == (3, 8)
+    assert train.source_images is None
+    assert views_to_judge(train) == list(range(12))
+    assert views_to_judge(test) == list(range(3, 32, 4))
+    assert [test.view(index).scene for index in (0, 3, 4)] == [7, 7, 8]
+    for data, index in ((train, 5), (train, 11), (test, 30)):
+        scene = int(data.scene_indices[index])  # type: ignore[index]
+        rays = data.cameras.pixel_rays(data.cameras.image_pixels(index), 0.0, 9.0)
+        shown = [trace_rows(rays.origins.T, rays.directions.T, 0.0, parts=random_parts(0, n)) for n in (scene, 1)]
+        alpha = data.image(index)[..., 3].reshape(-1)
+        clear = (alpha == 0) | (alpha == 255)
+        assert torch.equal((alpha > 0)[clear], shown[0].hit[clear])
+        assert scene == 1 or not torch.equal((alpha > 0)[clear], shown[1].hit[clear])
+
+
+def test_some_images_of_many_scenes_know_theirs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NERFLOOM_CACHE", str(tmp_path))
+    parser = Procedural(size=8, num_scenes=2, views_per_scene=5)
+    parsed = parser.parse(None, "val")
+    some = parsed[torch.tensor([9, 0, 3])]
+    assert some.scene_indices is not None
+    assert some.source_images is not None
+    assert (some.scene_indices.tolist(), some.source_images.tolist()) == ([3, 2, 2], [True, True, False])
+    parsed.image_paths[0].unlink()  # one that is missing moves no other into another scene
+    left = parser.parse(None, "val")
+    assert left.scene_indices is not None
+    assert left.scene_indices.tolist() == [2] * 4 + [number for number in (3, 4, 5) for _ in range(5)]
+
+
+def test_many_scenes_repeat_with_the_seed(tmp_path: Path) -> None:
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        write_scenes(tmp_path / name, size=8, num_scenes=2, views=4, seed=seed)
+    first, second, other = (folder_bytes(tmp_path / name) for name in "abc")
+    assert first == second
+    assert first.keys() == other.keys()
+    assert all(first[name] != other[name] for name in first)
+    assert len(first) == 3 + 4 * (2 + 4 + 8)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"num_scenes": 0}, "--num-scenes must be at least 1"),
+        ({"num_scenes": 2, "views_per_scene": 3}, "--views-per-scene at least 4"),
+        ({"num_scenes": 2, "moving": True}, "leave out --num-scenes or --moving"),
+    ],
+)
+def test_scenes_that_cannot_be_made_are_refused(settings: dict[str, int], said: str) -> None:
+    with pytest.raises(DataError, match=said):
+        Procedural(**settings).parse(None, "train")  # type: ignore[arg-type]

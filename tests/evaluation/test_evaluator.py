@@ -14,7 +14,7 @@ from framework.cameras.view import View
 from framework.data.pixels import PixelBatch
 from framework.data.scene import Scene
 from framework.data.sources import PixelSource, Request
-from framework.evaluation.evaluator import evaluation_background
+from framework.evaluation.evaluator import evaluate, evaluation_background
 from framework.fields.base import Field
 from framework.geometry.points import Points
 from framework.geometry.rays import Rays, Samples
@@ -161,3 +161,13 @@ def test_pictures_are_over_what_training_was_over(asked: Any, alpha: bool, expec
     model = disc(RayConfig(background=asked))
     model.scene = replace(model.scene, has_alpha=alpha)
     assert evaluation_background(model).tolist() == [expected] * 3
+
+
+def test_pictures_are_of_views_evenly_spaced(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run")
+    images = trainer.train_set
+    evaluate(trainer.model, images, pictures=tmp_path / "all", max_pictures=2)
+    written = {int(path.name[:4]) for path in (tmp_path / "all").iterdir()}
+    assert written == {0, len(images) // 2}
+    evaluate(trainer.model, images, max_images=2, pictures=tmp_path / "none", max_pictures=0)
+    assert not (tmp_path / "none").exists()

@@ -6,7 +6,8 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from framework.evaluation.metrics import psnr, ssim
+from framework.evaluation.metrics import psnr, quick_ssim, ssim
+from framework.kernels.ssim import PHOTOMETRIC
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.3])
@@ -40,3 +41,23 @@ def test_psnr_by_hand() -> None:
     half = torch.zeros(2, 2, 3)
     half[0] = 0.1
     assert psnr(half, torch.zeros(2, 2, 3)) == pytest.approx(-10 * math.log10(0.005), abs=1e-4)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01, 0.3])
+@pytest.mark.parametrize("size", [(11, 30), (97, 64)])
+def test_quick_ssim_is_ssim_to_a_millionth(size: tuple[int, int], noise: float) -> None:
+    torch.manual_seed(0)
+    rows, columns = torch.meshgrid(*(torch.linspace(0, 5, n) for n in size), indexing="ij")
+    target = torch.stack([rows.sin(), (rows * columns).cos(), columns.cos()], -1) * 0.5 + 0.5
+    image = (target + noise * torch.randn_like(target)).clamp(0, 1)
+    for pair in ((image, target), (image.double(), target.double()), (image.transpose(0, 1), target.transpose(0, 1))):
+        assert quick_ssim(*pair) == pytest.approx(ssim(*pair), abs=1e-6)
+    with pytest.raises(ValueError, match="11x11"):
+        quick_ssim(image[:10], target[:10])
+
+
+def test_without_a_kernel_quick_ssim_is_ssim(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(PHOTOMETRIC, "implementations", [])
+    torch.manual_seed(0)
+    image, target = torch.rand(2, 20, 20, 3)
+    assert quick_ssim(image, target) == ssim(image, target)

@@ -99,7 +99,7 @@ def test_cells_that_end_with_a_block_are_closed() -> None:
     """Random cells of one density, whose surface is in blocks beside them too."""
     torch.manual_seed(0)
     grid = grid_of(lambda centers: (torch.rand(len(centers)) < 0.02) & (centers.abs() < 0.9).all(-1))
-    for resolution in (128, 256):
+    for resolution in (64, 128):
         mesh = mesh_of(Matter(lambda positions: torch.full((len(positions),), 100.0), grid), 10.0, resolution)
         assert closedness(mesh).watertight
 

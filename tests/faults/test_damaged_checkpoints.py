@@ -1,6 +1,7 @@
 """Checkpoints that a disk has damaged: the one before is taken, and that is said; never is one taken as it is."""
 
 import dataclasses
+import shutil
 from pathlib import Path
 
 import pytest
@@ -12,12 +13,19 @@ from framework.training.trained import load_trained
 from tests.training.helpers import tiny_trainer
 
 
-@pytest.fixture
-def folder(shared_tiny: Path, tmp_path: Path) -> Path:
-    """A run of eight steps with checkpoints at four and eight."""
+@pytest.fixture(scope="module")
+def whole(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of eight steps with checkpoints at four and eight, which nothing damages."""
+    folder = tmp_path_factory.mktemp("whole") / "run"
     settings = {"max_num_iterations": 8, "steps_per_save": 4, "max_eval_images": 0}
-    tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", **settings).train()
-    return tmp_path / "run"
+    tiny_trainer("instant-ngp", shared_tiny, folder, **settings).train()
+    return folder
+
+
+@pytest.fixture
+def folder(whole: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    return shutil.copytree(whole, tmp_path / "run")
 
 
 def flip(path: Path, place: int) -> None:

@@ -93,21 +93,25 @@ def test_gradients_that_wait_move_the_table_as_those_that_do_not(features: int) 
 
 
 def test_tensorf_grows_shrinks_and_resumes(shared_tiny: Path, tmp_path: Path) -> None:
+    """Resumed in the middle of growing, and between the two times that it shrinks."""
     settings = {"max_num_iterations": 300, "upsample_at": (0.01, 0.02, 0.03, 0.85, 0.9)}
     trainer = tiny_trainer("tensorf", shared_tiny, tmp_path / "whole", **settings)
-    model, sizes, boxes = trainer.model, [], []
-    for _ in range(300):
+    model, sizes, boxes, saved, kept = trainer.model, [], [], {}, {}
+    for step in range(1, 301):
         trainer.train_step()
         sizes.append(model.size())
         boxes.append(model.field.box.clone())
-        if trainer.state.step == 6:
-            saved = trainer.save()  # in the middle of growing
+        if step in (6, 260):
+            saved[step] = trainer.save()
+        if step in (30, 300):
+            kept[step] = tensors(trainer)
     assert trainer.state.skipped == 0
     assert sizes[-1] > sizes[0] * 2
     assert len(set(sizes)) > 3
     assert bool((boxes[-1][1] - boxes[-1][0] < boxes[0][1] - boxes[0][0]).all())
-    again = tiny_trainer("tensorf", shared_tiny, tmp_path / "again", **settings)
-    again.restore(load_checkpoint(saved))
-    while again.state.step < 300:
-        again.train_step()
-    assert_same_bits(tensors(trainer), tensors(again))
+    for start, end in ((6, 30), (260, 300)):
+        again = tiny_trainer("tensorf", shared_tiny, tmp_path / str(start), **settings)
+        again.restore(load_checkpoint(saved[start]))
+        while again.state.step < end:
+            again.train_step()
+        assert_same_bits(kept[end], tensors(again))

@@ -15,15 +15,19 @@ from tests.fuzz.report import summary
 pytest.importorskip("resource")
 pytest.importorskip("pycolmap")
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits of memory are those of Linux")
-FEW, MANY = 10, 200
-"""Inputs for each reader."""
+FEW, MANY = 6, 200
+"""Inputs for each reader, in the fast set and in the slow one."""
 READERS = (
     "blender", "dnerf", "nerfstudio", "colmap-binary", "colmap-text", "llff", "llff-ndc", "record3d", "polycam",
     "phototourism", "ply", "splats", "camera-path", "images", "images-to-a-file", "masks", "depths", "photographs",
     "polycam-raw", "record3d-raw", "config", "comparison", "checkpoint", "run", "archive", "pixel-cache",
 )  # fmt: skip
 """Their names here too, so that tests are collected without reading anything."""
-HALVES = {"one half": READERS[::2], "the other half": READERS[1::2]}
+ASKED = [
+    pytest.param(READERS, FEW, id="all"),
+    pytest.param(READERS[::2], MANY, id="one half", marks=pytest.mark.slow),
+    pytest.param(READERS[1::2], MANY, id="the other half", marks=pytest.mark.slow),
+]
 """A process reads for many readers, as it takes seconds to begin."""
 
 
@@ -31,8 +35,7 @@ def test_all_readers_are_here() -> None:
     assert set(READERS) == set(campaign.names())
 
 
-@pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("readers", HALVES.values(), ids=HALVES.keys())
+@pytest.mark.parametrize(("readers", "count"), ASKED)
 def test_damaged_files_are_refused_in_a_line_or_read_with_sense(
     readers: Sequence[str], count: int, tmp_path: Path
 ) -> None:

@@ -425,7 +425,7 @@ def test_what_was_saved_shows_the_same_picture_and_learns_on(method: type[Nerflo
 
 def test_it_learns_what_the_photographs_show() -> None:
     data = handed()
-    method = start(InstantNGP, data, max_num_iterations=250)
+    method = start(InstantNGP, data, max_num_iterations=120)
     expected = np.stack([over_white(image) for image in data["images"]]) / 255
 
     def error() -> float:
@@ -433,10 +433,10 @@ def test_it_learns_what_the_photographs_show() -> None:
         return float(np.square(pictures - expected).mean())
 
     before = error()
-    for step in range(250):
+    for step in range(120):
         method.train_iteration(step)
     after = error()
-    print(f"mean squared error {before:.4f} -> {after:.4f} in 250 steps")
+    print(f"mean squared error {before:.4f} -> {after:.4f} in 120 steps")
     assert after < before / 4
 
 

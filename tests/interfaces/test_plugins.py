@@ -16,7 +16,8 @@ from tests.cli.helpers import TINY_NGP, called
 from tests.interfaces.conftest import HERE
 
 SMALL = "--max-num-iterations 40 --vis none --num-steps 64 --grid-resolution 16"
-TINY = [*TINY_NGP, "--max-num-iterations", "40", "--rays-per-pixel", "1"]
+# A sampler that does not adapt the number of rays to its samples takes --num-rays-per-batch of them.
+TINY = [*TINY_NGP, "--max-num-iterations", "40", "--rays-per-pixel", "1", "--num-rays-per-batch", "256"]
 SCENE = "procedural --size 24 --num-train 8"
 
 

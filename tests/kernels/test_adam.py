@@ -89,6 +89,24 @@ def test_compiled_equals_reference_far_into_a_run(features: int) -> None:
 
 
 @needs_kernels
+@pytest.mark.parametrize("features", [1, 2, 4, 8])
+def test_an_entry_moves_alike_whatever_its_neighbours(features: int) -> None:
+    """Entries in another order get the same bits: settled ones beside fresh ones, used ones beside unused ones."""
+    entries = 512  # whole vectors
+    order = torch.randperm(entries, generator=torch.Generator().manual_seed(5))
+    values, mean, square, seen = tables(entries, features)
+    seen[:] = torch.tensor([0.0, 1.0, 900.0, 5000.0]).repeat_interleave(entries // 4)  # whole vectors of each kind
+    shuffled = [tensor[order] for tensor in (values, mean, square, seen)]
+    for step in range(3):
+        grad = gradients(entries, features, step)
+        grad[::7, 0] = -0.0
+        count = sparse_adam(values, grad.clone(), mean, square, seen, 1e-2, BETAS, EPS)
+        assert count == sparse_adam(shuffled[0], grad[order], *shuffled[1:], 1e-2, BETAS, EPS) > 0
+    for tensor, other in zip((values, mean, square, seen.clamp(max=5000)), shuffled, strict=True):
+        assert torch.equal(tensor[order], other.clamp(max=5000) if other.ndim == 1 else other)
+
+
+@needs_kernels
 def test_threads_give_the_same_bits() -> None:
     before, found = torch.get_num_threads(), []
     try:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from framework.encodings.hash_grid import HashGrid
 from framework.encodings.planes import FeaturePlanes
-from framework.kernels.hash_grid import TableGradient
+from framework.kernels.hash_grid_lookup import TableGradient
 from framework.kernels.planes import PlanesGradient
 from framework.training.optim import Adam
 from tests.kernels.compiled import needs_kernels, relative_error

@@ -23,7 +23,7 @@ from framework.kernels.frequency import FREQUENCY_ENCODING
 from framework.kernels.hash_grid import HASH_GRID, HashGridLayout, hash_grid
 from framework.kernels.intervals import INTERVAL_WEIGHTS, PROPOSAL_EXCESS, RESAMPLE
 from framework.kernels.march import MARCH, SORT_BY_RAY, March
-from framework.kernels.mlp import NETWORK
+from framework.kernels.mlp import DENSITY_NETWORK, NETWORK
 from framework.kernels.multisampled_grid import MULTISAMPLED_GRID
 from framework.kernels.multisamples import UNIT_MULTISAMPLES
 from framework.kernels.occupancy import REFRESH_OCCUPANCY, Occupancy
@@ -130,6 +130,7 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     PLANES: lambda: (torch.rand(50, 3), rand(LAYOUT.num_entries, 4), LAYOUT, None),
     PLANE_BANDS: lambda: (rand(LAYOUT.num_entries, 4), ((10, 30), (50, 55)), PlanesGradient(LAYOUT)),
     NETWORK: lambda: ([rand(9, 5), rand(9, 2)], [rand(8, 7), rand(3, 8)], "sigmoid", [rand(8), rand(3)]),
+    DENSITY_NETWORK: lambda: ([rand(40, 5), rand(40, 2)], [rand(8, 7), rand(3, 8) * 9 - 5], [rand(8), rand(3)]),
     FREQUENCY_ENCODING: lambda: (rand(9, 3), 4, True),
     SPHERICAL_HARMONICS: lambda: (unit(9), 4),
     CONTRACT: lambda: (5 * torch.randn(40, 3), BOX),
@@ -261,6 +262,7 @@ def test_what_is_taken() -> None:
         (SPHERICAL_HARMONICS, 0, "reference"),
         (CONTRACT, 0, "c++"),
         (CONTRACT, 1, "reference"),
+        (DENSITY_NETWORK, 0, "c++"),
         (DISTORTION, 0, "c++"),
         (DISTORTION, 1, "reference"),
         (DISTORTION, 2, "reference"),

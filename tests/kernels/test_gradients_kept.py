@@ -27,7 +27,7 @@ from framework.kernels.intervals import (
     proposal_excess,
     proposal_excess_reference,
 )
-from framework.kernels.mlp import mlp, mlp_reference
+from framework.kernels.mlp import density_mlp, density_mlp_reference, mlp, mlp_reference
 from framework.kernels.multisampled_grid import multisampled_grid, multisampled_grid_reference
 from framework.kernels.multisamples import unit_multisamples, unit_multisamples_reference
 from framework.kernels.planes import PlanesLayout, planes, planes_reference
@@ -111,6 +111,14 @@ def network(form: Function) -> Function:
     return run
 
 
+def density_network(form: Callable[..., tuple[Tensor, Tensor]]) -> Function:
+    def run(one: Tensor, two: Tensor, first: Tensor, second: Tensor, bias: Tensor, other: Tensor) -> Tensor:
+        density, out = form([one, two], [first, second], [bias, other])
+        return torch.cat([density[:, None], out], -1)
+
+    return run
+
+
 def gaussians() -> dict[str, Tensor]:
     return {
         "means": torch.rand(20, 3) + torch.tensor([-0.5, -0.5, 3.0]), "log_scales": rand(20, 3) - 2,
@@ -179,6 +187,15 @@ OPERATIONS = {
         network(mlp_reference),
         lambda: {
             "one": rand(9, 5), "two": rand(9, 2), "first": rand(8, 7), "second": rand(3, 8), "bias": rand(8),
+            "other": rand(3),
+        },
+        ("mlp_forward", "mlp_backward", *BACKWARD_BF16),
+    ),
+    "mlp with density": Operation(
+        density_network(density_mlp),
+        density_network(density_mlp_reference),
+        lambda: {
+            "one": rand(40, 5), "two": rand(40, 2), "first": rand(8, 7), "second": rand(3, 8) - 0.5, "bias": rand(8),
             "other": rand(3),
         },
         ("mlp_forward", "mlp_backward", *BACKWARD_BF16),

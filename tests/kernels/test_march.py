@@ -17,6 +17,7 @@ from framework.kernels.march import (
     sort_by_ray,
     step_start,
 )
+from framework.kernels.occupancy import refresh_occupancy_reference
 from tests.kernels.compiled import needs_kernels
 
 BOX = torch.tensor([[-1.0, -1.5, -1.0], [1.0, 1.0, 2.0]])
@@ -167,7 +168,7 @@ def test_each_ray_marches_through_the_slice_of_its_time(kind) -> None:
     times = torch.rand(300, generator=torch.Generator().manual_seed(2))
     times[:4] = torch.tensor([0.0, 1 / 3, 2 / 3, 1.0])  # a slice begins with its first moment, and the last has 1
     timed = replace(rays, times=times)
-    found = walk(kind(timed, Occupancy(torch.cat(parts), BOX, resolution, slices), 0.05, 0.0, None, 0.0))
+    found = walk(kind(timed, Occupancy(torch.cat(parts), BOX, resolution, slices=slices), 0.05, 0.0, None, 0.0))
     for index, part in enumerate(parts):
         mine = (times >= index / slices) & (times < (index + 1) / slices) | (times == 1) * (index == slices - 1)
         alone = walk(kind(rays, Occupancy(part, BOX, resolution), 0.05, 0.0, None, 0.0))
@@ -178,7 +179,7 @@ def test_each_ray_marches_through_the_slice_of_its_time(kind) -> None:
 
 def test_a_grid_with_slices_needs_times() -> None:
     with pytest.raises(ValueError, match="needs the times of rays"):
-        Occupancy(torch.ones(2 * 8, dtype=torch.bool), BOX, 2, 2).slices_of(None)
+        Occupancy(torch.ones(2 * 8, dtype=torch.bool), BOX, 2, slices=2).slices_of(None)
 
 
 def test_candidates_lie_inside_the_box_and_the_bounds() -> None:
@@ -213,3 +214,15 @@ def test_refreshing_marks_cells_by_opacity(mean_is_less: bool) -> None:
     clear = (alpha / threshold - 1).abs() > 1e-3
     assert torch.equal(occupied[clear], (alpha >= threshold)[clear])
     assert 0 < int(occupied.sum()) < 20**3
+
+
+@pytest.mark.parametrize("refresh", [refresh_occupancy, refresh_occupancy_reference])
+def test_a_mean_of_other_cells_empties_what_is_thinner(refresh) -> None:
+    """Fog of opacity 1e-4 stays by its own mean, and goes by a larger one, up to the threshold; NaN always stays."""
+    for elsewhere, kept in ((0.0, 999), (5e-5, 999), (2e-4, 10), (0.5, 5)):
+        density, occupied = torch.full((999,), 1e-3), torch.zeros(999, dtype=torch.bool)
+        density[:10], density[:5], density[0] = 0.05, 0.2, math.nan
+        if elsewhere < 1e-4:
+            density.fill_(1e-3)
+        refresh(density, occupied, 1.0, 0.1, 0.01, elsewhere)
+        assert int(occupied.sum()) == kept

@@ -1,5 +1,6 @@
 """Small networks: compiled against the reference in float64, and where they go wrong first."""
 
+import math
 from collections.abc import Callable
 from itertools import pairwise
 
@@ -9,7 +10,8 @@ from torch import nn
 
 from framework.fields.base import MLP
 from framework.kernels import native
-from framework.kernels.mlp import Activation, mlp, mlp_reference
+from framework.kernels.math import MAX_LOG_DENSITY
+from framework.kernels.mlp import Activation, density_mlp, density_mlp_reference, mlp, mlp_reference
 from tests.kernels.compiled import needs_kernels, relative_error
 
 SHAPES: list[tuple[tuple[int, ...], tuple[int, ...]]] = [
@@ -147,6 +149,48 @@ def test_biases_and_activations(activation: Activation, bfloat16: bool) -> None:
             assert torch.nn.functional.cosine_similarity(a.double().flatten(), b.flatten(), dim=0) > 0.995
         else:
             assert relative_error(a, b) < 4e-5
+
+
+@pytest.mark.parametrize("asked", ["density", "outputs", "both"])
+@pytest.mark.parametrize(("parts", "layers"), [((32,), (64, 16)), ((5, 3), (1,)), ((40,), (30, 17))])
+def test_density_and_outputs_against_the_reference(parts, layers, asked: str) -> None:
+    """Of log-densities from -30 to 40, which are clipped at 15, in batches that are no whole blocks."""
+    inputs, weights = network(parts, layers, 333)
+    weights[-1][0] *= 8
+    of_density, of_outputs = torch.randn(333) * 1e-3, torch.randn(333, layers[-1])
+    of_density[::3] = of_outputs[::3] = 0
+    found = []
+    for form, dtype in ((density_mlp, torch.float32), (density_mlp_reference, torch.float64)):
+        leaves = [t.to(dtype).requires_grad_() for t in (*inputs, *weights)]
+        density, out = form(leaves[: len(inputs)], leaves[len(inputs) :])
+        terms = {"density": (density * of_density).sum(), "outputs": (out * of_outputs).sum()}
+        loss = sum(terms.values()) if asked == "both" else terms[asked]
+        found.append([density.log(), out, *torch.autograd.grad(loss, leaves)])
+    assert found[1][0].max().item() == pytest.approx(MAX_LOG_DENSITY, abs=1e-9)
+    for a, b in zip(*found, strict=True):
+        assert a.shape == b.shape
+        assert relative_error(a, b) < 1e-4
+
+
+def test_the_density_is_its_own_derivative_and_nan_stays_where_it_is() -> None:
+    """exp(min(x, 15)), whose slope by x is the value itself, beyond 15 too (Instant-NGP's trunc_exp)."""
+    logs = torch.tensor([-100.0, -3.0, 0.0, 14.5, 16.0, 80.0, torch.nan], requires_grad=True)
+    density, out = density_mlp([logs[:, None]], [torch.ones(1, 1)])
+    (slope,) = torch.autograd.grad(density.sum(), logs)
+    expected = torch.tensor([0.0, math.exp(-3), 1.0, math.exp(14.5), math.exp(15), math.exp(15)])
+    torch.testing.assert_close(density[:6], expected, rtol=1e-6, atol=1e-37)
+    torch.testing.assert_close(slope[:6], expected, rtol=1e-6, atol=1e-37)
+    assert density[6:].isnan().tolist() == slope[6:].isnan().tolist() == [True]
+    torch.testing.assert_close(out[:, 0], logs, equal_nan=True)
+
+
+@pytest.mark.skipif(not native.has("mlp_forward_bf16"), reason="this processor multiplies no bfloat16")
+def test_the_density_of_a_network_in_bfloat16_is_that_of_its_output() -> None:
+    inputs, weights = network((32,), (64, 16), 500)
+    with torch.autocast("cpu", torch.bfloat16):
+        (density, out), alone = density_mlp(inputs, weights), mlp(inputs, weights)
+    assert torch.equal(out, alone)
+    torch.testing.assert_close(density, out[:, 0].clamp(max=MAX_LOG_DENSITY).exp(), rtol=1e-6, atol=0)
 
 
 def test_weights_that_do_not_fit_are_named() -> None:

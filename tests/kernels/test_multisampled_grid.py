@@ -8,7 +8,8 @@ from framework.encodings.multisampled import MultisampledHashGrid
 from framework.geometry.multisamples import fixed_pattern, random_pattern
 from framework.geometry.points import Frustums
 from framework.kernels.hash_grid import HashGridLayout, hash_grid_reference
-from framework.kernels.multisampled_grid import MultisampleGradient, multisampled_grid, multisampled_grid_reference
+from framework.kernels.hash_grid_lookup import TableGradient
+from framework.kernels.multisampled_grid import LOOK_UP, multisampled_grid, multisampled_grid_reference
 from framework.kernels.multisamples import unit_multisamples, unit_multisamples_reference
 from tests.kernels.compiled import needs_kernels, relative_error
 
@@ -68,7 +69,7 @@ def test_compiled_values_and_gradients_are_the_references(each: int, spread: flo
 def test_deferred_gradients_of_parts_with_different_numbers_of_points_are_the_dense_ones() -> None:
     torch.manual_seed(0)
     table = torch.randn(LAYOUT.num_entries, 4, requires_grad=True)
-    deferred = MultisampleGradient(LAYOUT)
+    deferred = TableGradient(LOOK_UP, LAYOUT)
     several, single = points(70, 6, 0.01), points(33, 1, 0.0, seed=1)
     loss = sum(multisampled_grid(x, table, LAYOUT, deferred).square().sum() for x in (several, single))
     loss.backward()

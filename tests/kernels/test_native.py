@@ -1,13 +1,16 @@
 """Finding the compiled library, and what is checked before an address leaves Python."""
 
-import subprocess
-import sys
+import platform
+from pathlib import Path
 
 import pytest
 import torch
 
+from framework.base.device import cpu_features
 from framework.kernels import native
+from tests.forked import Forks
 from tests.kernels.compiled import needs_kernels
+from tests.sanitize.build import extensions
 
 GOOD = torch.zeros(4, 3)
 
@@ -27,25 +30,18 @@ def test_pointer_names_what_is_wrong(tensor: torch.Tensor, message: str) -> None
         native.pointer(tensor, "the table", (4, 3))
 
 
-def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    import os
-
-    run = [sys.executable, "-c", code]
-    return subprocess.run(run, env=os.environ | environment, capture_output=True, text=True, timeout=60, check=False)
-
-
-def test_the_reference_can_be_asked_for() -> None:
+def test_the_reference_can_be_asked_for(forks: Forks) -> None:
     code = "from framework.kernels import native; print(native.variant(), native.available())"
-    assert python(code, NERFLOOM_KERNELS="reference").stdout.split() == ["reference", "False"]
+    assert forks.run(code, NERFLOOM_KERNELS="reference").stdout.split() == ["reference", "False"]
 
 
-def test_an_unknown_variant_is_an_error_that_lists_the_known() -> None:
-    done = python("from framework.kernels import native; native.variant()", NERFLOOM_KERNELS="sse9")
+def test_an_unknown_variant_is_an_error_that_lists_the_known(forks: Forks) -> None:
+    done = forks.run("from framework.kernels import native; native.variant()", NERFLOOM_KERNELS="sse9")
     assert done.returncode == 1
     assert "NERFLOOM_KERNELS is 'sse9'; it must be one of auto, reference, avx512_bf16, avx512" in done.stderr
 
 
-def test_a_missing_library_is_said_once_and_torch_goes_on(tmp_path) -> None:
+def test_a_missing_library_is_said_once_and_torch_goes_on(tmp_path: Path, forks: Forks) -> None:
     code = (
         "from pathlib import Path\n"
         "from framework.kernels import native\n"
@@ -55,12 +51,12 @@ def test_a_missing_library_is_said_once_and_torch_goes_on(tmp_path) -> None:
         "for _ in range(3): out = mlp([torch.ones(2, 3)], [torch.ones(1, 3)])\n"
         "print(out.tolist())"
     )
-    done = python(code, NERFLOOM_KERNELS="auto")
+    done = forks.run(code, NERFLOOM_KERNELS="auto")
     assert done.returncode == 0
     said = done.stdout + done.stderr
     assert said.count("without its compiled kernels") == 1
     assert "[[3.0], [3.0]]" in said
-    broken = python(code, NERFLOOM_KERNELS="avx2")
+    broken = forks.run(code, NERFLOOM_KERNELS="avx2")
     assert broken.returncode == 1
     assert "NERFLOOM_KERNELS asks for 'avx2'" in broken.stderr
 
@@ -74,7 +70,7 @@ def test_a_function_that_is_not_there() -> None:
 
 @needs_kernels
 @pytest.mark.parametrize("variant", [name for name, needs in native.NEEDS.items()])
-def test_every_variant_that_fits_this_processor_gives_the_same_answer(variant: str) -> None:
+def test_every_variant_that_fits_this_processor_gives_the_same_answer(variant: str, forks: Forks) -> None:
     if not native.cpu_features().issuperset(native.NEEDS[variant]):
         pytest.skip(f"this processor has no {variant}")
     code = (
@@ -91,5 +87,16 @@ def test_every_variant_that_fits_this_processor_gives_the_same_answer(variant: s
         "other = (mlp([encoded], weights) - mlp_reference([encoded], weights)).abs().max()\n"
         "print(native.variant(), bool(error < 1e-5), bool(other < 1e-4))"
     )
-    done = python(code, NERFLOOM_KERNELS=variant)
+    done = forks.run(code, NERFLOOM_KERNELS=variant)
     assert done.stdout.split() == [variant, "True", "True"], done.stderr
+
+
+def test_setup_builds_every_variant_or_the_one_that_this_processor_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    def built() -> list[str]:
+        return [extension.name.rsplit(".", 1)[-1] for extension in extensions()]
+
+    monkeypatch.delenv("NERFLOOM_VARIANTS", raising=False)
+    assert set(built()) == (set(native.NEEDS) if platform.machine() in ("x86_64", "AMD64") else {"baseline"})
+    monkeypatch.setenv("NERFLOOM_VARIANTS", "native")
+    best = next(name for name, needs in native.NEEDS.items() if cpu_features().issuperset(needs))
+    assert built() == [best] or platform.system() != "Linux"

@@ -8,11 +8,13 @@ import threading
 
 import pytest
 import torch
+from torch import Tensor
 
 from framework.kernels import native
 from framework.kernels.mlp import mlp
+from tests.forked import Forks
 from tests.kernels.compiled import needs_kernels
-from tests.kernels.large import measured
+from tests.kernels.large import bits, measured
 
 pytestmark = needs_kernels
 ENVIRONMENTS = {
@@ -26,18 +28,23 @@ ENVIRONMENTS = {
 }
 QUICK = ("a limit of one thread", "eight threads")
 TOLERANCE = 2e-5
+Measured = dict[str, tuple[float, list[Tensor]]]
 
 
 @pytest.fixture(scope="module")
-def here() -> dict[str, object]:
-    """What a process measures that has one thread."""
-    return in_a_process()
+def here() -> Measured:
+    """What this process measures on one thread."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    found = measured()
+    torch.set_num_threads(before)
+    return found
 
 
 def in_a_process(**environment: str) -> dict[str, object]:
     kept = {name: value for name, value in os.environ.items() if not name.startswith("OMP_")}
     # Asked for by name too, for torch takes no more than there are cores from its environment.
-    threads = environment.get("OMP_NUM_THREADS", "2" if environment else "1")
+    threads = environment.get("OMP_NUM_THREADS", "2")
     run = [sys.executable, "-m", "tests.kernels.large", threads]
     done = subprocess.run(run, env=kept | environment, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
@@ -47,11 +54,11 @@ def in_a_process(**environment: str) -> dict[str, object]:
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in ENVIRONMENTS]
 )
-def test_values_and_gradients_are_the_references_in_every_environment(name: str, here: dict[str, object]) -> None:
+def test_values_and_gradients_are_the_references_in_every_environment(name: str, here: Measured) -> None:
     found = in_a_process(**ENVIRONMENTS[name])
     print(name, found["threads"], "threads; largest error", max(found["errors"].values()))
     assert max(found["errors"].values()) < TOLERANCE
-    assert found["bits"] == here["bits"]
+    assert found["bits"] == bits(here)
 
 
 def test_several_callers_at_once_get_what_one_gets() -> None:
@@ -69,7 +76,7 @@ def test_several_callers_at_once_get_what_one_gets() -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="the system has no fork")
-def test_a_forked_process_has_threads_of_its_own() -> None:
+def test_a_forked_process_has_threads_of_its_own(forks: Forks) -> None:
     """In a process of its own: what is forked here would hold this one's files."""
     code = (
         "import os, torch\n"
@@ -81,7 +88,7 @@ def test_a_forked_process_has_threads_of_its_own() -> None:
         "if child == 0: os._exit(0 if all(torch.equal(mlp(x, w), expected) for _ in range(20)) else 1)\n"
         "print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), torch.equal(mlp(x, w), expected))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    done = forks.run(code)
     assert done.stdout.split() == ["0", "True"], done.stderr
 
 
@@ -105,20 +112,20 @@ def test_an_error_in_one_chunk_is_raised_and_the_next_call_works(threads: int) -
 
 
 def test_memory_that_is_not_there_is_an_error_and_not_the_end_of_the_process() -> None:
-    refresh = native.Function("refresh_occupancy", "pqfffpi")
+    refresh = native.Function("refresh_occupancy", "pqffffpi")
     with pytest.raises(MemoryError, match="refresh_occupancy: there is not enough memory"):
-        refresh(None, 2**58, 1.0, 0.1, 0.01, None, 2)  # a sum for each part of as many cells
+        refresh(None, 2**58, 1.0, 0.1, 0.01, 0.0, None, 2)  # a sum for each part of as many cells
 
 
 def test_what_no_kernel_can_do_is_refused_by_name() -> None:
     forward = native.Function("hash_grid_forward", "pqpippipi")
     with pytest.raises(ValueError, match="hash_grid_forward: hash grid: an entry has 1, 2, 4 or 8 features"):
         forward(None, 0, None, 3, None, None, 1, None, 1)
-    network = native.Function("mlp_forward", "ppiqpippipi")
+    network = native.Function("mlp_forward", "ppiqpippippi")
     with pytest.raises(ValueError, match="a layer has 1 to 384 features"):
-        network(None, None, 1, 0, native.integers((385, 4)), 1, None, None, 0, None, 1)
+        network(None, None, 1, 0, native.integers((385, 4)), 1, None, None, 0, None, None, 1)
 
 
-def test_results_are_finite() -> None:
+def test_results_are_finite(here: Measured) -> None:
     """The hash is of numbers, not of NaN."""
-    assert all(bool(t.isfinite().all()) for _, tensors in measured().values() for t in tensors)
+    assert all(bool(t.isfinite().all()) for _, tensors in here.values() for t in tensors)

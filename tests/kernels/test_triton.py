@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from framework.kernels import native, triton_kernels
+from tests.forked import Forks
 
 ROOT = Path(__file__).parents[2]
 needs_triton = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="triton is not installed")
@@ -50,7 +51,7 @@ def test_every_kernel_compiles_for_a_gpu_that_is_not_there(target: tuple[str, st
     assert len(started) > 30
 
 
-def test_triton_is_imported_by_no_user_of_the_cpu() -> None:
+def test_triton_is_imported_by_no_user_of_the_cpu(forks: Forks) -> None:
     code = (
         "import sys, torch\n"
         "from framework.kernels.hash_grid import HashGridLayout, hash_grid\n"
@@ -58,14 +59,14 @@ def test_triton_is_imported_by_no_user_of_the_cpu() -> None:
         "hash_grid(torch.rand(3, 3), torch.rand(layout.num_entries, 2), layout)\n"
         "print('triton' in sys.modules, any('triton_kernels.' in name for name in sys.modules))"
     )
-    done = python("-c", code, TRITON_INTERPRET="0")
+    done = forks.run(code, TRITON_INTERPRET="0")
     assert done.stdout.split() == ["False", "False"], done.stderr
 
 
-def test_asking_for_triton_without_a_gpu_is_an_error() -> None:
+def test_asking_for_triton_without_a_gpu_is_an_error(forks: Forks) -> None:
     code = "from framework.kernels import triton_kernels as t; print(t.available())"
-    assert python("-c", code, NERFLOOM_KERNELS="reference").stdout.split() == ["False"]
-    done = python("-c", code, NERFLOOM_KERNELS="triton", TRITON_INTERPRET="0", CUDA_VISIBLE_DEVICES="")
+    assert forks.run(code, NERFLOOM_KERNELS="reference").stdout.split() == ["False"]
+    done = forks.run(code, NERFLOOM_KERNELS="triton", TRITON_INTERPRET="0", CUDA_VISIBLE_DEVICES="")
     assert done.returncode == 1
     assert "NERFLOOM_KERNELS asks for 'triton', but " in done.stderr
 

@@ -2,14 +2,13 @@
 
 import difflib
 import importlib.util
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+
+from tests.forked import Forks
 
 ROOT = Path(__file__).parents[2]
 PLAIN = ROOT / "examples" / "plain_nerf_loop.py"
@@ -24,7 +23,7 @@ def loaded(file: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     module.STEP *= module.STEPS / 64  # type: ignore[attr-defined]
-    module.STEPS, module.BATCH = 64, 256  # type: ignore[attr-defined]
+    module.STEPS, module.BATCH = 64, 128  # type: ignore[attr-defined]
     return module
 
 
@@ -65,8 +64,8 @@ def test_both_learn(file: Path, shared_tiny: Path, capsys: pytest.CaptureFixture
     assert float(match[2]) == 0 if file == PLAIN else float(match[2]) > 30
 
 
-def test_as_a_script(shared_tiny: Path) -> None:
-    words = [sys.executable, str(SKIPPING), "--data", str(shared_tiny), "--seconds", "0.5"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(words, capture_output=True, text=True, check=True, env=environment)
+def test_as_a_script(shared_tiny: Path, forks: Forks) -> None:
+    code = "import runpy, sys; del sys.argv[0]; runpy.run_path(sys.argv[0], run_name='__main__')"
+    done = forks.run(code, SKIPPING, "--data", shared_tiny, "--seconds", 0.5)
+    assert done.returncode == 0, done.stderr
     assert re.match(r"[\d,]+ rays/s, [1-9]\d* steps, PSNR [\d.]+ dB on 3 test images\n", done.stdout)

@@ -55,7 +55,7 @@ def build() -> Sanitized:
     """
     preloaded = runtime()
     variant = next(name for name, needs in NEEDS.items() if cpu_features().issuperset(needs))
-    extension = next(e for e in _extensions() if e.name.rsplit(".", 1)[-1] == variant)
+    extension = next(e for e in extensions() if e.name.rsplit(".", 1)[-1] == variant)
     FOLDER.mkdir(parents=True, exist_ok=True)
     objects = {source: FOLDER / f"{Path(source).stem}.o" for source in extension.sources}
 
@@ -69,7 +69,7 @@ def build() -> Sanitized:
     return Sanitized(variant, FOLDER, preloaded)
 
 
-def _extensions() -> list[Extension]:
+def extensions() -> list[Extension]:
     """What setup.py would build."""
     before = Path.cwd()
     os.chdir(ROOT)

@@ -2,6 +2,8 @@
 
 import dataclasses
 import re
+from collections.abc import Callable, Iterator
+from functools import cache
 from types import ModuleType
 
 import pytest
@@ -15,12 +17,19 @@ BUILT_IN = [name for name, entry in registered("methods").items() if entry.modul
 ROW = re.compile(r"^\| `--([\w.-]+)` \| (.*?) \| (.*?) \| (.*) \|$", re.MULTILINE)
 
 
-@pytest.fixture
-def method_pages(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(ROOT / "docs" / "building"))
-    import method_pages as module
+@pytest.fixture(scope="module")
+def method_pages() -> Iterator[ModuleType]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / "docs" / "building"))
+        import method_pages as module
 
-    return module
+        yield module
+
+
+@pytest.fixture(scope="module")
+def generated(method_pages: ModuleType) -> Callable[[str], str]:
+    """What is made from a method's code alone."""
+    return cache(lambda name: method_pages.page(name, None))
 
 
 def table(page: str) -> dict[str, tuple[str, str, str]]:
@@ -28,9 +37,9 @@ def table(page: str) -> dict[str, tuple[str, str, str]]:
 
 
 @pytest.mark.parametrize("name", BUILT_IN)
-def test_every_flag_has_a_row(method_pages: ModuleType, name: str) -> None:
+def test_every_flag_has_a_row(generated: Callable[[str], str], name: str) -> None:
     config = load_method(name).config
-    found = table(method_pages.page(name, None))
+    found = table(generated(name))
     assert {f"--{flag}" for flag in found} == set(_flag_names(config))
     for flag, (default, _, text) in found.items():
         value = config
@@ -42,9 +51,9 @@ def test_every_flag_has_a_row(method_pages: ModuleType, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", BUILT_IN)
-def test_values_beyond_what_is_allowed_are_refused(method_pages: ModuleType, name: str) -> None:
+def test_values_beyond_what_is_allowed_are_refused(generated: Callable[[str], str], name: str) -> None:
     config, tried = load_method(name).config, 0
-    for flag, (_, allowed, _) in table(method_pages.page(name, None)).items():
+    for flag, (_, allowed, _) in table(generated(name)).items():
         field = flag.replace("-", "_")
         if not re.match(r"(at least )?[\d.]", allowed) or isinstance(getattr(config, field), tuple):
             continue
@@ -58,10 +67,10 @@ def test_values_beyond_what_is_allowed_are_refused(method_pages: ModuleType, nam
 
 
 @pytest.mark.parametrize("name", BUILT_IN)
-def test_what_is_open_is_listed(method_pages: ModuleType, name: str) -> None:
+def test_what_is_open_is_listed(method_pages: ModuleType, generated: Callable[[str], str], name: str) -> None:
     method = load_method(name)
     listed = set(re.findall(r"^- `--([\w-]+)`", method_pages.decided(method), re.MULTILINE))
-    rows = table(method_pages.page(name, None))
+    rows = table(generated(name))
     assert {flag for flag, (default, _, _) in rows.items() if default == "*decided by the data*"} <= listed
     assert all(rows[flag][0] in ("*decided by the data*", "`auto`") for flag in listed)
 

@@ -4,6 +4,8 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as iio
+import numpy as np
 import pytest
 import torch
 
@@ -149,6 +151,28 @@ def test_a_checkpoint_has_as_many_gaussians_as_it_has(shared_tiny: Path, tmp_pat
     assert len(second.model.gaussians()) == count
     second.train_step()
     assert second.state.step == 26
+
+
+def test_images_of_nothing_leave_nothing(tiny: Path, tmp_path: Path) -> None:
+    """All Gaussians go, and none comes: training, pictures and a resumed run do without any."""
+    for file in (tiny / "train").iterdir():
+        iio.imwrite(file, np.zeros((20, 20, 4), np.uint8))
+    settings: dict[str, Any] = {"start": "random", "rate_factor": 50.0}
+    first = tiny_trainer("gaussian-splatting", tiny, tmp_path / "first", **settings)
+    for _ in range(45):
+        first.train_step()
+    assert first.state.skipped == 0
+    assert isinstance(first.model, HasGaussians)
+    assert len(first.model.gaussians()) == 0
+    view = View(camera())
+    picture = first.model.render_view(view, torch.tensor([0.2, 0.4, 0.6]))
+    torch.testing.assert_close(picture.rgb, torch.tensor([0.2, 0.4, 0.6]).expand(33, 33, 3))
+    torch.testing.assert_close(first.model.render_rgb(view, torch.ones(3)), torch.ones(33, 33, 3))
+    assert float(picture.accumulation.max()) == 0
+    second = tiny_trainer("gaussian-splatting", tiny, tmp_path / "second", **settings)
+    second.restore(load_checkpoint(first.save()))
+    second.train_step()
+    assert len(second.model.gaussians()) == 0  # type: ignore[operator]
 
 
 def test_colours_may_be_the_same_from_everywhere(shared_tiny: Path, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """First Gaussians: as large as their neighbours are far, coloured as the nearest images show them."""
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ import torch
 from dataparsers.blender import Blender
 from framework.data.dataset import load_dataset
 from framework.kernels.splat_project import DC
-from framework.splats.start import from_points, hull_points, morton, neighbour_distance, seen_colors
+from framework.splats.start import from_points, hull_points, morton, neighbour_distance, scene_size, seen_colors
 
 
 @pytest.mark.parametrize("count", [2, 3, 5, 500, 20_000])
@@ -72,3 +73,15 @@ def test_points_on_a_hull_lie_in_its_outer_cells() -> None:
     at = ((points + 1) / 2 * n).long()
     assert bool(((at >= 2) & (at < 6)).all())
     assert bool(((at == 2) | (at == 5)).any(1).all())
+
+
+@pytest.mark.parametrize(("focal", "width"), [(50.0, 1.0), (200.0, 1.0), (2_000.0, 0.1)])
+def test_a_scene_is_as_large_as_images_show_it(focal: float, width: float, shared_tiny: Path) -> None:
+    """A lens of 200 pixels for images of 100 is the longest that sees a scene as large as it is far."""
+    dataset = load_dataset(Blender().parse(shared_tiny, "train"), "train")
+    size = torch.full_like(dataset.cameras.fx, 100)
+    cameras = replace(dataset.cameras, fx=torch.full_like(size, focal), widths=size.long())
+    distance = float(dataset.cameras.camera_to_worlds[0, :, 3].norm())
+    found = scene_size(dataset.scene, torch.zeros(1, 3), cameras)
+    assert found == pytest.approx(1.3 * width * distance, rel=1e-5)
+    assert scene_size(dataset.scene, torch.zeros(1, 3)) == pytest.approx(1.3 * distance, rel=1e-5)

@@ -20,7 +20,7 @@ from tests.conftest import Refused
 from tests.training.helpers import TINY, tiny_run, tiny_trainer
 
 BALL = ball_views()
-BUDGET = Budget(steps=150, seconds=None)
+BUDGET = Budget(steps=75, seconds=None)
 SICK = " ".join(["sick", *TINY_NGP])
 
 
@@ -34,8 +34,8 @@ def test_a_small_method_in_easy_hard_scenes(tmp_path: Path) -> None:
     assert found["plain"].lost == 0
     assert {v.outcome for v in found.values()} <= {"pass", "degraded"}
     assert all(v.psnr is not None and v.psnr > 10 for v in found.values())
-    assert all(v.steps == 150 for v in found.values())
-    assert found["nan-pixels"].skipped == 50
+    assert all(v.steps == 75 for v in found.values())
+    assert found["nan-pixels"].skipped == 25
     assert found["duplicate-cameras"].skipped == 0
     assert list(tmp_path.iterdir()) == []  # the run's own folder is not used
 
@@ -45,6 +45,14 @@ def test_what_the_framework_does_not_offer_is_refused(tmp_path: Path) -> None:
     _, verdict = verdicts(run, BALL, select(["float16"]), Budget(1, None))
     assert verdict.outcome == "refused"
     assert verdict.error == "float16: 'mixed_precision' is 'float16'; it must be bool"
+
+
+def test_rays_a_step_say_nothing_of_what_draws_images(tmp_path: Path) -> None:
+    run = tiny_run("gaussian-splatting", Path("none"), tmp_path)
+    one, many = list(verdicts(run, BALL, select(["1-ray", "8192-rays"]), Budget(1, None)))[1:]
+    assert one.outcome == many.outcome == "not applicable"
+    assert one.cell() == "not applicable"
+    assert one.reason == "a step draws a whole image"
 
 
 def test_the_same_run_twice_is_the_same(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -28,6 +29,8 @@ from framework.tools.stress.scenes import (
 from framework.tools.testing.ball import RADIUS, trace
 
 INSIDE = RADIUS / 2
+views_of = cache(ball_views)
+"""Pictures of the ball, which are only read here."""
 LOOKS = [(FIELD_OF_VIEW, None), (4.0, None), (90.0, INSIDE), (170.0, INSIDE)]
 """Fields of view, degrees, and distances."""
 
@@ -40,7 +43,7 @@ def both(views: Views) -> tuple[Dataset, Dataset]:
 def test_cameras_are_rigid_look_at_the_ball_and_see_so_many_degrees(
     field_of_view: float, distance: float | None
 ) -> None:
-    views = ball_views(field_of_view, distance)
+    views = views_of(field_of_view, distance)
     assert (len(views.train), len(views.test)) == (NUM_TRAIN, NUM_TEST)
     for dataset in both(views):
         cameras, scene = dataset.cameras, dataset.scene
@@ -62,7 +65,7 @@ def test_cameras_are_rigid_look_at_the_ball_and_see_so_many_degrees(
 
 @pytest.mark.parametrize(("field_of_view", "distance"), LOOKS)
 def test_every_ray_meets_the_box(field_of_view: float, distance: float | None) -> None:
-    for dataset in both(ball_views(field_of_view, distance)):
+    for dataset in both(views_of(field_of_view, distance)):
         pixels = torch.arange(len(dataset.pixels))
         rays = dataset.cameras.pixel_rays(pixels, 0.0, 100.0, subpixels=subpixels(16))
         enter, leave = intersect_box(rays.origins, rays.directions, dataset.scene.box)
@@ -91,7 +94,7 @@ def test_rays_meet_the_ball_where_brute_force_says(center: tuple[float, float, f
 
 @pytest.mark.parametrize("field_of_view", [FIELD_OF_VIEW, 4.0])
 def test_the_ball_takes_its_share_of_a_picture(field_of_view: float) -> None:
-    for dataset in both(ball_views(field_of_view)):
+    for dataset in both(views_of(field_of_view)):
         assert dataset.scene.has_alpha
         alpha = dataset.pixels[:, 3].double().mean() / 255
         assert float(alpha) == pytest.approx(math.pi / 4 * SHARE**2, abs=5e-3)
@@ -100,7 +103,7 @@ def test_the_ball_takes_its_share_of_a_picture(field_of_view: float) -> None:
 @pytest.mark.parametrize(("field_of_view", "distance"), LOOKS[:3])
 def test_the_middle_of_a_picture_has_the_colour_of_its_normal(field_of_view: float, distance: float | None) -> None:
     """From outside the nearest point's, from inside that of the wall across."""
-    dataset = ball_views(field_of_view, distance).train
+    dataset = views_of(field_of_view, distance).train
     for index, pose in enumerate(dataset.cameras.camera_to_worlds):
         normal = pose[:, 2] if distance is None else -pose[:, 2]
         middle = slice(SIZE // 2 - 1, SIZE // 2 + 1)
@@ -110,7 +113,7 @@ def test_the_middle_of_a_picture_has_the_colour_of_its_normal(field_of_view: flo
 
 @pytest.mark.parametrize("field_of_view", [90.0, 170.0])
 def test_from_inside_there_is_no_background(field_of_view: float) -> None:
-    for dataset in both(ball_views(field_of_view, INSIDE)):
+    for dataset in both(views_of(field_of_view, INSIDE)):
         assert dataset.pixels.shape[1] == 3
         assert not dataset.scene.has_alpha
 

@@ -36,8 +36,8 @@ def written(trainer: Trainer) -> list[dict[str, Any]]:
     return json.loads((trainer.run.folder / "learning_curve.json").read_text())
 
 
-@pytest.mark.parametrize("seconds", [4.0, 60.0, 3600.0])
-@pytest.mark.parametrize("size", [24, 400, 1500])
+@pytest.mark.parametrize("seconds", [4.0, 3600.0])
+@pytest.mark.parametrize("size", [24, 1500])
 @pytest.mark.parametrize(
     ("learnt", "shown", "rays_per_pixel"),  # rays a second in training and in pictures, as measured on two cores
     [(240e3, 1100e3, 4), (38e3, 88e3, 1), (12e3, 80e3, 1)],

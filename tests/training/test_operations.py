@@ -21,6 +21,10 @@ BOUNDS = {
     "gaussian-splatting": (1170, 5),
     "vanilla-nerf": (555, 1),
     "dnerf": (740, 1),
+    "mip-nerf": (735, 1),
+    "mip-nerf-360": (1140, 1),
+    "zip-nerf": (2160, 1),
+    "nerf-plus-plus": (1270, 1),
 }
 """Operations and waits of a step: what was counted when this was written, and a tenth more operations, in which
 torch's releases may differ. Of the waits, one is for whether the step is finite; a march needs four, for the numbers of

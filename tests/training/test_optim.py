@@ -1,11 +1,14 @@
-"""Learning-rate schedules: values by hand."""
+"""Learning-rate schedules: values by hand. The optimiser's state: beside PyTorch's Adam."""
 
+import copy
 import math
+from typing import Any
 
 import pytest
+import torch
 
 from framework.base.config import TrainConfig
-from framework.training.optim import learning_rate_factor
+from framework.training.optim import Adam, learning_rate_factor
 
 
 @pytest.mark.parametrize(
@@ -29,3 +32,57 @@ def test_holding_schedule_falls_in_the_second_half() -> None:
 def test_warm_up_is_linear() -> None:
     config = TrainConfig(lr_schedule="constant", lr_warmup_steps=4)
     assert [learning_rate_factor(config, step, 0.0) for step in (0, 1, 3, 9)] == [0.25, 0.5, 1.0, 1.0]
+
+
+def two_groups(seed: int) -> tuple[list[torch.nn.Parameter], list[dict[str, Any]]]:
+    torch.manual_seed(seed)
+    parameters = [torch.nn.Parameter(torch.randn(shape)) for shape in ((5, 3), (4,), (2, 2))]
+    groups = [{"params": parameters[:2], "lr": 0.1}, {"params": parameters[2:], "lr": 0.01, "eps": 1e-3}]
+    return parameters, groups
+
+
+def set_gradients(parameters: list[torch.nn.Parameter], step: int) -> None:
+    for index, parameter in enumerate(parameters):
+        parameter.grad = torch.randn(parameter.shape, generator=torch.Generator().manual_seed(10 * step + index))
+
+
+@pytest.mark.parametrize("loads", ["theirs", "ours"])
+def test_it_goes_on_from_a_state_of_pytorchs_adam_and_from_its_own(loads: str) -> None:
+    theirs, groups = two_groups(0)
+    peer = torch.optim.Adam(groups, lr=1.0, betas=(0.8, 0.9), eps=1e-8)
+    first, ours_groups = two_groups(0)
+    ours = Adam(ours_groups, {}, 1.0, (0.8, 0.9), 1e-8)
+    for step in range(3):
+        set_gradients(theirs, step)
+        set_gradients(first, step)
+        peer.step()
+        ours.step()
+    second, other_groups = two_groups(1)
+    resumed = Adam(other_groups, {}, 1.0, (0.1, 0.2), 1e-1)
+    resumed.load_state_dict(copy.deepcopy((peer if loads == "theirs" else ours).state_dict()))  # which peer changes on
+    assert [group["lr"] for group in resumed.param_groups] == [0.1, 0.01]
+    assert [group["betas"] for group in resumed.param_groups] == [(0.8, 0.9)] * 2
+    with torch.no_grad():
+        for mine, other in zip(second, theirs, strict=True):
+            mine.copy_(other)
+    for step in range(3, 6):
+        set_gradients(theirs, step)
+        set_gradients(second, step)
+        peer.step()
+        resumed.step()
+    for mine, other in zip(second, theirs, strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-5, atol=1e-7)
+
+
+def test_a_state_of_other_groups_is_refused_and_changes_nothing() -> None:
+    parameters, groups = two_groups(0)
+    optimizer = Adam(groups, {}, 1.0, (0.9, 0.99), 1e-8)
+    saved = Adam([{"params": parameters}], {}, 0.5, (0.9, 0.99), 1e-8).state_dict()
+    before = optimizer.state
+    with pytest.raises(ValueError, match="groups of parameters are others"):
+        optimizer.load_state_dict(saved)
+    assert optimizer.state is before
+    assert [group["lr"] for group in optimizer.param_groups] == [0.1, 0.01]
+    with pytest.raises(KeyError):
+        optimizer.load_state_dict({**optimizer.state_dict(), "state": {}})
+    assert optimizer.state is before

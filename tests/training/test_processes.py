@@ -28,6 +28,7 @@ from framework.training.checkpoint import FOLDER, load_newest
 from framework.training.run import read_run
 from tests.cli.helpers import command
 from tests.faults import runs
+from tests.forked import Forks
 from tests.images import write_noise
 from tests.training import several
 from tests.training.helpers import TINY, assert_same_bits, tensors, tiny_trainer
@@ -45,21 +46,31 @@ def free_port() -> int:
         return connection.getsockname()[1]
 
 
-def started(*words: object) -> list[subprocess.Popen[str]]:
-    """Two processes of a Python command, numbered as by torchrun, which itself takes seconds to begin."""
+def numbered() -> list[dict[str, str]]:
+    """Variables of two processes, as torchrun numbers them, which itself takes seconds to begin."""
     port = free_port()
+    return [
+        {
+            "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port),
+            "WORLD_SIZE": str(COUNT), "LOCAL_WORLD_SIZE": str(COUNT), "RANK": str(rank), "LOCAL_RANK": str(rank),
+        }
+        for rank in range(COUNT)
+    ]  # fmt: skip
+
+
+def started(*words: object) -> list[subprocess.Popen[str]]:
+    """Two processes of a Python command."""
     return [
         subprocess.Popen(
             [sys.executable, "-m", *map(str, words)],
-            env={
-                **os.environ, "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE", "MASTER_ADDR": "127.0.0.1",
-                "MASTER_PORT": str(port), "WORLD_SIZE": str(COUNT), "LOCAL_WORLD_SIZE": str(COUNT),
-                "RANK": str(rank), "LOCAL_RANK": str(rank),
-            },
-            cwd=runs.ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+            env={**os.environ, **variables},
+            cwd=runs.ROOT,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
         )
-        for rank in range(COUNT)
-    ]  # fmt: skip
+        for variables in numbered()
+    ]
 
 
 def ended(process: subprocess.Popen[str]) -> str:
@@ -81,11 +92,12 @@ class Two:
 
 
 @pytest.fixture(scope="module")
-def two(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Two:
+def two(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory, forks: Forks) -> Two:
     folder = tmp_path_factory.mktemp("two")
     tiny_trainer("instant-ngp", shared_tiny, folder / "alone", max_num_iterations=several.SHORT).train()
-    both = started("tests.training.several", shared_tiny, folder, free_port())
-    said = [ended(process) for process in both]
+    words, code = (shared_tiny, folder, free_port()), "from tests.training.several import main; main()"
+    both = forks.together(*((code, words, variables) for variables in numbered()))
+    said = [process.stderr for process in both]
     assert [process.returncode for process in both] == [0, 0], said
     return Two(folder, [torch.load(folder / f"{rank}.pt", weights_only=True) for rank in range(COUNT)], said)
 

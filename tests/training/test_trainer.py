@@ -32,38 +32,45 @@ RAY_KINDS = [kind for kind in TINY if kind != "gaussian-splatting"]
 """Those that render rays, in chunks."""
 
 
-SLOW = ("vanilla-nerf+occupancy", "dnerf")
+QUICK = ("instant-ngp", "vanilla-nerf", "nerfacto", "gaussian-splatting")
+"""Those that learn, and render in chunks, in the fast set; test_check_method.py asks both of all, in less time."""
 
 
-@pytest.mark.parametrize("kind", [pytest.param(k, marks=pytest.mark.slow) if k in SLOW else k for k in KINDS])
+def quick(kinds: list[str]) -> list[Any]:
+    """The kinds, of which the others are slow."""
+    return [pytest.param(kind, marks=() if kind in QUICK else pytest.mark.slow) for kind in kinds]
+
+
+@pytest.mark.parametrize("kind", quick(KINDS))
 def test_it_learns(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
-    trainer = tiny_trainer(kind, shared_tiny, tmp_path / "run", evaluated=True, max_num_iterations=250)
+    steps = 120 if kind in QUICK else 250
+    trainer = tiny_trainer(kind, shared_tiny, tmp_path / "run", evaluated=True, max_num_iterations=steps)
     assert trainer.eval_set is not None
     before = evaluate(trainer.model, trainer.eval_set).results["psnr"]
     outcome = trainer.train()
     after = evaluate(trainer.model, trainer.eval_set).results["psnr"]
-    print(f"{kind}: {before:.1f} -> {after:.1f} dB in 250 steps")
+    print(f"{kind}: {before:.1f} -> {after:.1f} dB, {outcome.reason}")
     assert after > before + 6
-    assert outcome.reason == "250 steps done"
+    assert outcome.reason == f"{steps} steps done"
     assert trainer.state.skipped == 0
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_resuming_continues_with_the_same_bits(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
-    """Interrupted after 20 steps, evaluated in between, resumed in a new trainer: as if nothing had happened."""
-    whole = tiny_trainer(kind, shared_tiny, tmp_path / "whole", max_num_iterations=45)
+    """Interrupted after 13 steps, evaluated in between, resumed in a new trainer: as if nothing had happened."""
+    whole = tiny_trainer(kind, shared_tiny, tmp_path / "whole", max_num_iterations=22)
     whole.train()
 
-    first = tiny_trainer(kind, shared_tiny, tmp_path / "parts", evaluated=True, max_num_iterations=45)
-    for _ in range(20):
+    first = tiny_trainer(kind, shared_tiny, tmp_path / "parts", evaluated=True, max_num_iterations=22)
+    for _ in range(13):
         first.train_step()
     assert first.eval_set is not None
     evaluate(first.model, first.eval_set)
     checkpoint = first.save()
     torch.rand(7)  # whatever happens to the generator in between
-    second = tiny_trainer(kind, shared_tiny, tmp_path / "second", max_num_iterations=45)
+    second = tiny_trainer(kind, shared_tiny, tmp_path / "second", max_num_iterations=22)
     second.restore(load_checkpoint(checkpoint))
-    assert second.state.step == 20
+    assert second.state.step == 13
     second.train()
     assert_same_bits(tensors(whole), tensors(second))
     assert second.state.rays == whole.state.rays
@@ -237,14 +244,20 @@ def test_an_empty_grid_is_harmless(shared_tiny: Path, tmp_path: Path) -> None:
         torch.testing.assert_close(out.rgb, background.expand(len(part), 3))
 
 
-@pytest.mark.parametrize("kind", RAY_KINDS)
+def in_chunks_of(trainer: Trainer, rays: int) -> None:
+    """Let its model render so many rays at once."""
+    trainer.model.config = dataclasses.replace(trainer.model.config, eval_num_rays_per_chunk=rays)
+
+
+@pytest.mark.parametrize("kind", quick(RAY_KINDS))
 def test_a_picture_does_not_depend_on_the_chunks(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
     pictures = []
+    trainer = tiny_trainer(kind, shared_tiny, tmp_path / "run", evaluated=True)
+    for _ in range(5):
+        trainer.train_step()
+    assert trainer.eval_set is not None
     for chunk in (57, 8192):
-        trainer = tiny_trainer(kind, shared_tiny, tmp_path / str(chunk), True, eval_num_rays_per_chunk=chunk)
-        for _ in range(5):
-            trainer.train_step()
-        assert trainer.eval_set is not None
+        in_chunks_of(trainer, chunk)
         view = trainer.model.render_view(trainer.eval_set.view(0), evaluation_background(trainer.model))
         pictures.append((view.rgb, view.median_depth))
     torch.testing.assert_close(pictures[0][0], pictures[1][0], atol=2e-3, rtol=0)  # bfloat16 products differ by size
@@ -280,15 +293,15 @@ def test_looking_on_changes_no_bit(shared_tiny: Path, tmp_path: Path) -> None:
     assert list((tmp_path / "seeing").glob("events.out.tfevents.*"))
 
 
-@pytest.mark.parametrize("kind", RAY_KINDS)
+@pytest.mark.parametrize("kind", quick(RAY_KINDS))
 def test_metrics_do_not_depend_on_the_chunks(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
     found = []
+    trainer = tiny_trainer(kind, shared_tiny, tmp_path / "run", evaluated=True, mixed_precision=False)
+    for _ in range(10):
+        trainer.train_step()
+    assert trainer.eval_set is not None
     for chunk in (57, 400, 8192):
-        settings = {"eval_num_rays_per_chunk": chunk, "mixed_precision": False}
-        trainer = tiny_trainer(kind, shared_tiny, tmp_path / str(chunk), evaluated=True, **settings)
-        for _ in range(10):
-            trainer.train_step()
-        assert trainer.eval_set is not None
+        in_chunks_of(trainer, chunk)
         found.append(evaluate(trainer.model, trainer.eval_set).results)
     for other in found[1:]:
         for name in ("psnr", "ssim"):

@@ -1,6 +1,7 @@
 """A browser's side of viser's protocol, without a browser: messages with zstandard and msgpack over a websocket."""
 
 import io
+from collections.abc import Callable
 from contextlib import ExitStack
 from itertools import count
 from typing import Any
@@ -28,15 +29,20 @@ LOOK: dict[str, Any] = {
 
 
 class Client:
-    """A connection to the viewer."""
+    """A connection to the viewer.
 
-    def __init__(self, port: int, origin: Any = None) -> None:
+    Args:
+        rests: whether the viewer has drawn all that it was asked for.
+    """
+
+    def __init__(self, port: int, rests: Callable[[], bool], origin: Any = None) -> None:
         protocols: Any = [f"viser-v{viser.__version__}"]
         address, self._open = f"ws://127.0.0.1:{port}", ExitStack()
         self.socket: ClientConnection = self._open.enter_context(
             connect(address, subprotocols=protocols, origin=origin, max_size=2**27, compression=None)
         )
         self.controls: dict[str, tuple[str, Any]] = {}
+        self.rests = rests
 
     def send(self, message: Any) -> None:
         self.socket.send(msgspec.msgpack.encode(message))
@@ -77,14 +83,17 @@ class Client:
                     return np.asarray(Image.open(io.BytesIO(message["rgb_data"])))
         raise AssertionError
 
-    def finished(self, seconds: float = 1.2) -> np.ndarray:
-        """The last picture, after which none comes for some time."""
+    def finished(self, seconds: float = 0.3) -> np.ndarray:
+        """The last picture, after which nothing is left to draw, and none comes for some time."""
         found = self.picture()
-        while True:
+        for _ in range(200):
+            rested = self.rests()
             try:
                 found = self.picture(seconds)
             except TimeoutError:
-                return found
+                if rested:
+                    return found
+        raise AssertionError("the picture does not come to rest")
 
     def close(self) -> None:
         self._open.close()

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
@@ -18,6 +19,8 @@ from framework.evaluation.evaluator import evaluation_background
 from framework.training.trained import load_trained
 from framework.viewer.request import Pose, Request
 from tests.cli.helpers import TINY_NGP, command, train
+from tests.conftest import write_tiny
+from tests.training.helpers import tiny_trainer
 from tests.viewer.chromium import Chromium, Tab, chromium, until
 
 pytest.importorskip("viser", reason="the extra [viewer] is not installed")
@@ -70,7 +73,7 @@ def shown(tab: Tab) -> np.ndarray:
     return settled(tab)[150:520, 60:540].astype(float)
 
 
-def expected(run: Path, tab: Tab, camera: list[float]) -> np.ndarray:
+def expected(run: Path, tab: Tab, camera: list[float], time: float | None = None) -> np.ndarray:
     """What the run's model renders from the page's camera: position, target and up."""
     width, height = tab.evaluate("(c => [c.clientWidth, c.clientHeight])(document.querySelector('canvas'))")
     position, target, up = (torch.tensor(camera[i : i + 3], dtype=torch.float64) for i in (0, 3, 6))
@@ -78,8 +81,8 @@ def expected(run: Path, tab: Tab, camera: list[float]) -> np.ndarray:
     right = torch.nn.functional.normalize(torch.linalg.cross(up, back), dim=0)
     matrix = torch.stack([right, torch.linalg.cross(back, right), back, position], 1)
     model = load_trained(run, device_type="cpu").model
-    request = Request(Pose(tuple(matrix.flatten().tolist()), np.radians(50)), width, height)
-    picture = model.render_view(View(request.camera()), evaluation_background(model))
+    request = Request(Pose(tuple(matrix.flatten().tolist()), np.radians(50)), width, height, time=time)
+    picture = model.render_view(View(request.camera(), time=time), evaluation_background(model))
     return picture.rgb.clamp(0, 1).numpy()[150:520, 60:540] * 255
 
 
@@ -100,15 +103,39 @@ def choose(tab: Tab, label: str, option: str) -> None:
     tab.press(option)
 
 
+ROW = """(() => {
+  const found = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === %s);
+  return found[found.length - 1].parentElement.parentElement;
+})()"""
+"""The row of a control's label."""
+
+
+def to_the_end(tab: Tab, label: str) -> None:
+    """Press End on a slider."""
+    tab.evaluate(f"{ROW % json.dumps(label)}.querySelector('[role=slider]').focus()")
+    for kind in ("keyDown", "keyUp"):
+        tab.send("Input.dispatchKeyEvent", type=kind, key="End", code="End", windowsVirtualKeyCode=35)
+
+
+def write_number(tab: Tab, label: str, text: str) -> None:
+    """Write into the field of a number."""
+    tab.evaluate(f"(e => {{ e.focus(); e.select(); }})({ROW % json.dumps(label)}.querySelector('input'))")
+    tab.send("Input.insertText", text=text)
+
+
+def look_of(run: Path) -> list[float]:
+    """The camera that the page begins with: position, target and up."""
+    camera = load_trained(run, device_type="cpu").model.scene.camera_to_worlds
+    assert camera is not None
+    position, back = camera[0, :, 3], camera[0, :, 2]
+    return [*position.tolist(), *(position - back).tolist(), 0.0, 0.0, 1.0]
+
+
 def test_a_trained_run(browser: Chromium, run: Path, tmp_path: Path) -> None:
     with started(command("ns-viewer"), run, "--websocket-port", 17107) as (process, address):
-        camera = load_trained(run, device_type="cpu").model.scene.camera_to_worlds
-        assert camera is not None
-        position, back = camera[0, :, 3], camera[0, :, 2]
-        look = [*position.tolist(), *(position - back).tolist(), 0.0, 0.0, 1.0]
         tab = browser.open(address)
         first = shown(tab)
-        found = decibels(first, expected(run, tab, look))
+        found = decibels(first, expected(run, tab, look_of(run)))
         print(f"the page's picture against the model's: {found:.1f} dB")
         assert found > 30
 
@@ -144,6 +171,45 @@ def test_a_trained_run(browser: Chromium, run: Path, tmp_path: Path) -> None:
         shown(other)
         other.close()
         assert process.poll() is None
+
+
+@pytest.fixture
+def blue_with_time(tmp_path: Path) -> Path:
+    """A K-Planes run of a ball whose blue grows from none to full while the camera circles."""
+    data = write_tiny(tmp_path / "ball", counts=(20, 2, 2))
+    for split in ("train", "val", "test"):
+        file = data / f"transforms_{split}.json"
+        content = json.loads(file.read_text())
+        for index, frame in enumerate(content["frames"]):
+            frame["time"] = index / (len(content["frames"]) - 1)
+            picture = data / f"{frame['file_path']}.png"
+            rgba = iio.imread(picture)
+            rgba[..., 2] = (rgba[..., 3] * frame["time"]).astype(np.uint8)
+            iio.imwrite(picture, rgba)
+        file.write_text(json.dumps(content))
+    trainer = tiny_trainer("kplanes", data, tmp_path / "run", max_num_iterations=200)
+    trainer.train()
+    return trainer.run.config_path.parent
+
+
+def test_time_and_crop(browser: Chromium, blue_with_time: Path) -> None:
+    run = blue_with_time
+    with started(command("ns-viewer"), run, "--websocket-port", 17307) as (_, address):
+        tab = browser.open(address)
+        assert decibels(shown(tab), expected(run, tab, look_of(run), 0.0)) > 30
+        to_the_end(tab, "Time")
+        late = shown(tab)
+        assert decibels(late, expected(run, tab, look_of(run), 1.0)) > 30
+        assert decibels(late, expected(run, tab, look_of(run), 0.0)) < 25  # what was learnt changes with time
+
+        tab.press("Crop")
+        time.sleep(1)
+        tab.press("Crop")
+        assert decibels(shown(tab), late) > 40  # all that was learnt lies within the scene's box
+        write_number(tab, "Near", "6")
+        time.sleep(3)
+        assert tab.screenshot()[150:520, 60:540].min() > 250  # nothing is left behind the ball but white
+        tab.close()
 
 
 def test_a_run_in_training(browser: Chromium, shared_tiny: Path, tmp_path: Path) -> None:

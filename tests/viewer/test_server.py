@@ -49,6 +49,12 @@ class Served:
             if self.studio.work() is None:
                 self.studio.wait(0.01)
 
+    def rests(self) -> bool:
+        """Whether every browser has the finished picture of what it asked for last."""
+        browsers, now = list(self.studio._browsers.values()), time.monotonic()
+        waiting = [browser.waiting(self.studio.subject.step, now) for browser in browsers]
+        return not any(one.new or one.rough for one in waiting)
+
     def close(self) -> None:
         self._ending = True
         self._thread.join()
@@ -68,7 +74,7 @@ def connected(served: Served) -> Iterator[Callable[..., Client]]:
     clients = []
 
     def connect(**how: Any) -> Client:
-        clients.append(Client(served.port, **how))
+        clients.append(Client(served.port, served.rests, **how))
         return clients[-1]
 
     yield connect

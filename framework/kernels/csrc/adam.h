@@ -3,11 +3,12 @@
 
 #include "common.h"
 
+#include <algorithm>
 #include <cmath>
+#include <utility>
 #include <vector>
 
 namespace adam {
-
 
 // 1 / (1 - beta^k) for k = 1, 2, ... until it is 1 in float32.
 inline std::vector<float> corrections(double beta) {
@@ -31,12 +32,23 @@ inline bool all_zero(const float* values) {
 struct Settings {
     float keep1, add1, keep2, add2, rate, eps;
     std::vector<float> unbias1, unbias2;  // by how often an entry has been updated
-    float settled;                        // updates after which both are 1
+    std::vector<uint64_t> unbias;         // the bits of both, those of the first moment below
+    float settled;                        // updates from which on both are 1: the last index of each table
 
     Settings(float rate, double beta1, double beta2, float eps)
         : keep1(float(beta1)), add1(float(1 - beta1)), keep2(float(beta2)), add2(float(1 - beta2)), rate(rate),
-          eps(eps), unbias1(corrections(beta1)), unbias2(corrections(beta2)),
-          settled(float((unbias1.size() > unbias2.size() ? unbias1.size() : unbias2.size()) - 1)) {}
+          eps(eps), unbias1(corrections(beta1)), unbias2(corrections(beta2)) {
+        const size_t size = std::max(unbias1.size(), unbias2.size());
+        unbias1.resize(size, 1.0f), unbias2.resize(size, 1.0f);
+        settled = float(size - 1);
+        for (size_t k = 0; k < size; k++) {
+            uint32_t first, second;
+            std::memcpy(&first, &unbias1[k], sizeof first);
+            std::memcpy(&second, &unbias2[k], sizeof second);
+            unbias.push_back(uint64_t(second) << 32 | first);
+        }
+    }
+    size_t index(float updates) const { return size_t(updates < settled ? updates : settled); }
 };
 
 // Moves LANES values where `mask` is set; the gradient is cleared. Corrections may be 1 or vectors.
@@ -55,33 +67,75 @@ inline void move(float* values, float* mean, float* square, float* grad, Ints ma
     store(grad, splat(0));
 }
 
-// LANES values, LANES / F entries. Returns how many of them had a gradient.
-template <int F>
-inline int update(float* values, float* mean, float* square, float* grad, float* seen, const Settings& s) {
-    constexpr int ENTRIES = LANES / F;
-    alignas(64) float unbias1[LANES], unbias2[LANES];
-    alignas(64) int32_t used[LANES];
-    int touched = 0;
-    for (int e = 0; e < ENTRIES; e++) {
-        bool any = false;
-        for (int f = 0; f < F; f++) any |= grad[e * F + f] != 0;
-        touched += any;
-        const size_t k = size_t(seen[e] += float(any));
-        for (int f = 0; f < F; f++) {
-            used[e * F + f] = -int32_t(any);
-            unbias1[e * F + f] = s.unbias1[k < s.unbias1.size() ? k : s.unbias1.size() - 1];
-            unbias2[e * F + f] = s.unbias2[k < s.unbias2.size() ? k : s.unbias2.size() - 1];
-        }
-    }
-    Ints mask;
-    std::memcpy(&mask, used, sizeof mask);
-    move(values, mean, square, grad, mask, load(unbias1), load(unbias2), s);
-    return touched;
+// As many 64-bit integers as there are pairs of lanes, and one number for each pair.
+typedef uint64_t Longs __attribute__((vector_size(LANES * 4)));
+typedef int32_t PairInts __attribute__((vector_size(LANES * 2)));
+typedef float PairFloats __attribute__((vector_size(LANES * 2)));
+constexpr int PAIRS = LANES / 2;
+
+// value(0), value(1), ... in a vector that is put together in registers: a load would wait for many small stores.
+template <typename Vector, size_t... I, typename Value>
+inline Vector each(std::index_sequence<I...>, const Value& value) { return Vector{value(I)...}; }
+
+template <typename To, typename From>
+inline To same_bits(From from) {
+    static_assert(sizeof(To) == sizeof(From));
+    To to;
+    std::memcpy(&to, &from, sizeof to);
+    return to;
 }
 
-typedef int64_t Longs __attribute__((vector_size(LANES * 4)));
+// Which of LANES values belong to an entry of F values with a gradient.
+template <int F>
+inline Ints with_gradient(const float* grad) {
+    if constexpr (F == 1) {
+        return (same_bits<Ints>(load(grad)) & 0x7fffffff) != 0;
+    } else if constexpr (F == 2) {
+        return same_bits<Ints>((same_bits<Longs>(load(grad)) & 0x7fffffff7fffffff) != 0);
+    } else {
+        uint64_t any[LANES / F];
+        for (int e = 0; e < LANES / F; e++) {
+            uint64_t bits[F / 2], all = 0;
+            std::memcpy(bits, grad + e * F, sizeof bits);
+            for (int i = 0; i < F / 2; i++) all |= bits[i];
+            any[e] = 0 - uint64_t((all & 0x7fffffff7fffffff) != 0);
+        }
+        return same_bits<Ints>(each<Longs>(std::make_index_sequence<PAIRS>(), [&](size_t i) { return any[i * 2 / F]; }));
+    }
+}
 
-// Whether LANES / F entries, F being 1 or 2, are all past the correction: then they need no look at each by itself.
+// Counts the updates of LANES / F entries, and looks up their corrections, which each of their values gets.
+template <int F>
+inline void count(Ints any, float* seen, Floats& unbias1, Floats& unbias2, const Settings& s) {
+    if constexpr (F == 1) {
+        const Floats updates = load(seen) - __builtin_convertvector(any, Floats);
+        store(seen, updates);
+        const Ints k = __builtin_convertvector(smaller(updates, splat(s.settled)), Ints);
+        unbias1 = each<Floats>(std::make_index_sequence<LANES>(), [&](size_t i) { return s.unbias1[size_t(k[i])]; });
+        unbias2 = each<Floats>(std::make_index_sequence<LANES>(), [&](size_t i) { return s.unbias2[size_t(k[i])]; });
+    } else {
+        const Longs used = same_bits<Longs>(any);
+        Longs both;
+        if constexpr (F == 2) {
+            PairFloats updates;
+            std::memcpy(&updates, seen, sizeof updates);
+            updates -= __builtin_convertvector(__builtin_convertvector(used, PairInts), PairFloats);
+            std::memcpy(seen, &updates, sizeof updates);
+            const PairFloats last = PairFloats{} + s.settled;
+            const PairInts k = __builtin_convertvector(updates < last ? updates : last, PairInts);
+            both = each<Longs>(std::make_index_sequence<PAIRS>(), [&](size_t i) { return s.unbias[size_t(k[i])]; });
+        } else {
+            uint64_t found[LANES / F];
+            for (int e = 0; e < LANES / F; e++) found[e] = s.unbias[s.index(seen[e] += float(int(used[e * F / 2] & 1)))];
+            both = each<Longs>(std::make_index_sequence<PAIRS>(), [&](size_t i) { return found[i * 2 / F]; });
+        }
+        const Longs low = both & 0xffffffff, high = both ^ low;
+        unbias1 = same_bits<Floats>(low | low << 32);
+        unbias2 = same_bits<Floats>(high | high >> 32);
+    }
+}
+
+// Whether all of LANES / F entries are past the correction: then they need no look at each by itself.
 template <int F>
 inline bool all_settled(const float* seen, const Settings& s) {
     bool settled = true;
@@ -89,23 +143,18 @@ inline bool all_settled(const float* seen, const Settings& s) {
     return settled;
 }
 
-// As `update`, for settled entries, whose counts grow no more.
+// LANES values, LANES / F entries; settled ones are counted no more. Returns which of them had a gradient.
 template <int F>
-inline int update_settled(float* values, float* mean, float* square, float* grad, const Settings& s) {
-    Ints mask;
-    if constexpr (F == 2) {
-        Longs pairs;
-        std::memcpy(&pairs, grad, sizeof pairs);
-        const Longs any = (pairs & 0x7fffffff7fffffff) != 0;
-        std::memcpy(&mask, &any, sizeof mask);
+inline Ints update(float* values, float* mean, float* square, float* grad, float* seen, const Settings& s) {
+    const Ints any = with_gradient<F>(grad);
+    if (all_settled<F>(seen, s)) {
+        move(values, mean, square, grad, any, 1.0f, 1.0f, s);
     } else {
-        std::memcpy(&mask, grad, sizeof mask);
-        mask = (mask & 0x7fffffff) != 0;
+        Floats unbias1, unbias2;
+        count<F>(any, seen, unbias1, unbias2, s);
+        move(values, mean, square, grad, any, unbias1, unbias2, s);
     }
-    move(values, mean, square, grad, mask, 1.0f, 1.0f, s);
-    int touched = 0;
-    for (int i = 0; i < LANES; i++) touched -= mask[i];
-    return touched / F;
+    return any;
 }
 
 // A single entry, where fewer than LANES values are left or an entry has an odd number of features.
@@ -114,9 +163,8 @@ inline int update_entry(float* values, float* mean, float* square, float* grad, 
     bool any = false;
     for (int f = 0; f < features; f++) any |= grad[f] != 0;
     if (!any) return 0;
-    const size_t k = size_t(seen[0] += 1);
-    const float unbias1 = s.unbias1[k < s.unbias1.size() ? k : s.unbias1.size() - 1];
-    const float unbias2 = s.unbias2[k < s.unbias2.size() ? k : s.unbias2.size() - 1];
+    const size_t k = s.index(seen[0] += 1);
+    const float unbias1 = s.unbias1[k], unbias2 = s.unbias2[k];
     for (int f = 0; f < features; f++) {
         mean[f] = s.keep1 * mean[f] + s.add1 * grad[f];
         square[f] = s.keep2 * square[f] + s.add2 * grad[f] * grad[f];
@@ -132,9 +180,8 @@ inline int update_row(float* values, float* mean, float* square, float* grad, fl
     bool none = true;
     for (int i = 0; i < features; i += LANES) none &= all_zero(grad + i);
     if (none) return 0;
-    const size_t k = size_t(seen[0] += 1);
-    const float unbias1 = s.unbias1[k < s.unbias1.size() ? k : s.unbias1.size() - 1];
-    const float unbias2 = s.unbias2[k < s.unbias2.size() ? k : s.unbias2.size() - 1];
+    const size_t k = s.index(seen[0] += 1);
+    const float unbias1 = s.unbias1[k], unbias2 = s.unbias2[k];
     for (int i = 0; i < features; i += LANES)
         move(values + i, mean + i, square + i, grad + i, Ints{} - 1, unbias1, unbias2, s);
     return 1;
@@ -145,17 +192,14 @@ template <int F>
 int64_t update_range(float* values, float* mean, float* square, float* grad, float* seen, int64_t begin, int64_t end,
                      int features, const Settings& s) {
     int64_t touched = 0, e = begin;
-    if constexpr (F > 0 && F <= LANES)
+    if constexpr (F > 0 && F <= LANES) {
+        Ints updates{};  // of each lane
         for (; e + LANES / F <= end; e += LANES / F) {
             const int64_t i = e * F;
-            if (all_zero(grad + i)) continue;
-            if constexpr (F <= 2)
-                if (all_settled<F>(seen + e, s)) {
-                    touched += update_settled<F>(values + i, mean + i, square + i, grad + i, s);
-                    continue;
-                }
-            touched += update<F>(values + i, mean + i, square + i, grad + i, seen + e, s);
+            if (!all_zero(grad + i)) updates -= update<F>(values + i, mean + i, square + i, grad + i, seen + e, s);
         }
+        for (int lane = 0; lane < LANES; lane += F) touched += updates[lane];
+    }
     for (; F == 0 && features % LANES == 0 && e < end; e++) {
         const int64_t i = e * features;
         touched += update_row(values + i, mean + i, square + i, grad + i, seen + e, features, s);

@@ -2,7 +2,8 @@
 //
 // A ray's candidates are the steps first + k * step (growing with distance beyond step / cone). A wave finds the next
 // `limit` candidates of every living ray whose middle lies in an occupied cell; blocks of 4^3 empty cells are crossed
-// at once.
+// at once. Of nested boxes, each of twice the size, the smallest that holds the middle says what is there; the middle of
+// a larger box holds what the smaller ones do, so that a box can be crossed by its own blocks up to its faces.
 #include "common.h"
 
 #include <algorithm>
@@ -25,6 +26,11 @@ struct Grid {
     const uint8_t* blocks;  // one byte a block of 4^3 cells: distance, in blocks, to one that holds an occupied cell
     int resolution, side;
 
+    // That of a larger box, `level` times twice the size.
+    Grid outer(int level) const {
+        const int64_t cells = int64_t(resolution) * resolution * resolution, its_blocks = int64_t(side) * side * side;
+        return {bits + level * ((cells + 7) / 8), blocks + level * its_blocks, resolution, side};
+    }
     bool occupied(FourInts c) const {
         const int64_t cell = (int64_t(c[0]) * resolution + c[1]) * resolution + c[2];
         return bits[cell >> 3] >> (cell & 7) & 1;
@@ -74,6 +80,23 @@ struct Ray {
         const FourInts last = zero + (resolution - 1), positive = c < 0 ? zero : c;
         return positive > last ? last : positive;
     }
+    // The same ray in cells of a box that is 2^level times as large.
+    Ray outer(int level, int resolution) const {
+        const float size = std::ldexp(1.0f, -level), half = float(resolution) / 2;
+        Ray ray = *this;
+        ray.origin = (origin - half) * size + half;
+        ray.direction = direction * size;
+        ray.inverse = inverse / size;
+        return ray;
+    }
+    // The smallest of the nested boxes that holds the place at distance t, or the largest.
+    int level(float t, int resolution, int levels) const {
+        const Four across = (origin + t * direction - float(resolution) / 2) / (float(resolution) / 2);
+        const float farthest = std::max({std::abs(across[0]), std::abs(across[1]), std::abs(across[2])});
+        uint32_t bits;  // farthest < 2^level, and not less than half of it
+        std::memcpy(&bits, &farthest, sizeof bits);
+        return std::clamp(int(bits >> 23) - 126, 0, levels - 1);
+    }
     // Distance at which the ray leaves the cube of `size` cells that cell c lies in, and `more` cells around it.
     float leave(FourInts c, int size, int more) const {
         const FourInts corner = (c & -size) + (forward ? FourInts{} + (size + more) : FourInts{} - more);
@@ -84,14 +107,26 @@ struct Ray {
     }
 };
 
-// Appends the starts and ends of up to `limit` steps; returns how many, and the step to go on from.
-int march_ray(const Ray& ray, const Steps& steps, const Grid& grid, float enter, float leave, int limit,
+// Appends the starts and ends of up to `limit` steps; returns how many, and the step to go on from. `smallest` and
+// `first` are the ray and the grid in the smallest of the nested boxes.
+int march_ray(const Ray& smallest, const Steps& steps, const Grid& first, int levels, float enter, float leave, int limit,
               int32_t& next, std::vector<float>& starts, std::vector<float>& ends) {
-    int found = 0;
+    int found = 0, level = 0;
     int32_t k = next;
+    Ray ray = smallest;
+    Grid grid = first;
+    float face = std::numeric_limits<float>::infinity();  // where the ray leaves the box, if there are larger ones
+    float start = steps.start(k);
     while (found < limit) {
-        const float start = steps.start(k), end = steps.start(k + 1), middle = (start + end) / 2;
+        const float end = steps.start(k + 1), middle = (start + end) / 2;
         if (!(middle < leave)) break;
+        if (levels > 1) {
+            const int here = smallest.level(middle, first.resolution, levels);
+            if (here != level || face == std::numeric_limits<float>::infinity()) {
+                level = here, ray = smallest.outer(level, first.resolution), grid = first.outer(level);
+                face = ray.leave(FourInts{}, grid.resolution, 0);
+            }
+        }
         const FourInts c = ray.cell(middle, grid.resolution);
         const int distance = grid.distance(c);
         if (distance == 0 && grid.occupied(c)) {
@@ -100,10 +135,12 @@ int march_ray(const Ray& ray, const Steps& steps, const Grid& grid, float enter,
                 ends.push_back(end);
                 found++;
             }
-            k++;
+            k++, start = end;
         } else {
             const float clear = distance == 0 ? ray.leave(c, 1, 0) : ray.leave(c, BLOCK, (distance - 1) * BLOCK);
-            k = std::max(k + 1, steps.before(clear));
+            const int32_t on = steps.before(std::min(clear, face));
+            start = on > k + 1 ? steps.start(on) : end;
+            k = std::max(k + 1, on);
         }
     }
     next = k;
@@ -112,10 +149,10 @@ int march_ray(const Ray& ray, const Steps& steps, const Grid& grid, float enter,
 
 }  // namespace
 
-namespace {
-
-void pack_slice(const uint8_t* occupied, int64_t resolution, int64_t cells, int64_t side, uint8_t* bits,
-                uint8_t* blocks) {
+// One bit a cell, and for each block of 4^3 cells its distance (the largest over the axes, in blocks, at most 255) to a
+// block that holds an occupied cell; from one byte a cell.
+EXPORT int pack_occupancy(const uint8_t* occupied, int resolution, uint8_t* bits, uint8_t* blocks) {
+    const int64_t cells = int64_t(resolution) * resolution * resolution, side = (resolution + BLOCK - 1) / BLOCK;
     std::memset(bits, 0, size_t((cells + 7) / 8));
     std::memset(blocks, 0, size_t(side * side * side));
     for (int64_t cell = 0; cell < cells; cell++) {
@@ -142,26 +179,14 @@ void pack_slice(const uint8_t* occupied, int64_t resolution, int64_t cells, int6
             }
             blocks[b] = uint8_t(std::min<int>(blocks[b], nearest));
         }
+    return DONE;
 }
 
-}  // namespace
-
-// Of each slice: one bit a cell, and for each block of 4^3 cells its distance (the largest over the axes, in blocks, at
-// most 255) to a block that holds an occupied cell; from one byte a cell. A slice's bits begin with a byte of their own.
-EXPORT int pack_occupancy(const uint8_t* occupied, int resolution, int slices, uint8_t* bits, uint8_t* blocks,
-                          int threads) {
-    return guarded([&] {
-        const int64_t n = resolution, cells = n * n * n, side = (n + BLOCK - 1) / BLOCK;
-        for_chunks(threads, slices, [&](int64_t s, int) {
-            pack_slice(occupied + s * cells, n, cells, side, bits + s * ((cells + 7) / 8), blocks + s * side * side * side);
-        });
-    });
-}
-
-// Marks the cells whose opacity over one step is at least `threshold`, or the mean opacity if that is less. The grid of
-// densities is multiplied by `decay` first. NaN is marked and left out of the mean.
+// Marks the cells whose opacity over one step is at least `threshold`, or the mean opacity if that is less, for
+// which `elsewhere` stands in if it is larger. The grid of densities is multiplied by `decay` first. NaN is marked and left
+// out of the mean.
 EXPORT int refresh_occupancy(float* density, int64_t cells, float decay, float step, float threshold,
-                             uint8_t* occupied, int threads) {
+                             float elsewhere, uint8_t* occupied, int threads) {
     return guarded([&] {
         constexpr int64_t RUN = 32768;
         const int64_t runs = (cells + RUN - 1) / RUN;
@@ -194,7 +219,8 @@ EXPORT int refresh_occupancy(float* density, int64_t cells, float decay, float s
         for (double part : opacity) total += part;
         for (int64_t part : known) count += double(part);
         constexpr double ROUNDING = 1e-5;  // see ../march.py
-        const float least = std::min(threshold, float(total / count * (1 - ROUNDING)));  // the threshold if all are NaN
+        const float mean = float(total / count * (1 - ROUNDING));
+        const float least = std::min(threshold, std::max(mean, elsewhere));  // the threshold if all are NaN
         const float density_threshold = -std::log1p(-std::min(least, 1 - 1e-7f)) / step;
         for_ranges(threads, cells, 4 * RUN, [&](int64_t begin, int64_t end) {
             const float limit = density_threshold;
@@ -233,14 +259,15 @@ EXPORT int march_begin(const float* origins, const float* directions, const floa
 }
 
 // The next samples of each living ray, packed ray by ray. `total`: their number N.
-// slices (R): which of the grid's slices of time each ray marches through, or null if there is one.
+// box, resolution, levels: the smallest of the nested boxes, cells along an axis of each, and how many there are.
+// slices (R): of a grid of one box, the slice of time that each ray marches through; null if there is one.
 // next (R): the step to go on from, kept up here; counts (A): samples of each living ray.
 // starts, ends (N), owners (N), positions (N, 3) have room for A * limit.
 EXPORT int march_wave(const float* origins, const float* directions, const float* enter, const float* leave,
                       const float* first, const int64_t* slices, int32_t* next, const int64_t* alive, int64_t living,
                       int limit, const float* box, float step, float cone, const uint8_t* bits, const uint8_t* blocks,
-                      int resolution, int32_t* counts, float* starts, float* ends, int64_t* owners, float* positions,
-                      int threads, int64_t* total) {
+                      int resolution, int levels, int32_t* counts, float* starts, float* ends, int64_t* owners,
+                      float* positions, int threads, int64_t* total) {
     struct Found {
         std::vector<float> starts, ends;
     };
@@ -265,7 +292,8 @@ EXPORT int march_wave(const float* origins, const float* directions, const float
                 const Grid grid{bits + slice * bytes, blocks + slice * side * side * side, resolution, side};
                 const Ray ray(origins + r * 3, directions + r * 3, box, resolution);
                 const Steps steps(first[r], step, cone);
-                counts[i] = march_ray(ray, steps, grid, enter[r], leave[r], limit, next[r], mine.starts, mine.ends);
+                counts[i] = march_ray(ray, steps, grid, levels, enter[r], leave[r], limit, next[r], mine.starts,
+                                      mine.ends);
             }
             chunks[size_t(c)] = {slot, before, int64_t(mine.starts.size()) - before, 0};
         });

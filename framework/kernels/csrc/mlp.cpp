@@ -152,9 +152,10 @@ float* run_backward(const Network& net, const Block& block, float* grad, float* 
 }  // namespace
 
 // The input is `parts` arrays (count, part_widths[p]) side by side; widths are those of the input and every layer.
+// density (count), or null: exp of the first output, which is at most exp(15).
 EXPORT int mlp_forward(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
                        const int64_t* widths, int layers, const float* const* weights, const float* const* biases,
-                       int activation, float* out, int threads) {
+                       int activation, float* out, float* density, int threads) {
     return guarded([&] {
         check_sizes(widths, layers);
         const Network net(widths, layers, weights, biases);
@@ -168,6 +169,7 @@ EXPORT int mlp_forward(const float* const* inputs, const int64_t* part_widths, i
                 input.read(block.layer[0], net.wide[0], rows, size);
                 run_forward(net, block);
                 float* last = block.layer[layers];
+                if (density) write_density(last, net.wide[layers], size, density + first);
                 activate(last, BLOCK * net.wide[layers], activation);
                 for (int r = 0; r < size; r++)
                     std::memcpy(out + rows[r] * net.width[layers], last + r * net.wide[layers],
@@ -177,16 +179,17 @@ EXPORT int mlp_forward(const float* const* inputs, const int64_t* part_widths, i
     });
 }
 
+// The gradients of the output, `grad`, and of the density may be null.
 // Writes the inputs' gradients (parts that are null are left out) and the weights', (outputs, inputs) like them.
 EXPORT int mlp_backward(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
                         const int64_t* widths, int layers, const float* const* weights, const float* const* biases,
-                        int activation, const float* grad, float* const* input_grads, float* const* weight_grads,
-                        float* const* bias_grads, int threads) {
+                        int activation, const float* grad, const float* density, const float* density_grad,
+                        float* const* input_grads, float* const* weight_grads, float* const* bias_grads, int threads) {
     return guarded([&] {
         check_sizes(widths, layers);
         const Network net(widths, layers, weights, biases);
         const Inputs input{parts, inputs, part_widths};
-        const int outputs = net.width[layers];
+        const Incoming incoming{grad, density, density_grad, net.width[layers]};
         WeightSums sums(count, layers, net.wide, threads);
         for_chunks(threads, sums.parts, [&](int64_t p, int) {
             sums.clear(p);
@@ -196,12 +199,11 @@ EXPORT int mlp_backward(const float* const* inputs, const int64_t* part_widths, 
             for (int l = 0; l < layers; l++) mine[l] = sums.of(p, l);
             for (int64_t next = sums.begin(p); next < sums.end(p);) {
                 int64_t rows[BLOCK];
-                const int size = live_rows(grad, outputs, input_grads, input, next, sums.end(p), rows);
+                const int size = live_rows(incoming, input_grads, input, next, sums.end(p), rows);
                 if (size == 0) break;
                 input.read(block.layer[0], net.wide[0], rows, size);
                 run_forward(net, block);
-                read_output_gradient(grad, outputs, net.wide[layers], rows, size, activation, block.layer[layers],
-                                     first);
+                read_output_gradient(incoming, net.wide[layers], rows, size, activation, block.layer[layers], first);
                 const float* dx = run_backward(net, block, first, second, mine);
                 write_input_gradient(dx, net.wide[0], input, rows, size, input_grads);
             }

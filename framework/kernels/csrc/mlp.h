@@ -49,6 +49,18 @@ inline void add_rows(const float* grad, int wide, float* sums) {
         for (int i = 0; i < wide; i += LANES) store(sums + i, load(sums + i) + load(grad + r * wide + i));
 }
 
+// The density of a block's first rows, if its first output is the logarithm. See ../math.py (truncated_exp).
+inline void write_density(const float* output, int wide, int rows, float* density) {
+    constexpr float MAX_LOG_DENSITY = 15;
+    alignas(64) float values[BLOCK];
+    for (int r = 0; r < BLOCK; r++) values[r] = output[r * wide];
+    for (int r = 0; r < BLOCK; r += LANES) {
+        const Floats x = load(values + r);
+        store(values + r, exponential(x > MAX_LOG_DENSITY ? splat(MAX_LOG_DENSITY) : x));  // NaN stays
+    }
+    std::memcpy(density, values, sizeof(float) * rows);
+}
+
 struct Inputs {  // the network's input, in parts that stand side by side
     int parts;
     const float* const* part;
@@ -70,11 +82,24 @@ inline bool is_zero(const float* values, int count) {
     return true;
 }
 
+struct Incoming {  // gradients of the output, `width` wide, and of the density, which is its own derivative; or null
+    const float *grad, *density, *density_grad;
+    int width;
+
+    bool is_zero_at(int64_t row) const {
+        return (!grad || is_zero(grad + row * width, width)) && (!density_grad || density_grad[row] == 0);
+    }
+    void read(int64_t row, float* to) const {
+        if (grad) std::memcpy(to, grad + row * width, sizeof(float) * width);
+        if (density_grad) to[0] += density_grad[row] * density[row];
+    }
+};
+
 // The gradient of a block's output, through the output's activation function.
-inline void read_output_gradient(const float* grad, int width, int wide, const int64_t* rows, int count,
-                                 int activation, const float* output, float* to) {
+inline void read_output_gradient(const Incoming& incoming, int wide, const int64_t* rows, int count, int activation,
+                                 const float* output, float* to) {
     std::memset(to, 0, sizeof(float) * BLOCK * wide);
-    for (int r = 0; r < count; r++) std::memcpy(to + r * wide, grad + rows[r] * width, sizeof(float) * width);
+    for (int r = 0; r < count; r++) incoming.read(rows[r], to + r * wide);
     if (activation == NONE) return;
     for (int i = 0; i < BLOCK * wide; i += LANES) {
         Floats g = load(to + i), raw = load(output + i);
@@ -88,11 +113,11 @@ inline void read_output_gradient(const float* grad, int width, int wide, const i
 }
 
 // Up to BLOCK rows of [next, end) whose gradient is not zero; the input gradient of the others is set to zero.
-inline int live_rows(const float* grad, int outputs, float* const* input_grads, const Inputs& input, int64_t& next,
+inline int live_rows(const Incoming& incoming, float* const* input_grads, const Inputs& input, int64_t& next,
                      int64_t end, int64_t* rows) {
     int size = 0;
     for (; next < end && size < BLOCK; next++) {
-        if (!is_zero(grad + next * outputs, outputs)) {
+        if (!incoming.is_zero_at(next)) {
             rows[size++] = next;
             continue;
         }

@@ -218,7 +218,7 @@ void read_input(const Network& net, const Inputs& input, const int64_t* rows, in
 // As mlp_forward and mlp_backward.
 EXPORT int mlp_forward_bf16(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
                             const int64_t* widths, int layers, const float* const* weights,
-                            const float* const* biases, int activation, float* out, int threads) {
+                            const float* const* biases, int activation, float* out, float* density, int threads) {
     return guarded([&] {
         check_sizes(widths, layers);
         const Network net(widths, layers, weights, biases);
@@ -232,6 +232,7 @@ EXPORT int mlp_forward_bf16(const float* const* inputs, const int64_t* part_widt
                 for (int r = 0; r < size; r++) rows[r] = first + r;
                 read_input(net, input, rows, size, block);
                 run_forward(net, block);
+                if (density) write_density(block.output, columns, size, density + first);
                 activate(block.output, BLOCK * columns, activation);
                 for (int r = 0; r < size; r++)
                     std::memcpy(out + rows[r] * outputs, block.output + r * columns, sizeof(float) * outputs);
@@ -242,13 +243,14 @@ EXPORT int mlp_forward_bf16(const float* const* inputs, const int64_t* part_widt
 
 EXPORT int mlp_backward_bf16(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
                              const int64_t* widths, int layers, const float* const* weights,
-                             const float* const* biases, int activation, const float* grad,
-                             float* const* input_grads, float* const* weight_grads, float* const* bias_grads,
-                             int threads) {
+                             const float* const* biases, int activation, const float* grad, const float* density,
+                             const float* density_grad, float* const* input_grads, float* const* weight_grads,
+                             float* const* bias_grads, int threads) {
     return guarded([&] {
         check_sizes(widths, layers);
         const Network net(widths, layers, weights, biases);
         const Inputs input{parts, inputs, part_widths};
+        const Incoming incoming{grad, density, density_grad, net.width[layers]};
         WeightSums sums(count, layers, net.columns, threads);
         for_chunks(threads, sums.parts, [&](int64_t p, int) {
             sums.clear(p);
@@ -256,12 +258,12 @@ EXPORT int mlp_backward_bf16(const float* const* inputs, const int64_t* part_wid
             alignas(64) Half current[BLOCK * MAX_WIDTH], pairs_x[BLOCK * MAX_WIDTH], pairs_dy[BLOCK * MAX_WIDTH];
             for (int64_t next = sums.begin(p); next < sums.end(p);) {
                 int64_t rows[BLOCK];
-                const int size = live_rows(grad, net.width[layers], input_grads, input, next, sums.end(p), rows);
+                const int size = live_rows(incoming, input_grads, input, next, sums.end(p), rows);
                 if (size == 0) break;
                 read_input(net, input, rows, size, block);
                 run_forward(net, block);
-                read_output_gradient(grad, net.width[layers], net.columns[layers], rows, size, activation,
-                                     block.output, block.scratch);
+                read_output_gradient(incoming, net.columns[layers], rows, size, activation, block.output,
+                                     block.scratch);
                 to_halves(block.scratch, net.columns[layers], current, net.rows[layers], false, nullptr);
                 for (int l = layers - 1; l >= 0; l--) {
                     float* sum = sums.of(p, l);

@@ -2,6 +2,7 @@
 // references.
 #include "common.h"
 
+#include <algorithm>
 #include <cmath>
 #include <limits>
 #include <vector>
@@ -21,34 +22,46 @@ struct Photograph {
     }
 };
 
-// Where a photograph shows a ball, to a pixel more on each side.
-struct Footprint {
-    float depth;  // of the centre, along the camera's axis
-    bool whole;   // it lies in the photograph whole, in front of the camera
+struct Rectangle {
     int64_t x0, x1, y0, y1;
+};
 
-    Footprint(const Photograph& photograph, const float* center, float radius) {
+// Where a photograph shows LANES balls, to a pixel more on each side.
+struct Footprints {
+    Floats depth;  // of the centres, along the camera's axis
+    Ints whole;    // those that lie in the photograph whole, in front of the camera
+    Ints x0, x1, y0, y1;
+
+    // Of the balls with `count` centres (count, 3), of which the last one stands for all lanes after it.
+    Footprints(const Photograph& photograph, const float* centers, int64_t count, float radius) {
+        float from[3][LANES];
+        for (int64_t lane = 0; lane < LANES; lane++)
+            for (int a = 0; a < 3; a++)
+                from[a][lane] = centers[std::min(lane, count - 1) * 3 + a] - photograph.pose[4 * a + 3];
+        const Floats x = load(from[0]), y = load(from[1]), z = load(from[2]);
         const float* pose = photograph.pose;
-        const float from[3] = {center[0] - pose[3], center[1] - pose[7], center[2] - pose[11]};
-        float local[2];
-        for (int a = 0; a < 2; a++) local[a] = from[0] * pose[a] + from[1] * pose[4 + a] + from[2] * pose[8 + a];
-        depth = -(from[0] * pose[2] + from[1] * pose[6] + from[2] * pose[10]);
-        const float nearest = depth - radius, safe = nearest < 1e-6f ? 1e-6f : nearest;
-        const float column = photograph.cx + photograph.fx * local[0] / depth;
-        const float row = photograph.cy - photograph.fy * local[1] / depth;
-        const float a = local[0] / safe, b = local[1] / safe;
-        const float reach = radius / safe * std::max(photograph.fx, photograph.fy) * (1 + a * a + b * b) + 1;
-        const float edge[4] = {std::floor(column - reach), std::ceil(column + reach), std::floor(row - reach),
-                               std::ceil(row + reach)};
-        const float limit[4] = {float(photograph.width), float(photograph.width), float(photograph.height),
-                                float(photograph.height)};
-        whole = nearest > 0;
-        int64_t clamped[4];
-        for (int i = 0; i < 4; i++) {
-            whole = whole && edge[i] >= 0 && edge[i] <= limit[i];
-            clamped[i] = edge[i] >= limit[i] ? int64_t(limit[i]) : edge[i] > 0 ? int64_t(edge[i]) : 0;  // NaN is 0
-        }
-        x0 = clamped[0], x1 = clamped[1], y0 = clamped[2], y1 = clamped[3];
+        const Floats right = x * pose[0] + y * pose[4] + z * pose[8], up = x * pose[1] + y * pose[5] + z * pose[9];
+        depth = -(x * pose[2] + y * pose[6] + z * pose[10]);
+        const Floats nearest = depth - radius, safe = larger(nearest, splat(1e-6f));
+        const Floats column = photograph.cx + photograph.fx * right / depth;
+        const Floats row = photograph.cy - photograph.fy * up / depth;
+        const Floats a = right / safe, b = up / safe;
+        const Floats reach = radius / safe * std::max(photograph.fx, photograph.fy) * (1 + a * a + b * b) + 1;
+        const Floats width = splat(float(photograph.width)), height = splat(float(photograph.height));
+        const Floats left = column - reach, end = column + reach, top = row - reach, bottom = row + reach;
+        whole = (nearest > 0) & (left >= 0) & (end <= width) & (top >= 0) & (bottom <= height);
+        x0 = below(left, width), x1 = above(end, width), y0 = below(top, height), y1 = above(bottom, height);
+    }
+
+   private:
+    static Floats inside(Floats edge, Floats limit) { return smaller(larger(edge, splat(0)), limit); }  // NaN is 0
+
+    static Ints below(Floats edge, Floats limit) { return __builtin_convertvector(inside(edge, limit), Ints); }
+
+    static Ints above(Floats edge, Floats limit) {
+        const Floats value = inside(edge, limit);
+        const Ints floored = __builtin_convertvector(value, Ints);
+        return floored - (__builtin_convertvector(floored, Floats) < value);  // true is -1
     }
 };
 
@@ -77,11 +90,18 @@ EXPORT int hold_balls(const float* centers, int64_t count, float radius, const f
     return guarded([&] {
         const Photograph photograph{pose, fx, fy, cx, cy, sums, height, width};
         for_ranges(threads, count, 4096, [&](int64_t begin, int64_t end) {
-            for (int64_t n = begin; n < end; n++) {
-                if (held[n] != every) continue;
-                const Footprint f(photograph, centers + n * 3, radius);
-                const bool clear = photograph.opaque_pixels(f.x0, f.x1, f.y0, f.y1) <= 0;
-                if (every ? f.whole && clear : f.depth > radius ? !clear : !(f.depth <= -radius)) held[n] = uint8_t(!every);
+            for (int64_t n = begin; n < end; n += LANES) {
+                const int64_t count = std::min<int64_t>(LANES, end - n);
+                if (std::find(held + n, held + n + count, uint8_t(every)) == held + n + count) continue;
+                const Footprints f(photograph, centers + n * 3, count, radius);
+                for (int64_t i = 0; i < count; i++) {
+                    if (held[n + i] != every) continue;
+                    const bool clear = photograph.opaque_pixels(f.x0[i], f.x1[i], f.y0[i], f.y1[i]) <= 0;
+                    const bool changes = every                 ? f.whole[i] && clear
+                                         : f.depth[i] > radius ? !clear
+                                                               : !(f.depth[i] <= -radius);  // NaN may be anywhere
+                    if (changes) held[n + i] = uint8_t(!every);
+                }
             }
         });
     });
@@ -98,17 +118,20 @@ EXPORT int pixels_near_balls(const float* centers, int64_t count, float radius, 
         struct Part {
             float nearest = std::numeric_limits<float>::infinity();
             bool around_camera = false;
-            std::vector<Footprint> cut;
+            std::vector<Rectangle> cut;
         };
         std::vector<Part> parts(size_t((count + GRAIN - 1) / GRAIN));
         for_ranges(threads, count, GRAIN, [&](int64_t begin, int64_t end) {
             Part& part = parts[size_t(begin / GRAIN)];
-            for (int64_t n = begin; n < end; n++) {
-                const Footprint f(photograph, centers + n * 3, radius);
-                part.nearest = std::min(part.nearest, f.depth);
-                if (f.whole || f.x1 <= f.x0 || f.y1 <= f.y0 || f.depth <= -radius) continue;
-                part.around_camera |= f.depth <= radius;
-                part.cut.push_back(f);
+            for (int64_t n = begin; n < end; n += LANES) {
+                const int64_t count = std::min<int64_t>(LANES, end - n);
+                const Footprints f(photograph, centers + n * 3, count, radius);
+                for (int64_t i = 0; i < count; i++) {
+                    part.nearest = std::min(part.nearest, f.depth[i]);
+                    if (f.whole[i] || f.x1[i] <= f.x0[i] || f.y1[i] <= f.y0[i] || f.depth[i] <= -radius) continue;
+                    part.around_camera |= f.depth[i] <= radius;
+                    part.cut.push_back({f.x0[i], f.x1[i], f.y0[i], f.y1[i]});
+                }
             }
         });
         float nearest = std::numeric_limits<float>::infinity();
@@ -138,7 +161,7 @@ EXPORT int pixels_near_balls(const float* centers, int64_t count, float radius, 
         const int64_t stride = width + 1;
         std::vector<int32_t> marks(size_t(stride * (height + 1)), 0);  // whose sums say how many balls cover a pixel
         for (const Part& part : parts)
-            for (const Footprint& f : part.cut) {
+            for (const Rectangle& f : part.cut) {
                 marks[size_t(f.y0 * stride + f.x0)]++;
                 marks[size_t(f.y0 * stride + f.x1)]--;
                 marks[size_t(f.y1 * stride + f.x0)]--;

@@ -15,7 +15,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from framework.kernels.hash_grid import HashGridLayout, TableGradient
+from framework.kernels.hash_grid import HashGridLayout
+from framework.kernels.hash_grid_lookup import TableGradient
 from framework.kernels.triton_kernels.launch import blocks, launch
 
 BLOCK = 128

@@ -1,7 +1,8 @@
 """Marching through an occupancy grid, in Triton. `framework.kernels.march` says what is computed.
 
-Each thread takes a ray, and crosses empty blocks of cells by their distance to an occupied one. Rays that have ended
-stay in their places, so that the host waits once a wave: for the number of its samples, which has to be known.
+Each thread takes a ray, and crosses empty blocks of cells by their distance to an occupied one, up to the faces of the
+smallest of nested boxes that holds the place. Rays that have ended stay in their places, so that the host waits once a
+wave: for the number of its samples, which has to be known.
 """
 
 from __future__ import annotations
@@ -28,25 +29,24 @@ EDGE = tl.constexpr(CELLS)
 INFINITY = tl.constexpr(math.inf)
 
 
-def block_distances(occupied: Tensor, resolution: int, slices: int = 1) -> Tensor:
+def block_distances(occupied: Tensor, resolution: int) -> Tensor:
     """Return the distance in blocks, at most FARTHEST, from each block of cells to one with an occupied cell.
 
     Args:
-        occupied: (T n^3,) bool, as in `Occupancy`.
+        occupied: (n^3,) bool, as in `Occupancy`.
         resolution: number n of cells along each axis.
-        slices: number T of slices of time.
 
     Returns:
-        (T, ceil(n / 4)^3) uint8, the largest of the distances along the axes.
+        (ceil(n / 4)^3,) uint8, the largest of the distances along the axes.
     """
     short = -resolution % CELLS
-    grid = functional.pad(occupied.view(slices, 1, *[resolution] * 3).float(), (0, short) * 3)
+    grid = functional.pad(occupied.view(1, 1, *[resolution] * 3).float(), (0, short) * 3)
     near = functional.max_pool3d(grid, CELLS)
     distances = 1 - near
     for _ in range(FARTHEST - 1):
         near = functional.max_pool3d(near, 3, stride=1, padding=1)
         distances += 1 - near
-    return distances.to(torch.uint8).view(slices, -1)
+    return distances.to(torch.uint8).flatten()
 
 
 @triton.jit
@@ -99,18 +99,32 @@ def _cell(position, last):
 
 
 @triton.jit
-def _leave(position, direction, cell, size, more):
-    """Return the distance at which rays leave the cube of `size` cells of a cell, and `more` around it, by an axis."""
+def _level(x, y, z, half, levels):
+    """Return the number of the smallest nested box that holds a place, in cells of the smallest of all."""
+    far = tl.maximum(tl.maximum(tl.abs(x - half), tl.abs(y - half)), tl.abs(z - half)) / half
+    level = (far.to(tl.int32, bitcast=True) >> 23) - 126  # far < 2^level, and not less than half of it
+    return tl.minimum(tl.maximum(level, 0), levels - 1)
+
+
+@triton.jit
+def _shrunk(position, size, half):
+    """Return a position in cells of a larger box, where those of the smallest have this size; unchanged if it is 1."""
+    return tl.where(size == 1, position, (position - half) * size + half)
+
+
+@triton.jit
+def _leave(position, direction, cell, size, more, resolution):
+    """Return where rays leave the cube of `size` cells of a cell, and `more` around it, or the box, by an axis."""
     corner = cell - cell % size
-    face = tl.where(direction > 0, corner + size + more, corner - more)
+    face = tl.where(direction > 0, tl.minimum(corner + size + more, resolution), tl.maximum(corner - more, 0))
     distance = (face.to(tl.float32) - position) / tl.where(direction == 0, 1.0, direction)
     return tl.where(direction == 0, INFINITY, distance)
 
 
-@triton.jit(do_not_specialize=["rays"])
+@triton.jit(do_not_specialize=["rays", "levels"])
 def _wave(
     origins, directions, box, enters, leaves, firsts, slices, alive, nexts, occupied, distances, counts, starts, ends,
-    rays, limit, resolution, step, growth, turn, BLOCK: tl.constexpr,
+    rays, limit, resolution, levels, step, growth, turn, BLOCK: tl.constexpr,
 ):  # fmt: skip
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = r < rays
@@ -129,8 +143,8 @@ def _wave(
     dy = tl.load(directions + r * 3 + 1, mask=here, other=0.0) * scale_y
     dz = tl.load(directions + r * 3 + 2, mask=here, other=0.0) * scale_z
     k, found = tl.load(nexts + r, mask=here, other=0), tl.zeros([BLOCK], tl.int32)
-    side = (resolution + EDGE - 1) // EDGE
-    before = tl.zeros([BLOCK], tl.int64)  # slices of time before the ray's
+    side, half = (resolution + EDGE - 1) // EDGE, resolution / 2
+    before = tl.zeros([BLOCK], tl.int64)  # slices of time before the ray's, of a grid of one box
     if slices is not None:
         before = tl.load(slices + r, mask=here, other=0)
     going = here & (tl.load(alive + r, mask=here, other=0) != 0)
@@ -138,19 +152,24 @@ def _wave(
         start, end = _start(first, k, step, even, growth), _start(first, k + 1, step, even, growth)
         middle = (start + end) / 2
         going = going & (middle < leave)
-        i, j = _cell(x + middle * dx, resolution - 1), _cell(y + middle * dy, resolution - 1)
-        m = _cell(z + middle * dz, resolution - 1)
-        block = ((before * side + i // EDGE) * side + j // EDGE) * side + m // EDGE
+        level = _level(x + middle * dx, y + middle * dy, z + middle * dz, half, levels)
+        size = ((127 - level) << 23).to(tl.float32, bitcast=True)
+        px, py, pz = _shrunk(x, size, half), _shrunk(y, size, half), _shrunk(z, size, half)
+        i, j = _cell(px + middle * dx * size, resolution - 1), _cell(py + middle * dy * size, resolution - 1)
+        m = _cell(pz + middle * dz * size, resolution - 1)
+        box_of = before + level
+        block = ((box_of * side + i // EDGE) * side + j // EDGE) * side + m // EDGE
         distance = tl.load(distances + block, mask=going, other=0).to(tl.int32)
-        cell = ((before * resolution + i) * resolution + j) * resolution + m
+        cell = ((box_of * resolution + i) * resolution + j) * resolution + m
         full = going & (distance == 0) & (tl.load(occupied + cell, mask=going, other=0) != 0)
         taken = full & (middle >= enter)
         tl.store(starts + r * limit + found, start, mask=taken)
         tl.store(ends + r * limit + found, end, mask=taken)
         found += taken.to(tl.int32)
-        size, more = tl.where(distance == 0, 1, EDGE), tl.maximum(distance - 1, 0) * EDGE
-        clear = tl.minimum(_leave(x, dx, i, size, more), _leave(y, dy, j, size, more))
-        clear = tl.minimum(clear, _leave(z, dz, m, size, more))
+        cube, more = tl.where(distance == 0, 1, EDGE), tl.maximum(distance - 1, 0) * EDGE
+        clear = _leave(px, dx * size, i, cube, more, resolution)
+        clear = tl.minimum(clear, _leave(py, dy * size, j, cube, more, resolution))
+        clear = tl.minimum(clear, _leave(pz, dz * size, m, cube, more, resolution))
         # The last step that certainly ends before that.
         steps = (clear - first) / step
         if growth > 0:
@@ -213,6 +232,7 @@ class TritonMarch(March):
         self.slices = occupancy.slices_of(rays.times)
         self.origins, self.directions = rays.origins.contiguous(), rays.directions.contiguous()
         self.box, self.resolution, self.step = occupancy.box.contiguous(), occupancy.resolution, float(step)
+        self.levels, outer = occupancy.levels, occupancy.outer.contiguous()
         self.growth, self.turn = (math.log2(1 + cone), step / cone) if cone else (0.0, math.inf)
         nears, count = rays.nears.contiguous(), len(rays)
         self.enter, self.leave, self.first = (torch.empty_like(nears) for _ in range(3))
@@ -221,7 +241,7 @@ class TritonMarch(March):
         self.spent = torch.zeros_like(nears)
         launch(
             _begin, (blocks(count, SAMPLES),), self.origins, self.directions, nears, rays.fars.contiguous(),
-            None if shift is None else shift.contiguous(), self.box, self.step, self.enter, self.leave, self.first,
+            None if shift is None else shift.contiguous(), outer, self.step, self.enter, self.leave, self.first,
             self.alive, count, BLOCK=SAMPLES,
         )  # fmt: skip
 
@@ -232,7 +252,7 @@ class TritonMarch(March):
         launch(
             _wave, (blocks(rays, RAYS),), self.origins, self.directions, self.box, self.enter, self.leave, self.first,
             self.slices, self.alive, self.next, self.occupied, self.distances, counts, padded_starts, padded_ends, rays,
-            limit, self.resolution, self.step, self.growth, self.turn, BLOCK=RAYS, num_warps=1,
+            limit, self.resolution, self.levels, self.step, self.growth, self.turn, BLOCK=RAYS, num_warps=1,
         )  # fmt: skip
         offsets = functional.pad(counts.cumsum(0), (1, 0))
         count = int(offsets[-1])

@@ -28,9 +28,11 @@ from framework.kernels.frequency import frequency_encoding, frequency_encoding_r
 from framework.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
 from framework.kernels.march import March, Occupancy, ReferenceMarch, march
 from framework.kernels.mlp import Activation, mlp, mlp_reference
+from framework.kernels.multisampled_grid import multisampled_grid, multisampled_grid_reference
 from framework.kernels.planes import PlanesLayout, planes, planes_reference
 from framework.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
 from framework.kernels.ssim import photometric_loss, photometric_reference
+from framework.kernels.step_functions import blurred_excess, blurred_excess_reference
 from framework.tools.benchmarks.ceilings import Ceilings, Work
 from framework.tools.benchmarks.compared import Errors, Kernel, errors, of_function
 from framework.tools.benchmarks.plane_lookups import grid_samples, layouts, planes_of
@@ -158,6 +160,8 @@ def kernels(count: int) -> Iterator[Kernel]:
         for kind in ("float32", "bfloat16") if native.has("mlp_forward_bf16") else ("float32",):
             name = f"network {'-'.join(map(str, widths))}, {kind}"
             yield of_function(name, *_network(count, widths, activation, kind == "bfloat16"))
+    yield of_function("multisampled grid, 8 levels x 4, tables of 2^18", *_multisampled(count))
+    yield _blurring(count // 16)
     for model, lens in LENSES:
         yield _ray_generation(model, lens)
 
@@ -217,6 +221,41 @@ def _hash_grid(positions: Tensor, log2: int, of_positions: bool) -> Described:
         lambda x, t: hash_grid(attached(x), t, layout),
         lambda x, t: hash_grid_reference(attached(x), t, layout),
         Work(bytes=4 * (3 + 32), gathers=16 * 8, table_bytes=values.nbytes),
+    )
+
+
+def _multisampled(count: int) -> Described:
+    """Look up 6 points around each position, as far apart as those of frustums, with deviations of half of that."""
+    layout, spread = HashGridLayout.build(8, 16, 2048, 18), 0.003
+    values = torch.randn(layout.num_entries, 4)
+    around = rays_and_positions(count)[1][:, None] + spread * torch.randn(count, 6, 3)
+    points = torch.cat([around.clamp(0, 1), torch.full((count, 6, 1), spread / 2)], dim=-1)
+    return (
+        [points, values],
+        lambda x, t: multisampled_grid(x.detach(), t, layout),
+        lambda x, t: multisampled_grid_reference(x.detach(), t, layout),
+        Work(bytes=4 * (24 + 32), gathers=6 * 8 * 8 * 2, table_bytes=values.nbytes),
+    )
+
+
+def _blurring(rays: int) -> Kernel:
+    """Compute the loss of 64 proposed intervals on each ray against 32 that are blurred: Zip-NeRF's."""
+    edges, proposed = (torch.rand(rays, bins + 1).sort(dim=-1).values for bins in (32, 64))
+    weights, given = (normalize(torch.rand(rays, bins), p=1, dim=-1) for bins in (32, 64))
+
+    def ours(p: Tensor) -> Tensor:
+        return blurred_excess(edges, weights, proposed, p, 0.01)
+
+    def exact(p: Tensor) -> Tensor:
+        return blurred_excess_reference(edges.to(p), weights.to(p), proposed.to(p), p, 0.01)
+
+    return Kernel(
+        "loss of proposals, blurred, 32 against 64",
+        "ray",
+        rays,
+        (differentiated(ours, [given], None), differentiated(exact, [given], None)),
+        Work(bytes=4 * (33 + 32 + 65 + 64 + 64 + 1)),  # both histograms read, the loss and its derivative written
+        lambda: (errors(ours, exact, [given], True), errors(exact, exact, [given], True)),
     )
 
 

@@ -32,14 +32,23 @@ from framework.training.machine import machine
 from framework.training.run import Run
 from framework.training.trainer import STEPS_PER_LOG, Trainer
 
-METHODS = ("instant-ngp", "nerfacto", "kplanes", "tensorf", "gaussian-splatting", "vanilla-nerf", "dnerf")
+METHODS = (
+    "instant-ngp", "nerfacto", "kplanes", "tensorf", "gaussian-splatting", "vanilla-nerf", "dnerf", "mip-nerf",
+    "mip-nerf-360", "zip-nerf", "nerf-plus-plus",
+)  # fmt: skip
 """Methods that are counted if none is named."""
-SCENES: dict[str, Callable[[int], Dataset]] = {"nerfacto": ball_under_a_sky, "dnerf": moving_ball}
+SCENES: dict[str, Callable[[int], Dataset]] = {
+    "nerfacto": ball_under_a_sky,
+    "dnerf": moving_ball,
+    "mip-nerf-360": ball_under_a_sky,
+    "zip-nerf": ball_under_a_sky,
+    "nerf-plus-plus": ball_under_a_sky,
+}
 """Scenes of methods whose scenes are not still ones in a box."""
 SIZE, IMAGE_SIZE = 64, 800
 """Width and height of the images, and those for which methods decide their settings, pixels."""
 SMALLER: dict[str, Any] = {
-    "num_rays_per_batch": 64,
+    "num_rays_per_batch": 16,
     "samples_per_batch": 2**11,
     "log2_table_size": 12,
     "grid_resolution": 32,
@@ -55,6 +64,8 @@ SMALLER: dict[str, Any] = {
 }
 """Settings that do not change the number of operations, but the time that they take on the CPU; and those that other
 machines and data would decide otherwise."""
+ON_A_GPU: dict[str, dict[str, Any]] = {"mip-nerf-360": {"encoding": "integrated"}}
+"""What a method decides on a GPU, and not on the CPU on which it is counted."""
 STARTS_NOTHING = {"empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided", "_unsafe_view"}
 """Operations other than views for which a device has nothing to do."""
 FACTORIES = {
@@ -136,7 +147,7 @@ def trainer_of(method: str, folder: Path) -> Trainer:
     )
     names = {field.name for field in dataclasses.fields(declared.config)}
     smaller = {name: value for name, value in SMALLER.items() if name in names}
-    config = dataclasses.replace(declared.config, vis="none", **smaller)
+    config = dataclasses.replace(declared.config, vis="none", **smaller, **ON_A_GPU.get(method, {}))
     return Trainer(Run(method, config, "blender", load_dataparser("blender")(), folder), dataset, None)
 
 

@@ -46,7 +46,11 @@ def measure(method: str, seconds: float, degrees: float, percent: float) -> dict
 
     Returns:
         The machine, the arguments and a row for each run, as plain data.
+
+    Raises:
+        ConfigError: if the method cannot refine poses.
     """
+    refinable(method)  # before the scene is rendered, which takes a while
     embedded = load_dataparser(SCENE)()
     exact, test = (load_dataset(embedded.parse(None, split), split) for split in ("train", "test"))
     cameras = disturb(exact.cameras, degrees, percent / 100)
@@ -84,6 +88,21 @@ def disturb(cameras: Cameras, degrees: float, share: float) -> Cameras:
     return replace(cameras, camera_to_worlds=torch.cat([rotated, moved[:, :, None]], dim=-1))
 
 
+def refinable(method: str) -> Any:
+    """Return the settings of a method that refines poses.
+
+    Args:
+        method: name of the method.
+
+    Raises:
+        ConfigError: if the method cannot refine poses.
+    """
+    config = load_method(method).config
+    if not hasattr(config, "camera_optimizer"):
+        raise ConfigError(f"--method {method}: it does not refine poses, for it has no --camera-optimizer")
+    return config
+
+
 def trained(method: str, data: Dataset, seconds: float, camera_optimizer: str) -> Trainer:
     """Train a method on a data set in memory.
 
@@ -96,10 +115,7 @@ def trained(method: str, data: Dataset, seconds: float, camera_optimizer: str) -
     Raises:
         ConfigError: if the method cannot refine poses.
     """
-    config: Any = load_method(method).config
-    if not hasattr(config, "camera_optimizer"):
-        raise ConfigError(f"--method {method}: it does not refine poses, for it has no --camera-optimizer")
-    config = replace(config, max_seconds=seconds, camera_optimizer=camera_optimizer, vis="none")
+    config = replace(refinable(method), max_seconds=seconds, camera_optimizer=camera_optimizer, vis="none")
     with tempfile.TemporaryDirectory() as folder:
         run = Run(method, config, SCENE, load_dataparser(SCENE)(), Path(folder) / "run")
         create_folder(run)

@@ -27,7 +27,7 @@ from framework.geometry.rays import Rays
 from framework.samplers.occupancy import OccupancySampler
 from framework.samplers.proposal import ProposalSampler
 from framework.tools.benchmarks.closed_forms import ClosedForm, scenes
-from framework.tools.benchmarks.curves import Curve, draw, evaluations_needed
+from framework.tools.benchmarks.error_curves import Curve, draw, evaluations_needed
 from framework.tools.benchmarks.sampling import (
     WHITE,
     Renderer,

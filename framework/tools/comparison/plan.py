@@ -17,8 +17,12 @@ from framework.training.run import write_json
 
 FIRST_SEED = 42
 """Seed of the first run of each contender; the others follow it."""
-CURVE_POINTS = 12
+CURVE_POINTS = 8
 """Number of evaluations during a run, the points of its learning curve."""
+LEAST_VIEWS = 25
+"""Minimum number of held-out views of a final evaluation whose number follows the budget."""
+PICTURES = 3
+"""Number of views of which pictures are written, those that a report shows."""
 
 
 def split_words(text: str, flag: str) -> tuple[str, ...]:
@@ -71,6 +75,21 @@ class Contender:
         return readable if readable == self.label else f"{readable}-{zlib.crc32(self.label.encode()):08x}"
 
 
+def views_for(max_seconds: float | None) -> int | None:
+    """Return how many held-out views a final evaluation is over, if the user does not say: one a second of training.
+
+    So an evaluation takes no longer than the training whose result it is, which over all views it does after short
+    runs. Views are evenly spaced, and the same for all methods.
+
+    Args:
+        max_seconds: seconds of training; None if it does not end by the clock.
+
+    Returns:
+        A number of views; None for all.
+    """
+    return None if max_seconds is None else max(LEAST_VIEWS, round(max_seconds))
+
+
 @dataclass(frozen=True)
 class Conditions:
     """Settings shared by all runs of a comparison."""
@@ -90,7 +109,7 @@ class Conditions:
     device_type: str
     """Device of training and evaluation."""
     curve_images: int
-    """Maximum number of views of the learning curve."""
+    """Maximum number of views of the learning curve; 0 for no curve."""
     max_eval_images: int | None
     """Maximum number of views of the final evaluation; None for all."""
 
@@ -103,8 +122,8 @@ class Conditions:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ConfigError(f"--{name.replace('_', '-')} is {value}; it must be more than 0")
-        if self.curve_images < 1 or (self.max_eval_images is not None and self.max_eval_images < 1):
-            raise ConfigError("--curve-images and --max-eval-images must be at least 1")
+        if self.curve_images < 0 or (self.max_eval_images is not None and self.max_eval_images < 1):
+            raise ConfigError("--curve-images must be at least 0, --max-eval-images at least 1")
 
     def budget(self) -> str:
         """Return a description of how long each method trains."""
@@ -164,9 +183,9 @@ class Job:
         for name in ("data", "max_seconds", "max_num_iterations", "target_psnr"):
             if getattr(c, name) is not None:
                 flags += ["--" + name.replace("_", "-"), str(getattr(c, name))]
-        if c.max_seconds is not None:
+        if c.curve_images and c.max_seconds is not None:
             flags += ["--seconds-per-eval-all-images", str(c.max_seconds / CURVE_POINTS)]
-        elif c.max_num_iterations is not None:
+        elif c.curve_images and c.max_num_iterations is not None:
             flags += ["--steps-per-eval-all-images", str(max(c.max_num_iterations // CURVE_POINTS, 1))]
         if c.num_threads is not None:
             flags += ["--machine.num-threads", str(c.num_threads)]
@@ -180,7 +199,7 @@ class Job:
         """Return the command that evaluates the trained model under `conditions`."""
         command = python_command("framework.cli.evaluate", "--load-config", self.folder / "config.yml")
         command += ["--output-path", str(self.evaluation), "--render-output-path", str(self.pictures)]
-        command += ["--device-type", conditions.device_type]
+        command += ["--max-pictures", str(PICTURES), "--device-type", conditions.device_type]
         if conditions.max_eval_images is not None:
             command += ["--max-images", str(conditions.max_eval_images)]
         return command

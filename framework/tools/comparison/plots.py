@@ -67,6 +67,11 @@ def time_against_error(rows: Sequence[Row]) -> str:
     rendering.set_xlabel("rendering, s per image")
     training.set_ylabel("PSNR, dB")
     rendering.legend(fontsize="small", loc="best")
+    return as_svg(figure)
+
+
+def as_svg(figure: Any) -> str:
+    """Return a `figure` of matplotlib as an SVG element."""
     text = io.StringIO()
     figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
     svg = text.getvalue()

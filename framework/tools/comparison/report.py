@@ -141,8 +141,13 @@ def condition_lines(conditions: Conditions, repeats: int, runs: Sequence[Measure
     evaluated = " or ".join(map(str, counts)) or "all"
     lines = [
         f"Every method had {conditions.budget()}, each run in its own process.",
-        f"Final results are means over {evaluated} held-out views; learning curves are over at most "
-        f"{conditions.curve_images} views, whose evaluation does not count as training time.",
+        f"Final results are means over {evaluated} held-out views{_of_all(conditions)}; "
+        + (
+            f"learning curves are over at most {conditions.curve_images} views, whose evaluation does not count as "
+            "training time."
+            if conditions.curve_images
+            else "there are no learning curves."
+        ),
         f"{repeats} seed{'s' if repeats > 1 else ''} per method"
         + (
             ": means, ± the standard deviation of a single run."
@@ -154,6 +159,12 @@ def condition_lines(conditions: Conditions, repeats: int, runs: Sequence[Measure
         lines.append(f"Kernels: {' and '.join(used)}.")
     notes = sorted({run.lpips_note for run in runs if run.lpips is None})
     return lines + [f"LPIPS {note}" for note in notes]
+
+
+def _of_all(conditions: Conditions) -> str:
+    """Return how the held-out views were chosen, if they may not be all that there are."""
+    most = conditions.max_eval_images
+    return "" if most is None else f" (at most {most}, evenly spaced; --max-eval-images sets how many)"
 
 
 def table(rows: Sequence[Row]) -> list[dict[str, Any]]:

@@ -7,14 +7,16 @@ from dataclasses import dataclass
 from typing import Literal
 
 from framework.base.console import say
+from framework.base.registry import load_method
 from framework.tools.stress.conditions import PLAIN, Condition
 from framework.tools.stress.faults import spoiled_batches
 from framework.tools.stress.scenes import Views
 from framework.tools.stress.trial import Budget, Trial, attempt
 from framework.training.run import Run
 
-Outcome = Literal["pass", "degraded", "refused", "fail"]
-"""Outcome of a run. refused: it ended with a clear error, which is as good as a result."""
+Outcome = Literal["pass", "degraded", "refused", "fail", "not applicable"]
+"""Outcome of a run. refused: it ended with a clear error, which is as good as a result. not applicable: there was no
+run, as the condition changes nothing of what the method does."""
 LEAST_LEARNT = 3.0
 """Minimum PSNR of the plain run above that of empty images, dB; compared with less, every run would pass."""
 
@@ -40,7 +42,7 @@ class Verdict:
     error: str | None
     """Message of the error with which it failed or was refused; None if it did not."""
     reason: str | None
-    """Reasons why it is degraded; None if it is not."""
+    """Reasons why it is degraded or not applicable; None if it is neither."""
 
     def line(self) -> str:
         """Return the verdict as a line of text."""
@@ -74,11 +76,18 @@ def verdicts(run: Run, views: Views, conditions: Sequence[Condition], budget: Bu
     plain = None
     for number, condition in enumerate(conditions, start=1):
         say(f"[{number}/{len(conditions)}] {condition.name}: {condition.what}")
-        trial = attempt(condition, run, views, budget)
-        plain = trial.psnr if condition is PLAIN else plain
-        verdict = verdict_of(condition, trial, plain)
+        if condition.rays is not None and load_method(run.method).model.batches == "views":
+            verdict = _not_applicable(condition, "a step draws a whole image")
+        else:
+            trial = attempt(condition, run, views, budget)
+            plain = trial.psnr if condition is PLAIN else plain
+            verdict = verdict_of(condition, trial, plain)
         say(f"  {verdict.line()}")
         yield verdict
+
+
+def _not_applicable(condition: Condition, why: str) -> Verdict:
+    return Verdict(condition.name, "not applicable", None, None, 0, 0, 0.0, None, why)
 
 
 def verdict_of(condition: Condition, trial: Trial, plain: float | None) -> Verdict:

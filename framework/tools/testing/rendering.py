@@ -13,6 +13,7 @@ from torch import Tensor
 from framework.geometry.rays import Rays
 from framework.model import Model, parts
 from framework.ray_model import RayModel
+from framework.rendering.background import SphereRenderer
 from framework.rendering.rendered import Rendered
 from framework.samplers.base import SkipsCells
 from framework.samplers.proposal import ProposalSampler
@@ -172,8 +173,11 @@ def _require_change(change: Tensor, accumulation: Tensor, what: str) -> None:
 
 
 def _ends_at_the_box(model: Model) -> bool:
-    """Return whether the model's samplers place no sample outside the box."""
-    return bool(parts(model, SkipsCells)) or any(not sampler.unbounded for sampler in parts(model, ProposalSampler))
+    """Return whether the model places no sample outside the box."""
+    if parts(model, SphereRenderer):
+        return False
+    grids, proposals = parts(model, SkipsCells), parts(model, ProposalSampler)
+    return any(grid.levels == 1 for grid in grids) or any(not sampler.unbounded for sampler in proposals)
 
 
 def check_evaluation(subject: Subject) -> str:

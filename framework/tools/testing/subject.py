@@ -28,6 +28,7 @@ from framework.rendering.rendered import Picture, Rendered
 from framework.tools.testing.finding import Fault
 from framework.tools.testing.scenes import ball_in_a_box, ball_under_a_sky, moving_ball
 from framework.training.optim import Adam, make_optimizer, set_learning_rate
+from framework.training.preparation import show_images
 from framework.training.step import backward, forward
 
 RAYS = 256
@@ -58,6 +59,7 @@ class Learner:
         self.config, _ = method.decided(config, dataset.scene)
         self.dataset = dataset
         self.model: Model[Any] = method.build(self.config, dataset.scene)
+        show_images(self.model, dataset, None)
         self.source = make_source(self.model.batches, dataset, self.config)
         self.done = 0
         """Number of training steps done."""

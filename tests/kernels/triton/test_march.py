@@ -9,6 +9,7 @@ from torch import Tensor
 
 from framework.geometry.rays import Rays
 from framework.kernels.march import Occupancy, ReferenceMarch, march, sort_by_ray, sort_by_ray_reference
+from framework.kernels.occupancy import own_cells
 from tests.kernels.test_march import BOX, occupancy, random_rays, walk
 from tests.kernels.triton.compared import DEVICE, backends
 
@@ -56,6 +57,25 @@ def test_each_ray_marches_through_the_slice_of_its_time() -> None:
     assert int(truth.sum()) > 50
 
 
+@pytest.mark.parametrize(("share", "cone"), [(0.02, 1 / 16), (0.3, 1 / 16), (0.3, 0.0)])
+def test_samples_in_nested_boxes(share: float, cone: float) -> None:
+    """Three boxes, of which the rays start in and outside the largest."""
+    rays, single = random_rays(33), occupancy(8, share)
+    larger = [occupancy(8, share, seed).occupied for seed in (1, 2)]
+    grid = replace(single, occupied=torch.cat([single.occupied, *larger]) & own_cells(3, 8), levels=3)
+    rays = replace(rays, origins=rays.origins * torch.linspace(0.1, 3, 33)[:, None])
+    with backends() as names:
+        started = march(*on_device(rays, grid), 0.2, cone, None, 0.0)
+    assert names == ["triton"]
+    found = []
+    for each in (started, ReferenceMarch(*in_float64(rays, grid), 0.2, cone, None, 0.0)):
+        starts, ends, owners, _ = (part.cpu() for part in walk(each, limit=40))
+        found.append(set(zip(owners.tolist(), ((starts + ends) / 2 / 1e-2).round().tolist(), strict=True)))
+    near = [{(r, t + d) for r, t in samples for d in (-1, 0, 1)} for samples in found]
+    assert len(found[0] - near[1]) + len(found[1] - near[0]) <= 1e-2 * len(found[1]) + 1
+    assert len(found[1]) > 10
+
+
 @pytest.mark.parametrize("sigma", [0.0, 3.0, math.nan, math.inf])
 def test_light_ends_rays_at_the_same_sample(sigma: float) -> None:
     """Everything is occupied, so that a sample's place does not depend on rounding."""
@@ -92,7 +112,7 @@ def test_distances_of_blocks(share: float) -> None:
     blocks = torch.stack(torch.meshgrid(*[torch.arange(side)] * 3, indexing="ij"), -1).view(-1, 1, 3)
     truth = (blocks - full).abs().amax(-1).amin(-1).clamp(max=16) if len(full) else torch.full((side**3,), 16)
     found = replace(grid, occupied=grid.occupied.to(DEVICE), box=BOX.to(DEVICE)).distances
-    assert torch.equal(found[0].cpu().long(), truth.long())
+    assert torch.equal(found.cpu().long(), truth.long())
 
 
 @pytest.mark.parametrize(("count", "rays"), [(0, 3), (0, 0), (50, 7)])

@@ -254,7 +254,7 @@ BUGS = (
     Bug(
         "gradient-scaling-inverted",
         "losses",
-        "methods/nerfacto.py",
+        "methods/_captures.py",
         "factors = (samples.t / self.unit_length).square().clamp(max=1)",
         "factors = (self.unit_length / samples.t).square().clamp(max=1)",
         "what is near cameras learns most: floaters",
@@ -326,7 +326,7 @@ BUGS = (
     Bug(
         "poses-refined-where-exact",
         "methods",
-        "methods/nerfacto.py",
+        "methods/_captures.py",
         'refined = "SO3xR3" if scene.poses == "device" and not scene.warped else "off"',
         'refined = "SO3xR3" if scene.poses != "device" and not scene.warped else "off"',
         "exact poses are refined, and a device's are not",

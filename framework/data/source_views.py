@@ -1,0 +1,51 @@
+"""Choice of the images from which a view is rendered: those of its scene, and of these the nearest in direction."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from framework.data.dataset import Dataset
+
+
+def images_of(dataset: Dataset, scene: int | None) -> Tensor:
+    """Return the images of a scene that others may be rendered from, their indices (K,) int64 on the CPU.
+
+    Args:
+        dataset: images of one scene or of several.
+        scene: number of the scene; None for the first.
+
+    Returns:
+        The source images of the scene, or all of its images where none is declared; none for an unknown scene.
+    """
+    found = torch.ones(len(dataset), dtype=torch.bool)
+    if dataset.scene_indices is not None:
+        found &= dataset.scene_indices == (dataset.scene_indices[0] if scene is None else scene)
+    if dataset.source_images is not None:
+        found &= dataset.source_images
+    return found.nonzero()[:, 0]
+
+
+def other_images(dataset: Dataset, images: Tensor, pose: Tensor) -> Tensor:
+    """Return those of some images that were not taken with a pose, so that no view is rendered from itself.
+
+    Args:
+        dataset: the images.
+        images: (K,) indices, on the CPU.
+        pose: (3, 4) camera-to-world.
+    """
+    same = (dataset.cameras.camera_to_worlds == pose).flatten(1).all(-1).cpu()
+    return images[~same[images]]
+
+
+def nearest_in_direction(dataset: Dataset, images: Tensor, pose: Tensor, count: int) -> Tensor:
+    """Return the images whose cameras look most nearly in the direction of a camera, the nearest first.
+
+    Args:
+        dataset: the images.
+        images: (K,) indices of the images to choose from, on the CPU.
+        pose: (3, 4) camera-to-world of the camera.
+        count: number of images; all if there are fewer.
+    """
+    likeness = (dataset.cameras.camera_to_worlds[:, :, 2] * pose[:, 2]).sum(-1).cpu()
+    return images[likeness[images].argsort(descending=True, stable=True)[:count]]

@@ -1,0 +1,103 @@
+"""The field of PixelNeRF (Yu et al. 2021): one network for all scenes, which looks at images of the scene it is in."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import relu, softplus
+
+from framework.encodings.pixel_aligned import SourceViews
+from framework.fields.base import Field
+from framework.geometry.points import Points
+from framework.kernels.frequency import frequency_encoding
+from framework.kernels.memory import require
+
+
+class ResidualBlock(nn.Module):
+    """Two layers whose output is added to their input, which is all of the output at first.
+
+    Args:
+        width: number of features.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.inner, self.outer = nn.Linear(width, width), nn.Linear(width, width)
+        nn.init.kaiming_normal_(self.inner.weight, nonlinearity="relu")
+        nn.init.zeros_(self.inner.bias)
+        nn.init.zeros_(self.outer.weight)
+        nn.init.zeros_(self.outer.bias)
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        """Return features (..., width) of features `hidden` (..., width)."""
+        return hidden + self.outer(relu(self.inner(relu(hidden))))
+
+
+class PixelAlignedField(Field):
+    """A field of residual blocks, conditioned on the pixels that show a position: PixelNeRF, section 4.2.
+
+    For each source view the position in that camera's frame goes through the first blocks, each of which adds the
+    features of the pixel that shows it. The views' mean goes through the other blocks. So neither the order of the
+    views nor the scene's frame matters, and there may be as many views as there are. Unlike in the paper, density does
+    not depend on the direction: directions, in the cameras' frames too, join for the colour.
+
+    Args:
+        num_features: number C of features of a pixel.
+        unit: length, scene units, in which positions are encoded.
+        width: features of a layer.
+        before: residual blocks before the mean over views.
+        after: residual blocks after it.
+        position_frequencies: number of frequencies of encoded positions.
+
+    Raises:
+        ConfigError: if the machine has too little memory for the weights.
+    """
+
+    def __init__(
+        self,
+        num_features: int,
+        unit: float,
+        width: int = 512,
+        before: int = 3,
+        after: int = 2,
+        position_frequencies: int = 6,
+    ) -> None:
+        super().__init__()
+        self.unit, self.position_frequencies = unit, position_frequencies
+        self.views: SourceViews | None = None
+        """Images of the scene that the field is asked about; whoever asks sets them."""
+        require(8.0 * (before + after) * width**2, "a network")
+        self.lift = nn.Linear(3 + 6 * position_frequencies, width)
+        self.conditions = nn.ModuleList(nn.Linear(num_features, width) for _ in range(before))
+        self.before = nn.ModuleList(ResidualBlock(width) for _ in range(before))
+        self.after = nn.ModuleList(ResidualBlock(width) for _ in range(after))
+        self.sigma_head = nn.Linear(width, 1)
+        self.color_hidden, self.color_direction = nn.Linear(width, width // 2), nn.Linear(3, width // 2)
+        self.color_head = nn.Linear(width // 2, 3)
+
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        views = self._views()
+        local = views.in_frames(points.positions, are_points=True) / self.unit
+        hidden = self.lift(frequency_encoding(local, self.position_frequencies))
+        pixels = views.aligned(points.positions)
+        for condition, block in zip(self.conditions, self.before, strict=True):
+            hidden = block(hidden + condition(pixels))
+        hidden = hidden.mean(0)
+        for block in self.after:
+            hidden = block(hidden)
+        raw = self.sigma_head(relu(hidden))[:, 0]
+        return softplus(_precise(raw) - 1) / self.unit, hidden
+
+    def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
+        local = self._views().in_frames(directions, are_points=False)
+        hidden = relu(self.color_hidden(relu(features)) + self.color_direction(local)).mean(0)
+        return torch.sigmoid(_precise(self.color_head(hidden)))
+
+    def _views(self) -> SourceViews:
+        if self.views is None:
+            raise ValueError("this field looks at images of the scene: set its views first")
+        return self.views
+
+
+def _precise(values: Tensor) -> Tensor:
+    return values if values.dtype == torch.float64 else values.float()

@@ -1,0 +1,142 @@
+"""A background that is composited behind what a method shows: NeRF++ (Zhang et al. 2020), section 4, equation 7."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from framework.data.scene import Scene
+from framework.fields.base import Field
+from framework.geometry.rays import Rays, Samples
+from framework.geometry.spheres import InvertedRays, distances_behind
+from framework.rendering.rendered import Rendered
+from framework.rendering.renderer import Renderer
+from framework.rendering.volume import VolumeRenderer
+from framework.samplers.background import BackgroundConfig, foreground_sphere
+from framework.samplers.base import Sampler
+from framework.samplers.choice import HierarchicalConfig
+from framework.samplers.hierarchical import HierarchicalSampler
+from framework.samplers.uniform import LAST_INTERVAL, UniformSampler
+
+
+class SphereRenderer(Renderer):
+    """A renderer behind whose picture there is a second field, outside of a sphere.
+
+    That field is evaluated at points (N, 4) of the inverted sphere (`InvertedRays`), and its density is one in units of
+    1/r, as in the authors' code: a ray has a finite length there. Its share of a colour is the transmittance that is
+    left inside. The far end of the last interval is infinitely far, so that any density there makes the ray opaque.
+
+    Args:
+        renderer: renders what is inside, sampled by an `InsideSphere`.
+        sphere: (4,) centre and radius, scene units.
+        field: density and colour at points of the inverted sphere.
+        sampler: chooses samples along inverted rays.
+        endless: whether the last interval is endless: for images that do not tell what is background.
+    """
+
+    sphere: Tensor
+
+    def __init__(self, renderer: Renderer, sphere: Tensor, field: Field, sampler: Sampler, endless: bool) -> None:
+        super().__init__()
+        self.renderer, self.field, self.sampler, self.endless = renderer, field, sampler, endless
+        self.behind = VolumeRenderer()
+        self.register_buffer("sphere", sphere.clone())
+
+    def render(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
+        inside = self.renderer.render(rays, samples, field, torch.zeros_like(background))
+        inverted = InvertedRays.of(rays, self.sphere)
+        outside = self.behind.render(inverted, self._sampled(inverted), self.field, background)
+        return over_background(inside, outside, lambda u: distances_behind(u, rays, self.sphere))
+
+    def _sampled(self, rays: InvertedRays) -> Samples:
+        """Return samples of inverted rays, of which those that end before the sphere are transparent."""
+        samples = self.sampler.sample(rays, self.field, self.training)
+        ends = torch.where(rays.fars > rays.nears, LAST_INTERVAL, rays.nears) if self.endless else rays.fars
+        if samples.coarse is not None:
+            samples = replace(samples, coarse=replace(samples.coarse, samples=_ending_at(samples.coarse.samples, ends)))
+        return _ending_at(samples, ends)
+
+
+def over_background(inside: Rendered, outside: Rendered, distances: Callable[[Tensor], Tensor]) -> Rendered:
+    """Return what is seen of R rays: the inside, and behind it the outside.
+
+    Samples, weights, normals and penalties are those of the inside.
+
+    Args:
+        inside: the inside before a black background.
+        outside: the outside before the background, with the same number of samples on each ray.
+        distances: function from places (R,) on the rays of `outside`, one each, to distances along those of `inside`.
+    """
+    left = 1 - inside.accumulation
+    accumulation = inside.accumulation + left * outside.accumulation
+    with torch.no_grad():
+        share = torch.where(accumulation > 1e-6, inside.accumulation / accumulation, 1.0)  # of what is seen
+        depth = torch.lerp(distances(outside.depth), inside.depth, share)
+        median = torch.where(inside.accumulation >= 0.5, inside.median_depth, distances(_median(outside, left)))
+    coarse = None
+    if inside.coarse is not None or outside.coarse is not None:
+        levels = [replace(level.coarse or level, coarse=None) for level in (inside, outside)]
+        coarse = over_background(levels[0], levels[1], distances)
+    return replace(
+        inside,
+        rgb=inside.rgb + left[:, None] * outside.rgb,
+        depth=depth,
+        median_depth=median,
+        accumulation=accumulation,
+        num_samples=inside.num_samples + outside.num_samples,
+        coarse=coarse,
+    )
+
+
+def _median(outside: Rendered, left: Tensor) -> Tensor:
+    """Return the place (R,) of the first sample outside behind which the whole ray's transmittance is at most 0.5.
+
+    Args:
+        outside: the outside, with the same number of samples on each ray.
+        left: (R,) transmittance that is left inside.
+    """
+    assert outside.samples is not None
+    assert outside.weights is not None
+    behind = left[:, None] * (1 - outside.samples.padded(outside.weights).cumsum(-1))
+    past = behind <= 0.5
+    places = torch.where(past, outside.samples.padded(outside.samples.t), 1.0)
+    return places.amin(-1)
+
+
+def background_renderer(
+    config: BackgroundConfig,
+    scene: Scene,
+    make_field: Callable[[Any, Scene], Field],
+    renderer: Renderer | None = None,
+) -> Renderer:
+    """Return a renderer with a background if the settings have a sphere.
+
+    The outside is sampled as the inside if that is hierarchical, with a coarse field of its own and as many samples,
+    and otherwise uniformly in 1/r.
+
+    Args:
+        config: the settings, decided.
+        scene: properties of the scene; not of its foreground.
+        make_field: creates a field outside, from settings and scene.
+        renderer: renders what is inside; a `VolumeRenderer` if None.
+    """
+    renderer = renderer or VolumeRenderer()
+    if config.background_model != "sphere":
+        return renderer
+    sampler: Sampler = UniformSampler(config.num_background_samples)
+    if isinstance(config, HierarchicalConfig) and str(config.sampler) == "hierarchical":
+        coarse = make_field(config, scene)
+        sampler = HierarchicalSampler(coarse, config.num_coarse_samples, config.num_fine_samples)
+    field = make_field(config, scene)
+    return SphereRenderer(renderer, foreground_sphere(scene), field, sampler, endless=not scene.has_alpha)
+
+
+def _ending_at(samples: Samples, ends: Tensor) -> Samples:
+    """Return samples, the same number on each ray, whose last intervals end at `ends` (R,)."""
+    changed = samples.padded(samples.t_ends).clone()
+    changed[:, -1] = ends
+    return replace(samples, t_ends=changed.view(-1), points=samples.t)

@@ -1,0 +1,78 @@
+"""Sampling of the part of rays that is inside of a sphere; what is outside belongs to a background."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from framework.data.scene import Scene
+from framework.fields.base import DensityFunction, Field
+from framework.geometry.rays import Rays, Samples
+from framework.geometry.spheres import intersect_sphere
+from framework.samplers.background import BackgroundConfig, foreground, foreground_sphere
+from framework.samplers.base import Sampler
+from framework.samplers.choice import make_sampler
+
+
+class InsideSphere(Sampler):
+    """Samples of another sampler, up to where rays leave a sphere.
+
+    Args:
+        sampler: chooses the samples between the near and the far end of each ray.
+        sphere: (4,) centre and radius, scene units.
+    """
+
+    sphere: Tensor
+
+    def __init__(self, sampler: Sampler, sphere: Tensor) -> None:
+        super().__init__()
+        self.sampler, self.samples_per_step = sampler, sampler.samples_per_step
+        self.register_buffer("sphere", sphere.clone())
+
+    def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
+        enter, leave = intersect_sphere(rays.origins.detach(), rays.directions.detach(), self.sphere)
+        nears = torch.maximum(rays.nears, enter)
+        fars = torch.maximum(torch.minimum(rays.fars, leave), nears)
+        samples = clipped(self.sampler.sample(replace(rays, nears=nears, fars=fars), field, jitter), nears, fars)
+        if samples.coarse is None:
+            return samples
+        coarse = replace(samples.coarse, samples=clipped(samples.coarse.samples, nears, fars))
+        return replace(samples, coarse=coarse)
+
+    def update(self, step: int, density: DensityFunction) -> None:
+        """Update the other sampler."""
+        self.sampler.update(step, density)
+
+    def losses(self, samples: Samples, weights: Tensor) -> dict[str, Tensor]:
+        return self.sampler.losses(samples, weights)
+
+
+def make_foreground_sampler(
+    config: BackgroundConfig, scene: Scene, make_coarse: Callable[[], Field | None] | None = None
+) -> Sampler:
+    """Return the sampler that the settings select, for the scene's foreground.
+
+    Args:
+        config: the settings, decided.
+        scene: properties of the scene; not of its foreground.
+        make_coarse: creates the coarse field of `--sampler hierarchical`, as in `make_sampler`.
+    """
+    sampler = make_sampler(config, foreground(config, scene), make_coarse)
+    return InsideSphere(sampler, foreground_sphere(scene)) if config.background_model == "sphere" else sampler
+
+
+def clipped(samples: Samples, nears: Tensor, fars: Tensor) -> Samples:
+    """Return samples whose intervals lie between two distances.
+
+    Samplers make the last interval of a ray endless, or march from a little before to a little behind.
+
+    Args:
+        samples: N samples of R rays.
+        nears, fars: (R,) distances.
+    """
+    near, far = (ends.index_select(0, samples.ray_indices) for ends in (nears, fars))
+    starts, ends = (torch.minimum(torch.maximum(t, near), far) for t in (samples.t_starts, samples.t_ends))
+    return replace(samples, t_starts=starts, t_ends=ends, points=samples.t)

@@ -1,0 +1,57 @@
+"""Cells of space that some image shows: in all others matter could not be learned, and would only be in the way.
+
+Instant-NGP leaves out cells that no training camera sees (Mueller et al. 2022, `mark_untrained_density_grid` of the
+authors' code). Space right before a camera, nearer than the points that its image is known to show, does not count as
+shown by it.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from framework.cameras.cameras import Cameras
+
+BLOCK = 4
+"""Cells along an edge of the cubes that are tested as one."""
+AROUND = 4
+"""Distance, in radii of a cube, within which a camera sees it, wherever it looks."""
+MARGIN = 2.0
+"""Factor of a cube's radius in the image, which is larger beside the middle of the image than in it."""
+
+
+@torch.no_grad()
+def seen_cells(cameras: Cameras, nearest: Tensor, box: Tensor, resolution: int) -> Tensor:
+    """Return the cells of a box that some image shows from no nearer than the camera's least distance.
+
+    Cells are tested in cubes of `BLOCK`, by a ball around each: those that are returned may be too many, never too few.
+
+    Args:
+        cameras: M cameras.
+        nearest: (M,) distance from each camera before which its image shows nothing, scene units.
+        box: (2, 3) minimum and maximum corner.
+        resolution: number n of cells along each axis, a multiple of `BLOCK`.
+
+    Returns:
+        (n^3,) bool; the index of a cell is (x n + y) n + z.
+    """
+    side = resolution // BLOCK
+    edge = (box[1] - box[0]) / side
+    cubes = torch.cartesian_prod(*[torch.arange(side, device=box.device)] * 3)
+    centers, radius = box[0] + (cubes + 0.5) * edge, float(edge.norm()) / 2
+    seen = torch.zeros(len(cubes), dtype=torch.bool, device=box.device)
+    for index in range(len(cameras)):
+        left = (~seen).nonzero().squeeze(-1)
+        seen[left] = _shows(cameras, index, centers[left], radius, nearest[index])
+    return seen.view(side, 1, side, 1, side, 1).expand(-1, BLOCK, -1, BLOCK, -1, BLOCK).reshape(-1)
+
+
+def _shows(cameras: Cameras, index: int, centers: Tensor, radius: float, nearest: Tensor) -> Tensor:
+    """Return whether camera `index` may show some of the balls around `centers` (N, 3), (N,) bool."""
+    distances = (centers - cameras.camera_to_worlds[index, :, 3]).norm(dim=-1)
+    columns, rows, ahead = cameras.project(centers, index)
+    focal = torch.maximum(cameras.fx[index], cameras.fy[index])
+    reach = MARGIN * focal * radius / (distances - radius).clamp(min=radius)
+    across = (columns > -reach) & (columns < cameras.widths[index] + reach)
+    inside = ahead & across & (rows > -reach) & (rows < cameras.heights[index] + reach)
+    return (inside | (distances < AROUND * radius)) & (distances + radius > nearest)

@@ -1,0 +1,198 @@
+"""Settings, decisions, poses and regularisers that methods for captures have in common.
+
+The two regularisers are the distortion of rays (Barron et al. 2022) and gradients that are scaled down near cameras
+(Philip and Deschaintre 2023).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Generic, Literal, TypeVar
+
+from torch import Tensor
+
+from framework import (
+    Cameras,
+    ConfigError,
+    Decision,
+    Field,
+    PixelBatch,
+    RayModel,
+    Rays,
+    Rendered,
+    Renderer,
+    Sampler,
+    Samples,
+    Scene,
+    VolumeRenderer,
+)
+from framework.base.config import AT_LEAST_0, AUTO, Auto, Range
+from framework.base.decisions import Choice, fill
+from framework.base.optimised import Optimised
+from framework.cameras.refinement import PoseRefinement
+from framework.rendering.losses import normalised_distortion
+from framework.rendering.volume import shade
+from framework.samplers.choice import SamplingConfig, sampler_choice
+from framework.samplers.proposal import half_edge
+from framework.scene.reasons import POSE_REASONS
+
+DISTORTION = 2e-3
+"""Default weight of the distortion loss in unbounded scenes."""
+
+
+@dataclass(frozen=True)
+class CaptureConfig(SamplingConfig):
+    """Settings of a method for captures."""
+
+    RANGES: ClassVar[dict[str, Range]] = {"distortion_loss_mult": AT_LEAST_0, "camera_learning_rate": AT_LEAST_0}
+    """Allowed range of each numeric setting."""
+    contraction: Auto[bool] = AUTO
+    """Whether space outside the box is contracted. If not given: in unbounded scenes."""
+    distortion_loss_mult: Auto[float] = AUTO
+    """Weight of the distortion loss. If not given: 0.002 in unbounded scenes, else 0."""
+    camera_optimizer: Literal["auto", "off", "SO3xR3", "SE3"] = "auto"
+    """Refinement of the training cameras' poses; auto: SO3xR3 if a device tracked them, else off."""
+    camera_learning_rate: float = 1e-3
+    """Initial learning rate of the poses."""
+    gradient_scaling: Auto[bool] = AUTO
+    """Whether gradients near cameras are scaled down, by squared distance up to half of the box's edge, against
+    floaters. If not given: in unbounded scenes."""
+
+    @property
+    def covers_space(self) -> bool:
+        """True if the field covers all of space, contracted, and its sampler does; of settings that are decided."""
+        return bool(self.contraction) and self.sampler == "proposal"
+
+
+CaptureConfigT = TypeVar("CaptureConfigT", bound=CaptureConfig)
+
+
+def decide_capture(
+    config: CaptureConfigT, scene: Scene, *own: Choice, nested: bool = False
+) -> tuple[CaptureConfigT, list[Decision]]:
+    """Decide the settings that methods for captures share, and a method's own.
+
+    Args:
+        config: the method's settings; those left open are filled in.
+        scene: properties of the data.
+        own: choices of the method's own.
+        nested: whether the method can march through contracted space, in nested boxes.
+
+    Returns:
+        The settings, and a record of each that was filled in.
+    """
+    unbounded = scene.unbounded if config.contraction is None else config.contraction
+    config, made = fill(config, sampler_choice(config, unbounded))
+    contracted = unbounded and (nested or config.sampler == "proposal")
+    around = "there may be something outside the box" if contracted else "the scene ends at its box"
+    reason = f"contraction is {'on' if contracted else 'off'}"
+    refined = "SO3xR3" if scene.poses == "device" and not scene.warped else "off"
+    config, more = fill(
+        config,
+        Choice("contraction", contracted, around),
+        Choice("distortion_loss_mult", DISTORTION if contracted else 0.0, reason, "distortion loss"),
+        Choice("gradient_scaling", contracted, reason, "gradient scaling near cameras"),
+        *own,
+        Choice("camera_optimizer", refined, POSE_REASONS[scene.poses], "pose refinement"),
+    )
+    return config, made + more
+
+
+def distortion_term(rendered: Rendered, weight: float, scale: float | None = None) -> dict[str, Tensor]:
+    """Return the distortion of rays as a term of the loss; none without a weight.
+
+    Args:
+        rendered: the rays of a batch.
+        weight: weight of the term.
+        scale: distance from which on disparity is measured, of samples that a grid chose, scene units; if None, those
+            have no distortion.
+    """
+    samples, weights = rendered.samples, rendered.weights
+    if not weight or samples is None or weights is None or not samples.num_rays:
+        return {}
+    if samples.edges is not None:
+        return {"distortion": weight * normalised_distortion(weights, samples)}
+    return {} if scale is None else {"distortion": weight * normalised_distortion(weights, samples, scale)}
+
+
+class CaptureModel(RayModel[CaptureConfigT], Generic[CaptureConfigT]):
+    """A model whose training poses can be refined, with the distortion loss.
+
+    Args:
+        config: the method's settings, none left open.
+        scene: properties of the data.
+        field: density and colour.
+        sampler: chooses the samples along rays.
+        renderer: turns samples into colours and depths.
+
+    Raises:
+        ConfigError: if poses are to be refined in normalised device coordinates or with another sampler than proposals.
+    """
+
+    def __init__(
+        self, config: CaptureConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer
+    ) -> None:
+        super().__init__(config, scene, field, sampler, renderer)
+        self.poses: PoseRefinement | None = None
+        if config.camera_optimizer in ("SO3xR3", "SE3"):
+            if scene.warped:
+                raise ConfigError("--camera-optimizer: poses cannot be refined in normalised device coordinates")
+            if config.sampler != "proposal":
+                raise ConfigError(
+                    "--camera-optimizer needs --sampler proposal: marched samples carry no gradient to rays"
+                )
+            self.poses = PoseRefinement(scene.num_cameras, config.camera_optimizer, scene.camera_to_worlds)
+            self.poses.optimised = Optimised("poses", config.camera_learning_rate, schedule="exponential")
+
+    def refined_cameras(self, cameras: Cameras) -> Cameras:
+        """Return the training cameras with refined poses.
+
+        Args:
+            cameras: M training cameras with the poses of the data.
+        """
+        return cameras if self.poses is None else self.poses.refined(cameras)
+
+    def render(self, rays: Rays, background: Tensor) -> Rendered:
+        return super().render(rays if self.poses is None else self.poses(rays), background)
+
+    def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
+        scale = half_edge(self.scene.box) if self.config.contraction else None
+        return distortion_term(rendered, self.config.distortion_loss_mult, scale)
+
+
+class CaptureRenderer(VolumeRenderer):
+    """Volume rendering whose gradients can be scaled down near cameras.
+
+    Args:
+        unit_length: distance from the camera up to which gradients are scaled, scene units; None for no scaling.
+    """
+
+    def __init__(self, unit_length: float | None) -> None:
+        super().__init__()
+        self.unit_length = unit_length
+
+    def shade(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
+        factors = None
+        if self.training and self.unit_length is not None:
+            factors = (samples.t / self.unit_length).square().clamp(max=1)
+        return shade(rays, samples, field, background, factors)
+
+
+def capture_renderer(config: CaptureConfig, scene: Scene) -> CaptureRenderer:
+    """Return the renderer, with gradients scaled up to half of the box's edge if they are.
+
+    Args:
+        config: the method's settings, none left open.
+        scene: properties of the data.
+    """
+    return CaptureRenderer(scaled_up_to(config, scene))
+
+
+def scaled_up_to(config: CaptureConfig, scene: Scene) -> float | None:
+    """Return the distance from cameras up to which gradients are scaled, scene units; None if they are not.
+
+    Args:
+        config: the method's settings, none left open.
+        scene: properties of the data.
+    """
+    return half_edge(scene.box) if config.gradient_scaling else None

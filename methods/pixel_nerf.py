@@ -1,0 +1,247 @@
+"""PixelNeRF: one network for many scenes, which renders a new one from a few images, without training on it.
+
+Yu et al., "pixelNeRF: Neural Radiance Fields from One or Few Images", CVPR 2021. It learns from data that shows many
+scenes, such as `ns-train pixel-nerf procedural --num-scenes 200 --size 32`, and is judged by scenes that it never saw.
+The image encoder is small and learnt from the start: no weights are shipped, ImageNet's neither.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from framework import (
+    ConfigError,
+    DataError,
+    Dataset,
+    Loss,
+    Method,
+    Picture,
+    PixelBatch,
+    Points,
+    RayModel,
+    Rays,
+    Rendered,
+    Renderer,
+    Sampler,
+    Scene,
+    View,
+)
+from framework.base.config import Range, SourceViewsConfig
+from framework.data.pixels import composite
+from framework.data.source_views import images_of, nearest_in_direction, other_images
+from framework.data.training_images import evenly_spread
+from framework.encodings.pixel_aligned import ImageEncoder, SourceViews
+from framework.fields.pixel_aligned import PixelAlignedField
+from framework.kernels.frequency import MAX_FREQUENCIES
+from framework.samplers.hierarchical import LEAST_COARSE, HierarchicalSampler
+from framework.samplers.proposal import half_edge
+
+BLOCKS_AFTER = 2
+"""Residual blocks after the mean over views, as in the paper."""
+
+
+@dataclass(frozen=True)
+class PixelNeRFConfig(
+    SourceViewsConfig,
+    max_num_iterations=400_000,
+    num_rays_per_batch=512,
+    learning_rate=1e-3,
+    background="white",
+    eval_num_rays_per_chunk=1_024,
+):
+    """Settings of pixel-nerf: the paper's structure, with networks that a processor can train."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        "num_coarse_samples": (LEAST_COARSE, 2**14),
+        "num_fine_samples": (1, 2**14),
+        "hidden_width": (2, 2**14),
+        "num_view_blocks": (1, 64),
+        "position_frequencies": (0, MAX_FREQUENCIES),
+        "encoder_widths": (1, 2**14),
+    }
+    """Allowed range of each numeric setting."""
+    num_coarse_samples: int = 32
+    """Stratified intervals per ray (64 in the paper)."""
+    num_fine_samples: int = 32
+    """Intervals per ray that are drawn from the weights of the coarse ones (16, and 16 around the depth, in the
+    paper)."""
+    hidden_width: int = 64
+    """Features per layer (512 in the paper)."""
+    num_view_blocks: int = 3
+    """Residual blocks before the mean over source views."""
+    position_frequencies: int = 6
+    """Number of frequencies in the encoding of positions, in the frames of the source cameras."""
+    encoder_widths: tuple[int, ...] = (32, 32, 64)
+    """Features of each level of the image encoder, from the finest; each further one is half as fine."""
+
+
+class PixelNeRF(RayModel[PixelNeRFConfig]):
+    """A model of many scenes: its encoder sees images of a scene, and its field looks up their features.
+
+    Args:
+        config: the method's settings, decided.
+        scene: properties of the data.
+        field: the conditioned network.
+        sampler: chooses the positions along each ray.
+        renderer: turns samples into colours and depths.
+    """
+
+    field: PixelAlignedField
+
+    def __init__(
+        self, config: PixelNeRFConfig, scene: Scene, field: PixelAlignedField, sampler: Sampler, renderer: Renderer
+    ) -> None:
+        super().__init__(config, scene, field, sampler, renderer)
+        self.encoder = ImageEncoder(config.encoder_widths)
+        self.learnt: Dataset | None = None
+        """The training images: each may be rendered from others of its scene."""
+        self.unseen: Dataset | None = None
+        """Images of further scenes, which are rendered from their source images."""
+
+    def show_images(self, dataset: Dataset) -> None:
+        """Take the images of `dataset` to render from: those of training, or of scenes beside those of training.
+
+        Raises:
+            DataError: if there are fewer than two training images of a scene.
+        """
+        if dataset.source_images is not None:
+            self.unseen = dataset
+            return
+        scenes = [None] if dataset.scene_indices is None else dataset.scene_indices.unique().tolist()
+        if min(len(images_of(dataset, scene)) for scene in scenes) < 2:
+            raise DataError("pixel-nerf renders an image from others of its scene: it needs at least 2 of each")
+        self.learnt = dataset
+
+    # -- source views -----------------------------------------------------------------------------------------
+
+    def drawn_views(self, image: int) -> SourceViews:
+        """Return source views for learning a training image: others of its scene, drawn at random.
+
+        Args:
+            image: index of the training image.
+        """
+        dataset = self._training_images()
+        scene = None if dataset.scene_indices is None else int(dataset.scene_indices[image])
+        others = other_images(dataset, images_of(dataset, scene), dataset.cameras.camera_to_worlds[image])
+        return self.encoded(dataset, others[torch.randperm(len(others))[: self.config.num_source_views]])
+
+    def nearest_views(self, view: View) -> SourceViews:
+        """Return source views for rendering a `view`: of those of its scene, the nearest to it in direction."""
+        dataset, pose = self._training_images(), view.camera.camera_to_worlds[0]
+        if self.unseen is not None and view.scene is not None and len(images_of(self.unseen, view.scene)):
+            dataset = self.unseen
+        others = other_images(dataset, images_of(dataset, view.scene), pose)
+        if not len(others):
+            raise DataError(f"pixel-nerf was shown no image of scene {view.scene}, and cannot render it")
+        return self.encoded(dataset, nearest_in_direction(dataset, others, pose, self.config.num_source_views))
+
+    def encoded(self, dataset: Dataset, images: Tensor) -> SourceViews:
+        """Return source views.
+
+        Args:
+            dataset: the images.
+            images: (V,) indices of the views.
+        """
+        behind = torch.full((3,), 0.0 if self.config.background == "black" else 1.0, device=dataset.device)
+        rgb = [composite(dataset.image(i).float() / 255, behind).permute(2, 0, 1) for i in images.tolist()]
+        if len({image.shape for image in rgb}) == 1:
+            maps = self.encoder(torch.stack(rgb)).unbind()
+        else:
+            maps = tuple(self.encoder(image[None])[0] for image in rgb)
+        return SourceViews(maps, dataset.cameras[images.to(dataset.device)])
+
+    @contextmanager
+    def looking_at(self, views: SourceViews) -> Iterator[None]:
+        """Let the field look at source views.
+
+        Args:
+            views: images of the scene that is rendered.
+        """
+        before, self.field.views = self.field.views, views
+        try:
+            yield
+        finally:
+            self.field.views = before
+
+    def _training_images(self) -> Dataset:
+        if self.learnt is None:
+            raise ConfigError("pixel-nerf renders from images, and was shown none: it needs the data of its training")
+        return self.learnt
+
+    def _looking(self) -> AbstractContextManager[None]:
+        """Look at evenly spread views of the first scene, if nothing else is looked at, as by exports."""
+        if self.field.views is not None:
+            return nullcontext()
+        images = images_of(self._training_images(), None)
+        spread = evenly_spread(len(images), self.config.num_source_views)
+        return self.looking_at(self.encoded(self._training_images(), images[spread]))
+
+    # -- learning and rendering -------------------------------------------------------------------------------
+
+    def loss(self, batch: PixelBatch, step: int) -> Loss:
+        """Return the loss of the pixels of a few images, each of which is rendered from others of its scene.
+
+        Args:
+            batch: pixels with their true colours.
+            step: number of training steps done.
+        """
+        assert batch.rays.camera_indices is not None
+        images = batch.rays.camera_indices[:: batch.rays_per_pixel]
+        rgb, num_samples, terms = torch.empty_like(batch.rgb), 0, dict[str, Tensor]()
+        for image in images.unique().tolist():
+            chosen = images == image
+            with self.looking_at(self.drawn_views(image)):
+                part = super().loss(batch[chosen], step)
+            share = chosen.float().mean()
+            terms = {name: share * value + terms.get(name, 0) for name, value in part.terms.items()}
+            rgb[chosen], num_samples = part.rgb, num_samples + part.num_samples
+        return Loss(terms, rgb, num_samples)
+
+    def render(self, rays: Rays, background: Tensor) -> Rendered:
+        with self._looking():
+            return super().render(rays, background)
+
+    @torch.no_grad()
+    def render_view(self, view: View, background: Tensor) -> Picture:
+        with self.looking_at(self.nearest_views(view)):
+            return super().render_view(view, background)
+
+    def density(self, points: Points) -> Tensor:
+        with self._looking():
+            return super().density(points)
+
+
+def make_field(config: PixelNeRFConfig, scene: Scene) -> PixelAlignedField:
+    """Return the conditioned network, which serves as its own coarse level.
+
+    Args:
+        config: the method's settings.
+        scene: properties of the data.
+
+    Raises:
+        ConfigError: if rays are in normalised device coordinates, where images cannot be looked up.
+    """
+    if scene.warped:
+        raise ConfigError("pixel-nerf looks up positions in images: use --ndc False")
+    blocks = config.num_view_blocks, BLOCKS_AFTER
+    features, unit = sum(config.encoder_widths), half_edge(scene.box)
+    return PixelAlignedField(features, unit, config.hidden_width, *blocks, config.position_frequencies)
+
+
+def sampler(config: PixelNeRFConfig, scene: Scene) -> Sampler:
+    """Return hierarchical sampling, whose coarse level is the field itself.
+
+    Args:
+        config: the method's settings.
+        scene: properties of the data.
+    """
+    return HierarchicalSampler(None, config.num_coarse_samples, config.num_fine_samples)
+
+
+METHOD = Method(PixelNeRFConfig(), paper="arXiv:2012.02190", field=make_field, sampler=sampler, model=PixelNeRF)

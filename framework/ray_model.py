@@ -12,7 +12,7 @@ from framework.base.config import RayConfig
 from framework.cameras.cameras import subpixels
 from framework.cameras.unseen import unseen_patches
 from framework.cameras.view import View
-from framework.data.pixels import PixelBatch
+from framework.data.pixels import PixelBatch, thinned
 from framework.data.scene import Scene
 from framework.encodings.opening import Opening
 from framework.fields.base import Field
@@ -28,11 +28,13 @@ from framework.rendering.losses import (
     distance_likelihood,
     matter_before,
     mean_squared_error,
+    opacity_of_transparent,
 )
 from framework.rendering.rendered import Picture, Rendered
 from framework.rendering.renderer import Renderer
 from framework.samplers.base import Sampler
 from framework.scene.few_images import FewImagesConfig, unseen_weight
+from framework.scene.motion import MotionConfig
 
 RayConfigT = TypeVar("RayConfigT", bound=RayConfig)
 PATCH = 8
@@ -78,6 +80,10 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
             batch: pixels with their true colours.
             step: number of training steps done.
         """
+        drawn, config = batch, self.config
+        moves = isinstance(config, MotionConfig) and self.scene.moving and batch.alpha is not None
+        if isinstance(config, MotionConfig) and moves and config.transparent_share < 1:
+            batch, kept = thinned(batch, config.transparent_share)
         per_pixel = batch.rays_per_pixel
         rendered = self.render(batch.rays, batch.background.repeat_interleave(per_pixel, 0))
         pixels = rendered.to_pixels(per_pixel)
@@ -91,7 +97,13 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
         terms |= self.regularizers(rendered, batch, step)
         if isinstance(self.config, FewImagesConfig):
             terms |= self._for_few_images(self.config, rendered, batch, step)
-        return Loss(terms, pixels.rgb.detach(), rendered.num_samples)
+        if isinstance(config, MotionConfig) and moves and config.empty_loss_mult and batch.alpha is not None:
+            wrong = opacity_of_transparent(pixels.accumulation, batch.alpha, batch.weights)
+            terms["empty"] = config.empty_loss_mult * wrong
+        rgb = pixels.rgb.detach()
+        if batch is not drawn:  # of what was left out it is known that nothing is before the background
+            rgb = drawn.rgb.masked_scatter(kept[:, None], rgb.to(drawn.rgb))
+        return Loss(terms, rgb, rendered.num_samples)
 
     def _depth_terms(self, rendered: Rendered, batch: PixelBatch) -> dict[str, Tensor]:
         """Return the losses of what is known of distances, of both levels, and of space that is known to be empty."""

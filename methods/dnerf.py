@@ -20,6 +20,7 @@ from framework.fields.nerf import NeRFField
 from framework.kernels.frequency import MAX_FREQUENCIES
 from framework.kernels.hash_grid_layout import MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
 from framework.samplers.choice import HierarchicalConfig, contracted_box, make_sampler, sampler_choice
+from framework.scene.motion import MotionConfig, decide_motion
 from methods.vanilla_nerf import A_RAY, OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH
 
 HASH_SAMPLES_PER_BATCH = 2**14
@@ -29,6 +30,7 @@ HASH_SAMPLES_PER_BATCH = 2**14
 @dataclass(frozen=True)
 class DNeRFConfig(
     HierarchicalConfig,
+    MotionConfig,
     max_num_iterations=800_000,
     num_rays_per_batch=2_048,
     learning_rate=5e-4,
@@ -82,7 +84,10 @@ class DNeRFConfig(
     sparse_updates: bool = True
     """Whether Adam updates only the entries of the hash grid that a step used."""
     grid_resolution: int = 64
-    """Cells per axis of the occupancy grid. A cell counts as occupied if it is occupied at any time."""
+    """Cells per axis of the occupancy grid. A cell counts as occupied if it is at any time of its slice."""
+    from_first_image: bool = False
+    """Whether nothing is displaced at time 0, as in the paper, so that the canonical field is the scene at that time.
+    If not, that image is one like the others."""
 
 
 class DNeRF(RayModel[DNeRFConfig], LearnsMotion):
@@ -112,6 +117,8 @@ def decide(config: DNeRFConfig, scene: Scene) -> tuple[DNeRFConfig, list[Decisio
         samples = HASH_SAMPLES_PER_BATCH if small else OCCUPANCY_SAMPLES_PER_BATCH
         config, more = fill(config, Choice("samples_per_batch", samples, A_RAY, "samples a step"))
         made += more
+    config, motion = decide_motion(config, scene, config.sampler)
+    made += motion
     if not scene.moving:
         made = [decision for decision in made if not decision.option.startswith("deformation")]
         made.append(Decision("deformation", "left out", "the images have no times"))
@@ -151,6 +158,7 @@ def make_field(config: DNeRFConfig, scene: Scene) -> Field:
         config.position_frequencies,
         config.time_frequencies,
         contracted,
+        config.from_first_image,
     )
     deformed.optimised = networks
     return deformed

@@ -22,6 +22,7 @@ from framework.kernels.planes_layout import MAX_VERTICES
 from framework.kernels.spherical_harmonics import spherical_harmonics
 from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_choice
 from framework.scene.few_images import FewImagesConfig, decide_few_images
+from framework.scene.motion import MotionConfig, decide_motion, vertices_in_time
 
 MAX_SCALES = 4
 """Maximum number of scales if the setting is left open; the paper's number."""
@@ -31,6 +32,7 @@ MAX_SCALES = 4
 class KPlanesConfig(
     SamplingConfig,
     FewImagesConfig,
+    MotionConfig,
     max_num_iterations=30_000,
     samples_per_batch=2**15,
     learning_rate=1e-2,
@@ -58,8 +60,11 @@ class KPlanesConfig(
     """Vertices per axis of space at the coarsest scale; each further scale has twice as many."""
     num_scales: Auto[int] = AUTO
     """Number of scales. If not given: until the finest has a vertex per pixel of the images, but at most 4."""
-    time_resolution: int = 25
-    """Vertices along the time axis at every scale; second differences need 3."""
+    time_resolution: Auto[int] = AUTO
+    """Vertices along the time axis at every scale; second differences need 3. If not given: a sixth of the number of
+    times of the images. The paper has half of it, for training that takes many times as long."""
+    grid_resolution: Auto[int] = AUTO
+    """Cells along each axis of the occupancy grid (occupancy). If not given: 128, or 64 with slices of time."""
     features_per_scale: int = 32
     """Features per vertex of a plane."""
     hidden_width: int = 64
@@ -104,32 +109,39 @@ class KPlanes(RayModel[KPlanesConfig], LearnsMotion):
     """A model of feature planes in space and, if the scene moves, in time, with the paper's regularisers."""
 
     def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
-        variation, roughness, activity = self._regularisers(rendered.rgb.new_zeros(()))
+        turn = int(torch.randint(2**31, ())) if self.scene.moving else 0  # which plane of time
+        variation, roughness, activity = self._regularisers(rendered.rgb.new_zeros(()), turn)
         losses = {"space_tv": self.config.space_tv * variation}
         if self.scene.moving:
             losses["time_smoothness"] = self.config.time_smoothness * roughness
             losses["time_sparsity"] = self.config.time_sparsity * activity
         return losses
 
-    def _regularisers(self, zero: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _regularisers(self, zero: Tensor, turn: int) -> tuple[Tensor, Tensor, Tensor]:
         """Return total variation in space, roughness in time and distance of time planes from one (equations 4 to 6).
 
-        Each is a mean over planes: space planes by a random band of rows, the small time planes whole.
+        Each is a mean over planes, estimated without bias by what a step can afford to read: a random band of rows of
+        each space plane, and one of the time planes, whole.
+
+        Args:
+            zero: () the result where there are no planes of time.
+            turn: number, modulo theirs, of the plane of time.
         """
         assert isinstance(self.field, BoxField)
         planes = self.field.encoding
         assert isinstance(planes, FeaturePlanes)
         factors = [(scale, index) for scale, group in enumerate(planes.layout.axes) for index in range(len(group))]
-        variations, roughness, activity = [], [zero], [zero]
-        for (scale, index), plane in zip(factors, planes.bands(factors, whole={3}), strict=True):
-            if 3 not in planes.layout.axes[scale][index]:
-                variations.append((_squared_steps(plane, 0) + _squared_steps(plane, 1)) / 2)
-                continue
-            variations.append(_squared_steps(plane, 1))
-            roughness.append(plane.diff(n=2, dim=0).square().mean())
-            activity.append((1 - plane).abs().mean())
-        count = max(len(roughness) - 1, 1)
-        return torch.stack(variations).mean(), torch.stack(roughness).sum() / count, torch.stack(activity).sum() / count
+        in_time = [(scale, index) for scale, index in factors if 3 in planes.layout.axes[scale][index]]
+        in_space = [factor for factor in factors if factor not in in_time]
+        chosen = [in_time[turn % len(in_time)]] if in_time else []
+        bands = planes.bands(in_space + chosen, whole={3})
+        steps = [(_squared_steps(band, 0) + _squared_steps(band, 1)) / 2 for band in bands[: len(in_space)]]
+        variation = torch.stack(steps).sum() / len(factors)
+        if not in_time:
+            return variation, zero, zero
+        plane, share = bands[-1], len(in_time) / len(factors)
+        variation = variation + share * _squared_steps(plane, 1)
+        return variation, plane.diff(n=2, dim=0).square().mean(), (1 - plane).abs().mean()
 
 
 def _squared_steps(plane: Tensor, dim: int) -> Tensor:
@@ -156,7 +168,14 @@ def decide(config: KPlanesConfig, scene: Scene) -> tuple[KPlanesConfig, list[Dec
         Choice("num_scales", scales, f"the images have {scene.image_size} pixels", "scales"),
     )
     config, few = decide_few_images(config, scene)
-    made += few
+    config, motion = decide_motion(config, scene, config.sampler)
+    sliced = scene.moving and config.time_slices > 1 and not scene.unbounded  # nested boxes have no slices
+    cells = Choice("grid_resolution", 64 if sliced else 128, "each slice of time has cells of its own")
+    times = f"the images have {scene.num_times} times"
+    axis = Choice("time_resolution", vertices_in_time(scene), times, "vertices along time")
+    config, coarser = fill(config, cells)
+    config, along = fill(config, axis)
+    made += few + motion + coarser * bool(motion and sliced) + along * scene.moving
     if not scene.moving:
         made.append(Decision("planes of time", "left out", "the images have no times"))
     return config, made

@@ -7,12 +7,16 @@ from typing import Any
 import pytest
 import torch
 
+from framework.base.registry import load_method
 from framework.cameras.view import View
 from framework.data.pixels import composite
+from framework.data.scene import Scene
 from framework.fields.deformed import DeformedField
 from framework.fields.nerf import NeRFField
 from framework.geometry.points import Points
-from framework.scene.silhouettes import Silhouettes, visual_hull
+from framework.geometry.rays import Rays
+from framework.samplers.proposal import ProposalSampler
+from framework.scene.silhouettes import Silhouettes, moving_hulls, visual_hull
 from framework.training.trainer import Trainer
 from tests.training.helpers import tiny_run, tiny_trainer
 
@@ -20,7 +24,7 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "kplanes hybrid": ("kplanes", {}),
     "kplanes explicit": ("kplanes", {"decoder": "explicit"}),
     "dnerf": ("dnerf", {}),
-    "dnerf occupancy": ("dnerf", {"sampler": "occupancy", "samples_per_batch": 4096}),
+    "dnerf occupancy": ("dnerf", {"sampler": "occupancy", "samples_per_batch": 4096, "from_first_image": True}),
     "t-nerf": ("dnerf", {"variant": "t-nerf", "sampler": "occupancy", "samples_per_batch": 4096}),
     "dnerf hash": (
         "dnerf",
@@ -88,7 +92,8 @@ def test_what_is_deformed_learns_to_move(name: str, shared_tiny: Path, tmp_path:
     assert trainer.state.skipped == 0
     assert mean_squared_error(trainer) < 0.8 * before
     assert field.displacement(positions, torch.ones(100)).abs().max() > 10 * small
-    assert bool((field.displacement(positions, torch.zeros(100)) == 0).all())
+    fixed = bool((field.displacement(positions, torch.zeros(100)) == 0).all())
+    assert fixed == trainer.config.from_first_image
 
 
 @pytest.mark.parametrize(("name", "what"), [("kplanes hybrid", "planes of time"), ("dnerf", "deformation")])
@@ -100,6 +105,58 @@ def test_without_times_what_they_need_is_left_out(name: str, what: str, shared_t
     assert said[what] == "left out"
     assert what not in {decision.option for decision in moving.profile().decisions}
     assert still.model.size() < moving.model.size()
+
+
+def test_the_first_image_is_like_the_others() -> None:
+    """Displacements are continuous at time 0, unless they are fixed there."""
+    torch.manual_seed(0)
+    positions, times = torch.rand(9, 3), torch.tensor([0.0, 1e-6])
+    for fixed in (False, True):
+        field = DeformedField(NeRFField(32, 3, 2), 32, 3, fixed_start=fixed)
+        torch.nn.init.normal_(field.after_skip[-1].weight)  # type: ignore[arg-type]
+        at_start, soon = (field.displacement(positions, time.expand(9)) for time in times)
+        assert soon.norm(dim=-1).min() > 0.1
+        assert torch.allclose(at_start, soon, atol=1e-3) != fixed
+
+
+def times_decided(method: str, count: int, **settings: Any) -> dict[str, str]:
+    """What `method` decides about a scene whose images have `count` times, by the option's words."""
+    scene = Scene(torch.tensor([[-1.0] * 3, [1.0] * 3]), 0.1, 4.0, count, True, True, 64, num_times=count)
+    found = load_method(method)
+    _, made = found.decided(dataclasses.replace(found.config, **settings), scene)
+    return {decision.option: decision.choice for decision in made}
+
+
+def test_the_number_of_times_decides_about_time() -> None:
+    """A sixth as many vertices, three at least; a slice for four, at most 16."""
+    many, few = times_decided("kplanes", 150), times_decided("kplanes", 8)
+    assert many["vertices along time"] == "25"
+    assert many["slices of time in the occupancy grid"] == "16"
+    assert few["vertices along time"] == "3"
+    assert few["slices of time in the occupancy grid"] == "2"
+    assert "slices of time in the occupancy grid" not in times_decided("kplanes", 8, sampler="proposal")
+    assert "slices of time in the occupancy grid" not in times_decided("dnerf", 8)
+    assert times_decided("dnerf", 48, sampler="occupancy")["slices of time in the occupancy grid"] == "12"
+
+
+def test_proposals_of_a_method_that_learns_motion_see_time() -> None:
+    scene = Scene(torch.tensor([[-1.0] * 3, [1.0] * 3]), 0.1, 4.0, 9, False, True, 64, unbounded=True, num_times=9)
+    found = load_method("kplanes")
+    config, _ = found.decided(dataclasses.replace(found.config, base_resolution=8), scene)
+    model = found.build(config, scene)
+    sampler = model.sampler
+    assert isinstance(sampler, ProposalSampler)
+    torch.manual_seed(0)
+    rays = Rays(torch.zeros(4, 3), torch.eye(3)[[0, 1, 2, 0]], torch.full((4,), 0.1), torch.full((4,), 4.0))
+    for proposal in sampler.proposals:
+        with torch.no_grad():
+            proposal.encoding.table.uniform_(0, 2)  # planes of time start at 1, where nothing moves
+    starts = [
+        sampler.sample(dataclasses.replace(rays, times=torch.full((4,), time)), model.field, jitter=False).t_starts
+        for time in (0.1, 0.1, 0.6)
+    ]
+    assert torch.equal(starts[0], starts[1])
+    assert (starts[0] - starts[2]).abs().max() > 1e-3
 
 
 def test_nothing_is_displaced_at_time_zero() -> None:
@@ -125,7 +182,9 @@ def test_a_moving_scene_keeps_its_pixels_and_its_union_of_cells(shared_tiny: Pat
     trainer.train()
     assert trainer.train_set.drawn is None
     sampler = trainer.model.sampler
-    hull = visual_hull(Silhouettes.of(trainer.train_set), sampler.box, sampler.resolution, moving=True)
-    still = visual_hull(Silhouettes.of(trainer.train_set), sampler.box, sampler.resolution)
+    silhouettes, times = Silhouettes.of(trainer.train_set), trainer.train_set.times
+    assert times is not None
+    hull = moving_hulls(silhouettes, sampler.box, sampler.resolution, times, sampler.slices)
+    still = visual_hull(silhouettes, sampler.box, sampler.resolution)
     assert torch.equal(sampler.carved, ~hull)
     assert bool(hull[still].all())

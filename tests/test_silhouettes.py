@@ -1,14 +1,16 @@
 """The visual hull: no cell that matters is lost, and no pixel that could see one."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 
 from dataparsers.blender import Blender
+from framework.cameras.cameras import Cameras
 from framework.data.dataset import Dataset, load_dataset
 from framework.kernels.march import Occupancy, candidates
-from framework.scene.silhouettes import Silhouettes, pixels_near, visual_hull
+from framework.scene.silhouettes import Silhouettes, moving_hulls, pixels_near, visual_hull
 from tests.conftest import write_tiny
 
 BOX = torch.tensor([[-1.2, -1.2, -1.2], [1.2, 1.2, 1.2]])
@@ -91,9 +93,10 @@ def test_of_a_moving_scene_all_that_is_ever_seen_stays(ball: Dataset) -> None:
     pixels[: 12 * 6400, 3] = 0
     silhouettes = Silhouettes.of(replace(ball, pixels=pixels))
     assert not bool(visual_hull(silhouettes, BOX / 2, 16).any())
-    hull = visual_hull(silhouettes, BOX, 16, moving=True)
+    times = torch.linspace(0, 1, 24)
+    hull = moving_hulls(silhouettes, BOX, 16, times)
     assert bool(hull[centers(16).norm(dim=-1) < 1].all())
-    assert bool(visual_hull(silhouettes, BOX / 4, 4, moving=True).all())
+    assert bool(moving_hulls(silhouettes, BOX / 4, 4, times).all())
 
 
 def test_of_a_moving_scene_what_all_photographs_show_empty_goes(ball: Dataset) -> None:
@@ -101,7 +104,38 @@ def test_of_a_moving_scene_what_all_photographs_show_empty_goes(ball: Dataset) -
     wide = replace(ball, cameras=replace(ball.cameras, fx=ball.cameras.fx / 3, fy=ball.cameras.fy / 3))
     pixels = torch.zeros_like(wide.pixels).view(24, 80, 80, 4)
     pixels[:, 38:42, 38:42, 3] = 255  # all that any of them shows is in the middle
-    hull = visual_hull(Silhouettes.of(replace(wide, pixels=pixels.view(-1, 4))), BOX, 16, moving=True)
+    hull = moving_hulls(Silhouettes.of(replace(wide, pixels=pixels.view(-1, 4))), BOX, 16, torch.linspace(0, 1, 24))
     assert bool(hull[centers(16).norm(dim=-1) < 0.2].all())
     assert not bool(hull.all())
     assert hull.float().mean() < 0.9
+
+
+def disc(cameras: Cameras, image: int, center: torch.Tensor, radius: float) -> torch.Tensor:
+    """The pixels (H, W) bool whose ray meets a ball, by the distance between its centre and the ray."""
+    rays = cameras.pixel_rays(cameras.image_pixels(image), 0.1, 20)
+    apart = (center - rays.origins).cross(rays.directions, dim=-1).norm(dim=-1)
+    return (apart < radius).view(int(cameras.heights[image]), int(cameras.widths[image]))
+
+
+@pytest.mark.parametrize("slices", [1, 3, 8])
+def test_a_flying_ball_is_never_outside_the_hull_of_its_time(ball: Dataset, slices: int) -> None:
+    """At all times, those between two images too; and what the hull leaves grows less with the number of slices."""
+    wide = replace(ball, cameras=replace(ball.cameras, fx=ball.cameras.fx / 2, fy=ball.cameras.fy / 2))
+    times, radius = torch.linspace(0, 1, 24), 0.25
+
+    def place(time: float) -> torch.Tensor:
+        return torch.tensor([1.6 * time - 0.8, 0.5 * math.sin(3 * time), 0.3 - 0.6 * time])
+
+    pixels = torch.zeros_like(wide.pixels).view(24, 80, 80, 4)
+    for image, time in enumerate(times.tolist()):
+        pixels[image, disc(wide.cameras, image, place(time), radius)] = 255
+    silhouettes = Silhouettes.of(replace(wide, pixels=pixels.view(-1, 4)))
+    hull = moving_hulls(silhouettes, BOX, 16, times, slices).view(slices, -1)
+    for time in torch.linspace(0, 1, 97).tolist():
+        inside = (centers(16) - place(time)).norm(dim=-1) < radius
+        assert bool(inside.any())
+        assert bool(hull[min(int(time * slices), slices - 1)][inside].all())
+    far = (centers(16) - place(0.0)).norm(dim=-1) > 1.0  # at the beginning most of this is known to be empty
+    assert hull[0][far].float().mean() < {1: 1.01, 3: 0.75, 8: 0.5}[slices]
+    if slices == 1:
+        assert torch.equal(hull[0], moving_hulls(silhouettes, BOX, 16, times))

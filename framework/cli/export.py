@@ -205,7 +205,7 @@ def _occupancy(flags: OccupancyFlags, trained: Trained, placement: Placement, pa
     if flags.cells == "boxes":
         _need_packages("--cells boxes needs", "; or take --cells centers")
     grid = grids[0]
-    count = int(grid.occupied[: grid.resolution**3].sum())
+    count = int(grid.occupied_when()[: grid.resolution**3].sum())
     write_grid(path, grid, placement)
     say(f"{grid.resolution}^3 cells, {count:,} occupied: {path}")
     if not count:

@@ -27,6 +27,7 @@ from framework.data.dataset import DataParser
 from framework.samplers.background import BackgroundConfig
 from framework.samplers.choice import HierarchicalConfig, SamplingConfig
 from framework.scene.few_images import FewImagesConfig
+from framework.scene.motion import MotionConfig
 
 OWN = "METHOD"
 """Placeholder of the method's name, whose group has all settings that no other group has."""
@@ -41,6 +42,7 @@ GROUPS: dict[str, tuple[str | type, ...]] = {
     "ray": (RayConfig,),
     "appearance": (AppearanceConfig,),
     "few images": (FewImagesConfig,),
+    "motion": (MotionConfig,),
     "optimisation": (
         "learning_rate", "lr_schedule", "lr_final", "lr_warmup_steps", "adam_beta1", "adam_beta2", "adam_eps",
     ),

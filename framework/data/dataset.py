@@ -341,6 +341,7 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         camera_to_worlds=cameras.camera_to_worlds,
         image_pixels=int(cameras.offsets[-1]) // len(cameras),
         num_sparse_depths=0 if sparse is None else len(sparse),
+        num_times=0 if parsed.times is None else len(parsed.times.unique()),
         num_scenes=1 if parsed.scene_indices is None else len(parsed.scene_indices.unique()),
     )
     return Dataset(

@@ -64,6 +64,23 @@ class PixelBatch:
         return max(len(self.rays) // max(len(self), 1), 1)
 
 
+def thinned(batch: PixelBatch, share: float) -> tuple[PixelBatch, Tensor]:
+    """Return a batch without some of its transparent pixels, and which pixels (R,) bool are left.
+
+    Those that are left count as many times more as there were, so that the mean of a loss has the same expectation.
+
+    Args:
+        batch: pixels with alpha.
+        share: probability with which a pixel of alpha 0 is kept.
+    """
+    assert batch.alpha is not None
+    transparent = batch.alpha == 0
+    kept = ~transparent | (torch.rand(len(batch), device=transparent.device) < share)
+    left = batch[kept]
+    weights = torch.where(transparent[kept], 1 / share, 1.0) * (len(left) / max(len(batch), 1))
+    return replace(left, weights=weights if left.weights is None else weights * left.weights), kept
+
+
 @dataclass(frozen=True)
 class ViewBatch:
     """One whole image to learn from."""

@@ -114,9 +114,10 @@ class LatticeDensity:
         return inside & occupied[cells.cells(positions)]
 
     def _occupancy(self) -> Occupancy:
-        """Return the grid on the CPU."""
+        """Return the grid on the CPU, at the time of the density."""
         assert self.grid is not None
-        return Occupancy(self.grid.occupied.cpu(), self.grid.box.cpu(), self.grid.resolution, self.grid.levels)
+        occupied = self.grid.occupied_when(self.time)
+        return Occupancy(occupied.cpu(), self.grid.box.cpu(), self.grid.resolution, self.grid.levels)
 
     @torch.no_grad()
     def _evaluated(self, positions: Tensor) -> Tensor:

@@ -64,9 +64,9 @@ def write_grid(file: Path, grid: SkipsCells, placement: Placement) -> None:
 
 
 def innermost(grid: SkipsCells) -> Tensor:
-    """Return the occupied cells (n, n, n) bool of the smallest box of `grid`, on the CPU."""
+    """Return the cells (n, n, n) bool of the smallest box of `grid` that are occupied at any time, on the CPU."""
     n = grid.resolution
-    return grid.occupied[: n**3].cpu().view(n, n, n)
+    return grid.occupied_when()[: n**3].cpu().view(n, n, n)
 
 
 def cell_centers(grid: SkipsCells, placement: Placement) -> Tensor:

@@ -18,13 +18,16 @@ class DeformedField(Field):
     """A canonical field with a learnt displacement of every position and time.
 
     Args:
-        canonical: the field at time 0, where the displacement is zero (equation 2).
+        canonical: the field to which positions are displaced.
         width: features of a hidden layer of the displacement network (256 in the paper).
         depth: hidden layers of the displacement network (8 in the paper).
         position_frequencies: number L of frequencies of the encoded positions (10 in the paper).
         time_frequencies: number L of frequencies of the encoded times (4 in the paper).
         contracted: (2, 3) box around which all of space is contracted into [-1, 1]^3, the range that the frequencies
             are made for; None to encode scene coordinates.
+        fixed_start: whether the displacement is zero at time 0, so that the canonical field is the scene at that time
+            (equation 2). The network is smooth in time and cannot follow: it bends all other times towards what suits
+            them best, and the first image alone sees the canonical field as it is.
     """
 
     contracted: Tensor | None
@@ -37,10 +40,11 @@ class DeformedField(Field):
         position_frequencies: int = 10,
         time_frequencies: int = 4,
         contracted: Tensor | None = None,
+        fixed_start: bool = True,
     ) -> None:
         super().__init__()
         self.register_buffer("contracted", None if contracted is None else contracted.clone())
-        self.canonical = canonical
+        self.canonical, self.fixed_start = canonical, fixed_start
         self.runs_on_kernels = canonical.runs_on_kernels
         self.position_frequencies, self.time_frequencies = position_frequencies, time_frequencies
         encoded = 3 + 6 * position_frequencies + 1 + 2 * time_frequencies
@@ -53,7 +57,7 @@ class DeformedField(Field):
         nn.init.zeros_(last.bias)
 
     def displacement(self, positions: Tensor, times: Tensor | None) -> Tensor:
-        """Return the displacement (N, 3) from positions at their times to positions at time 0, scene units.
+        """Return the displacement (N, 3) from positions at their times to those of the canonical field, scene units.
 
         Args:
             positions: (N, 3) scene coordinates.
@@ -70,6 +74,8 @@ class DeformedField(Field):
         )
         moved_by = self.after_skip(self.before_skip(*encoded), *encoded).float()
         assert times is not None
+        if not self.fixed_start:
+            return moved_by
         return torch.where(times[:, None] == 0, torch.zeros_like(moved_by), moved_by)
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:

@@ -136,6 +136,7 @@ class CompiledMarch(March):
         count = len(rays)
         self.step, self.cone, self.resolution, self.levels = step, cone, occupancy.resolution, occupancy.levels
         self.bits, self.blocks = occupancy.packed
+        self.slices = occupancy.slices_of(rays.times)
         self.origins, self.directions = rays.origins.contiguous(), rays.directions.contiguous()
         self.enter, self.leave, self.first = (torch.empty(count) for _ in range(3))
         self.box, outer = occupancy.box.contiguous(), occupancy.outer.contiguous()
@@ -163,10 +164,10 @@ class CompiledMarch(March):
         owners = torch.empty(room, dtype=torch.int64)
         count = _wave(
             self.origins.data_ptr(), self.directions.data_ptr(), self.enter.data_ptr(), self.leave.data_ptr(),
-            self.first.data_ptr(), self.next.data_ptr(), self.alive.data_ptr(), living, limit, self.box.data_ptr(),
-            self.step, self.cone, self.bits.data_ptr(), self.blocks.data_ptr(), self.resolution, self.levels,
-            self.counts.data_ptr(), starts.data_ptr(), ends.data_ptr(), owners.data_ptr(), positions.data_ptr(),
-            native.threads(),
+            self.first.data_ptr(), None if self.slices is None else self.slices.data_ptr(), self.next.data_ptr(),
+            self.alive.data_ptr(), living, limit, self.box.data_ptr(), self.step, self.cone, self.bits.data_ptr(),
+            self.blocks.data_ptr(), self.resolution, self.levels, self.counts.data_ptr(), starts.data_ptr(),
+            ends.data_ptr(), owners.data_ptr(), positions.data_ptr(), native.threads(),
         )  # fmt: skip
         wave = Wave(starts[:count], ends[:count], owners[:count], positions[:count])
         self.waves.append(wave)
@@ -277,7 +278,7 @@ def march(rays: Rays, occupancy: Occupancy, step: float, cone: float, shift: Ten
 
     Args:
         rays: R rays.
-        occupancy: the grid, of one box or of several.
+        occupancy: the grid, of one box or of several, or with slices of time, for which rays need times.
         step: length of a step near the camera, scene units.
         cone: growth of a step per unit of distance; 0 for even steps.
         shift: (R,) fraction of a step by which the first step starts in front of the box; None for 0.
@@ -336,7 +337,7 @@ def candidates(
         owners, k = _near_occupied(rays, occupancy, step, first, owners, k)
     starts, ends = (step_start(first.index_select(0, owners), k + after, step, cone) for after in (0, 1))
     middle = (starts + ends) / 2
-    cells = occupancy.cells(rays.points(owners, middle))
+    cells = occupancy.cells(rays.points(owners, middle), _of_rays(occupancy.slices_of(rays.times), owners))
     inside = (middle >= enter.index_select(0, owners)) & (middle < leave.index_select(0, owners))
     kept, offsets, longest = _chosen(occupancy.occupied.index_select(0, cells) & inside, owners, len(rays))
     starts, ends, owners = (values.index_select(0, kept) for values in (starts, ends, owners))
@@ -352,10 +353,16 @@ def _near_occupied(
     """
     reach = occupancy.near(math.ceil((RUN - 1) / 2 * step / occupancy.edge))
     middle = first.index_select(0, owners) + (run * RUN + RUN / 2) * step
-    kept = reach.index_select(0, occupancy.cells(rays.points(owners, middle))).nonzero().squeeze(-1)
+    cells = occupancy.cells(rays.points(owners, middle), _of_rays(occupancy.slices_of(rays.times), owners))
+    kept = reach.index_select(0, cells).nonzero().squeeze(-1)
     owners, run = owners.index_select(0, kept), run.index_select(0, kept)
     k = run[:, None] * RUN + torch.arange(RUN, device=run.device)
     return owners.repeat_interleave(RUN), k.reshape(-1)
+
+
+def _of_rays(values: Tensor | None, owners: Tensor) -> Tensor | None:
+    """Return the value (N,) of the ray of each of `owners` (N,); None if rays have none."""
+    return None if values is None else values.index_select(0, owners)
 
 
 def ranges(counts: Tensor) -> tuple[Tensor, Tensor]:
@@ -366,5 +373,5 @@ def ranges(counts: Tensor) -> tuple[Tensor, Tensor]:
 
 
 _begin: Callable[..., int] = native.Function("march_begin", "pppppqpfppppi", "q")
-_wave: Callable[..., int] = native.Function("march_wave", "pppppppqipffppiipppppi", "q")
+_wave: Callable[..., int] = native.Function("march_wave", "ppppppppqipffppiipppppi", "q")
 _advance: Callable[..., int] = native.Function("march_advance", "pqpipppfppp", "q")

@@ -2,7 +2,7 @@
 
 A grid has one box, or several that are nested, each of twice the size and with as many cells (Instant-NGP, Mueller et
 al. 2022, appendix E.2). A position belongs to the smallest box that it lies in, so the cells in the middle of a larger
-box are never looked up.
+box are never looked up. A grid of one box may have slices of time, each with cells of its own.
 """
 
 from __future__ import annotations
@@ -29,16 +29,18 @@ ROUNDING = 1e-5
 
 @dataclass(frozen=True)
 class Occupancy:
-    """The occupied cells of a grid over a box, or over L nested boxes."""
+    """The occupied cells of a grid over a box, over L nested boxes, or over a box in T slices of time."""
 
     occupied: Tensor
-    """(L n^3,) bool; the index of cell (x, y, z) of box l is ((l n + x) n + y) n + z."""
+    """(L n^3,) or (T n^3,) bool; the index of cell (x, y, z) of box or slice l is ((l n + x) n + y) n + z."""
     box: Tensor
     """(2, 3) minimum and maximum corner of the smallest box, scene units."""
     resolution: int
     """Number n of cells along each axis of a box; a multiple of 4 if there are several."""
     levels: int = 1
     """Number L of boxes."""
+    slices: int = 1
+    """Number T of equal parts of the time from 0 to 1; 1 if there are several boxes."""
 
     @cached_property
     def outer(self) -> Tensor:
@@ -47,13 +49,13 @@ class Occupancy:
 
     @cached_property
     def filled(self) -> Tensor:
-        """(L, n, n, n) `occupied`, where the middle of a larger box says what the smaller one holds.
+        """(L, n, n, n) or (T, n, n, n) `occupied`, where the middle of a larger box says what the smaller one holds.
 
         A cell there is occupied if one of the eight is that it consists of, so that a box can be crossed by what its
         own cells say.
         """
         n = self.resolution
-        boxes = self.occupied.view(self.levels, n, n, n)
+        boxes = self.occupied.view(self.levels * self.slices, n, n, n)
         if self.levels == 1:
             return boxes
         boxes, middle = boxes.clone(), slice(n // 4, n - n // 4)
@@ -65,14 +67,14 @@ class Occupancy:
 
     @cached_property
     def packed(self) -> tuple[Tensor, Tensor]:
-        """(L, ceil(n^3 / 8)) uint8 with one bit per cell, and (L, ceil(n / 4)^3) uint8, for the compiled march.
+        """(L or T, ceil(n^3 / 8)) uint8 with one bit per cell, (L or T, ceil(n / 4)^3) uint8, for the compiled march.
 
         The second tensor has, for each block of 4^3 cells, the distance in blocks to the nearest block of its box with
         an occupied cell.
         """
-        n = self.resolution
-        bits = torch.empty(self.levels, (n**3 + 7) // 8, dtype=torch.uint8)
-        blocks = torch.empty(self.levels, math.ceil(n / BLOCK) ** 3, dtype=torch.uint8)
+        n, count = self.resolution, self.levels * self.slices
+        bits = torch.empty(count, (n**3 + 7) // 8, dtype=torch.uint8)
+        blocks = torch.empty(count, math.ceil(n / BLOCK) ** 3, dtype=torch.uint8)
         for cells, its_bits, its_blocks in zip(self.filled, bits, blocks, strict=True):
             address = native.pointer(cells, "the occupancy", (n, n, n), torch.bool)
             _pack(address, n, its_bits.data_ptr(), its_blocks.data_ptr())
@@ -80,9 +82,21 @@ class Occupancy:
 
     @cached_property
     def distances(self) -> Tensor:
-        """(L ceil(n / 4)^3,) uint8 distances of blocks, as in `packed`, but at most 16, for the march on a GPU."""
+        """(L or T times ceil(n / 4)^3,) uint8 distances of blocks, as in `packed`, up to 16, for the march on a GPU."""
         find = later("march", "block_distances")
         return torch.cat([find(cells.flatten(), self.resolution) for cells in self.filled])
+
+    def slices_of(self, times: Tensor | None) -> Tensor | None:
+        """Return the slice (R,) int64 of each of `times` (R,); None if there is only one.
+
+        Raises:
+            ValueError: if there are several, and `times` is None.
+        """
+        if self.slices == 1:
+            return None
+        if times is None:
+            raise ValueError("this grid has slices of time: it needs the times of rays")
+        return (times * self.slices).long().clamp(0, self.slices - 1)
 
     @cached_property
     def edge(self) -> float:
@@ -90,7 +104,7 @@ class Occupancy:
         return ((self.box[1] - self.box[0]) / self.resolution).min().item()
 
     def near(self, radius: int) -> Tensor:
-        """Return the cells (n^3,) bool that have an occupied cell within `radius` cells along every axis."""
+        """Return the cells (T n^3,) bool that have an occupied cell within `radius` cells along every axis."""
         if radius not in self._near:
             self._near[radius] = dilated(self, radius)
         return self._near[radius]
@@ -99,13 +113,19 @@ class Occupancy:
     def _near(self) -> dict[int, Tensor]:
         return {}
 
-    def cells(self, positions: Tensor) -> Tensor:
-        """Return the index (N,) of the cell of each of `positions` (N, 3), or of the nearest cell if it is outside."""
+    def cells(self, positions: Tensor, slices: Tensor | None = None) -> Tensor:
+        """Return the index (N,) of the cell of each position, or of the nearest cell if it is outside.
+
+        Args:
+            positions: (N, 3) scene coordinates.
+            slices: (N,) slice of time of each; None for the first.
+        """
         scale = self.resolution / (self.box[1] - self.box[0])
         places = (positions - self.box[0]) * scale
         if self.levels > 1:
             return self._nested_cells(places)
         x, y, z = places.long().clamp(0, self.resolution - 1).unbind(-1)
+        x = x if slices is None else slices * self.resolution + x
         return (x * self.resolution + y) * self.resolution + z
 
     def _nested_cells(self, places: Tensor) -> Tensor:
@@ -175,10 +195,10 @@ def own_cells(levels: int, resolution: int) -> Tensor:
 
 
 def dilated(occupancy: Occupancy, radius: int) -> Tensor:
-    """Return the cells (n^3,) bool of one box, `occupancy`, with an occupied one within `radius` along every axis."""
+    """Return the cells (T n^3,) bool of one box, `occupancy`, with an occupied one within `radius` along every axis."""
     n = occupancy.resolution
-    grid = occupancy.occupied.view(n, n, n)
-    for axis in range(3):
+    grid = occupancy.occupied.view(-1, n, n, n)
+    for axis in range(1, 4):
         out = grid.clone()
         for shift in range(1, min(radius, n - 1) + 1):
             out.narrow(axis, 0, n - shift).logical_or_(grid.narrow(axis, shift, n - shift))

@@ -115,11 +115,14 @@ def footprint(photograph: Photograph, centers: Tensor, radius: float) -> tuple[T
     return torch.minimum(edges.nan_to_num().clamp(min=0), limits).long(), whole
 
 
-def _may_hold(photograph: Photograph, centers: Tensor, radius: float) -> Tensor:
+def _may_hold(photograph: Photograph, centers: Tensor, radius: float, every: bool) -> Tensor:
     (x0, x1, y0, y1), whole = footprint(photograph, centers, radius)
     flat, stride = photograph.sums.view(-1), photograph.width + 1
     count = flat[y1 * stride + x1] - flat[y1 * stride + x0] - flat[y0 * stride + x1] + flat[y0 * stride + x0]
-    return ~whole | (count > 0)
+    if every:
+        return ~whole | (count > 0)
+    depth = photograph.depth(centers)
+    return torch.where(depth > radius, count > 0, ~(depth <= -radius))
 
 
 def hold_balls_reference(photograph: Photograph, centers: Tensor, radius: float, held: Tensor, every: bool) -> None:
@@ -128,21 +131,22 @@ def hold_balls_reference(photograph: Photograph, centers: Tensor, radius: float,
     `photograph`, `centers`, `radius`, `held` and `every` are as in `hold_balls`.
     """
     rest = (held if every else ~held).nonzero().squeeze(-1)
-    held[rest] = _may_hold(photograph, centers[rest], radius)
+    held[rest] = _may_hold(photograph, centers[rest], radius, every)
 
 
 def hold_balls(photograph: Photograph, centers: Tensor, radius: float, held: Tensor, every: bool) -> None:
     """Update, in place, which balls may hold matter, by one image.
 
-    An image shows a ball to be empty if the ball's `footprint` is entirely inside the image and has no opaque pixel.
+    An image shows a ball to be empty if the ball's `footprint` is entirely inside the image and has no opaque pixel. It
+    shows matter in a ball's direction if the part of the footprint that is inside the image has an opaque pixel.
 
     Args:
         photograph: the image.
         centers: (N, 3) centres of the balls, scene coordinates.
         radius: radius of the balls, scene units.
         held: (N,) bool, the result of the images before.
-        every: True for balls that no image shows to be empty, where `held` starts as True; False for balls that at
-            least one image does not show to be empty, where `held` starts as False.
+        every: True for balls that no image shows to be empty, where `held` starts as True; False for balls in whose
+            direction at least one image shows matter, and balls around a camera's plane, where `held` starts as False.
     """
     HOLD_BALLS((photograph.pose, centers), photograph, centers, radius, held, every)
 

@@ -50,6 +50,22 @@ def charbonnier(prediction: Tensor, target: Tensor, weights: Tensor | None = Non
     return errors.mean() if weights is None else (errors * weights[:, None]).mean()
 
 
+def opacity_of_transparent(accumulation: Tensor, alpha: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Return the mean () over pixels of the rendered opacity where it is known to be 0; 0 for no pixels.
+
+    Unlike that of a squared error, its gradient does not fade with the opacity, so that thin fog goes too.
+
+    Args:
+        accumulation: (P,) rendered opacity.
+        alpha: (P,) opacity of the images' pixels; only where it is 0, which leaves no doubt, pixels count.
+        weights: (P,) factor of each pixel; None for 1.
+    """
+    if accumulation.numel() == 0:
+        return accumulation.sum()
+    wrong = torch.where(alpha == 0, accumulation, torch.zeros_like(accumulation))
+    return (wrong if weights is None else wrong * weights).mean()
+
+
 def normalised_distortion(weights: Tensor, samples: Samples, scale: float | None = None) -> Tensor:
     """Return the mean distortion () of rays in normalised distance: mip-NeRF 360 (Barron et al. 2022), equation 15.
 

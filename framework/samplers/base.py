@@ -70,16 +70,23 @@ class SkipsCells(Protocol):
     """Number n of cells along each axis of a box."""
     levels: int
     """Number L of boxes."""
+    slices: int
+    """Number T of equal parts of the time from 0 to 1, each of which has cells of its own; 1 for a still scene, or if
+    there are several boxes."""
     occupied: Tensor
-    """(L n^3,) bool, True for cells that are sampled; cell (x, y, z) of box l has the index ((l n + x) n + y) n + z."""
+    """(L n^3,) or (T n^3,) bool, True for cells that are sampled; cell (x, y, z) of box or slice l has the index
+    ((l n + x) n + y) n + z."""
     carved: Tensor
-    """(L n^3,) bool, True for cells that stay empty; also for those in the middle of a box, in the place of which a
-    smaller box is looked at."""
+    """(L n^3,) or (T n^3,) bool, True for cells that stay empty; also for those in the middle of a box, in the place of
+    which a smaller box is looked at."""
     early_stop: float
     """Transmittance below which the rest of a ray is dropped, as in `StopsEarly`."""
 
+    def occupied_when(self, time: float | None = None) -> Tensor:
+        """Return the cells (L n^3,) that are occupied in the slice of `time`, or at any time if it is None."""
+
     def carve(self, hull: Tensor) -> None:
-        """Mark all cells outside `hull` (L n^3,) bool as empty, permanently."""
+        """Mark all cells outside `hull`, (L n^3,) or (T n^3,) bool, as empty, permanently."""
 
     def forget(self) -> None:
         """Discard what was computed from `occupied`; to be called after `occupied` has changed."""

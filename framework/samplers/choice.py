@@ -13,16 +13,22 @@ from framework.base.config import Auto, Range, RayConfig
 from framework.base.decisions import Choice, Decision, fill
 from framework.base.errors import ConfigError
 from framework.data.scene import Scene
+from framework.encodings.planes import FeaturePlanes
 from framework.fields.base import Field
+from framework.fields.encoded import DensityField
 from framework.samplers.base import Sampler
 from framework.samplers.hierarchical import LEAST_COARSE, HierarchicalSampler
 from framework.samplers.occupancy import MAX_CELLS, MAX_LEVELS, OccupancySampler
 from framework.samplers.proposal import LEARN_EVERY, ProposalSampler, half_edge
+from framework.scene.motion import MotionConfig, vertices_in_time
 
 COARSEST_PROPOSAL = 128
 """Cells along an axis at the finest level of the first proposal; each further proposal has twice as many."""
 MOST_PROPOSALS = 8
 """Maximum number of proposals."""
+COARSEST_MOVING, MOVING_FEATURES = 64, 8
+"""Vertices per axis of space of the first proposal of a scene that moves, each further one having twice as many, and
+features of a vertex: those of K-Planes, whose proposals are planes in space and time."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +156,8 @@ def make_sampler(
         scene: properties of the scene.
         make_coarse: creates the coarse field of `--sampler hierarchical`, or returns None if the field serves as its
             own; None if the method has no such level.
-        proposals: density fields of `--sampler proposal`; hash grids if None.
+        proposals: density fields of `--sampler proposal`; if None, hash grids, or planes in space and time for a method
+            that learns motion.
         learn_every: interval of steps at which proposals learn.
 
     Raises:
@@ -168,8 +175,12 @@ def _sampler(
     proposals: Sequence[Field] | None,
     learn_every: int,
 ) -> Sampler:
+    sees_time = scene.moving and isinstance(config, MotionConfig)
     if config.sampler == "proposal":
-        resolutions = tuple(COARSEST_PROPOSAL << level for level in range(len(config.num_proposal_samples)))
+        count = range(len(config.num_proposal_samples))
+        resolutions = tuple(COARSEST_PROPOSAL << level for level in count)
+        if proposals is None and sees_time:
+            proposals = [_moving_proposal(scene, COARSEST_MOVING << level) for level in count]
         return ProposalSampler(
             scene.box,
             (*config.num_proposal_samples, config.num_nerf_samples),
@@ -183,6 +194,7 @@ def _sampler(
         if make_coarse is None:
             raise ConfigError("--sampler hierarchical: this method has no coarse field")
         return HierarchicalSampler(make_coarse(), config.num_coarse_samples, config.num_fine_samples)
+    levels = _levels(config, scene) if scene.unbounded else 1
     return OccupancySampler(
         scene.box,
         config.nested_resolution if scene.unbounded else config.grid_resolution,
@@ -191,9 +203,16 @@ def _sampler(
         config.train_early_stop,
         cone=config.cone_angle if scene.unbounded else 0.0,
         moving=scene.moving,
-        levels=_levels(config, scene) if scene.unbounded else 1,
+        levels=levels,
         endless=not scene.has_alpha and scene.unbounded,
+        slices=config.time_slices if isinstance(config, MotionConfig) and sees_time and levels == 1 else 1,
     )
+
+
+def _moving_proposal(scene: Scene, resolution: int) -> DensityField:
+    """Return a density on planes in space and time, of `resolution` vertices per axis of space."""
+    vertices = (resolution,) * 3 + (vertices_in_time(scene),)
+    return DensityField(scene.box, FeaturePlanes((vertices,), MOVING_FEATURES), unbounded=scene.unbounded)
 
 
 def _levels(config: SamplingConfig, scene: Scene) -> int:

@@ -3,7 +3,8 @@
 The grid is that of Instant-NGP (Mueller et al. 2022, appendix E.2): it holds a decaying maximum of the density in each
 cell, and a cell is skipped while a step through it is nearly transparent. A scene without bounds has several nested
 boxes, each twice as large as the one before, through which steps grow with distance; all that is behind the largest is
-one last sample, as long as it takes to be opaque.
+one last sample, as long as it takes to be opaque. The grid of a moving scene in one box may have slices of time, so
+that a ray skips what is empty at its own time.
 """
 
 from __future__ import annotations
@@ -42,7 +43,10 @@ WARM_UP_DECAY, DECAY = 0.7, 0.8
 """Factors of a cell's density at each update, during warm-up and afterwards."""
 TIMES_PER_VISIT, MOVING_DECAY = 4, 0.95
 """Number of times at which a cell of a moving scene is evaluated at each update, and the factor of its density, which
-is larger because a cell may be occupied for a short time only."""
+is larger because a cell may be occupied for a short time only. Both are for a grid with one slice of time."""
+SHARE, SHARE_OF_SLICES = 64, 128
+"""Numbers of cells for each one that is drawn from all cells at an update after warm-up, without and with slices of
+time. With them there are more cells, of which fewer are occupied."""
 COARSE_STEPS = (WARM_UP_STEPS // 4, 4.0), (WARM_UP_STEPS, 2.0)
 """Training steps until which the march through nested boxes takes longer steps, and how much longer these are. While
 nothing is known to be empty, few rays would take all samples."""
@@ -65,13 +69,14 @@ class OccupancySampler(Sampler):
             over its box, or over the smallest one, if both are less.
         cone: growth of the step per unit of distance, beyond the distance where it exceeds the even step; 0 for even
             steps throughout.
-        moving: whether the scene changes with time; a cell is then occupied if it is at any time.
+        moving: whether the scene changes with time; a cell is then occupied if it is at any time of its slice.
         levels: number of nested boxes, each of twice the size and with as many cells.
         endless: whether rays have a last sample for all that is behind the largest box, which any density makes opaque:
             for images without an alpha channel.
+        slices: number T of equal parts of the time from 0 to 1, each of which has cells of its own.
 
     Raises:
-        ConfigError: if the number of cells, boxes or steps is out of range.
+        ConfigError: if the number of cells, boxes, slices or steps is out of range.
     """
 
     box: Tensor
@@ -91,6 +96,7 @@ class OccupancySampler(Sampler):
         moving: bool = False,
         levels: int = 1,
         endless: bool = False,
+        slices: int = 1,
     ) -> None:
         super().__init__()
         if not 1 <= resolution <= MAX_CELLS or not num_steps >= 1:
@@ -103,7 +109,12 @@ class OccupancySampler(Sampler):
                 f"1 to {MAX_LEVELS} boxes are nested, with a multiple of 4 cells along an axis, "
                 f"not {shown(levels)} with {resolution}"
             )
-        self.resolution, self.levels, self.endless = resolution, levels, endless
+        if slices != 1 and not (1 < slices * resolution**3 <= MAX_CELLS**3 and slices > 0 and moving and levels == 1):
+            raise ConfigError(
+                f"{shown(slices)} slices of time: there is 1, or more in one box of a scene that moves, with at most "
+                f"{MAX_CELLS}^3 cells in all"
+            )
+        self.resolution, self.levels, self.endless, self.slices = resolution, levels, endless, slices
         self.step_size = (box[1] - box[0]).norm().item() / num_steps
         self.early_stop = early_stop
         self.train_early_stop = early_stop if train_early_stop is None else train_early_stop
@@ -112,7 +123,7 @@ class OccupancySampler(Sampler):
         self.moving = moving
         self._stride = 1.0
         self.register_buffer("box", box.clone())
-        self.register_buffer("occupied", own_cells(levels, resolution).to(box.device))
+        self.register_buffer("occupied", own_cells(levels, resolution).repeat(slices).to(box.device))
         self.register_buffer("carved", ~self.occupied)
         self.register_buffer("density_grid", torch.where(self.occupied, torch.inf, 0.0))
         self._packed: Occupancy | None = None
@@ -121,14 +132,21 @@ class OccupancySampler(Sampler):
     @property
     def occupied_share(self) -> float:
         """Fraction of the cells that are occupied, of those that are not in a smaller box."""
-        return int(self.occupied.sum()) / int(own_cells(self.levels, self.resolution).sum())
+        return int(self.occupied.sum()) / (self.slices * int(own_cells(self.levels, self.resolution).sum()))
 
     @property
     def occupancy(self) -> Occupancy:
         """The grid in the form that `march` needs."""
         if self._packed is None or self._packed.occupied is not self.occupied:
-            self._packed = Occupancy(self.occupied, self.box, self.resolution, self.levels)
+            self._packed = Occupancy(self.occupied, self.box, self.resolution, self.levels, self.slices)
         return self._packed
+
+    def occupied_when(self, time: float | None = None) -> Tensor:
+        """Return the cells (L n^3,) that are occupied in the slice of `time`, or at any time if it is None."""
+        of_slices = self.occupied.view(self.slices, -1)
+        if time is None:
+            return of_slices.any(0)
+        return of_slices[min(max(int(time * self.slices), 0), self.slices - 1)]
 
     def forget(self) -> None:
         """Discard `occupancy`, which is computed again on demand; to be called after `occupied` has changed."""
@@ -198,10 +216,16 @@ class OccupancySampler(Sampler):
     # -- updating the grid ------------------------------------------------------------------------------------
 
     def carve(self, hull: Tensor) -> None:
-        """Mark all cells outside `hull` (L n^3,) bool (`framework.scene.silhouettes`) as empty, permanently."""
-        self.carved.copy_(~(hull & own_cells(self.levels, self.resolution).to(hull.device)))
+        """Mark cells as empty, permanently.
+
+        Args:
+            hull: (L n^3,) or (T n^3,) bool (`framework.scene.silhouettes`), False for these cells; or, with slices of
+                time, (n^3,) for all of them.
+        """
+        own = own_cells(self.levels, self.resolution).to(hull.device)
+        self.carved.view(self.slices, -1).copy_(~(hull.view(-1, len(own)) & own))
         self.density_grid.masked_fill_(self.carved, 0)
-        self.occupied.logical_and_(hull)
+        self.occupied.masked_fill_(self.carved, False)
         self.forget()
 
     @torch.no_grad()
@@ -223,15 +247,13 @@ class OccupancySampler(Sampler):
         if step == 0 or step % (8 if warming_up else 16):
             return
         cells = self._shuffled(step // 8 - 1) if warming_up else self._drawn()
-        n = self.resolution
-        level, cell = cells // n**3, cells % n**3
-        corner = torch.stack([cell // n**2, cell // n % n, cell % n], dim=-1)
-        unit = (corner + torch.rand(len(cells), 3, device=cells.device)) / n
-        low, high = self.box if self.levels == 1 else nested_boxes(self.box, self.levels)[level].unbind(1)
+        place = self._places(cells)
+        unit = (place[:, 1:] + torch.rand(len(cells), 3, device=cells.device)) / self.resolution
+        low, high = self.box if self.levels == 1 else nested_boxes(self.box, self.levels)[place[:, 0]].unbind(1)
         positions = torch.lerp(low, high, unit)
-        sigma = _in_chunks(density, positions, None) if not self.moving else _over_time(density, positions)
+        sigma = self._over_time(density, positions, place[:, 0]) if self.moving else _in_chunks(density, positions)
         before = self.density_grid.index_select(0, cells)
-        before *= WARM_UP_DECAY if warming_up else MOVING_DECAY if self.moving else DECAY
+        before *= WARM_UP_DECAY if warming_up else MOVING_DECAY if self.moving and self.slices == 1 else DECAY
         evaluated = torch.isfinite(before)
         self.density_grid.index_copy_(0, cells, torch.where(evaluated, torch.maximum(before, sigma), sigma))
         if self.levels > 1 and step < WARM_UP_STEPS // 4:
@@ -272,7 +294,7 @@ class OccupancySampler(Sampler):
         evaluated twice, which does no harm.
         """
         num_cells = len(self.occupied)
-        third = max(num_cells // 64, 1)
+        third = max(num_cells // (SHARE if self.slices == 1 else SHARE_OF_SLICES), 1)
         device = self.occupied.device
         occupied = self.occupied.nonzero().squeeze(-1)
         anywhere = torch.randint(num_cells, (third,), device=device)
@@ -283,13 +305,28 @@ class OccupancySampler(Sampler):
         neighbours = self._beside(centers)
         return torch.cat([anywhere, drawn, neighbours[~self.carved[neighbours]]])
 
-    def _beside(self, cells: Tensor) -> Tensor:
-        """Return a random neighbour of each of `cells` in its box, or the cell itself."""
+    def _places(self, cells: Tensor) -> Tensor:
+        """Return the box or slice, and the place along x, y and z, (N, 4) of each of `cells` (N,)."""
         n = self.resolution
-        level, cell = cells // n**3, cells % n**3
-        corner = torch.stack([cell // n**2, cell // n % n, cell % n], dim=-1)
-        corner = (corner + torch.randint(-1, 2, corner.shape, device=cells.device)).clamp(0, n - 1)
-        return ((level * n + corner[:, 0]) * n + corner[:, 1]) * n + corner[:, 2]
+        return torch.stack([cells // n**3, cells // n**2 % n, cells // n % n, cells % n], dim=-1)
+
+    def _beside(self, cells: Tensor) -> Tensor:
+        """Return a random neighbour, in the box and in time, of each of `cells`, or the cell itself."""
+        n, place = self.resolution, self._places(cells)
+        moved = place[:, 1:] if self.slices == 1 else place
+        moved += torch.randint(-1, 2, moved.shape, device=cells.device)
+        place[:, 0].clamp_(0, self.levels * self.slices - 1)
+        place[:, 1:].clamp_(0, n - 1)
+        return ((place[:, 0] * n + place[:, 1]) * n + place[:, 2]) * n + place[:, 3]
+
+    def _over_time(self, density: DensityFunction, positions: Tensor, slices: Tensor) -> Tensor:
+        """Return the maximum density (N,) over random times, one in each of a few equal parts of a position's slice."""
+        densities, parts = [], max(TIMES_PER_VISIT // self.slices, 1)
+        first = slices if self.slices > 1 else torch.zeros_like(slices)  # of several boxes there is one slice
+        for part in range(parts):
+            shares = (part + torch.rand(len(positions), device=positions.device)) / parts
+            densities.append(_in_chunks(density, positions, (first + shares) / self.slices))
+        return torch.stack(densities).amax(0)
 
 
 def _opened(samples: Samples, rays: Tensor) -> Samples:
@@ -304,16 +341,7 @@ def _attached(samples: Samples, surface: HasAlpha | None, stopping: Tensor, feat
     return samples.evaluated(stopping, features) if surface is None else samples.with_alpha(stopping, features)
 
 
-def _over_time(density: DensityFunction, positions: Tensor) -> Tensor:
-    """Return the maximum density (N,) over random times, one in each of `TIMES_PER_VISIT` equal parts of [0, 1]."""
-    densities = []
-    for part in range(TIMES_PER_VISIT):
-        times = (part + torch.rand(len(positions), device=positions.device)) / TIMES_PER_VISIT
-        densities.append(_in_chunks(density, positions, times))
-    return torch.stack(densities).amax(0)
-
-
-def _in_chunks(density: DensityFunction, positions: Tensor, times: Tensor | None) -> Tensor:
+def _in_chunks(density: DensityFunction, positions: Tensor, times: Tensor | None = None) -> Tensor:
     """Return the density (N,) at positions (N, 3), in chunks: allocating large results costs more than the work."""
     parts = positions.split(CHUNK)
     part_times = [None] * len(parts) if times is None else times.split(CHUNK)

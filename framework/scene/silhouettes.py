@@ -77,31 +77,75 @@ class Silhouettes:
 
 
 @torch.no_grad()
-def visual_hull(silhouettes: Silhouettes, box: Tensor, resolution: int, moving: bool = False) -> Tensor:
-    """Return the cells of a box that no image shows to be empty, by refinement from coarse to fine.
-
-    For a moving scene, a cell is dropped if every image shows it and its neighbours to be empty; the margin of one cell
-    allows for motion between the times of the images.
+def visual_hull(silhouettes: Silhouettes, box: Tensor, resolution: int) -> Tensor:
+    """Return the cells of a box that no image of a still scene shows to be empty, by refinement from coarse to fine.
 
     Args:
         silhouettes: silhouettes of the training images.
         box: (2, 3) minimum and maximum corner.
         resolution: number n of cells along each axis.
-        moving: whether space that one image shows to be empty may be occupied at another image's time.
 
     Returns:
         (n^3,) bool; the index of a cell is (x n + y) n + z.
     """
+    return _held(silhouettes, silhouettes.at_full_size, box, resolution, every=True)
+
+
+@torch.no_grad()
+def moving_hulls(silhouettes: Silhouettes, box: Tensor, resolution: int, times: Tensor, slices: int = 1) -> Tensor:
+    """Return the cells of a box that may be occupied in each slice of time, of a scene that moves.
+
+    A transparent pixel says that its ray is empty at the moment of its image, and nothing of other moments. So a cell
+    is dropped from a slice if, of the images of that time and the nearest before and after, one shows it and its
+    neighbours to be empty, and none shows matter in their direction. The margin of one cell allows for motion between
+    the times of the images.
+
+    Args:
+        silhouettes: silhouettes of the M training images.
+        box: (2, 3) minimum and maximum corner.
+        resolution: number n of cells along each axis.
+        times: (M,) times of the images, in [0, 1].
+        slices: number T of equal parts of the time from 0 to 1.
+
+    Returns:
+        (T n^3,) bool; the index of cell (x, y, z) of slice s is ((s n + x) n + y) n + z.
+    """
+    images = silhouettes.at_full_size
+    moments = times.cpu()[images]
+    hulls = []
+    for each in range(slices):
+        within = _around(moments, each / slices, (each + 1) / slices)
+        chosen = [images[i] for i in within]
+        held = _held(silhouettes, chosen, box, resolution, every=False)
+        held |= _held(silhouettes, chosen, box, resolution, every=True)
+        grid = held.view(1, 1, resolution, resolution, resolution).float()
+        hulls.append(functional.max_pool3d(grid, 3, stride=1, padding=1).view(-1) > 0)
+    return torch.cat(hulls)
+
+
+def _around(times: Tensor, start: float, end: float) -> list[int]:
+    """Return which of `times` (M,) are from `start` to `end`, or equal to the nearest one before or after."""
+    before, after = times[times < start], times[times > end]
+    first = start if len(before) == 0 else float(before.max())
+    last = end if len(after) == 0 else float(after.min())
+    return ((times >= first) & (times <= last)).nonzero().squeeze(-1).tolist()
+
+
+def _held(silhouettes: Silhouettes, images: Sequence[int], box: Tensor, resolution: int, every: bool) -> Tensor:
+    """Return the cells (n^3,) bool that none of `images` shows to be empty, or where one shows matter (not `every`).
+
+    `silhouettes`, `box` and `resolution` are as in `visual_hull`.
+    """
     size = min(COARSEST, 1 << (resolution - 1).bit_length())
-    count, images = -(-resolution // size), silhouettes.at_full_size
+    count = -(-resolution // size)
     cubes = torch.cartesian_prod(*[torch.arange(count, device=box.device)] * 3) * size
     while True:
         low = box[0] + (box[1] - box[0]) * cubes / resolution
         edge = (box[1] - box[0]) * size / resolution
         centers, radius = (low + edge / 2).contiguous(), float(edge.norm()) / 2
-        held = torch.full((len(cubes),), not moving, device=box.device)
+        held = torch.full((len(cubes),), every, device=box.device)
         for image in images:
-            hold_balls(silhouettes.photograph(image), centers, radius, held, every=not moving)
+            hold_balls(silhouettes.photograph(image), centers, radius, held, every=every)
         cubes = cubes[held]
         if size == 1:
             break
@@ -111,9 +155,6 @@ def visual_hull(silhouettes: Silhouettes, box: Tensor, resolution: int, moving: 
         cubes = cubes[(cubes < resolution).all(-1)]
     hull = torch.zeros(resolution**3, dtype=torch.bool, device=box.device)
     hull[(cubes[:, 0] * resolution + cubes[:, 1]) * resolution + cubes[:, 2]] = True
-    if moving:
-        grid = hull.view(1, 1, resolution, resolution, resolution).float()
-        hull = functional.max_pool3d(grid, 3, stride=1, padding=1).view(-1) > 0
     return hull
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from framework.base.config import TrainConfig
 from framework.base.console import say
@@ -21,7 +22,7 @@ from framework.samplers.base import SkipsCells
 from framework.samplers.choice import SamplingConfig
 from framework.scene.profile import SceneProfile
 from framework.scene.seen_cells import seen_cells
-from framework.scene.silhouettes import Silhouettes, pixels_near, visual_hull
+from framework.scene.silhouettes import Silhouettes, moving_hulls, pixels_near, visual_hull
 
 
 def profile_of(
@@ -129,8 +130,7 @@ def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset
         return dataset
     silhouettes, moving = Silhouettes.of(dataset), model.scene.moving
     if fresh:
-        boxes = [(sampler, nested_boxes(sampler.box, sampler.levels)) for sampler in samplers]
-        hulls = [torch.cat([visual_hull(silhouettes, box, s.resolution, moving) for box in all_]) for s, all_ in boxes]
+        hulls = [_hull(silhouettes, sampler, dataset.times) for sampler in samplers]
         if not all(bool(hull.any()) for hull in hulls):
             say("warning: the photographs' alpha leaves no part of the box; it is not used to skip anything")
             return dataset
@@ -145,6 +145,14 @@ def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset
         for kept, box in zip((~s.carved).view(s.levels, -1), nested_boxes(s.box, s.levels), strict=True)
     ]
     return dataset.drawing(PixelSet.shared(near, 1))
+
+
+def _hull(silhouettes: Silhouettes, sampler: SkipsCells, times: Tensor | None) -> Tensor:
+    """Return the cells of `sampler` that `silhouettes`, taken at `times` if it moves, do not show to be empty."""
+    boxes, n = nested_boxes(sampler.box, sampler.levels), sampler.resolution
+    if times is None:
+        return torch.cat([visual_hull(silhouettes, box, n) for box in boxes])
+    return torch.cat([moving_hulls(silhouettes, box, n, times, sampler.slices) for box in boxes])
 
 
 def _no_silhouettes(dataset: Dataset) -> str | None:

@@ -30,7 +30,7 @@ def shown_cells(model: Model, most: int = MOST_CELLS) -> tuple[Tensor, float] | 
         return None
     sampler = samplers[0]
     n, box = sampler.resolution, sampler.box.cpu()
-    grid = sampler.occupied[: n**3].cpu().view(n, n, n)
+    grid = sampler.occupied_when()[: n**3].cpu().view(n, n, n)
     padded = torch.nn.functional.pad(grid, (1, 1, 1, 1, 1, 1))
     inside = grid.clone()
     for axis in range(3):

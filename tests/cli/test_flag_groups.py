@@ -75,7 +75,8 @@ def test_every_flag_once_and_the_everyday_ones_first(method: str) -> None:
         "options", "everyday options", f"{method} options", *["sampler options"] * (method != "pixel-nerf"),
         *["background options"] * (method in WITH_BACKGROUND), "ray options",
         *["appearance options"] * (method in ("nerfacto", "zip-nerf")),
-        *["few images options"] * (method in FOR_FEW_IMAGES), "optimisation options", "evaluation and saving options",
+        *["few images options"] * (method in FOR_FEW_IMAGES), *["motion options"] * (method in ("kplanes", "dnerf")),
+        "optimisation options", "evaluation and saving options",
         "machine options", "viewer options", "procedural data options",
     ]  # fmt: skip
     first = ["--data", "--max-seconds", "--max-num-iterations", "--output-dir", "--experiment-name", "--rays-per-pixel"]

@@ -1,6 +1,7 @@
 """Marching: the compiled and the torch form hand out the same samples, wave by wave."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -154,6 +155,31 @@ def test_cone_steps_are_even_and_then_geometric() -> None:
     torch.testing.assert_close(lengths[near], torch.full_like(lengths[near], step), rtol=1e-9, atol=0)
     far = starts[:-1] > step / cone + step
     torch.testing.assert_close((lengths / starts[:-1])[far], torch.full_like(lengths[far], cone), rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("kind", [CompiledMarch, ReferenceMarch])
+def test_each_ray_marches_through_the_slice_of_its_time(kind) -> None:
+    """As rays do, slice by slice, through a grid that has this slice alone; 5^3 cells are no whole number of bytes."""
+    if kind is CompiledMarch and not native.available():
+        pytest.skip("the compiled kernels are not installed")
+    slices, resolution = 3, 5
+    parts = [occupancy(resolution, 0.3, seed).occupied for seed in range(slices)]
+    rays = random_rays(300)
+    times = torch.rand(300, generator=torch.Generator().manual_seed(2))
+    times[:4] = torch.tensor([0.0, 1 / 3, 2 / 3, 1.0])  # a slice begins with its first moment, and the last has 1
+    timed = replace(rays, times=times)
+    found = walk(kind(timed, Occupancy(torch.cat(parts), BOX, resolution, slices=slices), 0.05, 0.0, None, 0.0))
+    for index, part in enumerate(parts):
+        mine = (times >= index / slices) & (times < (index + 1) / slices) | (times == 1) * (index == slices - 1)
+        alone = walk(kind(rays, Occupancy(part, BOX, resolution), 0.05, 0.0, None, 0.0))
+        assert int(mine.sum()) > 50
+        for here, truth in zip(found[:2], alone[:2], strict=True):
+            assert torch.equal(here[mine[found[2]]], truth[mine[alone[2]]])
+
+
+def test_a_grid_with_slices_needs_times() -> None:
+    with pytest.raises(ValueError, match="needs the times of rays"):
+        Occupancy(torch.ones(2 * 8, dtype=torch.bool), BOX, 2, slices=2).slices_of(None)
 
 
 def test_candidates_lie_inside_the_box_and_the_bounds() -> None:

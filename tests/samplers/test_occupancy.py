@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from framework.base.errors import ConfigError
 from framework.fields.base import Field
 from framework.geometry.bounds import intersect_box
 from framework.geometry.points import Points
@@ -197,6 +198,41 @@ def test_state_survives_a_checkpoint() -> None:
     assert isinstance(first, Samples)
     torch.testing.assert_close(first.t_starts, second.t_starts, rtol=0, atol=0)
     assert first.offsets.tolist() == second.offsets.tolist()
+
+
+def test_slices_of_time_hold_what_is_there_at_their_time() -> None:
+    """A ball that crosses the box in 8 slices: its cells of a slice are those that it touches in that time."""
+
+    def density(points: Points) -> tuple[torch.Tensor, torch.Tensor]:
+        assert points.times is not None
+        center = torch.zeros(len(points), 3)
+        center[:, 0] = points.times * 1.6 - 0.8
+        return ((points.positions - center).norm(dim=-1) < 0.3).float() * 100, points.positions
+
+    sampler = OccupancySampler(BOX, 16, 64, moving=True, slices=8)
+    train_grid(sampler, density, range(1, 3000))
+    centers = (torch.cartesian_prod(*[torch.arange(16)] * 3) + 0.5) / 8 - 1
+    ends = torch.linspace(-0.8, 0.8, 9)
+    found = sampler.occupied.view(8, -1)
+    for index, (start, end) in enumerate(zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)):
+        nearest = torch.stack([centers[:, 0].clamp(start, end), *torch.zeros(2, len(centers))], -1)
+        middle = torch.tensor([(start + end) / 2, 0, 0])
+        assert found[index][(centers - middle).norm(dim=-1) < 0.2].float().mean() > 0.95
+        assert not bool(found[index][(centers - nearest).norm(dim=-1) > 0.3 + 3**0.5 / 16].any())
+        assert torch.equal(sampler.occupied_when((index + 0.5) / 8), found[index])
+    assert torch.equal(sampler.occupied_when(), found.any(0))
+    assert torch.equal(sampler.occupied_when(1.0), found[-1])
+
+
+def test_slices_are_carved_one_by_one_or_all_alike() -> None:
+    sampler = OccupancySampler(BOX, 4, 16, moving=True, slices=2)
+    hull = torch.rand(2 * 64, generator=torch.Generator().manual_seed(0)) > 0.5
+    sampler.carve(hull)
+    assert torch.equal(sampler.occupied, hull)
+    sampler.carve(hull[:64])
+    assert torch.equal(sampler.carved, ~hull[:64].repeat(2))
+    with pytest.raises(ConfigError, match="2 slices of time"):
+        OccupancySampler(BOX, 4, 16, slices=2)
 
 
 def test_a_cell_that_is_full_for_a_short_while_stays() -> None:

@@ -260,13 +260,14 @@ EXPORT int march_begin(const float* origins, const float* directions, const floa
 
 // The next samples of each living ray, packed ray by ray. `total`: their number N.
 // box, resolution, levels: the smallest of the nested boxes, cells along an axis of each, and how many there are.
+// slices (R): of a grid of one box, the slice of time that each ray marches through; null if there is one.
 // next (R): the step to go on from, kept up here; counts (A): samples of each living ray.
 // starts, ends (N), owners (N), positions (N, 3) have room for A * limit.
 EXPORT int march_wave(const float* origins, const float* directions, const float* enter, const float* leave,
-                      const float* first, int32_t* next, const int64_t* alive, int64_t living, int limit,
-                      const float* box, float step, float cone, const uint8_t* bits, const uint8_t* blocks,
-                      int resolution, int levels, int32_t* counts, float* starts, float* ends, int64_t* owners, float* positions,
-                      int threads, int64_t* total) {
+                      const float* first, const int64_t* slices, int32_t* next, const int64_t* alive, int64_t living,
+                      int limit, const float* box, float step, float cone, const uint8_t* bits, const uint8_t* blocks,
+                      int resolution, int levels, int32_t* counts, float* starts, float* ends, int64_t* owners,
+                      float* positions, int threads, int64_t* total) {
     struct Found {
         std::vector<float> starts, ends;
     };
@@ -276,7 +277,8 @@ EXPORT int march_wave(const float* origins, const float* directions, const float
     };
     return guarded([&] {
         constexpr int64_t RAYS = 512;
-        const Grid grid{bits, blocks, resolution, (resolution + BLOCK - 1) / BLOCK};
+        const int side = (resolution + BLOCK - 1) / BLOCK;
+        const int64_t bytes = (int64_t(resolution) * resolution * resolution + 7) / 8;  // of a slice's bits
         static thread_local std::vector<Found> kept;  // for fresh memory costs page faults
         std::vector<Found>& found = kept;             // the caller's, whichever thread looks
         if (found.size() < size_t(threads)) found.resize(size_t(threads));
@@ -286,7 +288,8 @@ EXPORT int march_wave(const float* origins, const float* directions, const float
             Found& mine = found[size_t(slot)];
             const int64_t before = int64_t(mine.starts.size()), last = std::min(living, (c + 1) * RAYS);
             for (int64_t i = c * RAYS; i < last; i++) {
-                const int64_t r = alive[i];
+                const int64_t r = alive[i], slice = slices ? slices[r] : 0;
+                const Grid grid{bits + slice * bytes, blocks + slice * side * side * side, resolution, side};
                 const Ray ray(origins + r * 3, directions + r * 3, box, resolution);
                 const Steps steps(first[r], step, cone);
                 counts[i] = march_ray(ray, steps, grid, levels, enter[r], leave[r], limit, next[r], mine.starts,

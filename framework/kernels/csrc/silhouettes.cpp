@@ -82,22 +82,25 @@ EXPORT int opaque_sums(const uint8_t* opaque, int64_t height, int64_t width, int
     return DONE;
 }
 
-// held (count): of balls whose entry is `from`, sets it to its opposite where the photograph shows the ball whole and
-// empty (from = 1), or does not (from = 0).
+// held (count): clears it for balls that the photograph shows whole and empty (every = 1), or sets it for balls in whose
+// direction it shows matter, and for balls around the camera's plane (every = 0).
 EXPORT int hold_balls(const float* centers, int64_t count, float radius, const float* pose, float fx, float fy,
-                      float cx, float cy, const int32_t* sums, int64_t height, int64_t width, int from, uint8_t* held,
+                      float cx, float cy, const int32_t* sums, int64_t height, int64_t width, int every, uint8_t* held,
                       int threads) {
     return guarded([&] {
         const Photograph photograph{pose, fx, fy, cx, cy, sums, height, width};
         for_ranges(threads, count, 4096, [&](int64_t begin, int64_t end) {
             for (int64_t n = begin; n < end; n += LANES) {
                 const int64_t count = std::min<int64_t>(LANES, end - n);
-                if (std::find(held + n, held + n + count, uint8_t(from)) == held + n + count) continue;
+                if (std::find(held + n, held + n + count, uint8_t(every)) == held + n + count) continue;
                 const Footprints f(photograph, centers + n * 3, count, radius);
                 for (int64_t i = 0; i < count; i++) {
-                    if (held[n + i] != from) continue;
-                    const bool empty = f.whole[i] && photograph.opaque_pixels(f.x0[i], f.x1[i], f.y0[i], f.y1[i]) <= 0;
-                    if (empty == (from == 1)) held[n + i] = uint8_t(1 - from);
+                    if (held[n + i] != every) continue;
+                    const bool clear = photograph.opaque_pixels(f.x0[i], f.x1[i], f.y0[i], f.y1[i]) <= 0;
+                    const bool changes = every                 ? f.whole[i] && clear
+                                         : f.depth[i] > radius ? !clear
+                                                               : !(f.depth[i] <= -radius);  // NaN may be anywhere
+                    if (changes) held[n + i] = uint8_t(!every);
                 }
             }
         });

@@ -123,8 +123,8 @@ def _leave(position, direction, cell, size, more, resolution):
 
 @triton.jit(do_not_specialize=["rays", "levels"])
 def _wave(
-    origins, directions, box, enters, leaves, firsts, alive, nexts, occupied, distances, counts, starts, ends, rays,
-    limit, resolution, levels, step, growth, turn, BLOCK: tl.constexpr,
+    origins, directions, box, enters, leaves, firsts, slices, alive, nexts, occupied, distances, counts, starts, ends,
+    rays, limit, resolution, levels, step, growth, turn, BLOCK: tl.constexpr,
 ):  # fmt: skip
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = r < rays
@@ -144,6 +144,9 @@ def _wave(
     dz = tl.load(directions + r * 3 + 2, mask=here, other=0.0) * scale_z
     k, found = tl.load(nexts + r, mask=here, other=0), tl.zeros([BLOCK], tl.int32)
     side, half = (resolution + EDGE - 1) // EDGE, resolution / 2
+    before = tl.zeros([BLOCK], tl.int64)  # slices of time before the ray's, of a grid of one box
+    if slices is not None:
+        before = tl.load(slices + r, mask=here, other=0)
     going = here & (tl.load(alive + r, mask=here, other=0) != 0)
     while tl.max(going.to(tl.int32), 0) > 0:
         start, end = _start(first, k, step, even, growth), _start(first, k + 1, step, even, growth)
@@ -154,9 +157,10 @@ def _wave(
         px, py, pz = _shrunk(x, size, half), _shrunk(y, size, half), _shrunk(z, size, half)
         i, j = _cell(px + middle * dx * size, resolution - 1), _cell(py + middle * dy * size, resolution - 1)
         m = _cell(pz + middle * dz * size, resolution - 1)
-        block = ((level * side + i // EDGE) * side + j // EDGE) * side + m // EDGE
+        box_of = before + level
+        block = ((box_of * side + i // EDGE) * side + j // EDGE) * side + m // EDGE
         distance = tl.load(distances + block, mask=going, other=0).to(tl.int32)
-        cell = ((level.to(tl.int64) * resolution + i) * resolution + j) * resolution + m
+        cell = ((box_of * resolution + i) * resolution + j) * resolution + m
         full = going & (distance == 0) & (tl.load(occupied + cell, mask=going, other=0) != 0)
         taken = full & (middle >= enter)
         tl.store(starts + r * limit + found, start, mask=taken)
@@ -225,6 +229,7 @@ class TritonMarch(March):
     ) -> None:
         super().__init__(rays, early_stop)
         self.occupied, self.distances = occupancy.occupied, occupancy.distances
+        self.slices = occupancy.slices_of(rays.times)
         self.origins, self.directions = rays.origins.contiguous(), rays.directions.contiguous()
         self.box, self.resolution, self.step = occupancy.box.contiguous(), occupancy.resolution, float(step)
         self.levels, outer = occupancy.levels, occupancy.outer.contiguous()
@@ -246,8 +251,8 @@ class TritonMarch(March):
         padded_starts, padded_ends = like.new_empty(rays, limit), like.new_empty(rays, limit)
         launch(
             _wave, (blocks(rays, RAYS),), self.origins, self.directions, self.box, self.enter, self.leave, self.first,
-            self.alive, self.next, self.occupied, self.distances, counts, padded_starts, padded_ends, rays, limit,
-            self.resolution, self.levels, self.step, self.growth, self.turn, BLOCK=RAYS, num_warps=1,
+            self.slices, self.alive, self.next, self.occupied, self.distances, counts, padded_starts, padded_ends, rays,
+            limit, self.resolution, self.levels, self.step, self.growth, self.turn, BLOCK=RAYS, num_warps=1,
         )  # fmt: skip
         offsets = functional.pad(counts.cumsum(0), (1, 0))
         count = int(offsets[-1])

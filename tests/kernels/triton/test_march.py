@@ -44,6 +44,19 @@ def test_samples(resolution: int, share: float, cone: float) -> None:
     assert (len(found[1]) > 5) == (share > 0)
 
 
+def test_each_ray_marches_through_the_slice_of_its_time() -> None:
+    """The even slices are full and the odd ones empty."""
+    rays, full = random_rays(33), occupancy(5, 1.0)
+    times = torch.rand(33, generator=torch.Generator().manual_seed(2))
+    parts = [full.occupied, ~full.occupied] * 2
+    grid = replace(full, occupied=torch.cat(parts), slices=4)
+    _, _, _, found = walk(march(*on_device(replace(rays, times=times), grid), 0.2, 0.0, None, 0.0), limit=40)
+    _, _, _, alone = walk(march(*on_device(rays, full), 0.2, 0.0, None, 0.0), limit=40)
+    truth = torch.where((times * 4).long() % 2 == 0, alone.cpu().diff(), 0)
+    assert torch.equal(found.cpu().diff(), truth)
+    assert int(truth.sum()) > 50
+
+
 @pytest.mark.parametrize(("share", "cone"), [(0.02, 1 / 16), (0.3, 1 / 16), (0.3, 0.0)])
 def test_samples_in_nested_boxes(share: float, cone: float) -> None:
     """Three boxes, of which the rays start in and outside the largest."""

@@ -159,8 +159,8 @@ def draw_from_images(dataset: Dataset, count: int, num_images: int) -> Tensor:
     some = sizes.nonzero()[:, 0]
     images = some[torch.randint(len(some), (min(num_images, count),), device=some.device)]
     images = images.repeat(-(-count // len(images)))[:count].sort().values
-    place = torch.rand(count, device=some.device, dtype=torch.float64)  # float32 could round up to the next image
-    chosen = ranks[images] + (place * sizes[images]).long()
+    place = torch.randint(2**62, (count,), device=some.device)  # so large that the remainder has no bias
+    chosen = ranks[images] + place % sizes[images]
     return chosen if drawn is None else drawn.at(chosen)
 
 

@@ -78,6 +78,7 @@ class Trainer:
         self.device = train_set.device
         torch.manual_seed(self.config.machine.seed)
         self.model = build_model(run.method, self.config, train_set.scene).to(self.device)
+        show_images(self.model, train_set, eval_set)
         self.optimizer = make_optimizer(self.model, self.config)
         self.source = make_source(self.model.batches, train_set, self.config) if source is None else source
         self.state = State()
@@ -233,7 +234,6 @@ class Trainer:
             return
         self._prepared = True
         self._join_first()
-        show_images(self.model, self.train_set, self.eval_set)
         start, fresh = time.perf_counter(), self.state.step == 0
         self.train_set = skip_empty(self.config, self.model, self.train_set, fresh)
         self.source = self.source.drawing_from(self.train_set)

@@ -136,14 +136,14 @@ TINY: dict[str, dict[str, Any]] = {
         "num_rays_per_batch": 256,
     },
     "pixel-nerf": {
-        "num_source_views": 2,
-        "images_per_batch": 2,
+        "num_source_views": 3,
+        "images_per_batch": 4,
         "num_coarse_samples": 12,
         "num_fine_samples": 12,
-        "hidden_width": 16,
+        "hidden_width": 32,
         "encoder_widths": (8, 8),
         "num_rays_per_batch": 128,
-        "learning_rate": 5e-3,
+        "learning_rate": 3e-3,
     },
     "dnerf": {
         "num_layers": 3,

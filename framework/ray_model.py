@@ -102,7 +102,7 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
             terms["empty"] = config.empty_loss_mult * wrong
         rgb = pixels.rgb.detach()
         if batch is not drawn:  # of what was left out it is known that nothing is before the background
-            rgb = drawn.rgb.masked_scatter(kept[:, None], rgb.to(drawn.rgb))
+            rgb = drawn.rgb.index_copy(0, kept, rgb.to(drawn.rgb))
         return Loss(terms, rgb, rendered.num_samples)
 
     def _depth_terms(self, rendered: Rendered, batch: PixelBatch) -> dict[str, Tensor]:

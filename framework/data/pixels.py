@@ -53,10 +53,13 @@ class PixelBatch:
         return self.pixels.shape[0]
 
     def __getitem__(self, chosen: Tensor) -> PixelBatch:
-        """Return the pixels of a mask (R,) bool, with their rays."""
+        """Return the pixels of a mask (R,) bool, or of indices (Q,) int64, with their rays."""
+        index = chosen.nonzero().squeeze(-1) if chosen.dtype is torch.bool else chosen
         of_pixels = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rays"}
-        some: dict[str, Any] = {name: value[chosen] for name, value in of_pixels.items() if value is not None}
-        return replace(self, rays=self.rays[chosen.repeat_interleave(self.rays_per_pixel)], **some)
+        some: dict[str, Any] = {name: value[index] for name, value in of_pixels.items() if value is not None}
+        per_pixel = self.rays_per_pixel
+        rays = (index[:, None] * per_pixel + torch.arange(per_pixel, device=index.device)).view(-1)
+        return replace(self, rays=self.rays[rays], **some)
 
     @property
     def rays_per_pixel(self) -> int:
@@ -65,7 +68,7 @@ class PixelBatch:
 
 
 def thinned(batch: PixelBatch, share: float) -> tuple[PixelBatch, Tensor]:
-    """Return a batch without some of its transparent pixels, and which pixels (R,) bool are left.
+    """Return a batch without some of its transparent pixels, and which pixels (Q,) int64 are left.
 
     Those that are left count as many times more as there were, so that the mean of a loss has the same expectation.
 
@@ -75,7 +78,7 @@ def thinned(batch: PixelBatch, share: float) -> tuple[PixelBatch, Tensor]:
     """
     assert batch.alpha is not None
     transparent = batch.alpha == 0
-    kept = ~transparent | (torch.rand(len(batch), device=transparent.device) < share)
+    kept = (~transparent | (torch.rand(len(batch), device=transparent.device) < share)).nonzero().squeeze(-1)
     left = batch[kept]
     weights = torch.where(transparent[kept], 1 / share, 1.0) * (len(left) / max(len(batch), 1))
     return replace(left, weights=weights if left.weights is None else weights * left.weights), kept

@@ -53,7 +53,7 @@ def test_thinning_keeps_what_is_opaque_and_all_of_a_pixel(per_pixel: int) -> Non
     alpha = torch.tensor([0.0, 1.0, 0.0, 0.5] * 50)
     batch = batch_of(alpha, per_pixel)
     left, kept = thinned(batch, 0.25)
-    assert bool(kept[alpha > 0].all())
+    assert set(kept.tolist()) >= set((alpha > 0).nonzero().squeeze(-1).tolist())
     assert 5 < int((alpha[kept] == 0).sum()) < 50
     assert torch.equal(left.pixels, batch.pixels[kept])
     assert torch.equal(left.rgb, batch.rgb[kept])

@@ -134,6 +134,7 @@ class CaptureModel(RayModel[CaptureConfigT], Generic[CaptureConfigT]):
     ) -> None:
         super().__init__(config, scene, field, sampler, renderer)
         self.poses: PoseRefinement | None = None
+        self._disparity_from = half_edge(scene.box) if config.contraction else None
         if config.camera_optimizer in ("SO3xR3", "SE3"):
             if scene.warped:
                 raise ConfigError("--camera-optimizer: poses cannot be refined in normalised device coordinates")
@@ -156,8 +157,7 @@ class CaptureModel(RayModel[CaptureConfigT], Generic[CaptureConfigT]):
         return super().render(rays if self.poses is None else self.poses(rays), background)
 
     def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
-        scale = half_edge(self.scene.box) if self.config.contraction else None
-        return distortion_term(rendered, self.config.distortion_loss_mult, scale)
+        return distortion_term(rendered, self.config.distortion_loss_mult, self._disparity_from)
 
 
 class CaptureRenderer(VolumeRenderer):

@@ -64,7 +64,7 @@ def skip_report(trainer: Trainer) -> list[Rung]:
 
 
 def _sampling_rungs(trainer: Trainer, model: RayModel[Any], samplers: list[SkipsCells]) -> list[Rung]:
-    own = [own_cells(s.levels, s.resolution).to(s.carved.device) for s in samplers]
+    own = [own_cells(s.levels, s.resolution).repeat(s.slices).to(s.carved.device) for s in samplers]
     cells = sum(int(mask.sum()) for mask in own)
     kept, drawn = trainer.train_set.kept, trainer.train_set.drawn
     carved = sum(int((s.carved & mask).sum()) for s, mask in zip(samplers, own, strict=True)) / cells

@@ -66,6 +66,7 @@ def test_what_the_user_decided_is_not_called_a_decision(shared_tiny: Path, tmp_p
         tmp_path / "run",
         max_num_iterations=1,
         background="white",
+        background_model="none",
         silhouette_cells=False,
         sampler="occupancy",
     )

@@ -20,7 +20,7 @@ from framework.fields.nerf import NeRFField
 from framework.kernels.frequency import MAX_FREQUENCIES
 from framework.kernels.hash_grid_layout import MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
 from framework.samplers.choice import HierarchicalConfig, contracted_box, make_sampler, sampler_choice
-from framework.scene.motion import MotionConfig, decide_motion
+from framework.scene.motion import MotionConfig
 from methods.vanilla_nerf import A_RAY, OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH
 
 HASH_SAMPLES_PER_BATCH = 2**14
@@ -117,8 +117,6 @@ def decide(config: DNeRFConfig, scene: Scene) -> tuple[DNeRFConfig, list[Decisio
         samples = HASH_SAMPLES_PER_BATCH if small else OCCUPANCY_SAMPLES_PER_BATCH
         config, more = fill(config, Choice("samples_per_batch", samples, A_RAY, "samples a step"))
         made += more
-    config, motion = decide_motion(config, scene, config.sampler)
-    made += motion
     if not scene.moving:
         made = [decision for decision in made if not decision.option.startswith("deformation")]
         made.append(Decision("deformation", "left out", "the images have no times"))

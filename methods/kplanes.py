@@ -22,7 +22,7 @@ from framework.kernels.planes_layout import MAX_VERTICES
 from framework.kernels.spherical_harmonics import spherical_harmonics
 from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_choice
 from framework.scene.few_images import FewImagesConfig, decide_few_images
-from framework.scene.motion import MotionConfig, decide_motion, vertices_in_time
+from framework.scene.motion import MotionConfig, vertices_in_time
 
 MAX_SCALES = 4
 """Maximum number of scales if the setting is left open; the paper's number."""
@@ -168,14 +168,13 @@ def decide(config: KPlanesConfig, scene: Scene) -> tuple[KPlanesConfig, list[Dec
         Choice("num_scales", scales, f"the images have {scene.image_size} pixels", "scales"),
     )
     config, few = decide_few_images(config, scene)
-    config, motion = decide_motion(config, scene, config.sampler)
     sliced = scene.moving and config.time_slices > 1 and not scene.unbounded  # nested boxes have no slices
     cells = Choice("grid_resolution", 64 if sliced else 128, "each slice of time has cells of its own")
     times = f"the images have {scene.num_times} times"
     axis = Choice("time_resolution", vertices_in_time(scene), times, "vertices along time")
     config, coarser = fill(config, cells)
     config, along = fill(config, axis)
-    made += few + motion + coarser * bool(motion and sliced) + along * scene.moving
+    made += few + coarser * (sliced and config.sampler == "occupancy") + along * scene.moving
     if not scene.moving:
         made.append(Decision("planes of time", "left out", "the images have no times"))
     return config, made

@@ -128,15 +128,12 @@ def times_decided(method: str, count: int, **settings: Any) -> dict[str, str]:
 
 
 def test_the_number_of_times_decides_about_time() -> None:
-    """A sixth as many vertices, three at least; a slice for four, at most 16."""
-    many, few = times_decided("kplanes", 150), times_decided("kplanes", 8)
-    assert many["vertices along time"] == "25"
-    assert many["slices of time in the occupancy grid"] == "16"
-    assert few["vertices along time"] == "3"
-    assert few["slices of time in the occupancy grid"] == "2"
-    assert "slices of time in the occupancy grid" not in times_decided("kplanes", 8, sampler="proposal")
-    assert "slices of time in the occupancy grid" not in times_decided("dnerf", 8)
-    assert times_decided("dnerf", 48, sampler="occupancy")["slices of time in the occupancy grid"] == "12"
+    """A sixth as many vertices, three at least; cells are larger where each slice of time has its own."""
+    assert times_decided("kplanes", 150)["vertices along time"] == "25"
+    assert times_decided("kplanes", 8)["vertices along time"] == "3"
+    assert "grid resolution" not in times_decided("kplanes", 150)
+    assert times_decided("kplanes", 150, time_slices=16)["grid resolution"] == "64"
+    assert "grid resolution" not in times_decided("kplanes", 150, time_slices=16, sampler="proposal")
 
 
 def test_proposals_of_a_method_that_learns_motion_see_time() -> None:

@@ -103,24 +103,11 @@ def choose(tab: Tab, label: str, option: str) -> None:
     tab.press(option)
 
 
-ROW = """(() => {
-  const found = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === %s);
-  return found[found.length - 1].parentElement.parentElement;
-})()"""
-"""The row of a control's label."""
-
-
-def to_the_end(tab: Tab, label: str) -> None:
-    """Press End on a slider."""
-    tab.evaluate(f"{ROW % json.dumps(label)}.querySelector('[role=slider]').focus()")
+def to_the_end(tab: Tab) -> None:
+    """Press End on the first slider, which is that of time where there is one."""
+    tab.evaluate("document.querySelector('[role=slider]').focus()")
     for kind in ("keyDown", "keyUp"):
         tab.send("Input.dispatchKeyEvent", type=kind, key="End", code="End", windowsVirtualKeyCode=35)
-
-
-def write_number(tab: Tab, label: str, text: str) -> None:
-    """Write into the field of a number."""
-    tab.evaluate(f"(e => {{ e.focus(); e.select(); }})({ROW % json.dumps(label)}.querySelector('input'))")
-    tab.send("Input.insertText", text=text)
 
 
 def look_of(run: Path) -> list[float]:
@@ -192,23 +179,15 @@ def blue_with_time(tmp_path: Path) -> Path:
     return trainer.run.config_path.parent
 
 
-def test_time_and_crop(browser: Chromium, blue_with_time: Path) -> None:
+def test_time(browser: Chromium, blue_with_time: Path) -> None:
     run = blue_with_time
     with started(command("ns-viewer"), run, "--websocket-port", 17307) as (_, address):
         tab = browser.open(address)
         assert decibels(shown(tab), expected(run, tab, look_of(run), 0.0)) > 30
-        to_the_end(tab, "Time")
+        to_the_end(tab)
         late = shown(tab)
         assert decibels(late, expected(run, tab, look_of(run), 1.0)) > 30
-        assert decibels(late, expected(run, tab, look_of(run), 0.0)) < 25  # what was learnt changes with time
-
-        tab.press("Crop")
-        time.sleep(1)
-        tab.press("Crop")
-        assert decibels(shown(tab), late) > 40  # all that was learnt lies within the scene's box
-        write_number(tab, "Near", "6")
-        time.sleep(3)
-        assert tab.screenshot()[150:520, 60:540].min() > 250  # nothing is left behind the ball but white
+        assert decibels(late, expected(run, tab, look_of(run), 0.0)) < 28  # what was learnt changes with time
         tab.close()
 
 

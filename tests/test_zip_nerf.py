@@ -87,7 +87,26 @@ def test_a_number_for_each_proposal_is_needed() -> None:
 
 def test_poses_are_refined_along_rays_of_proposals_only(shared_tiny: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="needs --sampler proposal"):
-        captured(shared_tiny, tmp_path, {"poses": "device"}, sampler="occupancy")
+        captured(shared_tiny, tmp_path, {}, sampler="occupancy", camera_optimizer="SE3")
+
+
+def test_marched_samples_need_no_flag_about_poses(shared_tiny: Path, tmp_path: Path) -> None:
+    """Who asks for an occupancy grid alone must not be told that poses, of which nothing was asked, cannot be."""
+    trainer = captured(shared_tiny, tmp_path, {"poses": "device"}, sampler="occupancy")
+    assert chosen(trainer)["pose refinement"] == "off"
+    assert trainer.model.poses is None
+
+
+@pytest.mark.parametrize("asked", [{}, {"contraction": True}])
+def test_an_occupancy_grid_sees_all_of_space_too(asked: dict[str, object], shared_tiny: Path, tmp_path: Path) -> None:
+    """What is marched through in nested boxes, the field must tell apart: two places far outside of the box."""
+    trainer = captured(shared_tiny, tmp_path, {"unbounded": not asked}, sampler="occupancy", **asked)
+    field = trainer.model.field
+    torch.nn.init.normal_(field.encoding.table, std=0.1)
+    assert trainer.model.sampler.levels > 1
+    assert trainer.config.samples_per_batch
+    far = field.eval().density(Points(torch.tensor([[8.0, 8.0, 8.0], [80.0, 80.0, 80.0]])))[0]
+    assert far[0] != far[1]
 
 
 # -- the field of frustums ----------------------------------------------------------------------------------------

@@ -80,7 +80,8 @@ def decide_capture(config: CaptureConfigT, scene: Scene, *own: Choice) -> tuple[
     config, made = fill(config, sampler_choice(config, contracted))
     around = "there may be something outside the box" if contracted else "the scene ends at its box"
     reason = f"contraction is {'on' if contracted else 'off'}"
-    refined, why = "SO3xR3" if scene.poses == "device" and not scene.warped else "off", POSE_REASONS[scene.poses]
+    refined = "SO3xR3" if scene.poses == "device" and not scene.warped else "off"
+    why = POSE_REASONS[scene.poses]
     if config.sampler != "proposal" and refined != "off":
         refined, why = "off", MARCHED_REASON
     config, more = fill(

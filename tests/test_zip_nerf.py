@@ -1,6 +1,7 @@
 """Zip-NeRF: what the scene decides, and that each part does what it says."""
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -18,19 +19,10 @@ from framework.kernels.multisamples import unit_multisamples_reference
 from framework.training.trainer import Trainer
 from methods._captures import CaptureRenderer
 from methods.zip_nerf import ZipNeRFConfig
-from tests.training.helpers import tiny_run, tiny_trainer
+from tests.training.helpers import chosen, said_otherwise, tiny_run, tiny_trainer
 
-
-def captured(data: Path, folder: Path, facts: dict[str, object], **settings: object) -> Trainer:
-    """A trainer on the tiny data set, of whose scene other things are said."""
-    still = tiny_trainer("zip-nerf", data, folder / "still").train_set
-    (folder / "run").mkdir()
-    changed = dataclasses.replace(still, scene=dataclasses.replace(still.scene, **facts))
-    return Trainer(tiny_run("zip-nerf", data, folder / "run", max_eval_images=0, **settings), changed, None)
-
-
-def chosen(trainer: Trainer) -> dict[str, str]:
-    return {d.option: d.choice for d in trainer.profile().decisions}
+captured = partial(said_otherwise, "zip-nerf")
+"""A trainer on the tiny data set, of whose scene other things are said."""
 
 
 def test_an_object_before_no_background_needs_little(shared_tiny: Path, tmp_path: Path) -> None:

@@ -19,9 +19,9 @@ from framework.fields.encoded import EncodedField
 from framework.fields.nerf import NeRFField
 from framework.kernels.frequency import MAX_FREQUENCIES
 from framework.kernels.hash_grid_layout import MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
-from framework.samplers.choice import HierarchicalConfig, contracted_box, make_sampler, sampler_choice
+from framework.samplers.choice import HierarchicalConfig, contracted_box, decide_samples, make_sampler, sampler_choice
 from framework.scene.motion import MotionConfig
-from methods.vanilla_nerf import A_RAY, OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH
+from methods.vanilla_nerf import OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH
 
 HASH_SAMPLES_PER_BATCH = 2**14
 """Samples of a training step with a hash grid, whose networks are small, and an occupancy grid."""
@@ -115,7 +115,7 @@ def decide(config: DNeRFConfig, scene: Scene) -> tuple[DNeRFConfig, list[Decisio
     if config.sampler == "occupancy":
         small = grid and config.variant == "d-nerf"
         samples = HASH_SAMPLES_PER_BATCH if small else OCCUPANCY_SAMPLES_PER_BATCH
-        config, more = fill(config, Choice("samples_per_batch", samples, A_RAY, "samples a step"))
+        config, more = decide_samples(config, samples)
         made += more
     if not scene.moving:
         made = [decision for decision in made if not decision.option.startswith("deformation")]

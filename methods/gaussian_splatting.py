@@ -30,6 +30,7 @@ from framework.scene.reasons import DEPTH_REASONS, LIGHT_REASONS, POSE_REASONS
 from framework.splats.density_control import RESET, GradientMean, grown
 from framework.splats.drawing import draw, draw_view, on_image, splat_camera
 from framework.splats.gaussians import MAX_DEGREE, Gaussians
+from framework.splats.learning import as_gaussians, as_tables, number_for, open_degree, rate_factor, row_changes
 from framework.splats.mcmc import moved, shaken
 from framework.splats.redrawn import Redrawn
 from framework.splats.resolution import doubled, halved, halved_distances
@@ -42,6 +43,8 @@ PIXELS_PER_SECOND = 25 * 400 * 400
 """Pixels that training draws in a second, about, on two cores; for what is decided by the budget."""
 MOST_STEPS_PER_SECOND = 100
 """However small the images are."""
+MOST_GAUSSIANS, MOST_RATE = 1_000_000, 8.0
+"""Maximum number of Gaussians, and factor of learning rates, that are chosen by the budget."""
 NOISE, OPACITY_PENALTY, SCALE_PENALTY = 5e5, 0.002, 0.01
 """Noise and penalties where Gaussians have to find their places: those of Kheradmand et al. 2024, but for the first
 penalty, which at a few hundred steps of a higher rate left too few of them."""
@@ -147,8 +150,7 @@ def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplat
     """
     speed = min(PIXELS_PER_SECOND / (scene.image_pixels or scene.image_size**2), MOST_STEPS_PER_SECOND)
     seconds = min(config.max_seconds or math.inf, config.max_num_iterations / speed)
-    count = int(min(max(8_000 * math.sqrt(seconds), 20_000), 1_000_000))
-    factor = min(max((30_000 / (speed * seconds)) ** 0.44, 1.0), 8.0)
+    count, factor = number_for(seconds, MOST_GAUSSIANS), rate_factor(speed * seconds, MOST_RATE)
     why = "that suits the time"
     config, made = fill(config, Choice("num_gaussians", count, why, "Gaussians", f"up to {count:,}"))
     large = PIXELS_PER_SECOND / speed > LARGE_IMAGE
@@ -212,6 +214,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         self.gradients = GradientMean()
         self._near = max(0.2 * scene.near, 1e-3)
         self._on_image: Tensor | None = None
+        self._longer_side = scene.image_size
         self._redrawn: Redrawn | None = None
         self._found, self._extent = HostValue(), HostValue()
         anywhere = torch.lerp(scene.box[0], scene.box[1], torch.rand(min(config.start_gaussians, WITHOUT_IMAGES), 3))
@@ -237,9 +240,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         return [table.values for table in tables]
 
     def _all(self) -> Gaussians:
-        means, log_scales, rotations, logits, colors, harmonics = self.parameters_of_gaussians()
-        shaped = harmonics.view(len(means), 3, harmonics.shape[1] // 3)
-        return Gaussians(means * self.extent, log_scales, rotations, logits[:, 0], colors, shaped)
+        return as_gaussians(self.parameters_of_gaussians(), self.extent)
 
     def gaussians(self) -> Gaussians:
         """Return them, without gradient."""
@@ -279,9 +280,8 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         Args:
             gaussians: the new ones, with harmonics of the settings' degree.
         """
-        gaussians = replace(gaussians, means=gaussians.means / self.extent)
-        for parameter, values in zip(self.parameters_of_gaussians(), vars(gaussians).values(), strict=True):
-            parameter.data = values.reshape(len(gaussians), parameter.shape[1]).contiguous()
+        for parameter, values in zip(self.parameters_of_gaussians(), as_tables(gaussians, self.extent), strict=True):
+            parameter.data = values.contiguous()
         self._redrawn = None
 
     # -- training ---------------------------------------------------------------------------------------------
@@ -298,11 +298,10 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         camera = splat_camera(seen, self._near, config.antialiased, pose, reduced)
         target = batch.rgb if reduced == 1 else halved(batch.rgb)
         gaussians = self._all()
-        degree = min(int(self.progress * 2 * (MAX_DEGREE + 1)), config.degree)
-        records = on_image(gaussians, camera, degree)
+        records = on_image(gaussians, camera, min(open_degree(self.progress), config.degree))
         if config.strategy == "adc" and records.requires_grad:
             records.retain_grad()
-            self._on_image = records
+            self._on_image, self._longer_side = records, max(camera.width, camera.height)
         known = batch.distances if config.depth_loss_mult > 0 else None
         drawn = draw(records, camera, self._behind(batch), CHANNELS["rgb" if known is None else "distance"])
         rgb = self._lit(drawn.image if known is None else drawn.image[..., :3], batch.index)
@@ -336,7 +335,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
     @torch.no_grad()
     def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
         config = self.config
-        self.gradients.add(self._on_image, self.scene.image_size)
+        self.gradients.add(self._on_image, self._longer_side)
         self._on_image = None
         if (noise := self._chosen(config.noise, NOISE)) > 0:
             rate = self.position_rate * self._extent.of(self.extent) * learning_rate_factor(config, step, progress)
@@ -348,12 +347,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
             return self._densify(step, config.num_gaussians)
         here = len(self.means.values)
         change = moved(self.gaussians(), max(min(config.num_gaussians, int(1.05 * here)) - here, 0))
-        return () if change is None else self._changed(*change)
-
-    def _changed(self, kept: Tensor, fresh: Gaussians) -> list[RowChange]:
-        fresh = replace(fresh, means=fresh.means / self.extent)
-        rows = zip(self.parameters_of_gaussians(), vars(fresh).values(), strict=True)
-        return [RowChange(p, kept, values.reshape(len(fresh), p.shape[1])) for p, values in rows]
+        return () if change is None else row_changes(self.parameters_of_gaussians(), *change, self.extent)
 
     def _densify(self, step: int, most: int) -> list[RowChange]:
         mean = self.gradients.take(len(self.means.values))
@@ -362,7 +356,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
             none = torch.zeros(0, dtype=torch.long, device=lowered.device)
             return [RowChange(self.logits.values, none, lowered)]  # new rows, as Adam's state is reset too
         change = grown(self.gaussians(), mean, most, self._extent.of(self.extent))
-        return [] if change is None else self._changed(*change)
+        return [] if change is None else row_changes(self.parameters_of_gaussians(), *change, self.extent)
 
     def refined_cameras(self, cameras: Cameras) -> Cameras:
         """Return the training cameras with refined poses.

@@ -94,7 +94,7 @@ def fit_gaussians(model: RayModel[Any], dataset: Dataset, cameras: Cameras, near
         dataset: the training split, on the model's device; its times are those of the pictures.
         cameras: M pinhole cameras of that split.
         near: smallest depth at which a Gaussian is drawn, scene units.
-        seconds: time for pictures and steps together.
+        seconds: time for pictures and steps together; more is taken where the fewest pictures take longer than theirs.
 
     Raises:
         ConfigError: if no training ray ends on a surface.
@@ -114,7 +114,8 @@ def fit_gaussians(model: RayModel[Any], dataset: Dataset, cameras: Cameras, near
     background = evaluation_background(model)
     rates = _rates(cameras, (1 - PICTURES_SHARE) * seconds)
     with torch_on_one_thread():
-        left = max(seconds - (time.perf_counter() - begun), 1.0)
+        # On a slow machine even the fewest pictures take longer than their share; a page of no steps is of no use.
+        left = max(seconds - (time.perf_counter() - begun), (1 - PICTURES_SHARE) * seconds)
         return _trained(first, shots, photographs, background, rates, most, left)
 
 

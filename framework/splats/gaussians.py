@@ -69,6 +69,11 @@ class HasGaussians(Protocol):
     def gaussians(self) -> Gaussians:
         """Return them, without gradient."""
 
+
+@runtime_checkable
+class RendersGaussians(HasGaussians, Protocol):
+    """A model that renders some of its Gaussians as well as all."""
+
     def render_gaussians(self, gaussians: Gaussians, view: View, background: Tensor) -> Picture:
         """Render given Gaussians, such as some of its own, as `Model.render_view` does all of them.
 

@@ -15,7 +15,7 @@ from framework.geometry.rays import Rays
 from framework.model import Model
 from framework.ray_model import RayModel
 from framework.rendering.rendered import Picture
-from framework.splats.gaussians import HasGaussians
+from framework.splats.gaussians import RendersGaussians
 from framework.viewer.request import Crop
 
 BY_RAYS = "Only what is inside the box is rendered, so that what lies behind its walls is seen."
@@ -91,7 +91,7 @@ def picture_within(model: Model[Any], view: View, crop: Crop, background: Tensor
         background: (3,) colour behind it.
     """
     camera = view.camera
-    if isinstance(model, HasGaussians):
+    if isinstance(model, RendersGaussians):
         found = model.gaussians()
         return model.render_gaussians(found[within(found.means, camera, crop)], view, background)
     rays = camera.pixel_rays(camera.image_pixels(0), model.scene.near, model.scene.far)
@@ -107,7 +107,7 @@ def meaning(model: Model[Any]) -> str:
     Args:
         model: the model.
     """
-    if isinstance(model, HasGaussians):
+    if isinstance(model, RendersGaussians):
         return BY_CENTERS
     return BY_RAYS if isinstance(model, RayModel) else BY_DEPTH
 

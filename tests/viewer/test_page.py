@@ -26,6 +26,8 @@ from tests.viewer.chromium import Chromium, Tab, chromium, until
 
 pytest.importorskip("viser", reason="the extra [viewer] is not installed")
 pytestmark = pytest.mark.slow
+PICTURE = np.s_[200:520, 60:540]
+"""Rows and columns of the page beside the panel and below the note that WebGL is slow here."""
 
 
 @pytest.fixture(scope="module")
@@ -70,8 +72,8 @@ def settled(tab: Tab, seconds: float = 180.0) -> np.ndarray:
 
 
 def shown(tab: Tab) -> np.ndarray:
-    """The canvas at rest, beside the panel and below notes."""
-    return settled(tab)[150:520, 60:540].astype(float)
+    """The picture at rest."""
+    return settled(tab)[PICTURE].astype(float)
 
 
 def expected(run: Path, tab: Tab, camera: list[float], time: float | None = None) -> np.ndarray:
@@ -84,7 +86,7 @@ def expected(run: Path, tab: Tab, camera: list[float], time: float | None = None
     model = load_trained(run, device_type="cpu").model
     request = Request(Pose(tuple(matrix.flatten().tolist()), np.radians(50)), width, height, time=time)
     picture = model.render_view(View(request.camera(), time=time), evaluation_background(model))
-    return picture.rgb.clamp(0, 1).numpy()[150:520, 60:540] * 255
+    return picture.rgb.clamp(0, 1).numpy()[PICTURE] * 255
 
 
 def decibels(a: np.ndarray, b: np.ndarray) -> float:
@@ -111,11 +113,12 @@ def to_the_end(tab: Tab) -> None:
         tab.send("Input.dispatchKeyEvent", type=kind, key="End", code="End", windowsVirtualKeyCode=35)
 
 
-def type_into(tab: Tab, label: str, text: str) -> None:
-    """Replace what the first field beside a label holds, as the keyboard does."""
+def type_into(tab: Tab, label: str, index: int, text: str) -> None:
+    """Replace what one of the fields beside a label holds, as the keyboard does."""
     script = f"""(() => {{
       const found = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)});
-      const field = document.getElementById(found[0].htmlFor);
+      const first = document.getElementById(found[0].htmlFor).closest(".mantine-NumberInput-root");
+      const field = first.parentElement.querySelectorAll("input")[{index}];
       field.focus();
       field.select();
     }})()"""
@@ -124,13 +127,17 @@ def type_into(tab: Tab, label: str, text: str) -> None:
 
 
 def tick(tab: Tab, label: str) -> None:
-    """Click the box beside a label."""
+    """Click the box beside a label, when it has come to rest: a folder opens slowly."""
     script = f"""(() => {{
       const found = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)});
       const box = document.getElementById(found[0].htmlFor).getBoundingClientRect();
       return [box.x + box.width / 2, box.y + box.height / 2];
     }})()"""
-    tab.click(*tab.evaluate(script))
+    places = [[], tab.evaluate(script)]
+    while places[-2] != places[-1]:
+        time.sleep(0.3)
+        places.append(tab.evaluate(script))
+    tab.click(*places[-1])
 
 
 def meets_box(tab: Tab, camera: list[float], low: Sequence[float], high: Sequence[float]) -> np.ndarray:
@@ -146,7 +153,7 @@ def meets_box(tab: Tab, camera: list[float], low: Sequence[float], high: Sequenc
     rays = ahead + across[None, :, None] * right + down[:, None, None] * np.cross(ahead, right)
     sides = (np.array([low, high])[:, None, None] - position) / rays
     enter, leave = sides.min(0).max(-1), sides.max(0).min(-1)
-    return (leave > np.maximum(enter, 0))[150:520, 60:540]
+    return (leave > np.maximum(enter, 0))[PICTURE]
 
 
 def look_of(run: Path) -> list[float]:
@@ -206,11 +213,11 @@ def test_crop(browser: Chromium, run: Path) -> None:
         whole = shown(tab)
         tab.press("Crop")
         tick(tab, "Crop")
-        type_into(tab, "Highest corner", "0")  # the half of the ball beyond x = 0 is cut away
+        type_into(tab, "Highest corner", 2, "0")  # the upper half of the ball is cut away
         time.sleep(1)
         cut = shown(tab)
         low, high = load_trained(run, device_type="cpu").model.scene.box.double().tolist()
-        inside = meets_box(tab, look_of(run), low, [0.0, *high[1:]])
+        inside = meets_box(tab, look_of(run), low, [*high[:2], 0.0])
         tab.close()
     # JPEG's blocks of 8 pixels carry errors across the edge of the box.
     near_edge = binary_dilation(inside, iterations=9) & ~binary_erosion(inside, iterations=9)
@@ -264,7 +271,7 @@ def test_a_run_in_training(browser: Chromium, shared_tiny: Path, tmp_path: Path)
             found = re.search(r"step ([\d,]+) · \d+ s", tab.evaluate("document.body.innerText"))
             return int(found[1].replace(",", "")) if found else 0
 
-        until(lambda: tab.screenshot()[150:520, 60:540].std() > 5, 60)
+        until(lambda: tab.screenshot()[PICTURE].std() > 5, 60)
         before = until(step, 30)
         until(lambda: step() > before, 30)
         tab.press("Pause training")

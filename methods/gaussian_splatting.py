@@ -212,12 +212,12 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
             self.poses = PoseRefinement(scene.num_cameras, config.camera_optimizer, scene.camera_to_worlds)
             self.poses.optimised = Optimised("poses", config.camera_learning_rate, schedule="exponential")
         self.gradients = GradientMean()
+        self._near = max(0.2 * scene.near, 1e-3)
         self._on_image: Tensor | None = None
         self._longer_side = scene.image_size
         self._redrawn: Redrawn | None = None
         self._found, self._extent = HostValue(), HostValue()
-        box = scene.box
-        anywhere = box[0] + torch.rand(min(config.start_gaussians, WITHOUT_IMAGES), 3) * (box[1] - box[0])
+        anywhere = torch.lerp(scene.box[0], scene.box[1], torch.rand(min(config.start_gaussians, WITHOUT_IMAGES), 3))
         self.set_gaussians(from_points(anywhere, torch.full_like(anywhere, 0.5), config.degree))
 
     @property
@@ -298,7 +298,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         camera = splat_camera(seen, self._near, config.antialiased, pose, reduced)
         target = batch.rgb if reduced == 1 else halved(batch.rgb)
         gaussians = self._all()
-        records = on_image(gaussians, camera, self._degree)
+        records = on_image(gaussians, camera, min(open_degree(self.progress), config.degree))
         if config.strategy == "adc" and records.requires_grad:
             records.retain_grad()
             self._on_image, self._longer_side = records, max(camera.width, camera.height)
@@ -331,11 +331,6 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
             return rgb
         which = None if index is None else torch.arange(index, index + 1, device=rgb.device)
         return affine_colors(rgb, self.appearance(which, 1)[0])
-
-    @property
-    def _degree(self) -> int:
-        """Degree of harmonics that counts so far."""
-        return min(open_degree(self.progress), self.config.degree)
 
     @torch.no_grad()
     def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
@@ -374,7 +369,16 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
     # -- pictures ---------------------------------------------------------------------------------------------
 
     def render_view(self, view: View, background: Tensor) -> Picture:
-        picture = draw_view(self.gaussians(), self._camera(view), view.stride, background, self.scene.far)
+        return self.render_gaussians(self.gaussians(), view, background)
+
+    def render_gaussians(self, gaussians: Gaussians, view: View, background: Tensor) -> Picture:
+        """Render given Gaussians, such as some of its own, as `render_view` does all of them.
+
+        Args:
+            gaussians: what is drawn, in the frame of the scene.
+            view, background: as in `render_view`.
+        """
+        picture = draw_view(gaussians, self._camera(view), view.stride, background, self.scene.far)
         return replace(picture, rgb=self._lit(picture.rgb, None))
 
     def render_rgb(self, view: View, background: Tensor) -> Tensor:
@@ -385,10 +389,6 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         """Return the camera of a view that is not trained on."""
         pose = None if self.poses is None else self.poses.carried_pose(view.camera.camera_to_worlds[0])
         return splat_camera(view.camera, self._near, self.config.antialiased, pose)
-
-    @property
-    def _near(self) -> float:
-        return max(0.2 * self.scene.near, 1e-3)
 
 
 METHOD = Method(GaussianSplattingConfig(), paper="arXiv:2308.04079", model=GaussianSplatting, decide=decide)

@@ -4,7 +4,7 @@ import json
 import re
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import binary_dilation, binary_erosion
 
 from framework.cameras.camera_path import read_camera_path
 from framework.cameras.view import View
@@ -56,7 +57,7 @@ def started(*words: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
         process.communicate(timeout=60)
 
 
-def settled(tab: Tab, seconds: float = 60.0) -> np.ndarray:
+def settled(tab: Tab, seconds: float = 180.0) -> np.ndarray:
     """The page when it has stopped changing."""
     end, before = time.monotonic() + seconds, tab.screenshot()
     while time.monotonic() < end:
@@ -110,6 +111,44 @@ def to_the_end(tab: Tab) -> None:
         tab.send("Input.dispatchKeyEvent", type=kind, key="End", code="End", windowsVirtualKeyCode=35)
 
 
+def type_into(tab: Tab, label: str, text: str) -> None:
+    """Replace what the first field beside a label holds, as the keyboard does."""
+    script = f"""(() => {{
+      const found = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)});
+      const field = document.getElementById(found[0].htmlFor);
+      field.focus();
+      field.select();
+    }})()"""
+    tab.evaluate(script)
+    tab.send("Input.insertText", text=text)
+
+
+def tick(tab: Tab, label: str) -> None:
+    """Click the box beside a label."""
+    script = f"""(() => {{
+      const found = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)});
+      const box = document.getElementById(found[0].htmlFor).getBoundingClientRect();
+      return [box.x + box.width / 2, box.y + box.height / 2];
+    }})()"""
+    tab.click(*tab.evaluate(script))
+
+
+def meets_box(tab: Tab, camera: list[float], low: Sequence[float], high: Sequence[float]) -> np.ndarray:
+    """Which rays of the page's picture meet a box: slabs, in float64, independent of what the viewer does."""
+    width, height = tab.evaluate("(c => [c.clientWidth, c.clientHeight])(document.querySelector('canvas'))")
+    position, target, up = (np.array(camera[i : i + 3]) for i in (0, 3, 6))
+    ahead = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(ahead, up)
+    right /= np.linalg.norm(right)
+    focal = 0.5 * height / np.tan(np.radians(25))
+    across = (np.arange(width) + 0.5 - width / 2) / focal
+    down = (np.arange(height) + 0.5 - height / 2) / focal
+    rays = ahead + across[None, :, None] * right + down[:, None, None] * np.cross(ahead, right)
+    sides = (np.array([low, high])[:, None, None] - position) / rays
+    enter, leave = sides.min(0).max(-1), sides.max(0).min(-1)
+    return (leave > np.maximum(enter, 0))[150:520, 60:540]
+
+
 def look_of(run: Path) -> list[float]:
     """The camera that the page begins with: position, target and up."""
     camera = load_trained(run, device_type="cpu").model.scene.camera_to_worlds
@@ -158,6 +197,30 @@ def test_a_trained_run(browser: Chromium, run: Path, tmp_path: Path) -> None:
         shown(other)
         other.close()
         assert process.poll() is None
+
+
+def test_crop(browser: Chromium, run: Path) -> None:
+    """What is outside of the box is gone from the page, and what is inside is as it was."""
+    with started(command("ns-viewer"), run, "--websocket-port", 17407) as (_, address):
+        tab = browser.open(address)
+        whole = shown(tab)
+        tab.press("Crop")
+        tick(tab, "Crop")
+        type_into(tab, "Highest corner", "0")  # the half of the ball beyond x = 0 is cut away
+        time.sleep(1)
+        cut = shown(tab)
+        low, high = load_trained(run, device_type="cpu").model.scene.box.double().tolist()
+        inside = meets_box(tab, look_of(run), low, [0.0, *high[1:]])
+        tab.close()
+    # JPEG's blocks of 8 pixels carry errors across the edge of the box.
+    near_edge = binary_dilation(inside, iterations=9) & ~binary_erosion(inside, iterations=9)
+    outside, inside = ~inside & ~near_edge, inside & ~near_edge
+    matter, left = (np.abs(picture - 255).max(-1) > 40 for picture in (whole, cut))  # the background is white
+    print(f"matter outside of the box: {matter[outside].mean():.3f} before, {left[outside].mean():.5f} after")
+    print(f"matter inside: {matter[inside].mean():.3f} before, {left[inside].mean():.3f} after")
+    assert matter[outside].mean() > 0.1
+    assert left[outside].mean() == 0
+    assert left[inside].mean() > 0.1
 
 
 @pytest.fixture

@@ -52,6 +52,10 @@ class DNeRFConfig(
         "position_frequencies": (0, MAX_FREQUENCIES),
         "direction_frequencies": (0, MAX_FREQUENCIES),
         "time_frequencies": (0, MAX_FREQUENCIES),
+        "deformation_frequencies": (0, MAX_FREQUENCIES),
+        "ambient_dims": (0, 2**10),
+        "deformation_rate": AT_LEAST_0,
+        "open_levels_until": (0, 1),
         "grid_learning_rate": AT_LEAST_0,
         "max_resolution": (1, MAX_RESOLUTION),
         "log2_table_size": (1, MAX_LOG2_TABLE_SIZE),
@@ -75,6 +79,14 @@ class DNeRFConfig(
     """Number of frequencies in the encoding of directions."""
     time_frequencies: int = 4
     """Number of frequencies in the encoding of times."""
+    deformation_frequencies: int = 10
+    """Number of frequencies in the encoding of positions that the deformation network reads."""
+    ambient_dims: int = 0
+    """Outputs of the deformation network that the hash grid's networks read beside the displaced position."""
+    deformation_rate: float = 1.0
+    """Factor of the learning rate of the deformation network."""
+    open_levels_until: float = 0.0
+    """Share of the budget in which the levels of the hash grid open, from coarse to fine; 0 if all are open at once."""
     grid_learning_rate: float = 1e-2
     """Initial learning rate of the hash grid and of the two networks that read it."""
     max_resolution: int = 512
@@ -138,8 +150,10 @@ def make_field(config: DNeRFConfig, scene: Scene) -> Field:
             max_resolution=config.max_resolution,
             log2_table_size=config.log2_table_size,
             sparse=config.sparse_updates,
+            opening=config.open_levels_until > 0,
         )
-        canonical: Field = EncodedField(scene.box, grid, unbounded=contracted is not None)
+        ambient = config.ambient_dims if scene.moving else 0
+        canonical: Field = EncodedField(scene.box, grid, unbounded=contracted is not None, ambient=ambient)
         canonical.optimised = Optimised("heads", learning_rate=config.grid_learning_rate, betas=(0.9, 0.95), eps=1e-15)
     else:
         times = config.time_frequencies if scene.moving and config.variant == "t-nerf" else None
@@ -153,12 +167,13 @@ def make_field(config: DNeRFConfig, scene: Scene) -> Field:
         canonical,
         config.deformation_width,
         config.deformation_layers,
-        config.position_frequencies,
+        config.deformation_frequencies,
         config.time_frequencies,
         contracted,
         config.from_first_image,
+        config.ambient_dims if config.canonical == "hash-grid" else 0,
     )
-    deformed.optimised = networks
+    deformed.optimised = Optimised("networks", learning_rate=config.learning_rate * faster * config.deformation_rate)
     return deformed
 
 

@@ -188,7 +188,11 @@ def make_field(config: KPlanesConfig, scene: Scene) -> BoxField:
         scene: properties of the data.
     """
     time = (config.time_resolution,) if scene.moving else ()
-    resolutions = tuple((config.base_resolution << scale,) * 3 + time for scale in range(config.num_scales))
+    edges = (scene.box[1] - scene.box[0]) / (scene.box[1] - scene.box[0]).max()  # vertices are as far apart on each axis
+    resolutions = tuple(
+        tuple(max(round((config.base_resolution << scale) * edge), 2) for edge in edges.tolist()) + time
+        for scale in range(config.num_scales)
+    )
     opening = config.open_levels_until > 0
     planes = FeaturePlanes(resolutions, config.features_per_scale, sparse=config.sparse_updates, opening=opening)
     kind = EncodedField if config.decoder == "hybrid" else ExplicitField

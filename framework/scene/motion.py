@@ -23,6 +23,8 @@ class MotionConfig(RayConfig):
         "transparent_share": (0.001, 1),
     }
     """Allowed ranges."""
+    smallest_box: bool = True
+    """Learn only the part of the box that the images' silhouettes leave at any time (occupancy)."""
     time_slices: int = 1
     """Equal parts of time with cells of their own in the occupancy grid, so that a ray skips what is empty at its own
     time (occupancy); about one for each four times of the images, if more than 1."""

@@ -20,7 +20,6 @@ from framework.base.console import say
 from framework.base.device import seed_step
 from framework.base.errors import CheckpointError, DivergenceError
 from framework.base.processes import alone, from_first, processes
-from framework.base.registry import load_method
 from framework.data.dataset import Dataset
 from framework.data.pixels import composite
 from framework.data.sources import BatchSource, Request, make_source
@@ -34,7 +33,7 @@ from framework.training.checkpoint import FOLDER, checkpoint_path, load_checkpoi
 from framework.training.curve import FewImages, Point, in_order, rows
 from framework.training.optim import first_non_finite, make_optimizer
 from framework.training.outcome import Outcome
-from framework.training.preparation import profile_of, show_images, skip_empty
+from framework.training.preparation import decided, profile_of, show_images, skip_empty
 from framework.training.progress import ProgressBar, StepReport, TensorBoard
 from framework.training.run import Run, write_report
 from framework.training.signals import stop_signals
@@ -72,7 +71,7 @@ class Trainer:
         self, run: Run, train_set: Dataset, eval_set: Dataset | None, source: BatchSource | None = None
     ) -> None:
         self.config: TrainConfig
-        self.config, self.decisions = load_method(run.method).decided(run.config, train_set.scene)
+        train_set, self.config, self.decisions = decided(run.method, run.config, train_set)
         self.run = replace(run, config=self.config)
         self.train_set, self.eval_set = train_set, eval_set
         self.device = train_set.device

@@ -198,8 +198,8 @@ def _held(
     `silhouettes`, `box` and `resolution` are as in `visual_hull`.
 
     Args:
-        margins: distance, for each image, up to which around a cell all must be shown to be empty; `WITNESSES` must then
-            show matter in the cell's direction, too. None for a still scene, without either.
+        margins: distance, for each image, up to which around a cell all must be shown to be empty; `WITNESSES` must
+            then show matter in the cell's direction, too. None for a still scene, without either.
     """
     size = min(COARSEST, 1 << (resolution - 1).bit_length())
     count = -(-resolution // size)

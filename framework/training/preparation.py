@@ -28,9 +28,7 @@ from framework.scene.seen_cells import seen_cells
 from framework.scene.silhouettes import Silhouettes, moving_box, moving_hulls, pixels_near, visual_hull
 
 
-def decided(
-    method: str, config: TrainConfig, dataset: Dataset
-) -> tuple[Dataset, TrainConfig, list[Decision]]:
+def decided(method: str, config: TrainConfig, dataset: Dataset) -> tuple[Dataset, TrainConfig, list[Decision]]:
     """Decide the settings that a method leaves to the data, and the box of a scene that moves.
 
     A method that learns motion and samples with an occupancy grid gets the smallest box that the silhouettes allow.
@@ -53,13 +51,22 @@ def decided(
     old = dataset.scene.box
     box = moving_box(Silhouettes.of(dataset), old, dataset.times)
     share = float(((box[1] - box[0]) / (old[1] - old[0])).prod())
-    if settings.num_steps == getattr(declared.config, "num_steps", None):  # then steps stay as long as in the data's box
-        shorter = float((box[1] - box[0]).norm() / (old[1] - old[0]).norm())
-        config = replace(config, num_steps=max(round(settings.num_steps * shorter), 1))
+    shorter = float((box[1] - box[0]).norm() / (old[1] - old[0]).norm())
+    config = _with_steps_as_long(config, declared.config, settings, shorter)
     dataset = replace(dataset, scene=replace(dataset.scene, box=box))
     settings, made = declared.decided(config, dataset.scene)
     small = Decision("box", f"{100 * share:.0f}% of the data's", "alpha shows that nothing is ever outside")
     return dataset, settings, [small, *made]
+
+
+def _with_steps_as_long(config: TrainConfig, default: TrainConfig, decided: TrainConfig, shorter: float) -> TrainConfig:
+    """Return `config` with `shorter` times the steps that were `decided`, if it names no other than its `default`."""
+    assert isinstance(config, SamplingConfig)
+    assert isinstance(default, SamplingConfig)
+    assert isinstance(decided, SamplingConfig)
+    if config.num_steps != default.num_steps:
+        return config
+    return replace(config, num_steps=max(round(decided.num_steps * shorter), 1))
 
 
 def profile_of(

@@ -119,10 +119,12 @@ def disc(cameras: Cameras, image: int, center: torch.Tensor, radius: float) -> t
     return (apart < radius).view(int(cameras.heights[image]), int(cameras.widths[image]))
 
 
-def flight(ball: Dataset, place: Callable[[float], torch.Tensor], radius: float) -> tuple[Dataset, torch.Tensor]:
-    """Photographs, all of the whole box, of a ball that flies, and their times."""
-    wide = replace(ball, cameras=replace(ball.cameras, fx=ball.cameras.fx / 2, fy=ball.cameras.fy / 2))
-    times, pixels = torch.linspace(0, 1, 24), torch.zeros_like(wide.pixels).view(24, 80, 80, 4)
+def flight(
+    ball: Dataset, place: Callable[[float], torch.Tensor], radius: float, zoom: float = 0.5
+) -> tuple[Dataset, torch.Tensor]:
+    """Photographs, by default all of the whole box, of a ball that flies, and their times; neighbours in time see other sides."""
+    wide = replace(ball, cameras=replace(ball.cameras, fx=ball.cameras.fx * zoom, fy=ball.cameras.fy * zoom))
+    times, pixels = torch.arange(24) * 7 % 24 / 23, torch.zeros_like(wide.pixels).view(24, 80, 80, 4)
     for image, time in enumerate(times.tolist()):
         pixels[image, disc(wide.cameras, image, place(time), radius)] = 255
     return replace(wide, pixels=pixels.view(-1, 4), times=times), times
@@ -144,7 +146,7 @@ def test_a_flying_ball_is_never_outside_the_hull_of_its_time(ball: Dataset, slic
         assert bool(inside.any())
         assert bool(hull[min(int(time * slices), slices - 1)][inside].all())
     far = (centers(16) - place(0.0)).norm(dim=-1) > 0.8
-    assert hull[0][far].float().mean() < {1: 0.5, 3: 0.3, 8: 0.25}[slices]
+    assert hull[0][far].float().mean() < {1: 0.15, 3: 0.05, 8: 0.02}[slices]
     box = moving_box(silhouettes, BOX, times)
     for time in torch.linspace(0, 1, 97).tolist():
         assert bool((box[0] < place(time) - radius).all())
@@ -154,19 +156,19 @@ def test_a_flying_ball_is_never_outside_the_hull_of_its_time(ball: Dataset, slic
 
 def test_the_box_of_a_scene_that_frames_cut_is_larger(ball: Dataset) -> None:
     """The same ball in the same place: where an image shows matter at its border, there may be more outside."""
-    seen, times = flight(ball, lambda time: torch.zeros(3), 0.25)
+    seen, times = flight(ball, lambda time: torch.zeros(3), 0.25, zoom=1.2)
     whole = Silhouettes.of(seen)
     assert not any(whole.touch_border(image) for image in range(24))
     pixels = seen.pixels.clone()
     pixels[79, 3] = 255  # a corner of the first image
     cut = Silhouettes.of(replace(seen, pixels=pixels))
     assert cut.touch_border(0)
-    small, large = (moving_box(silhouettes, 2 * BOX, times) for silhouettes in (whole, cut))
+    small, large = (moving_box(silhouettes, 1.5 * BOX, times) for silhouettes in (whole, cut))
     assert bool((small[0] < -0.25).all())
     assert bool((small[1] > 0.25).all())
     assert bool((large[0] <= small[0]).all())
     assert bool((large[1] >= small[1]).all())
-    assert float((small[1] - small[0]).prod()) < 0.5 * float((large[1] - large[0]).prod())
+    assert float((small[1] - small[0]).prod()) < 0.95 * float((large[1] - large[0]).prod())
 
 
 def test_wider_frames_show_the_same_and_nothing_around(ball: Dataset) -> None:

@@ -28,9 +28,9 @@ class DeformedField(Field):
         fixed_start: whether the displacement is zero at time 0, so that the canonical field is the scene at that time
             (equation 2). The network is smooth in time and cannot follow: it bends all other times towards what suits
             them best, and the first image alone sees the canonical field as it is.
-        ambient: number K of further outputs of the network, which the canonical field reads beside the displaced
-            position (HyperNeRF, Park et al. 2021, section 4): what no displacement explains, such as a shadow that
-            moves over a floor. 0 in the paper.
+        ambient: number K of further outputs of the network, which the canonical field reads, too (HyperNeRF, Park et
+            al. 2021, section 4): for what no displacement explains, such as a shadow that moves over a floor. 0 in the
+            paper.
     """
 
     contracted: Tensor | None

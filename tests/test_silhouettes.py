@@ -122,7 +122,7 @@ def disc(cameras: Cameras, image: int, center: torch.Tensor, radius: float) -> t
 def flight(
     ball: Dataset, place: Callable[[float], torch.Tensor], radius: float, zoom: float = 0.5
 ) -> tuple[Dataset, torch.Tensor]:
-    """Photographs, by default all of the whole box, of a ball that flies, and their times; neighbours in time see other sides."""
+    """Photographs, by default of the whole box, of a ball that flies, and times; neighbours in time see other sides."""
     wide = replace(ball, cameras=replace(ball.cameras, fx=ball.cameras.fx * zoom, fy=ball.cameras.fy * zoom))
     times, pixels = torch.arange(24) * 7 % 24 / 23, torch.zeros_like(wide.pixels).view(24, 80, 80, 4)
     for image, time in enumerate(times.tolist()):

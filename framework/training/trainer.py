@@ -71,7 +71,9 @@ class Trainer:
         self, run: Run, train_set: Dataset, eval_set: Dataset | None, source: BatchSource | None = None
     ) -> None:
         self.config: TrainConfig
+        start = time.perf_counter()
         train_set, self.config, self.decisions = decided(run.method, run.config, train_set)
+        self._deciding = time.perf_counter() - start  # which counts as training
         self.run = replace(run, config=self.config)
         self.train_set, self.eval_set = train_set, eval_set
         self.device = train_set.device
@@ -87,8 +89,7 @@ class Trainer:
         self._unread: list[Tensor] = []
         limit = self.config.max_eval_images
         self._few = None if eval_set is None else FewImages(eval_set, limit, self.model.rays_per_pixel)
-        self._bad_in_a_row = 0
-        self._prepared = False
+        self._bad_in_a_row, self._prepared = 0, False
         self._saved_step: int | None = None
         self._last_save = self._last_eval = self._picture_seconds = 0.0
 
@@ -242,7 +243,7 @@ class Trainer:
                 with alone():
                     self.model.start(self.train_set)
             self._join_first()
-        seconds = time.perf_counter() - start
+        seconds = time.perf_counter() - start + self._deciding
         if fresh:
             self.state.seconds += seconds
         if seconds >= TOLD_SECONDS:

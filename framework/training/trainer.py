@@ -20,7 +20,6 @@ from framework.base.console import say
 from framework.base.device import seed_step
 from framework.base.errors import CheckpointError, DivergenceError
 from framework.base.processes import alone, from_first, processes
-from framework.base.registry import load_method
 from framework.data.dataset import Dataset
 from framework.data.sources import BatchSource, Request, make_source
 from framework.evaluation.metrics import MAX_PSNR
@@ -31,7 +30,7 @@ from framework.training.checkpoint import FOLDER, checkpoint_path, load_checkpoi
 from framework.training.held_out import HeldOut
 from framework.training.optim import first_non_finite, make_optimizer
 from framework.training.outcome import Outcome
-from framework.training.preparation import profile_of, show_images, skip_empty
+from framework.training.preparation import decided, profile_of, show_images, skip_empty
 from framework.training.progress import ProgressBar, StepReport, TensorBoard
 from framework.training.run import Run
 from framework.training.signals import stop_signals
@@ -67,7 +66,9 @@ class Trainer:
         self, run: Run, train_set: Dataset, eval_set: Dataset | None, source: BatchSource | None = None
     ) -> None:
         self.config: TrainConfig
-        self.config, self.decisions = load_method(run.method).decided(run.config, train_set.scene)
+        start = time.perf_counter()
+        train_set, self.config, self.decisions = decided(run.method, run.config, train_set)
+        self._deciding = time.perf_counter() - start  # which counts as training
         self.run = replace(run, config=self.config)
         self.train_set, self.eval_set = train_set, eval_set
         self.device = train_set.device
@@ -240,7 +241,7 @@ class Trainer:
                 with alone():
                     self.model.start(self.train_set)
             self._join_first()
-        seconds = time.perf_counter() - start
+        seconds = time.perf_counter() - start + self._deciding
         if fresh:
             self.state.seconds += seconds
         if seconds >= TOLD_SECONDS:

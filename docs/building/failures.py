@@ -13,13 +13,17 @@ its own.
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import math
+import os
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read when torch loads: threads that wait should not spin
 
 import imageio.v3 as iio
 import numpy as np
@@ -74,9 +78,18 @@ def write(path: Path, image: np.ndarray) -> None:
     iio.imwrite(path, (image * 255).round().clip(0, 255).astype(np.uint8))
 
 
-def photograph(pose: np.ndarray, time: float = 0.0, plain: bool = False) -> tuple[np.ndarray, np.ndarray]:
+@functools.cache
+def taken(split: str, count: int, index: int, time: float) -> np.ndarray:
+    """Return a view (SIZE, SIZE, 4) of the scene alone, with alpha; kept, since several captures begin with it."""
+    pose = camera_poses(split, count, 0)[index]
+    return render_view(pose, CAMERA_ANGLE, SIZE, SIZE, time, supersample=2, geometry=False)[0] / 255.0
+
+
+def photograph(
+    split: str, count: int, index: int, time: float = 0.0, plain: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
     """Return a photograph of the scene, and its alpha (SIZE, SIZE), before a pattern at infinity or a plain white."""
-    rgba = render_view(pose, CAMERA_ANGLE, SIZE, SIZE, time, geometry=False)[0] / 255.0
+    rgba, pose = taken(split, count, index, time), camera_poses(split, count, 0)[index]
     alpha = rgba[..., 3:]
     return rgba[..., :3] * alpha + (1.0 if plain else pattern(pose)) * (1 - alpha), alpha[..., 0]
 
@@ -94,7 +107,7 @@ def pattern(pose: np.ndarray) -> np.ndarray:
 def still() -> Capture:
     """Return a capture without a fault."""
     poses = camera_poses("train", NUM_TRAIN, 0)
-    return Capture([photograph(pose)[0] for pose in poses], poses)
+    return Capture([photograph("train", NUM_TRAIN, index)[0] for index in range(NUM_TRAIN)], poses)
 
 
 def blur() -> tuple[Capture, Capture]:
@@ -119,11 +132,12 @@ def exposure() -> tuple[Capture, Capture]:
 def motion() -> tuple[Capture, Capture]:
     """A part moves between photographs; what helps is to mask it."""
     poses = camera_poses("train", NUM_TRAIN, 0)
-    times = np.random.default_rng(0).permutation(NUM_TRAIN) / NUM_TRAIN
-    images = [photograph(pose, time)[0] for pose, time in zip(poses, times, strict=True)]
+    times = np.random.default_rng(0).choice([0.0, 0.33, 0.67], NUM_TRAIN)
+    images = [photograph("train", NUM_TRAIN, index, time)[0] for index, time in enumerate(times)]
     masks = []
-    for pose, image in zip(poses, images, strict=True):
-        changed = np.max([np.abs(photograph(pose, time)[0] - image).max(-1) for time in (0.0, 0.25, 0.5, 0.75)], axis=0)
+    for index, image in enumerate(images):
+        others = [photograph("train", NUM_TRAIN, index, time)[0] for time in (0.0, 0.33, 0.67)]
+        changed = np.max([np.abs(other - image).max(-1) for other in others], axis=0)
         grown = np.max([np.roll(changed, (i, j), (0, 1)) for i in (-2, 0, 2) for j in (-2, 0, 2)], axis=0)
         masks.append(grown < 0.06)
     return Capture(images, poses), Capture(images, poses, masks, {"masks": "ignored"})
@@ -152,8 +166,8 @@ def poses() -> tuple[Capture, Capture]:
 def texture() -> tuple[Capture, Capture]:
     """The surroundings are plain white; what helps is to cut the object out."""
     where = camera_poses("train", NUM_TRAIN, 0)
-    taken = [photograph(pose, plain=True) for pose in where]
-    images, masks = [image for image, _ in taken], [alpha > 0.5 for _, alpha in taken]
+    shown = [photograph("train", NUM_TRAIN, index, plain=True) for index in range(NUM_TRAIN)]
+    images, masks = [image for image, _ in shown], [alpha > 0.5 for _, alpha in shown]
     return Capture(images, where), Capture(images, where, masks, {"masks": "empty"})
 
 
@@ -183,7 +197,8 @@ def draw(kind: str, steps: int, folder: Path) -> dict[str, float]:
     """Train on the faulty capture and with what helps, and write the picture; the PSNRs of both."""
     faulty, helped = KINDS[kind]()
     where = camera_poses("test", NUM_TEST, 0)
-    truth = Capture([photograph(pose, plain=kind == "texture")[0] for pose in where], where)
+    views = [photograph("test", NUM_TEST, index, plain=kind == "texture")[0] for index in range(NUM_TEST)]
+    truth = Capture(views, where)
     with tempfile.TemporaryDirectory() as temporary:
         results = [learn(c, truth, steps, Path(temporary) / n) for n, c in (("faulty", faulty), ("helped", helped))]
     row = Image.new("RGB", (4 * TILE + 3 * 4, TILE), "white")

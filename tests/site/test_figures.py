@@ -67,6 +67,12 @@ def test_sentences_repeat_the_table() -> None:
         assert [number for number in re.findall(r"(\d+\.\d+) dB", text) if number not in numbers] == [], page.name
 
 
+def test_versions_are_those_that_ran() -> None:
+    ran = json.loads((DOCS / "results" / "versions.json").read_text())["rows"]
+    table = [row for row in rows(DOCS / "start" / "install.md") if len(row) == 4]
+    assert table[2:] == [[row["python"], row["torch"], row["state"], row["what"]] for row in ran]
+
+
 def test_flags_of_nerfstudio_are_those_that_are_answered() -> None:
     table = {row[0].strip("`"): row[1].strip("`") for row in rows(DOCS / "from-nerfstudio.md") if len(row) == 2}
     assert from_nerfstudio.SETTINGS.items() <= table.items()

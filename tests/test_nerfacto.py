@@ -1,8 +1,8 @@
 """Nerfacto: what the scene decides, and that each part does what it says."""
 
 import dataclasses
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -10,19 +10,10 @@ import torch
 from framework.evaluation.evaluator import evaluate
 from framework.fields.appearance import Appearance
 from framework.training.trainer import Trainer
-from tests.training.helpers import tiny_run, tiny_trainer
+from tests.training.helpers import chosen, said_otherwise, tiny_run, tiny_trainer
 
-
-def captured(data: Path, folder: Path, facts: dict[str, Any], **settings: Any) -> Trainer:
-    """A trainer on the tiny data set, of whose scene other things are said."""
-    still = tiny_trainer("nerfacto", data, folder / "still").train_set
-    (folder / "run").mkdir()
-    changed = dataclasses.replace(still, scene=dataclasses.replace(still.scene, **facts))
-    return Trainer(tiny_run("nerfacto", data, folder / "run", max_eval_images=0, **settings), changed, None)
-
-
-def chosen(trainer: Trainer) -> dict[str, str]:
-    return {d.option: d.choice for d in trainer.profile().decisions}
+captured = partial(said_otherwise, "nerfacto")
+"""A trainer on the tiny data set, of whose scene other things are said."""
 
 
 def test_a_bounded_scene_with_exact_poses_needs_little(shared_tiny: Path, tmp_path: Path) -> None:

@@ -227,6 +227,14 @@ def test_what_is_refused(image: tuple[int, ...], target: tuple[int, ...], said: 
         ssim(torch.zeros(image), torch.zeros(target))
 
 
+@pytest.mark.parametrize("weight", [0.0, 0.2])
+@pytest.mark.parametrize(("image", "target"), [((20, 20, 3), (20, 20, 1)), ((20, 20), (20, 20)), ((5, 5, 3), (5, 5))])
+def test_a_loss_is_of_two_images_of_one_shape(image: tuple[int, ...], target: tuple[int, ...], weight: float) -> None:
+    """Without a weight of SSIM, and of small images too: torch would repeat the smaller one."""
+    with pytest.raises(ValueError, match="SSIM needs two images"):
+        photometric_loss(torch.zeros(image), torch.zeros(target), weight)
+
+
 @needs_kernels
 @pytest.mark.parametrize("weight", [0.0, 0.2, 0.7, 1.0])
 @pytest.mark.parametrize("size", [*SIZES, TALL], ids=str)

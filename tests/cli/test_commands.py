@@ -20,10 +20,11 @@ def test_help_is_quick_and_lists_every_method() -> None:
         done = subprocess.run([command("ns-train"), "--help"], capture_output=True, text=True, check=True)
         return time.perf_counter() - start, done.stdout
 
-    runs = [once() for _ in range(5)]
-    best = min(seconds for seconds, _ in runs)
-    print(f"ns-train --help: {best:.2f} s at best of 5")
-    assert best < 0.5
+    runs = [once()]
+    while runs[-1][0] >= 0.5 and len(runs) < 5:  # another program may have had the processor
+        runs.append(once())
+    print(f"ns-train --help: {runs[-1][0]:.2f} s in run {len(runs)} of 5")
+    assert runs[-1][0] < 0.5
     lines = runs[0][1].splitlines()
     for name in ("instant-ngp", "vanilla-nerf", "blender", "procedural"):
         assert sum(line.strip().startswith(name + " ") for line in lines) == 1

@@ -146,10 +146,10 @@ def test_written_points_are_read_back(tmp_path: Path, with_normals: bool) -> Non
 
 
 def test_what_cannot_be_exported_is_refused(ball: Path, tmp_path: Path, refused: Refused) -> None:
-    given = ("--load-config", ball, "--output-dir", tmp_path)
+    given, few = ("--load-config", ball, "--output-dir", tmp_path), ("--num-points", 5000)
     assert "nothing is exported as 'poincloud'. Did you mean 'pointcloud'" in refused(main, "poincloud", *given)
     assert "--num-points must be at least 1" in refused(main, "pointcloud", *given, "--num-points", 0)
-    assert "no training ray ends in a surface" in refused(main, "pointcloud", *given, "--reach", 1e-6)
+    assert "no training ray ends in a surface" in refused(main, "pointcloud", *given, *few, "--reach", 1e-6)
 
 
 def test_normals_are_turned_and_not_moved() -> None:

@@ -51,7 +51,9 @@ def test_images_reduced_beforehand_are_reduced_on(capture: Path) -> None:
 
 @pytest.mark.parametrize(("side", "factor"), [(1600, 1), (1601, 2), (3300, 4)])
 def test_images_are_reduced_to_1600_pixels_unless_told(capture: Path, side: int, factor: int) -> None:
-    write_images(capture / "images", NAMES, side, side * 3 // 4)
+    write_images(capture / "images", NAMES[:1], side, side * 3 // 4)
+    for name in NAMES[1:]:  # encoding each takes most of the time, and their sizes alone matter here
+        shutil.copy(capture / "images" / NAMES[0], capture / "images" / name)
     scene = Nerfstudio().parse(capture, "val")
     assert scene.downscale_factor == factor
     assert max(load_dataset(scene, "val").image(0).shape) <= 1600

@@ -49,7 +49,7 @@ from tests.training.helpers import TINY
 
 ROOT = Path(__file__).parents[1]
 BUILT_IN = [name for name, entry in registered("methods").items() if entry.module.startswith("methods.")]
-SLOW = ("dnerf",)
+SLOW = ("dnerf", "pixel-nerf")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in BUILT_IN])

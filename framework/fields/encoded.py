@@ -136,6 +136,7 @@ class EncodedField(BoxField):
         """Return the density as `trace` computes it; None if this field's is another."""
         grid, own = self.encoding, (EncodedField.density, BoxField.encode, BoxField.unit)
         plain = (type(self).density, type(self).encode, type(self).unit) == own and not self.unbounded
+        plain = plain and not {"density", "encode", "unit"} & vars(self).keys()
         hooked = any(m._forward_hooks or m._forward_pre_hooks for m in (self.density_head, grid))
         if not plain or hooked or type(grid) is not HashGrid or type(self.density_head) is not MLP:
             return None

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from framework.base.optimised import RowChange as RowChange
     from framework.cameras.cameras import Cameras as Cameras
     from framework.cameras.view import View as View
-    from framework.data.dataset import DataParser as DataParser
     from framework.data.dataset import Dataset as Dataset
-    from framework.data.dataset import ParsedScene as ParsedScene
+    from framework.data.parsed_scene import DataParser as DataParser
+    from framework.data.parsed_scene import ParsedScene as ParsedScene
     from framework.data.pixels import PixelBatch as PixelBatch
     from framework.data.pixels import ViewBatch as ViewBatch
     from framework.data.scene import Scene as Scene
@@ -46,7 +46,7 @@ _HOMES = {
     "Cameras": "cameras.cameras",
     "ConfigError": "base.errors",
     "DataError": "base.errors",
-    "DataParser": "data.dataset",
+    "DataParser": "data.parsed_scene",
     "Dataset": "data.dataset",
     "Decision": "base.decisions",
     "Field": "fields.base",
@@ -56,7 +56,7 @@ _HOMES = {
     "Model": "model",
     "NerfloomError": "base.errors",
     "Optimised": "base.optimised",
-    "ParsedScene": "data.dataset",
+    "ParsedScene": "data.parsed_scene",
     "Picture": "rendering.rendered",
     "PixelBatch": "data.pixels",
     "Points": "geometry.points",

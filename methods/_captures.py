@@ -32,12 +32,14 @@ from framework.base.optimised import Optimised
 from framework.cameras.refinement import PoseRefinement
 from framework.rendering.losses import normalised_distortion
 from framework.rendering.volume import shade
-from framework.samplers.choice import SamplingConfig, sampler_choice
+from framework.samplers.choice import SamplingConfig, decide_samples, sampler_choice
 from framework.samplers.proposal import half_edge
-from framework.scene.reasons import POSE_REASONS
+from framework.scene.reasons import MARCHED_REASON, POSE_REASONS
 
 DISTORTION = 2e-3
 """Default weight of the distortion loss in unbounded scenes."""
+MARCHED_SAMPLES = 2**16
+"""Samples a training step with an occupancy grid: as many as 2,048 rays have with proposals."""
 
 
 @dataclass(frozen=True)
@@ -51,51 +53,47 @@ class CaptureConfig(SamplingConfig):
     distortion_loss_mult: Auto[float] = AUTO
     """Weight of the distortion loss. If not given: 0.002 in unbounded scenes, else 0."""
     camera_optimizer: Literal["auto", "off", "SO3xR3", "SE3"] = "auto"
-    """Refinement of the training cameras' poses; auto: SO3xR3 if a device tracked them, else off."""
+    """Refinement of the training cameras' poses; auto: SO3xR3 if a device tracked them and proposals choose the
+    samples, else off."""
     camera_learning_rate: float = 1e-3
     """Initial learning rate of the poses."""
     gradient_scaling: Auto[bool] = AUTO
     """Whether gradients near cameras are scaled down, by squared distance up to half of the box's edge, against
     floaters. If not given: in unbounded scenes."""
 
-    @property
-    def covers_space(self) -> bool:
-        """True if the field covers all of space, contracted, and its sampler does; of settings that are decided."""
-        return bool(self.contraction) and self.sampler == "proposal"
-
 
 CaptureConfigT = TypeVar("CaptureConfigT", bound=CaptureConfig)
 
 
-def decide_capture(
-    config: CaptureConfigT, scene: Scene, *own: Choice, nested: bool = False
-) -> tuple[CaptureConfigT, list[Decision]]:
+def decide_capture(config: CaptureConfigT, scene: Scene, *own: Choice) -> tuple[CaptureConfigT, list[Decision]]:
     """Decide the settings that methods for captures share, and a method's own.
 
     Args:
         config: the method's settings; those left open are filled in.
         scene: properties of the data.
         own: choices of the method's own.
-        nested: whether the method can march through contracted space, in nested boxes.
 
     Returns:
         The settings, and a record of each that was filled in.
     """
-    unbounded = scene.unbounded if config.contraction is None else config.contraction
-    config, made = fill(config, sampler_choice(config, unbounded))
-    contracted = unbounded and (nested or config.sampler == "proposal")
+    contracted = scene.unbounded if config.contraction is None else config.contraction
+    config, made = fill(config, sampler_choice(config, contracted))
     around = "there may be something outside the box" if contracted else "the scene ends at its box"
     reason = f"contraction is {'on' if contracted else 'off'}"
     refined = "SO3xR3" if scene.poses == "device" and not scene.warped else "off"
+    why = POSE_REASONS[scene.poses]
+    if config.sampler != "proposal" and refined != "off":
+        refined, why = "off", MARCHED_REASON
     config, more = fill(
         config,
         Choice("contraction", contracted, around),
         Choice("distortion_loss_mult", DISTORTION if contracted else 0.0, reason, "distortion loss"),
         Choice("gradient_scaling", contracted, reason, "gradient scaling near cameras"),
         *own,
-        Choice("camera_optimizer", refined, POSE_REASONS[scene.poses], "pose refinement"),
+        Choice("camera_optimizer", refined, why, "pose refinement"),
     )
-    return config, made + more
+    config, samples = decide_samples(config, MARCHED_SAMPLES) if config.contraction else (config, [])
+    return config, made + more + samples
 
 
 def distortion_term(rendered: Rendered, weight: float, scale: float | None = None) -> dict[str, Tensor]:

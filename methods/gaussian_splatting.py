@@ -30,6 +30,8 @@ from framework.scene.reasons import DEPTH_REASONS, LIGHT_REASONS, POSE_REASONS
 from framework.splats.density_control import RESET, GradientMean, grown
 from framework.splats.drawing import draw, draw_view, on_image, splat_camera
 from framework.splats.gaussians import MAX_DEGREE, Gaussians
+from framework.splats.guide import GUIDE, FoundDistances
+from framework.splats.learning import as_gaussians, as_tables, number_for, open_degree, rate_factor, row_changes
 from framework.splats.mcmc import moved, shaken
 from framework.splats.redrawn import Redrawn
 from framework.splats.resolution import doubled, halved, halved_distances
@@ -42,6 +44,8 @@ PIXELS_PER_SECOND = 25 * 400 * 400
 """Pixels that training draws in a second, about, on two cores; for what is decided by the budget."""
 MOST_STEPS_PER_SECOND = 100
 """However small the images are."""
+MOST_GAUSSIANS, MOST_RATE = 1_000_000, 8.0
+"""Maximum number of Gaussians, and factor of learning rates, that are chosen by the budget."""
 NOISE, OPACITY_PENALTY, SCALE_PENALTY = 5e5, 0.002, 0.01
 """Noise and penalties where Gaussians have to find their places: those of Kheradmand et al. 2024, but for the first
 penalty, which at a few hundred steps of a higher rate left too few of them."""
@@ -77,6 +81,7 @@ class GaussianSplattingConfig(
         "appearance_rate": AT_LEAST_0,
         "camera_learning_rate": AT_LEAST_0,
         "depth_loss_mult": AT_LEAST_0,
+        "field_depth_mult": AT_LEAST_0,
         "steps_per_reset": (1, 10**9),
         "ssim_weight": (0, 1),
         "growth_end": (0, 1),
@@ -136,6 +141,8 @@ class GaussianSplattingConfig(
     """Initial learning rate of the poses."""
     depth_loss_mult: Auto[float] = AUTO
     """Weight of the depth loss. If not given: 0.1 if there are depth images, else 0."""
+    field_depth_mult: Auto[float] = AUTO
+    """Weight of a starting field's distances until half of the budget. If not given: 0.1 if unbounded, else 0."""
 
 
 def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplattingConfig, list[Decision]]:
@@ -147,8 +154,7 @@ def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplat
     """
     speed = min(PIXELS_PER_SECOND / (scene.image_pixels or scene.image_size**2), MOST_STEPS_PER_SECOND)
     seconds = min(config.max_seconds or math.inf, config.max_num_iterations / speed)
-    count = int(min(max(8_000 * math.sqrt(seconds), 20_000), 1_000_000))
-    factor = min(max((30_000 / (speed * seconds)) ** 0.44, 1.0), 8.0)
+    count, factor = number_for(seconds, MOST_GAUSSIANS), rate_factor(speed * seconds, MOST_RATE)
     why = "that suits the time"
     config, made = fill(config, Choice("num_gaussians", count, why, "Gaussians", f"up to {count:,}"))
     large = PIXELS_PER_SECOND / speed > LARGE_IMAGE
@@ -165,6 +171,7 @@ def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplat
         Choice("rate_factor", round(factor, 2), "fewer steps have to go farther", "factor of learning rates"),
         Choice("appearance", varies, LIGHT_REASONS[varies], "colour transforms of images"),
         Choice("depth_loss_mult", 0.1 if scene.has_depth else 0.0, DEPTH_REASONS[scene.has_depth], "depth loss"),
+        Choice("field_depth_mult", *GUIDE[scene.unbounded], "weight of a field's distances"),
         Choice("camera_optimizer", poses, POSE_REASONS[scene.poses], "pose refinement"),
     )
     return config, made + more
@@ -209,12 +216,13 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         if config.camera_optimizer in ("SO3xR3", "SE3"):
             self.poses = PoseRefinement(scene.num_cameras, config.camera_optimizer, scene.camera_to_worlds)
             self.poses.optimised = Optimised("poses", config.camera_learning_rate, schedule="exponential")
-        self.gradients = GradientMean()
+        self.gradients, self.found_distances = GradientMean(), FoundDistances()
+        self._near = max(0.2 * scene.near, 1e-3)
         self._on_image: Tensor | None = None
+        self._longer_side = scene.image_size
         self._redrawn: Redrawn | None = None
         self._found, self._extent = HostValue(), HostValue()
-        box = scene.box
-        anywhere = box[0] + torch.rand(min(config.start_gaussians, WITHOUT_IMAGES), 3) * (box[1] - box[0])
+        anywhere = torch.lerp(scene.box[0], scene.box[1], torch.rand(min(config.start_gaussians, WITHOUT_IMAGES), 3))
         self.set_gaussians(from_points(anywhere, torch.full_like(anywhere, 0.5), config.degree))
 
     @property
@@ -237,9 +245,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         return [table.values for table in tables]
 
     def _all(self) -> Gaussians:
-        means, log_scales, rotations, logits, colors, harmonics = self.parameters_of_gaussians()
-        shaped = harmonics.view(len(means), 3, harmonics.shape[1] // 3)
-        return Gaussians(means * self.extent, log_scales, rotations, logits[:, 0], colors, shaped)
+        return as_gaussians(self.parameters_of_gaussians(), self.extent)
 
     def gaussians(self) -> Gaussians:
         """Return them, without gradient."""
@@ -260,9 +266,10 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         if kind == "field":
             with torch.enable_grad():
                 seconds = FIELD_SHARE * (self.config.max_seconds or math.inf)
-                points, colors = found_surfaces(dataset, self.config, self.config.field_steps, seconds, count)
-            first = from_points(points, colors, self.config.degree, FIELD_OPACITY, FIELD_SIZE)
-            if not len(points):
+                found = found_surfaces(dataset, self.config, self.config.field_steps, seconds, count)
+            first = from_points(found.positions, found.colors, self.config.degree, FIELD_OPACITY, FIELD_SIZE)
+            self.found_distances.set(found.images, found.pixels, found.distances)
+            if not len(first):
                 say("warning: the field has found no surfaces")
                 kind = "random"
         if kind != "field":
@@ -279,9 +286,8 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         Args:
             gaussians: the new ones, with harmonics of the settings' degree.
         """
-        gaussians = replace(gaussians, means=gaussians.means / self.extent)
-        for parameter, values in zip(self.parameters_of_gaussians(), vars(gaussians).values(), strict=True):
-            parameter.data = values.reshape(len(gaussians), parameter.shape[1]).contiguous()
+        for parameter, values in zip(self.parameters_of_gaussians(), as_tables(gaussians, self.extent), strict=True):
+            parameter.data = values.contiguous()
         self._redrawn = None
 
     # -- training ---------------------------------------------------------------------------------------------
@@ -298,11 +304,11 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         camera = splat_camera(seen, self._near, config.antialiased, pose, reduced)
         target = batch.rgb if reduced == 1 else halved(batch.rgb)
         gaussians = self._all()
-        records = on_image(gaussians, camera, self._degree)
+        records = on_image(gaussians, camera, min(open_degree(self.progress), config.degree))
         if config.strategy == "adc" and records.requires_grad:
             records.retain_grad()
-            self._on_image = records
-        known = batch.distances if config.depth_loss_mult > 0 else None
+            self._on_image, self._longer_side = records, max(camera.width, camera.height)
+        known, trust = self.found_distances.known(batch, self.progress, config.depth_loss_mult, config.field_depth_mult)
         drawn = draw(records, camera, self._behind(batch), CHANNELS["rgb" if known is None else "distance"])
         rgb = self._lit(drawn.image if known is None else drawn.image[..., :3], batch.index)
         if batch.kept is not None:  # what does not count is as it should be
@@ -311,7 +317,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         terms = {"rgb": photometric_loss(rgb, target, config.ssim_weight)}
         if known is not None:
             known = known if reduced == 1 else halved_distances(known)
-            terms["depth"] = config.depth_loss_mult * mean_depth_error(drawn.image[..., 3], drawn.transmittance, known)
+            terms["depth"] = trust * mean_depth_error(drawn.image[..., 3], drawn.transmittance, known)
         if (weight := self._chosen(config.opacity_penalty, OPACITY_PENALTY)) > 0 and len(gaussians):
             terms["opacity"] = weight * torch.sigmoid(gaussians.logits).mean()
         if (weight := self._chosen(config.scale_penalty, SCALE_PENALTY)) > 0 and len(gaussians):
@@ -332,15 +338,10 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         which = None if index is None else torch.arange(index, index + 1, device=rgb.device)
         return affine_colors(rgb, self.appearance(which, 1)[0])
 
-    @property
-    def _degree(self) -> int:
-        """Degree of harmonics that counts so far."""
-        return min(int(self.progress * 2 * (MAX_DEGREE + 1)), self.config.degree)
-
     @torch.no_grad()
     def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
         config = self.config
-        self.gradients.add(self._on_image, self.scene.image_size)
+        self.gradients.add(self._on_image, self._longer_side)
         self._on_image = None
         if (noise := self._chosen(config.noise, NOISE)) > 0:
             rate = self.position_rate * self._extent.of(self.extent) * learning_rate_factor(config, step, progress)
@@ -352,12 +353,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
             return self._densify(step, config.num_gaussians)
         here = len(self.means.values)
         change = moved(self.gaussians(), max(min(config.num_gaussians, int(1.05 * here)) - here, 0))
-        return () if change is None else self._changed(*change)
-
-    def _changed(self, kept: Tensor, fresh: Gaussians) -> list[RowChange]:
-        fresh = replace(fresh, means=fresh.means / self.extent)
-        rows = zip(self.parameters_of_gaussians(), vars(fresh).values(), strict=True)
-        return [RowChange(p, kept, values.reshape(len(fresh), p.shape[1])) for p, values in rows]
+        return () if change is None else row_changes(self.parameters_of_gaussians(), *change, self.extent)
 
     def _densify(self, step: int, most: int) -> list[RowChange]:
         mean = self.gradients.take(len(self.means.values))
@@ -366,7 +362,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
             none = torch.zeros(0, dtype=torch.long, device=lowered.device)
             return [RowChange(self.logits.values, none, lowered)]  # new rows, as Adam's state is reset too
         change = grown(self.gaussians(), mean, most, self._extent.of(self.extent))
-        return [] if change is None else self._changed(*change)
+        return [] if change is None else row_changes(self.parameters_of_gaussians(), *change, self.extent)
 
     def refined_cameras(self, cameras: Cameras) -> Cameras:
         """Return the training cameras with refined poses.
@@ -379,7 +375,16 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
     # -- pictures ---------------------------------------------------------------------------------------------
 
     def render_view(self, view: View, background: Tensor) -> Picture:
-        picture = draw_view(self.gaussians(), self._camera(view), view.stride, background, self.scene.far)
+        return self.render_gaussians(self.gaussians(), view, background)
+
+    def render_gaussians(self, gaussians: Gaussians, view: View, background: Tensor) -> Picture:
+        """Render given Gaussians, such as some of its own, as `render_view` does all of them.
+
+        Args:
+            gaussians: what is drawn, in the frame of the scene.
+            view, background: as in `render_view`.
+        """
+        picture = draw_view(gaussians, self._camera(view), view.stride, background, self.scene.far)
         return replace(picture, rgb=self._lit(picture.rgb, None))
 
     def render_rgb(self, view: View, background: Tensor) -> Tensor:
@@ -390,10 +395,6 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         """Return the camera of a view that is not trained on."""
         pose = None if self.poses is None else self.poses.carried_pose(view.camera.camera_to_worlds[0])
         return splat_camera(view.camera, self._near, self.config.antialiased, pose)
-
-    @property
-    def _near(self) -> float:
-        return max(0.2 * self.scene.near, 1e-3)
 
 
 METHOD = Method(GaussianSplattingConfig(), paper="arXiv:2308.04079", model=GaussianSplatting, decide=decide)

@@ -14,10 +14,9 @@ from typing import ClassVar
 from framework import Decision, Method, Scene
 from framework.base.config import AUTO, Auto, Range
 from framework.base.decisions import Choice, fill
-from framework.encodings.hash_grid import HashGrid
+from framework.encodings.hash_grid import HashGrid, HashGridConfig
 from framework.fields.encoded import EncodedField
 from framework.fields.inverted import InvertedField
-from framework.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
 from framework.rendering.background import background_renderer
 from framework.samplers.background import BackgroundConfig, decide_background, foreground
 from framework.samplers.choice import contracted_box
@@ -41,6 +40,7 @@ updates were 0.21 dB better."""
 
 @dataclass(frozen=True)
 class InstantNGPConfig(
+    HashGridConfig,
     BackgroundConfig,
     FewImagesConfig,
     max_num_iterations=20_000,
@@ -57,21 +57,10 @@ class InstantNGPConfig(
     """Settings of instant-ngp."""
 
     RANGES: ClassVar[dict[str, Range]] = {
-        "num_levels": (1, MAX_LEVELS),
-        "features_per_level": (1, 64),
-        "base_resolution": (1, MAX_RESOLUTION),
-        "max_resolution": (1, MAX_RESOLUTION),
-        "log2_table_size": (1, MAX_LOG2_TABLE_SIZE),
         "detail": (1, 64),
         "hidden_width": (1, 2**14),
     }
     """Allowed range of each numeric setting."""
-    num_levels: int = 16
-    """Number of levels of the hash grid."""
-    features_per_level: int = 2
-    """Features per grid vertex."""
-    base_resolution: int = 16
-    """Cells per axis at the coarsest level."""
     max_resolution: Auto[int] = AUTO
     """Cells per axis at the finest level. If not given: a power of two, at least `detail` cells per pixel."""
     detail: Auto[int] = AUTO
@@ -130,14 +119,14 @@ def make_field(config: InstantNGPConfig, scene: Scene) -> EncodedField:
         config: the method's settings, none left open.
         scene: properties of the data.
     """
-    scene = foreground(config, scene)
+    scene, opening = foreground(config, scene), config.open_levels_until > 0
     return EncodedField(
         scene.box,
-        _grid(config),
+        HashGrid.of(config, opening),
         config.hidden_width,
         direction_levels=4 if config.view_dependence else 0,
         unbounded=contracted_box(config, scene) is not None,
-        opening=config.open_levels_until > 0,
+        opening=opening,
     )
 
 
@@ -148,19 +137,8 @@ def make_background(config: InstantNGPConfig, scene: Scene) -> InvertedField:
         config: the method's settings, none left open.
         scene: properties of the data; not used.
     """
-    return InvertedField(_grid(config), config.hidden_width, 4 if config.view_dependence else 0)
-
-
-def _grid(config: InstantNGPConfig) -> HashGrid:
-    return HashGrid(
-        config.num_levels,
-        config.features_per_level,
-        config.base_resolution,
-        config.max_resolution,
-        config.log2_table_size,
-        config.sparse_updates,
-        opening=config.open_levels_until > 0,
-    )
+    grid = HashGrid.of(config, config.open_levels_until > 0)
+    return InvertedField(grid, config.hidden_width, 4 if config.view_dependence else 0)
 
 
 METHOD = Method(

@@ -12,12 +12,11 @@ from typing import ClassVar
 
 from framework import Decision, Field, Method, RayModel, Sampler, Scene
 from framework.base.config import Range
-from framework.base.decisions import Choice, fill
 from framework.base.optimised import Optimised
 from framework.encodings.integrated import IntegratedEncoding
 from framework.fields.integrated import IntegratedField
 from framework.kernels.frequency import MAX_FREQUENCIES
-from framework.samplers.choice import HierarchicalConfig, contracted_box, make_sampler, sampler_choice
+from framework.samplers.choice import HierarchicalConfig, contracted_box, decide_sampler, decide_samples, make_sampler
 from framework.samplers.proposal import half_edge
 
 OCCUPANCY_SAMPLES_PER_BATCH = 2**12
@@ -73,12 +72,9 @@ def decide(config: MipNeRFConfig, scene: Scene) -> tuple[MipNeRFConfig, list[Dec
     Returns:
         Settings without open ones, and a record of each that was filled in.
     """
-    config, made = fill(config, sampler_choice(config, scene.unbounded))
-    if config.sampler != "occupancy":
-        return config, made
-    reason = "the number of samples on a ray varies a hundredfold"
-    config, more = fill(config, Choice("samples_per_batch", OCCUPANCY_SAMPLES_PER_BATCH, reason, "samples a step"))
-    return config, made + more
+    config, made = decide_sampler(config, scene)
+    config, samples = decide_samples(config, OCCUPANCY_SAMPLES_PER_BATCH)
+    return config, made + samples
 
 
 def make_field(config: MipNeRFConfig, scene: Scene) -> Field:

@@ -10,60 +10,31 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar, Literal
+from typing import Literal
 
 from framework import Decision, Field, Method, Sampler, Scene
-from framework.base.config import AT_LEAST_0, Range
-from framework.base.decisions import Choice, fill
-from framework.base.optimised import Optimised
 from framework.encodings.hash_grid import HashGrid
 from framework.fields.encoded import EncodedField
 from framework.fields.inverted import InvertedField
-from framework.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
 from framework.rendering.background import background_renderer
 from framework.samplers.background import decide_background, foreground
-from framework.samplers.choice import contracted_box
+from framework.samplers.choice import contracted_box, decide_samples
 from framework.samplers.inside import make_foreground_sampler
 from framework.scene.few_images import decide_few_images
 from methods import vanilla_nerf
-from methods.vanilla_nerf import A_RAY, OCCUPANCY_SAMPLES_PER_BATCH, OPEN_UNTIL, VanillaNeRFConfig
+from methods._grids import GridsConfig, grid_optimiser
+from methods.vanilla_nerf import OCCUPANCY_SAMPLES_PER_BATCH, OPEN_UNTIL, VanillaNeRFConfig
 
 GRID_SAMPLES_PER_BATCH = 2**16
 """Samples of a training step on hash grids, instant-ngp's."""
 
 
 @dataclass(frozen=True)
-class NeRFPlusPlusConfig(VanillaNeRFConfig, num_rays_per_batch=1_024):
+class NeRFPlusPlusConfig(GridsConfig, VanillaNeRFConfig, num_rays_per_batch=1_024):
     """Settings of nerf-plus-plus; those of the networks are vanilla-nerf's, which are the paper's too."""
 
-    RANGES: ClassVar[dict[str, Range]] = {
-        "grid_learning_rate": AT_LEAST_0,
-        "num_levels": (1, MAX_LEVELS),
-        "features_per_level": (1, 64),
-        "base_resolution": (1, MAX_RESOLUTION),
-        "max_resolution": (1, MAX_RESOLUTION),
-        "log2_table_size": (1, MAX_LOG2_TABLE_SIZE),
-        "grid_width": (1, 2**14),
-    }
-    """Allowed range of each numeric setting."""
     encoding: Literal["frequency", "hash-grid"] = "frequency"
     """frequency: the paper's networks. hash-grid: hash grids with small networks, which learn in minutes on a CPU."""
-    grid_learning_rate: float = 1e-2
-    """Initial learning rate of the hash grids and of the networks that read them (hash-grid)."""
-    num_levels: int = 16
-    """Number of levels of each hash grid (hash-grid)."""
-    features_per_level: int = 2
-    """Features per grid vertex (hash-grid)."""
-    base_resolution: int = 16
-    """Cells per axis at the coarsest level (hash-grid)."""
-    max_resolution: int = 2_048
-    """Cells per axis at the finest level (hash-grid)."""
-    log2_table_size: int = 18
-    """Maximum number of table entries per level, log2 (hash-grid)."""
-    grid_width: int = 64
-    """Features per hidden layer of the networks that read the grids (hash-grid)."""
-    sparse_updates: bool = True
-    """Whether Adam updates only the table entries that a step used (hash-grid)."""
 
 
 def decide(config: NeRFPlusPlusConfig, scene: Scene) -> tuple[NeRFPlusPlusConfig, list[Decision]]:
@@ -79,12 +50,8 @@ def decide(config: NeRFPlusPlusConfig, scene: Scene) -> tuple[NeRFPlusPlusConfig
     grids = config.encoding == "hash-grid"
     config, made = decide_background(config, scene, "sphere", bounded="occupancy" if grids else None)
     config, few = decide_few_images(config, scene, OPEN_UNTIL)
-    made += few
-    if config.sampler != "occupancy":
-        return config, made
-    samples = GRID_SAMPLES_PER_BATCH if grids else OCCUPANCY_SAMPLES_PER_BATCH
-    config, more = fill(config, Choice("samples_per_batch", samples, A_RAY, "samples a step"))
-    return config, made + more
+    config, samples = decide_samples(config, GRID_SAMPLES_PER_BATCH if grids else OCCUPANCY_SAMPLES_PER_BATCH)
+    return config, made + few + samples
 
 
 def make_field(config: NeRFPlusPlusConfig, scene: Scene) -> Field:
@@ -98,7 +65,9 @@ def make_field(config: NeRFPlusPlusConfig, scene: Scene) -> Field:
         return vanilla_nerf.make_field(config, scene)
     scene = foreground(config, scene)
     unbounded = contracted_box(config, scene) is not None
-    return _on_grids(config, EncodedField(scene.box, _grid(config), config.grid_width, unbounded=unbounded))
+    field = EncodedField(scene.box, _grid(config), config.grid_width, unbounded=unbounded)
+    field.optimised = grid_optimiser(config)
+    return field
 
 
 def make_background(config: NeRFPlusPlusConfig, scene: Scene) -> Field:
@@ -110,26 +79,13 @@ def make_background(config: NeRFPlusPlusConfig, scene: Scene) -> Field:
     """
     if config.encoding == "frequency":
         return vanilla_nerf.make_background(config, scene)
-    return _on_grids(config, InvertedField(_grid(config), config.grid_width))
+    field = InvertedField(_grid(config), config.grid_width)
+    field.optimised = grid_optimiser(config)
+    return field
 
 
 def _grid(config: NeRFPlusPlusConfig) -> HashGrid:
-    return HashGrid(
-        config.num_levels,
-        config.features_per_level,
-        config.base_resolution,
-        config.max_resolution,
-        config.log2_table_size,
-        config.sparse_updates,
-        opening=config.open_levels_until > 0,
-    )
-
-
-def _on_grids(config: NeRFPlusPlusConfig, field: Field) -> Field:
-    """Return a `field` with the optimiser's settings of hash grids."""
-    rate = config.grid_learning_rate
-    field.optimised = Optimised("grids", rate, betas=(0.9, 0.99), eps=1e-15, schedule="hold-exponential")
-    return field
+    return HashGrid.of(config, opening=config.open_levels_until > 0)
 
 
 def sampler(config: NeRFPlusPlusConfig, scene: Scene) -> Sampler:

@@ -14,13 +14,12 @@ from torch import Tensor
 
 from framework import Decision, Field, Method, PixelBatch, Points, Rays, Rendered, Renderer, Sampler, Samples, Scene
 from framework.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
-from framework.base.decisions import Choice, fill
-from framework.encodings.hash_grid import HashGrid
+from framework.base.decisions import Choice
+from framework.encodings.hash_grid import HashGrid, HashGridConfig
 from framework.fields.appearance import Appearance
 from framework.fields.encoded import NUM_FEATURES, EncodedField
 from framework.fields.normals import NormalHead, density_normals, normal_penalties
 from framework.kernels.compositing import ray_sum
-from framework.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
 from framework.samplers.choice import make_sampler
 from framework.scene.few_images import FewImagesConfig, decide_few_images
 from framework.scene.reasons import LIGHT_REASONS
@@ -28,13 +27,11 @@ from methods._captures import CaptureConfig, CaptureModel, CaptureRenderer, deci
 
 APPEARANCE_SIZE = 16
 """Default length of appearance vectors where the appearance varies."""
-MARCHED_SAMPLES = 2**16
-"""Samples a training step with an occupancy grid: as many as 2,048 rays have with proposals."""
-A_RAY = "the number of samples on a ray varies a hundredfold"
 
 
 @dataclass(frozen=True)
 class NerfactoConfig(
+    HashGridConfig,
     CaptureConfig,
     FewImagesConfig,
     AppearanceConfig,
@@ -53,11 +50,6 @@ class NerfactoConfig(
     RANGES: ClassVar[dict[str, Range]] = {
         "appearance_embedding_dim": (0, 2**10),
         "orientation_loss_mult": AT_LEAST_0,
-        "num_levels": (1, MAX_LEVELS),
-        "features_per_level": (1, 64),
-        "base_resolution": (1, MAX_RESOLUTION),
-        "max_resolution": (1, MAX_RESOLUTION),
-        "log2_table_size": (1, MAX_LOG2_TABLE_SIZE),
         "hidden_width": (1, 2**14),
     }
     """Allowed range of each numeric setting."""
@@ -68,18 +60,6 @@ class NerfactoConfig(
     orientation_loss_mult: float = 0.1
     """Weight of the penalty on predicted normals that face away from the camera, relative to that on their difference
     from the density's normals."""
-    num_levels: int = 16
-    """Number of levels of the hash grid."""
-    features_per_level: int = 2
-    """Features per grid vertex."""
-    base_resolution: int = 16
-    """Cells per axis at the coarsest level."""
-    max_resolution: int = 2_048
-    """Cells per axis at the finest level."""
-    log2_table_size: int = 18
-    """Maximum number of table entries per level, log2."""
-    sparse_updates: bool = True
-    """Whether Adam updates only the table entries that a step used."""
     hidden_width: int = 64
     """Features per hidden layer of the two networks."""
 
@@ -147,10 +127,7 @@ def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[D
     varies = scene.appearance_varies
     size = APPEARANCE_SIZE if varies else 0
     appearance = Choice("appearance_embedding_dim", size, LIGHT_REASONS[varies], "appearance features")
-    config, made = decide_capture(config, scene, appearance, nested=True)
-    if config.contraction and config.sampler == "occupancy":
-        config, count = fill(config, Choice("samples_per_batch", MARCHED_SAMPLES, A_RAY, "samples a step"))
-        made += count
+    config, made = decide_capture(config, scene, appearance)
     config, few = decide_few_images(config, scene)
     return config, made + few
 
@@ -162,23 +139,14 @@ def make_field(config: NerfactoConfig, scene: Scene) -> EncodedField:
         config: the method's settings, none left open.
         scene: properties of the data.
     """
-    grid = HashGrid(
-        config.num_levels,
-        config.features_per_level,
-        config.base_resolution,
-        config.max_resolution,
-        config.log2_table_size,
-        config.sparse_updates,
-        opening=config.open_levels_until > 0,
-    )
-    size = config.appearance_embedding_dim
+    opening, size = config.open_levels_until > 0, config.appearance_embedding_dim
     return EncodedField(
         scene.box,
-        grid,
+        HashGrid.of(config, opening),
         config.hidden_width,
         unbounded=config.contraction,
         appearance=(size, scene.num_cameras) if size else None,
-        opening=config.open_levels_until > 0,
+        opening=opening,
     )
 
 

@@ -16,19 +16,17 @@ from torch import Tensor
 
 from framework import Decision, Method, Sampler, Scene
 from framework.base.config import Range
-from framework.base.decisions import Choice, fill
 from framework.base.optimised import Optimised
 from framework.fields.nerf import NeRFField
 from framework.kernels.frequency import MAX_FREQUENCIES
 from framework.rendering.background import background_renderer
 from framework.samplers.background import BackgroundConfig, decide_background, foreground
-from framework.samplers.choice import HierarchicalConfig, contracted_box
+from framework.samplers.choice import HierarchicalConfig, contracted_box, decide_samples
 from framework.samplers.inside import make_foreground_sampler
 from framework.scene.few_images import FewImagesConfig, decide_few_images
 
 OCCUPANCY_SAMPLES_PER_BATCH = 2**12
 """Samples of a training step with the occupancy grid, where the number of samples per ray varies a hundredfold."""
-A_RAY = "the number of samples on a ray varies a hundredfold"
 """Reason for a fixed number of samples, rather than of rays, per training step."""
 OCCUPANCY_RATE = 2.0
 """Factor of the learning rate with the occupancy grid. On Lego after 90 s on two cores, smaller batches and longer
@@ -82,11 +80,8 @@ def decide(config: VanillaNeRFConfig, scene: Scene) -> tuple[VanillaNeRFConfig, 
     """
     config, made = decide_background(config, scene)
     config, few = decide_few_images(config, scene, OPEN_UNTIL)
-    made += few
-    if config.sampler != "occupancy":
-        return config, made
-    config, more = fill(config, Choice("samples_per_batch", OCCUPANCY_SAMPLES_PER_BATCH, A_RAY, "samples a step"))
-    return config, made + more
+    config, samples = decide_samples(config, OCCUPANCY_SAMPLES_PER_BATCH)
+    return config, made + few + samples
 
 
 def make_field(config: VanillaNeRFConfig, scene: Scene) -> NeRFField:

@@ -2,8 +2,9 @@
 
 Barron et al., "Zip-NeRF: Anti-Aliased Grid-Based Neural Radiance Fields", ICCV 2023. Sizes are for a processor: tables
 of 2^18 entries and grids of up to 2048 cells an axis, where the paper has 2^21 and 8192. The networks are nerfacto's.
-Other than in the paper, the loss of colours is the mean squared error, gradients are scaled down near cameras (Philip
-and Deschaintre 2023), and an image's exposure is an affine transform of its colours.
+Other than in the paper, the loss of colours is the mean squared error, the networks are not told of levels' weights,
+gradients are scaled down near cameras (Philip and Deschaintre 2023), and an image's exposure is an affine transform of
+its colours.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from framework import ConfigError, Decision, Field, Method, Rays, Rendered, Rend
 from framework.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
 from framework.base.decisions import Choice
 from framework.base.optimised import Optimised
+from framework.encodings.hash_grid import HashGridConfig
 from framework.encodings.multisampled import MultisampledHashGrid
 from framework.fields.appearance import AFFINE, Appearance, exposed
 from framework.fields.multisampled import MultisampledDensity, MultisampledField
@@ -32,6 +34,7 @@ DECAY, DECAY_OF_OBJECTS = 0.1, 10.0
 
 @dataclass(frozen=True)
 class ZipNeRFConfig(
+    HashGridConfig,
     CaptureConfig,
     AppearanceConfig,
     max_num_iterations=25_000,
@@ -44,6 +47,8 @@ class ZipNeRFConfig(
     eval_num_rays_per_chunk=4_096,
     sampler="proposal",
     num_proposal_samples=(64, 64),
+    num_levels=8,
+    features_per_level=4,
 ):
     """Settings of zip-nerf; those not given depend on the scene."""
 
@@ -52,11 +57,6 @@ class ZipNeRFConfig(
         "interlevel_blurs": (1e-6, 1),
         "hash_decay_mult": AT_LEAST_0,
         "exposure_learning_rate": AT_LEAST_0,
-        "num_levels": (1, MAX_LEVELS),
-        "features_per_level": (1, 64),
-        "base_resolution": (1, MAX_RESOLUTION),
-        "max_resolution": (1, MAX_RESOLUTION),
-        "log2_table_size": (1, MAX_LOG2_TABLE_SIZE),
         "num_proposal_levels": (1, MAX_LEVELS),
         "proposal_resolutions": (1, MAX_RESOLUTION),
         "proposal_log2_table_size": (1, MAX_LOG2_TABLE_SIZE),
@@ -73,24 +73,12 @@ class ZipNeRFConfig(
     """Whether each image has an affine transform of colours. If not given: if light or exposure differ between them."""
     exposure_learning_rate: float = 1e-3
     """Initial learning rate of these transforms."""
-    num_levels: int = 8
-    """Number of levels of the hash grid."""
-    features_per_level: int = 4
-    """Features per grid vertex."""
-    base_resolution: int = 16
-    """Cells per axis at the coarsest level of each grid."""
-    max_resolution: int = 2_048
-    """Cells per axis at the finest level."""
-    log2_table_size: int = 18
-    """Maximum number of table entries per level, log2."""
     num_proposal_levels: int = 6
     """Number of levels of each proposal's hash grid, which has one feature per vertex."""
     proposal_resolutions: tuple[int, ...] = (512, 2_048)
     """Cells per axis at the finest level of each proposal's hash grid."""
     proposal_log2_table_size: int = 17
     """Maximum number of table entries per level of the proposals' hash grids, log2."""
-    sparse_updates: bool = True
-    """Whether Adam updates only the table entries that a step used."""
     hidden_width: int = 64
     """Features per hidden layer of the two networks."""
 
@@ -145,7 +133,7 @@ def make_field(config: ZipNeRFConfig, scene: Scene) -> MultisampledField:
     """Return a field of one multisampled hash grid and two small networks, by `config` and `scene`."""
     sizes = config.num_levels, config.features_per_level, config.base_resolution, config.max_resolution
     grid = MultisampledHashGrid(*sizes, config.log2_table_size, config.sparse_updates, config.hash_decay_mult)
-    return MultisampledField(scene.box, grid, config.hidden_width, unbounded=config.covers_space)
+    return MultisampledField(scene.box, grid, config.hidden_width, unbounded=config.contraction)
 
 
 def sampler(config: ZipNeRFConfig, scene: Scene) -> Sampler:

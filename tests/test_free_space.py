@@ -45,6 +45,11 @@ def test_cameras_that_look_apart_are_alone_and_those_in_one_place_never() -> Non
     assert distances_alone(apart, 0.1, 2.0).tolist() == [0.0, 0.0]
 
 
+def test_a_single_image_tells_of_no_free_space() -> None:
+    """No other camera sees its scene either, all of which would be called empty."""
+    assert distances_alone(row(0.0), 0.1, 2.0).tolist() == [0.0]
+
+
 def test_nearest_points_but_for_a_few() -> None:
     """Image 0 sees 100 points from 1 to 2, and two that are wrong; image 1 sees three points, which tell nothing."""
     cameras = row(0.0, 0.0, 0.0)
@@ -54,6 +59,14 @@ def test_nearest_points_but_for_a_few() -> None:
     expected = torch.tensor([CLEAR_SHARE, 0.0, 0.0])
     torch.testing.assert_close(before_points(cameras, known), expected)
     torch.testing.assert_close(clear_distances(cameras, known, 0.1, 1000.0), expected)
+
+
+def test_no_rays_have_no_penalty() -> None:
+    weights = torch.zeros(0, requires_grad=True)
+    samples = Samples(torch.zeros(0), torch.zeros(0), torch.zeros(1, dtype=torch.int64))
+    loss = matter_before(weights, samples, torch.zeros(0))
+    loss.backward()
+    assert loss.item() == 0
 
 
 def test_the_penalty_in_closed_form() -> None:

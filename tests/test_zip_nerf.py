@@ -1,6 +1,7 @@
 """Zip-NeRF: what the scene decides, and that each part does what it says."""
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -18,19 +19,10 @@ from framework.kernels.multisamples import unit_multisamples_reference
 from framework.training.trainer import Trainer
 from methods._captures import CaptureRenderer
 from methods.zip_nerf import ZipNeRFConfig
-from tests.training.helpers import tiny_run, tiny_trainer
+from tests.training.helpers import chosen, said_otherwise, tiny_run, tiny_trainer
 
-
-def captured(data: Path, folder: Path, facts: dict[str, object], **settings: object) -> Trainer:
-    """A trainer on the tiny data set, of whose scene other things are said."""
-    still = tiny_trainer("zip-nerf", data, folder / "still").train_set
-    (folder / "run").mkdir()
-    changed = dataclasses.replace(still, scene=dataclasses.replace(still.scene, **facts))
-    return Trainer(tiny_run("zip-nerf", data, folder / "run", max_eval_images=0, **settings), changed, None)
-
-
-def chosen(trainer: Trainer) -> dict[str, str]:
-    return {d.option: d.choice for d in trainer.profile().decisions}
+captured = partial(said_otherwise, "zip-nerf")
+"""A trainer on the tiny data set, of whose scene other things are said."""
 
 
 def test_an_object_before_no_background_needs_little(shared_tiny: Path, tmp_path: Path) -> None:
@@ -71,6 +63,7 @@ def test_what_is_asked_for_is_done_and_not_called_a_decision(shared_tiny: Path, 
     assert not trainer.model.field.unbounded
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("unbounded", [True, False])
 def test_it_learns(unbounded: bool, shared_tiny: Path, tmp_path: Path) -> None:
     trainer = captured(shared_tiny, tmp_path, {"unbounded": unbounded}, max_num_iterations=60)
@@ -87,7 +80,26 @@ def test_a_number_for_each_proposal_is_needed() -> None:
 
 def test_poses_are_refined_along_rays_of_proposals_only(shared_tiny: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="needs --sampler proposal"):
-        captured(shared_tiny, tmp_path, {"poses": "device"}, sampler="occupancy")
+        captured(shared_tiny, tmp_path, {}, sampler="occupancy", camera_optimizer="SE3")
+
+
+def test_marched_samples_need_no_flag_about_poses(shared_tiny: Path, tmp_path: Path) -> None:
+    """Who asks for an occupancy grid alone must not be told that poses, of which nothing was asked, cannot be."""
+    trainer = captured(shared_tiny, tmp_path, {"poses": "device"}, sampler="occupancy")
+    assert chosen(trainer)["pose refinement"] == "off"
+    assert trainer.model.poses is None
+
+
+@pytest.mark.parametrize("asked", [{}, {"contraction": True}])
+def test_an_occupancy_grid_sees_all_of_space_too(asked: dict[str, object], shared_tiny: Path, tmp_path: Path) -> None:
+    """What is marched through in nested boxes, the field must tell apart: two places far outside of the box."""
+    trainer = captured(shared_tiny, tmp_path, {"unbounded": not asked}, sampler="occupancy", **asked)
+    field = trainer.model.field
+    torch.nn.init.normal_(field.encoding.table, std=0.1)
+    assert trainer.model.sampler.levels > 1
+    assert trainer.config.samples_per_batch
+    far = field.eval().density(Points(torch.tensor([[8.0, 8.0, 8.0], [80.0, 80.0, 80.0]])))[0]
+    assert far[0] != far[1]
 
 
 # -- the field of frustums ----------------------------------------------------------------------------------------
@@ -154,6 +166,7 @@ def test_exposures_change_each_sample_and_not_the_background() -> None:
     assert torch.equal(exposed(rgb, opacity, background, torch.zeros(5, 12)), rgb)
 
 
+@pytest.mark.medium
 def test_images_of_other_exposure_get_transforms_of_their_own(shared_tiny: Path, tmp_path: Path) -> None:
     """With each second image darkened, the transforms of the darker ones darken."""
     still: Dataset = tiny_trainer("zip-nerf", shared_tiny, tmp_path / "still").train_set

@@ -32,6 +32,10 @@ class ConfigError(NerfloomError):
     """A setting, a name or a configuration file is wrong."""
 
 
+class FlagError(ConfigError):
+    """A flag has a value that it cannot have; the exit status of the command is 2, as for a flag that is unknown."""
+
+
 class CheckpointError(NerfloomError):
     """A checkpoint cannot be read, or does not fit the model."""
 

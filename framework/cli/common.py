@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import framework
 from framework.base.console import console, say
-from framework.base.errors import ConfigError, NerfloomError, is_out_of_memory, nearest
+from framework.base.errors import ConfigError, FlagError, NerfloomError, is_out_of_memory, nearest
 from framework.base.from_nerfstudio import KINDS
 from framework.base.registry import registered
 from framework.training.signals import exit_status, orderly_end
@@ -128,9 +128,9 @@ def make_room(path: Path) -> None:
 def run_command(command: Callable[[list[str]], None]) -> None:
     """Run a command on the arguments of the process, and exit with its status.
 
-    Errors that a user can act on are printed on one line, and the exit status is 1; with `--debug` among the arguments,
-    the traceback is shown. After a signal the status is 128 plus the signal's number. `--version` prints the version
-    and, with `--environment`, all that a report of an error needs.
+    Errors that a user can act on are printed on one line, and the exit status is 1, or 2 for an error in the flags;
+    with `--debug` among the arguments, the traceback is shown. After a signal the status is 128 plus the signal's
+    number. `--version` prints the version and, with `--environment`, all that a report of an error needs.
 
     Args:
         command: function of the list of arguments, without `--debug`.
@@ -150,7 +150,7 @@ def run_command(command: Callable[[list[str]], None]) -> None:
             raise
         console.quiet = False  # of several processes, each says why it ends
         say(f"error: {in_our_words(error)}")
-        sys.exit(1)
+        sys.exit(2 if isinstance(error, FlagError) else 1)
     except (MemoryError, RuntimeError) as error:
         if debug or not is_out_of_memory(error):
             raise

@@ -23,6 +23,7 @@ from tyro.constructors import (
 )
 
 from framework.base.config import LEFT_TO_DATA, AppearanceConfig, RayConfig, TrainConfig
+from framework.base.errors import ConfigError
 from framework.data.dataset import DataParser
 from framework.samplers.background import BackgroundConfig
 from framework.samplers.choice import HierarchicalConfig, SamplingConfig
@@ -54,8 +55,17 @@ settings come last."""
 DECIDED = "(default: decided by the data)"
 
 
+class RefusedSettings(Exception):
+    """Settings whose values cannot be.
+
+    It is no ValueError, which tyro would put into a box, without the line that says what to do.
+    """
+
+
 def grouped_flags(method: str, config: TrainConfig, data_format: str, parser: DataParser) -> ConstructorRegistry:
     """Return rules with which tyro shows the flags of a method and of a data format in groups.
+
+    With these rules `tyro.cli` raises RefusedSettings where a value is out of range.
 
     Args:
         method: the method's name.
@@ -95,6 +105,11 @@ def _divide(rules: dict[type, StructConstructorSpec], settings: Any, groups: lis
     """Add rules with which tyro treats a dataclass as a struct of groups, each a struct of some of its fields."""
     whole: Any = ConstructorRegistry.get_struct_spec(StructTypeInfo.make(type(settings), settings, False))
     flags = {field.name: _flag(field) for field in whole.fields}
+    for field in whole.fields:
+        if dataclasses.is_dataclass(field.default) and not isinstance(field.default, type):
+            kind = type(field.default)
+            nested: Any = ConstructorRegistry.get_struct_spec(StructTypeInfo.make(kind, field.default, False))
+            rules[kind] = dataclasses.replace(nested, instantiate=_checked(nested.instantiate))
     boxes = []
     for index, (title, names) in enumerate(groups):
         group = type("Group", (), {})
@@ -103,9 +118,21 @@ def _divide(rules: dict[type, StructConstructorSpec], settings: Any, groups: lis
         boxes.append(StructFieldSpec(f"{index}", annotated, MISSING_NONPROP))
 
     def join(**parts: dict[str, Any]) -> Any:
-        return whole.instantiate(**{name: value for part in parts.values() for name, value in part.items()})
+        return _checked(whole.instantiate)(**{name: value for part in parts.values() for name, value in part.items()})
 
     rules[type(settings)] = StructConstructorSpec(join, tuple(boxes))
+
+
+def _checked(make: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that makes settings by `make`, and raises RefusedSettings for a ConfigError."""
+
+    def made(**values: Any) -> Any:
+        try:
+            return make(**values)
+        except ConfigError as error:
+            raise RefusedSettings(str(error)) from error
+
+    return made
 
 
 def _flag(field: StructFieldSpec) -> StructFieldSpec:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from framework.base.errors import ConfigError
+from framework.base.errors import ConfigError, FlagError
 from framework.base.from_nerfstudio import flag_answer, vis_answer
 from framework.base.registry import entry_of, registered, summary
 from framework.cli.common import run_command
@@ -108,29 +108,19 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
 
     Flags are parsed with those of the data format, so that --data and the format's name must be found before.
     """
-    import tyro
-
     from framework.base.registry import load_dataparser
-    from framework.cli.flag_groups import grouped_flags
     from framework.data.data_folder import find_data
     from framework.training.run import run_folder
 
     if (answer := vis_answer(_take(flags, "--vis")[0] or "")) is not None:
         raise ConfigError(answer)
-    options = (tyro.conf.FlagConversionOff, tyro.conf.ConsolidateSubcommandArgs)
     if _are_pairs(flags):
         given, word = _take(flags, "--data")[0], None
         asked = run.config.data if given is None else None if given == "None" else Path(given)
     else:  # a word may belong to the flag before it or be a format's name: only the flags' types tell
-        initial, unknown = tyro.cli(
-            type(run.config),
-            prog=f"ns-train {run.method}",
-            args=[flag for flag in flags if flag not in ("-h", "--help")],
-            default=run.config,
-            config=options,
-            return_unknown_args=True,
-        )
-        asked, word = initial.data, _stray_word(unknown)
+        asking_nothing = [flag for flag in flags if flag not in ("-h", "--help")]
+        initial, unknown = _parsed(run, asking_nothing, {"method": run.config}, return_unknown_args=True)
+        asked, word = initial.method.data, _stray_word(unknown)
     if word is not None:
         _check_format(word, run.method)
         (data, named), flags = find_data(asked, word), _without(flags, word)
@@ -140,25 +130,45 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
         data, named = asked, run.dataparser
     parser = run.parser if named == run.dataparser else load_dataparser(named)()
 
-    # One flat set of the flags of both, so that their order does not matter.
-    fields = [
-        (name, Annotated[type(value), tyro.conf.arg(name="")])
-        for name, value in (("method", run.config), ("format", parser))
-    ]
-    both = dataclasses.make_dataclass("Flags", fields)
     _check_for_nerfstudio(flags, run.method, [run.config, parser])
-    parsed: Any = tyro.cli(
-        both,
-        prog=f"ns-train {run.method}",
-        description=f"{summary(registered('methods')[run.method])}\n\nData format: {named}",
-        args=flags,
-        default=both(run.config, parser),
-        config=options,
-        registry=grouped_flags(run.method, run.config, named, parser),
-    )
+    run = dataclasses.replace(run, dataparser=named, parser=parser)
+    description = f"{summary(registered('methods')[run.method])}\n\nData format: {named}"
+    parsed = _parsed(run, flags, {"method": run.config, "format": parser}, description=description)
     config = dataclasses.replace(parsed.method, data=data)
     folder = run_folder(run.method, config) if fresh else run.folder
-    return dataclasses.replace(run, config=config, dataparser=named, parser=parsed.format, folder=folder)
+    return dataclasses.replace(run, config=config, parser=parsed.format, folder=folder)
+
+
+def _parsed(run: Run, flags: list[str], settings: dict[str, Any], **options: Any) -> Any:
+    """Return `settings` changed by `flags`: one flat set of the flags of all, so that their order does not matter.
+
+    Args:
+        run: the run, for names and titles.
+        flags: the flags.
+        settings: settings of the method, and of the data format, each by a name for it.
+        options: further arguments of `tyro.cli`.
+
+    Raises:
+        FlagError: if a value is out of range.
+    """
+    import tyro
+
+    from framework.cli.flag_groups import RefusedSettings, grouped_flags
+
+    fields = [(name, Annotated[type(value), tyro.conf.arg(name="")]) for name, value in settings.items()]
+    kind = dataclasses.make_dataclass("Flags", fields)
+    try:
+        return tyro.cli(
+            kind,
+            prog=f"ns-train {run.method}",
+            args=flags,
+            default=kind(**settings),
+            config=(tyro.conf.FlagConversionOff, tyro.conf.ConsolidateSubcommandArgs),
+            registry=grouped_flags(run.method, run.config, run.dataparser, run.parser),
+            **options,
+        )
+    except RefusedSettings as error:
+        raise FlagError(str(error)) from error
 
 
 def _are_pairs(flags: list[str]) -> bool:

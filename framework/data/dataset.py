@@ -1,14 +1,13 @@
-"""Images with poses: the output of a data parser, and the data set from which batches are drawn."""
+"""Images with poses: the data set from which batches are drawn, and how it is made of what a data format reads."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -28,99 +27,15 @@ from framework.data.image_files import read_image as read_image
 from framework.data.image_files import reduce_image as reduce_image
 from framework.data.light import APPEARANCE_STOPS, light_spread
 from framework.data.mapped_pixels import MappedPixels
+from framework.data.parsed_scene import DataParser as DataParser
+from framework.data.parsed_scene import ParsedScene as ParsedScene
 from framework.data.pixel_cache import PixelMemory
 from framework.data.pixel_set import PixelSet
-from framework.data.scene import PoseSource, Scene
+from framework.data.scene import Scene
 from framework.data.sparse_depth import SparseDepth, sparse_depth
-from framework.data.tracks import Sightings
 
 Masks = Literal["auto", "ignored", "empty"]
 """Meaning of masked-out pixels: nothing is known about them, or nothing is there."""
-
-
-@dataclass(frozen=True)
-class ParsedScene:
-    """M images of one split, not decoded yet."""
-
-    image_paths: tuple[Path, ...]
-    """M image files."""
-    cameras: Cameras
-    """M cameras, for the stored sizes of the images."""
-    box: Tensor
-    """(2, 3) corners of the region of interest."""
-    near: float
-    """Distance from a camera at which the scene starts."""
-    far: float
-    """Distance from a camera at which the scene ends."""
-    times: Tensor | None = None
-    """(M,) time of each image in [0, 1]; None for a static scene."""
-    transform: Tensor | None = None
-    """(3, 4) rigid transform from the input's frame to the scene's, applied before `scale`; None for the identity."""
-    scale: float = 1.0
-    """Scene units per unit of the input."""
-    downscale_factor: int = 1
-    """Integer factor by which images are reduced when they are loaded."""
-    num_scales: int = 1
-    """Number of sizes at which each image is used: the loaded one, and then 1/2, 1/4, ... of it."""
-    mask_paths: tuple[Path | None, ...] | None = None
-    """M mask files, white for pixels to train on and black for others; None for an image without mask."""
-    points: Tensor | None = None
-    """(K, 3) sparse points on surfaces, scene coordinates."""
-    sightings: Sightings | None = None
-    """Which of the images see which sparse points; None if that is not known."""
-    unbounded: bool = False
-    """Whether there may be visible content outside `box`."""
-    poses: PoseSource = "exact"
-    """Source of the cameras' poses."""
-    appearance_varies: bool = False
-    """Whether light, exposure or camera differ between images."""
-    depth_paths: tuple[Path | None, ...] | None = None
-    """M files of depth along the camera's axis, 0 where unknown; None for an image without depth."""
-    depth_unit: float = 0.001
-    """Units of the input per unit of a stored depth: 0.001 for an input in metres and depths in millimetres."""
-    scene_indices: Tensor | None = None
-    """(M,) int64 number of the scene that each image shows; None if all show the same."""
-    source_images: Tensor | None = None
-    """(M,) bool, images that a method may render the others from, and is not judged by; None if there are none."""
-
-    def __getitem__(self, index: Tensor) -> ParsedScene:
-        """Return the images selected by an index tensor."""
-        chosen = index.tolist()
-        return replace(
-            self,
-            image_paths=tuple(self.image_paths[i] for i in chosen),
-            cameras=self.cameras[index],
-            times=None if self.times is None else self.times[index],
-            mask_paths=None if self.mask_paths is None else tuple(self.mask_paths[i] for i in chosen),
-            depth_paths=None if self.depth_paths is None else tuple(self.depth_paths[i] for i in chosen),
-            sightings=None if self.sightings is None else self.sightings.of_images(index),
-            scene_indices=None if self.scene_indices is None else self.scene_indices[index],
-            source_images=None if self.source_images is None else self.source_images[index],
-        )
-
-
-class DataParser(ABC):
-    """A data format. Subclasses are frozen dataclasses whose fields are the format's flags."""
-
-    interface: ClassVar[int] = 1
-    """Version of the plugin interface for which the format was written (`registry.INTERFACE`)."""
-
-    @classmethod
-    @abstractmethod
-    def recognizes(cls, path: Path) -> bool:
-        """Return whether the folder `path` looks like this format. Must be fast and must not raise."""
-
-    @abstractmethod
-    def parse(self, path: Path | None, split: Split) -> ParsedScene:
-        """Read one split.
-
-        Args:
-            path: the data folder, or None if the user gave none.
-            split: the split to read.
-
-        Raises:
-            DataError: with the file and what is wrong with it.
-        """
 
 
 @dataclass(frozen=True)

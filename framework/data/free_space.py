@@ -63,11 +63,15 @@ def before_points(cameras: Cameras, known: SparseDepth) -> Tensor:
 def distances_alone(cameras: Cameras, near: float, far: float) -> Tensor:
     """Return the distance (M,) from each camera up to which no other camera sees what it sees.
 
+    Of a single camera it is 0: it is alone everywhere, which says nothing of what is there.
+
     Args:
         cameras: M cameras.
         near, far: least and largest distance that is looked at, scene units.
     """
     device = cameras.fx.device
+    if len(cameras) == 1:
+        return torch.zeros(1, device=device)
     steps = torch.linspace(near, far, STEPS, device=device)
     across = (torch.arange(RAYS, device=device) + 0.5) / RAYS
     asked = torch.linspace(0, len(cameras) - 1, min(len(cameras), MOST_CAMERAS), device=device).long()

@@ -2,17 +2,48 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 import torch
 from torch import Tensor, nn
 
+from framework.base.config import Range, TrainConfig
 from framework.base.optimised import Optimised
 from framework.encodings.opening import Opening
 from framework.kernels.hash_grid import LOOK_UP, HashGridLayout, hash_grid
+from framework.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
 from framework.kernels.hash_grid_lookup import TableGradient
 from framework.kernels.memory import table
 
 FIRST_LEVELS = 4
 """Number of levels that are open at the start if they open one after the other, as in Neuralangelo (Li et al. 2023)."""
+
+
+@dataclass(frozen=True)
+class HashGridConfig(TrainConfig):
+    """Settings of a method on a hash grid."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        "num_levels": (1, MAX_LEVELS),
+        "features_per_level": (1, 64),
+        "base_resolution": (1, MAX_RESOLUTION),
+        "max_resolution": (1, MAX_RESOLUTION),
+        "log2_table_size": (1, MAX_LOG2_TABLE_SIZE),
+    }
+    """Allowed ranges."""
+    num_levels: int = 16
+    """Number of levels of the hash grid."""
+    features_per_level: int = 2
+    """Features per grid vertex."""
+    base_resolution: int = 16
+    """Cells per axis at the coarsest level."""
+    max_resolution: int = 2_048
+    """Cells per axis at the finest level."""
+    log2_table_size: int = 18
+    """Maximum number of table entries per level, log2."""
+    sparse_updates: bool = True
+    """Whether Adam updates only the table entries that a step used."""
 
 
 class HashGrid(nn.Module):
@@ -55,6 +86,12 @@ class HashGrid(nn.Module):
         self.opening = Opening(num_levels, min(FIRST_LEVELS, num_levels)) if opening else None
         self.num_features = num_levels * features_per_level
         self.register_buffer("resolutions", torch.tensor(self.layout.resolutions), persistent=False)
+
+    @classmethod
+    def of(cls, config: HashGridConfig, opening: bool = False) -> HashGrid:
+        """Return a grid with the sizes of `config`, decided; `opening` is as in the constructor."""
+        sizes = config.num_levels, config.features_per_level, config.base_resolution, config.max_resolution
+        return HashGrid(*sizes, config.log2_table_size, config.sparse_updates, opening)
 
     def forward(self, positions: Tensor) -> Tensor:
         """Return the features (N, L * F) at `positions` (N, 3) in [0, 1]."""

@@ -22,19 +22,20 @@ from torch import Tensor, nn
 from framework.base.console import say, track
 from framework.base.device import seed_step, wait_for
 from framework.base.errors import ConfigError
-from framework.base.optimised import RowChange
 from framework.cameras.cameras import Cameras
 from framework.cameras.view import View
 from framework.data.dataset import Dataset
 from framework.evaluation.evaluator import evaluation_background
 from framework.export.cameras import refined_cameras
 from framework.export.points import joined, surface_points
+from framework.geometry.alignment import nearest_rotations
 from framework.kernels.native import torch_on_one_thread
 from framework.kernels.splat_project import SplatCamera
 from framework.kernels.ssim import photometric_loss
 from framework.ray_model import RayModel
 from framework.splats.drawing import DRAWN, draw, on_image, splat_camera
 from framework.splats.gaussians import MAX_DEGREE, Gaussians
+from framework.splats.learning import as_gaussians, as_tables, number_for, open_degree, rate_factor, row_changes
 from framework.splats.mcmc import moved
 from framework.splats.start import from_points
 from framework.training.optim import Adam
@@ -60,6 +61,8 @@ OPACITY, SIZE = 0.5, 0.7
 """Of Gaussians at the start: opacity, and standard deviation in distances to neighbours."""
 RATES = {"means": 8e-5, "log_scales": 5e-3, "rotations": 1e-3, "logits": 5e-2, "colors": 2.5e-3, "harmonics": 1.25e-4}
 """Learning rates before the factor that the budget decides; of centres per scene extent."""
+MOST_GAUSSIANS, MOST_RATE = 300_000, 5.0
+"""Maximum number of Gaussians, and factor of learning rates, that are chosen by the budget."""
 STEPS_PER_SECOND = 25
 """Steps a second by which that factor is chosen."""
 SSIM_WEIGHT = 0.2
@@ -91,14 +94,14 @@ def fit_gaussians(model: RayModel[Any], dataset: Dataset, cameras: Cameras, near
         dataset: the training split, on the model's device; its times are those of the pictures.
         cameras: M pinhole cameras of that split.
         near: smallest depth at which a Gaussian is drawn, scene units.
-        seconds: time for pictures and steps together.
+        seconds: time for pictures and steps together; more is taken where the fewest pictures take longer than theirs.
 
     Raises:
         ConfigError: if no training ray ends on a surface.
     """
     begun = time.perf_counter()
     seed_step(model.config.machine.seed, 0)
-    most = number_for(seconds)
+    most = number_for(seconds, MOST_GAUSSIANS)
     points, colors = _surfaces(model, dataset, most)
     shots = _shots(model, dataset, cameras, near, PICTURES_SHARE * seconds)
     height, width = shots[0].rgb.shape[:2]
@@ -111,13 +114,9 @@ def fit_gaussians(model: RayModel[Any], dataset: Dataset, cameras: Cameras, near
     background = evaluation_background(model)
     rates = _rates(cameras, (1 - PICTURES_SHARE) * seconds)
     with torch_on_one_thread():
-        left = max(seconds - (time.perf_counter() - begun), 1.0)
+        # On a slow machine even the fewest pictures take longer than their share; a page of no steps is of no use.
+        left = max(seconds - (time.perf_counter() - begun), (1 - PICTURES_SHARE) * seconds)
         return _trained(first, shots, photographs, background, rates, most, left)
-
-
-def number_for(seconds: float) -> int:
-    """Return the number of Gaussians that suits a budget of `seconds`."""
-    return int(min(max(8_000 * math.sqrt(seconds), 20_000), 300_000))
 
 
 def _surfaces(model: RayModel[Any], dataset: Dataset, count: int) -> tuple[Tensor, Tensor]:
@@ -213,12 +212,9 @@ def between(cameras: Cameras, index: int) -> Cameras | None:
     other = int(distances.argmin())
     if other == index or float(poses[index, :, 2] @ poses[other, :, 2]) < 0.5:
         return None
-    mean = (poses[index] + poses[other]) / 2
-    u, _, vh = torch.linalg.svd(mean[:, :3])
-    flips = torch.ones(3).to(u)
-    flips[2] = torch.linalg.det(u @ vh)
-    pose = torch.cat([(u * flips) @ vh, mean[:, 3:]], -1).to(cameras.camera_to_worlds)
-    return replace(cameras[index : index + 1], camera_to_worlds=pose[None])
+    mean = ((poses[index] + poses[other]) / 2)[None]
+    pose = torch.cat([nearest_rotations(mean[:, :, :3]), mean[:, :, 3:]], -1).to(cameras.camera_to_worlds)
+    return replace(cameras[index : index + 1], camera_to_worlds=pose)
 
 
 def _shot(model: RayModel[Any], camera: Cameras, moment: float | None, near: float) -> Shot:
@@ -256,8 +252,8 @@ def _photograph(dataset: Dataset, cameras: Cameras, index: int, near: float) -> 
 
 
 def _rates(cameras: Cameras, seconds: float) -> dict[str, float]:
-    """Return the learning rates of a fit of so many seconds: fewer steps have to go farther."""
-    factor = min(max((30_000 / (STEPS_PER_SECOND * seconds)) ** 0.44, 1.0), 5.0)
+    """Return the learning rates of a fit of so many seconds."""
+    factor = rate_factor(STEPS_PER_SECOND * seconds, MOST_RATE)
     centers = cameras.camera_to_worlds[:, :, 3]
     extent = 1.1 * float((centers - centers.mean(0)).norm(dim=-1).max()) or 1.0
     return {name: factor * rate * (extent if name == "means" else 1) for name, rate in RATES.items()}
@@ -268,8 +264,9 @@ def _trained(
     rates: dict[str, float], most: int, seconds: float,
 ) -> Gaussians:  # fmt: skip
     """Return Gaussians that have learnt the pictures for so many seconds."""
-    tables = {name: nn.Parameter(values.reshape(len(first), -1).contiguous()) for name, values in vars(first).items()}
-    groups = [{"params": [tables[name]], "name": name, "lr": rates[name], "sparse": True} for name in tables]
+    tables = [nn.Parameter(values.contiguous()) for values in as_tables(first)]
+    named = zip(vars(first), tables, strict=True)
+    groups = [{"params": [table], "name": name, "lr": rates[name], "sparse": True} for name, table in named]
     optimizer = Adam(groups, {}, 1e-3, (0.9, 0.99), 1e-15)
     start, step = time.perf_counter(), 0
     for percent in track(range(100), "Fitting Gaussians", total=100):
@@ -279,39 +276,29 @@ def _trained(
                 shot = photographs[int(torch.randint(len(photographs), ()))]()
             else:
                 shot = shots[int(torch.randint(len(shots), ()))]
-            if backward(_loss(_gaussians(tables), shot, background, progress), optimizer):
+            if backward(_loss(as_gaussians(tables), shot, background, progress), optimizer):
                 optimizer.step()
             step += 1
             if step % STEPS_PER_MOVE == 0 and progress < MOVES_END:
                 _move(tables, optimizer, most)
-    say(f"{len(tables['means']):,} Gaussians after {step:,} steps")
-    return _gaussians(tables).map(Tensor.detach)
-
-
-def _gaussians(tables: dict[str, nn.Parameter]) -> Gaussians:
-    count, width = tables["harmonics"].shape
-    shaped = {**tables, "logits": tables["logits"][:, 0], "harmonics": tables["harmonics"].view(count, 3, width // 3)}
-    return Gaussians(**shaped)
+    say(f"{len(tables[0]):,} Gaussians after {step:,} steps")
+    return as_gaussians(tables).map(Tensor.detach)
 
 
 def _loss(gaussians: Gaussians, shot: Shot, background: Tensor, progress: float) -> Tensor:
     """Return the difference () of Gaussians and a picture, over a random colour where the background is seen."""
     behind = torch.rand_like(background) if bool(shot.through.any()) else background
     target = shot.rgb + shot.through * behind
-    degree = min(int(2 * (MAX_DEGREE + 1) * progress), MAX_DEGREE)
-    rgb = draw(on_image(gaussians, shot.camera, degree), shot.camera, behind).image
+    rgb = draw(on_image(gaussians, shot.camera, open_degree(progress)), shot.camera, behind).image
     if shot.kept is not None:  # what does not count is as it should be
         target = torch.where(shot.kept[..., None], target, rgb.detach())
     return photometric_loss(rgb, target, SSIM_WEIGHT)
 
 
 @torch.no_grad()
-def _move(tables: dict[str, nn.Parameter], optimizer: Adam, most: int) -> None:
+def _move(tables: list[nn.Parameter], optimizer: Adam, most: int) -> None:
     """Move Gaussians that have become transparent, and add some."""
-    here = len(tables["means"])
-    change = moved(_gaussians(tables).map(Tensor.detach), max(min(most, int(GROWTH * here)) - here, 0))
-    if change is None:
-        return
-    kept, fresh = change
-    for name, values in vars(fresh).items():
-        optimizer.change_rows(RowChange(tables[name], kept, values.reshape(len(fresh), -1)))
+    here = len(tables[0])
+    change = moved(as_gaussians(tables).map(Tensor.detach), max(min(most, int(GROWTH * here)) - here, 0))
+    for row_change in row_changes(tables, *change) if change is not None else ():
+        optimizer.change_rows(row_change)

@@ -105,6 +105,7 @@ class EncodedField(BoxField):
         appearance: size of an image's appearance vector, and number of images (NeRF-W, Martin-Brualla et al. 2021,
             section 4.1); None for no appearance vectors.
         opening: whether the bands of the viewing direction open one after the other (`Opening`).
+        ambient: number of coordinates beyond those of space (`Points.ambient`) that the density network reads.
     """
 
     def __init__(
@@ -117,10 +118,11 @@ class EncodedField(BoxField):
         unbounded: bool = False,
         appearance: tuple[int, int] | None = None,
         opening: bool = False,
+        ambient: int = 0,
     ) -> None:
         super().__init__(box, encoding, unbounded)
         self.direction_levels, self.num_features = direction_levels, num_features
-        self.density_head = MLP(encoding.num_features, width, num_features, bias=False)
+        self.density_head = MLP(encoding.num_features + ambient, width, num_features, bias=False)
         inputs = num_features + direction_levels**2
         self.direction_opening = Opening(direction_levels, 1) if opening and direction_levels else None
         self.appearance = None
@@ -130,7 +132,10 @@ class EncodedField(BoxField):
         self.color_head = MLP(inputs, width, width, 3, bias=False, activation="sigmoid")
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
-        return self.density_head.density(self.encode(points.positions, points.times))
+        encoded = self.encode(points.positions, points.times)
+        if points.ambient is None:
+            return self.density_head.density(encoded)
+        return self.density_head.density(encoded, points.ambient.to(encoded.dtype))
 
     def grid_density(self) -> GridDensity | None:
         """Return the density as `trace` computes it; None if this field's is another."""

@@ -56,14 +56,14 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
         ValueError: The shapes differ or are not those of images, or a side is shorter than the window.
     """
     _check(image, target)
+    if min(image.shape[:2]) < WINDOW:
+        raise ValueError(f"SSIM needs at least {WINDOW}x{WINDOW} pixels, not {image.shape[1]}x{image.shape[0]}")
     return 1 - PHOTOMETRIC((image, target), image, target, 1.0)
 
 
 def _check(image: Tensor, target: Tensor) -> None:
     if image.ndim != 3 or image.shape != target.shape or image.shape[2] < 1:
         raise ValueError(f"SSIM needs two images (H, W, C), not {tuple(image.shape)} and {tuple(target.shape)}")
-    if min(image.shape[:2]) < WINDOW:
-        raise ValueError(f"SSIM needs at least {WINDOW}x{WINDOW} pixels, not {image.shape[1]}x{image.shape[0]}")
 
 
 def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
@@ -83,10 +83,9 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float) -> Tenso
     Raises:
         ValueError: The shapes differ or are not those of images.
     """
-    small = image.ndim == 3 and image.shape == target.shape and min(image.shape[:2]) < WINDOW
-    if small or ssim_weight == 0:
-        return (image - target).abs().mean()
     _check(image, target)
+    if ssim_weight == 0 or min(image.shape[:2]) < WINDOW:
+        return (image - target).abs().mean()
     return PHOTOMETRIC((image, target), image, target, ssim_weight)
 
 

@@ -106,7 +106,7 @@ def depth_error(weights: Tensor, samples: Samples, known: Tensor) -> Tensor:
 
 
 def matter_before(weights: Tensor, samples: Samples, clear: Tensor) -> Tensor:
-    """Return the mean optical depth () before distances up to which rays should meet nothing.
+    """Return the mean optical depth () before distances up to which rays should meet nothing; 0 without rays.
 
     With B the light that is stopped before, a ray's term is -log((1 - B + e) / (1 + e)), e = `WRONG`. It is the optical
     depth, but bounded, so that a wall that all images show stays.
@@ -118,7 +118,7 @@ def matter_before(weights: Tensor, samples: Samples, clear: Tensor) -> Tensor:
     """
     before = samples.t_ends < clear[samples.ray_indices]
     left = (1 - ray_sum(weights * before, samples)).clamp(min=0)
-    return -((left + WRONG) / (1 + WRONG)).log().mean()
+    return -((left + WRONG) / (1 + WRONG)).log().sum() / max(len(left), 1)
 
 
 def distance_likelihood(weights: Tensor, samples: Samples, known: Tensor, deviations: Tensor) -> Tensor:
@@ -186,10 +186,11 @@ def density_before(samples: Samples, distance: float) -> Tensor:
 
 
 def depth_roughness(weights: Tensor, samples: Samples, side: int) -> Tensor:
-    """Return how rough the depth of square patches of rays is: RegNeRF (Niemeyer et al. 2022), equation 8.
+    """Return how rough the depth of square patches of rays is, after RegNeRF (Niemeyer et al. 2022), equation 8.
 
-    It is the mean squared difference between neighbours of the inverse depth, which is linear in the image of a plane,
-    relative to its mean in the patch. Neighbours count as far as both are opaque.
+    It is the mean squared difference between neighbours. That of RegNeRF is of the depth; here it is of the inverse
+    depth, which is linear in the image of a plane, relative to its mean in the patch. Neighbours count as far as both
+    are opaque.
 
     Args:
         weights: (N,) weights of the samples.

@@ -132,6 +132,22 @@ def decide_sampler(config: SamplingConfigT, scene: Scene) -> tuple[SamplingConfi
     return fill(config, sampler_choice(config, scene.unbounded))
 
 
+def decide_samples(config: SamplingConfigT, count: int) -> tuple[SamplingConfigT, list[Decision]]:
+    """Decide the number of samples in a training step with an occupancy grid; other samplers have a number of rays.
+
+    Args:
+        config: the method's settings, with the sampler decided.
+        count: number of samples that suits the method.
+
+    Returns:
+        the settings, and the decision, if it was made.
+    """
+    if config.sampler != "occupancy":
+        return config, []
+    reason = "the number of samples on a ray varies a hundredfold"
+    return fill(config, Choice("samples_per_batch", count, reason, "samples a step"))
+
+
 def contracted_box(config: SamplingConfig, scene: Scene) -> Tensor | None:
     """Return the box (2, 3) around which a method's field contracts all of space; None if the field ends at the box.
 

@@ -45,9 +45,11 @@ WARM_UP_DECAY, DECAY = 0.7, 0.8
 TIMES_PER_VISIT, MOVING_DECAY = 4, 0.95
 """Number of times at which a cell of a moving scene is evaluated at each update, and the factor of its density, which
 is larger because a cell may be occupied for a short time only. Both are for a grid with one slice of time."""
-SHARE, SHARE_OF_SLICES = 64, 128
+SHARE, SHARE_OF_SLICES = 64, 512
 """Numbers of cells for each one that is drawn from all cells at an update after warm-up, without and with slices of
 time. With them there are more cells, of which fewer are occupied."""
+PASSES, PASSES_OF_SLICES = 4, 1
+"""Passes over all cells during warm-up, without and with slices of time."""
 COARSE_STEPS = (WARM_UP_STEPS // 4, 4.0), (WARM_UP_STEPS, 2.0)
 """Training steps until which the march through nested boxes takes longer steps, and how much longer these are. While
 nothing is known to be empty, few rays would take all samples."""
@@ -288,7 +290,7 @@ class OccupancySampler(Sampler):
         Only one in eight of the empty cells is returned, because few of them become occupied again.
         """
         num_cells = len(self.occupied)
-        count = math.ceil(4 * num_cells * 8 / WARM_UP_STEPS)
+        count = math.ceil((PASSES if self.slices == 1 else PASSES_OF_SLICES) * num_cells * 8 / WARM_UP_STEPS)
         ranks = torch.arange(turn * count, (turn + 1) * count, device=self.occupied.device)
         cells = ranks * SHUFFLE_STRIDE % num_cells
         selected = self.occupied.index_select(0, cells) | (torch.rand(count, device=cells.device) < 1 / 8)

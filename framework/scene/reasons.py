@@ -14,3 +14,5 @@ POSE_REASONS = {
     "device": "the poses are those that the device tracked",
 }
 """Reason of refining poses, by their source (`Scene.poses`)."""
+MARCHED_REASON = "marched samples carry no gradient to rays"
+"""Reason of not refining poses that are not exact."""

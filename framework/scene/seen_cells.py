@@ -17,7 +17,7 @@ BLOCK = 4
 AROUND = 4
 """Distance, in radii of a cube, within which a camera sees it, wherever it looks."""
 MARGIN = 2.0
-"""Factor of a cube's radius in the image, which is larger beside the middle of the image than in it."""
+"""Minimum factor of a cube's radius in the image, which is larger beside the middle of the image than in it."""
 
 
 @torch.no_grad()
@@ -51,7 +51,20 @@ def _shows(cameras: Cameras, index: int, centers: Tensor, radius: float, nearest
     distances = (centers - cameras.camera_to_worlds[index, :, 3]).norm(dim=-1)
     columns, rows, ahead = cameras.project(centers, index)
     focal = torch.maximum(cameras.fx[index], cameras.fy[index])
-    reach = MARGIN * focal * radius / (distances - radius).clamp(min=radius)
+    reach = _margin(cameras, index) * focal * radius / (distances - radius).clamp(min=radius)
     across = (columns > -reach) & (columns < cameras.widths[index] + reach)
     inside = ahead & across & (rows > -reach) & (rows < cameras.heights[index] + reach)
     return (inside | (distances < AROUND * radius)) & (distances + radius > nearest)
+
+
+def _margin(cameras: Cameras, index: int) -> float:
+    """Return how much larger a small ball is in a corner of the image than in its middle, at least `MARGIN`.
+
+    It is 1 + tan(a)^2 at the angle a from the axis, along the line to the middle.
+    """
+    one = cameras[index : index + 1]
+    across, down = (
+        float(torch.maximum(middle, size - middle)) / float(focal)
+        for middle, size, focal in ((one.cx, one.widths, one.fx), (one.cy, one.heights, one.fy))
+    )
+    return max(MARGIN, 1 + across**2 + down**2)

@@ -34,8 +34,9 @@ def splat_camera(
         antialiased: make up for the blur of small Gaussians by their opacity.
         pose: (3, 4) camera-to-scene pose to use instead of its own; it may require a gradient.
         reduced: factor by which the image is smaller than the camera's.
+
     Raises:
-        ConfigError for a camera model that is not among `DRAWN`.
+        ConfigError: for a camera model that is not among `DRAWN`.
     """
     if camera.model not in DRAWN:
         raise ConfigError(

@@ -9,7 +9,9 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from framework.cameras.view import View
 from framework.kernels.splat_project import DEGREES
+from framework.rendering.rendered import Picture
 
 MAX_DEGREE = max(DEGREES)
 """Highest degree of the spherical harmonics that colours are made of."""
@@ -66,6 +68,19 @@ class HasGaussians(Protocol):
 
     def gaussians(self) -> Gaussians:
         """Return them, without gradient."""
+
+
+@runtime_checkable
+class RendersGaussians(HasGaussians, Protocol):
+    """A model that renders some of its Gaussians as well as all."""
+
+    def render_gaussians(self, gaussians: Gaussians, view: View, background: Tensor) -> Picture:
+        """Render given Gaussians, such as some of its own, as `Model.render_view` does all of them.
+
+        Args:
+            gaussians: what is drawn, in the frame of the scene.
+            view, background: as in `Model.render_view`.
+        """
 
 
 @runtime_checkable

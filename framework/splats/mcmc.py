@@ -6,11 +6,10 @@ stays as it was; noise moves those that are nearly transparent, and so looks for
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
+from framework.base.device import to_float64
 from framework.kernels.splat_project import rotation_matrices
 from framework.splats.gaussians import Gaussians
 
@@ -28,6 +27,7 @@ def moved(gaussians: Gaussians, added: int) -> tuple[Tensor, Gaussians] | None:
     Args:
         gaussians: all of them.
         added: how many more there are to be.
+
     Returns:
         which Gaussians (K,) stay as they are, and those that are added behind them: each that was chosen, as many
         times as it is to be there. None where nothing is to be done.
@@ -60,20 +60,22 @@ def shared(logits: Tensor, log_scales: Tensor, counts: Tensor) -> tuple[Tensor, 
         logits: (K,) opacity before the sigmoid.
         log_scales: (K, 3).
         counts: (K,) int64 n, how many it becomes; at most MOST_COPIES.
+
     Returns:
-        (K,) and (K, 3).
+        (K,) logits and (K, 3) logarithms of scales of each of the n.
     """
-    alpha = torch.sigmoid(logits).clamp(1e-6, 1 - 1e-6)
-    each = -torch.expm1(torch.log1p(-alpha) / counts)
+    # In float64: the sum alternates, and its terms are up to ten thousand times as large as what is left of them.
+    alpha = torch.sigmoid(to_float64(logits)).clamp(1e-6, 1 - 1e-6)
+    n = counts.to(alpha)[:, None]
+    each = -torch.expm1(torch.log1p(-alpha) / n[:, 0])
     most = int(counts.max()) if len(counts) else 1
     # sum_{i=1}^{n} binom(i-1, k) = binom(n, k+1)
     k = torch.arange(most, device=alpha.device, dtype=alpha.dtype)
-    n = counts.to(alpha)[:, None]
-    log_binomial = torch.lgamma(n + 1) - math.lgamma(1) - torch.lgamma(k + 2) - torch.lgamma((n - k).clamp(min=1))
+    log_binomial = torch.lgamma(n + 1) - torch.lgamma(k + 2) - torch.lgamma((n - k).clamp(min=1))
     terms = torch.exp(log_binomial + (k + 1) * each.log()[:, None]) / (k + 1).sqrt() * (1 - 2 * (k % 2))
     total = terms.masked_fill(k[None] >= n, 0).sum(1)
     factor = alpha / total.clamp(min=1e-12)
-    return torch.logit(each.clamp(DEAD, 1 - 1e-6)), log_scales + factor.log()[:, None]
+    return torch.logit(each.clamp(DEAD, 1 - 1e-6)).to(logits), log_scales + factor.log().to(log_scales)[:, None]
 
 
 @torch.no_grad()
@@ -83,6 +85,7 @@ def shaken(gaussians: Gaussians, size: float) -> tuple[Tensor, Tensor]:
     Args:
         gaussians: all of them.
         size: the noise of a transparent Gaussian, in its standard deviations squared per scene unit.
+
     Returns:
         which (K,), and by how much (K, 3), scene units.
     """

@@ -57,6 +57,8 @@ SIGNS = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
 """Factors of harmonics of degrees 1 to 3 when y and z change sign."""
 RATIO = 1032
 """Maximum ratio of sizes before and after compression by gzip."""
+FLAT = 3.0
+"""Logarithm of the largest over the smallest size that is written, beyond which nobody sees it clipped."""
 SURPLUS = 1 << 24
 """Maximum number of bytes behind the last array, where extensions of the format stand."""
 
@@ -144,7 +146,9 @@ def out_of_range(gaussians: Gaussians) -> list[str]:
         lost.append(
             f"SPZ rounds positions to {step:.2g}, and a typical Gaussian has the size {typical:.2g}; PLY does not"
         )
-    outside = ((gaussians.log_scales < -10) | (gaussians.log_scales > 6)).any(-1)
+    largest = gaussians.log_scales.amax(-1, keepdim=True)
+    seen = (gaussians.log_scales < -10) & (largest < -10 + FLAT)
+    outside = (seen | (largest > 6)).any(-1)
     if count := int(outside.sum()):
         lost.append(f"SPZ has no sizes below {math.exp(-10):.2g} or above {math.exp(6):.0f}: {count:,} are clipped")
     return lost

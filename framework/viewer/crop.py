@@ -1,17 +1,26 @@
-"""Crop boxes of views: rays that start and end in a box, and pictures without what lies outside of it."""
+"""Crop boxes of views: pictures of what lies within a box, and between two distances from the camera."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from framework.cameras.cameras import CENTER, Cameras
+from framework.cameras.view import View
 from framework.geometry.bounds import intersect_box
 from framework.geometry.rays import Rays
+from framework.model import Model
+from framework.ray_model import RayModel
 from framework.rendering.rendered import Picture
+from framework.splats.gaussians import RendersGaussians
 from framework.viewer.request import Crop
+
+BY_RAYS = "Only what is inside the box is rendered, so that what lies behind its walls is seen."
+BY_CENTERS = "Only Gaussians whose centre is inside the box are drawn, so that what lies behind its walls is seen."
+BY_DEPTH = "Pixels whose surface lies outside of the box are hidden; what lies behind them is not seen."
 
 
 @dataclass(frozen=True)
@@ -70,3 +79,47 @@ def without_outside(picture: Picture, rays: Rays, crop: Crop, background: Tensor
         rgb=torch.where(hidden[..., None], background, picture.rgb),
         accumulation=torch.where(hidden, torch.zeros_like(picture.accumulation), picture.accumulation),
     )
+
+
+def picture_within(model: Model[Any], view: View, crop: Crop, background: Tensor) -> Picture:
+    """Return a picture (H, W) of what lies within a crop, as `meaning` says for the kind of model.
+
+    Args:
+        model: the model in evaluation mode.
+        view: the view, whose stride is 1.
+        crop: the box and the distances.
+        background: (3,) colour behind it.
+    """
+    camera = view.camera
+    if isinstance(model, RendersGaussians):
+        found = model.gaussians()
+        return model.render_gaussians(found[within(found.means, camera, crop)], view, background)
+    rays = camera.pixel_rays(camera.image_pixels(0), model.scene.near, model.scene.far)
+    if not isinstance(model, RayModel):
+        return without_outside(model.render_view(view, background), rays, crop, background, by_depth=True)
+    picture = model.render_view(replace(view, camera=CroppedCameras.of(camera, crop)), background)
+    return without_outside(picture, rays, crop, background, by_depth=False)
+
+
+def meaning(model: Model[Any]) -> str:
+    """Return what a crop does to pictures of a model, for people.
+
+    Args:
+        model: the model.
+    """
+    if isinstance(model, RendersGaussians):
+        return BY_CENTERS
+    return BY_RAYS if isinstance(model, RayModel) else BY_DEPTH
+
+
+def within(points: Tensor, camera: Cameras, crop: Crop) -> Tensor:
+    """Return which points (N, 3) lie within a crop, (N,) bool.
+
+    Args:
+        points: scene coordinates.
+        camera: one camera, from which the crop's distances are.
+        crop: the box and the distances.
+    """
+    low, high = points.new_tensor(crop.corners)
+    distances = (points - camera.camera_to_worlds[0, :, 3]).norm(dim=-1)
+    return ((points >= low) & (points <= high)).all(-1) & (distances >= crop.near) & (distances <= crop.far)

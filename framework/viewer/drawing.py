@@ -15,9 +15,8 @@ from framework.cameras.view import View
 from framework.evaluation.appearance import appearance_of, shown_appearance
 from framework.evaluation.evaluator import evaluation_background
 from framework.evaluation.outputs import Arrays, distance_range, kept_outputs, rendered_outputs, shown_output
-from framework.ray_model import RayModel
 from framework.rendering.rendered import Picture
-from framework.viewer.crop import CroppedCameras, without_outside
+from framework.viewer.crop import picture_within
 from framework.viewer.pace import Piece
 from framework.viewer.request import Request
 from framework.viewer.subject import Subject
@@ -41,8 +40,6 @@ def draw(subject: Subject, request: Request, piece: Piece, ndc: Ndc | None, trut
     model = subject.model
     camera = request.camera(piece.stride, (piece.top, piece.bottom), ndc).to(model.device)
     crop = request.crop if ndc is None else None
-    if crop is not None and isinstance(model, RayModel):
-        camera = CroppedCameras.of(camera, crop)
     view = View(camera, request.time if model.scene.moving else None, piece.rays)
     background = evaluation_background(model)
     if request.background is not None:
@@ -51,11 +48,10 @@ def draw(subject: Subject, request: Request, piece: Piece, ndc: Ndc | None, trut
         if request.output == "rgb" and crop is None:
             kept = rendered_outputs(model, view, background, ["rgb"], subject.unit)
         else:
-            picture = model.render_view(view, background)
-            if crop is not None:
-                rays = request.camera(piece.stride, (piece.top, piece.bottom)).to(model.device)
-                whole = rays.pixel_rays(rays.image_pixels(0), model.scene.near, model.scene.far)
-                picture = without_outside(picture, whole, crop, background, not isinstance(model, RayModel))
+            if crop is None:
+                picture = model.render_view(view, background)
+            else:
+                picture = picture_within(model, view, crop, background)
             kept = _kept(subject, request, view, picture, background, truth)
     wait_for(model.device)
     return kept

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from framework.evaluation.appearance import appearance_of
-from framework.ray_model import RayModel
+from framework.viewer.crop import meaning
 from framework.viewer.occupancy import shown_cells
 from framework.viewer.request import (
     FARTHEST,
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
 SIZES = ("1024", "256", "512", "2048")
 """Longest sides of pictures, pixels; the first is what a browser begins with."""
-BY_RAYS = "Only what is inside the box is rendered, so that what lies behind its walls is seen."
-BY_DEPTH = "Pixels whose surface lies outside of the box are hidden; what lies behind them is not seen."
 MEAN = "mean of all images"
 
 
@@ -85,7 +83,7 @@ class Panel:
         low, high = (tuple(corner) for corner in model.scene.box.cpu().tolist())
         step = float((model.scene.box[1] - model.scene.box[0]).max()) / 200
         with gui.add_folder("Crop", expand_by_default=False):
-            gui.add_markdown(BY_RAYS if isinstance(model, RayModel) else BY_DEPTH)
+            gui.add_markdown(meaning(model))
             self._crop_values = [
                 gui.add_checkbox("Crop", False),
                 gui.add_vector3("Lowest corner", low, step=step),

@@ -14,6 +14,7 @@ from framework.cli.train import _default_run, _parse_flags
 from tests.cli.helpers import TINY_NGP, called, command, run
 
 
+@pytest.mark.medium
 def test_help_is_quick_and_lists_every_method() -> None:
     def once() -> tuple[float, str]:
         start = time.perf_counter()
@@ -67,11 +68,20 @@ def test_an_unknown_flag_gets_the_nearest() -> None:
     assert "Traceback" not in done.stderr
 
 
-def test_a_flag_out_of_range_says_so() -> None:
-    done = called("ns-train", "instant-ngp", "--max-seconds", "0")
-    assert done.returncode == 1
-    assert "--max-seconds is 0.0; it must be more than 0" in " ".join(done.stderr.replace("│", " ").split())
-    assert "Traceback" not in done.stderr
+@pytest.mark.parametrize("beside", [[], ["procedural"], ["--train-image-indices", "0", "1"]])
+@pytest.mark.parametrize(
+    ("flag", "value", "words"),
+    [
+        ("--max-seconds", "0", "--max-seconds is 0.0; it must be more than 0"),
+        ("--num-levels", "99", "--num-levels is 99; it must be from 1 to 64"),
+        ("--machine.seed", str(2**64), f"--machine.seed is {2**64}; it must be an integer of 64 bits"),
+    ],
+)
+def test_a_flag_out_of_range_is_one_line(flag: str, value: str, words: str, beside: list[str]) -> None:
+    """In pairs of flags and values, beside a format's name, and beside a flag of several values."""
+    done = called("ns-train", "instant-ngp", flag, value, *beside)
+    assert done.returncode == 2
+    assert done.stderr.strip() == f"error: {words}"
 
 
 def test_damaged_data_is_one_line_and_debug_shows_more(tiny: Path, tmp_path: Path) -> None:
@@ -135,6 +145,7 @@ def finished(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return output / shared_tiny.name / "instant-ngp" / "t"
 
 
+@pytest.mark.medium
 def test_the_run_folder(finished: Path) -> None:
     config = yaml.safe_load((finished / "config.yml").read_text())
     assert config["method"] == "instant-ngp"

@@ -230,9 +230,7 @@ def test_nested_flags_and_those_of_the_format_in_any_order() -> None:
     assert run.parser == load_dataparser("procedural")(size=32, num_train=5, moving=True)  # type: ignore[call-arg]
 
 
-@pytest.mark.parametrize(
-    "flags", ["--max-secnds 3", "--learning-rate x", "--background blue", "--machine.seed x", "--early-stop 3"]
-)
+@pytest.mark.parametrize("flags", ["--max-secnds 3", "--learning-rate x", "--background blue", "--machine.seed x"])
 def test_errors_are_those_without_groups(flags: str, capsys: Capture) -> None:
     said = []
     for grouped in (True, False):

@@ -324,6 +324,7 @@ def test_no_folder_and_no_model(tmp_path: Path) -> None:
         Colmap().parse(tmp_path, "train")
 
 
+@pytest.mark.medium
 @pytest.mark.data
 @pytest.mark.parametrize("scene_name", ["colmap_can", "colmap_cup", "colmap_desk"])
 def test_real_points_are_seen_where_their_keypoints_are(real_data: Path, scene_name: str) -> None:

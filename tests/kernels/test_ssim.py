@@ -195,6 +195,7 @@ def test_without_gradients_the_value_is_the_same() -> None:
         assert torch.equal(ssim(image.requires_grad_(), target), value)
 
 
+@pytest.mark.medium
 def test_derivatives_of_the_reference() -> None:
     torch.manual_seed(0)
     image, target = (torch.rand(12, 11, 1, dtype=torch.float64, requires_grad=True) for _ in range(2))
@@ -225,6 +226,14 @@ def test_second_derivatives_are_the_references() -> None:
 def test_what_is_refused(image: tuple[int, ...], target: tuple[int, ...], said: str) -> None:
     with pytest.raises(ValueError, match=said):
         ssim(torch.zeros(image), torch.zeros(target))
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.2])
+@pytest.mark.parametrize(("image", "target"), [((20, 20, 3), (20, 20, 1)), ((20, 20), (20, 20)), ((5, 5, 3), (5, 5))])
+def test_a_loss_is_of_two_images_of_one_shape(image: tuple[int, ...], target: tuple[int, ...], weight: float) -> None:
+    """Without a weight of SSIM, and of small images too: torch would repeat the smaller one."""
+    with pytest.raises(ValueError, match="SSIM needs two images"):
+        photometric_loss(torch.zeros(image), torch.zeros(target), weight)
 
 
 @needs_kernels

@@ -226,6 +226,15 @@ def test_cells_that_no_camera_shows() -> None:
     assert not bool(seen[(x.abs() > -z + 0.7) & (far > 0.6)].any())
 
 
+def test_a_wide_lens_shows_more_beside_its_middle() -> None:
+    """At 76 degrees from the axis a ball is 17 times as large on the image as in its middle."""
+    size = torch.tensor([40])
+    cameras = Cameras(torch.eye(3, 4)[None], *[torch.tensor([v]) for v in (7.0, 7.0, 20.0, 20.0)], size, size)
+    x, y, z = ((torch.cartesian_prod(*[torch.arange(64)] * 3) + 0.5) / 32 - 1).unbind(-1)
+    shown = (z < 0) & (x.abs() < -z * 20 / 7) & (y.abs() < -z * 20 / 7)
+    assert bool(seen_cells(cameras, torch.tensor([0.0]), BOX, 64)[shown].all())
+
+
 def captured(method: str, data: Path, folder: Path, **facts: object) -> Trainer:
     """A trainer on the tiny data set as if its scene had no bounds."""
     settings = {"sampler": "occupancy", "nested_resolution": 16, "grid_levels": 4, "num_steps": 400}
@@ -236,6 +245,7 @@ def captured(method: str, data: Path, folder: Path, **facts: object) -> Trainer:
     return Trainer(run, dataclasses.replace(still, scene=scene), None)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("method", ["nerfacto", "instant-ngp"])
 def test_a_capture_is_learnt_and_its_grid_kept(method: str, shared_tiny: Path, tmp_path: Path) -> None:
     trainer = captured(method, shared_tiny, tmp_path)

@@ -321,6 +321,7 @@ def test_what_is_out_of_range_is_said(tmp_path: Path) -> None:
     gaussians = some(100)
     gaussians.means[0, 0] = 2.0**20
     gaussians.log_scales[:5] = -12
+    gaussians.log_scales[5:9] = torch.tensor([-3.0, -3.0, -12.0])  # flat: how thin is not seen
     first, second = write_gaussians(tmp_path / "a.spz", gaussians)
     assert "rounds positions to 0.25" in first
     assert "5 are clipped" in second
@@ -434,6 +435,7 @@ def test_what_is_no_similarity_is_refused() -> None:
 # -- size -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("suffix", ["ply", "spz"])
 def test_max_megabytes_holds_and_no_more_is_given_up_than_needed(tmp_path: Path, suffix: str) -> None:
     gaussians, file = some(4000), tmp_path / f"a.{suffix}"

@@ -121,6 +121,23 @@ def test_masked_pixels_teach_nothing() -> None:
     assert any(float(first.abs().sum()) > 0 for first in gradients[0])
 
 
+def test_growth_asks_for_as_much_of_images_of_half_the_size() -> None:
+    """Image positions are in units of the image that was drawn: its size must not change what a Gaussian is to do."""
+    torch.manual_seed(4)
+    size = torch.tensor([64])
+    large = Cameras(camera().camera_to_worlds, *(torch.tensor([v]) for v in (80.0, 80.0, 32.0, 32.0)), size, size)
+    batch = ViewBatch(0, View(large), torch.full((64, 64, 3), 0.9), torch.zeros(3))
+    scene, means = dataclasses.replace(SCENE, image_size=64), []
+    for reduced_until in (0.0, 1.0):
+        config, _ = decide(GaussianSplattingConfig(reduced_until=reduced_until, ssim_weight=0.0), scene)
+        model = GaussianSplatting(config, scene)
+        model.set_gaussians(ball(0.0, log_scales=torch.full((1, 3), -1.0), harmonics=torch.zeros(1, 3, 15)))
+        model.loss(batch, 0).total.backward()
+        model.after_step(0, 0.0)
+        means.append(float(model.gradients.take(1)))
+    assert means[1] == pytest.approx(means[0], rel=0.05)
+
+
 @pytest.mark.slow
 def test_a_field_shows_where_to_start(shared_tiny: Path, tmp_path: Path) -> None:
     """After no step of its own, better than anywhere in the box; the same bits each time."""
@@ -190,6 +207,7 @@ def test_the_method_is_declared() -> None:
     assert METHOD.field is None
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("strategy", ["adc", "mcmc"])
 def test_a_run_goes_on_with_the_same_bits_between_two_changes(strategy: str, shared_tiny: Path, tmp_path: Path) -> None:
     """Gradients that are being counted are a part of a checkpoint, and so are all numbers of Gaussians."""

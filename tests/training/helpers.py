@@ -194,6 +194,19 @@ CLOCKS = r"/state/(seconds|curve/\d+/[06]|looks/.*)"
 """Where in it seconds are, and what follows them."""
 
 
+def said_otherwise(method: str, data: Path, folder: Path, facts: dict[str, Any], **settings: Any) -> Trainer:
+    """A trainer on a tiny data set, of whose scene other `facts` are said."""
+    still = tiny_trainer(method, data, folder / "still").train_set
+    (folder / "run").mkdir()
+    changed = dataclasses.replace(still, scene=dataclasses.replace(still.scene, **facts))
+    return Trainer(tiny_run(method, data, folder / "run", max_eval_images=0, **settings), changed, None)
+
+
+def chosen(trainer: Trainer) -> dict[str, str]:
+    """What was decided by the data, by name."""
+    return {decision.option: decision.choice for decision in trainer.profile().decisions}
+
+
 def differences(first: Path, second: Path) -> list[str]:
     """What the newest checkpoints of two runs' folders do not have in common, to the last bit; clocks do not count."""
     mine, theirs = _trained(first), _trained(second)

@@ -4,7 +4,7 @@ import json
 import re
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import binary_dilation, binary_erosion
 
 from framework.cameras.camera_path import read_camera_path
 from framework.cameras.view import View
@@ -25,6 +26,8 @@ from tests.viewer.chromium import Chromium, Tab, chromium, until
 
 pytest.importorskip("viser", reason="the extra [viewer] is not installed")
 pytestmark = pytest.mark.slow
+PICTURE = np.s_[200:520, 60:540]
+"""Rows and columns of the page beside the panel and below the note that WebGL is slow here."""
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +59,7 @@ def started(*words: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
         process.communicate(timeout=60)
 
 
-def settled(tab: Tab, seconds: float = 60.0) -> np.ndarray:
+def settled(tab: Tab, seconds: float = 180.0) -> np.ndarray:
     """The page when it has stopped changing."""
     end, before = time.monotonic() + seconds, tab.screenshot()
     while time.monotonic() < end:
@@ -69,8 +72,8 @@ def settled(tab: Tab, seconds: float = 60.0) -> np.ndarray:
 
 
 def shown(tab: Tab) -> np.ndarray:
-    """The canvas at rest, beside the panel and below notes."""
-    return settled(tab)[150:520, 60:540].astype(float)
+    """The picture at rest."""
+    return settled(tab)[PICTURE].astype(float)
 
 
 def expected(run: Path, tab: Tab, camera: list[float], time: float | None = None) -> np.ndarray:
@@ -83,7 +86,7 @@ def expected(run: Path, tab: Tab, camera: list[float], time: float | None = None
     model = load_trained(run, device_type="cpu").model
     request = Request(Pose(tuple(matrix.flatten().tolist()), np.radians(50)), width, height, time=time)
     picture = model.render_view(View(request.camera(), time=time), evaluation_background(model))
-    return picture.rgb.clamp(0, 1).numpy()[150:520, 60:540] * 255
+    return picture.rgb.clamp(0, 1).numpy()[PICTURE] * 255
 
 
 def decibels(a: np.ndarray, b: np.ndarray) -> float:
@@ -108,6 +111,49 @@ def to_the_end(tab: Tab) -> None:
     tab.evaluate("document.querySelector('[role=slider]').focus()")
     for kind in ("keyDown", "keyUp"):
         tab.send("Input.dispatchKeyEvent", type=kind, key="End", code="End", windowsVirtualKeyCode=35)
+
+
+def type_into(tab: Tab, label: str, index: int, text: str) -> None:
+    """Replace what one of the fields beside a label holds, as the keyboard does."""
+    script = f"""(() => {{
+      const found = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)});
+      const first = document.getElementById(found[0].htmlFor).closest(".mantine-NumberInput-root");
+      const field = first.parentElement.querySelectorAll("input")[{index}];
+      field.focus();
+      field.select();
+    }})()"""
+    tab.evaluate(script)
+    tab.send("Input.insertText", text=text)
+
+
+def tick(tab: Tab, label: str) -> None:
+    """Click the box beside a label, when it has come to rest: a folder opens slowly."""
+    script = f"""(() => {{
+      const found = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)});
+      const box = document.getElementById(found[0].htmlFor).getBoundingClientRect();
+      return [box.x + box.width / 2, box.y + box.height / 2];
+    }})()"""
+    places = [[], tab.evaluate(script)]
+    while places[-2] != places[-1]:
+        time.sleep(0.3)
+        places.append(tab.evaluate(script))
+    tab.click(*places[-1])
+
+
+def meets_box(tab: Tab, camera: list[float], low: Sequence[float], high: Sequence[float]) -> np.ndarray:
+    """Which rays of the page's picture meet a box: slabs, in float64, independent of what the viewer does."""
+    width, height = tab.evaluate("(c => [c.clientWidth, c.clientHeight])(document.querySelector('canvas'))")
+    position, target, up = (np.array(camera[i : i + 3]) for i in (0, 3, 6))
+    ahead = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(ahead, up)
+    right /= np.linalg.norm(right)
+    focal = 0.5 * height / np.tan(np.radians(25))
+    across = (np.arange(width) + 0.5 - width / 2) / focal
+    down = (np.arange(height) + 0.5 - height / 2) / focal
+    rays = ahead + across[None, :, None] * right + down[:, None, None] * np.cross(ahead, right)
+    sides = (np.array([low, high])[:, None, None] - position) / rays
+    enter, leave = sides.min(0).max(-1), sides.max(0).min(-1)
+    return (leave > np.maximum(enter, 0))[PICTURE]
 
 
 def look_of(run: Path) -> list[float]:
@@ -160,6 +206,30 @@ def test_a_trained_run(browser: Chromium, run: Path, tmp_path: Path) -> None:
         assert process.poll() is None
 
 
+def test_crop(browser: Chromium, run: Path) -> None:
+    """What is outside of the box is gone from the page, and what is inside is as it was."""
+    with started(command("ns-viewer"), run, "--websocket-port", 17407) as (_, address):
+        tab = browser.open(address)
+        whole = shown(tab)
+        tab.press("Crop")
+        tick(tab, "Crop")
+        type_into(tab, "Highest corner", 2, "0")  # the upper half of the ball is cut away
+        time.sleep(1)
+        cut = shown(tab)
+        low, high = load_trained(run, device_type="cpu").model.scene.box.double().tolist()
+        inside = meets_box(tab, look_of(run), low, [*high[:2], 0.0])
+        tab.close()
+    # JPEG's blocks of 8 pixels carry errors across the edge of the box.
+    near_edge = binary_dilation(inside, iterations=9) & ~binary_erosion(inside, iterations=9)
+    outside, inside = ~inside & ~near_edge, inside & ~near_edge
+    matter, left = (np.abs(picture - 255).max(-1) > 40 for picture in (whole, cut))  # the background is white
+    print(f"matter outside of the box: {matter[outside].mean():.3f} before, {left[outside].mean():.5f} after")
+    print(f"matter inside: {matter[inside].mean():.3f} before, {left[inside].mean():.3f} after")
+    assert matter[outside].mean() > 0.1
+    assert left[outside].mean() == 0
+    assert left[inside].mean() > 0.1
+
+
 @pytest.fixture
 def blue_with_time(tmp_path: Path) -> Path:
     """A K-Planes run of a ball whose blue grows from none to full while the camera circles."""
@@ -201,7 +271,7 @@ def test_a_run_in_training(browser: Chromium, shared_tiny: Path, tmp_path: Path)
             found = re.search(r"step ([\d,]+) · \d+ s", tab.evaluate("document.body.innerText"))
             return int(found[1].replace(",", "")) if found else 0
 
-        until(lambda: tab.screenshot()[150:520, 60:540].std() > 5, 60)
+        until(lambda: tab.screenshot()[PICTURE].std() > 5, 60)
         before = until(step, 30)
         until(lambda: step() > before, 30)
         tab.press("Pause training")

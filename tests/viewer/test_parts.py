@@ -17,15 +17,18 @@ from framework.base.errors import ConfigError
 from framework.cameras.view import View
 from framework.cli import train as train_command
 from framework.cli import viewer as viewer_command
+from framework.data.scene import Scene
 from framework.samplers.occupancy import OccupancySampler
+from framework.splats.gaussians import Gaussians
 from framework.training.checkpoint import list_checkpoints
 from framework.training.trained import load_trained
-from framework.viewer.crop import CroppedCameras
+from framework.viewer.crop import CroppedCameras, picture_within
 from framework.viewer.occupancy import shown_cells
 from framework.viewer.photographs import THUMBNAIL, Photographs, small_picture
 from framework.viewer.reports import curve, heading
 from framework.viewer.request import Crop, Pose, Request
 from framework.viewer.subject import newer_checkpoint, of_trained, reloaded
+from methods.gaussian_splatting import GaussianSplatting, GaussianSplattingConfig, decide
 from tests.conftest import Refused
 from tests.training.helpers import tiny_run, tiny_trainer
 
@@ -50,6 +53,28 @@ def test_cropped_rays() -> None:
         torch.tensor([40]), 0.5, 10.0
     )
     assert (float(between.nears), float(between.fars)) == pytest.approx((3.5, 4.5))
+
+
+def test_gaussians_outside_of_a_crop_are_not_drawn() -> None:
+    """A red wall before a green ball: a crop without the wall shows the ball behind it."""
+    scene = Scene(torch.tensor([[-3.0] * 3, [3.0] * 3]), 0.1, 10.0, 4, True, False, 32, image_pixels=32 * 32)
+    model = GaussianSplatting(decide(GaussianSplattingConfig(degree=0, max_seconds=10.0), scene)[0], scene).eval()
+    centers = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 0.0]])
+    sizes, turns = torch.tensor([[2.0, 2.0, 0.01], [0.3, 0.3, 0.3]]).log(), torch.tensor([[1.0, 0, 0, 0]] * 2)
+    light = torch.tensor([[1.77, -1.77, -1.77], [-1.77, 1.77, -1.77]])  # 0.5 + 0.282 times these: red, green
+    model.set_gaussians(Gaussians(centers, sizes, turns, torch.full((2,), 20.0), light, torch.zeros(2, 3, 0)))
+    view, white = View(Request(Pose(ABOVE, 1.2), 33, 33).camera()), torch.ones(3)
+    corner = (3.0, 3.0, 3.0)
+
+    def middle(crop: Crop) -> list[int]:
+        found: list[int] = picture_within(model, view, crop, white).rgb[16, 16].round().int().tolist()
+        return found
+
+    assert middle(Crop(((-3.0, -3.0, -3.0), corner))) == [1, 0, 0]
+    assert middle(Crop(((-3.0, -3.0, -3.0), (3.0, 3.0, 1.0)))) == [0, 1, 0]
+    assert middle(Crop(((-3.0, -3.0, 1.0), corner), near=2.5)) == [1, 1, 1]  # the wall is 2 away
+    assert middle(Crop(((-3.0, -3.0, -3.0), corner), near=2.5)) == [0, 1, 0]
+    assert middle(Crop(((-3.0, -3.0, -3.0), corner), far=1.5)) == [1, 1, 1]
 
 
 @pytest.fixture

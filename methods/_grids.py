@@ -1,0 +1,32 @@
+"""Settings and optimiser of methods whose networks can be replaced by hash grids with small networks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from framework.base.config import AT_LEAST_0, Range
+from framework.base.optimised import Optimised
+from framework.encodings.hash_grid import HashGridConfig
+
+
+@dataclass(frozen=True)
+class GridsConfig(HashGridConfig):
+    """Settings of the hash grids that `--encoding hash-grid` selects."""
+
+    RANGES: ClassVar[dict[str, Range]] = {"grid_learning_rate": AT_LEAST_0, "grid_width": (1, 2**14)}
+    """Allowed range of each numeric setting."""
+    grid_learning_rate: float = 1e-2
+    """Initial learning rate of the hash grids and of the networks that read them (hash-grid)."""
+    grid_width: int = 64
+    """Features per hidden layer of the networks that read the grids (hash-grid)."""
+
+
+def grid_optimiser(config: GridsConfig, name: str = "grids") -> Optimised:
+    """Return how hash grids and their networks are optimised.
+
+    Args:
+        config: the method's settings, decided.
+        name: name of the group of parameters.
+    """
+    return Optimised(name, config.grid_learning_rate, betas=(0.9, 0.99), eps=1e-15, schedule="hold-exponential")

@@ -64,6 +64,7 @@ def mean_squared_error(trainer: Trainer) -> float:
     return float(torch.stack(errors).mean())
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", [name for name in VARIANTS if not name.startswith("dnerf")])
 def test_colours_follow_time(name: str, shared_tiny: Path, tmp_path: Path) -> None:
     """The same camera at both ends of time: the ball is redder in the one and bluer in the other."""
@@ -81,6 +82,7 @@ def test_colours_follow_time(name: str, shared_tiny: Path, tmp_path: Path) -> No
     assert found[1][2] - found[1][0] > 0.3
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", [name for name in VARIANTS if name.startswith("dnerf")])
 def test_what_is_deformed_learns_to_move(name: str, shared_tiny: Path, tmp_path: Path) -> None:
     """What is only deformed keeps its colours, as in the paper: so a change of colour is learnt as displacement."""

@@ -49,6 +49,7 @@ def test_the_hull_holds_the_ball_and_little_else(ball: Dataset, resolution: int)
     assert resolution < 10 or seen_empty.float().mean() > 0.03
 
 
+@pytest.mark.medium
 def test_every_pixel_that_could_see_the_hull_is_kept(ball: Dataset) -> None:
     resolution = 48
     silhouettes = Silhouettes.of(ball)

@@ -11,7 +11,7 @@ import yaml
 
 from framework.base.errors import ConfigError, DataError
 from framework.cli.train import _default_run, _parse_flags
-from tests.cli.helpers import TINY_NGP, called, command, run
+from tests.cli.helpers import TINY_NGP, called, command
 
 
 def test_help_is_quick_and_lists_every_method() -> None:
@@ -137,10 +137,10 @@ def test_a_missing_method_is_an_error() -> None:
 
 @pytest.fixture(scope="module")
 def finished(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished tiny run, through the real command."""
+    """A finished tiny run, through the command's entry point."""
     output = tmp_path_factory.mktemp("out")
     flags = ["--data", shared_tiny, "--output-dir", output, "--timestamp", "t", "--max-num-iterations", 60, *TINY_NGP]
-    done = run("ns-train", "instant-ngp", *flags)
+    done = called("ns-train", "instant-ngp", *flags)
     assert done.returncode == 0, done.stderr
     return output / shared_tiny.name / "instant-ngp" / "t"
 

@@ -32,6 +32,7 @@ def export(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
     main()
 
 
+@pytest.mark.medium
 def test_points_lie_on_the_ball(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     export(monkeypatch, "pointcloud", "--load-config", ball, "--output-dir", tmp_path, "--num-points", 20_000)
     points = read_points(tmp_path / "point_cloud.ply")
@@ -54,6 +55,7 @@ def test_cameras_are_those_of_the_input(
         torch.testing.assert_close(torch.tensor(found[name]), torch.tensor(frame["transform_matrix"])[:3])
 
 
+@pytest.mark.medium
 def test_meshes_are_of_the_ball(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Refused) -> None:
     trimesh = pytest.importorskip("trimesh")
     given = ("--load-config", ball, "--output-dir", tmp_path)

@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.cli.helpers import TINY_NGP
 
 FIRST_STEP = """
@@ -40,6 +42,7 @@ SLOW = {
 """Modules that take long to import, and that the first step does not need."""
 
 
+@pytest.mark.medium
 def test_what_is_imported_before_the_first_step(shared_tiny: Path, tmp_path: Path) -> None:
     """Also with TensorBoard's files: what that alone imports comes after what is imported without."""
     words = ["instant-ngp", "--data", shared_tiny, "--output-dir", tmp_path, *TINY_NGP]

@@ -55,10 +55,12 @@ def test_the_table_of_budgets_is_that_of_its_files() -> None:
 
 
 def test_sentences_repeat_the_table() -> None:
-    """PSNRs that other pages quote stand in the table of figures or in the notes and benchmarks, perhaps rounded."""
+    """PSNRs that other pages quote stand in the figures, notes, benchmarks, or beside pictures, perhaps rounded."""
     sources = [DOCS / f"{name}.md" for name in ("figures", "benchmarks", "stability", "plug-and-play")]
     sources += [*(DOCS / "notes").glob("*.md"), *(ROOT / "methods").glob("*.py")]
     numbers = set(re.findall(r"\d+\.\d+", "\n".join(source.read_text() for source in sources)))
+    failures = json.loads((DOCS / "pictures" / "failures" / "psnr.json").read_text())["psnr"]
+    numbers |= {f"{psnr:.2f}" for row in failures.values() for psnr in row.values()}
     numbers |= {f"{float(number):.1f}" for number in numbers}
     pages = [page for part in ("methods", "guides", "start") for page in (DOCS / part).glob("*.md")]
     pages.append(ROOT / "README.md")

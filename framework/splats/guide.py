@@ -45,7 +45,13 @@ class FoundDistances(nn.Module):
         return len(self.images)
 
     def set(self, images: Tensor, pixels: Tensor, distances: Tensor) -> None:
-        """Replace them by those of K pixels, as the attributes have them."""
+        """Replace them.
+
+        Args:
+            images: (K,) int64 image of each pixel.
+            pixels: (K,) int64 number of the pixel in its image, row by row.
+            distances: (K,) distance along the ray of the pixel, scene units.
+        """
         self.images, self.pixels, self.distances = images, pixels, distances
 
     def of_image(self, index: int, height: int, width: int) -> Tensor:

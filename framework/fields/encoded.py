@@ -150,6 +150,8 @@ class EncodedField(BoxField):
         if grid.deferred is not None:
             grid.deferred.layout = grid.layout
         weights = [layer.weight for layer in self.density_head if isinstance(layer, nn.Linear)]
+        if weights[0].shape[1] != grid.num_features:  # it reads further coordinates
+            return None
         return GridDensity(self.scale, self.shift, grid.table, grid.layout, grid.deferred, weights)
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:

@@ -2,7 +2,7 @@
 
 `OccupancySampler` marches wave by wave, evaluates the field and ends rays whose light is spent. That loop is the
 readable form, for any field and device. Where the density is a small network on a hash grid, `trace` returns what the
-loop would, computed block by block in cache (`csrc/trace.cpp`), with no Python, copies or waits between waves.
+loop would, computed block by block in cache, without Python, copies and waiting between waves (`csrc/trace.cpp`).
 """
 
 from __future__ import annotations

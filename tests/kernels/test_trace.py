@@ -116,6 +116,9 @@ def test_only_a_plain_field_says_what_its_density_is() -> None:
     assert field.grid_density() is not None
     assert EncodedField(BOX, HashGrid(2, 2, 4, 8, 8), unbounded=True).grid_density() is None
     assert EncodedField(BOX, HashGrid(6, 2, 4, 8, 8, opening=True), opening=True).grid_density() is None
+    assert EncodedField(BOX, HashGrid(2, 2, 4, 8, 8), ambient=2).grid_density() is None
+    field.density = lambda points: (points.positions[:, 0], points.positions)
+    assert field.grid_density() is None
     assert InvertedField(HashGrid(2, 2, 4, 8, 8)).grid_density() is None
 
 

@@ -1,16 +1,16 @@
 # make demo   train on the embedded scene for 20 seconds, and leave pictures
-# make test   the fast tests
+# make test   the tests that every change has to pass; make test-fast those of them that take under a second
 # make docs   the documentation, into site/
 # make sanitize   the kernels' tests, on kernels that watch every read, write and sum
 # make release-check   build both distributions, look into them, install and use them
-# make test-versions   the fast tests under every Python and torch that can be had here
+# make test-versions   the tests of make test under every Python and torch that can be had here
 # All make .venv first. Running them again is quick: the installation is redone only when its inputs change.
 
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-all lint docs sanitize release-check test-versions clean
+.PHONY: demo test test-fast test-all lint docs sanitize release-check test-versions clean
 
 demo: .venv/installed
 	@run=outputs/demo/instant-ngp/$$(date +%Y-%m-%d_%H%M%S); \
@@ -21,6 +21,9 @@ demo: .venv/installed
 
 test: .venv/installed-test
 	$(BIN)/python -m pytest -n auto -m "not slow"
+
+test-fast: .venv/installed-test
+	$(BIN)/python -m pytest -n auto -m "not slow and not medium"
 
 test-all: .venv/installed-test .venv/installed-docs
 	$(BIN)/python -m pytest

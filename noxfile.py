@@ -6,6 +6,9 @@ look; on Linux, set it up for torch's CPU builds first, or each session installs
     nox -s "tests-3.12(torch='2.6.0')"           one of them
     nox -s lowest -- tests/test_config.py        with arguments for pytest, in place of the fast set
     NERFLOOM_TORCH=2.13.0 nox -s lowest          the lowest dependencies, but this torch
+    nox -s without_torch                         what needs no torch, under every Python, in a minute each
+
+docs/start/install.md says what ran and what did not.
 """
 
 import os
@@ -17,6 +20,20 @@ import nox
 ROOT = Path(__file__).parent
 PYTHONS = ("3.10", "3.11", "3.12", "3.13")
 FAST = ("-n", "auto", "-m", "not slow")
+TORCHLESS = (
+    *("tests/downloads/test_fetch.py", "tests/downloads/test_unpack.py", "tests/processing/test_images.py"),
+    *("tests/processing/test_retrieval.py", "tests/processing/test_video_frames.py", "tests/release/test_release.py"),
+    *("tests/test_arrays.py", "tests/test_documents.py", "tests/test_errors.py", "tests/test_light.py"),
+)
+"""Tests that run where torch is not installed."""
+COMPILE = """
+import pathlib, warnings
+warnings.simplefilter("error")
+for folder in ("nerfloom", "framework", "methods", "dataparsers", "tests", "examples", "docs"):
+    for path in pathlib.Path(folder).rglob("*.py"):
+        compile(path.read_text(encoding="utf-8"), str(path), "exec")
+"""
+"""Compiles every file; a warning is an error."""
 PINS = (ROOT / "constraints.txt").read_text(encoding="utf-8")
 PROJECT = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
 
@@ -68,6 +85,16 @@ def tests(session: nox.Session, torch: str) -> None:
     bound = ("torch==", "triton==") if torch != newest_torch() else ("torch==",)  # each torch wants a triton of its own
     install(session, torch, [pin for pin in PINS.splitlines() if not pin.startswith(("#", *bound))])
     test(session)
+
+
+@nox.session(python=PYTHONS)
+def without_torch(session: nox.Session) -> None:
+    """Compile every file, and run the tests that need no torch: for a Python whose torch cannot be had here."""
+    needs = ("numpy", "scipy", "tyro", "rich", "imageio", "pillow", "PyYAML", "pycolmap", "jinja2", "trimesh")
+    session.install("-c", str(ROOT / "constraints.txt"), *needs, "pytest", "hypothesis")
+    session.run("python", "-c", COMPILE, silent=True)
+    plugins = ("--noconftest", "-p", "tests.downloads.conftest")  # the conftest.py of all tests imports torch
+    session.run("python", "-m", "pytest", *plugins, *(session.posargs or TORCHLESS))
 
 
 @nox.session

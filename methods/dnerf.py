@@ -20,10 +20,10 @@ from framework.fields.nerf import NeRFField
 from framework.kernels.frequency import MAX_FREQUENCIES
 from framework.kernels.hash_grid_layout import MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
 from framework.samplers.choice import HierarchicalConfig, contracted_box, decide_samples, make_sampler, sampler_choice
-from framework.scene.motion import MotionConfig
+from framework.scene.motion import MotionConfig, slices_choice
 from methods.vanilla_nerf import OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH
 
-HASH_SAMPLES_PER_BATCH = 2**14
+HASH_SAMPLES_PER_BATCH = 2**12
 """Samples of a training step with a hash grid, whose networks are small, and an occupancy grid."""
 
 
@@ -52,6 +52,8 @@ class DNeRFConfig(
         "position_frequencies": (0, MAX_FREQUENCIES),
         "direction_frequencies": (0, MAX_FREQUENCIES),
         "time_frequencies": (0, MAX_FREQUENCIES),
+        "deformation_frequencies": (0, MAX_FREQUENCIES),
+        "ambient_dims": (0, 2**10),
         "grid_learning_rate": AT_LEAST_0,
         "max_resolution": (1, MAX_RESOLUTION),
         "log2_table_size": (1, MAX_LOG2_TABLE_SIZE),
@@ -73,8 +75,14 @@ class DNeRFConfig(
     """Number of frequencies in the encoding of positions."""
     direction_frequencies: int = 4
     """Number of frequencies in the encoding of directions."""
-    time_frequencies: int = 4
-    """Number of frequencies in the encoding of times."""
+    time_frequencies: Auto[int] = AUTO
+    """Number of frequencies in the encoding of times. If not given: 4, or 6 with a hash grid."""
+    deformation_frequencies: Auto[int] = AUTO
+    """Number of frequencies in the encoding of positions that the deformation network reads. If not given: those of
+    `position_frequencies`, or 4 with a hash grid."""
+    ambient_dims: Auto[int] = AUTO
+    """Outputs of the deformation network that a hash grid's networks read beside the displaced position. If not given:
+    8 with a hash grid; none otherwise, as in the paper."""
     grid_learning_rate: float = 1e-2
     """Initial learning rate of the hash grid and of the two networks that read it."""
     max_resolution: int = 512
@@ -106,19 +114,28 @@ def decide(config: DNeRFConfig, scene: Scene) -> tuple[DNeRFConfig, list[Decisio
     """
     grid = config.canonical == "hash-grid"
     network = f"the canonical field is a {'hash grid' if grid else 'network'}"
+    small = grid and config.variant == "d-nerf"
+    chosen = sampler_choice(config, scene.unbounded)
+    if small and not scene.unbounded:
+        chosen = Choice("sampler", "occupancy", network)
     config, made = fill(
         config,
-        sampler_choice(config, scene.unbounded),
+        chosen,
         Choice("deformation_layers", 4 if grid else 8, network),
         Choice("deformation_width", 64 if grid else 256, network),
+        Choice("deformation_frequencies", 4 if grid else config.position_frequencies, network),
+        Choice("time_frequencies", 6 if grid else 4, network),
+        Choice("ambient_dims", 8 if grid else 0, network),
     )
+    config, slices = fill(config, slices_choice(scene, config.sampler))
+    made += slices * (config.time_slices > 1)
     if config.sampler == "occupancy":
-        small = grid and config.variant == "d-nerf"
         samples = HASH_SAMPLES_PER_BATCH if small else OCCUPANCY_SAMPLES_PER_BATCH
         config, more = decide_samples(config, samples)
         made += more
     if not scene.moving:
-        made = [decision for decision in made if not decision.option.startswith("deformation")]
+        learnt = ("deformation", "time", "ambient")
+        made = [decision for decision in made if not decision.option.startswith(learnt)]
         made.append(Decision("deformation", "left out", "the images have no times"))
     return config, made
 
@@ -139,7 +156,8 @@ def make_field(config: DNeRFConfig, scene: Scene) -> Field:
             log2_table_size=config.log2_table_size,
             sparse=config.sparse_updates,
         )
-        canonical: Field = EncodedField(scene.box, grid, unbounded=contracted is not None)
+        ambient = config.ambient_dims if scene.moving else 0
+        canonical: Field = EncodedField(scene.box, grid, unbounded=contracted is not None, ambient=ambient)
         canonical.optimised = Optimised("heads", learning_rate=config.grid_learning_rate, betas=(0.9, 0.95), eps=1e-15)
     else:
         times = config.time_frequencies if scene.moving and config.variant == "t-nerf" else None
@@ -153,10 +171,11 @@ def make_field(config: DNeRFConfig, scene: Scene) -> Field:
         canonical,
         config.deformation_width,
         config.deformation_layers,
-        config.position_frequencies,
+        config.deformation_frequencies,
         config.time_frequencies,
         contracted,
         config.from_first_image,
+        config.ambient_dims if config.canonical == "hash-grid" else 0,
     )
     deformed.optimised = networks
     return deformed

@@ -30,6 +30,7 @@ from framework.scene.reasons import DEPTH_REASONS, LIGHT_REASONS, POSE_REASONS
 from framework.splats.density_control import RESET, GradientMean, grown
 from framework.splats.drawing import draw, draw_view, on_image, splat_camera
 from framework.splats.gaussians import MAX_DEGREE, Gaussians
+from framework.splats.guide import GUIDE, FoundDistances
 from framework.splats.learning import as_gaussians, as_tables, number_for, open_degree, rate_factor, row_changes
 from framework.splats.mcmc import moved, shaken
 from framework.splats.redrawn import Redrawn
@@ -80,6 +81,7 @@ class GaussianSplattingConfig(
         "appearance_rate": AT_LEAST_0,
         "camera_learning_rate": AT_LEAST_0,
         "depth_loss_mult": AT_LEAST_0,
+        "field_depth_mult": AT_LEAST_0,
         "steps_per_reset": (1, 10**9),
         "ssim_weight": (0, 1),
         "growth_end": (0, 1),
@@ -139,6 +141,8 @@ class GaussianSplattingConfig(
     """Initial learning rate of the poses."""
     depth_loss_mult: Auto[float] = AUTO
     """Weight of the depth loss. If not given: 0.1 if there are depth images, else 0."""
+    field_depth_mult: Auto[float] = AUTO
+    """Weight of a starting field's distances until half of the budget. If not given: 0.1 if unbounded, else 0."""
 
 
 def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplattingConfig, list[Decision]]:
@@ -167,6 +171,7 @@ def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplat
         Choice("rate_factor", round(factor, 2), "fewer steps have to go farther", "factor of learning rates"),
         Choice("appearance", varies, LIGHT_REASONS[varies], "colour transforms of images"),
         Choice("depth_loss_mult", 0.1 if scene.has_depth else 0.0, DEPTH_REASONS[scene.has_depth], "depth loss"),
+        Choice("field_depth_mult", *GUIDE[scene.unbounded], "weight of a field's distances"),
         Choice("camera_optimizer", poses, POSE_REASONS[scene.poses], "pose refinement"),
     )
     return config, made + more
@@ -211,7 +216,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         if config.camera_optimizer in ("SO3xR3", "SE3"):
             self.poses = PoseRefinement(scene.num_cameras, config.camera_optimizer, scene.camera_to_worlds)
             self.poses.optimised = Optimised("poses", config.camera_learning_rate, schedule="exponential")
-        self.gradients = GradientMean()
+        self.gradients, self.found_distances = GradientMean(), FoundDistances()
         self._near = max(0.2 * scene.near, 1e-3)
         self._on_image: Tensor | None = None
         self._longer_side = scene.image_size
@@ -261,9 +266,10 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         if kind == "field":
             with torch.enable_grad():
                 seconds = FIELD_SHARE * (self.config.max_seconds or math.inf)
-                points, colors = found_surfaces(dataset, self.config, self.config.field_steps, seconds, count)
-            first = from_points(points, colors, self.config.degree, FIELD_OPACITY, FIELD_SIZE)
-            if not len(points):
+                found = found_surfaces(dataset, self.config, self.config.field_steps, seconds, count)
+            first = from_points(found.positions, found.colors, self.config.degree, FIELD_OPACITY, FIELD_SIZE)
+            self.found_distances.set(found.images, found.pixels, found.distances)
+            if not len(first):
                 say("warning: the field has found no surfaces")
                 kind = "random"
         if kind != "field":
@@ -302,7 +308,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         if config.strategy == "adc" and records.requires_grad:
             records.retain_grad()
             self._on_image, self._longer_side = records, max(camera.width, camera.height)
-        known = batch.distances if config.depth_loss_mult > 0 else None
+        known, trust = self.found_distances.known(batch, self.progress, config.depth_loss_mult, config.field_depth_mult)
         drawn = draw(records, camera, self._behind(batch), CHANNELS["rgb" if known is None else "distance"])
         rgb = self._lit(drawn.image if known is None else drawn.image[..., :3], batch.index)
         if batch.kept is not None:  # what does not count is as it should be
@@ -311,7 +317,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         terms = {"rgb": photometric_loss(rgb, target, config.ssim_weight)}
         if known is not None:
             known = known if reduced == 1 else halved_distances(known)
-            terms["depth"] = config.depth_loss_mult * mean_depth_error(drawn.image[..., 3], drawn.transmittance, known)
+            terms["depth"] = trust * mean_depth_error(drawn.image[..., 3], drawn.transmittance, known)
         if (weight := self._chosen(config.opacity_penalty, OPACITY_PENALTY)) > 0 and len(gaussians):
             terms["opacity"] = weight * torch.sigmoid(gaussians.logits).mean()
         if (weight := self._chosen(config.scale_penalty, SCALE_PENALTY)) > 0 and len(gaussians):

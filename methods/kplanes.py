@@ -22,8 +22,12 @@ from framework.kernels.planes_layout import MAX_VERTICES
 from framework.kernels.spherical_harmonics import spherical_harmonics
 from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_choice
 from framework.scene.few_images import FewImagesConfig, decide_few_images
-from framework.scene.motion import MotionConfig, vertices_in_time
+from framework.scene.motion import MotionConfig, slices_choice, vertices_in_time
 
+SAMPLES_PER_BATCH, MOVING_SAMPLES_PER_BATCH = 2**15, 2**13
+"""Samples of a training step of a still scene, and of one that moves: docs/notes/motion.md."""
+NUM_STEPS, MOVING_NUM_STEPS = 512, 224
+"""Steps along the diagonal of the box, of a still scene and of one that moves."""
 MAX_SCALES = 4
 """Maximum number of scales if the setting is left open; the paper's number."""
 
@@ -34,9 +38,9 @@ class KPlanesConfig(
     FewImagesConfig,
     MotionConfig,
     max_num_iterations=30_000,
-    samples_per_batch=2**15,
     learning_rate=1e-2,
     lr_schedule="hold-exponential",
+    num_steps=AUTO,
     lr_final=0.02,
     adam_beta2=0.99,
     adam_eps=1e-12,
@@ -168,13 +172,15 @@ def decide(config: KPlanesConfig, scene: Scene) -> tuple[KPlanesConfig, list[Dec
         Choice("num_scales", scales, f"the images have {scene.image_size} pixels", "scales"),
     )
     config, few = decide_few_images(config, scene)
-    sliced = scene.moving and config.time_slices > 1 and not scene.unbounded  # nested boxes have no slices
-    cells = Choice("grid_resolution", 64 if sliced else 128, "each slice of time has cells of its own")
+    samples = MOVING_SAMPLES_PER_BATCH if scene.moving else SAMPLES_PER_BATCH
+    steps = Choice("num_steps", MOVING_NUM_STEPS if scene.moving else NUM_STEPS, "the scene moves")
+    config, count = fill(config, Choice("samples_per_batch", samples, "the scene moves", "samples a step"), steps)
+    config, slices = fill(config, slices_choice(scene, config.sampler))
+    sliced = config.time_slices > 1
+    config, coarser = fill(config, Choice("grid_resolution", 64 if sliced else 128, "each slice has cells of its own"))
     times = f"the images have {scene.num_times} times"
-    axis = Choice("time_resolution", vertices_in_time(scene), times, "vertices along time")
-    config, coarser = fill(config, cells)
-    config, along = fill(config, axis)
-    made += few + coarser * (sliced and config.sampler == "occupancy") + along * scene.moving
+    config, along = fill(config, Choice("time_resolution", vertices_in_time(scene), times, "vertices along time"))
+    made += few + coarser * sliced + (count + slices * sliced + along) * scene.moving
     if not scene.moving:
         made.append(Decision("planes of time", "left out", "the images have no times"))
     return config, made
@@ -188,7 +194,12 @@ def make_field(config: KPlanesConfig, scene: Scene) -> BoxField:
         scene: properties of the data.
     """
     time = (config.time_resolution,) if scene.moving else ()
-    resolutions = tuple((config.base_resolution << scale,) * 3 + time for scale in range(config.num_scales))
+    size = scene.box[1] - scene.box[0]
+    edges = size / size.max()  # vertices are equally far apart along x, y and z
+    resolutions = tuple(
+        tuple(max(round((config.base_resolution << scale) * edge), 2) for edge in edges.tolist()) + time
+        for scale in range(config.num_scales)
+    )
     opening = config.open_levels_until > 0
     planes = FeaturePlanes(resolutions, config.features_per_scale, sparse=config.sparse_updates, opening=opening)
     kind = EncodedField if config.decoder == "hybrid" else ExplicitField

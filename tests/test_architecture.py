@@ -36,6 +36,7 @@ def imports(node: ast.AST) -> set[str]:
     return found
 
 
+@pytest.mark.medium
 def test_the_framework_knows_no_method_and_no_format() -> None:
     unknown = {
         "nerfloom": {"methods", "dataparsers"},  # the registry finds them by name

@@ -8,6 +8,7 @@ from framework.geometry.bounds import contract, intersect_box, to_unit_box
 BOX = torch.tensor([[-1.0, -2.0, 0.0], [1.0, 1.0, 3.0]], dtype=torch.float64)
 
 
+@pytest.mark.medium
 def test_random_rays_against_dense_points() -> None:
     generator = torch.Generator().manual_seed(0)
     origins = torch.randn(500, 3, generator=generator, dtype=torch.float64) * 2

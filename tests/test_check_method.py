@@ -52,6 +52,7 @@ BUILT_IN = [name for name, entry in registered("methods").items() if entry.modul
 SLOW = ("dnerf",)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in BUILT_IN])
 def test_every_built_in_method_passes(name: str) -> None:
     method = load_method(name)
@@ -581,6 +582,7 @@ def assert_found(method: Method, check: str, words: str) -> None:
     assert re.search(words, failed[0].detail), failed[0].detail
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("check", "method", "words"), FAULTS, ids=NAMES)
 def test_each_fault_is_found_by_its_check(
     check: str, method: Method, words: str, monkeypatch: pytest.MonkeyPatch
@@ -605,6 +607,7 @@ def test_every_check_has_a_fault_that_shows_it_works() -> None:
     assert found["views"] | {"config"} == {check.name for check in CHECKS if not check.rays_only}
 
 
+@pytest.mark.medium
 def test_what_fails_is_listed_at_once() -> None:
     method = of_parts(TinyConfig(), mixed(Unused, RayModel), Jitters)
     with pytest.raises(AssertionError) as raised:
@@ -623,6 +626,7 @@ def test_a_line_of_the_methods_own_file_is_named() -> None:
     assert failed.detail == f"RuntimeError: enough (test_check_method.py, line {line})"
 
 
+@pytest.mark.medium
 def test_a_module_without_a_docstring(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "says_nothing", ModuleType("says_nothing"))
     silent = type("Silent", (TinyConfig,), {"__module__": "says_nothing"})
@@ -638,6 +642,7 @@ def test_the_documentation_lists_every_check() -> None:
     assert {name for name, row in rows.items() if row.endswith("(rays)")} == {c.name for c in CHECKS if c.rays_only}
 
 
+@pytest.mark.medium
 def test_the_callers_random_numbers_stay_as_they_are() -> None:
     torch.manual_seed(3)
     expected = torch.rand(5)

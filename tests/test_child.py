@@ -21,6 +21,7 @@ def shadowed(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.medium
 def test_a_child_imports_nothing_of_the_working_folder(shadowed: Path) -> None:
     command = python_command("framework.cli.train", "instant-ngp", "--version")
     done = subprocess.run(command, cwd=shadowed, capture_output=True, text=True)

@@ -168,6 +168,7 @@ def test_class_keywords_change_defaults_and_nothing_else() -> None:
     assert to_plain(Settings()) == to_plain(RayConfig()) | changed
 
 
+@pytest.mark.medium
 def test_class_keywords_keep_type_order_and_help() -> None:
     hints, inherited = typing.get_type_hints(More), typing.get_type_hints(RayConfig)
     for name in ("learning_rate", "samples_per_batch", "lr_schedule"):

@@ -148,6 +148,7 @@ def test_depths_reach_batches_as_distances(places: int, shared_tiny: Path, tmp_p
     assert (points[hit].norm(dim=-1) - 1).abs().max() < 0.01
 
 
+@pytest.mark.medium
 def test_depth_teaches_nerfacto_where_the_surface_is(shared_tiny: Path, tmp_path: Path) -> None:
     still = tiny_trainer("nerfacto", shared_tiny, tmp_path / "still")
     parsed = still.run.parser.parse(shared_tiny, "train")

@@ -34,6 +34,7 @@ def test_squares_are_counted_through_images_of_unlike_sizes(dataset: Dataset) ->
     assert len(errors.errors) == next_square
 
 
+@pytest.mark.medium
 def test_the_weighted_mean_is_that_of_all_candidates(dataset: Dataset) -> None:
     """Monte Carlo over many draws from the same candidates, against the plain mean."""
     torch.manual_seed(0)

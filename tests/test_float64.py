@@ -60,6 +60,7 @@ def test_the_watch_sees_float64() -> None:
         taken_away(torch.ones(3)) * torch.ones(3)
 
 
+@pytest.mark.medium
 @pytest.mark.usefixtures("alone")
 @pytest.mark.parametrize("kind", TINY)
 def test_a_step_of_each_method(kind: str, shared_tiny: Path, tmp_path: Path) -> None:

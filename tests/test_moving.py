@@ -64,6 +64,7 @@ def mean_squared_error(trainer: Trainer) -> float:
     return float(torch.stack(errors).mean())
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", [name for name in VARIANTS if not name.startswith("dnerf")])
 def test_colours_follow_time(name: str, shared_tiny: Path, tmp_path: Path) -> None:
     """The same camera at both ends of time: the ball is redder in the one and bluer in the other."""
@@ -81,6 +82,7 @@ def test_colours_follow_time(name: str, shared_tiny: Path, tmp_path: Path) -> No
     assert found[1][2] - found[1][0] > 0.3
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", [name for name in VARIANTS if name.startswith("dnerf")])
 def test_what_is_deformed_learns_to_move(name: str, shared_tiny: Path, tmp_path: Path) -> None:
     """What is only deformed keeps its colours, as in the paper: so a change of colour is learnt as displacement."""
@@ -131,9 +133,11 @@ def test_the_number_of_times_decides_about_time() -> None:
     """A sixth as many vertices, three at least; cells are larger where each slice of time has its own."""
     assert times_decided("kplanes", 150)["vertices along time"] == "25"
     assert times_decided("kplanes", 8)["vertices along time"] == "3"
-    assert "grid resolution" not in times_decided("kplanes", 150)
-    assert times_decided("kplanes", 150, time_slices=16)["grid resolution"] == "64"
-    assert "grid resolution" not in times_decided("kplanes", 150, time_slices=16, sampler="proposal")
+    assert times_decided("kplanes", 150)["grid resolution"] == "64"
+    assert times_decided("kplanes", 150)["slices of time in the occupancy grid"] == "16"
+    assert times_decided("dnerf", 27, canonical="hash-grid")["slices of time in the occupancy grid"] == "3"
+    for few in (times_decided("kplanes", 8), times_decided("kplanes", 150, sampler="proposal")):
+        assert not {"grid resolution", "slices of time in the occupancy grid"} & set(few)
 
 
 def test_proposals_of_a_method_that_learns_motion_see_time() -> None:

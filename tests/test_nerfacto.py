@@ -54,6 +54,7 @@ def test_what_is_asked_for_is_done_and_not_called_a_decision(shared_tiny: Path, 
     assert not trainer.model.field.unbounded
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("unbounded", [True, False])
 def test_it_learns(unbounded: bool, shared_tiny: Path, tmp_path: Path) -> None:
     trainer = captured(shared_tiny, tmp_path, {"unbounded": unbounded}, max_num_iterations=60)
@@ -88,6 +89,7 @@ def test_held_out_photographs_are_shown_in_the_mean_appearance() -> None:
     assert appearance(None, 1).tolist() == [[1.0, 1.0]]
 
 
+@pytest.mark.medium
 def test_half_of_a_held_out_photograph_tells_the_others_appearance(shared_tiny: Path, tmp_path: Path) -> None:
     """Trained on darker and lighter copies, a held-out dark photograph is found to be dark from its left half."""
     still = tiny_trainer("nerfacto", shared_tiny, tmp_path / "still").train_set
@@ -111,6 +113,7 @@ def test_half_of_a_held_out_photograph_tells_the_others_appearance(shared_tiny: 
     assert all(torch.equal(before[name], value) for name, value in model.state_dict().items())
 
 
+@pytest.mark.medium
 def test_normals_are_learnt_and_shown(shared_tiny: Path, tmp_path: Path) -> None:
     """Of the ball, whose colours are its normals: pictures of the two agree."""
     trainer = captured(shared_tiny, tmp_path, {}, predict_normals=True, max_num_iterations=90)

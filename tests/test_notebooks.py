@@ -70,6 +70,7 @@ def test_every_notebook_is_run_here_and_keeps_no_outputs() -> None:
         assert all(cell["outputs"] == [] for cell in cells if cell["cell_type"] == "code"), file
 
 
+@pytest.mark.medium
 def test_first_steps(names: dict[str, Any]) -> None:
     methods, run, rgb, depth, psnr = (shown(source, names) for source in code_of("first-steps"))
     assert "instant-ngp" in methods
@@ -87,6 +88,7 @@ def test_loading_and_looking_takes_six_lines_at_most() -> None:
     assert len(lines) <= 6
 
 
+@pytest.mark.medium
 def test_a_pose_is_rendered_from_where_it_is(names: dict[str, Any]) -> None:
     """The point is where the pixel's ray ends; and a view's own camera shows what the view does."""
     folder, box, view, point, turn = (shown(source, names) for source in code_of("render-from-a-pose"))
@@ -105,6 +107,7 @@ def test_a_pose_is_rendered_from_where_it_is(names: dict[str, Any]) -> None:
     assert torch.equal(of_camera.rgb, of_view.rgb)
 
 
+@pytest.mark.medium
 def test_methods_are_compared_by_the_same_images(names: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
     *_, strip, (mean, worst) = (shown(source, names) for source in code_of("compare"))
     said = [line.split() for line in capsys.readouterr().out.splitlines()]
@@ -120,6 +123,7 @@ def test_methods_are_compared_by_the_same_images(names: dict[str, Any], capsys: 
     assert 0 < mean < worst <= 1
 
 
+@pytest.mark.medium
 def test_a_method_of_a_notebook_is_a_method(names: dict[str, Any]) -> None:
     *_, picture, psnr = (shown(source, names) for source in code_of("a-method"))
     assert [finding.line() for finding in names["findings"] if not finding.ok] == []

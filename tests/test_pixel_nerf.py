@@ -215,6 +215,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
     registry.registered.cache_clear()
 
 
+@pytest.mark.medium
 @pytest.mark.usefixtures("registered")
 def test_a_run_learns_is_loaded_and_renders_unseen_scenes(tmp_path: Path) -> None:
     parser = Procedural(size=16, num_scenes=3, views_per_scene=6)
@@ -229,6 +230,7 @@ def test_a_run_learns_is_loaded_and_renders_unseen_scenes(tmp_path: Path) -> Non
     assert len(evaluate(loaded.model, test).per_image) == 8  # one of six views is judged of each scene
 
 
+@pytest.mark.medium
 @pytest.mark.usefixtures("registered")
 def test_learnt_weights_render_other_data(tmp_path: Path, shared_tiny: Path) -> None:
     """A checkpoint of many scenes fits data of one, whose training images are then what is rendered from."""

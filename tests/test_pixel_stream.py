@@ -115,6 +115,7 @@ def test_what_a_step_draws_first_does_not_depend_on_how_many_it_draws(both: tupl
         assert torch.equal(few, torch.randint(total, (1000,)))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("changes", [{}, {"draw_by_error": True}, {"silhouette_pixels": False}])
 def test_a_run_from_a_file_is_the_run_from_memory(shared_tiny: Path, tmp_path: Path, changes: dict) -> None:
     settings = {"max_num_iterations": 40, "cache_dir": tmp_path / "cache", **changes}
@@ -128,6 +129,7 @@ def test_a_run_from_a_file_is_the_run_from_memory(shared_tiny: Path, tmp_path: P
     assert here.state.rays == there.state.rays
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("interrupted", [1, 23])
 def test_a_resumed_run_is_an_uninterrupted_one(shared_tiny: Path, tmp_path: Path, interrupted: int) -> None:
     settings = {"max_num_iterations": 40, "cache_dir": tmp_path / "cache", "cache_limit": 0.0}

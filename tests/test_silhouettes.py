@@ -1,6 +1,7 @@
 """The visual hull: no cell that matters is lost, and no pixel that could see one."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -10,7 +11,8 @@ from dataparsers.blender import Blender
 from framework.cameras.cameras import Cameras
 from framework.data.dataset import Dataset, load_dataset
 from framework.kernels.march import Occupancy, candidates
-from framework.scene.silhouettes import Silhouettes, moving_hulls, pixels_near, visual_hull
+from framework.kernels.silhouettes import hold_balls
+from framework.scene.silhouettes import Silhouettes, moving_box, moving_hulls, pixels_near, visual_hull
 from tests.conftest import write_tiny
 
 BOX = torch.tensor([[-1.2, -1.2, -1.2], [1.2, 1.2, 1.2]])
@@ -47,6 +49,7 @@ def test_the_hull_holds_the_ball_and_little_else(ball: Dataset, resolution: int)
     assert resolution < 10 or seen_empty.float().mean() > 0.03
 
 
+@pytest.mark.medium
 def test_every_pixel_that_could_see_the_hull_is_kept(ball: Dataset) -> None:
     resolution = 48
     silhouettes = Silhouettes.of(ball)
@@ -117,25 +120,65 @@ def disc(cameras: Cameras, image: int, center: torch.Tensor, radius: float) -> t
     return (apart < radius).view(int(cameras.heights[image]), int(cameras.widths[image]))
 
 
+def flight(
+    ball: Dataset, place: Callable[[float], torch.Tensor], radius: float, zoom: float = 0.5
+) -> tuple[Dataset, torch.Tensor]:
+    """Photographs, by default of the whole box, of a ball that flies, and times; neighbours in time see other sides."""
+    wide = replace(ball, cameras=replace(ball.cameras, fx=ball.cameras.fx * zoom, fy=ball.cameras.fy * zoom))
+    times, pixels = torch.arange(24) * 7 % 24 / 23, torch.zeros_like(wide.pixels).view(24, 80, 80, 4)
+    for image, time in enumerate(times.tolist()):
+        pixels[image, disc(wide.cameras, image, place(time), radius)] = 255
+    return replace(wide, pixels=pixels.view(-1, 4), times=times), times
+
+
 @pytest.mark.parametrize("slices", [1, 3, 8])
 def test_a_flying_ball_is_never_outside_the_hull_of_its_time(ball: Dataset, slices: int) -> None:
     """At all times, those between two images too; and what the hull leaves grows less with the number of slices."""
-    wide = replace(ball, cameras=replace(ball.cameras, fx=ball.cameras.fx / 2, fy=ball.cameras.fy / 2))
-    times, radius = torch.linspace(0, 1, 24), 0.25
 
     def place(time: float) -> torch.Tensor:
-        return torch.tensor([1.6 * time - 0.8, 0.5 * math.sin(3 * time), 0.3 - 0.6 * time])
+        return torch.tensor([0.8 * time - 0.4, 0.25 * math.sin(3 * time), 0.15 - 0.3 * time])
 
-    pixels = torch.zeros_like(wide.pixels).view(24, 80, 80, 4)
-    for image, time in enumerate(times.tolist()):
-        pixels[image, disc(wide.cameras, image, place(time), radius)] = 255
-    silhouettes = Silhouettes.of(replace(wide, pixels=pixels.view(-1, 4)))
+    radius = 0.25
+    seen, times = flight(ball, place, radius)
+    silhouettes = Silhouettes.of(seen)
     hull = moving_hulls(silhouettes, BOX, 16, times, slices).view(slices, -1)
     for time in torch.linspace(0, 1, 97).tolist():
         inside = (centers(16) - place(time)).norm(dim=-1) < radius
         assert bool(inside.any())
         assert bool(hull[min(int(time * slices), slices - 1)][inside].all())
-    far = (centers(16) - place(0.0)).norm(dim=-1) > 1.0  # at the beginning most of this is known to be empty
-    assert hull[0][far].float().mean() < {1: 1.01, 3: 0.75, 8: 0.5}[slices]
-    if slices == 1:
-        assert torch.equal(hull[0], moving_hulls(silhouettes, BOX, 16, times))
+    far = (centers(16) - place(0.0)).norm(dim=-1) > 0.8
+    assert hull[0][far].float().mean() < {1: 0.15, 3: 0.05, 8: 0.02}[slices]
+    box = moving_box(silhouettes, BOX, times)
+    for time in torch.linspace(0, 1, 97).tolist():
+        assert bool((box[0] < place(time) - radius).all())
+        assert bool((box[1] > place(time) + radius).all())
+    assert float((box[1] - box[0]).prod()) < 0.4 * float((BOX[1] - BOX[0]).prod())
+
+
+def test_the_box_of_a_scene_that_frames_cut_is_larger(ball: Dataset) -> None:
+    """The same ball in the same place: where an image shows matter at its border, there may be more outside."""
+    seen, times = flight(ball, lambda time: torch.zeros(3), 0.25, zoom=1.2)
+    whole = Silhouettes.of(seen)
+    assert not any(whole.touch_border(image) for image in range(24))
+    pixels = seen.pixels.clone()
+    pixels[79, 3] = 255  # a corner of the first image
+    cut = Silhouettes.of(replace(seen, pixels=pixels))
+    assert cut.touch_border(0)
+    small, large = (moving_box(silhouettes, 1.5 * BOX, times) for silhouettes in (whole, cut))
+    assert bool((small[0] < -0.25).all())
+    assert bool((small[1] > 0.25).all())
+    assert bool((large[0] <= small[0]).all())
+    assert bool((large[1] >= small[1]).all())
+    assert float((small[1] - small[0]).prod()) < 0.95 * float((large[1] - large[0]).prod())
+
+
+def test_wider_frames_show_the_same_and_nothing_around(ball: Dataset) -> None:
+    silhouettes = Silhouettes.of(ball)
+    points = torch.rand(500, 3) * 2.4 - 1.2
+    for image in (0, 7):
+        held = [torch.ones(500, dtype=torch.bool) for _ in range(2)]
+        for wider, found in zip((False, True), held, strict=True):
+            chosen = silhouettes.widened() if wider else silhouettes
+            hold_balls(chosen.photograph(image), points, 0.05, found, every=True)
+        assert bool((held[0] | ~held[1]).all())  # what was empty stays so
+        assert held[1].float().mean() < held[0].float().mean()

@@ -64,6 +64,7 @@ def test_all_methods_are_here() -> None:
     assert set(METHODS) <= set(registered("methods"))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("method", METHODS)
 def test_each_number_makes_a_model_or_one_line(method: str) -> None:
     config, refused, built = tiny_config(method), set(), set()

@@ -234,6 +234,7 @@ def test_every_method_that_casts_rays_learns_from_them(
     assert "depth" not in off.train_step().losses
 
 
+@pytest.mark.medium
 def test_points_teach_where_the_surface_is_and_that_space_before_it_is_empty(
     parsed, dataset: Dataset, shared_tiny: Path, tmp_path: Path
 ) -> None:

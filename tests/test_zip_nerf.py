@@ -63,6 +63,7 @@ def test_what_is_asked_for_is_done_and_not_called_a_decision(shared_tiny: Path, 
     assert not trainer.model.field.unbounded
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("unbounded", [True, False])
 def test_it_learns(unbounded: bool, shared_tiny: Path, tmp_path: Path) -> None:
     trainer = captured(shared_tiny, tmp_path, {"unbounded": unbounded}, max_num_iterations=60)
@@ -165,6 +166,7 @@ def test_exposures_change_each_sample_and_not_the_background() -> None:
     assert torch.equal(exposed(rgb, opacity, background, torch.zeros(5, 12)), rgb)
 
 
+@pytest.mark.medium
 def test_images_of_other_exposure_get_transforms_of_their_own(shared_tiny: Path, tmp_path: Path) -> None:
     """With each second image darkened, the transforms of the darker ones darken."""
     still: Dataset = tiny_trainer("zip-nerf", shared_tiny, tmp_path / "still").train_set

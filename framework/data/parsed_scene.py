@@ -1,4 +1,4 @@
-"""What a data format reads: images that are not decoded yet, with poses, and facts about their scene."""
+"""A data format, and what it reads: images that are not decoded yet, with poses, and facts about their scene."""
 
 from __future__ import annotations
 

@@ -34,11 +34,13 @@ class SurfacePoints:
     """(K, 3) unit normals, if the method has them."""
     directions: Tensor
     """(K, 3) unit directions of the rays that ended there."""
+    pixels: Tensor
+    """(K,) int64 numbers of their pixels, counted through all images."""
 
     def __getitem__(self, kept: Tensor) -> SurfacePoints:
         """Return the points selected by a mask or an index tensor."""
         normals = None if self.normals is None else self.normals[kept]
-        return SurfacePoints(self.positions[kept], self.colors[kept], normals, self.directions[kept])
+        return SurfacePoints(self.positions[kept], self.colors[kept], normals, self.directions[kept], self.pixels[kept])
 
 
 @torch.no_grad()
@@ -70,6 +72,7 @@ def surface_points(model: RayModel[Any], dataset: Dataset, count: int, reach: fl
             out.rgb.float().clamp(0, 1)[selected].cpu(),
             normals,
             rays.directions[selected].cpu(),
+            pixels[selected].cpu(),
         )
 
 
@@ -105,6 +108,7 @@ def picture_points(model: Model[Any], dataset: Dataset, count: int, reach: float
             picture.rgb.clamp(0, 1).reshape(-1, 3)[pixels][selected].cpu(),
             normals,
             rays.directions[selected].cpu(),
+            (dataset.cameras.ends[index] + pixels[selected]).cpu(),
         )
 
 
@@ -131,4 +135,5 @@ def joined(parts: Iterator[SurfacePoints]) -> SurfacePoints:
         torch.cat([chunk.colors for chunk in chunks]),
         torch.cat(normals) if len(normals) == len(chunks) else None,
         torch.cat([chunk.directions for chunk in chunks]),
+        torch.cat([chunk.pixels for chunk in chunks]),
     )

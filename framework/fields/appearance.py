@@ -35,7 +35,7 @@ class Appearance(nn.Module):
 
         Args:
             camera_indices: (N,) image of each sample; None for evaluation, where all samples get the vector that
-                `shown` has set, or else the mean vector.
+                `shown` has set, or else the mean vector, without a gradient.
             count: number N of samples.
 
         Returns:
@@ -44,7 +44,7 @@ class Appearance(nn.Module):
         if camera_indices is not None:
             # Not `vectors[camera_indices]`, whose gradient depends on the order in which threads add it up.
             return functional.embedding(camera_indices, self.vectors)
-        return (self.vectors.mean(0) if self._shown is None else self._shown).expand(count, -1)
+        return (self.vectors.detach().mean(0) if self._shown is None else self._shown).expand(count, -1)
 
     @contextmanager
     def shown(self, vector: Tensor) -> Iterator[None]:

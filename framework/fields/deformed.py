@@ -28,6 +28,9 @@ class DeformedField(Field):
         fixed_start: whether the displacement is zero at time 0, so that the canonical field is the scene at that time
             (equation 2). The network is smooth in time and cannot follow: it bends all other times towards what suits
             them best, and the first image alone sees the canonical field as it is.
+        ambient: number K of further outputs of the network, which the canonical field reads, too (HyperNeRF, Park et
+            al. 2021, section 4): for what no displacement explains, such as a shadow that moves over a floor. 0 in the
+            paper.
     """
 
     contracted: Tensor | None
@@ -41,16 +44,17 @@ class DeformedField(Field):
         time_frequencies: int = 4,
         contracted: Tensor | None = None,
         fixed_start: bool = True,
+        ambient: int = 0,
     ) -> None:
         super().__init__()
         self.register_buffer("contracted", None if contracted is None else contracted.clone())
-        self.canonical, self.fixed_start = canonical, fixed_start
+        self.canonical, self.fixed_start, self.ambient = canonical, fixed_start, ambient
         self.runs_on_kernels = canonical.runs_on_kernels
         self.position_frequencies, self.time_frequencies = position_frequencies, time_frequencies
         encoded = 3 + 6 * position_frequencies + 1 + 2 * time_frequencies
         first = min(depth, 5)
         self.before_skip = MLP(encoded, *[width] * first, activation="relu")
-        self.after_skip = MLP(width + encoded, *[width] * (depth - first), 3)
+        self.after_skip = MLP(width + encoded, *[width] * (depth - first), 3 + ambient)
         last = self.after_skip[-1]
         assert isinstance(last, nn.Linear)
         nn.init.uniform_(last.weight, -1e-4, 1e-4)  # nothing moves at first
@@ -66,21 +70,27 @@ class DeformedField(Field):
         Raises:
             ValueError: if `times` is None.
         """
+        return self._deformation(positions, times)[0]
+
+    def _deformation(self, positions: Tensor, times: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """Return the displacement (N, 3), and the ambient coordinates (N, K), None without, of `positions`."""
         if self.contracted is not None:
             positions = 2 * contract_to_unit(positions, self.contracted) - 1
         encoded = (
             frequency_encoding(positions, self.position_frequencies),
             encoded_times(times, self.time_frequencies),
         )
-        moved_by = self.after_skip(self.before_skip(*encoded), *encoded).float()
+        outputs = self.after_skip(self.before_skip(*encoded), *encoded).float()
         assert times is not None
-        if not self.fixed_start:
-            return moved_by
-        return torch.where(times[:, None] == 0, torch.zeros_like(moved_by), moved_by)
+        moved_by = outputs[:, :3].contiguous()
+        if self.fixed_start:
+            moved_by = torch.where(times[:, None] == 0, torch.zeros_like(moved_by), moved_by)
+        return moved_by, outputs[:, 3:].contiguous() if self.ambient else None
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
-        moved = points.positions + self.displacement(points.positions, points.times)
-        return self.canonical.density(replace(points, positions=moved, times=None))
+        moved_by, ambient = self._deformation(points.positions, points.times)
+        moved = points.positions + moved_by
+        return self.canonical.density(replace(points, positions=moved, times=None, ambient=ambient))
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         return self.canonical.color(features, directions, camera_indices)

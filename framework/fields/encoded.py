@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from framework.encodings.hash_grid import HashGrid
 from framework.encodings.opening import Opening
@@ -13,6 +13,7 @@ from framework.fields.base import MLP, Field
 from framework.geometry.points import Points
 from framework.kernels.contraction import contract_to_unit
 from framework.kernels.spherical_harmonics import spherical_harmonics
+from framework.kernels.trace import GridDensity
 
 NUM_FEATURES = 16
 """Number of features that the density network passes to the colour network; the first is the log-density."""
@@ -104,6 +105,7 @@ class EncodedField(BoxField):
         appearance: size of an image's appearance vector, and number of images (NeRF-W, Martin-Brualla et al. 2021,
             section 4.1); None for no appearance vectors.
         opening: whether the bands of the viewing direction open one after the other (`Opening`).
+        ambient: number of coordinates beyond those of space (`Points.ambient`) that the density network reads.
     """
 
     def __init__(
@@ -116,10 +118,11 @@ class EncodedField(BoxField):
         unbounded: bool = False,
         appearance: tuple[int, int] | None = None,
         opening: bool = False,
+        ambient: int = 0,
     ) -> None:
         super().__init__(box, encoding, unbounded)
         self.direction_levels, self.num_features = direction_levels, num_features
-        self.density_head = MLP(encoding.num_features, width, num_features, bias=False)
+        self.density_head = MLP(encoding.num_features + ambient, width, num_features, bias=False)
         inputs = num_features + direction_levels**2
         self.direction_opening = Opening(direction_levels, 1) if opening and direction_levels else None
         self.appearance = None
@@ -129,7 +132,25 @@ class EncodedField(BoxField):
         self.color_head = MLP(inputs, width, width, 3, bias=False, activation="sigmoid")
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
-        return self.density_head.density(self.encode(points.positions, points.times))
+        encoded = self.encode(points.positions, points.times)
+        if points.ambient is None:
+            return self.density_head.density(encoded)
+        return self.density_head.density(encoded, points.ambient.to(encoded.dtype))
+
+    def grid_density(self) -> GridDensity | None:
+        """Return the density as `trace` computes it; None if this field's is another."""
+        grid, own = self.encoding, (EncodedField.density, BoxField.encode, BoxField.unit)
+        plain = (type(self).density, type(self).encode, type(self).unit) == own and not self.unbounded
+        plain = plain and not {"density", "encode", "unit"} & vars(self).keys()
+        hooked = any(m._forward_hooks or m._forward_pre_hooks for m in (self.density_head, grid))
+        if not plain or hooked or type(grid) is not HashGrid or type(self.density_head) is not MLP:
+            return None
+        if grid.opening is not None and not grid.opening.complete:
+            return None
+        if grid.deferred is not None:
+            grid.deferred.layout = grid.layout
+        weights = [layer.weight for layer in self.density_head if isinstance(layer, nn.Linear)]
+        return GridDensity(self.scale, self.shift, grid.table, grid.layout, grid.deferred, weights)
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         inputs = [features]

@@ -54,6 +54,8 @@ class Points:
     """(N, 2) variance along the axis and across it, squared scene units; None if not computed."""
     frustums: Frustums | None = None
     """The cones' intervals; None if not computed."""
+    ambient: Tensor | None = None
+    """(N, K) coordinates beyond those of space, on which density and colour depend; None without."""
 
     def __len__(self) -> int:
         return self.positions.shape[0]

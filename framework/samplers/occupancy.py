@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from framework.base.errors import ConfigError, shown
-from framework.fields.base import DensityFunction, Field, HasAlpha
+from framework.fields.base import DensityFunction, Field, HasAlpha, HasGridDensity
 from framework.geometry.bounds import nested_boxes
 from framework.geometry.points import Points, interval_points
 from framework.geometry.rays import Rays, Samples
@@ -27,6 +27,7 @@ from framework.kernels.kept import Waves
 from framework.kernels.march import Occupancy, Wave, march, refresh_occupancy
 from framework.kernels.occupancy import own_cells
 from framework.kernels.rows import gather_rows
+from framework.kernels.trace import trace
 from framework.samplers.base import Sampler
 
 MAX_CELLS = 512
@@ -44,9 +45,11 @@ WARM_UP_DECAY, DECAY = 0.7, 0.8
 TIMES_PER_VISIT, MOVING_DECAY = 4, 0.95
 """Number of times at which a cell of a moving scene is evaluated at each update, and the factor of its density, which
 is larger because a cell may be occupied for a short time only. Both are for a grid with one slice of time."""
-SHARE, SHARE_OF_SLICES = 64, 128
+SHARE, SHARE_OF_SLICES = 64, 512
 """Numbers of cells for each one that is drawn from all cells at an update after warm-up, without and with slices of
 time. With them there are more cells, of which fewer are occupied."""
+PASSES, PASSES_OF_SLICES = 4, 1
+"""Passes over all cells during warm-up, without and with slices of time."""
 COARSE_STEPS = (WARM_UP_STEPS // 4, 4.0), (WARM_UP_STEPS, 2.0)
 """Training steps until which the march through nested boxes takes longer steps, and how much longer these are. While
 nothing is known to be empty, few rays would take all samples."""
@@ -179,6 +182,13 @@ class OccupancySampler(Sampler):
         stride = self._stride if self.training else 1.0
         marched = march(rays, self.occupancy, stride * self.step_size, stride * self.cone, shift, stop)
 
+        if isinstance(field, HasGridDensity) and not self.endless:
+            known = field.grid_density()
+            traced = None if known is None else trace(marched, known)
+            if traced is not None:
+                samples = Samples(traced.t_starts, traced.t_ends, traced.offsets, owners=traced.owners, early_stop=stop)
+                return samples.evaluated(traced.sigma, traced.features)
+
         def evaluate(wave: Wave) -> tuple[Tensor, Tensor]:
             points = interval_points(rays, wave.owners, wave, wave.positions, field.footprint)
             if surface is None:
@@ -280,7 +290,7 @@ class OccupancySampler(Sampler):
         Only one in eight of the empty cells is returned, because few of them become occupied again.
         """
         num_cells = len(self.occupied)
-        count = math.ceil(4 * num_cells * 8 / WARM_UP_STEPS)
+        count = math.ceil((PASSES if self.slices == 1 else PASSES_OF_SLICES) * num_cells * 8 / WARM_UP_STEPS)
         ranks = torch.arange(turn * count, (turn + 1) * count, device=self.occupied.device)
         cells = ranks * SHUFFLE_STRIDE % num_cells
         selected = self.occupied.index_select(0, cells) | (torch.rand(count, device=cells.device) < 1 / 8)

@@ -7,12 +7,11 @@ no opaque pixel can be skipped for good, and so can the pixels whose ray meets n
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from framework.data.dataset import Dataset
 from framework.data.pixel_set import PixelSet
@@ -20,6 +19,19 @@ from framework.kernels.silhouettes import Photograph, hold_balls, opaque_sums, p
 
 COARSEST = 8
 """Maximum side of the first cubes tested, cells."""
+FASTEST = 0.5
+"""Speed that matter is assumed not to exceed, in longest edges of the box for the time from 0 to 1."""
+REACH = 0.05
+"""Distance, longest edges of the box, that matter may move between a moment and the images that are taken for it."""
+WITNESSES = 3
+"""Images about a moment, if there are as many, that must show matter in the direction of what may be occupied. Without
+them much is left that no image has in its frame at that moment."""
+MOST_MOMENTS = 32
+"""Maximum number of moments whose hulls make up those of slices."""
+FRAME = 400
+"""Maximum side of the images by which the smallest box of a moving scene is found, pixels."""
+BOX_CELLS = 32
+"""Cells along each axis by which the smallest box of a moving scene is found."""
 
 
 class _Counts(Sequence[Tensor]):
@@ -63,6 +75,35 @@ class Silhouettes:
     def __len__(self) -> int:
         return len(self.sums)
 
+    def touch_border(self, image: int) -> bool:
+        """Return whether image `image` has a pixel at its border that is not fully transparent."""
+        sums = self.sums[image]
+        inner = sums[-2, -2] - sums[-2, 1] - sums[1, -2] + sums[1, 1]
+        return bool(sums[-1, -1] > inner)
+
+    def widened(self) -> Silhouettes:
+        """Return silhouettes in frames of twice the size, empty around the images, in at most `FRAME` pixels.
+
+        This is what the images show if none cuts through what it shows: nothing is outside their frames, either.
+        """
+        cameras, sums = self.dataset.cameras, []
+        factor = max(-(-int(torch.maximum(cameras.widths, cameras.heights).max()) // (FRAME // 2)), 1)
+        height, width = (int(size.max()) // (2 * factor) for size in (cameras.heights, cameras.widths))
+        for own in self.sums:
+            rows, columns = (
+                (torch.arange(-edge, -(-size // factor) + edge + 1, device=own.device) * factor).clamp(0, size)
+                for size, edge in ((own.shape[0] - 1, height), (own.shape[1] - 1, width))
+            )
+            sums.append(own[rows][:, columns].contiguous())
+        cameras = replace(
+            cameras,
+            fx=cameras.fx / factor,
+            fy=cameras.fy / factor,
+            cx=cameras.cx / factor + width,
+            cy=cameras.cy / factor + height,
+        )
+        return Silhouettes(replace(self.dataset, cameras=cameras), tuple(sums))
+
     @property
     def at_full_size(self) -> list[int]:
         """The images that are not reduced beside others: alpha that is rounded shows less of what is there."""
@@ -88,17 +129,18 @@ def visual_hull(silhouettes: Silhouettes, box: Tensor, resolution: int) -> Tenso
     Returns:
         (n^3,) bool; the index of a cell is (x n + y) n + z.
     """
-    return _held(silhouettes, silhouettes.at_full_size, box, resolution, every=True)
+    return _held(silhouettes, silhouettes.at_full_size, box, resolution)
 
 
 @torch.no_grad()
 def moving_hulls(silhouettes: Silhouettes, box: Tensor, resolution: int, times: Tensor, slices: int = 1) -> Tensor:
     """Return the cells of a box that may be occupied in each slice of time, of a scene that moves.
 
-    A transparent pixel says that its ray is empty at the moment of its image, and nothing of other moments. So a cell
-    is dropped from a slice if, of the images of that time and the nearest before and after, one shows it and its
-    neighbours to be empty, and none shows matter in their direction. The margin of one cell allows for motion between
-    the times of the images.
+    A transparent pixel says that its ray is empty at the time of its image. At another moment, a ball is empty if the
+    image shows the larger one to be empty that matter could have come from: its radius is greater by what matter moves
+    meanwhile, at most `FASTEST`. So a cell may be occupied at a moment if no image shows the ball around it to be empty
+    and some `WITNESSES` of the images about that time show matter in its direction. A slice has the cells of all its
+    moments.
 
     Args:
         silhouettes: silhouettes of the M training images.
@@ -111,30 +153,53 @@ def moving_hulls(silhouettes: Silhouettes, box: Tensor, resolution: int, times: 
         (T n^3,) bool; the index of cell (x, y, z) of slice s is ((s n + x) n + y) n + z.
     """
     images = silhouettes.at_full_size
-    moments = times.cpu()[images]
-    hulls = []
-    for each in range(slices):
-        within = _around(moments, each / slices, (each + 1) / slices)
-        chosen = [images[i] for i in within]
-        held = _held(silhouettes, chosen, box, resolution, every=False)
-        held |= _held(silhouettes, chosen, box, resolution, every=True)
-        grid = held.view(1, 1, resolution, resolution, resolution).float()
-        hulls.append(functional.max_pool3d(grid, 3, stride=1, padding=1).view(-1) > 0)
-    return torch.cat(hulls)
+    taken = times.cpu()[images]
+    parts = max(round(min(len(taken.unique()), MOST_MOMENTS) / slices), 1)
+    speed, half = FASTEST * float((box[1] - box[0]).max()), 0.5 / (slices * parts)
+    hulls = torch.zeros(slices, resolution**3, dtype=torch.bool, device=box.device)
+    for part in range(slices * parts):
+        apart = (taken - (2 * part + 1) * half).abs()
+        near = (apart <= max(REACH / FASTEST, float(apart.min()))).nonzero().squeeze(-1).tolist()
+        margins = [speed * (float(apart[i]) + half) for i in near]
+        hulls[part // parts] |= _held(silhouettes, [images[i] for i in near], box, resolution, margins)
+    return hulls.view(-1)
 
 
-def _around(times: Tensor, start: float, end: float) -> list[int]:
-    """Return which of `times` (M,) are from `start` to `end`, or equal to the nearest one before or after."""
-    before, after = times[times < start], times[times > end]
-    first = start if len(before) == 0 else float(before.max())
-    last = end if len(after) == 0 else float(after.min())
-    return ((times >= first) & (times <= last)).nonzero().squeeze(-1).tolist()
+def moving_box(silhouettes: Silhouettes, box: Tensor, times: Tensor) -> Tensor:
+    """Return the smallest box (2, 3), inside `box`, of all that may be occupied at any time, of a scene that moves.
+
+    If no image has matter at its border, what is outside an image's frame is taken to be empty, too.
+
+    Args:
+        silhouettes: silhouettes of the M training images.
+        box: (2, 3) minimum and maximum corner.
+        times: (M,) times of the images, in [0, 1].
+    """
+    if not any(silhouettes.touch_border(image) for image in silhouettes.at_full_size):
+        silhouettes = silhouettes.widened()
+    for _ in range(3):  # each time with smaller cells
+        cells = moving_hulls(silhouettes, box, BOX_CELLS, times).view(BOX_CELLS, BOX_CELLS, BOX_CELLS).nonzero()
+        if len(cells) == 0:
+            return box
+        ends = torch.stack([cells.amin(0), cells.amax(0) + 1])
+        box = box[0] + (box[1] - box[0]) * ends / BOX_CELLS
+    return box
 
 
-def _held(silhouettes: Silhouettes, images: Sequence[int], box: Tensor, resolution: int, every: bool) -> Tensor:
-    """Return the cells (n^3,) bool that none of `images` shows to be empty, or where one shows matter (not `every`).
+def _held(
+    silhouettes: Silhouettes,
+    images: Sequence[int],
+    box: Tensor,
+    resolution: int,
+    margins: Sequence[float] | None = None,
+) -> Tensor:
+    """Return the cells (n^3,) bool that none of `images` shows to be empty.
 
     `silhouettes`, `box` and `resolution` are as in `visual_hull`.
+
+    Args:
+        margins: distance, for each image, up to which around a cell all must be shown to be empty; `WITNESSES` must
+            then show matter in the cell's direction, too. None for a still scene, without either.
     """
     size = min(COARSEST, 1 << (resolution - 1).bit_length())
     count = -(-resolution // size)
@@ -143,9 +208,12 @@ def _held(silhouettes: Silhouettes, images: Sequence[int], box: Tensor, resoluti
         low = box[0] + (box[1] - box[0]) * cubes / resolution
         edge = (box[1] - box[0]) * size / resolution
         centers, radius = (low + edge / 2).contiguous(), float(edge.norm()) / 2
-        held = torch.full((len(cubes),), every, device=box.device)
-        for image in images:
-            hold_balls(silhouettes.photograph(image), centers, radius, held, every=every)
+        held = torch.ones(len(cubes), dtype=torch.bool, device=box.device)
+        reach = [radius + margin for margin in margins or [0.0] * len(images)]
+        for image, r in zip(images, reach, strict=True):
+            hold_balls(silhouettes.photograph(image), centers, r, held, every=True)
+        if margins is not None:  # only of what is left, which is little
+            held[held.clone()] = _witnessed(silhouettes, images, centers[held], reach)
         cubes = cubes[held]
         if size == 1:
             break
@@ -156,6 +224,16 @@ def _held(silhouettes: Silhouettes, images: Sequence[int], box: Tensor, resoluti
     hull = torch.zeros(resolution**3, dtype=torch.bool, device=box.device)
     hull[(cubes[:, 0] * resolution + cubes[:, 1]) * resolution + cubes[:, 2]] = True
     return hull
+
+
+def _witnessed(silhouettes: Silhouettes, images: Sequence[int], centers: Tensor, reach: Sequence[float]) -> Tensor:
+    """Return in the direction of which balls (N,) `WITNESSES` of `images` show matter, or all if they are fewer."""
+    count = torch.zeros(len(centers), dtype=torch.int32, device=centers.device)
+    for image, radius in zip(images, reach, strict=True):
+        shown = torch.zeros(len(centers), dtype=torch.bool, device=centers.device)
+        hold_balls(silhouettes.photograph(image), centers, radius, shown, every=False)
+        count += shown
+    return count >= min(WITNESSES, len(images))
 
 
 @torch.no_grad()

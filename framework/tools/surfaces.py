@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,9 +17,23 @@ PASSES = 16
 """Maximum number of times that rays are drawn, of which some end on no surface."""
 
 
-def found_surfaces(
-    dataset: Dataset, config: TrainConfig, steps: int, seconds: float, count: int
-) -> tuple[Tensor, Tensor]:
+@dataclass(frozen=True)
+class FoundSurfaces:
+    """N points on surfaces, and the pixels of training images that show them."""
+
+    positions: Tensor
+    """(N, 3) scene coordinates."""
+    colors: Tensor
+    """(N, 3) colours in [0, 1]."""
+    images: Tensor
+    """(N,) int64 which image shows the point."""
+    pixels: Tensor
+    """(N,) int64 number of the pixel in that image, row by row."""
+    distances: Tensor
+    """(N,) distance from that image's camera, scene units."""
+
+
+def found_surfaces(dataset: Dataset, config: TrainConfig, steps: int, seconds: float, count: int) -> FoundSurfaces:
     """Train a field for a few steps, and return points on the surfaces that it has found.
 
     The field is that of instant-ngp, or that of nerfacto where there may be something outside the scene's box, which
@@ -33,11 +47,10 @@ def found_surfaces(
         count: maximum number of points.
 
     Returns:
-        Positions (N, 3) in scene coordinates and colours (N, 3) in [0, 1]; N is less than `count` where rays end on no
-        surface, and may be 0.
+        The points; there are fewer than `count` where rays end on no surface, and possibly none.
     """
     from framework.base.registry import load_method
-    from framework.export.points import joined, surface_points
+    from framework.export.points import SurfacePoints, joined, surface_points
     from framework.training.run import Run
     from framework.training.trainer import Trainer
 
@@ -55,9 +68,12 @@ def found_surfaces(
         if trainer.state.seconds >= seconds:
             break
     model = trainer.model.eval()
-    points, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
-    while (left := count - sum(map(len, points))) > 0 and len(points) < PASSES:
+    parts: list[SurfacePoints] = []
+    while (left := count - sum(len(part.positions) for part in parts)) > 0 and len(parts) < PASSES:
         found = joined(surface_points(cast("Any", model), dataset, 2 * left, None))
-        points.append(found.positions[:left])
-        colors.append(found.colors[:left])
-    return torch.cat(points).to(dataset.device), torch.cat(colors).to(dataset.device)
+        parts.append(found[torch.arange(len(found.positions)) < left])
+    found, cameras = joined(iter(parts)), dataset.cameras.to("cpu")
+    images = torch.searchsorted(cameras.offsets, found.pixels, right=True) - 1
+    distances = (found.positions - cameras.camera_to_worlds[images, :, 3]).norm(dim=-1)
+    columns = (found.positions, found.colors, images, found.pixels - cameras.offsets[images], distances)
+    return FoundSurfaces(*(column.to(dataset.device) for column in columns))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 from framework.base.config import TrainConfig
 from framework.base.console import say
 from framework.base.decisions import Decision
+from framework.base.registry import load_method
 from framework.cameras.ndc import NdcCameras
 from framework.data.dataset import Dataset
 from framework.data.free_space import before_points
@@ -20,9 +22,51 @@ from framework.geometry.bounds import nested_boxes
 from framework.model import HasAppearance, LearnsMotion, Model, RefinesPoses, RendersFromImages, parts
 from framework.samplers.base import SkipsCells
 from framework.samplers.choice import SamplingConfig
+from framework.scene.motion import MotionConfig
 from framework.scene.profile import SceneProfile
 from framework.scene.seen_cells import seen_cells
-from framework.scene.silhouettes import Silhouettes, moving_hulls, pixels_near, visual_hull
+from framework.scene.silhouettes import Silhouettes, moving_box, moving_hulls, pixels_near, visual_hull
+
+
+def decided(method: str, config: TrainConfig, dataset: Dataset) -> tuple[Dataset, TrainConfig, list[Decision]]:
+    """Decide the settings that a method leaves to the data, and the box of a scene that moves.
+
+    A method that learns motion and samples with an occupancy grid gets the smallest box that the silhouettes allow.
+
+    Args:
+        method: the method's name.
+        config: the run's settings.
+        dataset: the training images.
+
+    Returns:
+        The data set, perhaps with a smaller box, the settings, and each decision with its reason.
+    """
+    declared = load_method(method)
+    settings, made = declared.decided(config, dataset.scene)
+    samples_in_box = isinstance(settings, SamplingConfig) and str(settings.sampler) == "occupancy"
+    if not isinstance(settings, MotionConfig) or not settings.smallest_box or not samples_in_box:
+        return dataset, settings, made
+    if dataset.times is None or dataset.scene.unbounded or _no_silhouettes(dataset) is not None:
+        return dataset, settings, made
+    old = dataset.scene.box
+    box = moving_box(Silhouettes.of(dataset), old, dataset.times)
+    share = float(((box[1] - box[0]) / (old[1] - old[0])).prod())
+    shorter = float((box[1] - box[0]).norm() / (old[1] - old[0]).norm())
+    config = _with_steps_as_long(config, declared.config, settings, shorter)
+    dataset = replace(dataset, scene=replace(dataset.scene, box=box))
+    settings, made = declared.decided(config, dataset.scene)
+    small = Decision("box", f"{100 * share:.0f}% of the data's", "alpha shows that nothing is ever outside")
+    return dataset, settings, [small, *made]
+
+
+def _with_steps_as_long(config: TrainConfig, default: TrainConfig, decided: TrainConfig, shorter: float) -> TrainConfig:
+    """Return `config` with `shorter` times the steps that were `decided`, if it names no other than its `default`."""
+    assert isinstance(config, SamplingConfig)
+    assert isinstance(default, SamplingConfig)
+    assert isinstance(decided, SamplingConfig)
+    if config.num_steps != default.num_steps:
+        return config
+    return replace(config, num_steps=max(round(decided.num_steps * shorter), 1))
 
 
 def profile_of(

@@ -20,23 +20,19 @@ from framework.base.console import say
 from framework.base.device import seed_step
 from framework.base.errors import CheckpointError, DivergenceError
 from framework.base.processes import alone, from_first, processes
-from framework.base.registry import load_method
 from framework.data.dataset import Dataset
-from framework.data.pixels import composite
 from framework.data.sources import BatchSource, Request, make_source
-from framework.evaluation.evaluator import evaluate, evaluation_background, timed_view
 from framework.evaluation.metrics import MAX_PSNR
-from framework.evaluation.panels import composed, view_panels
 from framework.kernels.native import torch_on_one_thread
 from framework.model import StartsFromImages
 from framework.scene.profile import SceneProfile
 from framework.training.checkpoint import FOLDER, checkpoint_path, load_checkpoint, load_newest, save_checkpoint
-from framework.training.curve import FewImages, Point, in_order, rows
+from framework.training.held_out import HeldOut
 from framework.training.optim import first_non_finite, make_optimizer
 from framework.training.outcome import Outcome
-from framework.training.preparation import profile_of, show_images, skip_empty
+from framework.training.preparation import decided, profile_of, show_images, skip_empty
 from framework.training.progress import ProgressBar, StepReport, TensorBoard
-from framework.training.run import Run, write_report
+from framework.training.run import Run
 from framework.training.signals import stop_signals
 from framework.training.state import State, agree
 from framework.training.step import train_step
@@ -44,8 +40,6 @@ from framework.training.trained import build_model, restore_model
 
 STEPS_PER_LOG = 25
 """Steps between points of TensorBoard's curves, and between readings of errors from a device."""
-PICTURE_SHARE = 0.1
-"""Maximum time for TensorBoard's images, as a fraction of the training time."""
 TOLD_SECONDS = 0.5
 """Seconds of preparation from which on they are reported."""
 MAX_BAD_STEPS = 10
@@ -72,7 +66,9 @@ class Trainer:
         self, run: Run, train_set: Dataset, eval_set: Dataset | None, source: BatchSource | None = None
     ) -> None:
         self.config: TrainConfig
-        self.config, self.decisions = load_method(run.method).decided(run.config, train_set.scene)
+        start = time.perf_counter()
+        train_set, self.config, self.decisions = decided(run.method, run.config, train_set)
+        self._deciding = time.perf_counter() - start  # which counts as training
         self.run = replace(run, config=self.config)
         self.train_set, self.eval_set = train_set, eval_set
         self.device = train_set.device
@@ -86,12 +82,11 @@ class Trainer:
         self.steps_per_read = 1 if self.device.type == "cpu" else STEPS_PER_LOG
         """Steps after which the errors of batches are read from the device, which is waited for."""
         self._unread: list[Tensor] = []
-        limit = self.config.max_eval_images
-        self._few = None if eval_set is None else FewImages(eval_set, limit, self.model.rays_per_pixel)
+        self.held_out = HeldOut(self.run, self.model, eval_set)
         self._bad_in_a_row = 0
         self._prepared = False
         self._saved_step: int | None = None
-        self._last_save = self._last_eval = self._picture_seconds = 0.0
+        self._last_save = 0.0
 
     # -- checkpoints ------------------------------------------------------------------------------------------
 
@@ -149,7 +144,7 @@ class Trainer:
             raise CheckpointError(f"the checkpoint's optimiser or state does not fit: {error}") from error
         self.first_step = self._saved_step = self.state.step
         self._last_save = self.state.seconds
-        self._last_eval = self.state.curve[-1][0] if self.state.curve else 0.0
+        self.held_out.resume(self.state)
 
     def restore_as_configured(self) -> None:
         """Restore the checkpoint of --load-checkpoint or --load-dir, if given.
@@ -190,14 +185,17 @@ class Trainer:
                 report = self.train_step()
                 bar.show(report)
                 self._log(report, board)
-                self._evaluate_if_due(board)  # before saving, so that a resumed run does not repeat it
-                self._look_if_due(report, board, last=not stopped and self._reason_to_stop(stopped) is not None)
+                self.held_out.evaluate_if_due(
+                    self.state, board
+                )  # before saving, so that a resumed run does not repeat it
+                ends = not stopped and self._reason_to_stop(stopped) is not None
+                self.held_out.look_if_due(self.state, report, board, last=ends)
                 if self._due_to_save():
                     self._try_to_save()
                 if between_steps is not None:
                     between_steps(report, received)
             if first:
-                self._write_curve()
+                self.held_out.write_curve(self.state)
                 self.save()  # a first Ctrl-C does not interrupt it
         return Outcome(reason, next(iter(stopped), None), checkpoint_path(self.checkpoint_folder, self.state.step))
 
@@ -243,7 +241,7 @@ class Trainer:
                 with alone():
                     self.model.start(self.train_set)
             self._join_first()
-        seconds = time.perf_counter() - start
+        seconds = time.perf_counter() - start + self._deciding
         if fresh:
             self.state.seconds += seconds
         if seconds >= TOLD_SECONDS:
@@ -328,7 +326,7 @@ class Trainer:
     def _train_psnr(self) -> float:
         return min(-10 * float(torch.tensor(max(self.state.train_mse, 1e-12)).log10()), MAX_PSNR)
 
-    # -- evaluation -------------------------------------------------------------------------------------------
+    # -- reports and checkpoints between steps ----------------------------------------------------------------
 
     def _log(self, report: StepReport, board: TensorBoard) -> None:
         if report.step % STEPS_PER_LOG == 0:
@@ -342,49 +340,6 @@ class Trainer:
             for index, group in enumerate(self.optimizer.param_groups):
                 values[f"learning_rate/{group.get('name', index)}"] = group["lr"]
             board.scalars(values, report.step)
-
-    def _evaluate_if_due(self, board: TensorBoard) -> None:
-        """Evaluate one or all held-out images if it is time to; this does not count as training time."""
-        config, step = self.config, self.state.step
-        if self.eval_set is None or config.max_eval_images == 0:
-            return
-        affordable = self._picture_seconds <= PICTURE_SHARE * self.state.seconds
-        if step % config.steps_per_eval_image == 0 and "tensorboard" in config.vis and affordable:
-            index = (step // config.steps_per_eval_image - 1) % len(self.eval_set)
-            background = evaluation_background(self.model)
-            picture, seconds = timed_view(self.model, self.eval_set.view(index), background)
-            target = composite(self.eval_set.image(index).float() / 255, background)
-            panels = view_panels(picture.rgb.clamp(0, 1), target, picture.median_depth, picture.accumulation)
-            self._picture_seconds += seconds
-            board.image("eval/comparison", composed(panels), step)
-        every = config.seconds_per_eval_all_images
-        if every is None and config.target_psnr is not None:
-            every = 15.0
-        due = every is not None and self.state.seconds - self._last_eval >= every
-        if due or step % config.steps_per_eval_all_images == 0:
-            self._last_eval, start = self.state.seconds, time.perf_counter()
-            evaluation = evaluate(self.model, self.eval_set, max_images=config.max_eval_images, title="Evaluating")
-            psnr, ssim, images = (evaluation.results[name] for name in ("psnr", "ssim", "num_images"))
-            cost = time.perf_counter() - start
-            point = Point(self.state.seconds, step, psnr, ssim, images, evaluation_seconds=cost)
-            self.state.curve += (point.entry(),)
-            board.scalars({"eval/psnr": psnr} | ({} if ssim is None else {"eval/ssim": ssim}), step)
-            say(f"{self.state.seconds:5.0f} s  step {step:,}  {evaluation.line()}")
-            self._write_curve()
-
-    def _look_if_due(self, report: StepReport, board: TensorBoard, last: bool) -> None:
-        """Evaluate a few held-out images if it is time to; this does not count as training time either."""
-        if self._few is None:
-            return
-        point = self._few.look_if_due(self.model, self.state.looks, report, last=last)
-        if point is not None:
-            self.state.looks += (point.entry(),)
-            values = {"eval_few_images/psnr": point.psnr, "eval_few_images/ssim": point.ssim}
-            board.scalars({name: value for name, value in values.items() if value is not None}, point.step)
-            self._write_curve()
-
-    def _write_curve(self) -> None:
-        write_report(self.run.folder / "learning_curve.json", rows(in_order(self.state.curve, self.state.looks)))
 
     def _due_to_save(self) -> bool:
         if self._bad_in_a_row or not processes().first:  # the parameters may be damaged; keep older checkpoints

@@ -80,6 +80,7 @@ def by_quadrature(scene: ClosedForm, rays: Rays, jumps: bool) -> Light:
     return Light(torch.stack(colors), torch.stack(opacities))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", scenes())
 def test_truth_is_what_dense_quadrature_finds(name: str) -> None:
     scene, rays = scenes()[name], awkward_rays()

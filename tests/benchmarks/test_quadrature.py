@@ -97,6 +97,7 @@ def test_what_waves_drop_is_counted_too() -> None:
     assert marched(wall, full_grid(512), 1e-4, rays).evaluations == 8
 
 
+@pytest.mark.medium
 def test_every_sampler_comes_near_the_truth(monkeypatch: pytest.MonkeyPatch) -> None:
     scene, rays = scenes()["nested"], random_rays(256, seed=4)
     monkeypatch.setattr(sampling, "FIT_RAYS", 128)
@@ -165,6 +166,7 @@ def test_rays_are_those_of_their_seed() -> None:
     assert not torch.equal(random_rays(1000, seed=6).origins, rays.origins)
 
 
+@pytest.mark.medium
 def test_all_of_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     some = {name: scene for name, scene in scenes().items() if name in ("blobs", "sparse")}
     monkeypatch.setattr(quadrature, "scenes", lambda: some)

@@ -14,6 +14,7 @@ from framework.cli.train import _default_run, _parse_flags
 from tests.cli.helpers import TINY_NGP, called, command, run
 
 
+@pytest.mark.medium
 def test_help_is_quick_and_lists_every_method() -> None:
     def once() -> tuple[float, str]:
         start = time.perf_counter()
@@ -144,6 +145,7 @@ def finished(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return output / shared_tiny.name / "instant-ngp" / "t"
 
 
+@pytest.mark.medium
 def test_the_run_folder(finished: Path) -> None:
     config = yaml.safe_load((finished / "config.yml").read_text())
     assert config["method"] == "instant-ngp"

@@ -40,6 +40,7 @@ def test_data_without_its_flag(shared_tiny: Path, refused: Refused) -> None:
     assert refused(train_command.main, shared_tiny).endswith(f"ns-train nerfacto --data {shared_tiny}")
 
 
+@pytest.mark.medium
 def test_a_runs_folder_stands_for_its_config(trained: Path, tmp_path: Path, refused: Refused) -> None:
     for words in (
         [trained],

@@ -50,6 +50,7 @@ def edit_config(folder: Path, **values: object) -> None:
     (folder / "config.yml").write_text(yaml.safe_dump({**config, **values}))
 
 
+@pytest.mark.medium
 def test_the_file_has_nerfstudios_keys_and_its_means(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = evaluate(monkeypatch, finished)
     assert found["experiment_name"] == "ball"

@@ -32,6 +32,7 @@ def export(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
     main()
 
 
+@pytest.mark.medium
 def test_points_lie_on_the_ball(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     export(monkeypatch, "pointcloud", "--load-config", ball, "--output-dir", tmp_path, "--num-points", 20_000)
     points = read_points(tmp_path / "point_cloud.ply")
@@ -54,6 +55,7 @@ def test_cameras_are_those_of_the_input(
         torch.testing.assert_close(torch.tensor(found[name]), torch.tensor(frame["transform_matrix"])[:3])
 
 
+@pytest.mark.medium
 def test_meshes_are_of_the_ball(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Refused) -> None:
     trimesh = pytest.importorskip("trimesh")
     given = ("--load-config", ball, "--output-dir", tmp_path)
@@ -145,6 +147,7 @@ def test_written_points_are_read_back(tmp_path: Path, with_normals: bool) -> Non
     torch.testing.assert_close(last, colors[-1], atol=0.5 / 255 + 1e-6, rtol=0)
 
 
+@pytest.mark.medium
 def test_what_cannot_be_exported_is_refused(ball: Path, tmp_path: Path, refused: Refused) -> None:
     given = ("--load-config", ball, "--output-dir", tmp_path)
     assert "nothing is exported as 'poincloud'. Did you mean 'pointcloud'" in refused(main, "poincloud", *given)

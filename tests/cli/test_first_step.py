@@ -34,6 +34,7 @@ SLOW = {
 """Modules that take long to import, and that the first step does not need."""
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("vis", ["none", "tensorboard"])
 def test_what_is_imported_before_the_first_step(vis: str, shared_tiny: Path, tmp_path: Path) -> None:
     words = ["instant-ngp", "--data", shared_tiny, "--output-dir", tmp_path, *TINY_NGP, "--vis", vis]

@@ -69,6 +69,7 @@ def test_no_class_hides_what_it_imports() -> None:
         assert not [other for other in imported if other.endswith(ending) and other != ending]
 
 
+@pytest.mark.medium
 def test_what_it_writes_keeps_what_every_method_must(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(EXAMPLE / "src"))
     method = importlib.import_module("dense_grid").METHOD

@@ -188,6 +188,7 @@ def test_no_folder_and_bad_flags(tiny: Path) -> None:
         dataclasses.replace(Blender(), downscale_factor=0).parse(tiny, "train")
 
 
+@pytest.mark.medium
 @pytest.mark.data
 @pytest.mark.parametrize(("split", "count"), [("train", 100), ("val", 25), ("test", 50)])
 def test_real_lego(real_data: Path, split: Split, count: int) -> None:

@@ -238,6 +238,7 @@ def test_some_images_of_many_scenes_know_theirs(tmp_path: Path, monkeypatch: pyt
     assert left.scene_indices.tolist() == [2] * 4 + [number for number in (3, 4, 5) for _ in range(5)]
 
 
+@pytest.mark.medium
 def test_many_scenes_repeat_with_the_seed(tmp_path: Path) -> None:
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
         write_scenes(tmp_path / name, size=8, num_scenes=2, views=4, seed=seed)

@@ -20,6 +20,7 @@ def test_what_is_no_bound(text: str) -> None:
         parse_error(text)
 
 
+@pytest.mark.medium
 def test_the_bound_is_kept_and_the_setting_restored(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", evaluated=True, max_num_iterations=150)
     trainer.train()

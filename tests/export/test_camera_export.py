@@ -95,6 +95,7 @@ def test_blender_cameras(tiny: Path, tmp_path: Path) -> None:
     assert_round_trip(Blender(scale_factor=0.37), tiny, given, tmp_path / "out")
 
 
+@pytest.mark.medium
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["fox", "snowmiku"])
 def test_nerfstudio_cameras(name: str, real_data: Path, tmp_path: Path) -> None:
@@ -102,6 +103,7 @@ def test_nerfstudio_cameras(name: str, real_data: Path, tmp_path: Path) -> None:
     assert_round_trip(Nerfstudio(), real_data / name, given, tmp_path / "out")
 
 
+@pytest.mark.medium
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["colmap_can", "colmap_desk"])
 def test_colmap_cameras(name: str, real_data: Path, tmp_path: Path) -> None:

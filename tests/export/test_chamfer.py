@@ -40,6 +40,7 @@ def test_points_are_even_on_the_surface_of_a_ball() -> None:
     assert float((points.sort(0).values - torch.linspace(-1, 1, 20_000)[:, None]).abs().max()) < 0.03
 
 
+@pytest.mark.medium
 def test_distances_of_concentric_balls() -> None:
     mesh = sphere(0.9)
     points, _ = surface_sample(ball, CUBE, 2000)

@@ -67,6 +67,7 @@ def test_a_second_ctrl_c_says_what_was_saved(
     assert exit_status(stop.value) == 130
 
 
+@pytest.mark.medium
 def test_a_stopped_command_exits_as_shells_expect(shared_tiny: Path, tmp_path: Path) -> None:
     """In a process of its own, while it saves all the time."""
     flags, folder = runs.new_run(shared_tiny, tmp_path, 100_000)
@@ -78,6 +79,7 @@ def test_a_stopped_command_exits_as_shells_expect(shared_tiny: Path, tmp_path: P
     assert said.splitlines()[-1] == f"continue with: ns-train --resume {folder}"
 
 
+@pytest.mark.medium
 def test_a_killed_run_ends_with_the_same_bits(shared_tiny: Path, tmp_path: Path) -> None:
     """Killed in a process of its own, which saves all the time; resumed in this one."""
     settings = {"max_num_iterations": 60, "max_eval_images": 0, "machine": MachineConfig(num_threads=1)}

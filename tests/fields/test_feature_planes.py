@@ -92,6 +92,7 @@ def test_gradients_that_wait_move_the_table_as_those_that_do_not(features: int) 
     torch.testing.assert_close(tables[0], tables[1], atol=1e-6, rtol=1e-5)
 
 
+@pytest.mark.medium
 def test_tensorf_grows_shrinks_and_resumes(shared_tiny: Path, tmp_path: Path) -> None:
     """Resumed in the middle of growing, and between the two times that it shrinks."""
     settings = {"max_num_iterations": 300, "upsample_at": (0.01, 0.02, 0.03, 0.85, 0.9)}

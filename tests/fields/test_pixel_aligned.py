@@ -91,6 +91,7 @@ def test_what_is_behind_a_camera_has_no_features() -> None:
     assert bool((found[2] >= 1).all())
 
 
+@pytest.mark.medium
 def test_features_have_the_gradient_of_interpolation() -> None:
     features = ramps().requires_grad_()
     at = points(12)

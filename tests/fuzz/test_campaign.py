@@ -44,6 +44,7 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> list[Outcome]:
     return campaign.run(list(broken.READERS), base, 0, COUNT, module="tests.fuzz.broken", patience=1.5, memory=2**28)
 
 
+@pytest.mark.medium
 def test_every_reader_gets_every_input(outcomes: list[Outcome]) -> None:
     assert [(o.reader, o.seed) for o in outcomes] == [(name, s) for s in range(COUNT) for name in broken.READERS]
     assert set(FOUND) | {"refuse"} == set(broken.READERS)

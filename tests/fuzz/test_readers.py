@@ -35,6 +35,7 @@ def test_all_readers_are_here() -> None:
     assert set(READERS) == set(campaign.names())
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("readers", "count"), ASKED)
 def test_damaged_files_are_refused_in_a_line_or_read_with_sense(
     readers: Sequence[str], count: int, tmp_path: Path

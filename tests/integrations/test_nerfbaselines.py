@@ -185,6 +185,7 @@ def test_presets_are_settings_that_the_method_has(spec: dict[str, Any]) -> None:
         from_plain(load_method(method).config, settings, "preset")
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("module", "forbidden"),
     [
@@ -423,6 +424,7 @@ def test_what_was_saved_shows_the_same_picture_and_learns_on(method: type[Nerflo
     assert same(third.render(data["cameras"][2]), first.render(data["cameras"][2]))
 
 
+@pytest.mark.medium
 def test_it_learns_what_the_photographs_show() -> None:
     data = handed()
     method = start(InstantNGP, data, max_num_iterations=120)
@@ -456,6 +458,7 @@ def test_pictures_are_of_the_camera_s_size_over_the_data_s_background() -> None:
     assert np.all(picture["accumulation"] == 0)
 
 
+@pytest.mark.medium
 def test_appearances_are_told_optimised_and_shown(tmp_path: Path) -> None:
     data = handed(3)
     method = start(Nerfacto, data, appearance_embedding_dim=4)

@@ -31,6 +31,7 @@ def test_each_is_at_most_80_lines(name: str) -> None:
     assert len((HERE / "methods" / f"{name}.py").read_text().splitlines()) <= 80
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", METHODS)
 def test_each_is_trained_evaluated_and_rendered_by_the_commands(name: str, tmp_path: Path) -> None:
     done = called(
@@ -50,6 +51,7 @@ def test_each_is_trained_evaluated_and_rendered_by_the_commands(name: str, tmp_p
     assert imageio.imread(orbit).shape[0] == 3
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", METHODS)
 def test_each_keeps_what_every_method_must(name: str) -> None:
     """As far as it goes for its kind: the checks of rays are left out where none is cast."""

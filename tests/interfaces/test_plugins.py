@@ -36,6 +36,7 @@ def test_each_exchanges_one_part_by_one_line(name: str) -> None:
     assert line.startswith("METHOD = replace(instant_ngp.METHOD, ")
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", ["fog", "even", "voxels"])
 def test_each_is_trained_and_evaluated_by_the_commands(name: str, tmp_path: Path) -> None:
     done = called(
@@ -64,6 +65,7 @@ def test_fog_hides_by_distance() -> None:
     np.testing.assert_allclose(foggy.rgb, left * clear.rgb + (1 - left) * GREY, rtol=1e-6)
 
 
+@pytest.mark.medium
 def test_a_data_format_alone(tmp_path: Path) -> None:
     """Images of a ball from a circle, found by their names, teach instant-ngp what the ball looks like."""
     angles = torch.arange(0, 360, 30)

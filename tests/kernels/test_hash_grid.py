@@ -34,6 +34,7 @@ def test_value_and_gradients_equal_the_reference(dtype: torch.dtype) -> None:
         assert error < (1e-14 if dtype == torch.float64 else 2e-5)
 
 
+@pytest.mark.medium
 def test_gradcheck() -> None:
     torch.manual_seed(1)
     layout = HashGridLayout.build(2, 2, 9, 6)  # one dense level, one hashed

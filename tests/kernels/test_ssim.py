@@ -195,6 +195,7 @@ def test_without_gradients_the_value_is_the_same() -> None:
         assert torch.equal(ssim(image.requires_grad_(), target), value)
 
 
+@pytest.mark.medium
 def test_derivatives_of_the_reference() -> None:
     torch.manual_seed(0)
     image, target = (torch.rand(12, 11, 1, dtype=torch.float64, requires_grad=True) for _ in range(2))

@@ -51,13 +51,16 @@ def in_a_process(**environment: str) -> dict[str, object]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in ENVIRONMENTS]
 )
 def test_values_and_gradients_are_the_references_in_every_environment(name: str, here: Measured) -> None:
+    """Here they are near the references, and there they have the same bits."""
+    errors = {operation: error for operation, (error, _) in here.items()}
     found = in_a_process(**ENVIRONMENTS[name])
-    print(name, found["threads"], "threads; largest error", max(found["errors"].values()))
-    assert max(found["errors"].values()) < TOLERANCE
+    print(name, found["threads"], "threads; largest error", max(errors.values()))
+    assert [operation for operation, error in errors.items() if not error < TOLERANCE] == []
     assert found["bits"] == bits(here)
 
 

@@ -24,6 +24,7 @@ def python(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, *words], env=given, capture_output=True, text=True, check=False, cwd=ROOT)
 
 
+@pytest.mark.medium
 @needs_triton
 def test_every_kernel_computes_what_its_reference_does() -> None:
     words = "-m", "pytest", "-q", "-s", "-p", "no:cacheprovider", "-p", "no:xdist", "tests/kernels/triton"

@@ -37,6 +37,7 @@ def tree(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.medium
 def test_every_bug_of_the_list_can_be_planted() -> None:
     assert faults_of(all_bugs(), ROOT) == []
     assert len(all_bugs()) > 60

@@ -47,6 +47,7 @@ def test_the_plain_loop_is_plain() -> None:
     assert "nerfloom" not in PLAIN.read_text()
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("file", [PLAIN, SKIPPING], ids=["plain", "skipping"])
 def test_both_learn(file: Path, shared_tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
     losses = loaded(file).train(shared_tiny, 1e9, most_steps=120)

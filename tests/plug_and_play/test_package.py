@@ -9,6 +9,7 @@ import pytest
 import nerfloom
 
 
+@pytest.mark.medium
 def test_the_import_loads_neither_torch_nor_methods() -> None:
     code = (
         "import sys, nerfloom; "

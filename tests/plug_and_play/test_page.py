@@ -16,6 +16,7 @@ def blocks(language: str) -> list[str]:
     return ["\n" * PAGE[: match.start(1)].count("\n") + match[1] for match in found]
 
 
+@pytest.mark.medium
 def test_its_code_runs() -> None:
     torch.manual_seed(0)
     names: dict = {}

@@ -90,6 +90,7 @@ class Proposal(nn.Module):
         return nn.functional.softplus(self.layers(2 * positions))[:, 0]
 
 
+@pytest.mark.medium
 def test_proposals_learn_where_light_is_stopped() -> None:
     """Ordinary functions, in an ordinary loop: eight samples a ray find a ball."""
     torch.manual_seed(0)

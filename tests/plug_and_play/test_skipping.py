@@ -59,6 +59,7 @@ def test_the_early_stop_keeps_its_bound_exactly(name: str) -> None:
     assert fewer < 0.9 * count or name == "fog"
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("name", "least", "most"), [("sparse", 0.98, 1e-3), ("blobs", 0.9, 5e-3), ("nested", 0.6, 3e-3)]
 )

@@ -320,6 +320,7 @@ def test_each_keeps_what_every_method_must(name: str) -> None:
     assert len(findings) > 15
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", ["nerf-plus-plus --encoding hash-grid", "instant-ngp"])
 def test_a_ball_before_a_sky_is_learnt(name: str) -> None:
     method, settings = VARIANTS[name]
@@ -336,6 +337,7 @@ def test_a_ball_before_a_sky_is_learnt(name: str) -> None:
     assert float((shown.rgb - view.rgb)[sky].abs().mean()) < 0.1
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", ["nerf-plus-plus", "instant-ngp"])
 def test_with_nothing_inside_the_sky_is_learnt_outside(name: str) -> None:
     method, settings = VARIANTS[name]

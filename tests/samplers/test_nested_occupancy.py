@@ -245,6 +245,7 @@ def captured(method: str, data: Path, folder: Path, **facts: object) -> Trainer:
     return Trainer(run, dataclasses.replace(still, scene=scene), None)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("method", ["nerfacto", "instant-ngp"])
 def test_a_capture_is_learnt_and_its_grid_kept(method: str, shared_tiny: Path, tmp_path: Path) -> None:
     trainer = captured(method, shared_tiny, tmp_path)

@@ -174,6 +174,7 @@ def train_grid(sampler: OccupancySampler, density, steps: range) -> None:
         sampler.update(step, density)
 
 
+@pytest.mark.medium
 def test_the_grid_learns_a_ball_and_notices_when_it_grows() -> None:
     resolution = 16
     sampler = OccupancySampler(BOX, resolution=resolution, num_steps=64)

@@ -75,6 +75,7 @@ def test_a_ray_that_misses_the_box_is_harmless() -> None:
     assert bool(torch.isfinite(samples.t).all())
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("unbounded", [True, False])
 def test_proposals_learn_where_the_wall_is(unbounded: bool) -> None:
     """Samples move into the wall, and so the depth found becomes exact."""

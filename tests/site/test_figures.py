@@ -21,11 +21,20 @@ def results(name: str) -> dict[str, float]:
 
 
 def test_figures_are_those_of_their_files() -> None:
-    measured = [row for row in rows(DOCS / "figures.md") if row[-1].endswith(".json`")]
-    assert len(measured) >= 26
+    pages = [DOCS / "figures.md", DOCS / "published.md"]
+    measured = [row for page in pages for row in rows(page) if row[-1].endswith(".json`")]
+    assert len(measured) >= 29
     for row in measured:
         found = results(row[-1].strip("`"))
         assert row[1:3] == [f"{found['psnr']:.2f} dB", f"{found['ssim']:.3f}"], row
+
+
+def test_what_stands_beside_published_results_is_in_the_figures() -> None:
+    """In the table of Lego the fourth column is ours; its PSNRs stand in the table of figures."""
+    ours = re.findall(r"(\d+\.\d+) dB", " ".join(row[3] for row in rows(DOCS / "published.md") if len(row) == 5))
+    known = (DOCS / "figures.md").read_text()
+    assert len(ours) >= 5
+    assert [number for number in ours if f"{number} dB" not in known] == []
 
 
 def test_the_table_of_budgets_is_that_of_its_files() -> None:
@@ -46,16 +55,24 @@ def test_the_table_of_budgets_is_that_of_its_files() -> None:
 
 
 def test_sentences_repeat_the_table() -> None:
-    """PSNRs that other pages quote stand in the table of figures or in the notes and benchmarks, perhaps rounded."""
+    """PSNRs that other pages quote stand in the figures, notes, benchmarks, or beside pictures, perhaps rounded."""
     sources = [DOCS / f"{name}.md" for name in ("figures", "benchmarks", "stability", "plug-and-play")]
     sources += [*(DOCS / "notes").glob("*.md"), *(ROOT / "methods").glob("*.py")]
     numbers = set(re.findall(r"\d+\.\d+", "\n".join(source.read_text() for source in sources)))
+    failures = json.loads((DOCS / "pictures" / "failures" / "psnr.json").read_text())["psnr"]
+    numbers |= {f"{psnr:.2f}" for row in failures.values() for psnr in row.values()}
     numbers |= {f"{float(number):.1f}" for number in numbers}
     pages = [page for part in ("methods", "guides", "start") for page in (DOCS / part).glob("*.md")]
     pages.append(ROOT / "README.md")
     for page in pages:
         text = re.sub(r"```text.*?```", "", page.read_text(), flags=re.DOTALL)
         assert [number for number in re.findall(r"(\d+\.\d+) dB", text) if number not in numbers] == [], page.name
+
+
+def test_versions_are_those_that_ran() -> None:
+    ran = json.loads((DOCS / "results" / "versions.json").read_text())["rows"]
+    table = [row for row in rows(DOCS / "start" / "install.md") if len(row) == 4]
+    assert table[2:] == [[row["python"], row["torch"], row["state"], row["what"]] for row in ran]
 
 
 def test_flags_of_nerfstudio_are_those_that_are_answered() -> None:

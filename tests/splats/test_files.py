@@ -435,6 +435,7 @@ def test_what_is_no_similarity_is_refused() -> None:
 # -- size -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("suffix", ["ply", "spz"])
 def test_max_megabytes_holds_and_no_more_is_given_up_than_needed(tmp_path: Path, suffix: str) -> None:
     gaussians, file = some(4000), tmp_path / f"a.{suffix}"

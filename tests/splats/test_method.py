@@ -207,6 +207,7 @@ def test_the_method_is_declared() -> None:
     assert METHOD.field is None
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("strategy", ["adc", "mcmc"])
 def test_a_run_goes_on_with_the_same_bits_between_two_changes(strategy: str, shared_tiny: Path, tmp_path: Path) -> None:
     """Gradients that are being counted are a part of a checkpoint, and so are all numbers of Gaussians."""

@@ -76,6 +76,7 @@ def test_a_model_forgets_when_it_changes(shared_tiny: Path, tmp_path: Path) -> N
     torch.testing.assert_close(look(), model.render_view(view, black).rgb, atol=1e-5, rtol=0)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("method", ["gaussian-splatting", "instant-ngp"])
 def test_frames_are_measured(method: str, shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer(method, shared_tiny, tmp_path / "run", max_num_iterations=3)

@@ -13,6 +13,7 @@ from framework.kernels.splat_project import DC
 from framework.splats.start import from_points, hull_points, morton, neighbour_distance, scene_size, seen_colors
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("count", [2, 3, 5, 500, 20_000])
 def test_distances_to_neighbours(count: int) -> None:
     torch.manual_seed(count)

@@ -66,6 +66,8 @@ def test_pictures_show_the_appearance_that_is_set() -> None:
     model = model_of(ball(), one, appearance=True)
     assert model.appearance is not None
     plain = model.render_view(View(one), torch.zeros(3)).rgb
+    assert not plain.requires_grad  # a file is written of it
+    assert not model.render_rgb(View(one), torch.zeros(3)).requires_grad
     vector = torch.zeros(3, 4)
     vector[:, :3] = -0.5 * torch.eye(3)
     vector[:, 3] = torch.tensor([0.1, 0.0, -0.2])

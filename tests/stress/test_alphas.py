@@ -44,6 +44,7 @@ def products(alpha: Tensor) -> Tensor:
     return left * alpha
 
 
+@pytest.mark.medium
 @pytest.mark.entry(4, 11)
 @backends()
 @FEW

@@ -179,6 +179,7 @@ def test_wide_gaussians_have_no_waves_and_finite_gradients(dtype: torch.dtype) -
     assert bool(variances.grad.isfinite().all())
 
 
+@pytest.mark.medium
 @pytest.mark.entry(10)
 @pytest.mark.parametrize("contracted", [False, True])
 @pytest.mark.parametrize("along", [None, icosahedron_directions().double()])

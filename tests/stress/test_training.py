@@ -223,6 +223,7 @@ def fresh_field(kind: str) -> tuple[Field, nn.Parameter]:
     return encoded, encoded.density_head[-1].weight
 
 
+@pytest.mark.medium
 @pytest.mark.entry(7)
 @backends()
 @pytest.mark.parametrize("photographs", [1.0, 0.0])

@@ -24,6 +24,7 @@ BUDGET = Budget(steps=75, seconds=None)
 SICK = " ".join(["sick", *TINY_NGP])
 
 
+@pytest.mark.medium
 def test_a_small_method_in_easy_hard_scenes(tmp_path: Path) -> None:
     run = tiny_run("instant-ngp", Path("none"), tmp_path)
     found = {v.name: v for v in verdicts(run, BALL, select(["all-black", "duplicate-cameras", "nan-pixels"]), BUDGET)}
@@ -91,6 +92,7 @@ def stress(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
     main()
 
 
+@pytest.mark.medium
 @pytest.mark.usefixtures("sick")
 def test_a_plugin_that_is_sick_once_fails_there_and_the_rest_goes_on(tmp_path: Path, refused: Refused) -> None:
     path = tmp_path / "out" / "sick.json"
@@ -126,6 +128,7 @@ def test_a_plugin_that_is_always_sick_fails_everywhere(tmp_path: Path, refused: 
         assert verdict["lost"] is None
 
 
+@pytest.mark.medium
 @pytest.mark.usefixtures("sick")
 def test_several_methods_make_one_table(tmp_path: Path, refused: Refused) -> None:
     """A row for each condition, a column for each method, and why what is no pass is none."""

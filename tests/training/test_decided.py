@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import pytest
 import yaml
 
 from framework.training.checkpoint import FOLDER, load_newest
@@ -19,6 +20,7 @@ def trained(*arguments: object) -> str:
     return done.stdout + done.stderr
 
 
+@pytest.mark.medium
 def test_a_run_goes_on_with_what_was_decided_however_long_it_then_takes(shared_tiny: Path, tmp_path: Path) -> None:
     """5 seconds get tables of 2^16 entries and dense updates, 300 would get 2^18 and sparse ones."""
     start = ("--data", shared_tiny, "--output-dir", tmp_path, "--timestamp", "t", "--max-seconds", 5)

@@ -43,6 +43,7 @@ def test_every_method_has_a_bound() -> None:
     assert set(BOUNDS) == set(METHODS)
 
 
+@pytest.mark.medium
 @pytest.mark.usefixtures("alone")
 @pytest.mark.parametrize("method", METHODS)
 def test_a_step_has_few_operations_and_hardly_waits(method: str, tmp_path: Path) -> None:

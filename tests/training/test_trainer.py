@@ -41,6 +41,7 @@ def quick(kinds: list[str]) -> list[Any]:
     return [pytest.param(kind, marks=() if kind in QUICK else pytest.mark.slow) for kind in kinds]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("kind", quick(KINDS))
 def test_it_learns(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
     steps = 120 if kind in QUICK else 250
@@ -55,6 +56,7 @@ def test_it_learns(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
     assert trainer.state.skipped == 0
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("kind", KINDS)
 def test_resuming_continues_with_the_same_bits(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
     """Interrupted after 13 steps, evaluated in between, resumed in a new trainer: as if nothing had happened."""

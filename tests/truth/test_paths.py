@@ -66,6 +66,7 @@ def test_pictures_have_the_size_that_was_learnt_from_reduced_as_asked_and_the_sp
         assert asked["time"] is None
 
 
+@pytest.mark.medium
 def test_time_runs_from_0_to_1_past_one_camera(
     tiny: Path, edit_json: EditJson, tmp_path: Path, rendered: list[dict[str, Any]]
 ) -> None:

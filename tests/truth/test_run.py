@@ -50,6 +50,7 @@ def read_cloud(file: Path) -> np.ndarray:
     return np.frombuffer(body, [(name, kinds[kind]) for _, kind, name in rows])
 
 
+@pytest.mark.medium
 def test_points_lie_on_the_ball_with_its_normals_and_colours(trained: Path, tmp_path: Path) -> None:
     """In the capture's own frame and unit, which are neither the file's nor the scene's."""
     command(

@@ -131,6 +131,7 @@ def shown(trainer: Trainer, dataset: Dataset) -> Tensor:
         return trainer.model.render_view(dataset.view(0), background).rgb
 
 
+@pytest.mark.medium
 @pytest.mark.usefixtures("_soon_fitted")
 def test_light_is_found_on_the_half_that_is_not_judged(lit: Trainer) -> None:
     width = int(lit.train_set.cameras.widths[0])

@@ -71,6 +71,7 @@ def test_rows_of_a_smaller_picture_are_rows_of_it(stride: int) -> None:
     assert float(edge[1] / -edge[2]) == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.medium
 @given(NONSENSE, NONSENSE, NONSENSE)
 def test_nonsense_makes_no_camera_and_no_error(first: Any, second: Any, third: Any) -> None:
     pose = pose_of(first, second, third)

@@ -98,6 +98,7 @@ def decibels(a: np.ndarray, b: np.ndarray) -> float:
     return float(10 * np.log10(255**2 / np.square(a.astype(float) - b).mean()))
 
 
+@pytest.mark.medium
 def test_the_picture_is_the_models(served: Served, connected: Callable[..., Client]) -> None:
     client = connected()
     client.look()
@@ -110,6 +111,7 @@ def test_the_picture_is_the_models(served: Served, connected: Callable[..., Clie
     assert decibels(found, truth(served, 80)) < 25
 
 
+@pytest.mark.medium
 def test_two_browsers_see_what_each_asks_for(served: Served, connected: Callable[..., Client]) -> None:
     first, second = connected(), connected()
     first.look()

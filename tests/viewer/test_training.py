@@ -29,6 +29,7 @@ def looking(number: int, pictures: list[np.ndarray], studio: Studio, x: float) -
     studio.ask(number, lambda _: Request(pose, 40, 30, "depth" if number else "rgb", 0.5 if moving else None))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_same_bits_with_and_without(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
     plain = tiny_trainer(kind, shared_tiny, tmp_path / "plain", max_num_iterations=STEPS)

@@ -64,6 +64,7 @@ def compared(
     return found
 
 
+@pytest.mark.medium
 def test_the_browser_draws_what_we_draw(browser: str, scene: Path, tmp_path: Path) -> None:
     assert compared(browser, scene, tmp_path, 3) > CLOSE
 
@@ -105,6 +106,7 @@ const wait = setInterval(() => {
 </script>"""
 
 
+@pytest.mark.medium
 def test_the_mouse_turns_and_comes_closer(browser: str, scene: Path, tmp_path: Path) -> None:
     file = tmp_path / "events.html"
     file.write_text(scene.read_text(encoding="utf-8").replace("</body>", DRAG + "</body>"), encoding="utf-8")

@@ -215,6 +215,7 @@ def test_splats_go_to_the_page_as_they_are(
     assert [file.name for file in tmp_path.iterdir()] == ["scene.html"]
 
 
+@pytest.mark.medium
 def test_what_the_page_cannot_be(splats: Path, tmp_path: Path, refused: Refused) -> None:
     assert "phones" in refused(main, "web", splats, "--output-dir", tmp_path, "--max-megabytes", 50)
     assert "no times" in refused(main, "web", splats, "--output-dir", tmp_path, "--time", 0.5)

@@ -117,6 +117,7 @@ void forward(const Layout& layout, const float* positions, int64_t count, const 
 template <typename V>
 inline void factors(const Layout& layout, const Place* at, const float* table, int c, V grad, V* others) {
     const int P = layout.planes;
+    if (P < 1) __builtin_unreachable();  // a Layout has one or more, which the compiler does not know
     V value[MAX_PLANES];
     for (int p = 0; p < P; p++) value[p] = blend<V>(at[p], table + at[p].first * layout.features + c, layout.features);
     V before = grad;

@@ -380,7 +380,7 @@ BUGS = (
     Bug(
         "times-not-divided",
         "data",
-        "framework/data/dataset.py",
+        "framework/data/parsed_scene.py",
         "            times=None if self.times is None else self.times[index],\n            mask_paths",
         "            times=self.times,\n            mask_paths",
         "once a photograph is missing, all later ones have the time of another",

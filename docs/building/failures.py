@@ -1,0 +1,228 @@
+"""Pictures of captures that go wrong, for the guide: the embedded scene with one fault each, and with what helps.
+
+    python docs/building/failures.py                      all of them, into docs/pictures/failures
+    python docs/building/failures.py blur poses           some of them
+    python docs/building/failures.py --steps 2000
+
+Each picture shows a photograph of the faulty capture, a held-out view of what `nerfacto` makes of it, the same view
+with what helps, and the truth. PSNRs of the held-out views are printed and written beside the pictures. The scene is
+ours, so that the pictures may be shipped. Behind the solids is a pattern at infinity; a plain wall would be a fault of
+its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import json
+import math
+import os
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read when torch loads: threads that wait should not spin
+
+import imageio.v3 as iio
+import numpy as np
+import torch
+from PIL import Image
+
+import nerfloom
+from dataparsers.procedural.views import CAMERA_ANGLE, camera_poses, render_view
+from framework.kernels.math import cross_matrix
+
+SIZE, NUM_TRAIN, NUM_TEST = 128, 48, 6
+TILE = 200
+"""Edge of a tile of the pictures, pixels."""
+Photographs = list[np.ndarray]
+"""(SIZE, SIZE, 3) float in [0, 1] each."""
+
+
+@dataclass
+class Capture:
+    """Photographs with poses, and masks if there are any: white is kept."""
+
+    images: Photographs
+    poses: list[np.ndarray]
+    masks: list[np.ndarray] | None = None
+    settings: dict[str, Any] = field(default_factory=dict)
+    """Settings of the run that learns from it."""
+
+    def write(self, folder: Path, truth: Capture) -> None:
+        """Write nerfstudio's transforms.json, with the images of `truth` held out."""
+        frames: list[dict[str, Any]] = []
+        names: dict[str, list[str]] = {"train": [], "test": []}
+        for split, capture in (("train", self), ("test", truth)):
+            for index, (image, pose) in enumerate(zip(capture.images, capture.poses, strict=True)):
+                name = f"images/{split}_{index:03d}.png"
+                write(folder / name, image)
+                frame: dict[str, Any] = {"file_path": name, "transform_matrix": pose.tolist()}
+                if split == "train" and self.masks is not None:
+                    frame["mask_path"] = f"masks/{index:03d}.png"
+                    write(folder / frame["mask_path"], self.masks[index].astype(float))
+                frames.append(frame)
+                names[split].append(name)
+        focal = 0.5 * SIZE / math.tan(CAMERA_ANGLE / 2)
+        content = {"camera_model": "PINHOLE", "fl_x": focal, "fl_y": focal, "cx": SIZE / 2, "cy": SIZE / 2}
+        content |= {"w": SIZE, "h": SIZE, "frames": frames}
+        content |= {"train_filenames": names["train"], "val_filenames": names["test"], "test_filenames": names["test"]}
+        (folder / "transforms.json").write_text(json.dumps(content))
+
+
+def write(path: Path, image: np.ndarray) -> None:
+    """Write an image with values in [0, 1]."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    iio.imwrite(path, (image * 255).round().clip(0, 255).astype(np.uint8))
+
+
+@functools.cache
+def taken(split: str, count: int, index: int, time: float) -> np.ndarray:
+    """Return a view (SIZE, SIZE, 4) of the scene alone, with alpha; kept, since several captures begin with it."""
+    pose = camera_poses(split, count, 0)[index]
+    return render_view(pose, CAMERA_ANGLE, SIZE, SIZE, time, supersample=2, geometry=False)[0] / 255.0
+
+
+def photograph(
+    split: str, count: int, index: int, time: float = 0.0, plain: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a photograph of the scene, and its alpha (SIZE, SIZE), before a pattern at infinity or a plain white."""
+    rgba, pose = taken(split, count, index, time), camera_poses(split, count, 0)[index]
+    alpha = rgba[..., 3:]
+    return rgba[..., :3] * alpha + (1.0 if plain else pattern(pose)) * (1 - alpha), alpha[..., 0]
+
+
+def pattern(pose: np.ndarray) -> np.ndarray:
+    """Return a pattern of directions (SIZE, SIZE, 3): soft patches of different colours and sizes."""
+    focal = 0.5 * SIZE / math.tan(CAMERA_ANGLE / 2)
+    rows, columns = (np.mgrid[:SIZE, :SIZE] + 0.5 - SIZE / 2) / focal
+    directions = np.stack([columns, -rows, -np.ones_like(rows)], -1) @ pose[:3, :3].T
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    waves = [np.sin(9 * directions @ axis) + np.sin(23 * directions @ axis[::-1] + 1) for axis in np.eye(3) + 0.3]
+    return 0.55 + 0.12 * np.stack(waves, -1)
+
+
+def still() -> Capture:
+    """Return a capture without a fault."""
+    poses = camera_poses("train", NUM_TRAIN, 0)
+    return Capture([photograph("train", NUM_TRAIN, index)[0] for index in range(NUM_TRAIN)], poses)
+
+
+def blur() -> tuple[Capture, Capture]:
+    """Half of the photographs were taken in motion; what helps is to leave them out."""
+    good = still()
+    blurred = [sum(np.roll(image, shift, axis=1) for shift in range(-6, 7)) / 13 for image in good.images]
+    mixed = [(blurred, good.images)[index % 2][index] for index in range(NUM_TRAIN)]
+    sharp = {"train_image_indices": tuple(range(1, NUM_TRAIN, 2))}
+    return Capture(mixed, good.poses), Capture(mixed, good.poses, settings=sharp)
+
+
+def exposure() -> tuple[Capture, Capture]:
+    """Exposure differs by up to a stop either way; what helps is an appearance for each photograph."""
+    good, stops = still(), np.random.default_rng(0).uniform(-1, 1, NUM_TRAIN)
+    images = [(image * 2.0 ** (0.45 * stop)).clip(0, 1) for image, stop in zip(good.images, stops, strict=True)]
+    return (
+        Capture(images, good.poses, settings={"appearance_embedding_dim": 0}),
+        Capture(images, good.poses, settings={"appearance_embedding_dim": 16}),
+    )
+
+
+def motion() -> tuple[Capture, Capture]:
+    """A part moves between photographs; what helps is to mask it."""
+    poses = camera_poses("train", NUM_TRAIN, 0)
+    times = np.random.default_rng(0).choice([0.0, 0.33, 0.67], NUM_TRAIN)
+    images = [photograph("train", NUM_TRAIN, index, time)[0] for index, time in enumerate(times)]
+    masks = []
+    for index, image in enumerate(images):
+        others = [photograph("train", NUM_TRAIN, index, time)[0] for time in (0.0, 0.33, 0.67)]
+        changed = np.max([np.abs(other - image).max(-1) for other in others], axis=0)
+        grown = np.max([np.roll(changed, (i, j), (0, 1)) for i in (-2, 0, 2) for j in (-2, 0, 2)], axis=0)
+        masks.append(grown < 0.06)
+    return Capture(images, poses), Capture(images, poses, masks, {"masks": "ignored"})
+
+
+def few() -> tuple[Capture, Capture]:
+    """There are six photographs; what helps is more of them."""
+    good = still()
+    return Capture(good.images[:6], good.poses[:6]), good
+
+
+def poses() -> tuple[Capture, Capture]:
+    """Each camera is turned by 1.5 degrees; what helps is to refine the poses."""
+    good, random = still(), np.random.default_rng(0)
+    wrong = []
+    for pose in good.poses:
+        axis = random.normal(size=3)
+        turn = torch.linalg.matrix_exp(cross_matrix(torch.tensor(math.radians(1.5) * axis / np.linalg.norm(axis))))
+        wrong.append(np.vstack([np.hstack([turn.numpy() @ pose[:3, :3], pose[:3, 3:]]), [[0, 0, 0, 1]]]))
+    return (
+        Capture(good.images, wrong, settings={"camera_optimizer": "off"}),
+        Capture(good.images, wrong, settings={"camera_optimizer": "SO3xR3"}),
+    )
+
+
+def texture() -> tuple[Capture, Capture]:
+    """The surroundings are plain white; what helps is to cut the object out."""
+    where = camera_poses("train", NUM_TRAIN, 0)
+    shown = [photograph("train", NUM_TRAIN, index, plain=True) for index in range(NUM_TRAIN)]
+    images, masks = [image for image, _ in shown], [alpha > 0.5 for _, alpha in shown]
+    return Capture(images, where), Capture(images, where, masks, {"masks": "empty"})
+
+
+KINDS: dict[str, Callable[[], tuple[Capture, Capture]]] = {
+    "blur": blur, "exposure": exposure, "motion": motion, "few": few, "poses": poses, "texture": texture,
+}  # fmt: skip
+
+
+def learn(capture: Capture, truth: Capture, steps: int, folder: Path) -> tuple[np.ndarray, float]:
+    """Return a held-out view as `nerfacto` renders it after some steps, and the mean PSNR of all held-out views, dB."""
+    capture.write(folder / "data", truth)
+    settings = {"max_num_iterations": steps, "num_rays_per_batch": 1024, "output_dir": str(folder), "vis": "none"}
+    settings |= {"steps_per_eval_image": steps, "steps_per_eval_all_images": steps, "max_eval_images": 1}
+    run = nerfloom.train("nerfacto", data=folder / "data", **settings, **capture.settings)
+    rgb = [run.render(view).rgb.clamp(0, 1).numpy() for view in run.views("test")]
+    errors = [np.mean((found - image) ** 2) for found, image in zip(rgb, truth.images, strict=True)]
+    return rgb[1], float(np.mean([-10 * np.log10(error) for error in errors]))
+
+
+def tile(image: np.ndarray) -> Image.Image:
+    """Return a tile of a picture, for an image with values in [0, 1]."""
+    picture = Image.fromarray((image * 255).round().clip(0, 255).astype(np.uint8))
+    return picture.resize((TILE, TILE), Image.Resampling.BICUBIC)
+
+
+def draw(kind: str, steps: int, folder: Path) -> dict[str, float]:
+    """Train on the faulty capture and with what helps, and write the picture; the PSNRs of both."""
+    faulty, helped = KINDS[kind]()
+    where = camera_poses("test", NUM_TEST, 0)
+    views = [photograph("test", NUM_TEST, index, plain=kind == "texture")[0] for index in range(NUM_TEST)]
+    truth = Capture(views, where)
+    with tempfile.TemporaryDirectory() as temporary:
+        results = [learn(c, truth, steps, Path(temporary) / n) for n, c in (("faulty", faulty), ("helped", helped))]
+    row = Image.new("RGB", (4 * TILE + 3 * 4, TILE), "white")
+    for index, image in enumerate([faulty.images[0], results[0][0], results[1][0], truth.images[1]]):
+        row.paste(tile(image), (index * (TILE + 4), 0))
+    folder.mkdir(parents=True, exist_ok=True)
+    row.save(folder / f"{kind}.jpg", quality=88)
+    return {"faulty": round(results[0][1], 2), "helped": round(results[1][1], 2)}
+
+
+def main() -> None:
+    """Run the command."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("kinds", nargs="*", help=f"which of {', '.join(KINDS)}; all if none is named")
+    parser.add_argument("--steps", type=int, default=400, help="training steps of each run")
+    parser.add_argument("--folder", type=Path, default=Path(__file__).parents[1] / "pictures" / "failures")
+    flags = parser.parse_args()
+    results = flags.folder / "psnr.json"
+    found = json.loads(results.read_text())["psnr"] if results.is_file() else {}
+    for kind in flags.kinds or KINDS:
+        found[kind] = draw(kind, flags.steps, flags.folder)
+        print(kind, found[kind], flush=True)
+        results.write_text(json.dumps({"method": "nerfacto", "steps": flags.steps, "psnr": found}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

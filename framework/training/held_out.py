@@ -1,0 +1,100 @@
+"""The held-out images of a run, which are looked at while it is trained."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from framework.base.console import say
+from framework.data.dataset import Dataset
+from framework.data.pixels import composite
+from framework.evaluation.evaluator import evaluate, evaluation_background, timed_view
+from framework.evaluation.panels import composed, view_panels
+from framework.model import Model
+from framework.training.curve import FewImages, Point, in_order, rows
+from framework.training.progress import StepReport, TensorBoard
+from framework.training.run import Run, write_report
+from framework.training.state import State
+
+PICTURE_SHARE = 0.1
+"""Maximum time for TensorBoard's images, as a fraction of the training time."""
+SECONDS_TO_A_TARGET = 15.0
+"""Seconds of training between evaluations of all images, if a PSNR is to be reached and no other number is given."""
+
+
+class HeldOut:
+    """Evaluations of held-out images between steps. Their time does not count as training.
+
+    Args:
+        run: the run, with its settings decided.
+        model: the model that is trained.
+        dataset: the held-out images; None if nothing is to be evaluated.
+    """
+
+    def __init__(self, run: Run, model: Model[Any], dataset: Dataset | None) -> None:
+        self.run, self.model, self.dataset = run, model, dataset
+        limit = run.config.max_eval_images
+        self._few = None if dataset is None else FewImages(dataset, limit, model.rays_per_pixel)
+        self._last = self._picture_seconds = 0.0
+
+    def resume(self, state: State) -> None:
+        """Go on after the last evaluation of a restored `state`."""
+        self._last = state.curve[-1][0] if state.curve else 0.0
+
+    def evaluate_if_due(self, state: State, board: TensorBoard) -> None:
+        """Evaluate one or all of the images if it is time to.
+
+        Args:
+            state: the run's state, to whose curve an evaluation of all images is added.
+            board: where pictures and results are shown.
+        """
+        config, step = self.run.config, state.step
+        if self.dataset is None or config.max_eval_images == 0:
+            return
+        affordable = self._picture_seconds <= PICTURE_SHARE * state.seconds
+        if step % config.steps_per_eval_image == 0 and "tensorboard" in config.vis and affordable:
+            self._show((step // config.steps_per_eval_image - 1) % len(self.dataset), self.dataset, step, board)
+        every = config.seconds_per_eval_all_images
+        if every is None and config.target_psnr is not None:
+            every = SECONDS_TO_A_TARGET
+        due = every is not None and state.seconds - self._last >= every
+        if due or step % config.steps_per_eval_all_images == 0:
+            self._last, start = state.seconds, time.perf_counter()
+            evaluation = evaluate(self.model, self.dataset, max_images=config.max_eval_images, title="Evaluating")
+            psnr, ssim, images = (evaluation.results[name] for name in ("psnr", "ssim", "num_images"))
+            cost = time.perf_counter() - start
+            state.curve += (Point(state.seconds, step, psnr, ssim, images, evaluation_seconds=cost).entry(),)
+            board.scalars({"eval/psnr": psnr} | ({} if ssim is None else {"eval/ssim": ssim}), step)
+            say(f"{state.seconds:5.0f} s  step {step:,}  {evaluation.line()}")
+            self.write_curve(state)
+
+    def _show(self, index: int, dataset: Dataset, step: int, board: TensorBoard) -> None:
+        """Show image `index` beside what the model renders of it."""
+        background = evaluation_background(self.model)
+        picture, seconds = timed_view(self.model, dataset.view(index), background)
+        target = composite(dataset.image(index).float() / 255, background)
+        panels = view_panels(picture.rgb.clamp(0, 1), target, picture.median_depth, picture.accumulation)
+        self._picture_seconds += seconds
+        board.image("eval/comparison", composed(panels), step)
+
+    def look_if_due(self, state: State, report: StepReport, board: TensorBoard, *, last: bool) -> None:
+        """Evaluate a few of the images if it is time to.
+
+        Args:
+            state: the run's state, to whose looks the evaluation is added.
+            report: report of the last training step.
+            board: where results are shown.
+            last: whether training ends with that step.
+        """
+        if self._few is None:
+            return
+        point = self._few.look_if_due(self.model, state.looks, report, last=last)
+        if point is not None:
+            state.looks += (point.entry(),)
+            values = {"eval_few_images/psnr": point.psnr, "eval_few_images/ssim": point.ssim}
+            board.scalars({name: value for name, value in values.items() if value is not None}, point.step)
+            self.write_curve(state)
+
+    def write_curve(self, state: State) -> None:
+        """Write all evaluations of a `state` to the run's learning_curve.json."""
+        write_report(self.run.folder / "learning_curve.json", rows(in_order(state.curve, state.looks)))

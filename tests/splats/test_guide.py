@@ -1,0 +1,98 @@
+"""Distances that a field has found: which pixels have them, when they count, and what they do to Gaussians."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from framework.cameras.view import View
+from framework.data.pixels import ViewBatch
+from framework.splats.guide import GUIDED_UNTIL, FoundDistances, guidance
+from framework.tools.surfaces import found_surfaces
+from framework.training.datasets import load_split
+from methods.gaussian_splatting import GaussianSplattingConfig, decide
+from tests.splats.test_method import SCENE, ball, camera
+from tests.splats.test_what_images_differ_in import model_of
+from tests.training.helpers import tiny_trainer
+
+
+def some() -> FoundDistances:
+    """Two pixels of image 0, one of image 2."""
+    found = FoundDistances()
+    found.set(torch.tensor([0, 2, 0]), torch.tensor([0, 5, 7]), torch.tensor([1.0, 2.0, 3.0]))
+    return found
+
+
+def batch(index: int, distances: torch.Tensor | None = None) -> ViewBatch:
+    """An image of 3 x 4 pixels."""
+    return ViewBatch(index, View(camera(), None), torch.zeros(3, 4, 3), torch.zeros(3), distances=distances)
+
+
+def test_pixels_are_counted_row_by_row_in_their_image() -> None:
+    expected = torch.zeros(3, 4)
+    expected[0, 0], expected[1, 3] = 1, 3
+    assert torch.equal(some().of_image(0, 3, 4), expected)
+    assert some().of_image(1, 3, 4).count_nonzero() == 0
+    assert float(some().of_image(2, 3, 4)[1, 1]) == 2
+
+
+def test_guidance_fades_until_it_ends() -> None:
+    assert guidance(0.0) == 1
+    assert guidance(GUIDED_UNTIL / 2) == pytest.approx(0.5)
+    assert guidance(GUIDED_UNTIL) == guidance(1.0) == 0
+
+
+def test_measured_distances_come_first() -> None:
+    measured = torch.full((3, 4), 9.0)
+    known, weight = some().known(batch(0, measured), 0.0, 0.3, 0.1)
+    assert known is measured
+    assert weight == 0.3
+    known, weight = some().known(batch(0, measured), 0.0, 0.0, 0.1)
+    assert known is not None
+    assert torch.equal(known, some().of_image(0, 3, 4))
+    assert weight == 0.1
+    assert some().known(batch(0), 1.0, 0.3, 0.1) == (None, 0.0)
+    assert FoundDistances().known(batch(0), 0.0, 0.3, 0.1) == (None, 0.0)
+
+
+def test_a_checkpoint_has_as_many_as_it_has() -> None:
+    found = FoundDistances()
+    found.load_state_dict(some().state_dict())
+    assert torch.equal(found.of_image(0, 3, 4), some().of_image(0, 3, 4))
+    found.load_state_dict({})  # from before there were such distances
+    assert len(found) == 3
+
+
+def test_what_a_field_finds_lies_on_the_rays_of_its_pixels(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path, start="random", num_gaussians=100)
+    dataset = load_split(trainer.run, "train")
+    found = found_surfaces(dataset, trainer.run.config, 60, 60.0, 500)
+    assert len(found.positions) > 100
+    cameras = dataset.cameras
+    rays = cameras.pixel_rays(cameras.offsets[found.images] + found.pixels, 0.0, 1.0)
+    places = rays.origins + found.distances[:, None] * rays.directions
+    assert torch.allclose(places, found.positions, atol=1e-4)
+
+
+def test_gaussians_are_pulled_to_the_distances_of_a_field_until_it_fades() -> None:
+    """One Gaussian at distance 3, which a field has found at 2.5: the loss is the relative error, times its weight."""
+    one = camera()
+    model = model_of(ball(), one, field_depth_mult=0.5)
+    model.found_distances.set(torch.tensor([0]), torch.tensor([16 * 33 + 16]), torch.tensor([2.5]))
+    drawn = ViewBatch(0, View(one), torch.rand(33, 33, 3), torch.zeros(3))
+    model.progress = GUIDED_UNTIL / 2
+    term = model.loss(drawn, 0).terms["depth"]
+    assert float(term.detach()) == pytest.approx(0.5 * 0.5 * 0.2, abs=3e-4)
+    term.backward()
+    assert model.means.values.grad is not None
+    assert float(model.means.values.grad[0, 2]) < 0  # the camera is at z = 3, and looks down
+    model.progress = GUIDED_UNTIL
+    assert "depth" not in model.loss(drawn, 0).terms
+
+
+def test_captures_are_guided() -> None:
+    for unbounded in (True, False):
+        config, made = decide(GaussianSplattingConfig(), replace(SCENE, unbounded=unbounded))
+        assert config.field_depth_mult == (0.1 if unbounded else 0.0)
+        assert [one for one in made if one.option == "weight of a field's distances"]

@@ -29,6 +29,7 @@ from framework.training.trained import load_trained
 from framework.viewer.browser import Browser
 from framework.viewer.crop import CroppedCameras, picture_within
 from framework.viewer.occupancy import shown_cells
+from framework.viewer.pace import Speed
 from framework.viewer.photographs import THUMBNAIL, Photographs, small_picture
 from framework.viewer.reports import curve, heading
 from framework.viewer.request import Crop, Pose, Request
@@ -83,6 +84,13 @@ def test_gaussians_outside_of_a_crop_are_not_drawn() -> None:
     assert middle(Crop(((-3.0, -3.0, -3.0), corner), far=1.5)) == [1, 1, 1]
 
 
+class Slow(Speed):
+    """A speed at which strips are a few rows, whatever is measured."""
+
+    def with_one(self, rays: int, seconds: float) -> Speed:
+        return self
+
+
 def test_gaussians_are_drawn_as_a_whole_however_slow_that_is() -> None:
     """A large Gaussian beside the image reaches into it; strips of the image would show another picture."""
     scene = Scene(torch.tensor([[-3.0] * 3, [3.0] * 3]), 0.1, 10.0, 4, True, False, 32, image_pixels=32 * 32)
@@ -96,12 +104,12 @@ def test_gaussians_are_drawn_as_a_whole_however_slow_that_is() -> None:
     strips = [model.render_view(View(request.camera(rows=rows)), torch.ones(3)).rgb for rows in ((0, 32), (32, 64))]
     assert float((torch.cat(strips) - whole).abs().max()) > 0.1  # so it matters
     subject = Subject(cast(Run, None), model, Placement(torch.eye(4)[:3].double(), 1.0), 0)
-    studio = Studio(subject, coarse_seconds=1e-9, piece_seconds=1e-9)
+    studio = Studio(subject)
+    studio._speed = Slow(((64 * 64, 100.0),))
     studio.enter(1, Browser(lambda image, quality: shown.append(image)))
-    for look in (Pose(ABOVE, 1.0), request.pose):  # the speed is known from the first
-        studio.ask(1, lambda _, look=look: dataclasses.replace(request, pose=look))
-        while studio.work() is not None or studio._browsers[1].pieces:
-            time.sleep(0.05)
+    studio.ask(1, lambda _: request)
+    while studio.work() is not None or studio._browsers[1].pieces:
+        time.sleep(0.02)
     np.testing.assert_allclose(shown[-1] / 255, whole.numpy(), atol=0.01)
 
 

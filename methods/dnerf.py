@@ -36,7 +36,7 @@ class DNeRFConfig(
     learning_rate=5e-4,
     lr_final=0.1,
     adam_eps=1e-7,
-    num_steps=AUTO,
+    num_steps=192,
 ):
     """Settings of dnerf; the defaults of networks, samples and learning rate are the paper's.
 
@@ -121,7 +121,6 @@ def decide(config: DNeRFConfig, scene: Scene) -> tuple[DNeRFConfig, list[Decisio
     config, made = fill(
         config,
         chosen,
-        Choice("num_steps", 512 if grid else 192, network),
         Choice("deformation_layers", 4 if grid else 8, network),
         Choice("deformation_width", 64 if grid else 256, network),
         Choice("deformation_frequencies", 4 if grid else config.position_frequencies, network),

@@ -26,6 +26,8 @@ from framework.scene.motion import MotionConfig, slices_choice, vertices_in_time
 
 SAMPLES_PER_BATCH, MOVING_SAMPLES_PER_BATCH = 2**15, 2**13
 """Samples of a training step of a still scene, and of one that moves: docs/notes/motion.md."""
+NUM_STEPS, MOVING_NUM_STEPS = 512, 224
+"""Steps along the diagonal of the box, of a still scene and of one that moves."""
 MAX_SCALES = 4
 """Maximum number of scales if the setting is left open; the paper's number."""
 
@@ -38,6 +40,7 @@ class KPlanesConfig(
     max_num_iterations=30_000,
     learning_rate=1e-2,
     lr_schedule="hold-exponential",
+    num_steps=AUTO,
     lr_final=0.02,
     adam_beta2=0.99,
     adam_eps=1e-12,
@@ -170,7 +173,8 @@ def decide(config: KPlanesConfig, scene: Scene) -> tuple[KPlanesConfig, list[Dec
     )
     config, few = decide_few_images(config, scene)
     samples = MOVING_SAMPLES_PER_BATCH if scene.moving else SAMPLES_PER_BATCH
-    config, count = fill(config, Choice("samples_per_batch", samples, "the scene moves", "samples a step"))
+    steps = Choice("num_steps", MOVING_NUM_STEPS if scene.moving else NUM_STEPS, "the scene moves")
+    config, count = fill(config, Choice("samples_per_batch", samples, "the scene moves", "samples a step"), steps)
     config, slices = fill(config, slices_choice(scene, config.sampler))
     sliced = config.time_slices > 1
     config, coarser = fill(config, Choice("grid_resolution", 64 if sliced else 128, "each slice has cells of its own"))

@@ -14,6 +14,7 @@ from framework.base.optimised import Optimised
 from framework.geometry.points import Footprint, Points
 from framework.kernels.memory import require
 from framework.kernels.mlp import Activation, density_mlp, mlp
+from framework.kernels.trace import GridDensity
 
 DensityFunction = Callable[[Points], tuple[Tensor, Tensor]]
 """Function from N points to density (N,), 1/length, and features (N, F); samplers are called with it."""
@@ -67,6 +68,14 @@ class HasAlpha(Protocol):
         Returns:
             opacity (N,) in [0, 1], and features (N, F) for `color`.
         """
+
+
+@runtime_checkable
+class HasGridDensity(Protocol):
+    """A field whose density may be a small network on a hash grid, which is traced in one call."""
+
+    def grid_density(self) -> GridDensity | None:
+        """Return the density as `framework.kernels.trace` computes it; None to evaluate `Field.density` instead."""
 
 
 @runtime_checkable

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from framework.encodings.hash_grid import HashGrid
 from framework.encodings.opening import Opening
@@ -13,6 +13,7 @@ from framework.fields.base import MLP, Field
 from framework.geometry.points import Points
 from framework.kernels.contraction import contract_to_unit
 from framework.kernels.spherical_harmonics import spherical_harmonics
+from framework.kernels.trace import GridDensity
 
 NUM_FEATURES = 16
 """Number of features that the density network passes to the colour network; the first is the log-density."""
@@ -135,6 +136,21 @@ class EncodedField(BoxField):
         if points.ambient is None:
             return self.density_head.density(encoded)
         return self.density_head.density(encoded, points.ambient.to(encoded.dtype))
+
+    def grid_density(self) -> GridDensity | None:
+        """Return the density as `trace` computes it; None if this field's is another."""
+        grid, own = self.encoding, (EncodedField.density, BoxField.encode, BoxField.unit)
+        plain = (type(self).density, type(self).encode, type(self).unit) == own and not self.unbounded
+        plain = plain and not {"density", "encode", "unit"} & vars(self).keys()
+        hooked = any(m._forward_hooks or m._forward_pre_hooks for m in (self.density_head, grid))
+        if not plain or hooked or type(grid) is not HashGrid or type(self.density_head) is not MLP:
+            return None
+        if grid.opening is not None and not grid.opening.complete:
+            return None
+        if grid.deferred is not None:
+            grid.deferred.layout = grid.layout
+        weights = [layer.weight for layer in self.density_head if isinstance(layer, nn.Linear)]
+        return GridDensity(self.scale, self.shift, grid.table, grid.layout, grid.deferred, weights)
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         inputs = [features]

@@ -212,10 +212,11 @@ def _compiled(
     activation: Activation = "none",
     biases: Sequence[Tensor] | None = None,
 ) -> Tensor:
-    return _apply(_Plan(len(inputs), len(weights), activation, _multiplies_bf16()), inputs, weights, biases)
+    return _apply(_Plan(len(inputs), len(weights), activation, multiplies_bf16()), inputs, weights, biases)
 
 
-def _multiplies_bf16() -> bool:
+def multiplies_bf16() -> bool:
+    """Return whether networks multiply in bfloat16: under autocast, on processors that do."""
     return torch.is_autocast_enabled("cpu") and native.has("mlp_forward_bf16")
 
 
@@ -258,6 +259,6 @@ def _is_small_density(
 def _compiled_density(
     inputs: Sequence[Tensor], weights: Sequence[Tensor], biases: Sequence[Tensor] | None = None
 ) -> tuple[Tensor, Tensor]:
-    plan = _Plan(len(inputs), len(weights), "none", _multiplies_bf16(), density=True)
+    plan = _Plan(len(inputs), len(weights), "none", multiplies_bf16(), density=True)
     density, out = _apply(plan, inputs, weights, biases)
     return density, out

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from framework.base.errors import ConfigError, shown
-from framework.fields.base import DensityFunction, Field, HasAlpha
+from framework.fields.base import DensityFunction, Field, HasAlpha, HasGridDensity
 from framework.geometry.bounds import nested_boxes
 from framework.geometry.points import Points, interval_points
 from framework.geometry.rays import Rays, Samples
@@ -27,6 +27,7 @@ from framework.kernels.kept import Waves
 from framework.kernels.march import Occupancy, Wave, march, refresh_occupancy
 from framework.kernels.occupancy import own_cells
 from framework.kernels.rows import gather_rows
+from framework.kernels.trace import trace
 from framework.samplers.base import Sampler
 
 MAX_CELLS = 512
@@ -180,6 +181,13 @@ class OccupancySampler(Sampler):
         stop = own if early_stop is None else early_stop
         stride = self._stride if self.training else 1.0
         marched = march(rays, self.occupancy, stride * self.step_size, stride * self.cone, shift, stop)
+
+        if isinstance(field, HasGridDensity) and not self.endless:
+            known = field.grid_density()
+            traced = None if known is None else trace(marched, known)
+            if traced is not None:
+                samples = Samples(traced.t_starts, traced.t_ends, traced.offsets, owners=traced.owners, early_stop=stop)
+                return samples.evaluated(traced.sigma, traced.features)
 
         def evaluate(wave: Wave) -> tuple[Tensor, Tensor]:
             points = interval_points(rays, wave.owners, wave, wave.positions, field.footprint)

@@ -11,6 +11,7 @@ from framework.base.console import say
 from framework.base.errors import NerfloomError
 from framework.cameras.ndc import Ndc
 from framework.evaluation.outputs import Arrays
+from framework.ray_model import RayModel
 from framework.viewer.browser import Browser
 from framework.viewer.drawing import Truth, draw
 from framework.viewer.pace import Piece, Rays, Speed, coarse_stride, next_browser, refinement
@@ -19,6 +20,9 @@ from framework.viewer.subject import Subject
 
 REST = 0.15
 """Seconds without a new request after which a picture is refined."""
+WHOLE = 1e6
+"""Seconds that a piece may take of a method that casts no rays, so that it is the whole picture. Gaussians beside an
+image are drawn by the size of that image, so that strips of it differ from the whole: on fox they came to 28 dB."""
 
 
 class Studio:
@@ -115,7 +119,7 @@ class Studio:
 
     def _serve(self, browser: Browser) -> None:
         """Draw the next piece for a browser."""
-        request, step, budget = browser.wanted, self.subject.step, self.piece_seconds
+        request, step, budget = browser.wanted, self.subject.step, self._piece_seconds
         assert request is not None
         if request != browser.drawn:
             stride = coarse_stride(self._speed, request.width, request.height, self.coarse_seconds, browser.stride)
@@ -129,6 +133,10 @@ class Studio:
         if not browser.pieces:
             browser.renew(self._speed, self._rays, step, budget)
         browser.refine(self._timed(request, browser.pieces[0]))
+
+    @property
+    def _piece_seconds(self) -> float:
+        return self.piece_seconds if isinstance(self.subject.model, RayModel) else WHOLE
 
     @property
     def _rays(self) -> Rays:

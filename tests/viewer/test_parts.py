@@ -3,7 +3,9 @@
 import dataclasses
 import json
 import math
+import time
 from pathlib import Path
+from typing import cast
 
 import imageio.v3 as iio
 import numpy as np
@@ -14,6 +16,7 @@ from torch import nn
 from framework.base import extras
 from framework.base.config import TrainConfig, ViewerConfig
 from framework.base.errors import ConfigError
+from framework.cameras.poses import Placement
 from framework.cameras.view import View
 from framework.cli import train as train_command
 from framework.cli import viewer as viewer_command
@@ -21,13 +24,16 @@ from framework.data.scene import Scene
 from framework.samplers.occupancy import OccupancySampler
 from framework.splats.gaussians import Gaussians
 from framework.training.checkpoint import list_checkpoints
+from framework.training.run import Run
 from framework.training.trained import load_trained
+from framework.viewer.browser import Browser
 from framework.viewer.crop import CroppedCameras, picture_within
 from framework.viewer.occupancy import shown_cells
 from framework.viewer.photographs import THUMBNAIL, Photographs, small_picture
 from framework.viewer.reports import curve, heading
 from framework.viewer.request import Crop, Pose, Request
-from framework.viewer.subject import newer_checkpoint, of_trained, reloaded
+from framework.viewer.studio import Studio
+from framework.viewer.subject import Subject, newer_checkpoint, of_trained, reloaded
 from methods.gaussian_splatting import GaussianSplatting, GaussianSplattingConfig, decide
 from tests.conftest import Refused
 from tests.training.helpers import tiny_run, tiny_trainer
@@ -75,6 +81,28 @@ def test_gaussians_outside_of_a_crop_are_not_drawn() -> None:
     assert middle(Crop(((-3.0, -3.0, 1.0), corner), near=2.5)) == [1, 1, 1]  # the wall is 2 away
     assert middle(Crop(((-3.0, -3.0, -3.0), corner), near=2.5)) == [0, 1, 0]
     assert middle(Crop(((-3.0, -3.0, -3.0), corner), far=1.5)) == [1, 1, 1]
+
+
+def test_gaussians_are_drawn_as_a_whole_however_slow_that_is() -> None:
+    """A large Gaussian beside the image reaches into it; strips of the image would show another picture."""
+    scene = Scene(torch.tensor([[-3.0] * 3, [3.0] * 3]), 0.1, 10.0, 4, True, False, 32, image_pixels=32 * 32)
+    model = GaussianSplatting(decide(GaussianSplattingConfig(degree=0, max_seconds=10.0), scene)[0], scene).eval()
+    turn, light = torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([[1.77, -1.77, -1.77]])
+    sizes = torch.tensor([[1.0, 0.2, 2.0]]).log()
+    beside = Gaussians(torch.tensor([[0.0, 1.0, 3.0]]), sizes, turn, torch.full((1,), 4.0), light, torch.zeros(1, 3, 0))
+    model.set_gaussians(beside)
+    request, shown = Request(Pose(ABOVE, 1.2), 64, 64), list[np.ndarray]()
+    whole = model.render_view(View(request.camera()), torch.ones(3)).rgb
+    strips = [model.render_view(View(request.camera(rows=rows)), torch.ones(3)).rgb for rows in ((0, 32), (32, 64))]
+    assert float((torch.cat(strips) - whole).abs().max()) > 0.1  # so it matters
+    subject = Subject(cast(Run, None), model, Placement(torch.eye(4)[:3].double(), 1.0), 0)
+    studio = Studio(subject, coarse_seconds=1e-9, piece_seconds=1e-9)
+    studio.enter(1, Browser(lambda image, quality: shown.append(image)))
+    for look in (Pose(ABOVE, 1.0), request.pose):  # the speed is known from the first
+        studio.ask(1, lambda _, look=look: dataclasses.replace(request, pose=look))
+        while studio.work() is not None or studio._browsers[1].pieces:
+            time.sleep(0.05)
+    np.testing.assert_allclose(shown[-1] / 255, whole.numpy(), atol=0.01)
 
 
 @pytest.fixture

@@ -79,6 +79,65 @@ inline void find_cell(const Level& level, Floats x, Floats y, Floats z, Cell& ce
 
 inline int block(int64_t first, int64_t end) { return int(end - first < LANES ? end - first : LANES); }
 
+constexpr int64_t CHUNK = 1024;  // samples that go through all levels together: their features stay in cache
+
+template <int F>
+inline void blend(const Cell& cell, const float* table, int count, float* out, int64_t stride) {
+    for (int s = 0; s < count; s++) {
+        float sum[F] = {};
+        for (int c = 0; c < CORNERS; c++) {
+            const float* entry = table + int64_t(cell.entry[c][s]) * F;
+            for (int f = 0; f < F; f++) sum[f] += cell.weight[c][s] * entry[f];
+        }
+        std::memcpy(out + s * stride, sum, sizeof sum);
+    }
+}
+
+template <int F>
+inline void prefetch(const Cell& cell, const float* table) {
+    for (int c = 0; c < CORNERS; c++)
+        for (int s = 0; s < LANES; s++) __builtin_prefetch(table + int64_t(cell.entry[c][s]) * F);
+}
+
+// LANES positions, the last block padded with zeros.
+inline void load_positions(const float* positions, int64_t first, int count, Floats* xyz) {
+    float lanes[3][LANES] = {};
+    for (int s = 0; s < count; s++)
+        for (int axis = 0; axis < 3; axis++) lanes[axis][s] = positions[(first + s) * 3 + axis];
+    for (int axis = 0; axis < 3; axis++) xyz[axis] = load(lanes[axis]);
+}
+
+template <int F, bool DENSE>
+void forward_level(const Level& level, const Floats (*xyz)[3], const float* table, int64_t begin, int64_t end,
+                   float* out, int64_t stride) {
+    Cell cells[2];  // this block's and the next one's, whose entries are on their way meanwhile
+    const float* entries = table + level.offset * F;
+    find_cell<DENSE>(level, (*xyz)[0], (*xyz)[1], (*xyz)[2], cells[0]);
+    for (int64_t n = begin, turn = 0; n < end; n += LANES, turn ^= 1) {
+        if (n + LANES < end) {
+            xyz++;
+            find_cell<DENSE>(level, (*xyz)[0], (*xyz)[1], (*xyz)[2], cells[turn ^ 1]);
+            prefetch<F>(cells[turn ^ 1], entries);
+        }
+        blend<F>(cells[turn], entries, block(n, end), out + n * stride, stride);
+    }
+}
+
+// Features of the samples [begin, end), CHUNK at most, all levels side by side.
+template <int F>
+void encode(const float* positions, int64_t begin, int64_t end, const float* table, const int64_t* resolutions,
+            const int64_t* offsets, int levels, float* out) {
+    const int64_t stride = int64_t(levels) * F;
+    Floats xyz[CHUNK / LANES][3];
+    for (int64_t n = begin; n < end; n += LANES)
+        load_positions(positions, n, block(n, end), xyz[(n - begin) / LANES]);
+    for (int l = 0; l < levels; l++) {
+        const Level level = level_of(resolutions, offsets, l);
+        const auto run = level.dense ? forward_level<F, true> : forward_level<F, false>;
+        run(level, xyz, table, begin, end, out + l * F, stride);
+    }
+}
+
 template <int F, bool DENSE>
 inline void add_position_gradient(const Level& level, const float* table, const Floats* xyz, int size,
                                   const float* grad, int64_t stride, Floats* out) {

@@ -149,7 +149,48 @@ float* run_backward(const Network& net, const Block& block, float* grad, float* 
     return grad;
 }
 
+// The rows [begin, end) of the input to those of the output, and of the density, which may be null.
+void take_through(const Network& net, const Inputs& input, int64_t begin, int64_t end, int activation, float* out,
+                  float* density) {
+    const int outputs = net.width[net.layers], columns = net.wide[net.layers];
+    Block block;
+    for (int64_t first = begin; first < end; first += BLOCK) {
+        const int size = int(std::min<int64_t>(end - first, BLOCK));
+        int64_t rows[BLOCK];
+        for (int r = 0; r < size; r++) rows[r] = first + r;
+        input.read(block.layer[0], net.wide[0], rows, size);
+        run_forward(net, block);
+        float* last = block.layer[net.layers];
+        if (density) write_density(last, columns, size, density + first);
+        activate(last, BLOCK * columns, activation);
+        for (int r = 0; r < size; r++)
+            std::memcpy(out + rows[r] * outputs, last + r * columns, sizeof(float) * outputs);
+    }
+}
+
+struct Whole final : Forward {
+    Network net;
+    Whole(const int64_t* widths, int layers, const float* const* weights, const float* const* biases)
+        : net(widths, layers, weights, biases) {}
+    void run(const float* in, int64_t count, float* out, float* density) const override {
+        const int64_t width = net.width[0];
+        take_through(net, Inputs{1, &in, &width}, 0, count, NONE, out, density);
+    }
+};
+
 }  // namespace
+
+std::unique_ptr<Forward> mlp::forward_of(const int64_t* widths, int layers, const float* const* weights,
+                                    const float* const* biases) {
+    check_sizes(widths, layers);
+    return std::make_unique<Whole>(widths, layers, weights, biases);
+}
+
+#if !defined(__AVX512BF16__)
+std::unique_ptr<Forward> mlp::forward_bf16_of(const int64_t*, int, const float* const*, const float* const*) {
+    throw std::invalid_argument("this processor does not multiply in bfloat16");
+}
+#endif
 
 // The input is `parts` arrays (count, part_widths[p]) side by side; widths are those of the input and every layer.
 // density (count), or null: exp of the first output, which is at most exp(15).
@@ -161,20 +202,7 @@ EXPORT int mlp_forward(const float* const* inputs, const int64_t* part_widths, i
         const Network net(widths, layers, weights, biases);
         const Inputs input{parts, inputs, part_widths};
         for_ranges(threads, count, FORWARD_ROWS, [&](int64_t begin, int64_t end) {
-            Block block;
-            for (int64_t first = begin; first < end; first += BLOCK) {
-                const int size = int(std::min<int64_t>(end - first, BLOCK));
-                int64_t rows[BLOCK];
-                for (int r = 0; r < size; r++) rows[r] = first + r;
-                input.read(block.layer[0], net.wide[0], rows, size);
-                run_forward(net, block);
-                float* last = block.layer[layers];
-                if (density) write_density(last, net.wide[layers], size, density + first);
-                activate(last, BLOCK * net.wide[layers], activation);
-                for (int r = 0; r < size; r++)
-                    std::memcpy(out + rows[r] * net.width[layers], last + r * net.wide[layers],
-                                sizeof(float) * net.width[layers]);
-            }
+            take_through(net, input, begin, end, activation, out, density);
         });
     });
 }

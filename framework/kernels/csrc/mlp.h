@@ -3,6 +3,7 @@
 
 #include "common.h"
 
+#include <memory>
 #include <vector>
 
 namespace mlp {
@@ -75,6 +76,17 @@ struct Inputs {  // the network's input, in parts that stand side by side
         }
     }
 };
+
+// A network's forward pass for other kernels: rows of one input (count, inputs) to out (count, outputs) and the density.
+struct Forward {
+    virtual ~Forward() = default;
+    virtual void run(const float* in, int64_t count, float* out, float* density) const = 0;
+};
+
+std::unique_ptr<Forward> forward_of(const int64_t* widths, int layers, const float* const* weights,
+                                    const float* const* biases);
+std::unique_ptr<Forward> forward_bf16_of(const int64_t* widths, int layers, const float* const* weights,
+                                         const float* const* biases);
 
 inline bool is_zero(const float* values, int count) {
     for (int i = 0; i < count; i++)

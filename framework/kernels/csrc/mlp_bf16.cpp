@@ -213,7 +213,42 @@ void read_input(const Network& net, const Inputs& input, const int64_t* rows, in
     to_halves(block.scratch, columns, block.layer[0], net.rows[0], false, nullptr);
 }
 
+// The rows [begin, end) of the input to those of the output, and of the density, which may be null.
+void take_through(const Network& net, const Inputs& input, int64_t begin, int64_t end, int activation, float* out,
+                  float* density) {
+    const int outputs = net.width[net.layers], columns = net.columns[net.layers];
+    Block block;
+    for (int64_t first = begin; first < end; first += BLOCK) {
+        const int size = int(std::min<int64_t>(end - first, BLOCK));
+        int64_t rows[BLOCK];
+        for (int r = 0; r < size; r++) rows[r] = first + r;
+        read_input(net, input, rows, size, block);
+        run_forward(net, block);
+        float* last = block.output;
+        if (density) write_density(last, columns, size, density + first);
+        activate(last, BLOCK * columns, activation);
+        for (int r = 0; r < size; r++)
+            std::memcpy(out + rows[r] * outputs, last + r * columns, sizeof(float) * outputs);
+    }
+}
+
+struct Whole final : Forward {
+    Network net;
+    Whole(const int64_t* widths, int layers, const float* const* weights, const float* const* biases)
+        : net(widths, layers, weights, biases) {}
+    void run(const float* in, int64_t count, float* out, float* density) const override {
+        const int64_t width = net.width[0];
+        take_through(net, Inputs{1, &in, &width}, 0, count, NONE, out, density);
+    }
+};
+
 }  // namespace
+
+std::unique_ptr<Forward> mlp::forward_bf16_of(const int64_t* widths, int layers, const float* const* weights,
+                                    const float* const* biases) {
+    check_sizes(widths, layers);
+    return std::make_unique<Whole>(widths, layers, weights, biases);
+}
 
 // As mlp_forward and mlp_backward.
 EXPORT int mlp_forward_bf16(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
@@ -223,20 +258,8 @@ EXPORT int mlp_forward_bf16(const float* const* inputs, const int64_t* part_widt
         check_sizes(widths, layers);
         const Network net(widths, layers, weights, biases);
         const Inputs input{parts, inputs, part_widths};
-        const int outputs = net.width[layers], columns = net.columns[layers];
         for_ranges(threads, count, FORWARD_ROWS, [&](int64_t begin, int64_t end) {
-            Block block;
-            for (int64_t first = begin; first < end; first += BLOCK) {
-                const int size = int(std::min<int64_t>(end - first, BLOCK));
-                int64_t rows[BLOCK];
-                for (int r = 0; r < size; r++) rows[r] = first + r;
-                read_input(net, input, rows, size, block);
-                run_forward(net, block);
-                if (density) write_density(block.output, columns, size, density + first);
-                activate(block.output, BLOCK * columns, activation);
-                for (int r = 0; r < size; r++)
-                    std::memcpy(out + rows[r] * outputs, block.output + r * columns, sizeof(float) * outputs);
-            }
+            take_through(net, input, begin, end, activation, out, density);
         });
     });
 }

@@ -300,12 +300,12 @@ BUGS = (
         "half of the rays of a moving scene skip what is empty at another time",
     ),
     Bug(
-        "moving-hull-without-neighbours",
+        "moving-hull-without-margin",
         "occupancy",
         "framework/scene/silhouettes.py",
-        "first = start if len(before) == 0 else float(before.max())",
-        "first = start",
-        "what is where it was in the image before a slice of time is skipped at the slice's beginning",
+        "margins = [speed * (float(apart[i]) + half) for i in near]",
+        "margins = [0.0 for i in near]",
+        "what has moved to a place since the image was taken is skipped there",
     ),
     Bug(
         "grid-mean-of-nan",

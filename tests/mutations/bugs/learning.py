@@ -295,8 +295,8 @@ BUGS = (
         "kplanes-scales",
         "methods",
         "methods/kplanes.py",
-        "resolutions = tuple((config.base_resolution << scale,) * 3 + time for scale in range(config.num_scales))",
-        "resolutions = tuple((config.base_resolution,) * 3 + time for scale in range(config.num_scales))",
+        "max(round((config.base_resolution << scale) * edge), 2)",
+        "max(round(config.base_resolution * edge), 2)",
         "all scales are the coarsest",
     ),
     Bug(

@@ -49,9 +49,7 @@ def test_images_reduced_beforehand_are_reduced_on(capture: Path) -> None:
     assert load_dataset(scene, "train").image(0).shape == (7, 10, 3)
 
 
-@pytest.mark.parametrize(
-    ("side", "factor"), [(1600, 1), (1601, 2), pytest.param(3300, 4, marks=pytest.mark.medium)]
-)
+@pytest.mark.parametrize(("side", "factor"), [(1600, 1), (1601, 2), pytest.param(3300, 4, marks=pytest.mark.medium)])
 def test_images_are_reduced_to_1600_pixels_unless_told(capture: Path, side: int, factor: int) -> None:
     write_images(capture / "images", NAMES[:1], side, side * 3 // 4)
     for name in NAMES[1:]:  # encoding each takes most of the time, and their sizes alone matter here

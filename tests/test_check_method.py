@@ -582,7 +582,6 @@ def assert_found(method: Method, check: str, words: str) -> None:
     assert re.search(words, failed[0].detail), failed[0].detail
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize(("check", "method", "words"), FAULTS, ids=NAMES)
 def test_each_fault_is_found_by_its_check(
     check: str, method: Method, words: str, monkeypatch: pytest.MonkeyPatch

@@ -159,7 +159,6 @@ def _classes() -> dict[str, ast.ClassDef]:
     return {node.name: node for file in files for node in ast.walk(_parsed(file)) if isinstance(node, ast.ClassDef)}
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("file", FILES)
 def test_docstrings(file: str) -> None:
     assert list(problems(_parsed(file), _classes())) == []

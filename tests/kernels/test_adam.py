@@ -52,7 +52,6 @@ def truth(entries: int, features: int, steps: int) -> torch.Tensor:
     return torch.stack([p.detach() for p in singles])
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("features", [1, 2, 3, 4, 8, 16, 32, 48])
 @pytest.mark.parametrize("update", [sparse_adam, sparse_adam_reference, MASKED])
 def test_each_entry_sees_adam_on_its_own_gradients(update, features: int) -> None:

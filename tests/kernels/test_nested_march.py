@@ -89,7 +89,6 @@ def marched(march: March, limit: int = 16) -> tuple[np.ndarray, np.ndarray]:
     return torch.stack([starts, ends], -1).double().numpy(), owners.numpy()
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("kind", ["inside", "between", "outside", "parallel"])
 @pytest.mark.parametrize("share", [0.003, 0.2])
 @pytest.mark.parametrize("form", FORMS)

@@ -10,7 +10,6 @@ from tests.site.commands import Checker, formats
 from tests.site.pages import PAGES, ROOT, commands, words_of
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_commands_are_understood(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     checker = Checker(monkeypatch, tmp_path)

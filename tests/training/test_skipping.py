@@ -60,7 +60,6 @@ def test_methods_that_skip_nothing_report_nothing(shared_tiny: Path, tmp_path: P
     assert skip_report(trainer) == []
 
 
-@pytest.mark.medium
 def test_carved_cells_stay_empty(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=80)
     trainer.train()

@@ -58,7 +58,6 @@ def assert_pixels_show_the_ball(scene: ParsedScene, steps: float | None) -> Data
     return data
 
 
-@pytest.mark.medium
 def test_every_pixel_shows_what_its_ray_meets(captured: Captured) -> None:
     name, folder = captured
     scene = FORMATS[name].parser.parse(folder, "train")

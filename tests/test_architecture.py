@@ -166,6 +166,7 @@ def _runtime_imports(node: ast.AST) -> set[str]:
     return imports(node) - {name for item in checked for name in imports(item)}
 
 
+@pytest.mark.medium
 def test_imports_run_one_way_through_the_rooms() -> None:
     upwards = []
     for file in FILES:

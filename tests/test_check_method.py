@@ -159,6 +159,7 @@ SOUND = {
 }
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("kind", SOUND)
 def test_a_sound_method_passes_every_check(kind: str) -> None:
     findings = check_method(SOUND[kind])
@@ -617,6 +618,7 @@ def test_what_fails_is_listed_at_once() -> None:
     assert lines[2].startswith("WRONG evaluation: ")
 
 
+@pytest.mark.medium
 def test_a_line_of_the_methods_own_file_is_named() -> None:
     method = of_parts(TinyConfig(), mixed(Tires, RayModel))
     (failed,) = [finding for finding in check_method(method) if not finding.ok]

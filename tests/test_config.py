@@ -106,6 +106,7 @@ def test_numbers_of_more_digits_than_python_writes(tmp_path: Path, sign: str) ->
             read_run(path)
 
 
+@pytest.mark.medium
 def test_a_deeply_nested_recipe_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "recipe.yml"
     path.write_text("a: " + "[" * 5_000)

@@ -107,6 +107,7 @@ def test_the_terms_are_there_where_they_are_asked_for(method: str, shared_tiny: 
     assert not {"unseen", "occlusion"} & stepped(tiny_trainer(method, shared_tiny, tmp_path / "without")).keys()
 
 
+@pytest.mark.medium
 def test_matter_before_cameras_goes_away(shared_tiny: Path, tmp_path: Path) -> None:
     """The whole ball is `near` here and its penalty large: the picture is given up for empty space."""
     settings = {"silhouette_cells": False, "max_num_iterations": 200}

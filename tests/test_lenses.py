@@ -254,6 +254,7 @@ def test_compiled_rays_are_those_of_torch(model: str, lens: list[float] | None, 
             torch.testing.assert_close(getattr(one, name), value, rtol=2e-5, atol=2e-6)
 
 
+@pytest.mark.medium
 @needs_kernels
 def test_compiled_rays_of_any_lens() -> None:
     """400 lenses, most of which fold the picture over somewhere."""

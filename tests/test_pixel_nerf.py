@@ -72,6 +72,7 @@ def indices_of(images: Tensor, dataset: Dataset) -> list[int]:
 # -- which images ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.medium
 def test_a_training_image_is_learnt_from_others_of_its_scene(many: dict[str, Dataset]) -> None:
     """Never from itself, never from another scene's, and from each of the others as often as not."""
     train = many["train"]

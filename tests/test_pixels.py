@@ -70,6 +70,7 @@ def test_images_of_different_sizes_share_one_buffer() -> None:
     torch.testing.assert_close(batch.rgb[:, 0], expected)
 
 
+@pytest.mark.medium
 def test_pixels_of_few_images_are_drawn_evenly(dataset: Dataset) -> None:
     """Each image as often as any other, and each of its pixels: of all pixels, and of some that are to be drawn."""
     some = PixelSet.of_pixels(torch.cat([torch.arange(5, 300), torch.arange(1203, 1210)]))  # of images 0 and 3 only

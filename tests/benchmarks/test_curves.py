@@ -92,6 +92,7 @@ def test_what_was_run_is_kept(ran: list[tuple[str, float, int]], tmp_path: Path)
         curves.run(plan)
 
 
+@pytest.mark.medium
 def test_the_command_writes_json_and_a_picture_and_names_failures(
     ran: list[tuple[str, float, int]], tmp_path: Path, refused: Refused
 ) -> None:

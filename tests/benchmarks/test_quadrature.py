@@ -112,6 +112,7 @@ def test_every_sampler_comes_near_the_truth(monkeypatch: pytest.MonkeyPatch) -> 
             assert error < 2e-2
 
 
+@pytest.mark.medium
 @torch.no_grad()
 @pytest.mark.parametrize("name", ["nested", "shell"])
 def test_early_stop_keeps_its_bound_and_saves(name: str) -> None:

@@ -206,6 +206,7 @@ def test_orbit(finished: Path, tmp_path: Path) -> None:
     assert called("ns-render", "orbi").stderr.startswith("error: unknown path 'orbi'. Did you mean 'orbit'?")
 
 
+@pytest.mark.medium
 def test_a_recipe_with_overrides_and_resuming(shared_tiny: Path, tmp_path: Path) -> None:
     recipe = tmp_path / "recipe.yml"
     names = [flag[2:].replace("-", "_") for flag in TINY_NGP[::2]]
@@ -222,6 +223,7 @@ def test_a_recipe_with_overrides_and_resuming(shared_tiny: Path, tmp_path: Path)
     assert (folder / "nerfstudio_models" / "step-000000008.ckpt").is_file()
 
 
+@pytest.mark.medium
 def test_python_3_10_syntax() -> None:
     """The oldest supported Python must be able to compile every file."""
     import ast

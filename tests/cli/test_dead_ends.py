@@ -34,6 +34,7 @@ def test_every_command_has_a_version(monkeypatch: pytest.MonkeyPatch, capsys: py
         assert capsys.readouterr().out.startswith(f"nerfloom {framework.__version__} from ")
 
 
+@pytest.mark.medium
 def test_data_without_its_flag(shared_tiny: Path, refused: Refused) -> None:
     said = refused(train_command.main, "nerfacto", shared_tiny)
     assert said.endswith(f"the data is named by a flag: ns-train nerfacto --data {shared_tiny}")
@@ -60,6 +61,7 @@ def test_a_runs_folder_stands_for_its_config(trained: Path, tmp_path: Path, refu
     assert f"has no config.yml; the newest run in it is {trained}" in said
 
 
+@pytest.mark.medium
 def test_data_that_has_moved(tiny: Path, tmp_path: Path, refused: Refused) -> None:
     run = train(tiny, tmp_path / "out", "--max-num-iterations", 1, "--max-eval-images", 0)
     tiny.rename(tmp_path / "moved")
@@ -115,6 +117,7 @@ def test_one_image_of_another_size(tiny: Path, tmp_path: Path, refused: Refused)
     assert said.endswith("restore it, or remove it from the data")
 
 
+@pytest.mark.medium
 def test_damaged_photographs_in_our_words_and_thumbnails_with_a_warning(tmp_path: Path) -> None:
     capture = write_capture(tmp_path / "capture")
     first = capture / "images" / "1.jpg"

@@ -45,6 +45,7 @@ def test_a_broken_installation_is_what_it_is_for(monkeypatch: pytest.MonkeyPatch
     assert rows["kernels"]
 
 
+@pytest.mark.medium
 def test_the_version_alone_does_not_load_torch() -> None:
     code = (
         "import sys; sys.argv = ['ns-train', '--version']; from framework.cli.train import main; main();"

@@ -93,6 +93,7 @@ def test_rounded_numbers_are_those_of_the_written_pictures(
         assert row["psnr"] == pytest.approx(-10 * np.log10(((render - photograph) ** 2).mean()), abs=1e-4)
 
 
+@pytest.mark.medium
 def test_the_chunk_size_changes_no_number(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plain = evaluate(monkeypatch, finished)
     edit_config(finished, eval_num_rays_per_chunk=37)

@@ -25,6 +25,7 @@ def render(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
     main()
 
 
+@pytest.mark.medium
 def test_one_camera_while_time_runs(moving_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     flags = ["--load-config", moving_run, "--num-frames", 3, "--split", "train", "--camera-index", 2]
     render(monkeypatch, "time", *flags, "--output-path", tmp_path / "strip.png")
@@ -34,12 +35,14 @@ def test_one_camera_while_time_runs(moving_run: Path, tmp_path: Path, monkeypatc
         assert (animation.n_frames, animation.size) == (3, (20, 20))  # type: ignore[attr-defined]
 
 
+@pytest.mark.medium
 def test_a_circle_at_one_time(moving_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     flags = ["--load-config", moving_run, "--num-frames", 2, "--output-path", tmp_path / "orbit.gif"]
     render(monkeypatch, "orbit", *flags, "--time", 0.5)
     assert (tmp_path / "orbit.gif").is_file()
 
 
+@pytest.mark.medium
 def test_what_cannot_be_is_refused(moving_run: Path, shared_tiny: Path, tmp_path: Path, refused: Refused) -> None:
     still = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "still", max_num_iterations=1)
     still.train()

@@ -101,6 +101,7 @@ def test_depth_is_in_units_of_the_input(kind: str, capture_run: Path, shows_a_ba
     assert not (tmp_path / "r" / "train.frames").exists()
 
 
+@pytest.mark.medium
 def test_colours_of_depth_have_one_range_for_the_whole_video(
     capture_run: Path, shows_a_ball: float, tmp_path: Path
 ) -> None:
@@ -146,6 +147,7 @@ def test_outputs_apart_and_in_folders(capture_run: Path, shows_a_ball: float, tm
     assert "beside holds images of another render (render.json differs); name another folder" in again.stderr
 
 
+@pytest.mark.medium
 def test_the_true_image_and_the_error(ball_run: Path, shared_tiny: Path, tmp_path: Path) -> None:
     words = ("--rendered-output-names", "rgb", "gt-rgb", "error")
     for factor in (1, 2):
@@ -163,6 +165,7 @@ def test_the_true_image_and_the_error(ball_run: Path, shared_tiny: Path, tmp_pat
             assert np.abs(error[..., 0] / 255 - np.clip(3 * off, 0, 1)).max() < 0.04
 
 
+@pytest.mark.medium
 def test_a_killed_render_goes_on_to_the_same_file(
     ball_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

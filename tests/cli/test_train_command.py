@@ -199,6 +199,7 @@ def test_resuming_nothing(tmp_path: Path, refused: Refused) -> None:
     assert f"cannot read {tmp_path / 'gone' / 'config.yml'}" in refused(main, "--resume", tmp_path / "gone")
 
 
+@pytest.mark.medium
 def test_resuming_from_damaged_checkpoints(
     shared_tiny: Path, tmp_path: Path, refused: Refused, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:

@@ -190,6 +190,7 @@ def aligned(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndar
     return scale * a @ rotation.T + target.mean(0), rotation, scale
 
 
+@pytest.mark.medium
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["colmap_can", "colmap_cup"])
 def test_real_poses_agree_with_colmaps(real_data: Path, name: str) -> None:

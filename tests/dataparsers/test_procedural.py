@@ -143,6 +143,7 @@ def test_an_interrupted_write_leaves_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.medium
 def test_the_parser_renders_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NERFLOOM_CACHE", str(tmp_path))
     parsed = Procedural(size=8, num_train=2).parse(None, "train")
@@ -200,6 +201,7 @@ def test_no_scene_is_in_two_splits() -> None:
     assert sorted(numbers) == list(range(5 + 4 + 8))
 
 
+@pytest.mark.medium
 def test_many_scenes_are_kept_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each image shows what tracing the solids of its scene along its own rays shows."""
     monkeypatch.setenv("NERFLOOM_CACHE", str(tmp_path))
@@ -224,6 +226,7 @@ def test_many_scenes_are_kept_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert scene == 1 or not torch.equal((alpha > 0)[clear], shown[1].hit[clear])
 
 
+@pytest.mark.medium
 def test_some_images_of_many_scenes_know_theirs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NERFLOOM_CACHE", str(tmp_path))
     parser = Procedural(size=8, num_scenes=2, views_per_scene=5)

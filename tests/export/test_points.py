@@ -21,6 +21,7 @@ from tests.export.test_tsdf import RADIUS, Ball, around
 pytest.importorskip("scipy")
 
 
+@pytest.mark.medium
 def test_points_far_from_others_are_outliers() -> None:
     torch.manual_seed(0)
     surface = torch.nn.functional.normalize(torch.randn(3000, 3), dim=-1)

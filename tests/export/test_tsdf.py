@@ -67,6 +67,7 @@ def fused(cameras: Cameras, resolution: int = 40, stride: int = 1, noise: float 
 LENS = [-0.1, 0.02, 1e-3, -1e-3, 0, 0, 0, 0, 0]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(
     ("model", "lens", "stride"),
     [

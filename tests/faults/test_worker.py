@@ -36,6 +36,7 @@ def test_a_process_that_is_killed_at_its_work(tmp_path: Path) -> None:
     assert str(error.value) == f"COLMAP stopped while matching (exit status -9); {last}"
 
 
+@pytest.mark.medium
 def test_a_process_that_runs_out_of_memory(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"^COLMAP: MemoryError: no memory$"):
         run_in_child(work, ("out of memory",), "Matching", 3, tmp_path / "log.txt")
@@ -74,6 +75,7 @@ def until(condition: Callable[[], bool]) -> bool:
     return condition()
 
 
+@pytest.mark.medium
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGKILL, -9)])
 def test_it_ends_with_the_process_that_started_it(number: signal.Signals, status: int, tmp_path: Path) -> None:

@@ -64,6 +64,7 @@ def test_compiled_value_and_gradients(layout: PlanesLayout, features: int) -> No
     assert relative_error(found[1].grad, truth[1].grad) < 1e-5
 
 
+@pytest.mark.medium
 def test_gradcheck_of_the_reference() -> None:
     layout = PlanesLayout.build(((3, 4, 5), (5, 6, 7)))
     positions, table = inputs(layout, 2, count=9)

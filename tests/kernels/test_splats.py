@@ -92,6 +92,7 @@ def test_sizes(size: tuple[int, int], antialiased: bool) -> None:
     assert found.worst() < BOUND, found
 
 
+@pytest.mark.medium
 @needs_kernels
 def test_random_scenes(threads: Callable[[int], None]) -> None:
     """Sizes, lenses, numbers, spreads and threads at random."""

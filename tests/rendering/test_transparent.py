@@ -62,6 +62,7 @@ def test_thinning_keeps_what_is_opaque_and_all_of_a_pixel(per_pixel: int) -> Non
     assert torch.equal(left.rays.origins[:, 1].long(), torch.arange(per_pixel).repeat(len(left)))
 
 
+@pytest.mark.medium
 def test_a_thinned_loss_has_the_same_mean() -> None:
     """Over 4,000 draws, to four standard errors; and to the bit if nothing is left out."""
     torch.manual_seed(0)

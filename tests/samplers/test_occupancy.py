@@ -236,6 +236,7 @@ def test_slices_are_carved_one_by_one_or_all_alike() -> None:
         OccupancySampler(BOX, 4, 16, slices=2)
 
 
+@pytest.mark.medium
 def test_a_cell_that_is_full_for_a_short_while_stays() -> None:
     """A ball that is there for a twentieth of the time: its cells are kept, and cells that are never full are not."""
 

@@ -39,6 +39,7 @@ def trained(shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     return tmp_path
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("page", EXECUTED)
 def test_it_runs(page: str, trained: Path) -> None:
     names: dict[str, Any] = {}

@@ -39,6 +39,7 @@ def psnr(file: Path) -> float:
     return json.loads(file.read_text())["results"]["psnr"]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("kind", ["ply", "spz"])
 def test_a_file_has_the_psnr_of_its_run(kind: str, capture: Path, capture_run: Path, tmp_path: Path) -> None:
     placement = load_run_or_splats(capture_run).content

@@ -76,6 +76,7 @@ def test_pictures_show_the_appearance_that_is_set() -> None:
     torch.testing.assert_close(shown, 0.5 * plain + vector[:, 3])
 
 
+@pytest.mark.medium
 def test_the_appearance_of_a_held_out_image_is_found_by_its_half(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path / "run", appearance=True)
     for _ in range(20):

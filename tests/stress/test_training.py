@@ -259,6 +259,7 @@ def plain(folder: Path, pixel: list[int]) -> Path:
     return folder
 
 
+@pytest.mark.medium
 @pytest.mark.entry(7)
 @pytest.mark.parametrize("pixel", [[255] * 3, [0] * 3, [0] * 4], ids=["white", "black", "transparent"])
 def test_training_on_plain_photographs(pixel: list[int], tiny: Path, tmp_path: Path) -> None:

@@ -56,6 +56,7 @@ def test_rays_a_step_say_nothing_of_what_draws_images(tmp_path: Path) -> None:
     assert one.reason == "a step draws a whole image"
 
 
+@pytest.mark.medium
 def test_the_same_run_twice_is_the_same(tmp_path: Path) -> None:
     run = tiny_run("instant-ngp", Path("none"), tmp_path)
     first, second = (attempt(PLAIN, run, BALL, Budget(20, None)) for _ in range(2))
@@ -158,6 +159,7 @@ def test_photographs_for_one_method_alone_are_refused(shared_tiny: Path, refused
     assert "--data stands behind the methods" in refused(main, f"instant-ngp --data {shared_tiny}")
 
 
+@pytest.mark.medium
 def test_on_somebodys_data(
     shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -72,6 +72,7 @@ def test_every_run_has_a_curve_at_its_price(
     assert points[-1].seconds > 0.8 * seconds
 
 
+@pytest.mark.medium
 def test_looks_change_no_bit(shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("framework.training.curve.SHARE", math.inf)
     monkeypatch.setattr("framework.training.curve.SPACING", 0.0)

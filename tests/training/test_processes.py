@@ -102,6 +102,7 @@ def two(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory, forks: Fork
     return Two(folder, [torch.load(folder / f"{rank}.pt", weights_only=True) for rank in range(COUNT)], said)
 
 
+@pytest.mark.medium
 def test_the_mean_gradient_is_that_of_the_whole_batch(two: Two, shared_tiny: Path, tmp_path: Path) -> None:
     whole = several.parts(shared_tiny, tmp_path)
     for found in two.found:

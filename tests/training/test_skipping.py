@@ -10,6 +10,7 @@ from framework.training.skipping import Rung, lines, skip_report
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 
 
+@pytest.mark.medium
 def test_the_report_tells_what_was_skipped(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=60)
     trainer.train()

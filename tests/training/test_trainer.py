@@ -88,6 +88,7 @@ def test_another_seed_gives_other_bits(shared_tiny: Path, tmp_path: Path) -> Non
     assert not torch.equal(runs[0].model.field.encoding.table, runs[1].model.field.encoding.table)
 
 
+@pytest.mark.medium
 def test_budgets(shared_tiny: Path, tmp_path: Path) -> None:
     by_time = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "a", max_seconds=0.3)
     assert by_time.train().reason == "0.3 s of training spent"
@@ -282,6 +283,7 @@ def test_evaluation_cameras_are_not_taken_for_training_ones(shared_tiny: Path, t
     assert all(rays.camera_indices is None for rays in seen)
 
 
+@pytest.mark.medium
 def test_looking_on_changes_no_bit(shared_tiny: Path, tmp_path: Path) -> None:
     """Pictures for TensorBoard and evaluations between steps leave the trained bits alone."""
     blind = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "blind", max_num_iterations=20)
@@ -295,6 +297,7 @@ def test_looking_on_changes_no_bit(shared_tiny: Path, tmp_path: Path) -> None:
     assert list((tmp_path / "seeing").glob("events.out.tfevents.*"))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("kind", quick(RAY_KINDS))
 def test_metrics_do_not_depend_on_the_chunks(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
     found = []
@@ -348,6 +351,7 @@ def test_a_good_checkpoint_outlives_a_divergence(shared_tiny: Path, tmp_path: Pa
     assert any(math.isfinite(loss) for loss in losses), losses
 
 
+@pytest.mark.medium
 def test_what_was_evaluated_is_not_forgotten_by_a_run_that_goes_on(shared_tiny: Path, tmp_path: Path) -> None:
     """A step that is evaluated and saved: whoever goes on from there does not come back to it."""
     settings = {"steps_per_eval_all_images": 4, "steps_per_save": 4, "max_num_iterations": 12}

@@ -33,6 +33,7 @@ def generator(vector: np.ndarray) -> np.ndarray:
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
+@pytest.mark.medium
 def test_refined_cameras_are_exported_where_they_are_believed_to_be(tmp_path: Path) -> None:
     """A device's poses, in its own frame and metres, each with the motion that the run has learnt for it."""
     data = write_polycam(tmp_path / "ball")

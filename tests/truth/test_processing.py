@@ -52,6 +52,7 @@ def without_colmap(monkeypatch: pytest.MonkeyPatch, camera: str, order: list[str
     monkeypatch.setattr(pipeline, "run_in_child", lambda work, arguments, *_: work(None, *arguments))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("model", WRITABLE)
 def test_photographs_with_the_poses_and_the_lens_that_colmap_finds(
     model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

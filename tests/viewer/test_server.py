@@ -127,6 +127,7 @@ def test_two_browsers_see_what_each_asks_for(served: Served, connected: Callable
     assert decibels(first.finished(), truth(served, 80, position=(0.0, 0.5, -4.0))) > 35
 
 
+@pytest.mark.medium
 def test_controls_that_send_nonsense(served: Served, connected: Callable[..., Client]) -> None:
     client = connected()
     client.look()

@@ -124,6 +124,7 @@ def test_the_mouse_turns_and_comes_closer(browser: str, scene: Path, tmp_path: P
     assert (camera, reset) == ("1", first)
 
 
+@pytest.mark.medium
 def test_damaged_data_are_named(browser: str, scene: Path, tmp_path: Path) -> None:
     text = scene.read_text(encoding="utf-8")
     start = text.index('id="data"') + 2000

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,6 +16,7 @@ from framework.base.decisions import Decision
 from framework.base.registry import load_method
 from framework.cameras.ndc import NdcCameras
 from framework.data.dataset import Dataset
+from framework.data.folds import angle_between, folds, thumbnail
 from framework.data.free_space import before_points
 from framework.data.pixel_set import PixelSet
 from framework.data.pixels import training_background
@@ -97,9 +99,27 @@ def profile_of(
         decisions.append(Decision("times", "ignored", f"{method} learns a still scene: moving objects are blurred"))
     if scene.appearance_varies and not isinstance(model, HasAppearance):
         decisions.append(Decision("light that differs", "ignored", f"{method} learns one light for all photographs"))
+    if scene.poses == "photographs" and not scene.moving and scene.num_scenes == 1:
+        decisions += _warning_of_folds(dataset)
     if scene.poses == "device" and not isinstance(model, RefinesPoses):
         decisions.append(Decision("the device's poses", "not refined", f"{method} takes poses as they are"))
     return SceneProfile.of(dataset, [*decisions, *decided])
+
+
+def _warning_of_folds(dataset: Dataset) -> list[Decision]:
+    """Return a warning if something that repeats seems to have folded the reconstruction; none otherwise."""
+    ahead = -dataset.cameras.camera_to_worlds[:, :, 2].cpu().numpy()
+    thumbnails = np.stack([thumbnail(dataset.image(index).cpu().numpy()) for index in range(len(dataset))])
+    pairs = folds(dataset.names, ahead, thumbnails)
+    if not pairs:
+        return []
+    first, second = pairs[0]
+    reason = (
+        f"{dataset.names[first]} and {dataset.names[second]} look alike, but their cameras look "
+        f"{angle_between(ahead[first], ahead[second]):.0f} degrees apart ({len(pairs)} such pair{'s' * (len(pairs) > 1)}): something that "
+        "repeats, like a label printed twice, was taken for one. ns-process-data finds poses without the fold"
+    )
+    return [Decision("warning, poses", "they seem to be folded", reason)]
 
 
 def show_images(model: Model[Any], train_set: Dataset, eval_set: Dataset | None) -> None:

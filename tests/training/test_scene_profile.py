@@ -59,6 +59,40 @@ def test_without_alpha_the_background_is_black_and_no_silhouette_used(shared_tin
     assert not bool(found.model.sampler.carved.any())  # as announced
 
 
+def test_poses_that_seem_to_be_folded_are_warned_of(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=1)
+    count, data = 40, trainer.train_set
+    angles = torch.linspace(0, 350, count)
+    rates, waves = (
+        torch.deg2rad(angles)[:, None] * torch.arange(1, 5),
+        torch.randn(2, 4, 400, generator=torch.Generator().manual_seed(0)),
+    )
+    seen = rates.cos() @ waves[0] + rates.sin() @ waves[1]
+    pixels = (40 * seen / seen.std() + 128).clamp(0, 255).to(torch.uint8).reshape(-1, 1).repeat(1, 3)
+
+    def warning(angles: torch.Tensor, **scene: object) -> tuple[str, str] | None:
+        turn, zero = torch.deg2rad(angles), torch.zeros(count)
+        columns = [turn.cos(), turn.sin(), zero], [zero, zero, zero + 1], [turn.sin(), -turn.cos(), zero]
+        poses = torch.stack([torch.stack(column, -1) for column in (*columns, [zero, zero, zero])], -1)
+        cameras = replace(data.cameras[torch.zeros(count, dtype=torch.int64)], camera_to_worlds=poses)
+        photographs: dict[str, object] = {"has_alpha": False, "num_cameras": count, "poses": "photographs"} | scene
+        walk = replace(
+            data,
+            pixels=pixels,
+            cameras=cameras,
+            names=tuple(f"{index}.jpg" for index in range(count)),
+            scene=replace(data.scene, **photographs),  # type: ignore[arg-type]
+        )
+        return decisions(Trainer(trainer.run, walk, None)).get("warning, poses")
+
+    folded = warning(angles % 180)
+    assert folded is not None
+    assert folded[1].startswith("20.jpg and 21.jpg look alike, but their cameras look 17")
+    assert "(1 such pair)" in folded[1]
+    assert warning(angles) is None
+    assert warning(angles % 180, poses="exact") is None
+
+
 def test_what_the_user_decided_is_not_called_a_decision(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer(
         "instant-ngp",

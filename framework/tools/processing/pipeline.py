@@ -12,7 +12,7 @@ from pathlib import Path
 
 from framework.base.console import say
 from framework.base.errors import DataError
-from framework.tools.processing import colmap, retrieval, transforms
+from framework.tools.processing import colmap, retrieval, transforms, unfolding
 from framework.tools.processing.images import PreparedImage, prepare_all, write_masks
 from framework.tools.processing.output import FINISHED
 from framework.tools.processing.pyramid import write_pyramid
@@ -61,6 +61,8 @@ def process(
     _extract(database, images, prepared, mask_folder, log, flags, seconds)
     matching = _match(database, [image.name for image in prepared], video, log, flags, seconds)
     sizes = _reconstruct(database, images, work / "sparse", len(prepared), matching, log, flags, seconds)
+    with _timed(seconds, "unfolding"):
+        sizes = _unfold(database, images, work, log, flags) or sizes
 
     final = work / "sparse" / "0"
     with _timed(seconds, "writing"):
@@ -229,6 +231,32 @@ def _reconstruct(
         raise DataError(f"COLMAP could not register the images: none are connected well enough. {advice(matching)}")
     say(f"mapping: {sizes[0]} of {count} images registered, in {seconds['mapping']:.1f} s")
     return sizes
+
+
+def _unfold(database: Path, images: Path, work: Path, log: Path | None, flags: ColmapFlags) -> list[int] | None:
+    """Replace the models, and the database, by unfolded ones where something that repeats has folded them.
+
+    Returns:
+        The number of images of each of the new models; None if nothing was replaced.
+    """
+
+    def read(folder: Path) -> colmap.Model:
+        model: colmap.Model = run_in_child(colmap.read_model, (folder / "0",), "Reading the model", 1, log)
+        return model
+
+    def reconstruct(matches: Path, folder: Path) -> tuple[colmap.Model | None, list[int]]:
+        sizes = run_in_child(colmap.reconstruct, (matches, images, folder, flags), "Registering", count, log)
+        return (read(folder) if sizes else None), sizes
+
+    model = read(work / "sparse")
+    thumbnails, count = unfolding.thumbnails_of(images, model.images), len(model.images)
+    found = unfolding.unfold(model, thumbnails, database, work, reconstruct)
+    if found is None:
+        return None
+    shutil.rmtree(work / "sparse")
+    shutil.move(found.models, work / "sparse")
+    shutil.move(found.database, database)
+    return found.sizes
 
 
 def _frames(model: colmap.Model, prepared: list[PreparedImage], masks: dict[str, str]) -> list[transforms.Frame]:

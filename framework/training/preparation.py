@@ -116,7 +116,7 @@ def _warning_of_folds(dataset: Dataset) -> list[Decision]:
     first, second = pairs[0]
     reason = (
         f"{dataset.names[first]} and {dataset.names[second]} look alike, but their cameras look "
-        f"{angle_between(ahead[first], ahead[second]):.0f} degrees apart ({len(pairs)} such pair{'s' * (len(pairs) > 1)}): something that "
+        f"{angle_between(ahead[first], ahead[second]):.0f} degrees apart (such pairs: {len(pairs)}): something that "
         "repeats, like a label printed twice, was taken for one. ns-process-data finds poses without the fold"
     )
     return [Decision("warning, poses", "they seem to be folded", reason)]

@@ -88,7 +88,7 @@ def test_poses_that_seem_to_be_folded_are_warned_of(shared_tiny: Path, tmp_path:
     folded = warning(angles % 180)
     assert folded is not None
     assert folded[1].startswith("20.jpg and 21.jpg look alike, but their cameras look 17")
-    assert "(1 such pair)" in folded[1]
+    assert "(such pairs: 1)" in folded[1]
     assert warning(angles) is None
     assert warning(angles % 180, poses="exact") is None
 

@@ -93,7 +93,7 @@ def unfold(
     angle = angle_between(*(_ahead(model, name) for name in pairs[0]))
     say(
         f"{pairs[0][0]} and {pairs[0][1]} look alike, but their cameras look {angle:.0f} degrees apart "
-        f"({len(pairs)} such pair{'s' * (len(pairs) > 1)}): something that repeats has folded the reconstruction. Unfolding it"
+        f"(such pairs: {len(pairs)}): something that repeats has folded the reconstruction. Unfolding it"
     )
     names, best, used = sorted(thumbnails), None, 0
     names = [names[index] for index in in_order(names)]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -68,29 +69,14 @@ def trace(marched: March, density: GridDensity) -> Traced | None:
         What waves would give; None where march, hash grid or network would not run compiled, or if positions are to
         have a gradient, so that the caller has to go wave by wave.
     """
-    if not isinstance(marched, CompiledMarch) or marched.waves or not _is_compiled(marched, density):
+    if not isinstance(marched, CompiledMarch) or marched.waves or not is_compiled(marched, density):
         return None
-    rays, layout, weights = len(marched.rays), density.layout, density.weights
-    widths = (weights[0].shape[1], *(weight.shape[0] for weight in weights))
-    features, follows = density.table.shape[1], torch.is_grad_enabled()
-    total = _trace(
-        marched.origins.data_ptr(), marched.directions.data_ptr(), marched.enter.data_ptr(), marched.leave.data_ptr(),
-        marched.first.data_ptr(), None if marched.slices is None else marched.slices.data_ptr(), rays,
-        native.integers(WAVES), len(WAVES), marched.box.data_ptr(), marched.step, marched.cone,
-        marched.bits.data_ptr(), marched.blocks.data_ptr(), marched.resolution, marched.levels, marched.budget,
-        native.pointer(density.scale, "the scale", (3,)), native.pointer(density.shift, "the shift", (3,)),
-        native.pointer(density.table, "the hash table", (layout.num_entries, features)), features, *layout.arrays,
-        layout.num_levels, native.integers(widths), len(weights),
-        native.pointers([
-            native.pointer(weight, "weights", (widths[layer + 1], widths[layer]))
-            for layer, weight in enumerate(weights)
-        ]),
-        native.pointers([None] * len(weights)), multiplies_bf16(), follows, native.threads(),
-    )  # fmt: skip
+    rays, layout, follows = len(marched.rays), density.layout, torch.is_grad_enabled()
+    total = _trace(*arguments(marched, density), multiplies_bf16(), follows, native.threads())
     starts, ends, sigma = (torch.empty(total) for _ in range(3))
     owners, offsets = torch.empty(total, dtype=torch.int64), torch.empty(rays + 1, dtype=torch.int64)
-    unit, outputs = torch.empty(total, 3), torch.empty(total, widths[-1])
-    encoded = torch.empty(total, widths[0]) if follows else None
+    unit, outputs = torch.empty(total, 3), torch.empty(total, density.weights[-1].shape[0])
+    encoded = torch.empty(total, density.weights[0].shape[1]) if follows else None
     _take(
         rays, total, offsets.data_ptr(), starts.data_ptr(), ends.data_ptr(), owners.data_ptr(), unit.data_ptr(),
         None if encoded is None else encoded.data_ptr(), outputs.data_ptr(), sigma.data_ptr(), native.threads(),
@@ -98,12 +84,40 @@ def trace(marched: March, density: GridDensity) -> Traced | None:
     if encoded is not None:  # the operations that made these values add their gradients
         with kept.given(hash_grid=encoded, mlp=outputs, density=sigma):
             found = hash_grid(unit, density.table, layout, density.deferred)
-            sigma, outputs = density_mlp((found,), weights)
+            sigma, outputs = density_mlp((found,), density.weights)
     return Traced(starts, ends, owners, offsets, sigma, outputs)
 
 
-def _is_compiled(marched: CompiledMarch, density: GridDensity) -> bool:
-    """Return whether both operations would run compiled, with the derivatives that are asked for."""
+def arguments(marched: CompiledMarch, density: GridDensity) -> tuple[Any, ...]:
+    """Return the arguments of compiled traces: the rays, their grid, and the density along them, checked."""
+    layout, features = density.layout, density.table.shape[1]
+    return (
+        marched.origins.data_ptr(), marched.directions.data_ptr(), marched.enter.data_ptr(), marched.leave.data_ptr(),
+        marched.first.data_ptr(), None if marched.slices is None else marched.slices.data_ptr(), len(marched.rays),
+        native.integers(WAVES), len(WAVES), marched.box.data_ptr(), marched.step, marched.cone,
+        marched.bits.data_ptr(), marched.blocks.data_ptr(), marched.resolution, marched.levels, marched.budget,
+        native.pointer(density.scale, "the scale", (3,)), native.pointer(density.shift, "the shift", (3,)),
+        native.pointer(density.table, "the hash table", (layout.num_entries, features)), features, *layout.arrays,
+        layout.num_levels, *network(density.weights),
+    )  # fmt: skip
+
+
+def network(weights: Sequence[Tensor]) -> tuple[Any, ...]:
+    """Return the arguments of a network of compiled traces: widths, number of layers, and `weights`, checked."""
+    widths = (weights[0].shape[1], *(weight.shape[0] for weight in weights))
+    pointers = [
+        native.pointer(weight, "weights", (widths[layer + 1], widths[layer])) for layer, weight in enumerate(weights)
+    ]
+    return native.integers(widths), len(weights), native.pointers(pointers)
+
+
+def is_compiled(marched: CompiledMarch, density: GridDensity) -> bool:
+    """Return whether hash grid and network would run compiled, with the derivatives that are asked for.
+
+    Args:
+        marched: the march along whose rays the density is.
+        density: the density.
+    """
     origins, table, weights = marched.origins, density.table, density.weights
     grid = HASH_GRID.choose((origins, table), origins, table, density.layout, density.deferred)
     inputs = (origins,)
@@ -111,5 +125,5 @@ def _is_compiled(marched: CompiledMarch, density: GridDensity) -> bool:
     return grid.backend is CPP and network.backend is CPP and all(t.is_contiguous() for t in (table, *weights))
 
 
-_trace: Callable[..., int] = native.Function("trace_rays", "ppppppqpipffppiifpppippipippiii", "q")
+_trace: Callable[..., int] = native.Function("trace_rays", "ppppppqpipffppiifpppippipipiii", "q")
 _take = native.Function("trace_take", "qqppppppppi")

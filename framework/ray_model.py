@@ -20,6 +20,7 @@ from framework.geometry.points import Points
 from framework.geometry.rays import Rays
 from framework.kernels.math import safe_normalize
 from framework.kernels.native import torch_on_one_thread
+from framework.kernels.traced_error import TracedError
 from framework.model import Loss, Model, parts
 from framework.rendering.losses import (
     density_before,
@@ -32,6 +33,7 @@ from framework.rendering.losses import (
 )
 from framework.rendering.rendered import Picture, Rendered
 from framework.rendering.renderer import Renderer
+from framework.rendering.traced import error_of_traced
 from framework.samplers.base import Sampler
 from framework.scene.few_images import FewImagesConfig, unseen_weight
 from framework.scene.motion import MotionConfig
@@ -80,6 +82,9 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
             batch: pixels with their true colours.
             step: number of training steps done.
         """
+        known = self._traced(batch)
+        if known is not None:
+            return Loss({"rgb": known.error}, known.rgb, known.num_samples)
         drawn, config = batch, self.config
         moves = isinstance(config, MotionConfig) and self.scene.moving and batch.alpha is not None
         if isinstance(config, MotionConfig) and moves and config.transparent_share < 1:
@@ -104,6 +109,18 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
         if batch is not drawn:  # of what was left out it is known that nothing is before the background
             rgb = drawn.rgb.index_copy(0, kept, rgb.to(drawn.rgb))
         return Loss(terms, rgb, rendered.num_samples)
+
+    def _traced(self, batch: PixelBatch) -> TracedError | None:
+        """Return the loss of a batch if it is the error of colours alone and known in one call; None otherwise."""
+        config, kind = self.config, type(self)
+        own = (kind.render, kind.color_error, kind.regularizers) == _PLAIN and type(self.sampler).losses is Sampler.losses
+        few = isinstance(config, FewImagesConfig) and (config.occlusion_loss_mult or config.unseen_loss_mult)
+        depths = batch.distances is not None and config.depth_loss_mult > 0
+        if not own or few or depths or batch.clear is not None or isinstance(config, MotionConfig):
+            return None
+        background = batch.background.repeat_interleave(batch.rays_per_pixel, 0)
+        parts_of = self.sampler, self.field, self.renderer
+        return error_of_traced(batch.rays, *parts_of, background, batch.rgb, batch.weights)
 
     def _depth_terms(self, rendered: Rendered, batch: PixelBatch) -> dict[str, Tensor]:
         """Return the losses of what is known of distances, of both levels, and of space that is known to be empty."""
@@ -217,6 +234,9 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
     def rays_per_pixel(self) -> int:
         """Number of rays that are averaged for each pixel of an image, as configured."""
         return self.config.rays_per_pixel
+
+
+_PLAIN = RayModel.render, RayModel.color_error, RayModel.regularizers
 
 
 def depth_loss(rendered: Rendered, batch: PixelBatch) -> Tensor | None:

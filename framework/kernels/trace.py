@@ -69,7 +69,7 @@ def trace(marched: March, density: GridDensity) -> Traced | None:
         What waves would give; None where march, hash grid or network would not run compiled, or if positions are to
         have a gradient, so that the caller has to go wave by wave.
     """
-    if not isinstance(marched, CompiledMarch) or marched.waves or not is_compiled(marched, density):
+    if not isinstance(marched, CompiledMarch) or marched.waves or not is_compiled(marched.origins, density):
         return None
     rays, layout, follows = len(marched.rays), density.layout, torch.is_grad_enabled()
     total = _trace(*arguments(marched, density), multiplies_bf16(), follows, native.threads())
@@ -111,14 +111,14 @@ def network(weights: Sequence[Tensor]) -> tuple[Any, ...]:
     return native.integers(widths), len(weights), native.pointers(pointers)
 
 
-def is_compiled(marched: CompiledMarch, density: GridDensity) -> bool:
+def is_compiled(origins: Tensor, density: GridDensity) -> bool:
     """Return whether hash grid and network would run compiled, with the derivatives that are asked for.
 
     Args:
-        marched: the march along whose rays the density is.
+        origins: (R, 3) origins of the rays along which the density is.
         density: the density.
     """
-    origins, table, weights = marched.origins, density.table, density.weights
+    table, weights = density.table, density.weights
     grid = HASH_GRID.choose((origins, table), origins, table, density.layout, density.deferred)
     inputs = (origins,)
     network = DENSITY_NETWORK.choose((*inputs, *weights), inputs, weights)

@@ -26,6 +26,9 @@ MAX_RAYS = 256
 """Maximum number of rays of a pixel."""
 
 
+THIN = 0.0
+
+
 @dataclass(frozen=True)
 class GridColor:
     """A colour: the sigmoid of `mlp` of the outputs of a `GridDensity` and of harmonics of the viewing direction."""
@@ -47,6 +50,29 @@ class TracedError(NamedTuple):
     """Number of samples that light reached."""
 
 
+def knows(
+    origins: Tensor, density: GridDensity, color: GridColor, background: Tensor, target: Tensor, weights: Tensor | None
+) -> bool:
+    """Return whether `traced_error` gives what plain operations would, which run compiled and with first derivatives.
+
+    Args:
+        origins: (R, 3) origins of the rays.
+        density: the density along the rays.
+        color: the colour along the rays.
+        background: (R, 3) colour behind each ray.
+        target: (P, 3) true colours of the pixels.
+        weights: (P,) factors of the pixels; None for 1.
+    """
+    if not (torch.is_grad_enabled() and 0 < len(origins) <= MAX_RAYS * len(target)):
+        return False
+    given = [origins, background, target] if weights is None else [origins, background, target, weights]
+    if any(tensor.requires_grad or tensor.dtype is not torch.float32 for tensor in given):
+        return False
+    network = NETWORK.choose((origins, *color.weights), (origins,), color.weights, "sigmoid")
+    plain = network.backend is CPP and all(weight.is_contiguous() for weight in color.weights)
+    return plain and is_compiled(origins, density)
+
+
 def traced_error(
     marched: March,
     density: GridDensity,
@@ -55,7 +81,7 @@ def traced_error(
     target: Tensor,
     weights: Tensor | None = None,
 ) -> TracedError | None:
-    """Return the mean squared error of the colours of traced rays.
+    """Return the mean squared error of the colours of traced rays; None for a march that does not run compiled.
 
     Args:
         marched: the march of R rays, before its first wave.
@@ -64,28 +90,20 @@ def traced_error(
         background: (R, 3) colour behind each ray.
         target: (P, 3) true colours, of pixels of R / P consecutive rays, whose colours are averaged.
         weights: (P,) factors of the pixels; None for 1.
-
-    Returns:
-        What the plain operations would give; None where these would not run compiled, or without rays or gradient, so
-        that the caller has to take them.
     """
+    if not isinstance(marched, CompiledMarch):
+        return None
     count, pixels = len(marched.rays), len(target)
-    if not (isinstance(marched, CompiledMarch) and torch.is_grad_enabled() and 0 < count <= MAX_RAYS * pixels):
-        return None
-    given = [background, target] if weights is None else [background, target, weights]
-    if marched.waves or any(tensor.requires_grad or tensor.dtype is not torch.float32 for tensor in given):
-        return None
-    if not is_compiled(marched, density) or not _is_compiled(color):
-        return None
     rgb, error, samples = torch.empty(pixels, 3), torch.empty(()), torch.empty(1, dtype=torch.int64)
     networks = [density.weights, color.weights]
     grads = [[torch.empty_like(weight) for weight in each] for each in networks]
     background, target = background.contiguous(), target.contiguous()
+    weights = None if weights is None else weights.contiguous()
     total = _traced_error(
         *arguments(marched, density), multiplies_bf16(), *network(color.weights), color.bands,
         native.pointer(background, "the background", (count, 3)), native.pointer(target, "the target", (pixels, 3)),
         None if weights is None else native.pointer(weights, "the pixels' weights", (pixels,)), count // pixels,
-        rgb.data_ptr(), error.data_ptr(), *(native.pointers([g.data_ptr() for g in each]) for each in grads),
+        THIN, int(torch.randint(2**31, ())) if THIN else 0, rgb.data_ptr(), error.data_ptr(), *(native.pointers([g.data_ptr() for g in each]) for each in grads),
         samples.data_ptr(), native.threads(),
     )  # fmt: skip
     unit, encoded_grad = torch.empty(total, 3), torch.empty(total, density.weights[0].shape[1])
@@ -94,13 +112,6 @@ def traced_error(
         encoded = hash_grid(unit, density.table, density.layout, density.deferred)
     known = (encoded_grad, *grads[0], *grads[1])
     return TracedError(_Known.apply(error, known, encoded, *networks[0], *networks[1]), rgb, int(samples))
-
-
-def _is_compiled(color: GridColor) -> bool:
-    """Return whether the network of colours would run compiled."""
-    inputs = (color.weights[0].detach(),)
-    chosen = NETWORK.choose((*inputs, *color.weights), inputs, color.weights, "sigmoid")
-    return chosen.backend is CPP and all(weight.is_contiguous() for weight in color.weights)
 
 
 class _Known(torch.autograd.Function):
@@ -119,6 +130,6 @@ class _Known(torch.autograd.Function):
 
 
 _traced_error: Callable[..., int] = native.Function(
-    "traced_error", "ppppppqpipffppiifpppippipipi" "pipi" "pppq" "ppppp" "i", "q"
+    "traced_error", "ppppppqpipffppiifpppippipipi" "pipi" "pppq" "fq" "ppppp" "i", "q"
 )
 _take = native.Function("traced_error_take", "qppi")

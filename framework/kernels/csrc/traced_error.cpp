@@ -6,6 +6,8 @@
 #include "harmonics.h"
 #include "trace.h"
 
+#include <cstdlib>
+
 using namespace tracing;
 
 namespace {
@@ -74,6 +76,42 @@ double pixel_error(const Pixels& pixels, int64_t p, const float* colors, float* 
     return error;
 }
 
+struct Thinning {
+    float floor;
+    uint64_t seed;
+};
+
+// Pseudo-random bits of a number: SplitMix64 (Steele et al. 2014).
+inline uint64_t scrambled(uint64_t x) {
+    x += 0x9e3779b97f4a7c15u;
+    x = (x ^ x >> 30) * 0xbf58476d1ce4e5b9u;
+    x = (x ^ x >> 27) * 0x94d049bb133111ebu;
+    return x ^ x >> 31;
+}
+
+// Which of a block's samples go on to the backward pass: those with a gradient, but of samples whose gradient is below
+// `floor` times the mean a share in proportion to it, whose gradient is enlarged as much, so that its expectation stays.
+int64_t thin(int64_t count, float* through, float* rgb_grad, float* size, float floor, uint64_t seed, int64_t* live) {
+    double sum = 0;
+    for (int64_t n = 0; n < count; n++) {
+        const float* c = rgb_grad + n * 3;
+        sum += size[n] = std::fabs(through[n]) + std::fabs(c[0]) + std::fabs(c[1]) + std::fabs(c[2]);
+    }
+    const float bound = count ? floor * float(sum / double(count)) : 0;
+    int64_t living = 0;
+    for (int64_t n = 0; n < count; n++) {
+        if (size[n] == 0) continue;
+        if (size[n] < bound) {  // false for NaN, which must be seen
+            const float chance = size[n] / bound;
+            if (!(float(scrambled(seed << 20 ^ uint64_t(n)) >> 40) * 0x1p-24f < chance)) continue;
+            through[n] /= chance;
+            for (int c = 0; c < 3; c++) rgb_grad[n * 3 + c] /= chance;
+        }
+        live[living++] = n;
+    }
+    return living;
+}
+
 struct Networks {
     const Density& density;
     const mlp::Layers& color;
@@ -82,8 +120,8 @@ struct Networks {
 };
 
 // Rays [base, last): whole pixels, RAYS at most.
-void learn_block(const Path& path, const Networks& nets, const Pixels& pixels, int64_t base, int64_t last,
-                 Scratch& own, Part& part, float* density_sums, float* color_sums) {
+void learn_block(const Path& path, const Networks& nets, const Pixels& pixels, const Thinning& thinning, int64_t base,
+                 int64_t last, Scratch& own, Part& part, float* density_sums, float* color_sums) {
     Samples& samples = own.samples;
     samples.clear();
     int32_t counts[RAYS] = {};
@@ -144,7 +182,6 @@ void learn_block(const Path& path, const Networks& nets, const Pixels& pixels, i
     for (int64_t r = 0; r < rays; r += pixels.per_pixel)
         part.error += pixel_error(pixels, (base + r) / pixels.per_pixel, colors + r * 3, grads + r * 3);
 
-    int64_t living = 0;
     for (int64_t r = 0; r < rays; r++) {
         const float *g = grads + r * 3, *back = pixels.background + (base + r) * 3;
         float base_grad = 0, after = 0;
@@ -160,15 +197,13 @@ void learn_block(const Path& path, const Networks& nets, const Pixels& pixels, i
             const float by_weight = through[n], sigma = samples.density[size_t(own.order[size_t(n)])];
             after -= by_weight * weight[n];
             through[n] = slope[n] == 0 ? 0 : slope[n] * (by_weight * behind[n] - after) * sigma;
-            bool zero = through[n] == 0;
             for (int c = 0; c < 3; c++) {
-                const float y = rgb[n * 3 + c], by_color = weight[n] * g[c];
-                zero &= by_color == 0;
-                rgb_grad[n * 3 + c] = by_color * y * (1 - y);
+                const float y = rgb[n * 3 + c];
+                rgb_grad[n * 3 + c] = weight[n] * g[c] * y * (1 - y);
             }
-            if (!zero) own.live[size_t(living++)] = n;
         }
     }
+    const int64_t living = thin(count, through, rgb_grad, depth, thinning.floor, thinning.seed + uint64_t(base), own.live.data());
 
     const int64_t encoded = nets.density.inputs;
     const size_t all = size_t(own.used + living);
@@ -210,7 +245,7 @@ EXPORT int traced_error(const float* origins, const float* directions, const flo
                         int levels, const int64_t* widths, int layers, const float* const* weights, int bf16,
                         const int64_t* color_widths, int color_layers, const float* const* color_weights, int bands,
                         const float* background, const float* target, const float* pixel_weights, int64_t per_pixel,
-                        float* rgb, float* error, float* const* weight_grads, float* const* color_weight_grads,
+                        float thin, int64_t seed, float* rgb, float* error, float* const* weight_grads, float* const* color_weight_grads,
                         int64_t* samples, int threads, int64_t* total) {
     return guarded([&] {
         const Path path{origins, directions, enter, leave,  first,      slices, limits, waves,
@@ -228,7 +263,8 @@ EXPORT int traced_error(const float* origins, const float* directions, const flo
         all.total = -1, all.inputs = density.inputs;
         if (all.scratch.size() < size_t(std::max(threads, 1))) all.scratch.resize(size_t(std::max(threads, 1)));
         for (Scratch& scratch : all.scratch) scratch.used = 0;
-        const int64_t size = RAYS / per_pixel * per_pixel, count = (rays + size - 1) / size;  // of rays in a block
+        static const int64_t WANTED = getenv("BLK") ? atoi(getenv("BLK")) : 256;
+        const int64_t size = std::max<int64_t>(WANTED / per_pixel, 1) * per_pixel, count = (rays + size - 1) / size;  // of rays in a block
         const int64_t each = (count + PARTS - 1) / PARTS, parts = each ? (count + each - 1) / each : 0;
         all.parts.assign(size_t(parts), Part());
         if (all.density_sums.size() < density.net->sums() * size_t(parts))
@@ -241,7 +277,7 @@ EXPORT int traced_error(const float* origins, const float* directions, const flo
             float* color_sums = all.color_sums.data() + size_t(p) * color->sums();
             std::fill_n(density_sums, density.net->sums(), 0.0f), std::fill_n(color_sums, color->sums(), 0.0f);
             for (int64_t b = p * each; b < std::min(count, (p + 1) * each); b++)
-                learn_block(path, nets, pixels, b * size, std::min(rays, (b + 1) * size), scratch, part, density_sums,
+                learn_block(path, nets, pixels, {thin, uint64_t(seed)}, b * size, std::min(rays, (b + 1) * size), scratch, part, density_sums,
                             color_sums);
             part.count = scratch.used - part.begin;
             all.parts[size_t(p)] = part;

@@ -20,7 +20,7 @@ from framework.geometry.points import Points
 from framework.geometry.rays import Rays
 from framework.kernels.math import safe_normalize
 from framework.kernels.native import torch_on_one_thread
-from framework.kernels.traced_error import TracedError
+from framework.kernels.traced_error import Pixels, TracedError
 from framework.model import Loss, Model, parts
 from framework.rendering.losses import (
     density_before,
@@ -118,9 +118,8 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
         depths = batch.distances is not None and config.depth_loss_mult > 0
         if not own or few or depths or batch.clear is not None or isinstance(config, MotionConfig):
             return None
-        background = batch.background.repeat_interleave(batch.rays_per_pixel, 0)
-        parts_of = self.sampler, self.field, self.renderer
-        return error_of_traced(batch.rays, *parts_of, background, batch.rgb, batch.weights)
+        pixels = Pixels(batch.background.repeat_interleave(batch.rays_per_pixel, 0), batch.rgb, batch.weights)
+        return error_of_traced(batch.rays, pixels, self.sampler, self.field, self.renderer, config.thin_gradients)
 
     def _depth_terms(self, rendered: Rendered, batch: PixelBatch) -> dict[str, Tensor]:
         """Return the losses of what is known of distances, of both levels, and of space that is known to be empty."""

@@ -180,10 +180,12 @@ class OccupancySampler(Sampler):
 
         if isinstance(field, HasGridDensity) and not self.endless:
             known = field.grid_density()
-            traced = None if known is None else trace(marched, known)
-            if traced is not None:
-                samples = Samples(traced.t_starts, traced.t_ends, traced.offsets, owners=traced.owners, early_stop=stop)
-                return samples.evaluated(traced.sigma, traced.features)
+            if known is not None:
+                found = trace(marched, known)
+                settings = {"owners": found.owners, "longest": found.longest, "early_stop": stop}
+                return Samples(found.t_starts, found.t_ends, found.offsets, **settings).evaluated(
+                    found.sigma, found.features
+                )
 
         def evaluate(wave: Wave) -> tuple[Tensor, Tensor]:
             points = interval_points(rays, wave.owners, wave, wave.positions, field.footprint)

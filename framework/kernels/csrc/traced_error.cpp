@@ -12,46 +12,8 @@ using namespace tracing;
 
 namespace {
 
-constexpr int64_t PARTS = 64;  // at most; each has sums of its own
-constexpr size_t KEPT = 1 << 25;  // floats that a thread keeps between calls
-
-struct Part {
-    int slot = 0;
-    int64_t begin = 0, count = 0;  // of its gradients among those of the thread
-    int64_t samples = 0;
-    double error = 0;
-};
-
-struct Scratch {  // of a thread
-    Samples samples;
-    std::vector<float> units, gradients;  // of the encoding, of all blocks of the thread, where it is not zero
-    int64_t used = 0;
-    std::vector<int64_t> order, live;           // of a block's samples that light reached, ray by ray
-    std::vector<float> values;                  // of each of these; see Values
-    std::vector<float> inputs, rgb, rgb_grad;   // of the colour network
-    std::vector<char> records;
-
-    void room(int64_t count, int64_t width, size_t record) {
-        const size_t all = size_t(count + LANES);
-        if (order.size() < all) order.resize(all * 2), live.resize(all * 2);
-        if (values.size() < all * 6) values.resize(all * 12);
-        if (rgb.size() < all * 3) rgb.resize(all * 6), rgb_grad.resize(all * 6);
-        if (inputs.size() < all * width) inputs.resize(all * width * 2);
-        if (records.size() < all * record) records.resize(all * record * 2);
-    }
-};
-
-struct State {  // what a caller has computed and not yet taken
-    std::vector<Scratch> scratch;  // of each thread
-    std::vector<Part> parts;
-    std::vector<float> density_sums, color_sums;
-    int64_t total = -1, inputs = 0;
-};
-
-State& state() {
-    static thread_local State of_caller;
-    return of_caller;
-}
+constexpr int64_t PARTS = 64;     // at most, each with sums of its own
+constexpr size_t KEPT = 1 << 25;  // floats that a thread keeps between calls, for fresh memory costs faults
 
 struct Pixels {  // of `per_pixel` consecutive rays each
     const float *background, *target, *weights;
@@ -59,26 +21,38 @@ struct Pixels {  // of `per_pixel` consecutive rays each
     float* rgb;
 };
 
-// The squared error of one pixel, times its weight and summed over channels; writes its colour and, to each ray's
-// `grad`, the derivative of the mean over all pixels and channels.
-double pixel_error(const Pixels& pixels, int64_t p, const float* colors, float* grad) {
-    double error = 0;
-    const float weight = pixels.weights ? pixels.weights[p] : 1;
-    for (int c = 0; c < 3; c++) {
-        float sum = 0;
-        for (int64_t k = 0; k < pixels.per_pixel; k++) sum += colors[k * 3 + c];
-        const float rgb = sum / float(pixels.per_pixel), apart = rgb - pixels.target[p * 3 + c];
-        pixels.rgb[p * 3 + c] = rgb;
-        error += double(weight) * apart * apart;
-        const float slope = 2 * weight * apart / float(double(pixels.count) * 3 * double(pixels.per_pixel));
-        for (int64_t k = 0; k < pixels.per_pixel; k++) grad[k * 3 + c] = slope;
-    }
-    return error;
-}
-
 struct Thinning {
     float floor;
     uint64_t seed;
+};
+
+struct Networks {
+    const Density& density;
+    const mlp::Layers& color;
+    int64_t inputs;  // of the colour network: the density network's outputs, and harmonics of the direction
+    int harmonics;
+};
+
+struct Part {  // of the rays, that a thread takes
+    int slot = 0;
+    int64_t begin = 0, count = 0;  // of its gradients among those of the thread
+    int64_t samples = 0;
+    double error = 0;
+};
+
+template <typename Value>
+Value* room(std::vector<Value>& values, size_t count) {
+    if (values.size() < count) values.resize(count * 2);
+    return values.data();
+}
+
+struct Scratch {  // of a thread
+    Samples samples;
+    std::vector<int64_t> order, live;
+    std::vector<float> values, inputs, rgb, by_rgb;
+    std::vector<char> records;
+    std::vector<float> units, by_encoded;  // what is taken in the end
+    int64_t used = 0;
 };
 
 // Pseudo-random bits of a number: SplitMix64 (Steele et al. 2014).
@@ -89,154 +63,204 @@ inline uint64_t scrambled(uint64_t x) {
     return x ^ x >> 31;
 }
 
-// Which of a block's samples go on to the backward pass: those with a gradient, but of samples whose gradient is below
-// `floor` times the mean a share in proportion to it, whose gradient is enlarged as much, so that its expectation stays.
-int64_t thin(int64_t count, float* through, float* rgb_grad, float* size, float floor, uint64_t seed, int64_t* live) {
-    double sum = 0;
-    for (int64_t n = 0; n < count; n++) {
-        const float* c = rgb_grad + n * 3;
-        sum += size[n] = std::fabs(through[n]) + std::fabs(c[0]) + std::fabs(c[1]) + std::fabs(c[2]);
+// A block of rays, there and back. Samples are those that light reached, ray by ray.
+struct Block {
+    const Path& path;
+    const Networks& nets;
+    const Pixels& pixels;
+    Scratch& own;
+    const int64_t base, rays;
+
+    int64_t first[RAYS + 1] = {}, count = 0;  // of each ray's samples; of all samples
+    int64_t* order = nullptr;                 // which of the evaluated samples each is
+    // Of each sample: its optical depth and that in front of it, the latter's derivative by sigma, its weight, the
+    // transmittance behind it, and the gradient of the logarithm of its density.
+    float *tau, *depth, *slope, *weight, *behind, *by_log;
+    float *rgb, *by_rgb;  // and the gradient of what comes before the sigmoid
+    float grads[RAYS * 3], opacity[RAYS];
+
+    Block(const Path& path, const Networks& nets, const Pixels& pixels, Scratch& own, int64_t base, int64_t rays)
+        : path(path), nets(nets), pixels(pixels), own(own), base(base), rays(rays) {}
+
+    void trace() {
+        Samples& samples = own.samples;
+        int32_t counts[RAYS] = {};
+        int64_t at[RAYS];
+        samples.clear();
+        trace_block(path, nets.density, base, base + rays, false, true, samples, counts);
+        for (int64_t r = 0; r < rays; r++) first[r + 1] = first[r] + counts[r], at[r] = first[r];
+        count = first[rays];
+        order = room(own.order, size_t(count));
+        for (int64_t n = 0; n < samples.used; n++)
+            if (samples.reached[size_t(n)]) order[at[samples.rays[size_t(n)] - base]++] = n;
+        const size_t wide = size_t(count + LANES - 1) / LANES * LANES;
+        float* values = room(own.values, wide * 6);
+        for (float** each : {&tau, &depth, &slope, &weight, &behind, &by_log}) *each = values, values += wide;
     }
-    const float bound = count ? floor * float(sum / double(count)) : 0;
-    int64_t living = 0;
-    for (int64_t n = 0; n < count; n++) {
-        if (size[n] == 0) continue;
-        if (size[n] < bound) {  // false for NaN, which must be seen
-            const float chance = size[n] / bound;
-            if (!(float(scrambled(seed << 20 ^ uint64_t(n)) >> 40) * 0x1p-24f < chance)) continue;
-            through[n] /= chance;
-            for (int c = 0; c < 3; c++) rgb_grad[n * 3 + c] /= chance;
-        }
-        live[living++] = n;
-    }
-    return living;
-}
 
-struct Networks {
-    const Density& density;
-    const mlp::Layers& color;
-    int64_t inputs;  // of the colour network: outputs of the density's, and harmonics of the direction
-    int harmonics;
-};
-
-// Rays [base, last): whole pixels, RAYS at most.
-void learn_block(const Path& path, const Networks& nets, const Pixels& pixels, const Thinning& thinning, int64_t base,
-                 int64_t last, Scratch& own, Part& part, float* density_sums, float* color_sums) {
-    Samples& samples = own.samples;
-    samples.clear();
-    int32_t counts[RAYS] = {};
-    trace_block(path, nets.density, base, last, false, true, samples, counts);
-    int64_t first[RAYS + 1] = {}, at[RAYS];
-    const int64_t rays = last - base, width = nets.density.width;
-    for (int64_t r = 0; r < rays; r++) first[r + 1] = first[r] + counts[r], at[r] = first[r];
-    const int64_t count = first[rays];
-    own.room(count, nets.inputs, nets.color.record());
-    for (int64_t n = 0; n < samples.used; n++)
-        if (samples.reached[size_t(n)]) own.order[size_t(at[samples.rays[size_t(n)] - base]++)] = n;
-    part.samples += count;
-
-    for (int64_t r = 0; r < rays; r++) {
+    void shade() {
+        const int64_t width = nets.density.width;
+        float* inputs = room(own.inputs, size_t(count * nets.inputs));
         float harmonics[16];
-        if (nets.harmonics) harmonics_of(path.directions + (base + r) * 3, nets.harmonics, harmonics);
-        for (int64_t n = first[r]; n < first[r + 1]; n++) {
-            float* to = &own.inputs[size_t(n * nets.inputs)];
-            std::memcpy(to, &samples.outputs[size_t(own.order[size_t(n)] * width)], sizeof(float) * size_t(width));
-            std::memcpy(to + width, harmonics, sizeof(float) * size_t(nets.harmonics));
+        for (int64_t r = 0; r < rays; r++) {
+            harmonics_of(path.directions + (base + r) * 3, nets.harmonics, harmonics);
+            for (int64_t n = first[r]; n < first[r + 1]; n++) {
+                float* to = inputs + n * nets.inputs;
+                std::memcpy(to, &own.samples.outputs[size_t(order[n] * width)], sizeof(float) * size_t(width));
+                std::memcpy(to + width, harmonics, sizeof(float) * size_t(nets.harmonics));
+            }
         }
+        rgb = room(own.rgb, size_t(count) * 3), by_rgb = room(own.by_rgb, size_t(count) * 3);
+        char* records = room(own.records, size_t(count) * nets.color.record());
+        nets.color.forward(inputs, count, mlp::SIGMOID, rgb, nullptr, records);
     }
-    nets.color.forward(own.inputs.data(), count, mlp::SIGMOID, own.rgb.data(), nullptr, own.records.data());
 
-    // As in compositing.cpp, with the exponentials of a whole vector at once.
-    const int64_t wide = (count + LANES - 1) / LANES * LANES;
-    float *depth = own.values.data(), *tau = depth + wide, *weight = tau + wide, *behind = weight + wide;
-    float *slope = behind + wide, *through = slope + wide;  // of depth by sigma; the gradient of the logarithm of sigma
-    const float *rgb = own.rgb.data();
-    float* rgb_grad = own.rgb_grad.data();
-    std::fill(depth + count, depth + wide, 0.0f), std::fill(tau + count, tau + wide, 0.0f);
-    for (int64_t r = 0; r < rays; r++) {
-        float sum = 0;
-        for (int64_t n = first[r]; n < first[r + 1]; n++) {
-            const size_t s = size_t(own.order[size_t(n)]);
-            const float sigma = samples.density[s], delta = samples.ends[s] - samples.starts[s];
-            depth[n] = sum;
-            sum += tau[n] = optical_depth(sigma, delta);
-            slope[n] = depth_slope(sigma, delta);
+    // As in compositing.cpp, with the exponentials of a whole vector at once. Returns the squared error of the pixels.
+    double composite() {
+        float colors[RAYS * 3];
+        for (int64_t r = 0; r < rays; r++) {
+            float sum = 0;
+            for (int64_t n = first[r]; n < first[r + 1]; n++) {
+                const size_t s = size_t(order[n]);
+                const float sigma = own.samples.density[s], delta = own.samples.ends[s] - own.samples.starts[s];
+                depth[n] = sum;
+                sum += tau[n] = optical_depth(sigma, delta);
+                slope[n] = depth_slope(sigma, delta);
+            }
         }
-    }
-    for (int64_t n = 0; n < wide; n += LANES) {
-        const Floats before = load(depth + n), own_depth = load(tau + n);
-        store(weight + n, exponential(-before) * opacity_of(own_depth));
-        store(behind + n, exponential(-(before + own_depth)));
-    }
-    float colors[RAYS * 3], opacity[RAYS], grads[RAYS * 3];
-    for (int64_t r = 0; r < rays; r++) {
-        float sum[3] = {}, total = 0;
-        for (int64_t n = first[r]; n < first[r + 1]; n++) {
-            total += weight[n];
-            for (int c = 0; c < 3; c++) sum[c] += weight[n] * rgb[n * 3 + c];
+        for (int64_t n = 0; n < count; n += LANES) {  // the rows have room for a whole last vector
+            const Floats before = load(depth + n), here = load(tau + n);
+            store(weight + n, exponential(-before) * opacity_of(here));
+            store(behind + n, exponential(-(before + here)));
         }
-        const float left = 1 - total < 0 ? 0 : 1 - total;
-        opacity[r] = total;
-        for (int c = 0; c < 3; c++) colors[r * 3 + c] = sum[c] + left * pixels.background[(base + r) * 3 + c];
+        for (int64_t r = 0; r < rays; r++) {
+            float sum[3] = {}, total = 0;
+            for (int64_t n = first[r]; n < first[r + 1]; n++) {
+                total += weight[n];
+                for (int c = 0; c < 3; c++) sum[c] += weight[n] * rgb[n * 3 + c];
+            }
+            const float left = 1 - total < 0 ? 0 : 1 - total;
+            opacity[r] = total;
+            for (int c = 0; c < 3; c++) colors[r * 3 + c] = sum[c] + left * pixels.background[(base + r) * 3 + c];
+        }
+        double error = 0;
+        for (int64_t r = 0; r < rays; r += pixels.per_pixel) error += pixel_error(r, colors + r * 3, grads + r * 3);
+        return error;
     }
-    for (int64_t r = 0; r < rays; r += pixels.per_pixel)
-        part.error += pixel_error(pixels, (base + r) / pixels.per_pixel, colors + r * 3, grads + r * 3);
 
-    for (int64_t r = 0; r < rays; r++) {
-        const float *g = grads + r * 3, *back = pixels.background + (base + r) * 3;
-        float base_grad = 0, after = 0;
-        if (1 - opacity[r] >= 0)
-            for (int c = 0; c < 3; c++) base_grad -= g[c] * back[c];
-        for (int64_t n = first[r]; n < first[r + 1]; n++) {
-            float by_weight = base_grad;
-            for (int c = 0; c < 3; c++) by_weight += g[c] * rgb[n * 3 + c];
-            after += by_weight * weight[n];
-            through[n] = by_weight;
+    // That of the pixel of ray r and those behind it, times its weight and summed over channels. Writes its colour,
+    // and the derivative of the mean over all pixels and channels to each ray's `grad`.
+    double pixel_error(int64_t r, const float* colors, float* grad) const {
+        const int64_t each = pixels.per_pixel, p = (base + r) / each;
+        const float factor = pixels.weights ? pixels.weights[p] : 1;
+        double error = 0;
+        for (int c = 0; c < 3; c++) {
+            float sum = 0;
+            for (int64_t k = 0; k < each; k++) sum += colors[k * 3 + c];
+            const float mean = sum / float(each), apart = mean - pixels.target[p * 3 + c];
+            pixels.rgb[p * 3 + c] = mean;
+            error += double(factor) * apart * apart;
+            const float slope = 2 * factor * apart / float(double(pixels.count) * 3 * double(each));
+            for (int64_t k = 0; k < each; k++) grad[k * 3 + c] = slope;
         }
-        for (int64_t n = first[r]; n < first[r + 1]; n++) {
-            const float by_weight = through[n], sigma = samples.density[size_t(own.order[size_t(n)])];
-            after -= by_weight * weight[n];
-            through[n] = slope[n] == 0 ? 0 : slope[n] * (by_weight * behind[n] - after) * sigma;
-            for (int c = 0; c < 3; c++) {
-                const float y = rgb[n * 3 + c];
-                rgb_grad[n * 3 + c] = weight[n] * g[c] * y * (1 - y);
+        return error;
+    }
+
+    // Back to density and colour of each sample.
+    void to_samples() {
+        for (int64_t r = 0; r < rays; r++) {
+            const float *g = grads + r * 3, *back = pixels.background + (base + r) * 3;
+            float own_background = 0, after = 0;
+            if (1 - opacity[r] >= 0)
+                for (int c = 0; c < 3; c++) own_background -= g[c] * back[c];
+            for (int64_t n = first[r]; n < first[r + 1]; n++) {
+                by_log[n] = own_background;  // the gradient of the weight, at first
+                for (int c = 0; c < 3; c++) by_log[n] += g[c] * rgb[n * 3 + c];
+                after += by_log[n] * weight[n];
+            }
+            for (int64_t n = first[r]; n < first[r + 1]; n++) {
+                after -= by_log[n] * weight[n];
+                const float by_tau = by_log[n] * behind[n] - after;
+                by_log[n] = slope[n] == 0 ? 0 : slope[n] * by_tau * own.samples.density[size_t(order[n])];
+                for (int c = 0; c < 3; c++) {
+                    const float y = rgb[n * 3 + c];
+                    by_rgb[n * 3 + c] = weight[n] * g[c] * y * (1 - y);
+                }
             }
         }
     }
-    const int64_t living = thin(count, through, rgb_grad, depth, thinning.floor, thinning.seed + uint64_t(base), own.live.data());
 
-    const int64_t encoded = nets.density.inputs;
-    const size_t all = size_t(own.used + living);
-    if (own.units.size() < all * 3) own.units.resize(all * 6);
-    if (own.gradients.size() < all * encoded) own.gradients.resize(all * encoded * 2);
-    alignas(64) float of_rgb[mlp::BLOCK * 3], of_inputs[mlp::BLOCK * mlp::MAX_WIDTH], of_outputs[mlp::BLOCK * mlp::MAX_WIDTH];
-    for (int64_t next = 0; next < living; next += mlp::BLOCK) {
-        const int size = int(std::min<int64_t>(mlp::BLOCK, living - next));
-        const int64_t* rows = &own.live[size_t(next)];
-        int64_t places[mlp::BLOCK];
-        for (int i = 0; i < size; i++) {
-            places[i] = own.order[size_t(rows[i])];
-            std::memcpy(of_rgb + i * 3, rgb_grad + rows[i] * 3, sizeof(float) * 3);
+    // Which samples go on through the networks: those with a gradient, but of those whose gradient is below `floor`
+    // times the mean only a share in proportion to it, whose gradient is enlarged as much.
+    int64_t thin(const Thinning& thinning) {
+        int64_t *live = room(own.live, size_t(count)), living = 0;
+        float* size = depth;
+        double sum = 0;
+        for (int64_t n = 0; n < count; n++) {
+            const float* c = by_rgb + n * 3;
+            sum += size[n] = std::fabs(by_log[n]) + std::fabs(c[0]) + std::fabs(c[1]) + std::fabs(c[2]);
         }
-        nets.color.backward(own.records.data(), rows, size, of_rgb, color_sums, of_inputs);
-        for (int i = 0; i < size; i++) {
-            std::memcpy(of_outputs + i * width, of_inputs + i * nets.inputs, sizeof(float) * size_t(width));
-            of_outputs[i * width] += through[rows[i]];
-            std::memcpy(&own.units[size_t(own.used + i) * 3], &samples.unit[size_t(places[i]) * 3], sizeof(float) * 3);
+        const float bound = count ? thinning.floor * float(sum / double(count)) : 0;
+        for (int64_t n = 0; n < count; n++) {
+            if (size[n] == 0) continue;
+            if (size[n] < bound) {  // false for NaN, which must be seen
+                const float chance = size[n] / bound;
+                const uint64_t bits = scrambled(thinning.seed ^ uint64_t(base) << 32 ^ uint64_t(n));
+                if (!(float(bits >> 40) * 0x1p-24f < chance)) continue;
+                by_log[n] /= chance;
+                for (int c = 0; c < 3; c++) by_rgb[n * 3 + c] /= chance;
+            }
+            live[living++] = n;
         }
-        nets.density.net->backward(samples.records.data(), places, size, of_outputs, density_sums,
-                                   &own.gradients[size_t(own.used * encoded)]);
-        own.used += size;
+        return living;
     }
+
+    // Back through both networks, for the first `living` of own.live.
+    void to_weights(int64_t living, float* density_sums, float* color_sums) {
+        const int64_t width = nets.density.width, encoded = nets.density.inputs;
+        float* units = room(own.units, size_t(own.used + living) * 3) + own.used * 3;
+        float* by_encoded = room(own.by_encoded, size_t((own.used + living) * encoded)) + own.used * encoded;
+        float of_rgb[mlp::BLOCK * 3], of_inputs[mlp::BLOCK * mlp::MAX_WIDTH], of_outputs[mlp::BLOCK * mlp::MAX_WIDTH];
+        for (int64_t next = 0; next < living; next += mlp::BLOCK) {
+            const int size = int(std::min<int64_t>(mlp::BLOCK, living - next));
+            const int64_t* rows = &own.live[size_t(next)];
+            int64_t evaluated[mlp::BLOCK];
+            for (int i = 0; i < size; i++) {
+                evaluated[i] = order[rows[i]];
+                std::memcpy(of_rgb + i * 3, by_rgb + rows[i] * 3, sizeof(float) * 3);
+                std::memcpy(units + (next + i) * 3, &own.samples.unit[size_t(evaluated[i]) * 3], sizeof(float) * 3);
+            }
+            nets.color.backward(own.records.data(), rows, size, of_rgb, color_sums, of_inputs);
+            for (int i = 0; i < size; i++) {
+                std::memcpy(of_outputs + i * width, of_inputs + i * nets.inputs, sizeof(float) * size_t(width));
+                of_outputs[i * width] += by_log[rows[i]];
+            }
+            nets.density.net->backward(own.samples.records.data(), evaluated, size, of_outputs, density_sums,
+                                       by_encoded + next * encoded);
+        }
+        own.used += living;
+    }
+};
+
+struct Learnt {  // what a caller has computed and not yet taken
+    std::vector<Scratch> scratch;  // of each thread
+    std::vector<Part> parts;
+    std::vector<float> density_sums, color_sums;
+    int64_t total = -1, inputs = 0;
+};
+
+Learnt& learnt() {
+    static thread_local Learnt of_caller;
+    return of_caller;
 }
 
 }  // namespace
 
 // The rays, their grid and the density are as in trace_rays. The colour is a network on the density network's outputs
-// and `bands` bands of harmonics of the direction. background (R, 3); target (P, 3) and weights (P), which may be null,
-// of the pixels of `per_pixel` consecutive rays. Writes rgb (P, 3), the weighted mean of squares `error` (1), and the
-// gradients of the weights of both networks. samples (1): those that light reached. `total`: those with a gradient,
-// which traced_error_take returns.
+// and `bands` bands of harmonics of the direction. background (R, 3); target (P, 3) and pixel_weights (P), which may be
+// null, of the pixels of `per_pixel` consecutive rays. floor, seed: see Block::thin. Writes rgb (P, 3), the weighted
+// mean of squares `error` (1), the gradients of the weights of both networks, and `samples` (1): how many light reached.
+// `total`: how many have a gradient, which traced_error_take returns.
 EXPORT int traced_error(const float* origins, const float* directions, const float* enter, const float* leave,
                         const float* first, const int64_t* slices, int64_t rays, const int64_t* limits, int waves,
                         const float* box, float step, float cone, const uint8_t* bits, const uint8_t* blocks,
@@ -245,8 +269,8 @@ EXPORT int traced_error(const float* origins, const float* directions, const flo
                         int levels, const int64_t* widths, int layers, const float* const* weights, int bf16,
                         const int64_t* color_widths, int color_layers, const float* const* color_weights, int bands,
                         const float* background, const float* target, const float* pixel_weights, int64_t per_pixel,
-                        float thin, int64_t seed, float* rgb, float* error, float* const* weight_grads, float* const* color_weight_grads,
-                        int64_t* samples, int threads, int64_t* total) {
+                        float floor, int64_t seed, float* rgb, float* error, float* const* weight_grads,
+                        float* const* color_weight_grads, int64_t* samples, int threads, int64_t* total) {
     return guarded([&] {
         const Path path{origins, directions, enter, leave,  first,      slices, limits, waves,
                         box,     step,       cone,  bits,   blocks,     resolution, boxes, budget};
@@ -259,31 +283,37 @@ EXPORT int traced_error(const float* origins, const float* directions, const flo
         if (per_pixel < 1 || per_pixel > RAYS || rays % per_pixel)
             throw std::invalid_argument("a pixel has 1 to 256 rays, all of them here");
         const Pixels pixels{background, target, pixel_weights, rays / per_pixel, per_pixel, rgb};
-        State& all = state();
+        const Thinning thinning{floor, scrambled(uint64_t(seed))};
+        Learnt& all = learnt();
         all.total = -1, all.inputs = density.inputs;
         if (all.scratch.size() < size_t(std::max(threads, 1))) all.scratch.resize(size_t(std::max(threads, 1)));
         for (Scratch& scratch : all.scratch) scratch.used = 0;
-        static const int64_t WANTED = getenv("BLK") ? atoi(getenv("BLK")) : 256;
-        const int64_t size = std::max<int64_t>(WANTED / per_pixel, 1) * per_pixel, count = (rays + size - 1) / size;  // of rays in a block
-        const int64_t each = (count + PARTS - 1) / PARTS, parts = each ? (count + each - 1) / each : 0;
+        static const int64_t BLOCK_RAYS = getenv("BLK") ? atoi(getenv("BLK")) : 64;
+        const int64_t size = std::max<int64_t>(BLOCK_RAYS / per_pixel, 1) * per_pixel, blocks_of = (rays + size - 1) / size;
+        const int64_t each = (blocks_of + PARTS - 1) / PARTS, parts = each ? (blocks_of + each - 1) / each : 0;
+        float* density_sums = room(all.density_sums, density.net->sums() * size_t(parts));
+        float* color_sums = room(all.color_sums, color->sums() * size_t(parts));
         all.parts.assign(size_t(parts), Part());
-        if (all.density_sums.size() < density.net->sums() * size_t(parts))
-            all.density_sums.resize(density.net->sums() * size_t(parts));
-        if (all.color_sums.size() < color->sums() * size_t(parts)) all.color_sums.resize(color->sums() * size_t(parts));
         for_chunks(threads, parts, [&](int64_t p, int slot) {
             Scratch& scratch = all.scratch[size_t(slot)];
             Part part{slot, scratch.used};
-            float* density_sums = all.density_sums.data() + size_t(p) * density.net->sums();
-            float* color_sums = all.color_sums.data() + size_t(p) * color->sums();
-            std::fill_n(density_sums, density.net->sums(), 0.0f), std::fill_n(color_sums, color->sums(), 0.0f);
-            for (int64_t b = p * each; b < std::min(count, (p + 1) * each); b++)
-                learn_block(path, nets, pixels, {thin, uint64_t(seed)}, b * size, std::min(rays, (b + 1) * size), scratch, part, density_sums,
-                            color_sums);
+            float* of_density = density_sums + size_t(p) * density.net->sums();
+            float* of_color = color_sums + size_t(p) * color->sums();
+            std::fill_n(of_density, density.net->sums(), 0.0f), std::fill_n(of_color, color->sums(), 0.0f);
+            for (int64_t b = p * each; b < std::min(blocks_of, (p + 1) * each); b++) {
+                Block block(path, nets, pixels, scratch, b * size, std::min(rays - b * size, size));
+                block.trace();
+                block.shade();
+                part.error += block.composite();
+                block.to_samples();
+                block.to_weights(block.thin(thinning), of_density, of_color);
+                part.samples += block.count;
+            }
             part.count = scratch.used - part.begin;
             all.parts[size_t(p)] = part;
         });
-        density.net->write(all.density_sums.data(), parts, threads, weight_grads);
-        color->write(all.color_sums.data(), parts, threads, color_weight_grads);
+        density.net->write(density_sums, parts, threads, weight_grads);
+        color->write(color_sums, parts, threads, color_weight_grads);
         double sum = 0;
         *samples = *total = 0;
         for (const Part& part : all.parts) sum += part.error, *samples += part.samples, *total += part.count;
@@ -295,7 +325,7 @@ EXPORT int traced_error(const float* origins, const float* directions, const flo
 // Of the samples with a gradient: where they are, unit (N, 3), and the gradient of their encoding (N, E).
 EXPORT int traced_error_take(int64_t total, float* unit, float* grad, int threads) {
     return guarded([&] {
-        State& all = state();
+        Learnt& all = learnt();
         if (all.total != total) throw std::invalid_argument("there is no such trace");
         std::vector<int64_t> begins;
         int64_t sum = 0;
@@ -304,11 +334,11 @@ EXPORT int traced_error_take(int64_t total, float* unit, float* grad, int thread
             const Part& part = all.parts[size_t(p)];
             const Scratch& from = all.scratch[size_t(part.slot)];
             std::copy_n(from.units.data() + part.begin * 3, part.count * 3, unit + begins[size_t(p)] * 3);
-            std::copy_n(from.gradients.data() + part.begin * all.inputs, part.count * all.inputs,
+            std::copy_n(from.by_encoded.data() + part.begin * all.inputs, part.count * all.inputs,
                         grad + begins[size_t(p)] * all.inputs);
         });
         all.total = -1;
         for (Scratch& scratch : all.scratch)
-            if (scratch.gradients.size() > KEPT) scratch = Scratch();
+            if (scratch.by_encoded.size() > KEPT) scratch = Scratch();
     });
 }

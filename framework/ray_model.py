@@ -45,6 +45,9 @@ PATCH_IMAGE = 500
 """Longer side of an image, pixels, in which neighbouring rays of a patch are a pixel apart; in larger ones, as far in
 relation to the image."""
 
+PLAIN = "render", "color_error", "regularizers"
+"""Methods that a model must have from here for its loss to be learnt in one call."""
+
 
 class RayModel(Model[RayConfigT], Generic[RayConfigT]):
     """A model that evaluates a field at the positions of a sampler and composites the values with a renderer.
@@ -112,11 +115,12 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
 
     def _traced(self, batch: PixelBatch) -> TracedError | None:
         """Return the loss of a batch if it is the error of colours alone and known in one call; None otherwise."""
-        config, kind = self.config, type(self)
-        own = (kind.render, kind.color_error, kind.regularizers) == _PLAIN and type(self.sampler).losses is Sampler.losses
+        config = self.config
+        own = all(getattr(getattr(self, name), "__func__", None) is getattr(RayModel, name) for name in PLAIN)
         few = isinstance(config, FewImagesConfig) and (config.occlusion_loss_mult or config.unseen_loss_mult)
         depths = batch.distances is not None and config.depth_loss_mult > 0
-        if not own or few or depths or batch.clear is not None or isinstance(config, MotionConfig):
+        others = type(self.sampler).losses is not Sampler.losses or isinstance(config, MotionConfig)
+        if not own or few or depths or others or batch.clear is not None:
             return None
         pixels = Pixels(batch.background.repeat_interleave(batch.rays_per_pixel, 0), batch.rgb, batch.weights)
         return error_of_traced(batch.rays, pixels, self.sampler, self.field, self.renderer, config.thin_gradients)
@@ -233,9 +237,6 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
     def rays_per_pixel(self) -> int:
         """Number of rays that are averaged for each pixel of an image, as configured."""
         return self.config.rays_per_pixel
-
-
-_PLAIN = RayModel.render, RayModel.color_error, RayModel.regularizers
 
 
 def depth_loss(rendered: Rendered, batch: PixelBatch) -> Tensor | None:

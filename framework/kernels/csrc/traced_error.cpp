@@ -6,12 +6,11 @@
 #include "harmonics.h"
 #include "trace.h"
 
-#include <cstdlib>
-
 using namespace tracing;
 
 namespace {
 
+constexpr int64_t BLOCK_RAYS = 64;  // whose samples fit the second cache; with 256 a step takes 1.1 times as long
 constexpr int64_t PARTS = 64;     // at most, each with sums of its own
 constexpr size_t KEPT = 1 << 25;  // floats that a thread keeps between calls, for fresh memory costs faults
 
@@ -288,9 +287,8 @@ EXPORT int traced_error(const float* origins, const float* directions, const flo
         all.total = -1, all.inputs = density.inputs;
         if (all.scratch.size() < size_t(std::max(threads, 1))) all.scratch.resize(size_t(std::max(threads, 1)));
         for (Scratch& scratch : all.scratch) scratch.used = 0;
-        static const int64_t BLOCK_RAYS = getenv("BLK") ? atoi(getenv("BLK")) : 64;
-        const int64_t size = std::max<int64_t>(BLOCK_RAYS / per_pixel, 1) * per_pixel, blocks_of = (rays + size - 1) / size;
-        const int64_t each = (blocks_of + PARTS - 1) / PARTS, parts = each ? (blocks_of + each - 1) / each : 0;
+        const int64_t size = std::max<int64_t>(BLOCK_RAYS / per_pixel, 1) * per_pixel, count = (rays + size - 1) / size;
+        const int64_t each = (count + PARTS - 1) / PARTS, parts = each ? (count + each - 1) / each : 0;
         float* density_sums = room(all.density_sums, density.net->sums() * size_t(parts));
         float* color_sums = room(all.color_sums, color->sums() * size_t(parts));
         all.parts.assign(size_t(parts), Part());
@@ -300,7 +298,7 @@ EXPORT int traced_error(const float* origins, const float* directions, const flo
             float* of_density = density_sums + size_t(p) * density.net->sums();
             float* of_color = color_sums + size_t(p) * color->sums();
             std::fill_n(of_density, density.net->sums(), 0.0f), std::fill_n(of_color, color->sums(), 0.0f);
-            for (int64_t b = p * each; b < std::min(blocks_of, (p + 1) * each); b++) {
+            for (int64_t b = p * each; b < std::min(count, (p + 1) * each); b++) {
                 Block block(path, nets, pixels, scratch, b * size, std::min(rays - b * size, size));
                 block.trace();
                 block.shade();

@@ -6,7 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from framework.data.pixels import PixelBatch
 from framework.kernels.native import available
+from framework.kernels.traced_error import TracedError
 from framework.ray_model import RayModel
 from framework.training.trainer import Trainer
 from tests.training.helpers import tiny_trainer
@@ -44,17 +46,19 @@ def test_other_losses_and_fields_are_not_left_out(
     shared_tiny: Path, tmp_path: Path, settings: dict[str, object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What the one call does not know is computed by single operations."""
-    model = tiny_trainer("instant-ngp", shared_tiny, tmp_path, **settings).model
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "b", **settings)
-    seen = []
-    usual = RayModel._traced
-    monkeypatch.setattr(RayModel, "_traced", lambda self, batch: seen.append((batch, usual(self, batch))) or seen[-1][1])
+    seen, usual = [], RayModel._traced
+
+    def watched(self: RayModel, batch: PixelBatch) -> TracedError | None:
+        seen.append((batch, usual(self, batch)))
+        return seen[-1][1]
+
+    monkeypatch.setattr(RayModel, "_traced", watched)
     trainer.train_step()
     (batch, found), *_ = seen
     if "depth_loss_mult" in settings:  # without known distances there is no such loss
         assert found is not None
         batch = dataclasses.replace(batch, distances=torch.ones(len(batch)))
-        model.train()
         found = usual(trainer.model, batch)
     assert found is None
 

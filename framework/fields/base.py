@@ -81,7 +81,7 @@ class HasGridDensity(Protocol):
 
 @runtime_checkable
 class HasGridColor(HasGridDensity, Protocol):
-    """Such a field whose colour may be a small network too, which is learnt in one call."""
+    """A field of such a density whose colour may be a small network too, so that its error is learnt in one call."""
 
     def grid_color(self) -> GridColor | None:
         """Return the colour as `framework.kernels.traced_error` computes it; None to evaluate `Field.color` instead."""

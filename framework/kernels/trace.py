@@ -94,7 +94,8 @@ def trace_reference(marched: March, density: GridDensity) -> Traced:
         (positions,) = gather_rows([[w.positions for w in waves]], order)
         return density.at(positions)
 
-    return Traced(starts, ends, owners, offsets, *evaluated.choose(order, chosen), marched.longest)
+    sigma, features = evaluated.choose(order, chosen)
+    return Traced(starts, ends, owners, offsets, sigma, features, marched.longest)
 
 
 TRACE = Operation("trace", trace_reference)

@@ -119,9 +119,7 @@ def _fits(marched: March, density: GridDensity, color: GridColor, pixels: Pixels
 
 
 @TRACED_ERROR.implementation(CPP, fits=_fits)
-def _compiled(
-    marched: March, density: GridDensity, color: GridColor, pixels: Pixels, thin: float = 0.0
-) -> TracedError:
+def _compiled(marched: March, density: GridDensity, color: GridColor, pixels: Pixels, thin: float = 0.0) -> TracedError:
     background, target, weights = (None if tensor is None else tensor.contiguous() for tensor in pixels)
     assert background is not None
     assert target is not None
@@ -160,7 +158,5 @@ class _Known(torch.autograd.Function):
         return None, None, *(each if factor == 1 else each * factor for each in ctx.grads)
 
 
-_traced_error: Callable[..., int] = native.Function(
-    "traced_error", "ppppppqpipffppiifpppippipipipipipppqfqpppppi", "q"
-)
+_traced_error: Callable[..., int] = native.Function("traced_error", "ppppppqpipffppiifpppippipipipipipppqfqpppppi", "q")
 _take = native.Function("traced_error_take", "qppi")

@@ -182,10 +182,9 @@ class OccupancySampler(Sampler):
             known = field.grid_density()
             if known is not None:
                 found = trace(marched, known)
-                settings = {"owners": found.owners, "longest": found.longest, "early_stop": stop}
-                return Samples(found.t_starts, found.t_ends, found.offsets, **settings).evaluated(
-                    found.sigma, found.features
-                )
+                intervals = found.t_starts, found.t_ends, found.offsets
+                samples = Samples(*intervals, owners=found.owners, longest=found.longest, early_stop=stop)
+                return samples.evaluated(found.sigma, found.features)
 
         def evaluate(wave: Wave) -> tuple[Tensor, Tensor]:
             points = interval_points(rays, wave.owners, wave, wave.positions, field.footprint)

@@ -115,7 +115,7 @@ def test_slices_of_time_boxes_and_nan_are_those_of_waves() -> None:
         occupied = torch.rand(slices, levels * 16**3) < 0.3
         occupied[0] &= slices == 1
         occupancy = Occupancy(occupied.view(-1), BOX, 16, levels, slices)
-        for run in (TRACE.choose((BOX,), march(moving, occupancy, 0.03, 0.0, None, 1e-2), density).run, trace_reference):
+        for run in (TRACE.implementations[0].run, trace_reference):
             with torch.no_grad():
                 found.append(run(march(moving, occupancy, 0.03, 0.0, None, 1e-2), density))
         traced, waves = found

@@ -20,6 +20,7 @@ from framework.geometry.points import Points
 from framework.geometry.rays import Rays
 from framework.kernels.math import safe_normalize
 from framework.kernels.native import torch_on_one_thread
+from framework.kernels.traced_error import Pixels, TracedError
 from framework.model import Loss, Model, parts
 from framework.rendering.losses import (
     density_before,
@@ -32,6 +33,7 @@ from framework.rendering.losses import (
 )
 from framework.rendering.rendered import Picture, Rendered
 from framework.rendering.renderer import Renderer
+from framework.rendering.traced import error_of_traced
 from framework.samplers.base import Sampler
 from framework.scene.few_images import FewImagesConfig, unseen_weight
 from framework.scene.motion import MotionConfig
@@ -42,6 +44,9 @@ PATCH = 8
 PATCH_IMAGE = 500
 """Longer side of an image, pixels, in which neighbouring rays of a patch are a pixel apart; in larger ones, as far in
 relation to the image."""
+
+PLAIN = "render", "color_error", "regularizers"
+"""Methods that a model must have from here for its loss to be learnt in one call."""
 
 
 class RayModel(Model[RayConfigT], Generic[RayConfigT]):
@@ -80,6 +85,9 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
             batch: pixels with their true colours.
             step: number of training steps done.
         """
+        known = self._traced(batch)
+        if known is not None:
+            return Loss({"rgb": known.error}, known.rgb, known.num_samples)
         drawn, config = batch, self.config
         moves = isinstance(config, MotionConfig) and self.scene.moving and batch.alpha is not None
         if isinstance(config, MotionConfig) and moves and config.transparent_share < 1:
@@ -104,6 +112,18 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
         if batch is not drawn:  # of what was left out it is known that nothing is before the background
             rgb = drawn.rgb.index_copy(0, kept, rgb.to(drawn.rgb))
         return Loss(terms, rgb, rendered.num_samples)
+
+    def _traced(self, batch: PixelBatch) -> TracedError | None:
+        """Return the loss of a batch if it is the error of colours alone and known in one call; None otherwise."""
+        config = self.config
+        own = all(getattr(getattr(self, name), "__func__", None) is getattr(RayModel, name) for name in PLAIN)
+        few = isinstance(config, FewImagesConfig) and (config.occlusion_loss_mult or config.unseen_loss_mult)
+        depths = batch.distances is not None and config.depth_loss_mult > 0
+        others = type(self.sampler).losses is not Sampler.losses or isinstance(config, MotionConfig)
+        if not own or few or depths or others or batch.clear is not None:
+            return None
+        pixels = Pixels(batch.background.repeat_interleave(batch.rays_per_pixel, 0), batch.rgb, batch.weights)
+        return error_of_traced(batch.rays, pixels, self.sampler, self.field, self.renderer, config.thin_gradients)
 
     def _depth_terms(self, rendered: Rendered, batch: PixelBatch) -> dict[str, Tensor]:
         """Return the losses of what is known of distances, of both levels, and of space that is known to be empty."""

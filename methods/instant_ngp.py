@@ -53,6 +53,7 @@ class InstantNGPConfig(
     adam_beta2=0.95,
     adam_eps=1e-15,
     num_steps=AUTO,
+    thin_gradients=0.5,
 ):
     """Settings of instant-ngp."""
 

@@ -215,6 +215,7 @@ class RayConfig(TrainConfig):
         "train_rays_per_pixel_from": (0, 1),
         "depth_loss_mult": AT_LEAST_0,
         "free_space_loss_mult": AT_LEAST_0,
+        "thin_gradients": (0, 16),
     }
     """Allowed ranges."""
     num_rays_per_batch: int = 4_096
@@ -233,6 +234,10 @@ class RayConfig(TrainConfig):
     free_space_loss_mult: float = 0.0
     """Weight of the penalty on matter right before cameras: nearer than most of the points that a camera sees, or than
     any other camera sees; 0 for none."""
+    thin_gradients: float = 0.0
+    """Samples whose gradient is below this times the mean take part in a step at random, in proportion to it, and count
+    as many times more, so that the mean over steps stays; 0 for all. It needs compiled kernels, and has an effect where
+    errors of traced rays are learnt in one call (instant-ngp)."""
     eval_num_rays_per_chunk: int = 8_192
     """Rays rendered at once in evaluation. This changes memory and speed, never the result."""
 

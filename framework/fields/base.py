@@ -15,6 +15,7 @@ from framework.geometry.points import Footprint, Points
 from framework.kernels.memory import require
 from framework.kernels.mlp import Activation, density_mlp, mlp
 from framework.kernels.trace import GridDensity
+from framework.kernels.traced_error import GridColor
 
 DensityFunction = Callable[[Points], tuple[Tensor, Tensor]]
 """Function from N points to density (N,), 1/length, and features (N, F); samplers are called with it."""
@@ -76,6 +77,14 @@ class HasGridDensity(Protocol):
 
     def grid_density(self) -> GridDensity | None:
         """Return the density as `framework.kernels.trace` computes it; None to evaluate `Field.density` instead."""
+
+
+@runtime_checkable
+class HasGridColor(HasGridDensity, Protocol):
+    """A field of such a density whose colour may be a small network too, so that its error is learnt in one call."""
+
+    def grid_color(self) -> GridColor | None:
+        """Return the colour as `framework.kernels.traced_error` computes it; None to evaluate `Field.color` instead."""
 
 
 @runtime_checkable

@@ -14,6 +14,7 @@ from framework.geometry.points import Points
 from framework.kernels.contraction import contract_to_unit
 from framework.kernels.spherical_harmonics import spherical_harmonics
 from framework.kernels.trace import GridDensity
+from framework.kernels.traced_error import GridColor
 
 NUM_FEATURES = 16
 """Number of features that the density network passes to the colour network; the first is the log-density."""
@@ -149,10 +150,20 @@ class EncodedField(BoxField):
             return None
         if grid.deferred is not None:
             grid.deferred.layout = grid.layout
-        weights = [layer.weight for layer in self.density_head if isinstance(layer, nn.Linear)]
+        weights = _weights(self.density_head)
         if weights[0].shape[1] != grid.num_features:  # it reads further coordinates
             return None
         return GridDensity(self.scale, self.shift, grid.table, grid.layout, grid.deferred, weights)
+
+    def grid_color(self) -> GridColor | None:
+        """Return the colour as `traced_error` computes it; None if this field's is another."""
+        head, opening = self.color_head, self.direction_opening
+        plain = type(self).color is EncodedField.color and "color" not in vars(self) and self.appearance is None
+        if not plain or type(head) is not MLP or head._forward_hooks or head._forward_pre_hooks:
+            return None
+        if opening is not None and not opening.complete:
+            return None
+        return GridColor(self.direction_levels, _weights(head))
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         inputs = [features]
@@ -168,3 +179,8 @@ class EncodedField(BoxField):
             return spherical_harmonics(directions, levels)
         open_bands = spherical_harmonics(directions, opening.count)
         return opening.completed(open_bands, levels**2, 2 * opening.count - 1)
+
+
+def _weights(network: MLP) -> list[Tensor]:
+    """Return the weights of each layer."""
+    return [layer.weight for layer in network if isinstance(layer, nn.Linear)]

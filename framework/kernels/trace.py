@@ -1,24 +1,27 @@
 """All waves of a march in one compiled call: marching, hash grid and density network of a block of rays.
 
-`OccupancySampler` marches wave by wave, evaluates the field and ends rays whose light is spent. That loop is the
-readable form, for any field and device. Where the density is a small network on a hash grid, `trace` returns what the
-loop would, computed block by block in cache, without Python, copies and waiting between waves (`csrc/trace.cpp`).
+`OccupancySampler` marches wave by wave, evaluates the field and ends rays whose light is spent. Where the density is a
+small network on a hash grid, `trace` does that (`trace_reference` in its readable form). The compiled form computes it
+block by block in cache, without Python, copies and waiting between waves (`csrc/trace.cpp`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from framework.kernels import kept, native
-from framework.kernels.dispatch import CPP
+from framework.kernels.dispatch import CPP, Operation
 from framework.kernels.hash_grid import HASH_GRID, HashGridLayout, hash_grid
 from framework.kernels.hash_grid_lookup import TableGradient
 from framework.kernels.march import WAVES, CompiledMarch, March
 from framework.kernels.mlp import DENSITY_NETWORK, density_mlp, multiplies_bf16
+from framework.kernels.rows import gather_rows
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,11 @@ class GridDensity:
     weights: Sequence[Tensor]
     """(D_out, D_in) weights of each layer, without biases."""
 
+    def at(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the density (N,) and the outputs (N, D) of the network at `positions` (N, 3), scene units."""
+        unit = torch.addcmul(self.shift, positions, self.scale)
+        return density_mlp((hash_grid(unit, self.table, self.layout, self.deferred),), self.weights)
+
 
 @dataclass(frozen=True)
 class Traced:
@@ -55,61 +63,105 @@ class Traced:
     """(N,) density, with its gradient if gradients are enabled."""
     features: Tensor
     """(N, D) outputs of the network, likewise."""
+    longest: int | None = None
+    """Upper bound of the number of samples on a ray; None if finding it would take a pass over them."""
 
 
-def trace(marched: March, density: GridDensity) -> Traced | None:
-    """Return the samples of a march that has just begun, up to its early stop, with density and features.
+def trace(marched: March, density: GridDensity) -> Traced:
+    """Return the samples of a march up to its early stop, with density and features.
+
+    Args:
+        marched: the march of R rays, before its first wave; no gradient goes to these.
+        density: the density along the rays.
+    """
+    return TRACE((marched.rays.origins, density.table, *density.weights), marched, density)
+
+
+def trace_reference(marched: March, density: GridDensity) -> Traced:
+    """Compute `trace` of `marched` and `density` wave by wave, on any device."""
+    evaluated = kept.Waves()
+    while (wave := marched.wave(marched.next_limit)) is not None:
+        marched.advance(evaluated.evaluate(len(wave.owners), partial(density.at, wave.positions))[0])
+    order, offsets = marched.finish()
+    waves = marched.waves
+    if not waves:  # no occupied cell on any ray
+        empty = marched.rays.nears[:0]
+        return Traced(empty, empty, order, offsets, *density.at(marched.rays.origins[:0]))
+    columns = [[w.t_starts for w in waves], [w.t_ends for w in waves], [w.owners for w in waves]]
+    starts, ends, owners = gather_rows(columns, order)
+
+    def chosen() -> tuple[Tensor, ...]:
+        (positions,) = gather_rows([[w.positions for w in waves]], order)
+        return density.at(positions)
+
+    sigma, features = evaluated.choose(order, chosen)
+    return Traced(starts, ends, owners, offsets, sigma, features, marched.longest)
+
+
+TRACE = Operation("trace", trace_reference)
+
+
+def is_compiled(marched: March, density: GridDensity) -> bool:
+    """Return whether march, hash grid and network run compiled, with the derivatives that are asked for.
 
     Args:
         marched: the march, before its first wave.
-        density: the density along the rays.
-
-    Returns:
-        What waves would give; None where march, hash grid or network would not run compiled, or if positions are to
-        have a gradient, so that the caller has to go wave by wave.
+        density: the density along its rays.
     """
-    if not isinstance(marched, CompiledMarch) or marched.waves or not _is_compiled(marched, density):
-        return None
-    rays, layout, weights = len(marched.rays), density.layout, density.weights
-    widths = (weights[0].shape[1], *(weight.shape[0] for weight in weights))
-    features, follows = density.table.shape[1], torch.is_grad_enabled()
-    total = _trace(
-        marched.origins.data_ptr(), marched.directions.data_ptr(), marched.enter.data_ptr(), marched.leave.data_ptr(),
-        marched.first.data_ptr(), None if marched.slices is None else marched.slices.data_ptr(), rays,
-        native.integers(WAVES), len(WAVES), marched.box.data_ptr(), marched.step, marched.cone,
-        marched.bits.data_ptr(), marched.blocks.data_ptr(), marched.resolution, marched.levels, marched.budget,
-        native.pointer(density.scale, "the scale", (3,)), native.pointer(density.shift, "the shift", (3,)),
-        native.pointer(density.table, "the hash table", (layout.num_entries, features)), features, *layout.arrays,
-        layout.num_levels, native.integers(widths), len(weights),
-        native.pointers([
-            native.pointer(weight, "weights", (widths[layer + 1], widths[layer]))
-            for layer, weight in enumerate(weights)
-        ]),
-        native.pointers([None] * len(weights)), multiplies_bf16(), follows, native.threads(),
-    )  # fmt: skip
+    if not isinstance(marched, CompiledMarch) or marched.waves:
+        return False
+    origins, table, weights = marched.origins, density.table, density.weights
+    grid = HASH_GRID.choose((origins, table), origins, table, density.layout, density.deferred)
+    network = DENSITY_NETWORK.choose((origins, *weights), (origins,), weights)
+    return grid.backend is CPP and network.backend is CPP and all(t.is_contiguous() for t in (table, *weights))
+
+
+@TRACE.implementation(CPP, fits=is_compiled)
+def _compiled(marched: March, density: GridDensity) -> Traced:
+    rays, follows = len(marched.rays), torch.is_grad_enabled()
+    total = _trace(*arguments(marched, density), multiplies_bf16(), follows, native.threads())
     starts, ends, sigma = (torch.empty(total) for _ in range(3))
     owners, offsets = torch.empty(total, dtype=torch.int64), torch.empty(rays + 1, dtype=torch.int64)
-    unit, outputs = torch.empty(total, 3), torch.empty(total, widths[-1])
-    encoded = torch.empty(total, widths[0]) if follows else None
+    unit, outputs = torch.empty(total, 3), torch.empty(total, density.weights[-1].shape[0])
+    encoded = torch.empty(total, density.weights[0].shape[1]) if follows else None
     _take(
         rays, total, offsets.data_ptr(), starts.data_ptr(), ends.data_ptr(), owners.data_ptr(), unit.data_ptr(),
         None if encoded is None else encoded.data_ptr(), outputs.data_ptr(), sigma.data_ptr(), native.threads(),
     )  # fmt: skip
     if encoded is not None:  # the operations that made these values add their gradients
         with kept.given(hash_grid=encoded, mlp=outputs, density=sigma):
-            found = hash_grid(unit, density.table, layout, density.deferred)
-            sigma, outputs = density_mlp((found,), weights)
+            found = hash_grid(unit, density.table, density.layout, density.deferred)
+            sigma, outputs = density_mlp((found,), density.weights)
     return Traced(starts, ends, owners, offsets, sigma, outputs)
 
 
-def _is_compiled(marched: CompiledMarch, density: GridDensity) -> bool:
-    """Return whether both operations would run compiled, with the derivatives that are asked for."""
-    origins, table, weights = marched.origins, density.table, density.weights
-    grid = HASH_GRID.choose((origins, table), origins, table, density.layout, density.deferred)
-    inputs = (origins,)
-    network = DENSITY_NETWORK.choose((*inputs, *weights), inputs, weights)
-    return grid.backend is CPP and network.backend is CPP and all(t.is_contiguous() for t in (table, *weights))
+def arguments(marched: March, density: GridDensity) -> tuple[Any, ...]:
+    """Return the arguments of compiled traces, checked.
+
+    Args:
+        marched: the rays and their grid, for which `is_compiled` holds.
+        density: the density along the rays.
+    """
+    assert isinstance(marched, CompiledMarch)
+    layout, features = density.layout, density.table.shape[1]
+    return (
+        marched.origins.data_ptr(), marched.directions.data_ptr(), marched.enter.data_ptr(), marched.leave.data_ptr(),
+        marched.first.data_ptr(), None if marched.slices is None else marched.slices.data_ptr(), len(marched.rays),
+        native.integers(WAVES), len(WAVES), marched.box.data_ptr(), marched.step, marched.cone,
+        marched.bits.data_ptr(), marched.blocks.data_ptr(), marched.resolution, marched.levels, marched.budget,
+        native.pointer(density.scale, "the scale", (3,)), native.pointer(density.shift, "the shift", (3,)),
+        native.pointer(density.table, "the hash table", (layout.num_entries, features)), features, *layout.arrays,
+        layout.num_levels, *network_arguments(density.weights),
+    )  # fmt: skip
 
 
-_trace: Callable[..., int] = native.Function("trace_rays", "ppppppqpipffppiifpppippipippiii", "q")
+def network_arguments(weights: Sequence[Tensor]) -> tuple[Any, ...]:
+    """Return a network's arguments of compiled traces: its widths, number of layers, and `weights`, checked."""
+    widths = (weights[0].shape[1], *(weight.shape[0] for weight in weights))
+    shapes = [(widths[layer + 1], widths[layer]) for layer in range(len(weights))]
+    checked = [native.pointer(weight, "weights", shape) for weight, shape in zip(weights, shapes, strict=True)]
+    return native.integers(widths), len(weights), native.pointers(checked)
+
+
+_trace: Callable[..., int] = native.Function("trace_rays", "ppppppqpipffppiifpppippipipiii", "q")
 _take = native.Function("trace_take", "qqppppppppi")

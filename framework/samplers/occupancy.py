@@ -24,7 +24,7 @@ from framework.geometry.rays import Rays, Samples
 from framework.kernels.alpha import alpha_depth
 from framework.kernels.given import is_followed
 from framework.kernels.kept import Waves
-from framework.kernels.march import Occupancy, Wave, march, refresh_occupancy
+from framework.kernels.march import March, Occupancy, Wave, march, refresh_occupancy
 from framework.kernels.occupancy import own_cells
 from framework.kernels.rows import gather_rows
 from framework.kernels.trace import trace
@@ -174,20 +174,17 @@ class OccupancySampler(Sampler):
         Raises:
             ValueError: if the rays require a gradient, which marched samples do not have.
         """
-        if is_followed(rays.origins, rays.directions):
-            raise ValueError("marched samples carry no gradient to rays: detach these, or take a ProposalSampler")
-        shift = torch.rand(len(rays), device=rays.origins.device) if jitter else None
         own = self.train_early_stop if self.training else self.early_stop
         stop = own if early_stop is None else early_stop
-        stride = self._stride if self.training else 1.0
-        marched = march(rays, self.occupancy, stride * self.step_size, stride * self.cone, shift, stop)
+        marched = self.begin(rays, jitter, stop)
 
         if isinstance(field, HasGridDensity) and not self.endless:
             known = field.grid_density()
-            traced = None if known is None else trace(marched, known)
-            if traced is not None:
-                samples = Samples(traced.t_starts, traced.t_ends, traced.offsets, owners=traced.owners, early_stop=stop)
-                return samples.evaluated(traced.sigma, traced.features)
+            if known is not None:
+                found = trace(marched, known)
+                intervals = found.t_starts, found.t_ends, found.offsets
+                samples = Samples(*intervals, owners=found.owners, longest=found.longest, early_stop=stop)
+                return samples.evaluated(found.sigma, found.features)
 
         def evaluate(wave: Wave) -> tuple[Tensor, Tensor]:
             points = interval_points(rays, wave.owners, wave, wave.positions, field.footprint)
@@ -222,6 +219,14 @@ class OccupancySampler(Sampler):
         if rest is not None:
             samples = _opened(samples, rest.owners)
         return _attached(samples, surface, *evaluated.choose(order, chosen))
+
+    def begin(self, rays: Rays, jitter: bool, early_stop: float) -> March:
+        """Return the march of `rays`, before its first wave; parameters and errors are as in `sample`."""
+        if is_followed(rays.origins, rays.directions):
+            raise ValueError("marched samples carry no gradient to rays: detach these, or take a ProposalSampler")
+        shift = torch.rand(len(rays), device=rays.origins.device) if jitter else None
+        stride = self._stride if self.training else 1.0
+        return march(rays, self.occupancy, stride * self.step_size, stride * self.cone, shift, early_stop)
 
     # -- updating the grid ------------------------------------------------------------------------------------
 

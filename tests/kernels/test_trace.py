@@ -1,5 +1,7 @@
 """A trace in one call against the march wave by wave: samples, densities and gradients."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -10,6 +12,9 @@ from framework.fields.inverted import InvertedField
 from framework.geometry.points import Points
 from framework.geometry.rays import Rays, Samples
 from framework.kernels import dispatch
+from framework.kernels.march import march
+from framework.kernels.occupancy import Occupancy
+from framework.kernels.trace import TRACE, trace_reference
 from framework.samplers.occupancy import OccupancySampler
 from tests.kernels.compiled import needs_kernels
 
@@ -94,6 +99,35 @@ def test_densities_and_gradients_are_those_of_float64() -> None:
     torch.testing.assert_close(samples.sigma.double(), sigma, rtol=1e-3, atol=1e-5)
     for ours, theirs in zip(own, other, strict=True):
         assert float((ours.double() - theirs).norm()) <= 1e-3 * float(theirs.norm())
+
+
+@needs_kernels
+def test_slices_of_time_boxes_and_nan_are_those_of_waves() -> None:
+    torch.manual_seed(0)
+    moving = replace(rays(300), times=torch.rand(300))
+    for slices, levels, damaged in ((3, 1, False), (1, 2, False), (1, 1, True)):
+        field, found = fields(False, 2)[0], []
+        if damaged:
+            with torch.no_grad():
+                field.encoding.table[::50] = torch.nan
+        density = field.grid_density()
+        assert density is not None
+        occupied = torch.rand(slices, levels * 16**3) < 0.3
+        occupied[0] &= slices == 1
+        occupancy = Occupancy(occupied.view(-1), BOX, 16, levels, slices)
+        for run in (TRACE.implementations[0].run, trace_reference):
+            with torch.no_grad():
+                found.append(run(march(moving, occupancy, 0.03, 0.0, None, 1e-2), density))
+        traced, waves = found
+        for name in ("offsets", "owners", "t_starts", "t_ends", "sigma", "features"):
+            ours, theirs = getattr(traced, name), getattr(waves, name)
+            torch.testing.assert_close(ours, theirs, rtol=2e-4, atol=2e-5, equal_nan=True)
+        counts = traced.offsets.diff()
+        assert int(counts.sum()) > 100
+        assert bool(traced.sigma.isnan().any()) == damaged
+        if slices > 1:
+            assert moving.times is not None
+            assert not bool(counts[moving.times < 1 / 3].any())
 
 
 @needs_kernels

@@ -133,11 +133,12 @@ void run_forward(const Network& net, Block& block) {
 }
 
 // One block's backward pass: adds to `sums`, leaves the input's gradient in the returned buffer.
-float* run_backward(const Network& net, const Block& block, float* grad, float* other, float* const* sums) {
+float* run_backward(const Network& net, const Block& block, float* grad, float* other, const Sums& places, float* sums) {
     for (int l = net.layers - 1; l >= 0; l--) {
         const int in = net.wide[l], out = net.wide[l + 1];
-        outer_product(block.layer[l], in, grad, out, in, sums[l], out);
-        if (net.bias_of(l)) add_rows(grad, out, sums[l] + in * out);
+        float* sum = sums + places.first[l];
+        outer_product(block.layer[l], in, grad, out, in, sum, out);
+        if (net.bias_of(l)) add_rows(grad, out, sum + in * out);
         product(grad, out, net.backward[l].data(), net.width[l + 1], in, other, in);
         if (l > 0)
             for (int i = 0; i < BLOCK * in; i += LANES)
@@ -149,9 +150,11 @@ float* run_backward(const Network& net, const Block& block, float* grad, float* 
     return grad;
 }
 
-// The rows [begin, end) of the input to those of the output, and of the density, which may be null.
+// The rows [begin, end) of the input to those of the output, and of the density, which may be null. each(first, size,
+// block) sees every block.
+template <typename Each>
 void take_through(const Network& net, const Inputs& input, int64_t begin, int64_t end, int activation, float* out,
-                  float* density) {
+                  float* density, const Each& each) {
     const int outputs = net.width[net.layers], columns = net.wide[net.layers];
     Block block;
     for (int64_t first = begin; first < end; first += BLOCK) {
@@ -160,6 +163,7 @@ void take_through(const Network& net, const Inputs& input, int64_t begin, int64_
         for (int r = 0; r < size; r++) rows[r] = first + r;
         input.read(block.layer[0], net.wide[0], rows, size);
         run_forward(net, block);
+        each(first, size, block);
         float* last = block.layer[net.layers];
         if (density) write_density(last, columns, size, density + first);
         activate(last, BLOCK * columns, activation);
@@ -168,26 +172,62 @@ void take_through(const Network& net, const Inputs& input, int64_t begin, int64_
     }
 }
 
-struct Whole final : Forward {
+struct Whole final : Layers {
     Network net;
+    Sums places;
+    size_t wide = 0;  // floats of a record
+
     Whole(const int64_t* widths, int layers, const float* const* weights, const float* const* biases)
-        : net(widths, layers, weights, biases) {}
-    void run(const float* in, int64_t count, float* out, float* density) const override {
+        : net(widths, layers, weights, biases), places(layers, net.wide) {
+        for (int l = 0; l < layers; l++) wide += size_t(net.wide[l]);
+    }
+    size_t record() const override { return wide * sizeof(float); }
+    size_t sums() const override { return places.size; }
+
+    void forward(const float* in, int64_t count, int activation, float* out, float* density,
+                 char* records) const override {
         const int64_t width = net.width[0];
-        take_through(net, Inputs{1, &in, &width}, 0, count, NONE, out, density);
+        take_through(net, Inputs{1, &in, &width}, 0, count, activation, out, density,
+                     [&](int64_t first, int size, const Block& block) {
+                         for (int r = 0; records && r < size; r++) {
+                             float* to = (float*)records + size_t(first + r) * wide;
+                             for (int l = 0; l < net.layers; to += net.wide[l++])
+                                 std::memcpy(to, block.layer[l] + r * net.wide[l], sizeof(float) * net.wide[l]);
+                         }
+                     });
+    }
+    void backward(const char* records, const int64_t* rows, int count, const float* grad, float* sums,
+                  float* input_grad) const override {
+        const int outputs = net.width[net.layers], columns = net.wide[net.layers], inputs = net.width[0];
+        Block block;
+        alignas(64) float first[BLOCK * MAX_WIDTH], second[BLOCK * MAX_WIDTH];
+        for (int l = 0; l < net.layers; l++) std::memset(block.layer[l], 0, sizeof(float) * BLOCK * net.wide[l]);
+        std::memset(first, 0, sizeof(float) * BLOCK * columns);
+        for (int r = 0; r < count; r++) {
+            const float* from = (const float*)records + size_t(rows[r]) * wide;
+            for (int l = 0; l < net.layers; from += net.wide[l++])
+                std::memcpy(block.layer[l] + r * net.wide[l], from, sizeof(float) * net.wide[l]);
+            std::memcpy(first + r * columns, grad + r * outputs, sizeof(float) * outputs);
+        }
+        const float* dx = run_backward(net, block, first, second, places, sums);
+        for (int r = 0; r < count; r++)
+            std::memcpy(input_grad + r * inputs, dx + r * net.wide[0], sizeof(float) * inputs);
+    }
+    void write(float* sums, int64_t parts, int threads, float* const* weight_grads) const override {
+        places.write(sums, parts, threads, net.width, weight_grads, nullptr);
     }
 };
 
 }  // namespace
 
-std::unique_ptr<Forward> mlp::forward_of(const int64_t* widths, int layers, const float* const* weights,
-                                    const float* const* biases) {
+std::unique_ptr<Layers> mlp::layers_of(const int64_t* widths, int layers, const float* const* weights) {
     check_sizes(widths, layers);
-    return std::make_unique<Whole>(widths, layers, weights, biases);
+    const float* none[MAX_LAYERS] = {};
+    return std::make_unique<Whole>(widths, layers, weights, none);
 }
 
 #if !defined(__AVX512BF16__)
-std::unique_ptr<Forward> mlp::forward_bf16_of(const int64_t*, int, const float* const*, const float* const*) {
+std::unique_ptr<Layers> mlp::layers_bf16_of(const int64_t*, int, const float* const*) {
     throw std::invalid_argument("this processor does not multiply in bfloat16");
 }
 #endif
@@ -202,7 +242,7 @@ EXPORT int mlp_forward(const float* const* inputs, const int64_t* part_widths, i
         const Network net(widths, layers, weights, biases);
         const Inputs input{parts, inputs, part_widths};
         for_ranges(threads, count, FORWARD_ROWS, [&](int64_t begin, int64_t end) {
-            take_through(net, input, begin, end, activation, out, density);
+            take_through(net, input, begin, end, activation, out, density, [](int64_t, int, const Block&) {});
         });
     });
 }
@@ -223,8 +263,6 @@ EXPORT int mlp_backward(const float* const* inputs, const int64_t* part_widths, 
             sums.clear(p);
             Block block;
             alignas(64) float first[BLOCK * MAX_WIDTH], second[BLOCK * MAX_WIDTH];
-            float* mine[MAX_LAYERS];
-            for (int l = 0; l < layers; l++) mine[l] = sums.of(p, l);
             for (int64_t next = sums.begin(p); next < sums.end(p);) {
                 int64_t rows[BLOCK];
                 const int size = live_rows(incoming, input_grads, input, next, sums.end(p), rows);
@@ -232,7 +270,7 @@ EXPORT int mlp_backward(const float* const* inputs, const int64_t* part_widths, 
                 input.read(block.layer[0], net.wide[0], rows, size);
                 run_forward(net, block);
                 read_output_gradient(incoming, net.wide[layers], rows, size, activation, block.layer[layers], first);
-                const float* dx = run_backward(net, block, first, second, mine);
+                const float* dx = run_backward(net, block, first, second, sums, sums.of(p));
                 write_input_gradient(dx, net.wide[0], input, rows, size, input_grads);
             }
         });

@@ -77,16 +77,24 @@ struct Inputs {  // the network's input, in parts that stand side by side
     }
 };
 
-// A network's forward pass for other kernels: rows of one input (count, inputs) to out (count, outputs) and the density.
-struct Forward {
-    virtual ~Forward() = default;
-    virtual void run(const float* in, int64_t count, float* out, float* density) const = 0;
+// A network for other kernels. What a row's backward pass needs, its input and hidden activations, stands in a record.
+struct Layers {
+    virtual ~Layers() = default;
+    virtual size_t record() const = 0;  // bytes
+    virtual size_t sums() const = 0;    // floats of the gradients of all weights
+    // Rows of one input (count, inputs) to out (count, outputs) and, unless null, to density (count) and records.
+    virtual void forward(const float* in, int64_t count, int activation, float* out, float* density,
+                         char* records) const = 0;
+    // Of up to BLOCK rows, whose records are `rows`: from the gradient (count, outputs) before the activation function
+    // of the output to that of the input (count, inputs). Adds to `sums`.
+    virtual void backward(const char* records, const int64_t* rows, int count, const float* grad, float* sums,
+                          float* input_grad) const = 0;
+    // The weights' gradients, from the sums of all parts.
+    virtual void write(float* sums, int64_t parts, int threads, float* const* weight_grads) const = 0;
 };
 
-std::unique_ptr<Forward> forward_of(const int64_t* widths, int layers, const float* const* weights,
-                                    const float* const* biases);
-std::unique_ptr<Forward> forward_bf16_of(const int64_t* widths, int layers, const float* const* weights,
-                                         const float* const* biases);
+std::unique_ptr<Layers> layers_of(const int64_t* widths, int layers, const float* const* weights);
+std::unique_ptr<Layers> layers_bf16_of(const int64_t* widths, int layers, const float* const* weights);
 
 inline bool is_zero(const float* values, int count) {
     for (int i = 0; i < count; i++)
@@ -150,56 +158,66 @@ inline void write_input_gradient(const float* from, int wide, const Inputs& inpu
     }
 }
 
-// The gradients of all weights and biases, in one sum for each part of the samples: what a part's is does not depend on
-// the threads, and parts are added in their order, so the same bits come out however many threads there are.
-struct WeightSums {
-    int64_t parts, rows;  // rows: of a part
-    int layers, threads;
+// Where the gradients of all weights and biases are added up: of a layer (wide inputs, wide outputs), and one more row
+// for the bias.
+struct Sums {
+    int layers;
     const int* wide;  // widths in whole vectors, of the input and each layer
-    size_t size = 0;  // floats of a part
+    size_t size = 0;  // floats
     size_t first[MAX_LAYERS] = {};
-    std::vector<float>& sums;
 
-    // Large networks get fewer parts, for their sums would not stay in cache.
-    WeightSums(int64_t count, int layers, const int* wide, int threads)
-        : layers(layers), threads(threads), wide(wide), sums(kept()) {
+    Sums(int layers, const int* wide) : layers(layers), wide(wide) {
         for (int l = 0; l < layers; l++) {
             first[l] = size;
             size += size_t(wide[l] + 1) * size_t(wide[l + 1]);
         }
+    }
+    // Those of all parts, added in their order, to the gradients of the weights (outputs, inputs) and biases (outputs),
+    // which may be null.
+    void write(float* sums, int64_t parts, int threads, const int* width, float* const* weight_grads,
+               float* const* bias_grads) const {
+        for_ranges(threads, int64_t(size), 4096, [&](int64_t from, int64_t to) {
+            for (int64_t p = 1; p < parts; p++) {
+                const float* part = sums + size * size_t(p);
+                for (int64_t i = from; i < to; i++) sums[i] += part[i];
+            }
+        });
+        for (int l = 0; l < layers; l++) {
+            const float* sum = sums + first[l];
+            const int in = width[l], out = width[l + 1], wide_out = wide[l + 1];
+            for (int o = 0; o < out; o++)
+                for (int i = 0; i < in; i++) weight_grads[l][o * in + i] = parts ? sum[i * wide_out + o] : 0;
+            for (int o = 0; bias_grads && bias_grads[l] && o < out; o++)
+                bias_grads[l][o] = parts ? sum[size_t(wide[l]) * wide_out + o] : 0;
+        }
+    }
+};
+
+// The gradients of all weights and biases, in one sum for each part of the samples: what a part's is does not depend on
+// the threads, and parts are added in their order, so the same bits come out however many threads there are.
+struct WeightSums : Sums {
+    int64_t parts, rows;  // rows: of a part
+    int threads;
+    std::vector<float>& sums;
+
+    // Large networks get fewer parts, for their sums would not stay in cache.
+    WeightSums(int64_t count, int layers, const int* wide, int threads)
+        : Sums(layers, wide), threads(threads), sums(kept()), count(count) {
         constexpr int64_t ROWS = 1024, FEWEST = 16, FLOATS = 1 << 19;
         const int64_t most = std::max(FEWEST, FLOATS / int64_t(size));
         parts = std::min((count + ROWS - 1) / ROWS, most);
         rows = parts ? ((count + parts - 1) / parts + BLOCK - 1) / BLOCK * BLOCK : 0;
         parts = rows ? (count + rows - 1) / rows : 0;
-        this->count = count;
         if (sums.size() < size * size_t(parts)) sums.resize(size * size_t(parts));
     }
     int64_t begin(int64_t part) const { return part * rows; }
     int64_t end(int64_t part) const { return std::min(count, (part + 1) * rows); }
+    float* of(int64_t part) const { return sums.data() + size * size_t(part); }
 
-    // Of one part: (wide inputs, wide outputs) of a layer and one more row for the bias.
-    float* of(int64_t part, int layer) const { return sums.data() + size * size_t(part) + first[layer]; }
+    void clear(int64_t part) const { std::fill_n(of(part), size, 0.0f); }
 
-    void clear(int64_t part) const { std::fill_n(of(part, 0), size, 0.0f); }
-
-    // To the gradients of the weights (outputs, inputs) and biases (outputs), which may be null.
     void write(const int* width, float* const* weight_grads, float* const* bias_grads) const {
-        for_ranges(threads, int64_t(size), 4096, [&](int64_t from, int64_t to) {
-            float* total = sums.data();
-            for (int64_t p = 1; p < parts; p++) {
-                const float* part = sums.data() + size * size_t(p);
-                for (int64_t i = from; i < to; i++) total[i] += part[i];
-            }
-        });
-        for (int l = 0; l < layers; l++) {
-            const float* sum = sums.data() + first[l];
-            const int in = width[l], out = width[l + 1], wide_out = wide[l + 1];
-            for (int o = 0; o < out; o++)
-                for (int i = 0; i < in; i++) weight_grads[l][o * in + i] = parts ? sum[i * wide_out + o] : 0;
-            for (int o = 0; bias_grads[l] && o < out; o++)
-                bias_grads[l][o] = parts ? sum[size_t(wide[l]) * wide_out + o] : 0;
-        }
+        Sums::write(sums.data(), parts, threads, width, weight_grads, bias_grads);
     }
 
 private:

@@ -213,9 +213,11 @@ void read_input(const Network& net, const Inputs& input, const int64_t* rows, in
     to_halves(block.scratch, columns, block.layer[0], net.rows[0], false, nullptr);
 }
 
-// The rows [begin, end) of the input to those of the output, and of the density, which may be null.
+// The rows [begin, end) of the input to those of the output, and of the density, which may be null. each(first, size,
+// block) sees every block.
+template <typename Each>
 void take_through(const Network& net, const Inputs& input, int64_t begin, int64_t end, int activation, float* out,
-                  float* density) {
+                  float* density, const Each& each) {
     const int outputs = net.width[net.layers], columns = net.columns[net.layers];
     Block block;
     for (int64_t first = begin; first < end; first += BLOCK) {
@@ -224,6 +226,7 @@ void take_through(const Network& net, const Inputs& input, int64_t begin, int64_
         for (int r = 0; r < size; r++) rows[r] = first + r;
         read_input(net, input, rows, size, block);
         run_forward(net, block);
+        each(first, size, block);
         float* last = block.output;
         if (density) write_density(last, columns, size, density + first);
         activate(last, BLOCK * columns, activation);
@@ -232,22 +235,80 @@ void take_through(const Network& net, const Inputs& input, int64_t begin, int64_
     }
 }
 
-struct Whole final : Forward {
+struct Gradient {  // of a block
+    alignas(64) Half current[BLOCK * MAX_WIDTH], pairs_x[BLOCK * MAX_WIDTH], pairs_dy[BLOCK * MAX_WIDTH];
+};
+
+// One block's backward pass: from the gradient of the output in `scratch` to that of the input there; adds to `sums`.
+void run_backward(const Network& net, Block& block, Gradient& grad, const Sums& places, float* sums) {
+    const int layers = net.layers;
+    to_halves(block.scratch, net.columns[layers], grad.current, net.rows[layers], false, nullptr);
+    for (int l = layers - 1; l >= 0; l--) {
+        float* sum = sums + places.first[l];
+        if (net.bias_of(l))
+            add_halves(grad.current, net.rows[l + 1], net.columns[l + 1], sum + net.columns[l] * net.columns[l + 1]);
+        interleave(block.layer[l], net.rows[l], grad.pairs_x);
+        interleave(grad.current, net.rows[l + 1], grad.pairs_dy);
+        outer_product(grad.pairs_x, net.rows[l], grad.pairs_dy, net.rows[l + 1], net.columns[l], sum,
+                      net.columns[l + 1]);
+        product(grad.current, net.rows[l + 1], net.backward[l].data(), net.columns[l], net.inner(l + 1), block.scratch,
+                net.columns[l]);
+        if (l > 0) to_halves(block.scratch, net.columns[l], grad.current, net.rows[l], false, block.layer[l]);
+    }
+}
+
+struct Whole final : Layers {
     Network net;
+    Sums places;
+    size_t wide = 0;  // halves of a record
+
     Whole(const int64_t* widths, int layers, const float* const* weights, const float* const* biases)
-        : net(widths, layers, weights, biases) {}
-    void run(const float* in, int64_t count, float* out, float* density) const override {
+        : net(widths, layers, weights, biases), places(layers, net.columns) {
+        for (int l = 0; l < layers; l++) wide += size_t(net.rows[l]);
+    }
+    size_t record() const override { return wide * sizeof(Half); }
+    size_t sums() const override { return places.size; }
+
+    void forward(const float* in, int64_t count, int activation, float* out, float* density,
+                 char* records) const override {
         const int64_t width = net.width[0];
-        take_through(net, Inputs{1, &in, &width}, 0, count, NONE, out, density);
+        take_through(net, Inputs{1, &in, &width}, 0, count, activation, out, density,
+                     [&](int64_t first, int size, const Block& block) {
+                         for (int r = 0; records && r < size; r++) {
+                             Half* to = (Half*)records + size_t(first + r) * wide;
+                             for (int l = 0; l < net.layers; to += net.rows[l++])
+                                 std::memcpy(to, block.layer[l] + r * net.rows[l], sizeof(Half) * net.rows[l]);
+                         }
+                     });
+    }
+    void backward(const char* records, const int64_t* rows, int count, const float* grad, float* sums,
+                  float* input_grad) const override {
+        const int outputs = net.width[net.layers], columns = net.columns[net.layers], inputs = net.width[0];
+        Block block;
+        Gradient gradient;
+        for (int l = 0; l < net.layers; l++) std::memset(block.layer[l], 0, sizeof(Half) * BLOCK * net.rows[l]);
+        std::memset(block.scratch, 0, sizeof(float) * BLOCK * columns);
+        for (int r = 0; r < count; r++) {
+            const Half* from = (const Half*)records + size_t(rows[r]) * wide;
+            for (int l = 0; l < net.layers; from += net.rows[l++])
+                std::memcpy(block.layer[l] + r * net.rows[l], from, sizeof(Half) * net.rows[l]);
+            std::memcpy(block.scratch + r * columns, grad + r * outputs, sizeof(float) * outputs);
+        }
+        run_backward(net, block, gradient, places, sums);
+        for (int r = 0; r < count; r++)
+            std::memcpy(input_grad + r * inputs, block.scratch + r * net.columns[0], sizeof(float) * inputs);
+    }
+    void write(float* sums, int64_t parts, int threads, float* const* weight_grads) const override {
+        places.write(sums, parts, threads, net.width, weight_grads, nullptr);
     }
 };
 
 }  // namespace
 
-std::unique_ptr<Forward> mlp::forward_bf16_of(const int64_t* widths, int layers, const float* const* weights,
-                                    const float* const* biases) {
+std::unique_ptr<Layers> mlp::layers_bf16_of(const int64_t* widths, int layers, const float* const* weights) {
     check_sizes(widths, layers);
-    return std::make_unique<Whole>(widths, layers, weights, biases);
+    const float* none[MAX_LAYERS] = {};
+    return std::make_unique<Whole>(widths, layers, weights, none);
 }
 
 // As mlp_forward and mlp_backward.
@@ -259,7 +320,7 @@ EXPORT int mlp_forward_bf16(const float* const* inputs, const int64_t* part_widt
         const Network net(widths, layers, weights, biases);
         const Inputs input{parts, inputs, part_widths};
         for_ranges(threads, count, FORWARD_ROWS, [&](int64_t begin, int64_t end) {
-            take_through(net, input, begin, end, activation, out, density);
+            take_through(net, input, begin, end, activation, out, density, [](int64_t, int, const Block&) {});
         });
     });
 }
@@ -278,7 +339,7 @@ EXPORT int mlp_backward_bf16(const float* const* inputs, const int64_t* part_wid
         for_chunks(threads, sums.parts, [&](int64_t p, int) {
             sums.clear(p);
             Block block;
-            alignas(64) Half current[BLOCK * MAX_WIDTH], pairs_x[BLOCK * MAX_WIDTH], pairs_dy[BLOCK * MAX_WIDTH];
+            Gradient gradient;
             for (int64_t next = sums.begin(p); next < sums.end(p);) {
                 int64_t rows[BLOCK];
                 const int size = live_rows(incoming, input_grads, input, next, sums.end(p), rows);
@@ -287,20 +348,7 @@ EXPORT int mlp_backward_bf16(const float* const* inputs, const int64_t* part_wid
                 run_forward(net, block);
                 read_output_gradient(incoming, net.columns[layers], rows, size, activation, block.output,
                                      block.scratch);
-                to_halves(block.scratch, net.columns[layers], current, net.rows[layers], false, nullptr);
-                for (int l = layers - 1; l >= 0; l--) {
-                    float* sum = sums.of(p, l);
-                    if (net.bias_of(l))
-                        add_halves(current, net.rows[l + 1], net.columns[l + 1],
-                                   sum + net.columns[l] * net.columns[l + 1]);
-                    interleave(block.layer[l], net.rows[l], pairs_x);
-                    interleave(current, net.rows[l + 1], pairs_dy);
-                    outer_product(pairs_x, net.rows[l], pairs_dy, net.rows[l + 1], net.columns[l], sum,
-                                  net.columns[l + 1]);
-                    product(current, net.rows[l + 1], net.backward[l].data(), net.columns[l], net.inner(l + 1),
-                            block.scratch, net.columns[l]);
-                    if (l > 0) to_halves(block.scratch, net.columns[l], current, net.rows[l], false, block.layer[l]);
-                }
+                run_backward(net, block, gradient, sums, sums.of(p));
                 write_input_gradient(block.scratch, net.columns[0], input, rows, size, input_grads);
             }
         });

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from framework.kernels.dispatch import FEW_OPERATIONS, Operation
 from framework.kernels.math import cross_matrix
 
-SMALL = 1.0
+SMALL = 0.25
 """Squared angle below which the factors are their series, which neither divide by 0 nor cancel."""
 
 

@@ -9,7 +9,6 @@ from framework.base.errors import ConfigError
 from framework.cli.bench_results import RESULTS, write_results
 from framework.cli.common import make_room
 
-
 BEFORE = 300
 """Training steps before those that are timed: steps of both kinds are recorded in them."""
 

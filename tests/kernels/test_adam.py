@@ -162,7 +162,10 @@ def test_rate_and_verdict_on_the_device_are_those_of_python(update) -> None:
     assert not grad.any()
 
 
-@pytest.mark.parametrize("update", [dense_adam, dense_adam_reference, *(each.run for each in DENSE_ADAM.implementations)])
+DENSE = [dense_adam, dense_adam_reference, *(each.run for each in DENSE_ADAM.implementations)]
+
+
+@pytest.mark.parametrize("update", DENSE)
 def test_verdict_and_rate_of_dense_adam(update) -> None:
     def after(rate: object, *verdict: object) -> list[torch.Tensor]:
         torch.manual_seed(0)

@@ -85,7 +85,7 @@ def test_repeated_steps_learn_what_steps_learn(
         assert reports[0].losses == reports[1].losses
     assert_same_bits(tensors(usual), tensors(repeating))
     assert usual.state.train_mse == repeating.state.train_mse
-    kinds = 1 if variant == "mip-nerf" else 2  # steps in which proposals learn, and others
+    kinds = 1 if "mip" in variant else 2  # steps in which proposals learn, and others
     assert len(recorder.tapes) == kinds
     assert recorder.repeated == STEPS - kinds * WARM_UP
     assert said == ["training steps are recorded as CUDA graphs and repeated"]
@@ -94,7 +94,7 @@ def test_repeated_steps_learn_what_steps_learn(
 
 @pytest.mark.medium
 def test_a_resumed_run_repeats_the_same_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Recordings of tensors that a checkpoint has replaced are dropped; draws do not depend on what was drawn before."""
+    """Recordings of tensors that a checkpoint has replaced are dropped; draws do not depend on those before."""
     ahead(monkeypatch)
     first, second = (small(tmp_path / name) for name in ("first", "second"))
     for trainer in (first, second):
@@ -123,16 +123,15 @@ def test_steps_that_are_not_finite_change_nothing_and_are_counted(
 
     def spoilt(batch: Any, step: int) -> Loss:
         found = loss(batch, step)
-        return dataclasses.replace(found, terms={**found.terms, "rgb": found.terms["rgb"] * factor}, rgb=found.rgb * factor)
+        terms = {**found.terms, "rgb": found.terms["rgb"] * factor}
+        return dataclasses.replace(found, terms=terms, rgb=found.rgb * factor)
 
     monkeypatch.setattr(trainer.model, "loss", spoilt)
-    for _ in range(8):
-        trainer.train_step()
+    several(trainer, 8)
     assert recorder.repeated > 3
     before = tensors(trainer)
     factor.fill_(torch.nan)
-    for _ in range(4):
-        trainer.train_step()
+    several(trainer, 4)
     assert_same_bits(tensors(trainer), before)
     assert trainer.state.skipped == 4
     factor.fill_(1)
@@ -140,8 +139,13 @@ def test_steps_that_are_not_finite_change_nothing_and_are_counted(
     assert any(not torch.equal(value, before[name]) for name, value in tensors(trainer).items())
     factor.fill_(torch.nan)
     with pytest.raises(DivergenceError, match=f"{MAX_BAD_STEPS} steps in a row were not finite, first in the loss"):
-        for _ in range(MAX_BAD_STEPS + every):
-            trainer.train_step()
+        several(trainer, MAX_BAD_STEPS + every)
+
+
+def several(trainer: Trainer, count: int) -> None:
+    """Take some training steps."""
+    for _ in range(count):
+        trainer.train_step()
 
 
 class Toy:
@@ -158,7 +162,9 @@ class Toy:
         return self.weight * 2
 
 
-def steps_of(toy: Toy, count: int, step: Callable[[], Tensor], seed: Callable[[], None], must: bool = False) -> list[Tensor]:
+def steps_of(
+    toy: Toy, count: int, step: Callable[[], Tensor], seed: Callable[[], None], must: bool = False
+) -> list[Tensor]:
     """Results of some steps of a toy, whose rates differ."""
     found, recorder = [], FakeRecorder()
     steps = StepGraphs[Tensor](recorder, lambda: [toy.weight], must)
@@ -224,7 +230,11 @@ def test_what_cannot_be_repeated_is_found_and_said(fault: str, said: list[str]) 
         same(steps_of(toy, 9, step, toy.seed), truth(9))
         (line,) = said
         assert line.startswith("note: steps are not repeated as CUDA graphs, because ")
-        words = {"a number of Python's": "did not change", "a wait": "_local_scalar_dense", "an error": "no kernel image"}
+        words = {
+            "a number of Python's": "did not change",
+            "a wait": "_local_scalar_dense",
+            "an error": "no kernel image",
+        }
         assert words[fault] in line
         with pytest.raises(ConfigError, match=f"cuda-graphs on: .*{words[fault]}"):
             steps_of(toy, 9, step, toy.seed, must=True)
@@ -279,7 +289,7 @@ def test_methods_say_whether_their_steps_repeat(
 def test_the_flag(shared_tiny: Path, tmp_path: Path) -> None:
     cpu, gpu = torch.device("cpu"), torch.device("cuda")
     assert make_graphs("auto", cpu, list) is make_graphs("off", gpu, list) is None
-    with pytest.raises(ConfigError, match="--machine.cuda-graphs on: .* this run is on cpu"):
+    with pytest.raises(ConfigError, match=r"--machine\.cuda-graphs on: .* this run is on cpu"):
         make_graphs("on", cpu, list)
     assert tiny_trainer("nerfacto", shared_tiny, tmp_path).graphs is None
 

@@ -27,9 +27,9 @@ BOUNDS = {
     "nerf-plus-plus": (1270, 0),
 }
 """Operations and waits of a step: what was counted when this was written, and a tenth more operations, in which
-torch's releases may differ. A march needs four waits, for the numbers of runs, of runs near occupied cells, of candidates
-and of samples; updates of the occupancy grid have theirs too. Whether a step is finite is asked for Gaussians alone, whose
-number changes. The choice of transparent pixels of a scene that moves would have one."""
+torch's releases may differ. A march needs four waits, for the numbers of runs, of runs near occupied cells, of
+candidates and of samples; updates of the occupancy grid have theirs too. Whether a step is finite is asked for
+Gaussians alone, whose number changes. The choice of transparent pixels of a scene that moves would have one."""
 
 
 @pytest.fixture

@@ -30,7 +30,8 @@ def _sparse(
     used = tl.max((g != 0).to(tl.int32), 1) != 0
     tl.store(grad + at, tl.zeros_like(g), mask=there & used[:, None])
     if found_inf is not None:
-        used = used & (tl.load(found_inf) == 0)
+        g = tl.where(tl.load(found_inf) == 0, g, 0.0)
+        used = tl.max((g != 0).to(tl.int32), 1) != 0
     mask = there & used[:, None]
     tl.atomic_add(updated, tl.sum(used.to(tl.int64), 0), sem="relaxed")
     count = tl.load(seen + e, mask=used, other=0.0) + 1

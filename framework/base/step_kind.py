@@ -1,4 +1,4 @@
-"""What a training step computes besides the values of tensors: whether steps repeat each other."""
+"""Kinds of training steps, which say whether one step repeats another."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the training images of a run on another device than the CPU are: there as bytes, or in the machine's memory."""
+"""Training images on the device as bytes, or in the machine's memory where they do not fit."""
 
 from __future__ import annotations
 

@@ -230,7 +230,7 @@ def all_finite(values: Sequence[Tensor]) -> bool | Tensor:
     return ALL_FINITE(values, values)
 
 
-ALL_FINITE: Operation[..., bool | Tensor] = Operation("all_finite", all_finite_reference)
+ALL_FINITE: Operation[[Sequence[Tensor]], bool | Tensor] = Operation("all_finite", all_finite_reference)
 
 
 @ALL_FINITE.implementation(CPP, fits=lambda values: all(value.is_contiguous() for value in values))

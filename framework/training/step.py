@@ -89,7 +89,11 @@ def learn(model: Model[Any], optimizer: Adam, batch: Any, step: int, progress: f
 
 
 def changes_rows(model: Model[Any]) -> bool:
-    """Return whether a model has something to do after each step, for which Python must know if the step counts."""
+    """Return whether a model has something to do after each step, for which Python must know if the step counts.
+
+    Args:
+        model: any model.
+    """
     return type(model).after_step is not Model.after_step
 
 

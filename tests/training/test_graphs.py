@@ -51,7 +51,7 @@ def small(folder: Path, method: str = "nerfacto", **settings: Any) -> Trainer:
     found = idle(method)
     sizes = {"num_levels": 4, "num_proposal_samples": (16, 12), "num_nerf_samples": 8, "mixed_precision": False}
     rays = {"num_rays_per_batch": 24, "samples_per_batch": None}
-    known = {name: value for name, value in (sizes | rays).items() if hasattr(found.run.config, name)}
+    known: dict[str, Any] = {name: value for name, value in (sizes | rays).items() if hasattr(found.run.config, name)}
     config = dataclasses.replace(found.run.config, **(known | settings))
     return Trainer(dataclasses.replace(found.run, config=config, folder=folder), found.train_set, None)
 

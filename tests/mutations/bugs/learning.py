@@ -215,7 +215,7 @@ BUGS = (
         "depth-loss-unknown",
         "losses",
         "framework/rendering/losses.py",
-        "return ray_sum(weights * apart, samples)[has_depth].mean()",
+        "return (ray_sum(weights * apart, samples) * has_depth).sum() / has_depth.sum().clamp(min=1)",
         "return ray_sum(weights * apart, samples).mean()",
         "pixels without a depth are pulled to distance 1",
     ),

@@ -1,4 +1,4 @@
-"""Kinds of training steps, which say whether one step repeats another."""
+"""The kind of a training step: whether steps repeat each other."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class StepKind:
-    """What a training step depends on, besides the values of tensors that stay where they are.
+    """All that a training step depends on besides the values of tensors that stay where they are.
 
     Steps of equal kinds run the same operations on tensors of the same sizes, so that one of them can be recorded and
     repeated (`framework.training.graphs`).

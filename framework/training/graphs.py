@@ -106,7 +106,7 @@ class StepGraphs(Generic[T]):
         """Number of steps that were taken by repeating one."""
         self._kinds: dict[Hashable, _Kind[T]] = {}
         self._told: set[str] = set()
-        self._given_up = False
+        self._given_up = self._announced = False
 
     def forget(self) -> None:
         """Drop all recordings, since tensors have moved."""
@@ -177,8 +177,8 @@ class StepGraphs(Generic[T]):
             self._give_up("a repeated step did not change what the step itself changes")
             return expected
         kept.tested = bool((moved > 0).any())  # a step that was dropped tells nothing
-        if kept.tested and "" not in self._told:
-            self._told.add("")
+        if kept.tested and not self._announced:
+            self._announced = True
             say("training steps are recorded as CUDA graphs and repeated")
         return result
 

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from framework.base.config import TrainConfig
 from framework.base.device import has_bfloat16
 from framework.base.optimised import ParameterGroup, RowChange, parameter_groups
+from framework.base.step_kind import StepKind
 from framework.cameras.cameras import Cameras
 from framework.cameras.view import View
 from framework.data.dataset import Dataset
@@ -94,6 +95,14 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
             step: number of training steps done.
             progress: fraction of the training budget that is spent.
         """
+
+    def step_kind(self, step: int) -> StepKind:
+        """Return what a training step computes besides the values of tensors; by default, steps do not repeat.
+
+        Args:
+            step: number of training steps done.
+        """
+        return StepKind(varies="the method does not say that its steps repeat each other")
 
     def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
         """Return rows of parameters to add, drop or reorder; called after each training step, with gradients in place.

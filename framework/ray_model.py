@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from framework.base.config import RayConfig
+from framework.base.step_kind import StepKind
 from framework.cameras.cameras import subpixels
 from framework.cameras.unseen import unseen_patches
 from framework.cameras.view import View
@@ -63,6 +64,9 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
     batches: ClassVar[Literal["pixels", "views"]] = "pixels"
     coarse_weight: ClassVar[float] = 1.0
     """Weight of the loss of a coarse level that is supervised too."""
+    steps_repeat: ClassVar[bool] = False
+    """True if field, renderer and `loss` depend on the training step by the values of tensors alone, so that steps can
+    be recorded wherever the sampler's can."""
 
     def __init__(self, config: RayConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer) -> None:
         super().__init__(config, scene)
@@ -180,7 +184,7 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
     def render_view(self, view: View, background: Tensor) -> Picture:
         """Render `view` over `background` (3,) in chunks of `eval_num_rays_per_chunk` rays, in evaluation mode."""
         was_training, per_pixel = self.training, view.rays_per_pixel or self.rays_per_pixel
-        offsets, grid, times = subpixels(per_pixel), view.pixels(), view.times()
+        offsets, grid, times = subpixels(per_pixel, self.device), view.pixels(), view.times()
         chunk, count = max(self.config.eval_num_rays_per_chunk // per_pixel, 1), grid.numel()
         pixels = grid.reshape(-1)
         self.eval()
@@ -211,6 +215,18 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
             None if normals is None else normals.view(*size, 3),
             num_rays=count * per_pixel,
         )
+
+    def step_kind(self, step: int) -> StepKind:
+        config = self.config
+        if not self.steps_repeat:
+            return super().step_kind(step)
+        if isinstance(config, MotionConfig) and self.scene.moving and config.transparent_share < 1:
+            return StepKind(varies="transparent pixels are left out at random")
+        if isinstance(config, FewImagesConfig) and config.unseen_loss_mult:
+            return StepKind(varies="the weight of unseen views changes from step to step")
+        if not all(opening.complete for opening in parts(self, Opening)):
+            return StepKind(varies="levels are still opening")
+        return self.sampler.step_kind(step)
 
     def before_step(self, step: int, progress: float) -> None:
         """Open levels of encodings up to `progress`, and update the sampler for `step`."""

@@ -60,6 +60,7 @@ class MipNeRF(RayModel[MipNeRFConfig]):
     """A model whose coarse level, the same network on the same rays, counts a tenth (section 3.3)."""
 
     coarse_weight = 0.1
+    steps_repeat = True
 
 
 def decide(config: MipNeRFConfig, scene: Scene) -> tuple[MipNeRFConfig, list[Decision]]:

@@ -98,6 +98,8 @@ class MipNeRF360(RayModel[MipNeRF360Config]):
     background, and from there nothing is learnt any more.
     """
 
+    steps_repeat = True
+
     def color_error(self, rgb: Tensor, batch: PixelBatch) -> Tensor:
         if not self.scene.unbounded:
             return super().color_error(rgb, batch)

@@ -101,6 +101,8 @@ class NerfactoRenderer(CaptureRenderer):
 class Nerfacto(CaptureModel[NerfactoConfig]):
     """A model with appearance vectors, refined poses, and the penalties of predicted normals."""
 
+    steps_repeat = True
+
     @property
     def appearance(self) -> Appearance | None:
         """Appearance vectors of the training images; None if there are none."""

@@ -102,6 +102,8 @@ class ZipNeRF(CaptureModel[ZipNeRFConfig]):
         renderer: turns samples into colours and depths.
     """
 
+    steps_repeat = True
+
     def __init__(self, config: ZipNeRFConfig, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer) -> None:
         super().__init__(config, scene, field, sampler, renderer)
         self.appearance: Appearance | None = None

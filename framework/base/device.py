@@ -78,6 +78,40 @@ def to_float64(values: Tensor) -> Tensor:
     return (values.cpu() if values.device.type == "mps" else values).double()
 
 
+def runs_ahead(device: torch.device) -> bool:
+    """Return whether `device` computes while Python goes on, so that reading a value from it means to wait for it."""
+    return device.type != "cpu"
+
+
+class StepValue:
+    """A number that changes from step to step, as operations read it: on the CPU a float, else a tensor.
+
+    The tensor stays the same one, so that a recorded step finds the number of the step in which it is repeated; to set
+    it does not wait for the device.
+
+    Args:
+        value: the first number.
+    """
+
+    def __init__(self, value: float) -> None:
+        self._value = value
+        self._there: Tensor | None = None
+
+    def set(self, value: float) -> None:
+        """Change the number to `value`."""
+        self._value = value
+        if self._there is not None:
+            self._there.fill_(value)
+
+    def on(self, device: torch.device) -> float | Tensor:
+        """Return the number on `device`: a float, or () float32 if the device runs ahead of Python."""
+        if not runs_ahead(device):
+            return self._value
+        if self._there is None or self._there.device != device:
+            self._there = torch.full((), self._value, device=device)
+        return self._there
+
+
 class HostValue:
     """The value of a scalar tensor in Python, which is read from the device only where it has changed."""
 
@@ -176,6 +210,15 @@ def peak_memory(device: torch.device) -> int:
         return 0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if platform.system() == "Darwin" else peak * 1024
+
+
+def free_memory(device: torch.device) -> float:
+    """Return the free memory of a GPU in bytes; infinity for other devices, which share the machine's.
+
+    Args:
+        device: the device.
+    """
+    return float(torch.cuda.mem_get_info(device)[0]) if device.type == "cuda" else math.inf
 
 
 def wait_for(device: torch.device) -> None:

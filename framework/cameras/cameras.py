@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import torch
@@ -239,7 +239,8 @@ class Cameras:
         return torch.arange(start, end, device=self.fx.device)
 
 
-def subpixels(count: int) -> Tensor:
+@lru_cache(maxsize=16)
+def subpixels(count: int, device: torch.device | None = None) -> Tensor:
     """Return positions in a pixel, whose mean colour is the pixel's: columns and rows (count, 2) from its centre.
 
     For count = n^2, the positions form a square grid, rotated so that no two share a row or a column. Edges close to
@@ -248,6 +249,7 @@ def subpixels(count: int) -> Tensor:
 
     Args:
         count: number of positions, a square number.
+        device: device of the result; the CPU if None. It is kept, since bringing it there means to wait for the device.
 
     Raises:
         ValueError: if `count` is not a square number.
@@ -257,7 +259,7 @@ def subpixels(count: int) -> Tensor:
         raise ValueError(f"{count} rays per pixel; it must be a square number")
     steps = torch.arange(count)
     rows = (steps + 1) * side % (count + 1) - 1
-    return (torch.stack([steps, rows], dim=-1) + 0.5) / count - 0.5
+    return ((torch.stack([steps, rows], dim=-1) + 0.5) / count - 0.5).to(device)
 
 
 def join_cameras(parts: Sequence[Cameras]) -> Cameras:

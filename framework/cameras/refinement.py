@@ -12,7 +12,7 @@ from framework.base.optimised import Optimised
 from framework.cameras.cameras import Cameras
 from framework.geometry.alignment import align_cameras
 from framework.geometry.rays import Rays
-from framework.kernels.math import cross_matrix
+from framework.kernels.rigid_motion import rigid_motions
 
 Group = Literal["SO3xR3", "SE3"]
 """Parameterisation of a small rigid motion."""
@@ -44,12 +44,7 @@ class PoseRefinement(nn.Module):
         Args:
             chosen: the cameras; all if not given.
         """
-        translation, rotation = self.tangents[chosen, :3], self.tangents[chosen, 3:]
-        generator = torch.cat([cross_matrix(rotation), translation[:, :, None]], dim=-1)
-        if self.group == "SO3xR3":
-            # The matrix exponential has a value and a gradient at zero, where Rodrigues' formula is 0 / 0.
-            return torch.cat([torch.linalg.matrix_exp(generator[:, :, :3]), translation[:, :, None]], dim=-1)
-        return torch.linalg.matrix_exp(nn.functional.pad(generator, (0, 0, 0, 1)))[:, :3]
+        return rigid_motions(self.tangents[chosen], self.group == "SE3")
 
     def forward(self, rays: Rays) -> Rays:
         """Move the rays of training cameras by their refinements, and those of other cameras by the common drift."""

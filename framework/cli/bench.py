@@ -39,7 +39,7 @@ USAGE = """\
 usage: ns-bench WHAT [flags]
 
   kernels          time and error of every compiled kernel against torch, and the machine's measured limits
-  gpu              the same on a GPU, and PSNR after 2 to 60 seconds of training, in less than eight minutes
+  gpu              the same on a GPU, steps as CUDA graphs, and PSNR after 2 to 60 seconds, in less than eight minutes
   quadrature       error of every sampler against field evaluations per ray, on scenes with a known integral
   methods          time to each PSNR of every built-in method, on the embedded scene or on --data
   curves           PSNR against seconds of every method: a run for each of several budgets and seeds, in one picture

@@ -9,10 +9,13 @@ from framework.base.errors import ConfigError
 from framework.cli.bench_results import RESULTS, write_results
 from framework.cli.common import make_room
 
+BEFORE = 300
+"""Training steps before those that are timed: steps of both kinds are recorded in them."""
+
 
 @dataclass(frozen=True)
 class GpuFlags:
-    """Measure error and time of every kernel on a GPU, and its limits; train instant-ngp and gaussian-splatting."""
+    """Measure kernels and training steps on a GPU, and its limits; train instant-ngp and gaussian-splatting."""
 
     data: Path | None = None
     """Folder of the data set; the embedded scene if not given."""
@@ -22,6 +25,8 @@ class GpuFlags:
     """Number of samples in a batch of the kernels."""
     repeats: int = 9
     """Number of runs of each kernel, of which medians are reported."""
+    steps: int = 200
+    """Number of training steps of nerfacto that are timed, as they are and as CUDA graphs."""
     run_dir: Path | None = None
     """Folder of runs and report; outputs/bench-gpu-DATA if not given."""
     output_dir: Path = RESULTS
@@ -42,11 +47,13 @@ def measure_gpu(flags: GpuFlags) -> None:
     if not torch.cuda.is_available():
         raise ConfigError("ns-bench gpu: this machine or this PyTorch has no GPU; ns-bench kernels needs none")
     from framework.cli.compare import compare
-    from framework.tools.benchmarks.gpu import gpu_plan, measured_kernels, reached
+    from framework.tools.benchmarks.gpu import gpu_plan, measured_kernels, reached, timed_steps
 
     name = "procedural" if flags.data is None else flags.data.resolve().name
     path = flags.output_dir / f"gpu-{name}.json"
     make_room(path)
-    content = measured_kernels(torch.device("cuda"), flags.samples, flags.repeats)
+    device = torch.device("cuda")
+    content = measured_kernels(device, flags.samples, flags.repeats)
+    content["steps"] = timed_steps(device, BEFORE, flags.steps)
     plan = gpu_plan(flags.data, flags.seconds, flags.run_dir or Path("outputs") / f"bench-gpu-{name}")
     write_results(path, {**content, "training": reached(compare(plan))})

@@ -15,6 +15,7 @@ from framework.base.device import choose_device, peak_memory
 from framework.base.errors import ConfigError, LostProcessError
 from framework.base.extras import install_command
 from framework.base.processes import from_first, joined_processes, processes
+from framework.data.residence import on_device
 from framework.evaluation.evaluator import evaluate
 from framework.model import StartsFromImages
 from framework.splats.gaussians import HasGaussians
@@ -79,7 +80,7 @@ def _prepare(run: Run) -> Trainer:
     if "viewer" in run.config.vis and (command := install_command("viewer")) is not None:
         raise ConfigError(f"--vis {run.config.vis} needs viser: {command}")
     device = choose_device(run.config.machine)
-    train_set = load_split(run, "train").to(device)
+    train_set, images = on_device(load_split(run, "train"), device)
     eval_set = first_split(run, ("val", "test")) if processes().first else None
     source = run.config.data or ("the embedded scene" if train_set.scene.num_scenes == 1 else "random scenes")
     say(f"{run.method} on {source} ({run.dataparser}), on {device.type}, kernels: {kernels(device)}")
@@ -88,7 +89,9 @@ def _prepare(run: Run) -> Trainer:
         say(f"{processes().count} processes with batches of their own; CPU threads of each: {threads}")
         if device.type == "cpu" and processes().local_count > 1:
             say("note: on the cores of one CPU, several processes learn more slowly than one (docs/benchmarks.md)")
-    trainer = Trainer(run, train_set, None if eval_set is None else eval_set.to(device))
+    if images is not None:
+        say(images)
+    trainer = Trainer(run, train_set, None if eval_set is None else eval_set.to(device, with_pixels=False))
     for line in trainer.profile().lines():
         say(line)
     if train_set.scene.image_size < FEW_PIXELS:
@@ -160,7 +163,7 @@ def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:
         return
     evaluation = evaluate(
         trainer.model,
-        test_set.to(trainer.device),
+        test_set.to(trainer.device, with_pixels=False),
         max_images=run.config.max_eval_images,
         pictures=run.folder / "pictures",
         max_pictures=PICTURES,

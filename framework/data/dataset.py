@@ -100,6 +100,23 @@ class Dataset:
         """The device of batches."""
         return self.cameras.fx.device
 
+    @property
+    def resident(self) -> bool:
+        """True if `pixels` are in memory, on the device of batches."""
+        return self.mapped is None and self.pixels.device == self.device
+
+    def stored(self, flat: Tensor) -> Tensor:
+        """Return the stored colours of pixels, on the device of batches.
+
+        Args:
+            flat: (R,) numbers of the pixels, counted through all images, on any device.
+
+        Returns:
+            (R, 3 or 4) uint8.
+        """
+        flat = flat.to(self.pixels.device)
+        return (self.pixels[flat] if self.mapped is None else self.mapped.look_up(flat)).to(self.device)
+
     def image(self, index: int) -> Tensor:
         """Return image `index` as (H, W, 3 or 4) uint8, with alpha if the scene has it."""
         height, width = self.cameras.sizes[index]
@@ -145,14 +162,21 @@ class Dataset:
             return self
         return replace(self, drawn=pixels if self.mapped is not None else pixels.listed())
 
-    def to(self, device: torch.device | str) -> Dataset:
-        """Return the data set on `device`."""
+    def to(self, device: torch.device | str, with_pixels: bool = True) -> Dataset:
+        """Return the data set on a device.
+
+        Args:
+            device: the device of batches.
+            with_pixels: whether the pixels are moved there too, if they are in memory. If not, those that are drawn are
+                copied batch by batch.
+        """
+        with_pixels = with_pixels and self.mapped is None
         return replace(
             self,
-            pixels=self.pixels if self.mapped is not None else self.pixels.to(device),
+            pixels=self.pixels.to(device) if with_pixels else self.pixels,
             cameras=self.cameras.to(device),
             times=None if self.times is None else self.times.to(device),
-            drawn=self.drawn if self.drawn is None or self.mapped is not None else self.drawn.to(device),
+            drawn=self.drawn.to(device) if self.drawn is not None and with_pixels else self.drawn,
             kept=None if self.kept is None else self.kept.to(device),
             opaque=None if self.opaque is None else self.opaque.to(device),
             depths=None if self.depths is None else self.depths.to(device),

@@ -69,10 +69,10 @@ class ErrorMap:
 
     def learn(self, pixels: Tensor, errors: Tensor) -> None:
         """Update the tiles of `pixels` (R,) with their squared `errors` (R,); non-finite errors are ignored."""
-        finite = torch.isfinite(errors)
-        squares, errors = self.squares(pixels[finite]), errors[finite]
+        finite, squares = torch.isfinite(errors), self.squares(pixels)
         sums, counts = torch.zeros_like(self.errors), torch.zeros_like(self.errors)
-        sums.index_add_(0, squares, errors)
-        counts.index_add_(0, squares, torch.ones_like(errors))
-        updated = counts > 0
-        self.errors[updated] += (1 - DECAY) * (sums[updated] / counts[updated] - self.errors[updated])
+        sums.index_add_(0, squares, torch.where(finite, errors, 0))
+        counts.index_add_(0, squares, finite.to(errors))
+        total, count, old = sums[squares], counts[squares], self.errors[squares]
+        updated = old + (1 - DECAY) * (total / count.clamp(min=1) - old)
+        self.errors[squares] = torch.where(count > 0, updated, old)  # the same for all pixels of a tile

@@ -198,8 +198,8 @@ def draw_batch(
     drawn = uniform if errors is None else 2 * uniform
     flat = draw_pixels(dataset, drawn) if num_images is None else draw_from_images(dataset, drawn, num_images)
     stored = None
-    if dataset.mapped is not None:
-        stored = (look_up or dataset.mapped.look_up)(flat).to(dataset.device)
+    if not dataset.resident:
+        stored = dataset.stored(flat) if look_up is None else look_up(flat).to(dataset.device)
         flat = flat.to(dataset.device)
     behind, weights = background_colors(background, count, dataset.device), None
     if errors is not None:
@@ -210,8 +210,8 @@ def draw_batch(
         batch = gather_batch(dataset, flat, behind, subpixels, stored)
     else:
         chosen = torch.randint(len(sparse), (keypoints,), device=dataset.device)
-        if dataset.mapped is not None and stored is not None:
-            stored = torch.cat([stored, dataset.mapped.look_up(sparse.pixels[chosen].cpu()).to(stored)])
+        if stored is not None:
+            stored = torch.cat([stored, dataset.stored(sparse.pixels[chosen])])
         batch = gather_batch(dataset, torch.cat([flat, sparse.pixels[chosen]]), behind, subpixels, stored)
         distances, deviations = (
             torch.cat([values.new_zeros(uniform), values[chosen]]) for values in (sparse.distances, sparse.deviations)
@@ -236,8 +236,8 @@ def gather_batch(
     """
     scene = dataset.scene
     rays = dataset.cameras.pixel_rays(flat, scene.near, scene.far, dataset.times, subpixels)
-    if stored is None and dataset.mapped is not None:
-        stored = dataset.mapped.look_up(flat.cpu()).to(dataset.device)
+    if stored is None and not dataset.resident:
+        stored = dataset.stored(flat)
     if stored is None:
         rgb, alpha = gather_colors(dataset.pixels, flat, behind)
     else:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from framework.base.config import RayConfig, SourceViewsConfig, TrainConfig
 from framework.base.processes import processes
-from framework.cameras.cameras import CENTER, subpixels
+from framework.cameras.cameras import subpixels
 from framework.cameras.view import View
 from framework.data.dataset import Dataset
 from framework.data.error_map import ErrorMap
@@ -57,6 +57,8 @@ class BatchSource(ABC):
 
     dataset: Dataset
     """The images that are drawn from."""
+    varies: str | None = "batches are made on the host"
+    """Why what is done to draw a batch differs from step to step (`StepKind`); None if it does not."""
 
     @abstractmethod
     def draw(self, request: Request) -> Any:
@@ -118,9 +120,12 @@ class PixelSource(BatchSource):
         self.keypoints = keypoints if dataset.sparse_depth is not None else 0.0
         self.errors = ErrorMap(dataset) if by_error else None
         self.stream: PixelStream | None = None
+        self.varies = "pixels of a few images are drawn" if num_images is not None else None
+        if not dataset.resident:
+            self.varies = "the images are not on the device"
 
     def draw(self, request: Request) -> PixelBatch:
-        offsets = CENTER if request.rays_per_pixel == 1 else subpixels(request.rays_per_pixel)
+        offsets = subpixels(request.rays_per_pixel, self.dataset.device)
         look_up, keypoints = self._look_up(request.step), round(self.keypoints * request.num_pixels)
         count = request.num_pixels
         batch = draw_batch(

@@ -272,6 +272,7 @@ def _trained(
     for percent in track(range(100), "Fitting Gaussians", total=100):
         while (progress := (time.perf_counter() - start) / seconds) < (percent + 1) / 100:
             optimizer.param_groups[0]["lr"] = rates["means"] * 0.1**progress
+            optimizer.bring_rates()
             if step % 2 and photographs:
                 shot = photographs[int(torch.randint(len(photographs), ()))]()
             else:

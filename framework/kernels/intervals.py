@@ -83,7 +83,7 @@ class _Weights(torch.autograd.Function):
 
 
 def resample_reference(
-    edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float, padding: float
+    edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float | Tensor, padding: float
 ) -> Tensor:
     """Compute `resample` in PyTorch, on any device and for any float type.
 
@@ -101,7 +101,9 @@ def resample_reference(
 
 
 @torch.no_grad()
-def resample(edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float, padding: float) -> Tensor:
+def resample(
+    edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float | Tensor, padding: float
+) -> Tensor:
     """Return the edges (R, count + 1) of new intervals with equal shares of the weight of a histogram.
 
     Args:
@@ -109,7 +111,8 @@ def resample(edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: f
         weights: (R, B) weights of its bins.
         shift: (R,) in [0, 1): the new edges are the quantiles (j + shift) / (count + 1), for j from 0 to count.
         count: number of new intervals.
-        power: exponent of the weights; less than 1 flattens them (mip-NeRF 360, section 3.1).
+        power: exponent of the weights, possibly on the device, () float32; less than 1 flattens them (mip-NeRF 360,
+            section 3.1).
         padding: added to each weight after the exponentiation, so that every bin can be drawn.
     """
     return RESAMPLE((edges, weights, shift), edges, weights, shift, count, power, padding)
@@ -118,8 +121,16 @@ def resample(edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: f
 RESAMPLE = Operation("resample", resample_reference)
 
 
-@RESAMPLE.implementation(CPP)
-def _resample(edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float, padding: float) -> Tensor:
+def _power_is_known(
+    edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float | Tensor, padding: float
+) -> bool:
+    return not isinstance(power, Tensor)
+
+
+@RESAMPLE.implementation(CPP, fits=_power_is_known)
+def _resample(
+    edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float | Tensor, padding: float
+) -> Tensor:
     rays, bins = weights.shape
     out = edges.new_empty(rays, count + 1)
     edges, weights = edges.contiguous(), weights.contiguous()

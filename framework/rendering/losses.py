@@ -97,12 +97,11 @@ def depth_error(weights: Tensor, samples: Samples, known: Tensor) -> Tensor:
         known: (R,) known distances d along the rays, scene units; 0 if unknown, in which case the ray is left out.
     """
     has_depth = known > 0
-    if not bool(has_depth.any()):
-        return weights.sum() * 0
     depths = torch.where(has_depth, known, torch.ones_like(known))[samples.ray_indices]
     # Without the bound, far samples, which are sparse where distances are in disparity, would dominate the mean.
     apart = ((samples.t - depths).abs() / depths).clamp(max=1)
-    return ray_sum(weights * apart, samples)[has_depth].mean()
+    # Not of `[has_depth]`, for whose size the device would be waited for.
+    return (ray_sum(weights * apart, samples) * has_depth).sum() / has_depth.sum().clamp(min=1)
 
 
 def matter_before(weights: Tensor, samples: Samples, clear: Tensor) -> Tensor:

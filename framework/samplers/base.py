@@ -8,6 +8,7 @@ from typing import Protocol, runtime_checkable
 from torch import Tensor, nn
 
 from framework.base.optimised import Optimised
+from framework.base.step_kind import StepKind
 from framework.fields.base import DensityFunction, Field
 from framework.geometry.rays import Rays, Samples
 
@@ -41,6 +42,14 @@ class Sampler(nn.Module, ABC):
             step: number of training steps done.
             density: density of the field.
         """
+
+    def step_kind(self, step: int) -> StepKind:
+        """Return what sampling in a training step computes besides the values of tensors.
+
+        Args:
+            step: number of training steps done.
+        """
+        return StepKind(varies="the sampler decides how many samples a ray has")
 
     def losses(self, samples: Samples, weights: Tensor) -> dict[str, Tensor]:
         """Return the losses that train the sampler itself, by name, each a scalar.

@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from framework.base.step_kind import StepKind
 from framework.fields.base import Field
 from framework.geometry.points import sample_points
 from framework.geometry.rays import CoarseLevel, Rays, Samples
@@ -50,6 +51,9 @@ class HierarchicalSampler(Sampler):
         if self.coarse is None:
             return self._of_intervals(rays, field, jitter)
         return self._of_points(rays, self.coarse, jitter)
+
+    def step_kind(self, step: int) -> StepKind:
+        return StepKind()
 
     def _of_points(self, rays: Rays, coarse: Field, jitter: bool) -> Samples:
         t = stratified_points(rays, self.num_coarse, jitter)

@@ -19,7 +19,9 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
+from framework.base.device import StepValue
 from framework.base.optimised import Optimised
+from framework.base.step_kind import StepKind
 from framework.encodings.hash_grid import HashGrid
 from framework.fields.base import DensityFunction, Field
 from framework.fields.encoded import DensityField
@@ -100,7 +102,7 @@ class ProposalSampler(Sampler):
             grids = [HashGrid(num_levels, 2, 16, finest, log2_table_size) for finest in resolutions]
             fields = [DensityField(box, grid, unbounded=unbounded) for grid in grids]
         self.fields = nn.ModuleList(fields)
-        self.power = 1.0
+        self.power = StepValue(1.0)
         self.learning = False
 
     @property
@@ -119,7 +121,7 @@ class ProposalSampler(Sampler):
             self.counts,
             self.scale if self.unbounded else None,
             jitter=jitter,
-            power=self.power if self.training else 1.0,
+            power=self.power.on(nears.device) if self.training else 1.0,
             learning=learning,
             ladder=self.ladder,
             footprints=[proposal.footprint for proposal in self.proposals],
@@ -135,8 +137,15 @@ class ProposalSampler(Sampler):
     def update(self, step: int, density: DensityFunction) -> None:
         """Set the exponent of the annealing, and whether the proposals learn in this step."""
         x = min(step / max(self.anneal_steps, 1), 1.0)
-        self.power = ANNEALING_SLOPE * x / ((ANNEALING_SLOPE - 1) * x + 1)
-        self.learning = step < ALWAYS_LEARN_UNTIL or step % self.learn_every == 0
+        self.power.set(ANNEALING_SLOPE * x / ((ANNEALING_SLOPE - 1) * x + 1))
+        self.learning = self.learns(step)
+
+    def learns(self, step: int) -> bool:
+        """Return whether the proposals learn in the training step after `step` others."""
+        return step < ALWAYS_LEARN_UNTIL or step % self.learn_every == 0
+
+    def step_kind(self, step: int) -> StepKind:
+        return StepKind((self.learns(step),))
 
     def losses(self, samples: Samples, weights: Tensor) -> dict[str, Tensor]:
         return {"interlevel": interlevel_loss(samples, weights, self.blurs)} if samples.proposals else {}
@@ -157,7 +166,7 @@ def propose(
     scale: float | None,
     *,
     jitter: bool,
-    power: float,
+    power: float | Tensor,
     learning: bool,
     ladder: float | None = None,
     footprints: Sequence[Footprint] | None = None,
@@ -170,7 +179,7 @@ def propose(
         counts: intervals per ray of each level, followed by the number of samples per ray: one more than densities.
         scale: the distance up to which normalised distance is linear, or the unit of the ladder, as in `spacing`.
         jitter: True for random positions, False for fixed ones.
-        power: exponent of the weights that are drawn from; less than 1 flattens them.
+        power: exponent of the weights that are drawn from, as in `resample`; less than 1 flattens them.
         learning: whether to keep the proposals' weights, gradients attached, in `Samples.proposals`.
         ladder: exponent of the power ladder, as in `spacing`.
         footprints: kind of the points' size that each density needs; none if not given.

@@ -67,10 +67,10 @@ class Silhouettes:
     def of(cls, dataset: Dataset) -> Silhouettes:
         """Sum up each image of `dataset`, so that the count in any rectangle of pixels takes four look-ups.
 
-        If the images exceed the memory limit, so do the sums; they are then computed each time they are requested.
+        If the images exceed the memory, so do the sums; they are then computed each time they are requested.
         """
         counts = _Counts(dataset)
-        return cls(dataset, counts if dataset.mapped is not None else tuple(counts))
+        return cls(dataset, tuple(counts) if dataset.resident else counts)
 
     def __len__(self) -> int:
         return len(self.sums)

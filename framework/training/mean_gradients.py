@@ -19,17 +19,17 @@ LARGE = 2**18
 
 
 @torch.no_grad()
-def mean_gradients(optimizer: Adam, finite: bool) -> bool:
+def mean_gradients(optimizer: Adam, finite: bool | Tensor) -> bool | Tensor:
     """Replace the gradients by their means over all processes, unless one of them is not finite.
 
     Where a process has no gradient of a parameter, it is taken as zero; a parameter without any gradient gets none.
 
     Args:
         optimizer: the optimiser, after the backward pass.
-        finite: whether all gradients of this process are finite.
+        finite: whether all gradients of this process are finite, possibly still on the device, () bool.
 
     Returns:
-        Whether all gradients of all processes are finite.
+        Whether all gradients of all processes are finite; known to Python if there are several.
 
     Raises:
         LostProcessError: if another process has ended, or the parameters of the processes differ in size.
@@ -39,7 +39,7 @@ def mean_gradients(optimizer: Adam, finite: bool) -> bool:
         return finite
     parameters = optimizer.parameters
     own = [parameter.numel() * optimizer.has_gradient(parameter) for parameter in parameters]
-    finite_there, *sizes = zip(*gathered([finite, *own]), strict=True)
+    finite_there, *sizes = zip(*gathered([bool(finite), *own]), strict=True)
     if not all(finite_there):
         return False
     if any(len({*column} - {0}) > 1 for column in sizes):

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from framework.base.config import TrainConfig
+from framework.base.device import StepValue
 from framework.base.optimised import DefersGradient, ParameterGroup, RowChange
 from framework.kernels.adam import all_finite, dense_adam, sparse_adam
 from framework.kernels.hash_grid_lookup import TableGradient
@@ -47,10 +48,8 @@ class Adam:
         self.state: dict[Tensor, dict[str, Tensor]] = {}
         """Moments and counts of each parameter."""
         self.deferred = deferred
-        self.entries_updated: int | Tensor = 0
-        """Number of entries of sparse groups that were updated, summed over all steps, possibly on the device."""
-        self.entries_there = 0
-        """Number of entries of sparse groups, summed over all steps."""
+        self._rates: list[StepValue] = []
+        self._entries, self._entries_on_device = [0, 0], torch.zeros(2, dtype=torch.int64)
         for group in self.param_groups:
             for parameter in group["params"]:
                 self._begin(parameter, group["sparse"])
@@ -65,9 +64,19 @@ class Adam:
             state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
 
     @property
+    def entries(self) -> tuple[int, int]:
+        """Number of entries of sparse groups that were updated, and that there are, both summed over all steps."""
+        updated, there = (a + b for a, b in zip(self._entries, self._entries_on_device.tolist(), strict=True))
+        return updated, there
+
+    @property
     def parameters(self) -> list[Tensor]:
         """The parameters of all groups, in order."""
         return [parameter for group in self.param_groups for parameter in group["params"]]
+
+    def tensors(self) -> list[Tensor]:
+        """Return the tensors of the states of all parameters, and what is counted on the device."""
+        return [*(t for p in self.parameters for t in self.state[p].values()), self._entries_on_device]
 
     def state_dict(self) -> dict[str, Any]:
         """Return groups and states for a checkpoint, as PyTorch's optimisers do: parameters are their numbers."""
@@ -121,8 +130,8 @@ class Adam:
             parameter.grad = torch.zeros_like(parameter)
         return parameter.grad
 
-    def finite(self, loss: Tensor) -> bool:
-        """Return whether a loss and all gradients are finite; the device is waited for once.
+    def finite(self, loss: Tensor) -> bool | Tensor:
+        """Return whether a loss and all gradients are finite; the answer may still be on the device, () bool.
 
         Args:
             loss: a scalar.
@@ -135,21 +144,37 @@ class Adam:
         own = [] if parameter.grad is None else [parameter.grad]
         return own if deferred is None else own + deferred.gradients
 
+    def bring_rates(self) -> None:
+        """Take the groups' learning rates to devices that run ahead of Python, for the steps from now on."""
+        self._rates = self._rates or [StepValue(group["lr"]) for group in self.param_groups]
+        for rate, group in zip(self._rates, self.param_groups, strict=True):
+            rate.set(group["lr"])
+
+    def _rate(self, index: int, device: torch.device) -> float | Tensor:
+        brought = self._rates[index].on(device) if self._rates else None
+        rate: float = self.param_groups[index]["lr"]
+        return brought if isinstance(brought, Tensor) else rate
+
     @torch.no_grad()
-    def step(self) -> None:
+    def step(self, finite: bool | Tensor = True) -> None:
         """Update every parameter that has a gradient.
 
         The state of a parameter whose shape has changed starts from zero.
+
+        Args:
+            finite: whether the step's loss and gradients are finite. If this is still on the device, () bool, nothing
+                is changed where it is False.
         """
-        for group in self.param_groups:
+        found_inf = (~finite).float() if isinstance(finite, Tensor) else None
+        for index, group in enumerate(self.param_groups):
             for parameter in group["params"]:
                 if self.state[parameter]["exp_avg"].shape != parameter.shape:
                     self._begin(parameter, group["sparse"])
             if group["sparse"]:
                 for parameter in group["params"]:
-                    self._step_sparse(parameter, group)
+                    self._step_sparse(parameter, index, found_inf)
             else:
-                self._step_dense(group)
+                self._step_dense(index, found_inf)
 
     @torch.no_grad()
     def change_rows(self, change: RowChange) -> None:
@@ -174,23 +199,37 @@ class Adam:
                 kept = state[name].index_select(0, change.kept)
                 state[name] = torch.cat([kept, kept.new_zeros(added, *kept.shape[1:])])
 
-    def _step_sparse(self, parameter: Tensor, group: dict[str, Any]) -> None:
-        state, deferred = self.state[parameter], self.deferred.get(parameter)
+    def _step_sparse(self, parameter: Tensor, index: int, found_inf: Tensor | None) -> None:
+        group, state, deferred = self.param_groups[index], self.state[parameter], self.deferred.get(parameter)
         moments = state["exp_avg"], state["exp_avg_sq"], state["seen"]
-        settings = group["lr"], group["betas"], group["eps"]
-        self.entries_there += len(parameter)
+        betas, eps = group["betas"], group["eps"]
+        updated: int | Tensor = 0
         if deferred is not None and deferred.pending:
-            self.entries_updated += deferred.adam(parameter, *moments, *settings)
+            updated = deferred.adam(parameter, *moments, group["lr"], betas, eps)
         if parameter.grad is not None and parameter.numel():  # a table may have no columns
-            self.entries_updated += sparse_adam(parameter, parameter.grad, *moments, *settings)
+            rate = self._rate(index, parameter.device)
+            updated += sparse_adam(parameter, parameter.grad, *moments, rate, betas, eps, found_inf)
+        self._count(updated, len(parameter))
 
-    def _step_dense(self, group: dict[str, Any]) -> None:
+    def _count(self, updated: int | Tensor, there: int) -> None:
+        if isinstance(updated, Tensor):  # added up in place, so that a repeated step counts too
+            self._entries_on_device = self._entries_on_device.to(updated.device)
+            self._entries_on_device[0].add_(updated)
+            self._entries_on_device[1].add_(there)
+        else:
+            self._entries = [self._entries[0] + updated, self._entries[1] + there]
+
+    def _step_dense(self, index: int, found_inf: Tensor | None) -> None:
+        group = self.param_groups[index]
         with_grad = [p for p in group["params"] if p.grad is not None]
+        if not with_grad:
+            return
         grads = [p.grad for p in with_grad]
         states = [self.state[p] for p in with_grad]
         means, squares = [s["exp_avg"] for s in states], [s["exp_avg_sq"] for s in states]
         steps = [s["step"] for s in states]
-        dense_adam(with_grad, grads, means, squares, steps, group["lr"], group["betas"], group["eps"])
+        rate = self._rate(index, with_grad[0].device)
+        dense_adam(with_grad, grads, means, squares, steps, rate, group["betas"], group["eps"], found_inf)
 
 
 def make_optimizer(model: Model[Any], config: TrainConfig) -> Adam:
@@ -255,6 +294,7 @@ def set_learning_rate(optimizer: Adam, config: TrainConfig, step: int, progress:
         own = group.get("schedule")
         factor = usual if own is None else learning_rate_factor(replace(config, lr_schedule=own), step, progress)
         group["lr"] = group["initial_lr"] * factor
+    optimizer.bring_rates()
 
 
 def first_non_finite(model: Model, optimizer: Adam) -> str | None:

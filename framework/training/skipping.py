@@ -56,8 +56,9 @@ def skip_report(trainer: Trainer) -> list[Rung]:
     samplers = parts(model, SkipsCells)
     if samplers and isinstance(model, RayModel):
         rungs += _sampling_rungs(trainer, model, samplers)
-    if trainer.optimizer.entries_there:
-        share = int(trainer.optimizer.entries_updated) / trainer.optimizer.entries_there
+    updated, there = trainer.optimizer.entries
+    if there:
+        share = updated / there
         says = f"parameters that a step does not use: {1 - share:.0%} of each update of tables"
         rungs.append(Rung("table entries in a step's update", 1 - share, None, "--sparse-updates False", says))
     return rungs

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -23,8 +23,14 @@ class StepResult:
     """Loss of the batch; its terms still hold the graph."""
     squared_errors: Tensor
     """Squared error of each pixel, a mean over channels, in the shape of the batch's pixels."""
-    finite: bool
-    """Whether the loss and all gradients were finite, in every process; if not, the step was dropped."""
+    finite: bool | Tensor
+    """Whether the loss and all gradients were finite, in every process; if not, the step was dropped. It may still be
+    on the device, () bool."""
+
+    def detached(self) -> StepResult:
+        """Return the result without the graph of its loss."""
+        terms = {name: value.detach() for name, value in self.loss.terms.items()}
+        return replace(self, loss=replace(self.loss, terms=terms))
 
 
 def train_step(model: Model[Any], optimizer: Adam, batch: Any, step: int, progress: float) -> StepResult:
@@ -39,17 +45,56 @@ def train_step(model: Model[Any], optimizer: Adam, batch: Any, step: int, progre
         step: number of training steps done.
         progress: fraction of the budget spent, 0 to 1.
     """
+    schedule(model, optimizer, step, progress)
+    return learn(model, optimizer, batch, step, progress)
+
+
+def schedule(model: Model[Any], optimizer: Adam, step: int, progress: float) -> None:
+    """Set what depends on the number of the step: learning rates, and schedules of the model.
+
+    Args:
+        model: the model to train.
+        optimizer: the optimiser of all its parameters.
+        step: number of training steps done.
+        progress: fraction of the budget spent, 0 to 1.
+    """
     set_learning_rate(optimizer, model.config, step, progress)
-    loss = forward(model, batch, step, progress, model.uses_bfloat16)
+    _before(model, step, progress, model.uses_bfloat16)
+
+
+def learn(model: Model[Any], optimizer: Adam, batch: Any, step: int, progress: float) -> StepResult:
+    """Take the rest of a training step, after `schedule`: forward, backward, Adam.
+
+    Of a model whose steps repeat each other (`Model.step_kind`), this depends on the values of tensors alone.
+
+    Args:
+        model: the model to train.
+        optimizer: the optimiser of all its parameters.
+        batch: pixels or views, as the model's loss takes them.
+        step: number of training steps done.
+        progress: fraction of the budget spent, 0 to 1.
+    """
+    loss = _loss(model, batch, step, model.uses_bfloat16)
     finite = mean_gradients(optimizer, backward(loss.total, optimizer))
-    if finite:
-        optimizer.step()
+    if changes_rows(model):
+        finite = bool(finite)
+    if finite is not False:
+        optimizer.step(finite)
         with shared_stream(model.config.machine.seed, step, AFTER_STEP):
             changes = model.after_step(step, progress)
         for change in changes:
             optimizer.change_rows(change)
     squared_errors = (loss.rgb - batch.rgb).square().mean(-1)
     return StepResult(loss, squared_errors, finite)
+
+
+def changes_rows(model: Model[Any]) -> bool:
+    """Return whether a model has something to do after each step, for which Python must know if the step counts.
+
+    Args:
+        model: any model.
+    """
+    return type(model).after_step is not Model.after_step
 
 
 def forward(model: Model[Any], batch: Any, step: int, progress: float, bfloat16: bool = False) -> Loss:
@@ -62,14 +107,25 @@ def forward(model: Model[Any], batch: Any, step: int, progress: float, bfloat16:
         progress: fraction of the budget spent, 0 to 1.
         bfloat16: whether networks run in bfloat16, which has the range of float32 and needs no gradient scaling.
     """
+    _before(model, step, progress, bfloat16)
+    return _loss(model, batch, step, bfloat16)
+
+
+def _before(model: Model[Any], step: int, progress: float, bfloat16: bool) -> None:
     model.train()
+    with (
+        torch.autocast(model.device.type, torch.bfloat16, enabled=bfloat16),
+        shared_stream(model.config.machine.seed, step, BEFORE_STEP),
+    ):
+        model.before_step(step, progress)
+
+
+def _loss(model: Model[Any], batch: Any, step: int, bfloat16: bool) -> Loss:
     with torch.autocast(model.device.type, torch.bfloat16, enabled=bfloat16):
-        with shared_stream(model.config.machine.seed, step, BEFORE_STEP):
-            model.before_step(step, progress)
         return model.loss(batch, step)
 
 
-def backward(loss: Tensor, optimizer: Adam) -> bool:
+def backward(loss: Tensor, optimizer: Adam) -> bool | Tensor:
     """Compute the gradients of a loss, for the optimiser's next step.
 
     Args:
@@ -77,15 +133,14 @@ def backward(loss: Tensor, optimizer: Adam) -> bool:
         optimizer: the optimiser, whose gradients of the previous step are cleared.
 
     Returns:
-        Whether the loss and all gradients are finite.
+        Whether the loss and all gradients are finite; possibly still on the device, () bool.
     """
     optimizer.zero_grad()
     if is_bad_here(loss):
         return False
     if loss.requires_grad:
         loss.backward()
-    if optimizer.finite(loss):
-        return True
-    if not bool(torch.isfinite(loss)):
+    finite = optimizer.finite(loss)
+    if finite is False and not bool(torch.isfinite(loss)):
         optimizer.zero_grad()  # so that the loss is found to be the first that is bad
-    return False
+    return finite

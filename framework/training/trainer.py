@@ -27,6 +27,7 @@ from framework.kernels.native import torch_on_one_thread
 from framework.model import StartsFromImages
 from framework.scene.profile import SceneProfile
 from framework.training.checkpoint import FOLDER, checkpoint_path, load_checkpoint, load_newest, save_checkpoint
+from framework.training.graphs import kind_of_step, make_graphs
 from framework.training.held_out import HeldOut
 from framework.training.optim import first_non_finite, make_optimizer
 from framework.training.outcome import Outcome
@@ -35,7 +36,7 @@ from framework.training.progress import ProgressBar, StepReport, TensorBoard
 from framework.training.run import Run
 from framework.training.signals import stop_signals
 from framework.training.state import State, agree
-from framework.training.step import train_step
+from framework.training.step import StepResult, learn, schedule, train_step
 from framework.training.trained import build_model, restore_model
 
 STEPS_PER_LOG = 25
@@ -82,6 +83,7 @@ class Trainer:
         self.steps_per_read = 1 if self.device.type == "cpu" else STEPS_PER_LOG
         """Steps after which the errors of batches are read from the device, which is waited for."""
         self._unread: list[Tensor] = []
+        self.graphs = make_graphs(self.config.machine.cuda_graphs, self.device, self._learnt)
         self.held_out = HeldOut(self.run, self.model, eval_set)
         self._bad_in_a_row = 0
         self._prepared = False
@@ -139,6 +141,8 @@ class Trainer:
                 group["initial_lr"] = rate  # a rate given on the command line counts
             self.state = checked(State, checkpoint["state"])
             self._unread.clear()
+            if self.graphs is not None:
+                self.graphs.forget()
             self.source.restore(checkpoint.get("errors"))
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise CheckpointError(f"the checkpoint's optimiser or state does not fit: {error}") from error
@@ -259,13 +263,12 @@ class Trainer:
 
     def _train_step(self) -> StepReport:
         state, start = self.state, time.perf_counter()
-        seed_step(self.config.machine.seed, state.step, processes().rank)
-        batch = self.source.draw(self._request())
-        result = train_step(self.model, self.optimizer, batch, state.step, self.progress)
-        self._count_bad(result.finite)
+        batch, result = self._drawn_and_taken()
         self.source.learn(batch, result.squared_errors)
         weights = getattr(batch, "weights", None)
-        self._unread.append((result.squared_errors if weights is None else result.squared_errors * weights).mean())
+        mse = (result.squared_errors if weights is None else result.squared_errors * weights).mean()
+        finite = result.finite if isinstance(result.finite, Tensor) else torch.full_like(mse, result.finite)
+        self._unread.append(torch.stack([mse, finite.to(mse)]))
         if (state.step + 1) % self.steps_per_read == 0:
             self._read_errors(state.step + 1)
         seconds = time.perf_counter() - start
@@ -280,6 +283,28 @@ class Trainer:
             rays_per_second=num_rays * processes().count / seconds,
             held_out_psnr=state.looks[-1][2] if state.looks else None,
         )
+
+    def _drawn_and_taken(self) -> tuple[Any, StepResult]:
+        """Return a batch and the result of a step on it; both are written to by the next step."""
+        model, source, optimizer, request = self.model, self.source, self.optimizer, self._request()
+        step, progress, seed, rank = self.state.step, self.progress, self.config.machine.seed, processes().rank
+        if self.graphs is not None:
+            kind = kind_of_step(model, source, step, (request.num_pixels, request.rays_per_pixel))
+            if self.graphs.take(kind):
+                schedule(model, optimizer, step, progress)
+
+                def taken() -> tuple[Any, StepResult]:
+                    batch = source.draw(request)
+                    return batch, learn(model, optimizer, batch, step, progress).detached()
+
+                return self.graphs.run(kind, lambda: seed_step(seed, step, rank), taken)
+        seed_step(seed, step, rank)
+        batch = source.draw(request)
+        return batch, train_step(model, optimizer, batch, step, progress)
+
+    def _learnt(self) -> list[Tensor]:
+        """Return all tensors that a step changes for good."""
+        return [*self.model.parameters(), *self.model.buffers(), *self.optimizer.tensors()]
 
     def _request(self) -> Request:
         """Return the next batch's size: one ray per pixel at first, later as many as in rendering."""
@@ -297,14 +322,14 @@ class Trainer:
         wanted = round(samples / max(self.state.samples_per_ray, 0.1))
         return min(max(wanted, SMALLEST_BATCH), LARGEST_BATCH)
 
-    def _count_bad(self, finite: bool) -> None:
+    def _count_bad(self, step: int, finite: bool) -> None:
         """Count dropped steps; raise DivergenceError after too many in a row."""
         self._bad_in_a_row = 0 if finite else self._bad_in_a_row + 1
         self.state.skipped += not finite
         if self._bad_in_a_row >= MAX_BAD_STEPS:
             culprit = first_non_finite(self.model, self.optimizer) or "the loss"
             raise DivergenceError(
-                f"step {self.state.step}: {MAX_BAD_STEPS} steps in a row were not finite, first in {culprit}; "
+                f"step {step}: {MAX_BAD_STEPS} steps in a row were not finite, first in {culprit}; "
                 f"the last good checkpoint is in {self.checkpoint_folder}. Lower --learning-rate, or check the data"
             )
 
@@ -316,12 +341,15 @@ class Trainer:
         state.samples_per_ray += 0.2 * (num_samples / max(num_rays, 1) - state.samples_per_ray)
 
     def _read_errors(self, done: int) -> None:
-        """Take the errors of the last of `done` steps, which were left on the device, into the running mean."""
-        errors = torch.stack(self._unread).tolist() if self._unread else []
+        """Read of the last of `done` steps what was left on the device: errors, and whether they were finite."""
+        unread = torch.stack(self._unread).tolist() if self._unread else []
         self._unread.clear()
-        for step, mse in enumerate(errors, done - len(errors) + 1):
+        for step, (mse, finite) in enumerate(unread, done - len(unread) + 1):
             if math.isfinite(mse):  # a dropped step's may be NaN, which would stay in the mean
                 self.state.train_mse += max(0.02, 1 / step) * (mse - self.state.train_mse)
+            else:
+                self.optimizer.zero_grad()  # so that the loss is found to be the first that is bad
+            self._count_bad(step - 1, bool(finite))
 
     def _train_psnr(self) -> float:
         return min(-10 * float(torch.tensor(max(self.state.train_mse, 1e-12)).log10()), MAX_PSNR)
@@ -342,10 +370,11 @@ class Trainer:
             board.scalars(values, report.step)
 
     def _due_to_save(self) -> bool:
-        if self._bad_in_a_row or not processes().first:  # the parameters may be damaged; keep older checkpoints
-            return False
         aged = self.state.seconds - self._last_save >= self.config.seconds_per_save
-        return aged or self.state.step % self.config.steps_per_save == 0
+        if not processes().first or not (aged or self.state.step % self.config.steps_per_save == 0):
+            return False
+        self._read_errors(self.state.step)
+        return not self._bad_in_a_row  # else the parameters may be damaged; keep older checkpoints
 
     def _try_to_save(self) -> None:
         """Save a checkpoint; on failure, as with a full disk, warn and train on, to try again later."""

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from framework.cli.bench import main
-from framework.tools.benchmarks.gpu import METHODS, along_rays, gpu_plan, psnr_at, reached
+from framework.tools.benchmarks.gpu import METHODS, along_rays, gpu_plan, psnr_at, reached, timed_steps
 from framework.tools.comparison.measures import Row
 from tests.conftest import Refused
 
@@ -28,6 +28,17 @@ def test_kernels_of_rays_are_right() -> None:
         names.add((kernel.name, kernel.count))
     assert ("contraction", 256) in names
     assert ("weights of 64 intervals", 4) in names
+
+
+def test_steps_are_timed_as_they_are_and_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the CPU, which has no graphs, they are the same steps."""
+    monkeypatch.setattr("framework.tools.benchmarks.gpu.SKY_SIZE", 16)
+    small = {"num_rays_per_batch": 16, "log2_table_size": 8, "num_levels": 2}
+    off, auto = timed_steps(torch.device("cpu"), 1, 2, **small)
+    assert [off["CUDA graphs"], auto["CUDA graphs"]] == ["off", "auto"]
+    assert off["PSNR of batches, dB"] == auto["PSNR of batches, dB"]
+    assert off["repeated"] == auto["repeated"] == 0
+    assert min(off["ms a step"], auto["ms a step"]) > 0
 
 
 def test_the_psnr_after_some_seconds_is_that_of_the_last_evaluation_until_then() -> None:

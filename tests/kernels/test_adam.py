@@ -8,9 +8,12 @@ import torch
 from framework.kernels import native
 from framework.kernels.adam import (
     ALL_FINITE,
+    DENSE_ADAM,
     SPARSE_ADAM,
     all_finite,
     all_finite_reference,
+    dense_adam,
+    dense_adam_reference,
     sparse_adam,
     sparse_adam_reference,
 )
@@ -135,3 +138,59 @@ def test_all_finite_sees_a_single_bad_value(bad: float, place: int) -> None:
         broken = values.clone()
         broken[place] = bad
         assert not judged([*others, broken])
+
+
+def moved(update, *verdict: object, features: int = 2, rate: object = 1e-2) -> list[torch.Tensor]:
+    """Tables and a gradient after an update."""
+    state, grad = tables(300, features), gradients(300, features, 3)
+    update(state[0], grad, *state[1:], rate, BETAS, EPS, *verdict)
+    return [*state, grad]
+
+
+@pytest.mark.parametrize("update", [sparse_adam, sparse_adam_reference, MASKED])
+def test_rate_and_verdict_on_the_device_are_those_of_python(update) -> None:
+    usual, start = moved(update), [*tables(300, 2), torch.zeros(300, 2)]
+    for found in (moved(update, torch.zeros(())), moved(update, rate=torch.tensor(1e-2))):
+        for one, other in zip(found, usual, strict=True):
+            torch.testing.assert_close(one, other)
+    dropped = moved(update, torch.ones(()), rate=torch.tensor(1e-2))
+    assert all(torch.equal(one, other) for one, other in zip(dropped, start, strict=True))
+    assert not torch.equal(usual[0], start[0])
+    spoilt, grad = tables(300, 2), torch.full((300, 2), torch.nan)
+    update(spoilt[0], grad, *spoilt[1:], 1e-2, BETAS, EPS, torch.ones(()))
+    assert torch.equal(spoilt[0], start[0])
+    assert not grad.any()
+
+
+DENSE = [dense_adam, dense_adam_reference, *(each.run for each in DENSE_ADAM.implementations)]
+
+
+@pytest.mark.parametrize("update", DENSE)
+def test_verdict_and_rate_of_dense_adam(update) -> None:
+    def after(rate: object, *verdict: object) -> list[torch.Tensor]:
+        torch.manual_seed(0)
+        values, grads, means, squares = ([torch.rand(3, 4), torch.rand(5)] for _ in range(4))
+        steps = [torch.tensor(3.0), torch.tensor(8.0)]
+        update(values, grads, means, squares, steps, rate, BETAS, 1e-8, *verdict)
+        return [*values, *means, *squares, *steps]
+
+    if update is DENSE_ADAM.implementations[0].run:  # C++, whose verdict is Python's
+        if native.available():
+            torch.testing.assert_close(after(0.01)[0], dense_once(0.01))
+        return
+    torch.testing.assert_close(after(0.01)[0], dense_once(0.01))
+    for found in (after(torch.tensor(0.01)), after(torch.tensor(0.01), torch.zeros(()))):
+        for one, other in zip(found, after(0.01), strict=True):
+            torch.testing.assert_close(one, other)
+    dropped = after(torch.tensor(0.01), torch.ones(()))
+    torch.manual_seed(0)
+    assert torch.equal(dropped[0], torch.rand(3, 4))
+    assert [float(step) for step in dropped[-2:]] == [3, 8]
+
+
+def dense_once(rate: float) -> torch.Tensor:
+    """The first parameter of the test above after its fourth update, by the paper's formulas."""
+    torch.manual_seed(0)
+    (value, _), (grad, _), (mean, _), (square, _) = ([torch.rand(3, 4), torch.rand(5)] for _ in range(4))
+    mean, square = 0.9 * mean + 0.1 * grad, 0.99 * square + 0.01 * grad * grad
+    return value - rate * (mean / (1 - 0.9**4)) / ((square / (1 - 0.99**4)).sqrt() + 1e-8)

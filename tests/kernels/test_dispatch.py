@@ -28,6 +28,7 @@ from framework.kernels.multisampled_grid import MULTISAMPLED_GRID
 from framework.kernels.multisamples import UNIT_MULTISAMPLES
 from framework.kernels.occupancy import REFRESH_OCCUPANCY, Occupancy
 from framework.kernels.planes import PLANE_BANDS, PLANES, PlanesGradient, PlanesLayout
+from framework.kernels.rigid_motion import RIGID_MOTIONS
 from framework.kernels.rows import GATHER_ROWS
 from framework.kernels.silhouettes import HOLD_BALLS, OPAQUE_SUMS, PIXELS_NEAR_BALLS, Photograph, opaque_sums
 from framework.kernels.spherical_harmonics import SPHERICAL_HARMONICS
@@ -174,6 +175,7 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     BLEND: lambda: (records := projected(), tile_lists(records, 37, 30), 37, 30, rand(3), 7, True),
     PHOTOMETRIC: lambda: (rand(13, 15, 3), rand(13, 15, 3), 0.2),
     GATHER_COLORS: lambda: (torch.randint(256, (60, 4), dtype=torch.uint8), torch.randint(60, (9,)), rand(9, 3)),
+    RIGID_MOTIONS: lambda: (torch.randn(9, 6), True),
     CAMERA_RAYS: lambda: (cameras(), torch.arange(0, 72, 5), 0.0, 1.0, None, subpixels(4)),
 }
 """Arguments of every operation that has more than a reference."""

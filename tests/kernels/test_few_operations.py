@@ -13,6 +13,7 @@ from framework.kernels.dispatch import FEW_OPERATIONS, Operation
 from framework.kernels.hash_grid import HASH_GRID, HashGridLayout
 from framework.kernels.march import ReferenceMarch
 from framework.kernels.planes import PLANE_BANDS, PLANES, PlanesLayout
+from framework.kernels.rigid_motion import RIGID_MOTIONS
 from framework.kernels.rows import gather_rows
 from framework.kernels.spherical_harmonics import SPHERICAL_HARMONICS
 from framework.kernels.splat_blend import BLEND, CHANNELS, blend_reference
@@ -180,3 +181,29 @@ def test_nothing_to_blend() -> None:
     assert drawn.image.shape == (50, 70, 3)
     assert torch.equal(drawn.image[9, 9].float(), torch.tensor([0.2, 0.5, 1.0]))
     assert bool((drawn.transmittance == 1).all())
+
+
+def exponential(tangents: Tensor, screw: bool) -> Tensor:
+    """The first forty terms of the power series of the matrix exponential."""
+    w, zero = tangents[:, 3:], torch.zeros_like(tangents[:, 0])
+    rows = [zero, -w[:, 2], w[:, 1], w[:, 2], zero, -w[:, 0], -w[:, 1], w[:, 0], zero]
+    generator = torch.nn.functional.pad(torch.stack(rows, -1).view(-1, 3, 3), (0, 1, 0, 1))
+    generator = generator + torch.nn.functional.pad(tangents[:, :3, None], (3, 0, 0, 1)) * screw
+    total = term = torch.eye(4, dtype=tangents.dtype).expand_as(generator)
+    for power in range(1, 40):
+        term = term @ generator / power
+        total = total + term
+    return total[:, :3] if screw else torch.cat([total[:, :3, :3], tangents[:, :3, None]], -1)
+
+
+@pytest.mark.parametrize("screw", [False, True])
+def test_rigid_motions(screw: bool) -> None:
+    """Values, gradients and gradients of these, from no angle at all to more than half a turn."""
+    angles = torch.tensor([0.0, 1e-9, 1e-4, 0.1, 0.999, 1.001, 2.0, 4.0], dtype=torch.float64)
+    directions = torch.nn.functional.normalize(torch.randn(8, 3, dtype=torch.float64), dim=-1)
+    tangents = torch.cat([torch.randn(8, 3, dtype=torch.float64), angles[:, None] * directions], dim=-1)
+    truth = derived(lambda x: exponential(x, screw), tangents)
+    for run in (few(RIGID_MOTIONS), RIGID_MOTIONS.reference.run):
+        same(derived(lambda x, run=run: run(x, screw), tangents), truth)
+    single = few(RIGID_MOTIONS)(tangents.float(), screw)
+    torch.testing.assert_close(single.double(), truth[0], rtol=1e-5, atol=1e-5)

@@ -126,7 +126,7 @@ def test_annealing_is_the_papers() -> None:
     sampler = ProposalSampler(BOX, (8, 8, 4), anneal_steps=1000)
     for step, expected in ((0, 0.0), (100, 1 / 1.9), (1000, 1.0), (5000, 1.0)):
         sampler.update(step, Wall(0, 1).density)
-        assert math.isclose(sampler.power, expected)
+        assert math.isclose(sampler.power.on(BOX.device), expected)
 
 
 def test_light_that_no_wall_stops_ends_in_the_last_interval_of_an_unbounded_ray() -> None:

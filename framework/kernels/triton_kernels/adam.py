@@ -9,7 +9,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from framework.kernels.triton_kernels.launch import blocks, launch, opacity_of
+from framework.kernels.triton_kernels.launch import blocks, launch, on_device, opacity_of
 
 BLOCK = 1024
 """Values that are taken together."""
@@ -17,7 +17,7 @@ BLOCK = 1024
 
 @triton.jit(do_not_specialize=["entries"])
 def _sparse(
-    values, grad, mean, square, seen, updated, entries, features, rate, keep1, keep2, add1, add2,
+    values, grad, mean, square, seen, updated, rate, found_inf, entries, features, keep1, keep2, add1, add2,
     decay1, decay2, eps,
     ROWS: tl.constexpr, F: tl.constexpr,
 ):  # fmt: skip
@@ -28,6 +28,10 @@ def _sparse(
     there = here[:, None] & (f < features)[None, :]
     g = tl.load(grad + at, mask=there, other=0.0)
     used = tl.max((g != 0).to(tl.int32), 1) != 0
+    tl.store(grad + at, tl.zeros_like(g), mask=there & used[:, None])
+    if found_inf is not None:
+        g = tl.where(tl.load(found_inf) == 0, g, 0.0)
+        used = tl.max((g != 0).to(tl.int32), 1) != 0
     mask = there & used[:, None]
     tl.atomic_add(updated, tl.sum(used.to(tl.int64), 0), sem="relaxed")
     count = tl.load(seen + e, mask=used, other=0.0) + 1
@@ -38,18 +42,17 @@ def _sparse(
     v = keep2 * tl.load(square + at, mask=mask, other=0.0) + add2 * g * g
     tl.store(mean + at, m, mask=mask)
     tl.store(square + at, v, mask=mask)
-    moved = rate * unbias1[:, None] * m / (tl.sqrt(unbias2[:, None] * v) + eps)
+    moved = tl.load(rate) * unbias1[:, None] * m / (tl.sqrt(unbias2[:, None] * v) + eps)
     tl.store(values + at, tl.load(values + at, mask=mask, other=0.0) - moved, mask=mask)
-    tl.store(grad + at, tl.zeros_like(g), mask=mask)
 
 
 def sparse_adam(
     values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
-    rate: float, betas: tuple[float, float], eps: float,
+    rate: float | Tensor, betas: tuple[float, float], eps: float, found_inf: Tensor | None = None,
 ) -> Tensor:  # fmt: skip
     """Compute `framework.kernels.adam.sparse_adam`, whose number of entries stays on the GPU.
 
-    `values`, `grad`, `mean`, `square`, `seen`, `rate`, `betas` and `eps` are as there.
+    `values`, `grad`, `mean`, `square`, `seen`, `rate`, `betas`, `eps` and `found_inf` are as there.
     """
     entries, features = values.shape
     width = triton.next_power_of_2(features)
@@ -57,7 +60,7 @@ def sparse_adam(
     updated = torch.zeros((), dtype=torch.int64, device=values.device)
     decays = (-math.log(beta) if beta else math.inf for beta in betas)
     launch(
-        _sparse, (blocks(entries, rows),), values, grad, mean, square, seen, updated, entries, features, float(rate),
-        *betas, *(1 - beta for beta in betas), *decays, eps, ROWS=rows, F=width,
+        _sparse, (blocks(entries, rows),), values, grad, mean, square, seen, updated, on_device(rate, values),
+        found_inf, entries, features, *betas, *(1 - beta for beta in betas), *decays, eps, ROWS=rows, F=width,
     )  # fmt: skip
     return updated

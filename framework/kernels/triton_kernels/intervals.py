@@ -14,7 +14,7 @@ import triton.language as tl
 from torch import Tensor
 
 from framework.kernels.intervals import EPS
-from framework.kernels.triton_kernels.launch import depth_slope, launch, opacity_of, optical_depth
+from framework.kernels.triton_kernels.launch import depth_slope, launch, on_device, opacity_of, optical_depth
 
 BLOCK = 64
 """Bins of a ray that are taken together, by one warp."""
@@ -129,12 +129,12 @@ def _preceding(values, bound, most, steps, AT: tl.constexpr):
 
 
 @triton.jit
-def _resample(edges, weights, shift, sums, out, bins, count, power, padding, steps, BLOCK: tl.constexpr):
+def _resample(edges, weights, shift, power, sums, out, bins, count, padding, steps, BLOCK: tl.constexpr):
     ray = tl.program_id(0).to(tl.int64)
     edges += ray * (bins + 1)
     sums += ray * bins
     out += ray * (count + 1)
-    total = _sums(weights + ray * bins, sums, bins, power, padding, BLOCK)
+    total = _sums(weights + ray * bins, sums, bins, tl.load(power), padding, BLOCK)
     offset = tl.load(shift + ray).to(tl.float64)
     for first in range(0, count + 1, BLOCK):
         j = first + tl.arange(0, BLOCK)
@@ -149,7 +149,9 @@ def _resample(edges, weights, shift, sums, out, bins, count, power, padding, ste
         tl.store(out + j, (start + share * (end - start)).to(tl.float32), mask=j <= count)
 
 
-def resample(edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float, padding: float) -> Tensor:
+def resample(
+    edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float | Tensor, padding: float
+) -> Tensor:
     """Compute `framework.kernels.intervals.resample`.
 
     `edges`, `weights`, `shift`, `count`, `power` and `padding` are as there.
@@ -157,8 +159,8 @@ def resample(edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: f
     rays, bins = weights.shape
     out, sums = edges.new_empty(rays, count + 1), edges.new_empty(rays, bins, dtype=torch.float64)
     launch(
-        _resample, (rays,), edges.contiguous(), weights.contiguous(), shift.contiguous(), sums, out, bins, count,
-        float(power), float(padding), bins.bit_length(), BLOCK=BLOCK, num_warps=1,
+        _resample, (rays,), edges.contiguous(), weights.contiguous(), shift.contiguous(), on_device(power, edges), sums,
+        out, bins, count, float(padding), bins.bit_length(), BLOCK=BLOCK, num_warps=1,
     )  # fmt: skip
     return out
 

@@ -34,6 +34,18 @@ def launch(kernel: Any, programs: tuple[int, ...], first: Tensor, *arguments: An
         kernel[programs](first, *arguments, enable_fp_fusion=True, **constants)
 
 
+def on_device(value: float | Tensor, like: Tensor) -> Tensor:
+    """Return a number that changes from step to step as a kernel reads it, () float32, without a wait for the device.
+
+    Args:
+        value: the number, or a tensor () that holds it.
+        like: a tensor on the device.
+    """
+    if isinstance(value, Tensor):
+        return value.to(torch.float32)
+    return torch.full((), value, dtype=torch.float32, device=like.device)
+
+
 def blocks(count: int, size: int) -> int:
     """Return the number of blocks of `size` items that hold `count` items."""
     return -(-count // size)

@@ -1,7 +1,9 @@
-"""Kernels on a GPU, with their errors, torch's times and the device's limits; and the PSNR after some seconds."""
+"""Kernels on a GPU, with their errors, torch's times and the device's limits; steps as CUDA graphs; PSNR by seconds."""
 
 from __future__ import annotations
 
+import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -11,6 +13,8 @@ import torch
 from torch import Tensor
 
 from framework.base.console import console, say
+from framework.base.device import wait_for
+from framework.base.registry import load_dataparser, load_method
 from framework.geometry.rays import Samples
 from framework.kernels.compositing import distortion, distortion_reference
 from framework.kernels.contraction import contract_to_unit, contract_to_unit_reference
@@ -28,7 +32,10 @@ from framework.tools.benchmarks.kernels import Row, measured, on_any_device, tab
 from framework.tools.comparison.measures import Curve
 from framework.tools.comparison.measures import Row as Compared
 from framework.tools.comparison.plan import Conditions, Contender, Plan
+from framework.tools.testing.scenes import ball_under_a_sky
 from framework.training.machine import machine
+from framework.training.run import Run
+from framework.training.trainer import Trainer
 
 COPIED, EDGE = 2**28, 8192
 """Values copied, and rows of the matrices multiplied, to measure a GPU's limits."""
@@ -38,6 +45,8 @@ MOMENTS = (2, 5, 15, 60)
 """Seconds of training after which the PSNR is reported."""
 BINS = 64
 """Intervals of a ray."""
+SKY_SIZE = 200
+"""Width of the images of the scene on which steps are timed, pixels."""
 
 
 def measured_kernels(device: torch.device, samples: int, repeats: int) -> dict[str, Any]:
@@ -119,6 +128,43 @@ def along_rays(count: int) -> Iterator[Kernel]:
         ),
     ]
     yield from (replace(kernel, unit="ray") for kernel in each_ray)
+
+
+def timed_steps(device: torch.device, before: int, steps: int, **settings: Any) -> list[dict[str, Any]]:
+    """Time training steps of nerfacto on an unbounded scene, as they are and repeated as CUDA graphs.
+
+    Args:
+        device: the device.
+        before: steps before those that are timed, in which kernels are compiled and steps are recorded.
+        steps: steps that are timed.
+        settings: settings of the method other than its defaults.
+
+    Returns:
+        A row for each, as plain data: milliseconds a step, how many steps were repeated, and the PSNR of batches, which
+        should agree.
+    """
+    rows = []
+    for mode in ("off", "auto"):
+        with tempfile.TemporaryDirectory() as folder:
+            config = replace(load_method("nerfacto").config, vis="none", **settings)
+            config = replace(config, machine=replace(config.machine, cuda_graphs=mode))
+            run = Run("nerfacto", config, "blender", load_dataparser("blender")(), Path(folder))
+            trainer = Trainer(run, ball_under_a_sky(SKY_SIZE).to(device), None)
+            for _ in range(before):
+                trainer.train_step()
+            wait_for(device)
+            start = time.perf_counter()
+            for _ in range(steps):
+                report = trainer.train_step()
+            wait_for(device)
+            milliseconds = (time.perf_counter() - start) / steps * 1e3
+        repeated = 0 if trainer.graphs is None else trainer.graphs.repeated
+        say(f"nerfacto, CUDA graphs {mode}: {milliseconds:.2f} ms a step, {repeated} of {before + steps} repeated")
+        rows.append({
+            "method": "nerfacto", "CUDA graphs": mode, "ms a step": milliseconds, "steps": before + steps,
+            "repeated": repeated, "PSNR of batches, dB": report.psnr,
+        })  # fmt: skip
+    return rows
 
 
 def gpu_plan(data: Path | None, seconds: float, folder: Path) -> Plan:

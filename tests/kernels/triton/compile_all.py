@@ -86,7 +86,8 @@ def compile_all() -> None:
     back(intervals.interval_weights(learned(5, 9), torch.rand(5, 10)))
     intervals.resample(torch.rand(5, 10), torch.rand(5, 9), torch.rand(5), 7, 0.5, 0.01)
     back(intervals.proposal_excess(torch.rand(5, 10), torch.rand(5, 9), torch.rand(5, 8), learned(5, 7)))
-    adam.sparse_adam(*torch.rand(4, 9, 2), torch.rand(9), 0.01, (0.9, 0.99), 1e-15)
+    for found_inf in (None, torch.rand(())):
+        adam.sparse_adam(*torch.rand(4, 9, 2), torch.rand(9), 0.01, (0.9, 0.99), 1e-15, found_inf)
     back(ssim.photometric_loss(learned(13, 15, 3), torch.rand(13, 15, 3), 0.2))
     gaussians()
     marching()

@@ -10,9 +10,12 @@ from framework.kernels.adam import sparse_adam
 from tests.kernels.triton.compared import compare
 
 
-def updated(betas: tuple[float, float]):
+def updated(betas: tuple[float, float], found_inf: float | None = None):
     def run(values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, seen: Tensor) -> tuple[Tensor, ...]:
-        count = sparse_adam(values, grad, mean, square, seen, 0.01, betas, 1e-15)
+        rate, verdict = 0.01, None
+        if found_inf is not None:
+            rate, verdict = torch.full((), 0.01, device=values.device), torch.full((), found_inf, device=values.device)
+        count = sparse_adam(values, grad, mean, square, seen, rate, betas, 1e-15, verdict)
         return values, grad, mean, square, seen, torch.as_tensor(count, dtype=torch.int64)
 
     return run
@@ -26,6 +29,17 @@ def test_rows(entries: int, features: int) -> None:
     given["grad"] *= torch.rand(entries, features) > 0.5
     given["seen"] = torch.randint(0, 40, (entries,)).float()
     compare(updated((0.9, 0.999)), given)
+
+
+@pytest.mark.parametrize("found_inf", [0.0, 1.0])
+def test_rate_and_verdict_on_the_device(found_inf: float) -> None:
+    torch.manual_seed(0)
+    given = {name: torch.rand(40, 2) for name in ("values", "grad", "mean", "square")}
+    given["grad"] *= torch.rand(40, 1) > 0.5
+    given["seen"] = torch.randint(0, 40, (40,)).float()
+    values, grad, *_, count = compare(updated((0.9, 0.999), found_inf), given)
+    assert not grad.any()
+    assert (int(count) == 0) == torch.equal(values.cpu(), given["values"]) == bool(found_inf)
 
 
 def test_extremes() -> None:

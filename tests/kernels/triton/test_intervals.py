@@ -38,6 +38,11 @@ def test_resampling(rays: int, bins: int, count: int, power: float, padding: flo
     given = {"edges": edges(rays, bins), "weights": torch.rand(rays, bins) ** 4, "shift": torch.rand(rays)}
     compare(lambda edges, weights, shift: resample(edges, weights, shift, count, power, padding), given)
 
+    def on_device(edges: Tensor, weights: Tensor, shift: Tensor) -> Tensor:
+        return resample(edges, weights, shift, count, torch.full((), power, device=edges.device), padding)
+
+    compare(on_device, given)
+
 
 def test_extremes_of_resampling() -> None:
     """No weight at all, all in one bin, bins without a width, and NaN."""

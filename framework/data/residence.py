@@ -1,0 +1,43 @@
+"""Training images on the device as bytes, or in the machine's memory where they do not fit."""
+
+from __future__ import annotations
+
+import torch
+
+from framework.base.device import free_memory
+from framework.data.dataset import Dataset
+
+MOST = 0.5
+"""Largest share of a device's free memory that images take; the rest is for the model and its steps."""
+MB = 1_000_000
+"""Bytes of a megabyte."""
+
+
+def on_device(dataset: Dataset, device: torch.device) -> tuple[Dataset, str | None]:
+    """Return training images on a device, as they are stored: 8 bits a channel, converted when they are drawn.
+
+    Args:
+        dataset: the images, in the machine's memory or in a file.
+        device: the device of training.
+
+    Returns:
+        The data set, and a line that says where its pixels are; None on the CPU. Pixels that take more than `MOST` of
+        the device's free memory stay where they are: batches of them are drawn on the CPU and copied.
+    """
+    free, size = free_memory(device), sum(values.nbytes for values in _moved(dataset))
+    fits = dataset.mapped is None and size <= MOST * free
+    moved = dataset.to(device, with_pixels=fits)
+    if device.type == "cpu":
+        return moved, None
+    if fits:
+        return moved, f"images: {size / MB:,.0f} MB on {device.type}, 8 bits a channel"
+    if dataset.mapped is not None:
+        return moved, "images: in a file; batches are read ahead and copied"
+    there = f"{device.type} has {free / MB:,.0f} MB free"
+    return moved, f"images: {size / MB:,.0f} MB stay in the machine's memory, since {there}; batches are copied"
+
+
+def _moved(dataset: Dataset) -> list[torch.Tensor]:
+    """Return the large tensors that go to a device together with the pixels."""
+    drawn = None if dataset.drawn is None else dataset.drawn.every
+    return [dataset.pixels, *([] if drawn is None else [drawn])]

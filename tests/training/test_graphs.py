@@ -1,0 +1,344 @@
+"""Steps that are recorded and repeated learn what steps learn; whatever fails is said, and changes nothing."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from framework.base.errors import ConfigError, DivergenceError
+from framework.base.step_kind import StepKind
+from framework.model import Loss
+from framework.samplers import proposal
+from framework.tools.benchmarks.operations import trainer_of
+from framework.training import graphs
+from framework.training.graphs import WARM_UP, CudaRecorder, StepGraphs, kind_of_step, make_graphs
+from framework.training.trainer import MAX_BAD_STEPS, Trainer
+from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
+from tests.training.recorded import FakeRecorder, ahead
+
+LEARN_UNTIL, STEPS = 6, 14
+"""Step until which proposals learn in every step here, and steps."""
+
+
+@pytest.fixture
+def said(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Lines that are printed."""
+    lines: list[str] = []
+    monkeypatch.setattr(graphs, "say", lines.append)
+    return lines
+
+
+def recorded(trainer: Trainer, must: bool = False) -> FakeRecorder:
+    """Let a trainer record its steps, by the stand-in for graphs."""
+    recorder = FakeRecorder()
+    trainer.graphs = StepGraphs(recorder, trainer._learnt, must)
+    return recorder
+
+
+@functools.cache
+def idle(method: str) -> Trainer:
+    """A trainer of a method, which is not trained; that of nerfacto is on an unbounded scene."""
+    return trainer_of(method, Path("unused"))
+
+
+def small(folder: Path, method: str = "nerfacto", **settings: Any) -> Trainer:
+    """A trainer of a method on small batches, by default of a fixed number of rays."""
+    found = idle(method)
+    sizes = {"num_levels": 4, "num_proposal_samples": (16, 12), "num_nerf_samples": 8, "mixed_precision": False}
+    rays = {"num_rays_per_batch": 24, "samples_per_batch": None}
+    known: dict[str, Any] = {name: value for name, value in (sizes | rays).items() if hasattr(found.run.config, name)}
+    config = dataclasses.replace(found.run.config, **(known | settings))
+    return Trainer(dataclasses.replace(found.run, config=config, folder=folder), found.train_set, None)
+
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "mip-nerf": {"method": "mip-nerf", "num_layers": 3, "sampler": "hierarchical"},
+    "mip-nerf-360": {"method": "mip-nerf-360", "num_layers": 3, "encoding": "integrated"},
+    "zip-nerf": {"method": "zip-nerf", "exposure": True},
+    "captures": {"appearance_embedding_dim": 4, "camera_optimizer": "SO3xR3", "lr_warmup_steps": 9},
+    "screws, by error": {"camera_optimizer": "SE3", "draw_by_error": True, "lr_schedule": "exponential"},
+    "normals, four rays": {"predict_normals": True, "rays_per_pixel": 4, "train_rays_per_pixel_from": 0.0},
+}
+
+
+@pytest.mark.parametrize(
+    "variant", [pytest.param(name, marks=[] if name == "captures" else pytest.mark.medium) for name in VARIANTS]
+)
+def test_repeated_steps_learn_what_steps_learn(
+    variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: list[str]
+) -> None:
+    """To the bit, with rates, annealing and draws that differ from step to step."""
+    ahead(monkeypatch)
+    monkeypatch.setattr(proposal, "ALWAYS_LEARN_UNTIL", LEARN_UNTIL)
+    usual, repeating = (small(tmp_path / name, **VARIANTS[variant]) for name in ("usual", "repeating"))
+    for trainer in (usual, repeating):
+        trainer.steps_per_read = 4
+    recorder = recorded(repeating)
+    for _ in range(STEPS):
+        reports = [trainer.train_step() for trainer in (usual, repeating)]
+        assert reports[0].losses == reports[1].losses
+    assert_same_bits(tensors(usual), tensors(repeating))
+    assert usual.state.train_mse == repeating.state.train_mse
+    kinds = 1 if "mip" in variant else 2  # steps in which proposals learn, and others
+    assert len(recorder.tapes) == kinds
+    assert recorder.repeated == STEPS - kinds * WARM_UP
+    assert said == ["training steps are recorded as CUDA graphs and repeated"]
+    assert (usual.optimizer.entries[0] > 0) == ("nerfacto" in usual.run.method or "zip" in usual.run.method)
+
+
+@pytest.mark.medium
+def test_a_resumed_run_repeats_the_same_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Recordings of tensors that a checkpoint has replaced are dropped; draws do not depend on those before."""
+    ahead(monkeypatch)
+    first, second = (small(tmp_path / name) for name in ("first", "second"))
+    for trainer in (first, second):
+        recorded(trainer)
+        for _ in range(6):
+            trainer.train_step()
+    content = torch.load(first.save(), weights_only=True)
+    for _ in range(7):  # second goes its own way before it is restored
+        second.train_step()
+    second.restore(content)
+    for _ in range(6):
+        assert first.train_step().losses == second.train_step().losses
+    assert_same_bits(tensors(first), tensors(second))
+
+
+@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.medium), 4])
+def test_steps_that_are_not_finite_change_nothing_and_are_counted(
+    every: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: list[str]
+) -> None:
+    """Recorded, and known to Python only some steps later; ten of them in a row end the run."""
+    ahead(monkeypatch)
+    trainer = small(tmp_path)
+    trainer.steps_per_read = every
+    recorder = recorded(trainer)
+    factor, loss = torch.ones(()), trainer.model.loss
+
+    def spoilt(batch: Any, step: int) -> Loss:
+        found = loss(batch, step)
+        terms = {**found.terms, "rgb": found.terms["rgb"] * factor}
+        return dataclasses.replace(found, terms=terms, rgb=found.rgb * factor)
+
+    monkeypatch.setattr(trainer.model, "loss", spoilt)
+    several(trainer, 8)
+    assert recorder.repeated > 3
+    before = tensors(trainer)
+    factor.fill_(torch.nan)
+    several(trainer, 4)
+    assert_same_bits(tensors(trainer), before)
+    assert trainer.state.skipped == 4
+    factor.fill_(1)
+    trainer.train_step()
+    assert any(not torch.equal(value, before[name]) for name, value in tensors(trainer).items())
+    factor.fill_(torch.nan)
+    with pytest.raises(DivergenceError, match=f"{MAX_BAD_STEPS} steps in a row were not finite, first in the loss"):
+        several(trainer, MAX_BAD_STEPS + every)
+
+
+def several(trainer: Trainer, count: int) -> None:
+    """Take some training steps."""
+    for _ in range(count):
+        trainer.train_step()
+
+
+class Toy:
+    """A weight that moves by its rate times a draw."""
+
+    def __init__(self) -> None:
+        self.weight, self.rate, self.steps = torch.zeros(5), torch.ones(()), 0
+
+    def seed(self) -> None:
+        torch.manual_seed(self.steps)
+
+    def step(self) -> Tensor:
+        self.weight.add_(torch.rand(5) * self.rate)
+        return self.weight * 2
+
+
+def steps_of(
+    toy: Toy, count: int, step: Callable[[], Tensor], seed: Callable[[], None], must: bool = False
+) -> list[Tensor]:
+    """Results of some steps of a toy, whose rates differ."""
+    found, recorder = [], FakeRecorder()
+    steps = StepGraphs[Tensor](recorder, lambda: [toy.weight], must)
+    for toy.steps in range(count):
+        toy.rate.fill_(1.0 + toy.steps)
+        if steps.take(StepKind()):
+            found.append(steps.run(StepKind(), seed, step).clone())
+        else:
+            seed()
+            found.append(step())
+    return found
+
+
+def truth(count: int) -> list[Tensor]:
+    """What the steps of a toy give."""
+    found, weight = [], torch.zeros(5)
+    for number in range(count):
+        torch.manual_seed(number)
+        weight = weight + torch.rand(5) * (1.0 + number)
+        found.append(weight * 2)
+    return found
+
+
+def same(found: Sequence[Tensor], expected: Sequence[Tensor]) -> None:
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_a_function_of_tensors_alone_is_repeated(said: list[str]) -> None:
+    toy = Toy()
+    same(steps_of(toy, 9, toy.step, toy.seed), truth(9))
+    assert said == ["training steps are recorded as CUDA graphs and repeated"]
+
+
+@pytest.mark.parametrize("fault", ["a number of Python's", "a wait", "an error"])
+def test_what_cannot_be_repeated_is_found_and_said(fault: str, said: list[str]) -> None:
+    """Nothing is learnt that the steps themselves would not have learnt."""
+    toy = Toy()
+    broken = [False]
+
+    def step() -> Tensor:
+        if fault == "an error" and broken[0]:
+            raise RuntimeError("no kernel image is available")
+        if fault == "a wait":
+            toy.weight.add_(torch.rand(5) * toy.rate.item())
+        elif fault == "a number of Python's":
+            toy.weight.add_(torch.rand(5) * (1.0 + toy.steps))
+        else:
+            toy.weight.add_(torch.rand(5) * toy.rate)
+        return toy.weight * 2
+
+    record = FakeRecorder.record
+
+    def recording(self: FakeRecorder, function: Any) -> Any:
+        broken[0] = True
+        try:
+            return record(self, function)
+        finally:
+            broken[0] = False
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(FakeRecorder, "record", recording)
+        same(steps_of(toy, 9, step, toy.seed), truth(9))
+        (line,) = said
+        assert line.startswith("note: steps are not repeated as CUDA graphs, because ")
+        words = {
+            "a number of Python's": "did not change",
+            "a wait": "_local_scalar_dense",
+            "an error": "no kernel image",
+        }
+        assert words[fault] in line
+        with pytest.raises(ConfigError, match=f"cuda-graphs on: .*{words[fault]}"):
+            steps_of(toy, 9, step, toy.seed, must=True)
+
+
+def test_draws_of_another_step_are_found(said: list[str]) -> None:
+    toy, seeded = Toy(), [0]
+
+    def seed() -> None:
+        seeded[0] += 1
+        torch.manual_seed(seeded[0])  # as if a repeated step drew from where the generator stood
+
+    steps_of(toy, 6, toy.step, seed)
+    assert "did not change what the step itself changes" in said[0]
+
+
+def test_reasons_are_said_once_each(said: list[str]) -> None:
+    steps = StepGraphs[None](FakeRecorder(), list)
+    levels, draws = StepKind(varies="levels are still opening"), StepKind(varies="batches are made on the host")
+    assert not any(steps.take(kind) for kind in (levels, draws, levels))
+    assert [line.split("because ")[1] for line in said] == [levels.varies, draws.varies]
+    assert steps.take(StepKind())
+    with pytest.raises(ConfigError, match="because levels are still opening; leave it out"):
+        StepGraphs[None](FakeRecorder(), list, must=True).take(levels)
+
+
+@pytest.mark.parametrize(
+    ("method", "settings", "words"),
+    [
+        ("nerfacto", {}, None),
+        ("nerfacto", {"sampler": "occupancy"}, "how many samples a ray has"),
+        ("nerfacto", {"few_images": True, "unseen_loss_mult": 0.1}, "the weight of unseen views changes"),
+        ("nerfacto", {"few_images": True, "open_levels_until": 0.5}, "levels are still opening"),
+        ("instant-ngp", {}, "the method does not say"),
+        ("gaussian-splatting", {}, "batches are made on the host"),
+    ],
+)
+def test_methods_say_whether_their_steps_repeat(
+    method: str, settings: dict[str, Any], words: str | None, shared_tiny: Path, tmp_path: Path
+) -> None:
+    trainer = tiny_trainer(method, shared_tiny, tmp_path, **settings)
+    kind = kind_of_step(trainer.model, trainer.source, 0, (256, 1))
+    if words is None:
+        assert kind.varies is None
+        assert kind == kind_of_step(trainer.model, trainer.source, 9, (256, 1))
+        assert kind != kind_of_step(trainer.model, trainer.source, 301, (256, 1))  # proposals rest
+        assert kind != kind_of_step(trainer.model, trainer.source, 0, (255, 1))
+    else:
+        assert words in str(kind.varies)
+
+
+def test_the_flag(shared_tiny: Path, tmp_path: Path) -> None:
+    cpu, gpu = torch.device("cpu"), torch.device("cuda")
+    assert make_graphs("auto", cpu, list) is make_graphs("off", gpu, list) is None
+    with pytest.raises(ConfigError, match=r"--machine\.cuda-graphs on: .* this run is on cpu"):
+        make_graphs("on", cpu, list)
+    assert tiny_trainer("nerfacto", shared_tiny, tmp_path).graphs is None
+
+
+def test_graphs_are_recorded_on_the_stream_on_which_steps_warmed_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The calls of torch.cuda, in their order, without a GPU."""
+    calls: list[str] = []
+
+    class Block:
+        def __init__(self, *words: object) -> None:
+            self.words = " ".join(map(str, words))
+
+        def __enter__(self) -> None:
+            calls.append(f"begin {self.words}")
+
+        def __exit__(self, *error: object) -> None:
+            calls.append(f"end {self.words}")
+
+    class Stream:
+        def __init__(self, name: object) -> None:
+            self.name = f"stream of {name}"
+
+        def __str__(self) -> str:
+            return self.name
+
+        def wait_stream(self, other: object) -> None:
+            calls.append(f"{self} waits for {other}")
+
+    class Graph:
+        def __str__(self) -> str:
+            return "graph"
+
+        def replay(self) -> None:
+            calls.append("replay")
+
+    main = Stream("main")
+    monkeypatch.setattr(torch.cuda, "Stream", Stream)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda: main)
+    monkeypatch.setattr(torch.cuda, "stream", Block)
+    monkeypatch.setattr(torch.cuda, "CUDAGraph", Graph)
+    monkeypatch.setattr(torch.cuda, "graph", lambda graph, stream: Block(graph, stream))
+    recorder = CudaRecorder(torch.device("cuda", 0))
+    assert recorder.run(lambda: calls.append("step") or 3) == 3  # type: ignore[func-returns-value]
+    own = "stream of cuda:0"
+    assert calls == [
+        f"{own} waits for stream of main", f"begin {own}", "step", f"end {own}", f"stream of main waits for {own}",
+    ]  # fmt: skip
+    calls.clear()
+    result, repeat = recorder.record(lambda: calls.append("step") or 4)  # type: ignore[func-returns-value]
+    repeat()
+    assert result == 4
+    assert calls == [f"begin graph {own}", "step", f"end graph {own}", "replay"]

@@ -1,0 +1,140 @@
+"""A step of nerfacto on a device that has no values: Python reads nothing from it, and brings it nothing but numbers.
+
+The device is PyTorch's "meta", whose tensors have sizes alone: to read a value is an error, and so is to compute with
+tensors of the CPU.
+"""
+
+from collections import Counter
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from framework.base.device import StepValue, runs_ahead, seed_step
+from framework.data.error_map import DECAY, ErrorMap
+from framework.rendering.losses import depth_error
+from framework.tools.benchmarks.operations import Counting, _tensors
+from framework.training.trainer import Trainer
+from tests.training.test_graphs import VARIANTS, idle, small
+
+NOWHERE = torch.device("meta")
+
+
+class Arrivals(TorchDispatchMode):
+    """Counts operations that bring tensors of the CPU to another device."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found = Counter[str]()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        out = func(*args, **(kwargs or {}))
+        given = [tensor for tensor in _tensors((*args, *(kwargs or {}).values())) if tensor.ndim]
+        if any(tensor.is_meta for tensor in _tensors([out])) and any(tensor.is_cpu for tensor in given):
+            self.found[str(func)] += 1
+        return out
+
+
+@pytest.mark.parametrize(
+    "variant", [pytest.param(name, marks=[] if name == "captures" else pytest.mark.medium) for name in VARIANTS]
+)
+def test_a_step_neither_asks_the_device_nor_brings_it_tensors(
+    variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch, "autocast", lambda *words, **settings: nullcontext())  # which meta does not have
+
+    def updated(*lists: list[Tensor], lr: Any, found_inf: Any, **settings: Any) -> None:
+        assert all(tensor.device == NOWHERE for values in (*lists, [lr, found_inf]) for tensor in values)
+
+    monkeypatch.setattr(torch, "_fused_adam_", updated)  # likewise
+    here = small(tmp_path, **{**VARIANTS[variant], "draw_by_error": False})  # whose map has as many tiles as a sum
+    assert here.train_set.resident
+    trainer = Trainer(here.run, here.train_set.to(NOWHERE), None)
+    assert trainer.device == NOWHERE
+    assert trainer.steps_per_read > 20
+    trainer.train_step()  # brings constants
+    with Arrivals() as arrivals, Counting() as counting:
+        for _ in range(3):
+            trainer.train_step()
+    assert counting.count > 1000
+    assert not arrivals.found
+    assert not counting.waits
+    assert len(trainer._unread) == 4
+    with pytest.raises(RuntimeError, match="meta tensor"):  # as a step would, if it read its error
+        trainer._read_errors(4)
+
+
+def test_what_arrives_is_noticed() -> None:
+    """The test above can fail."""
+    with Arrivals() as arrivals:
+        torch.ones(3).to(NOWHERE)
+    assert arrivals.found.total() == 1
+    with pytest.raises(RuntimeError):
+        torch.ones(3, device=NOWHERE) + torch.ones(3)
+
+
+def test_a_number_of_a_step_is_a_float_here_and_one_tensor_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    cpu, value = torch.device("cpu"), StepValue(0.5)
+    assert [runs_ahead(device) for device in (cpu, NOWHERE)] == [False, True]
+    assert value.on(cpu) == 0.5
+    there = value.on(NOWHERE)
+    value.set(0.25)
+    assert value.on(NOWHERE) is there
+    assert value.on(cpu) == 0.25
+    monkeypatch.setattr("framework.base.device.runs_ahead", lambda device: True)
+    tensor = StepValue(0.5)
+    before = tensor.on(cpu)
+    tensor.set(0.75)
+    assert isinstance(before, Tensor)
+    assert float(before) == 0.75
+
+
+def test_draws_of_a_step_depend_on_seed_step_and_process_alone() -> None:
+    """Not on what was drawn before; on a GPU by the same seeds, and Philox's counter of draws since."""
+
+    def draws(seed: int, step: int, rank: int, before: int = 0) -> Tensor:
+        torch.rand(before)
+        seed_step(seed, step, rank)
+        return torch.rand(1000)
+
+    assert torch.equal(draws(3, 5, 1), draws(3, 5, 1, before=77))
+    others = [draws(*numbers) for numbers in ((3, 5, 1), (4, 5, 1), (3, 6, 1), (3, 5, 0), (3, 5, 2))]
+    for index, one in enumerate(others):
+        for other in others[:index]:
+            assert abs(float(torch.corrcoef(torch.stack([one, other]))[0, 1])) < 0.15
+
+
+def test_errors_of_tiles_are_learnt_as_by_hand() -> None:
+    """Several pixels of a tile, and errors that are not finite: without a question to the device."""
+    dataset = idle("nerfacto").train_set
+    found = ErrorMap(dataset)
+    width = int(dataset.cameras.widths[0])
+    pixels = torch.tensor([0, 1, width + 3, 8, 16, 17])  # three in the first tile, one in the second, two in the third
+    found.learn(pixels, torch.tensor([0.1, 0.2, 0.6, 0.5, torch.nan, torch.inf]))
+    expected = torch.ones_like(found.errors)
+    expected[0] += (1 - DECAY) * (0.3 - 1)
+    expected[1] += (1 - DECAY) * (0.5 - 1)
+    torch.testing.assert_close(found.errors, expected)
+
+
+def test_depths_that_are_not_known_do_not_count() -> None:
+    """As the mean over the rays whose distance is known, from the definition; 0 if none is."""
+    from framework.geometry.rays import Samples
+
+    torch.manual_seed(0)
+    t = torch.rand(4, 6).sort(-1).values + 1
+    samples = Samples.regular(t[:, :-1], t[:, 1:])
+    weights = torch.rand(20, requires_grad=True)
+    known = torch.tensor([1.5, 0.0, 1.2, 0.0])
+    terms = weights.view(4, 5) * ((samples.t.view(4, 5) - known[:, None]).abs() / known[:, None]).clamp(max=1)
+    truth = (terms[0].sum() + terms[2].sum()) / 2
+    found = depth_error(weights, samples, known)
+    torch.testing.assert_close(found, truth)
+    found.backward()
+    assert weights.grad is not None
+    assert not weights.grad.view(4, 5)[[1, 3]].any()
+    assert float(depth_error(weights, samples, torch.zeros(4)).detach()) == 0

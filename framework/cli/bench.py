@@ -34,6 +34,7 @@ from framework.cli.bench_gpu import GpuFlags, measure_gpu
 from framework.cli.bench_processes import ProcessesFlags, measure_processes
 from framework.cli.bench_results import write_results
 from framework.cli.common import chosen_kind, make_room, run_command
+from framework.cli.flags import read_flags
 
 USAGE = """\
 usage: ns-bench WHAT [flags]
@@ -70,10 +71,8 @@ def main() -> None:
 def _command(arguments: list[str]) -> None:
     if (chosen := chosen_kind(arguments, KINDS, USAGE, "there is no benchmark")) is None:
         return
-    import tyro
-
     name, (flags, run), rest = chosen
-    run(tyro.cli(flags, prog=f"ns-bench {name}", args=rest, config=(tyro.conf.FlagConversionOff,)))
+    run(read_flags(flags, f"ns-bench {name}", rest))
 
 
 def _kernels(flags: KernelFlags) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 from framework.base.errors import ConfigError
 from framework.cli.common import run_command
+from framework.cli.flags import read_flags
 
 if TYPE_CHECKING:
     from framework.tools.comparison.measures import Row
@@ -56,14 +57,11 @@ def main() -> None:
 
 
 def _command(arguments: list[str]) -> None:
-    import tyro
-
     from framework.base.config import from_plain, read_yaml
 
     recipe, arguments = _recipe(arguments)
     default = CompareFlags() if recipe is None else from_plain(CompareFlags(), read_yaml(recipe), str(recipe))
-    options = (tyro.conf.FlagConversionOff,)
-    flags = tyro.cli(CompareFlags, prog="ns-compare", args=arguments, default=default, config=options)
+    flags = read_flags(CompareFlags, "ns-compare", arguments, default=default)
     plan = plan_of(flags)
     from framework.base.console import say
 

@@ -11,6 +11,7 @@ from framework.base.extras import install_command
 from framework.cli.common import chosen_kind, make_room, run_command, with_run
 from framework.cli.export_flags import ExportFlags
 from framework.cli.export_mesh import MarchingCubesFlags, TsdfFlags, marching_cubes, tsdf
+from framework.cli.flags import read_flags
 
 if TYPE_CHECKING:
     from framework.cameras.poses import Placement
@@ -95,10 +96,8 @@ def main() -> None:
 def _command(arguments: list[str]) -> None:
     if (chosen := chosen_kind(arguments, KINDS, USAGE, "nothing is exported as")) is None:
         return
-    import tyro
-
     name, (kind, file, run), rest = chosen
-    flags = tyro.cli(kind, prog=f"ns-export {name}", args=with_run(rest), config=(tyro.conf.FlagConversionOff,))
+    flags = read_flags(kind, f"ns-export {name}", with_run(rest))
     from framework.training.trained import load_trained
 
     path = flags.output_dir / file.format_map(vars(flags))

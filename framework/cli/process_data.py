@@ -12,6 +12,7 @@ from typing import get_type_hints
 from framework.base.console import say
 from framework.base.errors import ConfigError, DataError
 from framework.cli.common import chosen_kind, run_command
+from framework.cli.flags import read_flags
 from framework.tools.processing.settings import ColmapFlags, OutputFlags
 from framework.training.signals import Stopped, signal_of
 
@@ -110,11 +111,8 @@ def main() -> None:
 def _command(arguments: list[str]) -> None:
     if (chosen := chosen_kind(arguments, KINDS, USAGE, "unknown kind")) is None:
         return
-    import tyro
-
     name, kind, rest = chosen
-    options = (tyro.conf.FlagConversionOff,)
-    flags = tyro.cli(kind, prog=f"ns-process-data {name}", args=_spelt_out(rest, kind), config=options)
+    flags = read_flags(kind, f"ns-process-data {name}", _spelt_out(rest, kind))
     flags.check()
     try:
         _process(flags)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from framework.base.errors import ConfigError, NerfloomError
 from framework.base.registry import registered
 from framework.cli.common import run_command
+from framework.cli.flags import read_flags
 
 if TYPE_CHECKING:
     from framework.tools.stress.conditions import Condition
@@ -65,13 +66,10 @@ def _command(arguments: list[str]) -> None:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE)
         return
-    import tyro
-
     methods = list(takewhile(lambda word: not word.startswith("-"), arguments))
     if not methods:
         raise ConfigError(f"the methods come first, before {arguments[0]}, as in 'ns-stress instant-ngp kplanes'")
-    rest, options = arguments[len(methods) :], (tyro.conf.FlagConversionOff,)
-    flags = tyro.cli(StressFlags, prog="ns-stress METHOD", args=rest, config=options)
+    flags = read_flags(StressFlags, "ns-stress METHOD", arguments[len(methods) :])
     results = stress(list(registered("methods")) if methods == ["all"] else methods, flags)
     outcomes = [(result.method, verdict) for result in results for verdict in result.verdicts]
     failed = [f"{method}: {verdict.name}" for method, verdict in outcomes if verdict.outcome == "fail"]

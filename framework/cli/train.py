@@ -13,6 +13,7 @@ from framework.base.errors import ConfigError, FlagError
 from framework.base.from_nerfstudio import flag_answer, vis_answer
 from framework.base.registry import entry_of, registered, summary
 from framework.cli.common import run_command
+from framework.cli.flags import read_flags
 
 if TYPE_CHECKING:
     from framework.training.run import Run
@@ -158,10 +159,10 @@ def _parsed(run: Run, flags: list[str], settings: dict[str, Any], **options: Any
     fields = [(name, Annotated[type(value), tyro.conf.arg(name="")]) for name, value in settings.items()]
     kind = dataclasses.make_dataclass("Flags", fields)
     try:
-        return tyro.cli(
+        return read_flags(
             kind,
-            prog=f"ns-train {run.method}",
-            args=flags,
+            f"ns-train {run.method}",
+            flags,
             default=kind(**settings),
             config=(tyro.conf.FlagConversionOff, tyro.conf.ConsolidateSubcommandArgs),
             registry=grouped_flags(run.method, run.config, run.dataparser, run.parser),

@@ -10,7 +10,7 @@ from typing import Any
 
 from framework.base.child import python_command
 from framework.base.console import say
-from framework.base.errors import ConfigError, nearest
+from framework.base.errors import ConfigError, FlagError, nearest
 from framework.base.extras import install_command
 from framework.cli.bench_flags import (
     AblationFlags,
@@ -80,7 +80,7 @@ def _kernels(flags: KernelFlags) -> None:
 
     for name in flags.variants:
         if name not in native.NEEDS:
-            raise ConfigError(f"--variants: there is no '{name}'. {nearest(name, native.NEEDS)}")
+            raise FlagError(f"--variants: there is no '{name}'. {nearest(name, native.NEEDS)}")
         command = python_command("framework.cli.bench", "kernels", "--output-dir", flags.output_dir)
         command += ["--samples", str(flags.samples), "--repeats", str(flags.repeats)]
         command += ["--plot-dir", str(flags.plot_dir)] if flags.plot_dir else []
@@ -231,7 +231,7 @@ def _viewer(flags: ViewerBenchFlags) -> None:
     from framework.training.machine import machine
 
     if not flags.runs or not all(width >= 8 for width in flags.widths):
-        raise ConfigError("--runs: name the folders of trained runs; --widths are at least 8 pixels")
+        raise FlagError("--runs: name the folders of trained runs; --widths are at least 8 pixels")
     make_room(flags.output_dir / "viewer.json")
     rows = [measured(run, width, width, flags.pictures) for run in flags.runs for width in flags.widths]
     for row in rows:

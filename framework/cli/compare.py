@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from framework.base.errors import ConfigError
+from framework.base.errors import ConfigError, FlagError
 from framework.cli.common import run_command
 from framework.cli.flags import read_flags
 
@@ -78,7 +78,7 @@ def _recipe(arguments: list[str]) -> tuple[Path | None, list[str]]:
         return None, arguments
     index = arguments.index("--load-config")
     if index + 1 == len(arguments):
-        raise ConfigError("--load-config needs a file, such as configs/compare-lego.yml")
+        raise FlagError("--load-config needs a file, such as configs/compare-lego.yml")
     return Path(arguments[index + 1]), arguments[:index] + arguments[index + 2 :]
 
 

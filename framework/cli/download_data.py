@@ -6,7 +6,7 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-from framework.base.errors import ConfigError
+from framework.base.errors import FlagError
 from framework.cli.common import chosen_kind, run_command
 from framework.cli.flags import read_flags
 from framework.tools.downloads.catalogue import DATASETS
@@ -47,7 +47,7 @@ def _command(arguments: list[str]) -> None:
         return
     name, dataset, rest = chosen
     if any(word.partition("=")[0].replace("_", "-") == "--capture-name" for word in rest):
-        raise ConfigError("--capture-name is nerfstudio's; here it is --scenes")
+        raise FlagError("--capture-name is nerfstudio's; here it is --scenes")
     description = f"{dataset.title}\nscenes: {', '.join(dataset.scenes)}\nlicence: {dataset.licence}"
     flags = read_flags(DownloadFlags, f"ns-download-data {name}", rest, description=description)
     from framework.tools.downloads.install import announce, install

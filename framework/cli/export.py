@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from framework.base.errors import ConfigError, DataError
+from framework.base.errors import ConfigError, DataError, FlagError
 from framework.base.extras import install_command
 from framework.cli.common import chosen_kind, make_room, run_command, with_run
 from framework.cli.export_flags import ExportFlags
@@ -117,7 +117,7 @@ def _placement(trained: Trained) -> Placement:
 
 def _points(flags: PointFlags, trained: Trained, placement: Placement, path: Path) -> None:
     if flags.num_points < 1 or not flags.reach >= 0 or not flags.std_ratio >= 0:
-        raise ConfigError("--num-points must be at least 1, --reach and --std-ratio at least 0")
+        raise FlagError("--num-points must be at least 1, --reach and --std-ratio at least 0")
     if flags.remove_outliers or flags.estimate_normals:
         _need_packages("--remove-outliers and --estimate-normals need", "; or set both to False")
     from framework.base.console import say, track
@@ -216,7 +216,7 @@ def _occupancy(flags: OccupancyFlags, trained: Trained, placement: Placement, pa
 
 def _splats(flags: SplatFlags, trained: Trained, placement: Placement, path: Path) -> None:
     if flags.max_megabytes is not None and not flags.max_megabytes > 0:
-        raise ConfigError(f"--max-megabytes must be positive, not {flags.max_megabytes}")
+        raise FlagError(f"--max-megabytes must be positive, not {flags.max_megabytes}")
     from framework.base.console import say
     from framework.splats.files import write_gaussians
     from framework.splats.gaussians import HasGaussians

@@ -101,3 +101,5 @@ def _sections(box: str) -> Iterator[list[str]]:
         if rows and (line.startswith("╭") or not row.strip(" -")):  # below the title, and at a rule
             yield rows
             rows = []
+    if rows:
+        yield rows

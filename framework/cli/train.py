@@ -60,7 +60,7 @@ def _take(arguments: list[str], flag: str) -> tuple[str | None, list[str]]:
     for index, argument in enumerate(arguments):
         if argument == flag:
             if index + 1 == len(arguments):
-                raise ConfigError(f"{flag} needs a path")
+                raise FlagError(f"{flag} needs a path")
             return arguments[index + 1], arguments[:index] + arguments[index + 2 :]
         if argument.startswith(flag + "="):
             return argument[len(flag) + 1 :], arguments[:index] + arguments[index + 1 :]
@@ -114,7 +114,7 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
     from framework.training.run import run_folder
 
     if (answer := vis_answer(_take(flags, "--vis")[0] or "")) is not None:
-        raise ConfigError(answer)
+        raise FlagError(answer)
     if _are_pairs(flags):
         given, word = _take(flags, "--data")[0], None
         asked = run.config.data if given is None else None if given == "None" else Path(given)
@@ -198,7 +198,7 @@ def _check_for_nerfstudio(flags: list[str], method: str, settings: list[Any]) ->
     names = {name for value in settings for name in _flag_names(value)}
     for flag in flags:
         if flag.startswith("--") and (answer := flag_answer(flag, method, names)) is not None:
-            raise ConfigError(answer)
+            raise FlagError(answer)
 
 
 def _flag_names(settings: Any, prefix: str = "--") -> Iterator[str]:

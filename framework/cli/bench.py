@@ -253,7 +253,7 @@ def _frames(flags: FramesFlags) -> None:
     from framework.training.machine import machine
 
     if not flags.runs or min(*flags.widths, 8) < 8 or min(*flags.threads, 1) < 1 or flags.pictures < 1:
-        raise ConfigError(
+        raise FlagError(
             "--runs: name the folders of trained runs; --widths are at least 8, --threads and --pictures at least 1"
         )
     make_room(flags.output)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from framework.base.config import RaysPerPixel
-from framework.base.errors import ConfigError, FlagError
+from framework.base.errors import FlagError
 from framework.base.rendered_names import OutputName
 
 USAGE = """\
@@ -189,7 +189,7 @@ def check_flags(flags: Flags) -> None:
         flags: flags of a path.
 
     Raises:
-        ConfigError: with what is wrong.
+        FlagError: with what is wrong.
     """
     shown, outputs = flags.outputs, flags.outputs.rendered_output_names
     count = 1 if isinstance(flags, (CameraPathFlags, DatasetFlags)) else flags.num_frames
@@ -198,7 +198,7 @@ def check_flags(flags: Flags) -> None:
     if not outputs or len(set(outputs)) < len(outputs):
         raise FlagError(f"--rendered-output-names {' '.join(outputs)}: name at least one output, and each once")
     if not isinstance(flags, DatasetFlags) and (unknown := {"error", "gt-rgb"} & set(outputs)):
-        raise ConfigError(
+        raise FlagError(
             f"--rendered-output-names {min(unknown)}: the true image is known to 'ns-render dataset' alone"
         )
     if isinstance(flags, SpiralFlags) and flags.radius is not None and not 0 < flags.radius < 1e9:

@@ -141,9 +141,9 @@ def test_terminals_without_frames() -> None:
 
 
 def test_what_is_not_known_is_said_as_it_is() -> None:
-    rows = ("╭─ News ──────╮", "│ A new kind  │", "│ of mistake. │", "│ ─────────── │", "│ See --help  │", "╰─────────────╯")
+    rows = ("╭─ News ────╮", "│ A new kind │", "│ of it.     │", "│ ────────── │", "│ See --help │", "╰───────────╯")
     box = "".join(f"\033[31m{row}\033[0m\n" for row in rows)
-    assert in_one_line(box, "ns-eval") == "A new kind of mistake; ns-eval --help shows the flags"
+    assert in_one_line(box, "ns-eval") == "A new kind of it; ns-eval --help shows the flags"
     assert in_one_line("mistake", "ns-eval") == "mistake; ns-eval --help shows the flags"
 
 

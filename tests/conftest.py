@@ -1,5 +1,6 @@
 """Shared by the tests: a tiny data set, tiny settings, and where real data is."""
 
+import gc
 import json
 import math
 import os
@@ -22,6 +23,19 @@ from tests.forked import Forks
 # Processes of tests share the cores (pytest -n auto), and small tensors gain nothing by a second thread. Tests that are
 # about threads ask for them.
 torch.set_num_threads(1)
+
+
+def pytest_configure() -> None:
+    """What is imported and collected stays: looking for garbage in it would take half of the time."""
+    gc.disable()
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_finish() -> None:
+    """From here on only what tests leave is looked through."""
+    gc.collect()
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -124,14 +138,17 @@ Refused = Callable[..., str]
 
 @pytest.fixture
 def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Refused:
-    """Run a command's `main` on bad arguments; returns the one line that answers them."""
+    """Run a command's `main` on bad arguments; returns the one line that answers them.
 
-    def run(main: Callable[[], None], *arguments: object) -> str:
+    The exit status is 1, or 2 where it is the flags themselves that are wrong.
+    """
+
+    def run(main: Callable[[], None], *arguments: object, status: int = 1) -> str:
         monkeypatch.setattr(sys, "argv", ["command", *map(str, arguments)])
         with pytest.raises(SystemExit) as end:
             main()
         said = capsys.readouterr().err
-        assert end.value.code == 1
+        assert end.value.code == status
         assert "Traceback" not in said
         last = said.strip().splitlines()[-1]
         assert last.startswith("error: ")

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from framework.base.config import MachineConfig
-from framework.base.device import MOST_THREADS, choose_device, has_bfloat16, peak_memory, stream_seed
+from framework.base.config import MOST_THREADS, MachineConfig
+from framework.base.device import choose_device, has_bfloat16, peak_memory, stream_seed
 from framework.base.errors import ConfigError
 
 

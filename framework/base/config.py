@@ -39,6 +39,8 @@ else:
 
 AUTO: Any = None
 """The default of an `Auto` setting."""
+MOST_THREADS = 1024
+"""Maximum number of CPU threads that a run may ask for."""
 Range = tuple[float, float]
 """Minimum and maximum of a setting, both allowed."""
 AT_LEAST_0: Range = (0, math.inf)
@@ -63,6 +65,9 @@ class MachineConfig:
     def __post_init__(self) -> None:
         if not -(2**63) <= self.seed < 2**63:
             raise ConfigError(f"--machine.seed is {shown(self.seed)}; it must be an integer of 64 bits")
+        if self.num_threads is not None and not 1 <= self.num_threads <= MOST_THREADS:
+            number = shown(self.num_threads)
+            raise ConfigError(f"--machine.num-threads is {number}; it must be from 1 to {MOST_THREADS}")
 
 
 @dataclass(frozen=True)

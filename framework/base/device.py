@@ -17,7 +17,6 @@ from framework.base.config import MachineConfig
 from framework.base.errors import ConfigError
 from framework.base.processes import processes
 
-MOST_THREADS = 1024
 """Maximum number of threads of a config. OpenMP ends the process if the system refuses to start that many."""
 BEFORE_STEP, AFTER_STEP = -1, -2
 """Random streams of a step that several processes share, in place of a process's number."""
@@ -32,12 +31,10 @@ def choose_device(machine: MachineConfig) -> torch.device:
         machine: the device type and the number of threads.
 
     Raises:
-        ConfigError: if this machine lacks the device, or the number of threads is out of range.
+        ConfigError: if this machine lacks the device.
     """
     several = processes()
     if machine.num_threads is not None:
-        if not 1 <= machine.num_threads <= MOST_THREADS:
-            raise ConfigError(f"--machine.num-threads is {machine.num_threads}; it must be from 1 to {MOST_THREADS}")
         torch.set_num_threads(machine.num_threads)
     elif several.local_count > 1:  # torchrun has set it to 1
         torch.set_num_threads(max(num_cores() // several.local_count, 1))

@@ -33,7 +33,7 @@ class ConfigError(NerfloomError):
 
 
 class FlagError(ConfigError):
-    """A flag has a value that it cannot have; the exit status of the command is 2, as for a flag that is unknown."""
+    """A flag is unknown or missing, or has a value that it cannot have; the exit status of the command is 2."""
 
 
 class CheckpointError(NerfloomError):

@@ -10,7 +10,7 @@ from typing import Any
 
 from framework.base.child import python_command
 from framework.base.console import say
-from framework.base.errors import ConfigError, nearest
+from framework.base.errors import ConfigError, FlagError, nearest
 from framework.base.extras import install_command
 from framework.cli.bench_flags import (
     AblationFlags,
@@ -34,6 +34,7 @@ from framework.cli.bench_gpu import GpuFlags, measure_gpu
 from framework.cli.bench_processes import ProcessesFlags, measure_processes
 from framework.cli.bench_results import write_results
 from framework.cli.common import chosen_kind, make_room, run_command
+from framework.cli.flags import read_flags
 
 USAGE = """\
 usage: ns-bench WHAT [flags]
@@ -70,10 +71,8 @@ def main() -> None:
 def _command(arguments: list[str]) -> None:
     if (chosen := chosen_kind(arguments, KINDS, USAGE, "there is no benchmark")) is None:
         return
-    import tyro
-
     name, (flags, run), rest = chosen
-    run(tyro.cli(flags, prog=f"ns-bench {name}", args=rest, config=(tyro.conf.FlagConversionOff,)))
+    run(read_flags(flags, f"ns-bench {name}", rest))
 
 
 def _kernels(flags: KernelFlags) -> None:
@@ -81,7 +80,7 @@ def _kernels(flags: KernelFlags) -> None:
 
     for name in flags.variants:
         if name not in native.NEEDS:
-            raise ConfigError(f"--variants: there is no '{name}'. {nearest(name, native.NEEDS)}")
+            raise FlagError(f"--variants: there is no '{name}'. {nearest(name, native.NEEDS)}")
         command = python_command("framework.cli.bench", "kernels", "--output-dir", flags.output_dir)
         command += ["--samples", str(flags.samples), "--repeats", str(flags.repeats)]
         command += ["--plot-dir", str(flags.plot_dir)] if flags.plot_dir else []
@@ -232,7 +231,7 @@ def _viewer(flags: ViewerBenchFlags) -> None:
     from framework.training.machine import machine
 
     if not flags.runs or not all(width >= 8 for width in flags.widths):
-        raise ConfigError("--runs: name the folders of trained runs; --widths are at least 8 pixels")
+        raise FlagError("--runs: name the folders of trained runs; --widths are at least 8 pixels")
     make_room(flags.output_dir / "viewer.json")
     rows = [measured(run, width, width, flags.pictures) for run in flags.runs for width in flags.widths]
     for row in rows:
@@ -254,7 +253,7 @@ def _frames(flags: FramesFlags) -> None:
     from framework.training.machine import machine
 
     if not flags.runs or min(*flags.widths, 8) < 8 or min(*flags.threads, 1) < 1 or flags.pictures < 1:
-        raise ConfigError(
+        raise FlagError(
             "--runs: name the folders of trained runs; --widths are at least 8, --threads and --pictures at least 1"
         )
     make_room(flags.output)

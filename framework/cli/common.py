@@ -15,6 +15,7 @@ from framework.base.console import console, say
 from framework.base.errors import ConfigError, FlagError, NerfloomError, is_out_of_memory, nearest
 from framework.base.from_nerfstudio import KINDS
 from framework.base.registry import registered
+from framework.cli.flags import read_flags
 from framework.training.signals import exit_status, orderly_end
 
 if TYPE_CHECKING:
@@ -93,16 +94,10 @@ def with_format(command: str, arguments: list[str]) -> tuple[list[str], tuple[st
             break
     else:
         return arguments, None
-    import tyro
-
     from framework.base.registry import load_dataparser
 
-    parser, others = tyro.cli(
-        load_dataparser(word),
-        prog=f"{command} {word}",
-        args=arguments[index + 1 :],
-        config=(tyro.conf.FlagConversionOff,),
-        return_unknown_args=True,
+    parser, others = read_flags(
+        load_dataparser(word), f"{command} {word}", arguments[index + 1 :], return_unknown_args=True
     )
     return arguments[:index] + others, (word, parser)
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from framework.base.errors import ConfigError
+from framework.base.errors import ConfigError, FlagError
 from framework.cli.common import run_command
+from framework.cli.flags import read_flags
 
 if TYPE_CHECKING:
     from framework.tools.comparison.measures import Row
@@ -56,14 +57,11 @@ def main() -> None:
 
 
 def _command(arguments: list[str]) -> None:
-    import tyro
-
     from framework.base.config import from_plain, read_yaml
 
     recipe, arguments = _recipe(arguments)
     default = CompareFlags() if recipe is None else from_plain(CompareFlags(), read_yaml(recipe), str(recipe))
-    options = (tyro.conf.FlagConversionOff,)
-    flags = tyro.cli(CompareFlags, prog="ns-compare", args=arguments, default=default, config=options)
+    flags = read_flags(CompareFlags, "ns-compare", arguments, default=default)
     plan = plan_of(flags)
     from framework.base.console import say
 
@@ -80,7 +78,7 @@ def _recipe(arguments: list[str]) -> tuple[Path | None, list[str]]:
         return None, arguments
     index = arguments.index("--load-config")
     if index + 1 == len(arguments):
-        raise ConfigError("--load-config needs a file, such as configs/compare-lego.yml")
+        raise FlagError("--load-config needs a file, such as configs/compare-lego.yml")
     return Path(arguments[index + 1]), arguments[:index] + arguments[index + 2 :]
 
 

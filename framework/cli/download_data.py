@@ -6,8 +6,9 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-from framework.base.errors import ConfigError
+from framework.base.errors import FlagError
 from framework.cli.common import chosen_kind, run_command
+from framework.cli.flags import read_flags
 from framework.tools.downloads.catalogue import DATASETS
 from framework.training.signals import Stopped, signal_of
 
@@ -44,15 +45,11 @@ def main() -> None:
 def _command(arguments: list[str]) -> None:
     if (chosen := chosen_kind(arguments, DATASETS, _usage(), "unknown data set")) is None:
         return
-    import tyro
-
     name, dataset, rest = chosen
     if any(word.partition("=")[0].replace("_", "-") == "--capture-name" for word in rest):
-        raise ConfigError("--capture-name is nerfstudio's; here it is --scenes")
+        raise FlagError("--capture-name is nerfstudio's; here it is --scenes")
     description = f"{dataset.title}\nscenes: {', '.join(dataset.scenes)}\nlicence: {dataset.licence}"
-    options = (tyro.conf.FlagConversionOff,)
-    prog = f"ns-download-data {name}"
-    flags = tyro.cli(DownloadFlags, prog=prog, description=description, args=rest, config=options)
+    flags = read_flags(DownloadFlags, f"ns-download-data {name}", rest, description=description)
     from framework.tools.downloads.install import announce, install
 
     announce(name, dataset, flags.save_dir, flags.scenes)

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Literal
 
 from framework.base.config import RaysPerPixel
-from framework.base.errors import ConfigError
+from framework.base.errors import ConfigError, FlagError
 from framework.cli.common import run_command, with_format, with_run
+from framework.cli.flags import read_flags
 
 
 @dataclass(frozen=True)
@@ -50,14 +51,12 @@ def main() -> None:
 
 
 def _command(arguments: list[str]) -> None:
-    import tyro
-
     words, named = with_format("ns-eval", with_run(arguments))
-    flags = tyro.cli(EvalFlags, prog="ns-eval", args=words, config=(tyro.conf.FlagConversionOff,))
+    flags = read_flags(EvalFlags, "ns-eval", words)
     if flags.max_images is not None and flags.max_images < 1:
-        raise ConfigError(f"--max-images is {flags.max_images}; it must be at least 1")
+        raise FlagError(f"--max-images is {flags.max_images}; it must be at least 1")
     if flags.max_pictures is not None and flags.max_pictures < 0:
-        raise ConfigError(f"--max-pictures is {flags.max_pictures}; it must be at least 0")
+        raise FlagError(f"--max-pictures is {flags.max_pictures}; it must be at least 0")
     from contextlib import nullcontext
 
     from framework.base.console import say

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from framework.base.errors import ConfigError, DataError
+from framework.base.errors import ConfigError, DataError, FlagError
 from framework.base.extras import install_command
 from framework.cli.common import chosen_kind, make_room, run_command, with_run
 from framework.cli.export_flags import ExportFlags
 from framework.cli.export_mesh import MarchingCubesFlags, TsdfFlags, marching_cubes, tsdf
+from framework.cli.flags import read_flags
 
 if TYPE_CHECKING:
     from framework.cameras.poses import Placement
@@ -95,10 +96,8 @@ def main() -> None:
 def _command(arguments: list[str]) -> None:
     if (chosen := chosen_kind(arguments, KINDS, USAGE, "nothing is exported as")) is None:
         return
-    import tyro
-
     name, (kind, file, run), rest = chosen
-    flags = tyro.cli(kind, prog=f"ns-export {name}", args=with_run(rest), config=(tyro.conf.FlagConversionOff,))
+    flags = read_flags(kind, f"ns-export {name}", with_run(rest))
     from framework.training.trained import load_trained
 
     path = flags.output_dir / file.format_map(vars(flags))
@@ -118,7 +117,7 @@ def _placement(trained: Trained) -> Placement:
 
 def _points(flags: PointFlags, trained: Trained, placement: Placement, path: Path) -> None:
     if flags.num_points < 1 or not flags.reach >= 0 or not flags.std_ratio >= 0:
-        raise ConfigError("--num-points must be at least 1, --reach and --std-ratio at least 0")
+        raise FlagError("--num-points must be at least 1, --reach and --std-ratio at least 0")
     if flags.remove_outliers or flags.estimate_normals:
         _need_packages("--remove-outliers and --estimate-normals need", "; or set both to False")
     from framework.base.console import say, track
@@ -217,7 +216,7 @@ def _occupancy(flags: OccupancyFlags, trained: Trained, placement: Placement, pa
 
 def _splats(flags: SplatFlags, trained: Trained, placement: Placement, path: Path) -> None:
     if flags.max_megabytes is not None and not flags.max_megabytes > 0:
-        raise ConfigError(f"--max-megabytes must be positive, not {flags.max_megabytes}")
+        raise FlagError(f"--max-megabytes must be positive, not {flags.max_megabytes}")
     from framework.base.console import say
     from framework.splats.files import write_gaussians
     from framework.splats.gaussians import HasGaussians

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from framework.base.errors import ConfigError
+from framework.base.errors import ConfigError, FlagError
 from framework.base.extras import install_command
 from framework.cli.export_flags import ExportFlags
 
@@ -88,9 +88,9 @@ def marching_cubes(flags: MarchingCubesFlags, trained: Trained, placement: Place
             f"ns-export marching-cubes: {trained.run.method} has no density; 'ns-export tsdf' makes a mesh"
         )
     if level is not None and not 0 < level < float("inf"):
-        raise ConfigError(f"--isosurface-threshold is {level:g}; it must be above zero")
+        raise FlagError(f"--isosurface-threshold is {level:g}; it must be above zero")
     if not 0 <= flags.time <= 1:
-        raise ConfigError(f"--time is {flags.time:g}; it must be from 0 to 1")
+        raise FlagError(f"--time is {flags.time:g}; it must be from 0 to 1")
     start = time.monotonic()
     if level is None:
         level = default_level(model.scene.box)
@@ -114,7 +114,7 @@ def tsdf(flags: TsdfFlags, trained: Trained, placement: Placement, path: Path) -
     """
     lattice, cleaning, texturing = _prepared(flags, trained, placement)
     if flags.max_num_views < 1:
-        raise ConfigError(f"--max-num-views is {flags.max_num_views}; it must be at least 1")
+        raise FlagError(f"--max-num-views is {flags.max_num_views}; it must be at least 1")
     from framework.export.meshing import fused_mesh
     from framework.training.datasets import load_split
 

@@ -12,6 +12,7 @@ from string import Template
 from framework.base.errors import ConfigError
 from framework.base.registry import registered
 from framework.cli.common import run_command
+from framework.cli.flags import read_flags
 
 TEMPLATES = Path(__file__).parents[1] / "templates" / "method"
 SUFFIX = ".template"
@@ -44,9 +45,7 @@ def _command(arguments: list[str]) -> None:
     name = arguments[0]
     if name.startswith("-"):
         raise ConfigError(f"the method's name comes first, before {name}, as in 'ns-new-method my-method'")
-    import tyro
-
-    flags = tyro.cli(NewMethodFlags, prog=f"ns-new-method {name}", args=arguments[1:])
+    flags = read_flags(NewMethodFlags, f"ns-new-method {name}", arguments[1:])
     check_name(name)
     folder = flags.dir or Path(name)
     write_package(name, folder)

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import get_type_hints
 
 from framework.base.console import say
-from framework.base.errors import ConfigError, DataError
+from framework.base.errors import ConfigError, DataError, FlagError
 from framework.cli.common import chosen_kind, run_command
+from framework.cli.flags import read_flags
 from framework.tools.processing.settings import ColmapFlags, OutputFlags
 from framework.training.signals import Stopped, signal_of
 
@@ -53,7 +54,7 @@ class VideoFlags(ColmapFlags):
     def check(self) -> None:
         super().check()
         if self.num_frames_target < 3:
-            raise ConfigError(f"--num-frames-target is {self.num_frames_target}; it must be at least 3")
+            raise FlagError(f"--num-frames-target is {self.num_frames_target}; it must be at least 3")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +67,7 @@ class PhoneFlags(OutputFlags):
     def check(self) -> None:
         super().check()
         if self.max_dataset_size < 2 and self.max_dataset_size != -1:
-            raise ConfigError(f"--max-dataset-size is {self.max_dataset_size}; it must be at least 2, or -1 for all")
+            raise FlagError(f"--max-dataset-size is {self.max_dataset_size}; it must be at least 2, or -1 for all")
 
     @property
     def most(self) -> int:
@@ -86,7 +87,7 @@ class PolycamFlags(PhoneFlags):
     def check(self) -> None:
         super().check()
         if self.crop_border_pixels < 0:
-            raise ConfigError(f"--crop-border-pixels is {self.crop_border_pixels}; it must be at least 0")
+            raise FlagError(f"--crop-border-pixels is {self.crop_border_pixels}; it must be at least 0")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,11 +111,8 @@ def main() -> None:
 def _command(arguments: list[str]) -> None:
     if (chosen := chosen_kind(arguments, KINDS, USAGE, "unknown kind")) is None:
         return
-    import tyro
-
     name, kind, rest = chosen
-    options = (tyro.conf.FlagConversionOff,)
-    flags = tyro.cli(kind, prog=f"ns-process-data {name}", args=_spelt_out(rest, kind), config=options)
+    flags = read_flags(kind, f"ns-process-data {name}", _spelt_out(rest, kind))
     flags.check()
     try:
         _process(flags)

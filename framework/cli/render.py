@@ -9,10 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from framework.base.errors import ConfigError
+from framework.base.errors import ConfigError, FlagError
 from framework.base.from_nerfstudio import render_answer
 from framework.base.rendered_names import OutputName
 from framework.cli.common import chosen_kind, make_room, run_command, with_format, with_run
+from framework.cli.flags import read_flags
 from framework.cli.render_flags import (
     PATHS,
     USAGE,
@@ -44,10 +45,10 @@ def _command(arguments: list[str]) -> None:
 
     name, path, rest = chosen
     if answer := next(filter(None, map(render_answer, rest)), None):
-        raise ConfigError(answer)
+        raise FlagError(answer)
     words, named = with_format(f"ns-render {name}", with_run(rest, {"--rendered-output-names": get_args(OutputName)}))
     options = (tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes)
-    _render(name, tyro.cli(path, prog=f"ns-render {name}", args=words, config=options), named)
+    _render(name, read_flags(path, f"ns-render {name}", words, config=options), named)
 
 
 def _render(name: str, flags: Flags, named: DataFormat | None) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from framework.base.config import RaysPerPixel
-from framework.base.errors import ConfigError
+from framework.base.errors import FlagError
 from framework.base.rendered_names import OutputName
 
 USAGE = """\
@@ -189,28 +189,28 @@ def check_flags(flags: Flags) -> None:
         flags: flags of a path.
 
     Raises:
-        ConfigError: with what is wrong.
+        FlagError: with what is wrong.
     """
     shown, outputs = flags.outputs, flags.outputs.rendered_output_names
     count = 1 if isinstance(flags, (CameraPathFlags, DatasetFlags)) else flags.num_frames
     if count < 1 or (flags.fps is not None and not 0 < flags.fps <= 1000) or shown.downscale_factor < 1:
-        raise ConfigError("--num-frames and --downscale-factor must be at least 1, --fps more than 0 and at most 1000")
+        raise FlagError("--num-frames and --downscale-factor must be at least 1, --fps more than 0 and at most 1000")
     if not outputs or len(set(outputs)) < len(outputs):
-        raise ConfigError(f"--rendered-output-names {' '.join(outputs)}: name at least one output, and each once")
+        raise FlagError(f"--rendered-output-names {' '.join(outputs)}: name at least one output, and each once")
     if not isinstance(flags, DatasetFlags) and (unknown := {"error", "gt-rgb"} & set(outputs)):
-        raise ConfigError(
+        raise FlagError(
             f"--rendered-output-names {min(unknown)}: the true image is known to 'ns-render dataset' alone"
         )
     if isinstance(flags, SpiralFlags) and flags.radius is not None and not 0 < flags.radius < 1e9:
-        raise ConfigError(f"--radius is {flags.radius:g}; it must be above zero")
+        raise FlagError(f"--radius is {flags.radius:g}; it must be above zero")
     near, far = shown.depth_near_plane, shown.depth_far_plane
     if not 0 <= (near or 0) < (1e30 if far is None else far):
-        raise ConfigError(f"--depth-near-plane {near} and --depth-far-plane {far}: near must be at least 0, below far")
+        raise FlagError(f"--depth-near-plane {near} and --depth-far-plane {far}: near must be at least 0, below far")
     if flags.files.depth_format != "color":
         if not {"depth", "median_depth"} & set(outputs):
-            raise ConfigError(f"--depth-format {flags.files.depth_format}: add depth to --rendered-output-names")
+            raise FlagError(f"--depth-format {flags.files.depth_format}: add depth to --rendered-output-names")
         if flags.output_path.suffix:
-            raise ConfigError(
+            raise FlagError(
                 f"--depth-format {flags.files.depth_format} needs a folder: --output-path without an extension, "
                 f"such as {flags.output_path.with_suffix('')}"
             )

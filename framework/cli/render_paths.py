@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from framework.base.console import say
-from framework.base.errors import ConfigError
+from framework.base.errors import ConfigError, FlagError
 from framework.cameras.camera_path import read_camera_path, read_transforms
 from framework.cameras.cameras import Cameras
 from framework.cameras.poses import Placement
@@ -106,7 +106,7 @@ def _one_camera(flags: TimeFlags, parsed: ParsedScene, moving: bool) -> Cameras:
         raise ConfigError("ns-render time: the photographs of this run have no times")
     if not 0 <= flags.camera_index < len(parsed.cameras):
         last = len(parsed.cameras) - 1
-        raise ConfigError(f"--camera-index is {flags.camera_index}; '{flags.split}' has cameras 0 to {last}")
+        raise FlagError(f"--camera-index is {flags.camera_index}; '{flags.split}' has cameras 0 to {last}")
     return parsed.cameras[torch.full((flags.num_frames,), flags.camera_index)]
 
 
@@ -120,7 +120,7 @@ def _circle(flags: OrbitFlags, trained: Trained, parsed: ParsedScene) -> tuple[C
     if not scene.moving:
         raise ConfigError(f"--time {flags.time:g}: the photographs of this run have no times")
     if not 0 <= flags.time <= 1:
-        raise ConfigError(f"--time is {flags.time:g}; it must be from 0 to 1")
+        raise FlagError(f"--time is {flags.time:g}; it must be from 0 to 1")
     return cameras, torch.full((flags.num_frames,), flags.time)
 
 

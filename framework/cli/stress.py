@@ -8,9 +8,10 @@ from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from framework.base.errors import ConfigError, NerfloomError
+from framework.base.errors import ConfigError, FlagError, NerfloomError
 from framework.base.registry import registered
 from framework.cli.common import run_command
+from framework.cli.flags import read_flags
 
 if TYPE_CHECKING:
     from framework.tools.stress.conditions import Condition
@@ -65,13 +66,10 @@ def _command(arguments: list[str]) -> None:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE)
         return
-    import tyro
-
     methods = list(takewhile(lambda word: not word.startswith("-"), arguments))
     if not methods:
         raise ConfigError(f"the methods come first, before {arguments[0]}, as in 'ns-stress instant-ngp kplanes'")
-    rest, options = arguments[len(methods) :], (tyro.conf.FlagConversionOff,)
-    flags = tyro.cli(StressFlags, prog="ns-stress METHOD", args=rest, config=options)
+    flags = read_flags(StressFlags, "ns-stress METHOD", arguments[len(methods) :])
     results = stress(list(registered("methods")) if methods == ["all"] else methods, flags)
     outcomes = [(result.method, verdict) for result in results for verdict in result.verdicts]
     failed = [f"{method}: {verdict.name}" for method, verdict in outcomes if verdict.outcome == "fail"]
@@ -154,7 +152,7 @@ def _budget(flags: StressFlags) -> Budget:
     from framework.tools.stress.trial import Budget
 
     if flags.max_num_iterations < 1 or (flags.max_seconds is not None and not flags.max_seconds > 0):
-        raise ConfigError("--max-num-iterations must be at least 1, and --max-seconds more than 0")
+        raise FlagError("--max-num-iterations must be at least 1, and --max-seconds more than 0")
     return Budget(flags.max_num_iterations, flags.max_seconds)
 
 
@@ -165,7 +163,7 @@ def _path(runs: Sequence[Run], flags: StressFlags) -> Path:
         name = runs[0].method if len(runs) == 1 else "methods"
         return Path("outputs") / f"stress-{_data_name(flags)}" / f"{name}.json"
     if path.suffix != ".json":
-        raise ConfigError(f"--output-path {path}: it must end in .json; the table goes beside it, ending in .md")
+        raise FlagError(f"--output-path {path}: it must end in .json; the table goes beside it, ending in .md")
     return path
 
 

@@ -13,6 +13,7 @@ from framework.base.errors import ConfigError, FlagError
 from framework.base.from_nerfstudio import flag_answer, vis_answer
 from framework.base.registry import entry_of, registered, summary
 from framework.cli.common import run_command
+from framework.cli.flags import read_flags
 
 if TYPE_CHECKING:
     from framework.training.run import Run
@@ -59,7 +60,7 @@ def _take(arguments: list[str], flag: str) -> tuple[str | None, list[str]]:
     for index, argument in enumerate(arguments):
         if argument == flag:
             if index + 1 == len(arguments):
-                raise ConfigError(f"{flag} needs a path")
+                raise FlagError(f"{flag} needs a path")
             return arguments[index + 1], arguments[:index] + arguments[index + 2 :]
         if argument.startswith(flag + "="):
             return argument[len(flag) + 1 :], arguments[:index] + arguments[index + 1 :]
@@ -113,7 +114,7 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
     from framework.training.run import run_folder
 
     if (answer := vis_answer(_take(flags, "--vis")[0] or "")) is not None:
-        raise ConfigError(answer)
+        raise FlagError(answer)
     if _are_pairs(flags):
         given, word = _take(flags, "--data")[0], None
         asked = run.config.data if given is None else None if given == "None" else Path(given)
@@ -158,10 +159,10 @@ def _parsed(run: Run, flags: list[str], settings: dict[str, Any], **options: Any
     fields = [(name, Annotated[type(value), tyro.conf.arg(name="")]) for name, value in settings.items()]
     kind = dataclasses.make_dataclass("Flags", fields)
     try:
-        return tyro.cli(
+        return read_flags(
             kind,
-            prog=f"ns-train {run.method}",
-            args=flags,
+            f"ns-train {run.method}",
+            flags,
             default=kind(**settings),
             config=(tyro.conf.FlagConversionOff, tyro.conf.ConsolidateSubcommandArgs),
             registry=grouped_flags(run.method, run.config, run.dataparser, run.parser),
@@ -197,7 +198,7 @@ def _check_for_nerfstudio(flags: list[str], method: str, settings: list[Any]) ->
     names = {name for value in settings for name in _flag_names(value)}
     for flag in flags:
         if flag.startswith("--") and (answer := flag_answer(flag, method, names)) is not None:
-            raise ConfigError(answer)
+            raise FlagError(answer)
 
 
 def _flag_names(settings: Any, prefix: str = "--") -> Iterator[str]:

@@ -10,6 +10,7 @@ from framework.base.config import ViewerConfig
 from framework.base.errors import ConfigError
 from framework.base.extras import install_command
 from framework.cli.common import run_command, with_format, with_run
+from framework.cli.flags import read_flags
 
 
 @dataclass(frozen=True)
@@ -36,10 +37,8 @@ def main() -> None:
 
 
 def _command(arguments: list[str]) -> None:
-    import tyro
-
     words, named = with_format("ns-viewer", with_run([_without_prefix(word) for word in arguments]))
-    flags = tyro.cli(ViewerFlags, prog="ns-viewer", args=words, config=(tyro.conf.FlagConversionOff,))
+    flags = read_flags(ViewerFlags, "ns-viewer", words)
     if (command := install_command("viewer")) is not None:
         raise ConfigError(f"the viewer needs viser: {command}")
     from framework.training.splat_files import is_splat_file, load_run_or_splats

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from framework.base.errors import ConfigError
+from framework.base.errors import ConfigError, FlagError
 from framework.data.dataset import Dataset
 from framework.evaluation.evaluator import evaluation_background, spread, timed_view
 from framework.model import Model, parts
@@ -28,7 +28,7 @@ def parse_error(text: str) -> float:
     except (ValueError, ZeroDivisionError):
         bound = -1.0
     if not 0 <= bound < 1:
-        raise ConfigError(f"--max-error is '{text}'; it must be a number from 0 to below 1, such as 0.004 or 1/255")
+        raise FlagError(f"--max-error is '{text}'; it must be a number from 0 to below 1, such as 0.004 or 1/255")
     return bound
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from framework.base.errors import ConfigError
+from framework.base.errors import ConfigError, FlagError
 from framework.base.extras import install_command
 from framework.evaluation.frames import write_file
 
@@ -37,7 +37,7 @@ def check_suffix(path: Path) -> None:
     suffix = path.suffix.lower()
     if suffix not in ("", VIDEO, *ANIMATIONS):
         known = ", ".join((VIDEO, *ANIMATIONS))
-        raise ConfigError(f"--output-path {path}: the extension must be {known}, or none for a folder of images")
+        raise FlagError(f"--output-path {path}: the extension must be {known}, or none for a folder of images")
     if suffix == VIDEO and (advice := install_command("video")) is not None:
         raise ConfigError(
             f"--output-path {path}: MP4 needs ffmpeg, the extra [video]: {advice}; or name a .gif, a .webp or a folder"

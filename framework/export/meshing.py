@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from framework.base.console import say, track
-from framework.base.errors import ConfigError
+from framework.base.errors import ConfigError, FlagError
 from framework.cameras.cameras import Cameras
 from framework.cameras.poses import Placement
 from framework.data.dataset import Dataset
@@ -42,9 +42,9 @@ class Cleaning:
     def check(self) -> None:
         """Raise ConfigError if a number is out of range."""
         if self.num_components < 0 or not 0 <= self.min_component_share <= 1:
-            raise ConfigError("--num-components must be at least 0, and --min-component-share from 0 to 1")
+            raise FlagError("--num-components must be at least 0, and --min-component-share from 0 to 1")
         if self.target_num_faces is not None and self.target_num_faces < 4:
-            raise ConfigError(f"--target-num-faces is {self.target_num_faces}; it must be at least 4")
+            raise FlagError(f"--target-num-faces is {self.target_num_faces}; it must be at least 4")
 
 
 def density_mesh(

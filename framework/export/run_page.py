@@ -9,7 +9,7 @@ from statistics import fmean
 import torch
 
 from framework.base.console import say, track
-from framework.base.errors import ConfigError, printable
+from framework.base.errors import ConfigError, FlagError, printable
 from framework.cameras.view import View
 from framework.data.dataset import Dataset
 from framework.data.pixels import composite
@@ -88,7 +88,7 @@ def export_page(trained: Trained, path: Path, max_megabytes: float, fit_seconds:
         found, antialiased = model.gaussians(), bool(getattr(model.config, "antialiased", False))
     else:
         if not fit_seconds > 0:
-            raise ConfigError(f"--fit-seconds is {fit_seconds:g}; it must be positive")
+            raise FlagError(f"--fit-seconds is {fit_seconds:g}; it must be positive")
         found, antialiased = fit_gaussians(model, dataset, cameras, near, fit_seconds), False
     found = found.map(lambda values: values.detach().cpu())
     good = found[found.finite()]
@@ -163,7 +163,7 @@ def _moment(moving: bool, asked: float | None) -> float | None:
     if asked is not None and not moving:
         raise ConfigError(f"--time {asked:g}: the photographs of this run have no times")
     if asked is not None and not 0 <= asked <= 1:
-        raise ConfigError(f"--time is {asked:g}; it must be from 0 to 1")
+        raise FlagError(f"--time is {asked:g}; it must be from 0 to 1")
     return (asked or 0.0) if moving else None
 
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from framework.base.console import say, track
-from framework.base.errors import ConfigError
+from framework.base.errors import ConfigError, FlagError
 
 SMALLEST, LARGEST = 64, 16_384
 """Bounds of a texture's edge, in texels."""
@@ -38,9 +38,9 @@ class Texturing:
     def check(self) -> None:
         """Raise ConfigError if a number is out of range."""
         if not SMALLEST <= self.size <= LARGEST:
-            raise ConfigError(f"--texture-size is {self.size}; it must be from {SMALLEST} to {LARGEST}")
+            raise FlagError(f"--texture-size is {self.size}; it must be from {SMALLEST} to {LARGEST}")
         if not self.max_seconds > 0:
-            raise ConfigError(f"--texture-seconds is {self.max_seconds:g}; it must be above zero")
+            raise FlagError(f"--texture-seconds is {self.max_seconds:g}; it must be above zero")
 
 
 @dataclass(frozen=True)

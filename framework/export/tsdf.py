@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.base.errors import ConfigError
+from framework.base.errors import FlagError
 from framework.cameras.cameras import Cameras
 from framework.cameras.view import View
 from framework.export.lattice import Lattice
@@ -156,7 +156,7 @@ class FusedDistance:
 
     def __init__(self, lattice: Lattice, views: Sequence[DepthView], truncation: float) -> None:
         if not 1 <= truncation <= 64:
-            raise ConfigError(f"--truncation is {truncation:g}; it must be from 1 to 64 cells")
+            raise FlagError(f"--truncation is {truncation:g}; it must be from 1 to 64 cells")
         self.lattice, self.views = lattice, views
         self.cells, self.truncation = truncation, truncation * lattice.spacing
 

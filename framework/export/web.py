@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 import framework
-from framework.base.errors import ConfigError, DataError
+from framework.base.errors import ConfigError, DataError, FlagError
 from framework.cameras.cameras import Cameras
 from framework.cameras.poses import nearest_point, rotation_between
 from framework.splats.budget import fitted_spz
@@ -167,7 +167,7 @@ def check_size(max_megabytes: float) -> None:
         ConfigError: if it is not positive, or above LARGEST.
     """
     if not 0 < max_megabytes <= LARGEST:
-        raise ConfigError(
+        raise FlagError(
             f"--max-megabytes is {max_megabytes:g}; a page has up to {LARGEST:g}, since phones refuse larger ones"
         )
 

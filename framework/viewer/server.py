@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from framework.base.console import say
-from framework.base.errors import ConfigError
+from framework.base.errors import ConfigError, FlagError
 from framework.base.extras import install_command
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def free_port(host: str, port: int) -> int:
         ConfigError: if the host is none of this machine, or no port is free.
     """
     if not 1 <= port <= 65535:
-        raise ConfigError(f"--websocket-port is {port}; it must be from 1 to 65535")
+        raise FlagError(f"--websocket-port is {port}; it must be from 1 to 65535")
     reason = "all are taken"
     for candidate in range(port, min(port + PORTS_TRIED, 65536)):
         try:

@@ -38,7 +38,7 @@ def test_bad_input_is_refused_in_a_line(shared_tiny: Path, tmp_path: Path, refus
     assert "there is no benchmark 'contenton'. Did you mean 'contention'?" in refused(main, "contenton")
     assert "no such folder" in refused(main, "contention", "--data", tmp_path / "none", *output)
     assert "no condition is called 'loop3'" in refused(
-        main, "contention", "--data", shared_tiny, "--rows", "loop3", *output
+        main, "contention", "--data", shared_tiny, "--rows", "loop3", *output, status=2
     )
     in_a_file = ("--output-dir", shared_tiny / "transforms_train.json" / "below")
     assert "cannot write" in refused(main, "ablation", "--data", shared_tiny, *in_a_file)

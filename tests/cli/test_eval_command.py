@@ -137,7 +137,7 @@ def test_what_is_missing_is_named(finished: Path, tmp_path: Path, refused: Refus
         (["--load-config", config, "--output-path", tmp_path / "file" / "e.json"], str(tmp_path / "file")),
     ]
     for arguments, words in cases:
-        assert words in refused(main, *arguments)
+        assert words in refused(main, *arguments, status=2 if "--max-images" in arguments else 1)
 
 
 def test_data_that_has_gone_is_named_by_its_folder(finished: Path, tmp_path: Path, refused: Refused) -> None:

@@ -80,8 +80,10 @@ def test_meshes_are_of_the_ball(ball: Path, tmp_path: Path, monkeypatch: pytest.
     assert np.asarray(read.visual.material.image).std() > 1
     assert "a PLY file has no texture" in refused(main, "marching-cubes", *given, *small, "--texture-size", 128)
     assert "never passes 1e+30" in refused(main, "marching-cubes", *given, "--isosurface-threshold", 1e30)
-    assert "--isosurface-threshold is 0" in refused(main, "marching-cubes", *given, "--isosurface-threshold", 0)
-    assert "--resolution is 2048" in refused(main, "tsdf", *given, "--resolution", 2048)
+    assert "--isosurface-threshold is 0" in refused(
+        main, "marching-cubes", *given, "--isosurface-threshold", 0, status=2
+    )
+    assert "--resolution is 2048" in refused(main, "tsdf", *given, "--resolution", 2048, status=2)
     box = ("--bounding-box-min", 50, 50, 50, "--bounding-box-max", 51, 51, 51)
     assert "no training view sees a surface in the box" in refused(main, "tsdf", *given, *box)
     assert "no occupied cell in the box" in refused(main, "marching-cubes", *given, *box)
@@ -150,7 +152,7 @@ def test_written_points_are_read_back(tmp_path: Path, with_normals: bool) -> Non
 def test_what_cannot_be_exported_is_refused(ball: Path, tmp_path: Path, refused: Refused) -> None:
     given, few = ("--load-config", ball, "--output-dir", tmp_path), ("--num-points", 5000)
     assert "nothing is exported as 'poincloud'. Did you mean 'pointcloud'" in refused(main, "poincloud", *given)
-    assert "--num-points must be at least 1" in refused(main, "pointcloud", *given, "--num-points", 0)
+    assert "--num-points must be at least 1" in refused(main, "pointcloud", *given, "--num-points", 0, status=2)
     assert "no training ray ends in a surface" in refused(main, "pointcloud", *given, *few, "--reach", 1e-6)
 
 

@@ -245,7 +245,5 @@ def test_errors_are_those_without_groups(flags: str, capsys: Capture) -> None:
 def test_an_unknown_flag_is_one_message_with_the_nearest() -> None:
     done = called("ns-train", "nerfacto", "--max-secnds", 3)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.count("Unrecognized options: --max-secnds") == 1
-    assert "Perhaps you meant:" in done.stderr
-    assert "--max-seconds {None}|FLOAT" in done.stderr
-    assert "Traceback" not in done.stderr
+    words = "unknown flag --max-secnds. Did you mean '--max-seconds'? ns-train nerfacto --help shows the flags"
+    assert done.stderr == f"error: {words}\n"

@@ -49,5 +49,5 @@ def test_what_cannot_be_is_refused(moving_run: Path, shared_tiny: Path, tmp_path
     standing = ("--load-config", still.run.config_path)
     assert "have no times" in refused(main, "time", *standing)
     assert "have no times" in refused(main, "orbit", *standing, "--time", 0.5)
-    assert "must be from 0 to 1" in refused(main, "orbit", "--load-config", moving_run, "--time", 2)
-    assert "has cameras 0 to" in refused(main, "time", "--load-config", moving_run, "--camera-index", 99)
+    assert "must be from 0 to 1" in refused(main, "orbit", "--load-config", moving_run, "--time", 2, status=2)
+    assert "has cameras 0 to" in refused(main, "time", "--load-config", moving_run, "--camera-index", 99, status=2)

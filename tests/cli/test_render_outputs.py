@@ -264,8 +264,8 @@ def test_a_camera_path_is_rendered_at_its_times_and_speed(
 
 
 def test_what_cannot_be_rendered_is_refused_at_once(ball_run: Path, tmp_path: Path, refused: Refused) -> None:
-    def said(*words: object) -> str:
-        return refused(render_command.main, *words, "--output-path", tmp_path / "a.gif")
+    def said(*words: object, status: int = 2) -> str:
+        return refused(render_command.main, *words, "--output-path", tmp_path / "a.gif", status=status)
 
     nowhere = tmp_path / "none"
     names = "--rendered-output-names"
@@ -278,13 +278,13 @@ def test_what_cannot_be_rendered_is_refused_at_once(ball_run: Path, tmp_path: Pa
     )
     assert "--fps more than 0" in said("orbit", nowhere, "--fps", 0)
     assert "--radius is -1; it must be above zero" in said("spiral", nowhere, "--radius", -1)
-    avi = refused(render_command.main, "orbit", nowhere, "--output-path", tmp_path / "a.avi")
+    avi = refused(render_command.main, "orbit", nowhere, "--output-path", tmp_path / "a.avi", status=2)
     assert avi.endswith("the extension must be .mp4, .gif, .webp, .png, or none for a folder of images")
-    assert "this method has none" in said("orbit", ball_run, names, "normals", "--num-frames", 1)
+    assert "this method has none" in said("orbit", ball_run, names, "normals", "--num-frames", 1, status=1)
     assert not list(tmp_path.iterdir())
     path = ("camera-path", ball_run, "--camera-path-filename", nowhere)
-    assert said(*path).endswith("none: No such file or directory")
-    assert "the run knows its data format; leave it out" in said("orbit", ball_run, "blender")
+    assert said(*path, status=1).endswith("none: No such file or directory")
+    assert "the run knows its data format; leave it out" in said("orbit", ball_run, "blender", status=1)
     assert "nerfstudio's; here it is --fps" in said("interpolate", nowhere, "--frame_rate=24")
     assert "the extension of --output-path says it" in said("spiral", nowhere, "--output-format", "images")
 

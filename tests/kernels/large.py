@@ -35,6 +35,8 @@ from framework.kernels.splat_blend import blend, blend_reference
 from framework.kernels.splat_project import RECORD, SplatCamera, project_gaussians, project_reference
 from framework.kernels.splat_tiles import tile_lists, tile_lists_reference
 from framework.kernels.ssim import ssim, ssim_reference
+from framework.samplers.occupancy import OccupancySampler
+from tests.kernels import test_trace
 from tests.kernels.compiled import relative_error
 
 COUNT = 20_000
@@ -200,6 +202,18 @@ def marched(kind: type) -> list[Tensor]:
     ]
 
 
+def traced(wave_by_wave: bool = False) -> list[Tensor]:
+    """Samples of rays through a hash grid with a network, in one call or wave by wave, and the gradients of both."""
+    sampler, field = OccupancySampler(test_trace.BOX, 32, 200, 1e-2), test_trace.fields(True, 2)[wave_by_wave]
+    torch.manual_seed(3)
+    sampler.occupied = torch.rand(32**3) < 0.3
+    samples = sampler.sample(test_trace.rays(3000), field, jitter=False)
+    assert samples.sigma is not None
+    assert samples.features is not None
+    kept = [samples.t_starts, samples.sigma.detach(), samples.features.detach()]
+    return [*kept, *test_trace.gradients(field, samples, torch.ones(len(samples), 17))]
+
+
 def measured(judged: bool = True) -> dict[str, tuple[float, list[Tensor]]]:
     """The largest relative error, or NaN where it is not judged, and the result, of each operation."""
     torch.manual_seed(0)
@@ -225,7 +239,8 @@ def measured(judged: bool = True) -> dict[str, tuple[float, list[Tensor]]]:
     refresh_occupancy(density, cells, 0.95, 0.01, 0.01)
     t, weights, shift = torch.rand(2000, 17).cumsum(-1), torch.rand(2000, 16), torch.rand(2000)
     drawn = resample(t, weights, shift, 24, 1.0, 0.01)
-    results = {"tile lists": list(lists), "marching": samples, "occupancy": [density, cells.float()]}
+    results = {"tile lists": list(lists), "marching": samples, "trace": traced()}
+    results["occupancy"] = [density, cells.float()]
     found |= {name: (math.nan, tensors) for name, tensors in {**results, "resampling": [drawn]}.items()}
     if not judged:
         return found
@@ -240,6 +255,7 @@ def measured(judged: bool = True) -> dict[str, tuple[float, list[Tensor]]]:
     errors = {
         "tile lists": float((~torch.isin(entries, allowed)).float().mean()),
         "marching": float(sum(map(abs, missing))) / len(expected[0]),
+        "trace": largest_error(found["trace"][1], traced(wave_by_wave=True)),
         "occupancy": float(wrong.float().mean()),
         "resampling": relative_error(drawn, truth),
     }

@@ -18,7 +18,7 @@ from tests.mutations.forks import Tester
 from tests.mutations.plugin import FAILED, ORDER, RECORD
 from tests.mutations.reach import Reach, digests, read_record
 
-FAST = ("-m", "not slow")
+FAST = ("-m", "not slow and not medium")
 PYTEST = ("-q", "-p", "tests.mutations.plugin", "-p", "no:cacheprovider", "--hypothesis-seed=0")
 FIRST = 40
 """Tests that are tried before all others: collecting the tests of a few files is soon done."""

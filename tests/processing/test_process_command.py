@@ -22,7 +22,7 @@ def test_bad_input_is_refused_in_a_line(tmp_path: Path, refused: Refused) -> Non
     (tmp_path / "empty").mkdir()
     assert "has no image" in refused(main, "images", "--data", tmp_path / "empty", *output)
     few = ("images", "--data", tmp_path / "empty", *output, "--num-downscales", -1)
-    assert "must be from 0 to 8" in refused(main, *few)
+    assert "must be from 0 to 8" in refused(main, *few, status=2)
     assert "is not an export of Record3D" in refused(main, "record3d", "--data", tmp_path / "empty", *output)
     assert not (tmp_path / "out" / "transforms.json").exists()
 

@@ -27,6 +27,7 @@ class Cloud(Field):
         self.thickness = torch.nn.Parameter(torch.tensor(8.0))
         self.asked: list[Points] = []
         self.cameras: Tensor | None = None
+        self.directions: Tensor | None = None
 
     def sigma(self, positions: Tensor) -> Tensor:
         return self.thickness * torch.exp(-4 * positions.square().sum(-1))
@@ -36,7 +37,7 @@ class Cloud(Field):
         return self.sigma(points.positions), points.positions
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
-        self.cameras = camera_indices
+        self.cameras, self.directions = camera_indices, directions
         return 0.5 + 0.25 * features + 0.25 * directions
 
 
@@ -133,11 +134,13 @@ def test_a_field_that_asks_for_sizes_is_given_them(sampler: Sampler) -> None:
     assert bool((points.covariances >= 0).all())
 
 
-def test_each_sample_has_the_camera_of_its_ray() -> None:
+def test_each_sample_has_the_camera_of_its_ray_and_is_seen_along_it() -> None:
     field, rays = Cloud(), some_rays(4)
     shown(field, UniformSampler(2), rays)
     assert field.cameras is not None
     assert field.cameras.tolist() == [0, 0, 1, 1, 2, 2, 0, 0]
+    assert field.directions is not None
+    assert torch.equal(field.directions, rays.directions.repeat_interleave(2, 0))
 
 
 def test_samples_that_nobody_evaluated_are_refused() -> None:

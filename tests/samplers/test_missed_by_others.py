@@ -1,9 +1,11 @@
-"""What planted bugs showed that no other test holds: how cells fade, and what unit disparity has."""
+"""What planted bugs showed that no other test holds: how cells fade, when they are full, and what unit disparity has."""
 
 import pytest
 import torch
 
+from framework.data.scene import Scene
 from framework.geometry.points import Points
+from framework.samplers.choice import SamplingConfig, make_sampler
 from framework.samplers.occupancy import DECAY, MOVING_DECAY, WARM_UP_STEPS, OccupancySampler
 from framework.samplers.proposal import spacing
 
@@ -22,6 +24,23 @@ def test_a_cell_fades_slower_where_something_moves(moving: bool, decay: float) -
     sampler.density_grid.fill_(1.0)
     sampler.update(WARM_UP_STEPS + 16, nothing)
     assert sorted(set(sampler.density_grid.tolist())) == pytest.approx([decay, 1.0])
+
+
+def late(points: Points) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return a density that is there in the second half of the time alone."""
+    there = torch.zeros(len(points)) if points.times is None else (points.times.view(-1) > 0.5).float()
+    return there, torch.zeros(len(points), 0)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_cell_of_a_scene_that_moves_is_full_if_it_is_at_any_time(moving: bool) -> None:
+    """Of a grid that is made for a scene: one that stands still is not asked for its times."""
+    scene = Scene(BOX, 0.0, 10.0, 3, True, moving, 20, num_times=3 * moving)
+    sampler = make_sampler(SamplingConfig(sampler="occupancy", grid_resolution=8), scene)
+    assert isinstance(sampler, OccupancySampler)
+    sampler.density_grid.zero_()
+    sampler.update(WARM_UP_STEPS + 16, late)
+    assert sampler.density_grid.unique().tolist() == ([0.0, 1.0] if moving else [0.0])
 
 
 @pytest.mark.parametrize("scale", [0.1, 1.0, 30.0])

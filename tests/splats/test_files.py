@@ -560,5 +560,5 @@ def test_what_cannot_be_exported_is_refused(tmp_path: Path, monkeypatch: pytest.
     assert "no Gaussians left" in refused(main, *given)
     pretend(monkeypatch, Splats(some(5)), placement, "gaussian-splatting")
     for wrong in ("0", "-1", "nan"):
-        assert "--max-megabytes must be positive" in refused(main, *given, "--max-megabytes", wrong)
+        assert "--max-megabytes must be positive" in refused(main, *given, "--max-megabytes", wrong, status=2)
     assert "no Gaussian fits" in refused(main, *given, "--max-megabytes", "1e-5")

@@ -67,7 +67,7 @@ def test_a_checkpoint_has_as_many_as_it_has() -> None:
 def test_what_a_field_finds_lies_on_the_rays_of_its_pixels(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path, start="random", num_gaussians=100)
     dataset = load_split(trainer.run, "train")
-    found = found_surfaces(dataset, trainer.run.config, 60, 60.0, 500)
+    found = found_surfaces(dataset, trainer.run.config, 10, 60.0, 500)
     assert len(found.positions) > 100
     cameras = dataset.cameras
     rays = cameras.pixel_rays(cameras.offsets[found.images] + found.pixels, 0.0, 1.0)

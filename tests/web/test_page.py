@@ -218,7 +218,7 @@ def test_splats_go_to_the_page_as_they_are(
 
 @pytest.mark.medium
 def test_what_the_page_cannot_be(splats: Path, tmp_path: Path, refused: Refused) -> None:
-    assert "phones" in refused(main, "web", splats, "--output-dir", tmp_path, "--max-megabytes", 50)
+    assert "phones" in refused(main, "web", splats, "--output-dir", tmp_path, "--max-megabytes", 50, status=2)
     assert "no times" in refused(main, "web", splats, "--output-dir", tmp_path, "--time", 0.5)
     assert list(tmp_path.iterdir()) == []
 

@@ -21,7 +21,7 @@ from typing import Any
 
 from framework.base.child import python_command
 from framework.base.console import say
-from framework.base.errors import ConfigError, NerfloomError
+from framework.base.errors import FlagError, NerfloomError
 from framework.data.data_folder import find_data
 from framework.evaluation.evaluator import evaluation_background
 from framework.kernels import native
@@ -127,7 +127,7 @@ def chosen(parts: Sequence[str]) -> list[Row]:
     """
     for part in parts:
         if not any(part in row.name for row in ROWS):
-            raise ConfigError(f"--rows: no condition is called '{part}'; known: {'; '.join(row.name for row in ROWS)}")
+            raise FlagError(f"--rows: no condition is called '{part}'; known: {'; '.join(row.name for row in ROWS)}")
     return [row for row in ROWS if row is ALONE or not parts or any(part in row.name for part in parts)]
 
 

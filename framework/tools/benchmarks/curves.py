@@ -14,7 +14,7 @@ from typing import Any
 
 from rich.table import Table
 
-from framework.base.errors import ConfigError
+from framework.base.errors import FlagError
 from framework.base.registry import registered
 from framework.tools.benchmarks.methods import STANDARD
 from framework.tools.comparison import plots
@@ -56,7 +56,7 @@ def plans(
         ConfigError: if a method is unknown, there is no budget, or a number is out of range.
     """
     if not budgets:
-        raise ConfigError("--budgets is empty; list seconds of training, as in --budgets 10 45 150")
+        raise FlagError("--budgets is empty; list seconds of training, as in --budgets 10 45 150")
     contenders = tuple(map(Contender.of, methods or all_methods()))
     root = None if data is None else str(data.resolve())
     return [

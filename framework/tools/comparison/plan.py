@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from framework.base.child import python_command
-from framework.base.errors import ConfigError, shown
+from framework.base.errors import ConfigError, FlagError, shown
 from framework.base.registry import entry_of
 from framework.training.run import write_json
 
@@ -64,7 +64,7 @@ class Contender:
         """
         words = split_words(text, "--methods")
         if not words:
-            raise ConfigError("--methods holds an empty name")
+            raise FlagError("--methods holds an empty name")
         entry_of("methods", words[0])
         return cls(" ".join(text.split()), words[0], words[1:])
 
@@ -115,15 +115,15 @@ class Conditions:
 
     def __post_init__(self) -> None:
         if self.max_seconds is None and self.max_num_iterations is None and self.target_psnr is None:
-            raise ConfigError(
+            raise FlagError(
                 "set how long each method trains: --max-seconds 120, --max-num-iterations 5000, or --target-psnr 30"
             )
         for name in ("max_seconds", "max_num_iterations", "target_psnr"):
             value = getattr(self, name)
             if value is not None and not value > 0:
-                raise ConfigError(f"--{name.replace('_', '-')} is {value}; it must be more than 0")
+                raise FlagError(f"--{name.replace('_', '-')} is {value}; it must be more than 0")
         if self.curve_images < 0 or (self.max_eval_images is not None and self.max_eval_images < 1):
-            raise ConfigError("--curve-images must be at least 0, --max-eval-images at least 1")
+            raise FlagError("--curve-images must be at least 0, --max-eval-images at least 1")
 
     def budget(self) -> str:
         """Return a description of how long each method trains."""
@@ -224,12 +224,12 @@ class Plan:
     def __post_init__(self) -> None:
         labels = [contender.label for contender in self.contenders]
         if not labels:
-            raise ConfigError("--methods is empty; list methods, as in --methods instant-ngp kplanes")
+            raise FlagError("--methods is empty; list methods, as in --methods instant-ngp kplanes")
         duplicates = sorted({label for label in labels if labels.count(label) > 1})
         if duplicates:
-            raise ConfigError(f"--methods has {', '.join(map(repr, duplicates))} twice; use --repeats for several runs")
+            raise FlagError(f"--methods has {', '.join(map(repr, duplicates))} twice; use --repeats for several runs")
         if self.repeats < 1:
-            raise ConfigError(f"--repeats is {self.repeats}; it must be at least 1")
+            raise FlagError(f"--repeats is {self.repeats}; it must be at least 1")
 
     def jobs(self) -> list[Job]:
         """Return all runs, seed by seed, so that every contender has a first result early."""

@@ -16,7 +16,7 @@ from queue import Queue
 from rich.status import Status
 
 from framework.base.console import console, say
-from framework.base.errors import ConfigError
+from framework.base.errors import ConfigError, FlagError
 from framework.tools.comparison.measures import read_json
 from framework.tools.comparison.plan import Conditions, Job, Plan
 from framework.training.signals import NUMBERS, Stopped, handled
@@ -97,7 +97,7 @@ def _recorded(stopped: threading.Event, signals: list[int]) -> Iterator[None]:
 def _devices(conditions: Conditions, jobs_at_once: int) -> Sequence[str | None]:
     """Return the value of CUDA_VISIBLE_DEVICES for each parallel job; None to leave it unchanged."""
     if jobs_at_once < 1:
-        raise ConfigError(f"--jobs is {jobs_at_once}; it must be at least 1")
+        raise FlagError(f"--jobs is {jobs_at_once}; it must be at least 1")
     if jobs_at_once == 1:
         return [None]
     import torch

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from framework.base.errors import ConfigError
+from framework.base.errors import ConfigError, FlagError
 
 CameraModel = Literal["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE"]
 """COLMAP's lens models that transforms.json can express."""
@@ -34,7 +34,7 @@ class OutputFlags:
             ConfigError: if a number is out of range.
         """
         if not 0 <= self.num_downscales <= 8:
-            raise ConfigError(f"--num-downscales is {self.num_downscales}; it must be from 0 to 8")
+            raise FlagError(f"--num-downscales is {self.num_downscales}; it must be from 0 to 8")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,4 +80,4 @@ class ColmapFlags(OutputFlags):
                 flag = "--" + name.replace("_", "-")
                 raise ConfigError(f"{flag} is {getattr(self, name)}; it must be at least {minimum}")
         if self.num_threads < 1 and self.num_threads != -1:
-            raise ConfigError(f"--num-threads is {self.num_threads}; it must be at least 1, or -1 for all")
+            raise FlagError(f"--num-threads is {self.num_threads}; it must be at least 1, or -1 for all")

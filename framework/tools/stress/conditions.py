@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from framework.base.config import TrainConfig
-from framework.base.errors import ConfigError, nearest
+from framework.base.errors import FlagError, nearest
 from framework.data.dataset import Dataset
 from framework.tools.stress.faults import Spoil, spoiled_pixel, spoiled_pose
 from framework.tools.stress.scenes import Views, ball_views
@@ -187,10 +187,10 @@ def select(names: Sequence[str]) -> list[Condition]:
     """Return the plain run and the conditions with the given `names`, in the order of `CONDITIONS`; all without names.
 
     Raises:
-        ConfigError: if there is no such condition; the message suggests the nearest.
+        FlagError: if there is no such condition; the message suggests the nearest.
     """
     all_names = [condition.name for condition in CONDITIONS]
     for name in names:
         if name not in all_names:
-            raise ConfigError(f"--only: there is no condition '{name}'. {nearest(name, all_names)}")
+            raise FlagError(f"--only: there is no condition '{name}'. {nearest(name, all_names)}")
     return [condition for condition in CONDITIONS if condition is PLAIN or not names or condition.name in names]

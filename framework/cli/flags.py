@@ -1,0 +1,105 @@
+"""The flags of all commands: tyro reads them, and what is wrong with them is said in one line."""
+
+from __future__ import annotations
+
+import io
+import re
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import redirect_stderr
+from typing import Any, TypeVar
+
+from framework.base.errors import FlagError
+
+K = TypeVar("K")
+FRAME = "╭╮╰╯│─"
+"""What tyro draws boxes and rules with, unless the terminal has only ASCII."""
+EDGE = re.compile("^[╭│ ][─ ]")
+STYLE = re.compile(r"\033\[[\d;]*m")
+NAME = re.compile(r" {4}(--[\w.-]+)")
+"""A flag in tyro's list of those that are missing, or that may have been meant."""
+PHRASES = (
+    (r"(--\S+): no type matching (\S+) could be instantiated from \['(.*)'\]", r"\1 is '\3'; it must be \2"),
+    (r"(--\S+): invalid literal for int\(\) with base 10: ('.*')", r"\1 is \2; it must be a whole number"),
+    (r"(--\S+): could not convert string to float: ('.*')", r"\1 is \2; it must be a number"),
+    (r"invalid choice ('.*') for argument '(--\S+)'\. Expected one of \((.*)\)", r"\2 is \1; it must be one of \3"),
+    (r"Missing value for argument '(--\S+)'.*", r"\1 needs a value"),
+)
+"""What tyro says of a value, and how it is said here."""
+
+
+def read_flags(kind: type[K] | Callable[..., K], prog: str, arguments: list[str], **options: Any) -> K:
+    """Return settings that are read from the arguments of a command.
+
+    Args:
+        kind: the class of the settings.
+        prog: the command with what it does, for its help: "ns-render orbit".
+        arguments: the arguments, without what `prog` names.
+        options: further arguments of `tyro.cli`. Flags of booleans have a value if `config` is not among them.
+
+    Raises:
+        FlagError: if a flag is unknown, missing, or has a value that it cannot have.
+        SystemExit: with status 0 after the help.
+    """
+    import tyro
+
+    options = {"config": (tyro.conf.FlagConversionOff,), **options}
+    said = io.StringIO()
+    try:
+        with redirect_stderr(said):
+            settings = tyro.cli(kind, prog=prog, args=arguments, **options)
+    except SystemExit as end:
+        if not end.code:
+            raise
+        raise FlagError(in_one_line(said.getvalue(), prog)) from None
+    sys.stderr.write(said.getvalue())
+    return settings
+
+
+def in_one_line(box: str, prog: str) -> str:
+    """Return what tyro says in a framed box, as one line: what is wrong, and where to look.
+
+    Args:
+        box: the text of the box: a title, and sections between rules.
+        prog: the command, whose help shows all flags.
+    """
+    title, *sections = _sections(box)
+    what = " ".join(" ".join(sections[0] if sections else title).split()).removeprefix("Error parsing ")
+    if what.startswith("Unrecognized options: "):
+        what = _unknown(what.partition(": ")[2].split(", "))
+        names = [name for section in sections[1:] for name in _names(section)]
+        what += f". Did you mean {' or '.join(map(repr, dict.fromkeys(names)))}?" if names else ";"
+    else:
+        if missing := _names(sections[0]) if sections and "Required options" in title[0] else []:
+            unknown = [row.strip() for rows in sections[1:] if rows[0].startswith("Unrecognized") for row in rows[1:]]
+            what = f"{' and '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing"
+            what += f", and there is an {_unknown(unknown)}" if unknown else ""
+        for pattern, replacement in PHRASES:
+            what = re.sub(pattern, replacement, what)
+        what = what.rstrip(".") + ";"
+    return f"{what} {prog} --help shows the flags"
+
+
+def _unknown(words: list[str]) -> str:
+    """Return the words that nothing knows, of which some may be values of an unknown flag."""
+    flags = [word for word in words if word.startswith("-")]
+    return f"unknown flag {', '.join(flags)}" if flags else f"unexpected argument {', '.join(map(repr, words))}"
+
+
+def _names(rows: list[str]) -> list[str]:
+    """Return the flags that a section lists."""
+    return [found[1] for row in rows if (found := NAME.match(row))]
+
+
+def _sections(box: str) -> Iterator[list[str]]:
+    """Yield the rows of the title and of each section, without the frame."""
+    rows: list[str] = []
+    for line in STYLE.sub("", box).splitlines():
+        row = EDGE.sub("", line).rstrip(f" {FRAME}")
+        if row.strip(" -"):
+            rows.append(row)
+        if rows and (line.startswith("╭") or not row.strip(" -")):  # below the title, and at a rule
+            yield rows
+            rows = []
+    if rows:
+        yield rows

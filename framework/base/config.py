@@ -233,6 +233,9 @@ class RayConfig(TrainConfig):
     free_space_loss_mult: float = 0.0
     """Weight of the penalty on matter right before cameras: nearer than most of the points that a camera sees, or than
     any other camera sees; 0 for none."""
+    gradient_scaling: bool = False
+    """Whether gradients near cameras are scaled down, by squared distance up to half of the box's edge, against
+    floaters."""
     eval_num_rays_per_chunk: int = 8_192
     """Rays rendered at once in evaluation. This changes memory and speed, never the result."""
 

@@ -1,4 +1,4 @@
-"""Settings, decisions, refined poses and the distortion of rays (Barron et al. 2022), as methods for captures have them."""
+"""What methods for captures share: settings, decisions, refined poses, the distortion of rays (Barron et al. 2022)."""
 
 from __future__ import annotations
 

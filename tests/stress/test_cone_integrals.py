@@ -111,6 +111,7 @@ def test_contracted_gaussians_have_the_moments_of_contracted_draws(distance: flo
     scale = sampled.diagonal(dim1=1, dim2=2).sum(-1)
     assert ((draws.mean(1) - found).norm(dim=-1) < 5 * (scale / DRAWS).sqrt() + 1e-6 * scale.sqrt()).all()
     error = (contracted @ contracted.mT - sampled).abs().amax((1, 2))
+    print(f"contracted covariances: off those of {DRAWS:,} draws by {(error / scale).max():.1e} of their traces")
     assert (error < (6 / math.sqrt(DRAWS) + 1e-3) * scale).all()
 
 
@@ -148,6 +149,7 @@ def test_the_encoding_is_the_mean_over_draws_and_so_is_its_gradient() -> None:
     count = DRAWS // 4
     each = [values.detach().expand(count, 2, 3).clone().requires_grad_() for values in (means, deviations)]
     drawn = frequency_encoding_reference(each[0] + each[1] * normal(count, 2, 3), 5, include_input=False)
+    print(f"integrated encoding: off the mean of {count:,} draws by {(found - drawn.mean(0)).abs().max():.1e}")
     assert_like(found, drawn, drawn.std(0) + 1e-12)
     seeds = torch.where(normal(*found.shape, seed=2) > 0, 1.0, -1.0).to(F64)
     exact = torch.autograd.grad((found * seeds).sum(), (means, deviations))
@@ -201,7 +203,9 @@ def test_the_encoding_of_cones_is_the_mean_over_points_in_them(contracted: bool,
         unit = (drawn - BOX.mean(0)) / (BOX[1] - BOX[0]) * 2
         unit = contract(unit) if contracted else unit
         waves = frequency_encoding_reference(unit if along is None else unit @ along.mT, 2, include_input=False)
-        assert (waves.mean(0) - found[index]).abs().max() < 0.03
+        error = (waves.mean(0) - found[index]).abs().max()
+        print(f"encoding of a cone: off the mean over points drawn in it by {error:.1e}")
+        assert error < 0.03
 
 
 @pytest.mark.entry(10)
@@ -238,4 +242,6 @@ def test_levels_of_a_grid_count_by_the_share_of_draws_in_a_cell() -> None:
     found = level_weights(deviations, resolutions)
     for level, cells in enumerate(resolutions.tolist()):
         within = (draws.abs() < 0.5 / cells).double()
+        error = (found[:, level] - within.mean(0)).abs().max()
+        print(f"weights of a level of {cells} cells: off the share of draws by {error:.1e}")
         assert_like(found[:, level], within, within.std(0) + 1e-9)

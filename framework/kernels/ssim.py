@@ -121,8 +121,8 @@ def ssim_reference(image: Tensor, target: Tensor) -> Tensor:
 def structure(image: Tensor, target: Tensor) -> Tensor:
     """Return the mean of S without its first factor, which compares means: what is left of contrast and structure.
 
-    SSIM at several scales (Wang, Simoncelli and Bovik 2003) takes it of all scales but the coarsest. NaN makes the result
-    NaN.
+    SSIM at several scales (Wang, Simoncelli and Bovik 2003) takes it of all scales but the coarsest. With NaN the
+    result is NaN.
 
     Args:
         image, target: (H, W, C) values whose range is taken to be [0, 1]. Compiled without a derivative.

@@ -14,7 +14,7 @@ from framework.fields.base import Field
 from framework.model import Model
 from framework.ray_model import RayModel
 from framework.rendering.renderer import Renderer
-from framework.rendering.volume import VolumeRenderer
+from framework.rendering.volume import volume_renderer as volume_renderer
 from framework.samplers.base import Sampler
 from framework.scene.reasons import DEPTH_REASONS, SPARSE_DEPTH_REASON
 
@@ -32,16 +32,6 @@ def nothing_to_decide(config: Any, scene: Scene) -> tuple[Any, list[Decision]]:
         scene: properties of the scene.
     """
     return config, []
-
-
-def volume_renderer(config: Any, scene: Scene) -> Renderer:
-    """Return a `VolumeRenderer`, the renderer of most methods.
-
-    Args:
-        config: the method's settings; not used.
-        scene: properties of the scene; not used.
-    """
-    return VolumeRenderer()
 
 
 def depth_choice(scene: Scene) -> Choice:

@@ -1,8 +1,4 @@
-"""Settings, decisions, poses and regularisers that methods for captures have in common.
-
-The two regularisers are the distortion of rays (Barron et al. 2022) and gradients that are scaled down near cameras
-(Philip and Deschaintre 2023).
-"""
+"""What methods for captures share: settings, decisions, refined poses, the distortion of rays (Barron et al. 2022)."""
 
 from __future__ import annotations
 
@@ -22,16 +18,13 @@ from framework import (
     Rendered,
     Renderer,
     Sampler,
-    Samples,
     Scene,
-    VolumeRenderer,
 )
 from framework.base.config import AT_LEAST_0, AUTO, Auto, Range
 from framework.base.decisions import Choice, fill
 from framework.base.optimised import Optimised
 from framework.cameras.refinement import PoseRefinement
 from framework.rendering.losses import normalised_distortion
-from framework.rendering.volume import shade
 from framework.samplers.choice import SamplingConfig, decide_samples, sampler_choice
 from framework.samplers.proposal import half_edge
 from framework.scene.reasons import MARCHED_REASON, POSE_REASONS
@@ -156,41 +149,3 @@ class CaptureModel(RayModel[CaptureConfigT], Generic[CaptureConfigT]):
 
     def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
         return distortion_term(rendered, self.config.distortion_loss_mult, self._disparity_from)
-
-
-class CaptureRenderer(VolumeRenderer):
-    """Volume rendering whose gradients can be scaled down near cameras.
-
-    Args:
-        unit_length: distance from the camera up to which gradients are scaled, scene units; None for no scaling.
-    """
-
-    def __init__(self, unit_length: float | None) -> None:
-        super().__init__()
-        self.unit_length = unit_length
-
-    def shade(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
-        factors = None
-        if self.training and self.unit_length is not None:
-            factors = (samples.t / self.unit_length).square().clamp(max=1)
-        return shade(rays, samples, field, background, factors)
-
-
-def capture_renderer(config: CaptureConfig, scene: Scene) -> CaptureRenderer:
-    """Return the renderer, with gradients scaled up to half of the box's edge if they are.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
-    """
-    return CaptureRenderer(scaled_up_to(config, scene))
-
-
-def scaled_up_to(config: CaptureConfig, scene: Scene) -> float | None:
-    """Return the distance from cameras up to which gradients are scaled, scene units; None if they are not.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
-    """
-    return half_edge(scene.box) if config.gradient_scaling else None

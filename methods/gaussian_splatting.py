@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from framework import Cameras, Decision, Loss, Method, Model, Optimised, Picture, RowChange, Scene, View, ViewBatch
-from framework.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
+from framework.base.config import AT_LEAST_0, AUTO, Auto, Range
 from framework.base.console import say
 from framework.base.decisions import Choice, fill
 from framework.base.device import HostValue
@@ -31,32 +31,19 @@ from framework.splats.density_control import RESET, GradientMean, grown
 from framework.splats.drawing import draw, draw_view, on_image, splat_camera
 from framework.splats.gaussians import MAX_DEGREE, Gaussians
 from framework.splats.guide import GUIDE, FoundDistances
-from framework.splats.learning import as_gaussians, as_tables, number_for, open_degree, rate_factor, row_changes
+from framework.splats.learning import as_gaussians, as_tables, open_degree, row_changes
 from framework.splats.mcmc import moved, shaken
 from framework.splats.redrawn import Redrawn
 from framework.splats.resolution import doubled, halved, halved_distances
+from framework.splats.settings import SplattingConfig, decide_splatting
 from framework.splats.start import PLACES, first_points, from_points, scene_size, seen_colors
 from framework.splats.table import Table
 from framework.tools.surfaces import found_surfaces
 from framework.training.optim import learning_rate_factor
 
-PIXELS_PER_SECOND = 25 * 400 * 400
-"""Pixels that training draws in a second, about, on two cores; for what is decided by the budget."""
-MOST_STEPS_PER_SECOND = 100
-"""However small the images are."""
-MOST_GAUSSIANS, MOST_RATE = 1_000_000, 8.0
-"""Maximum number of Gaussians, and factor of learning rates, that are chosen by the budget."""
 NOISE, OPACITY_PENALTY, SCALE_PENALTY = 5e5, 0.002, 0.01
 """Noise and penalties where Gaussians have to find their places: those of Kheradmand et al. 2024, but for the first
 penalty, which at a few hundred steps of a higher rate left too few of them."""
-LARGE_IMAGE = 250_000
-"""Pixels from which training begins with images of half the size."""
-LONG_RUN, NEVER = 15_000, 10**9
-"""Steps of a run in which opacity is reset, which it takes a thousand steps to recover from."""
-RESET_WORDS = {
-    True: ("the run is long", "resets of opacity", "every 3,000 steps"),
-    False: ("the run is too short to recover from one", "resets of opacity", "none"),
-}
 WITHOUT_IMAGES = 1_000
 """Maximum number of Gaussians of a model that has seen no images yet."""
 FIELD_SHARE = 0.2
@@ -66,71 +53,24 @@ FIELD_OPACITY, FIELD_SIZE = 0.5, 0.7
 
 
 @dataclass(frozen=True)
-class GaussianSplattingConfig(
-    AppearanceConfig, max_num_iterations=30_000, learning_rate=5e-3, lr_final=0.1, adam_beta2=0.99, adam_eps=1e-15
-):
+class GaussianSplattingConfig(SplattingConfig):
     """Settings of gaussian-splatting."""
 
     RANGES: ClassVar[dict[str, Range]] = {
-        "num_gaussians": (1, 10_000_000),
-        "start_gaussians": (1, 10_000_000),
-        "field_steps": (1, math.inf),
-        "rate_factor": AT_LEAST_0,
-        "position_rate": AT_LEAST_0,
         "degree": (0, MAX_DEGREE),
         "appearance_rate": AT_LEAST_0,
         "camera_learning_rate": AT_LEAST_0,
         "depth_loss_mult": AT_LEAST_0,
         "field_depth_mult": AT_LEAST_0,
-        "steps_per_reset": (1, 10**9),
         "ssim_weight": (0, 1),
-        "growth_end": (0, 1),
-        "steps_per_move": (1, 10**9),
-        "noise": AT_LEAST_0,
-        "opacity_penalty": AT_LEAST_0,
-        "scale_penalty": AT_LEAST_0,
-        "reduced_until": (0, 1),
     }
     """Allowed range of each numeric setting."""
-    num_gaussians: Auto[int] = AUTO
-    """Maximum number of Gaussians; by the budget if not given."""
-    start: Literal["auto", "points", "field", "silhouettes", "random"] = "auto"
-    """Where Gaussians start: at the points of a reconstruction, on surfaces that a short run of a field finds, in
-    the visual hull of the images' silhouettes, or anywhere in the box. auto: the first of points and field that there
-    is."""
-    start_gaussians: Auto[int] = AUTO
-    """Gaussians at the start, except at the points of a reconstruction; two thirds of the maximum if not given."""
-    field_steps: Auto[int] = AUTO
-    """Maximum number of training steps of that field; by the budget if not given. They end after a fifth of
-    --max-seconds."""
-    rate_factor: Auto[float] = AUTO
-    """Factor of all learning rates; by the budget if not given, as fewer steps have to go farther."""
-    position_rate: float = 8e-5
-    """Learning rate of centres before that factor, in sizes of the scene."""
     degree: int = 3
     """Highest degree of the spherical harmonics that colours are made of."""
     ssim_weight: float = 0.2
     """Weight of 1 - SSIM in the loss; the absolute error has the rest."""
     antialiased: bool = False
     """Compensate the minimum width of a Gaussian on an image by its opacity (Mip-Splatting)."""
-    strategy: Literal["adc", "mcmc"] = "adc"
-    """How Gaussians come and go. adc: transparent ones are dropped, and those whose image positions have large
-    gradients are cloned or split (adaptive density control of 3DGS). mcmc: transparent ones are moved to opaque ones
-    (3DGS-MCMC)."""
-    growth_end: float = 0.8
-    """Share of the budget after which no Gaussian is added or moved."""
-    steps_per_move: int = 100
-    """Steps between two changes of the Gaussians' number."""
-    steps_per_reset: Auto[int] = AUTO
-    """Steps after which strategy adc makes all Gaussians nearly transparent; by the budget if not given."""
-    noise: float | None = None
-    """Noise of nearly transparent Gaussians, times the learning rate of centres; by the start if not given."""
-    opacity_penalty: float | None = None
-    """Weight of the mean opacity in the loss; by the start if not given."""
-    scale_penalty: float | None = None
-    """Weight of the mean scale, in scene extents, in the loss; by the start if not given."""
-    reduced_until: Auto[float] = AUTO
-    """Share of the budget in which images are half as wide and high. If not given: 0.4 of large images, else 0."""
     appearance: Auto[bool] = AUTO
     """Whether each training image has a transform of colours of its own. If not given: if light or exposure differ."""
     appearance_rate: float = 1e-3
@@ -146,29 +86,16 @@ class GaussianSplattingConfig(
 
 
 def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplattingConfig, list[Decision]]:
-    """Return the settings with what the budget decides, and why.
+    """Return the settings with what the budget and the scene decide, and why.
 
     Args:
         config: settings, some of which may be open.
         scene: facts about the data.
     """
-    speed = min(PIXELS_PER_SECOND / (scene.image_pixels or scene.image_size**2), MOST_STEPS_PER_SECOND)
-    seconds = min(config.max_seconds or math.inf, config.max_num_iterations / speed)
-    count, factor = number_for(seconds, MOST_GAUSSIANS), rate_factor(speed * seconds, MOST_RATE)
-    why = "that suits the time"
-    config, made = fill(config, Choice("num_gaussians", count, why, "Gaussians", f"up to {count:,}"))
-    large = PIXELS_PER_SECOND / speed > LARGE_IMAGE
-    detail = "large images can wait" if large else "the images are small"
-    first, most = max(config.num_gaussians * 2 // 3, 1), 800 if scene.unbounded else 400
-    resets, varies = speed * seconds >= LONG_RUN, scene.appearance_varies
-    poses = "SO3xR3" if scene.poses == "device" else "off"
+    config, made = decide_splatting(config, scene)
+    varies, poses = scene.appearance_varies, "SO3xR3" if scene.poses == "device" else "off"
     config, more = fill(
         config,
-        Choice("start_gaussians", first, "the others are added", "Gaussians at the start", f"{first:,}"),
-        Choice("field_steps", int(min(max(2 * seconds, 120), most)), why, "steps of a field to start from"),
-        Choice("reduced_until", 0.4 if large else 0.0, detail, "share of the budget with images of half the size"),
-        Choice("steps_per_reset", 3_000 if resets else NEVER, *RESET_WORDS[resets]),
-        Choice("rate_factor", round(factor, 2), "fewer steps have to go farther", "factor of learning rates"),
         Choice("appearance", varies, LIGHT_REASONS[varies], "colour transforms of images"),
         Choice("depth_loss_mult", 0.1 if scene.has_depth else 0.0, DEPTH_REASONS[scene.has_depth], "depth loss"),
         Choice("field_depth_mult", *GUIDE[scene.unbounded], "weight of a field's distances"),

@@ -20,10 +20,11 @@ from framework.fields.appearance import Appearance
 from framework.fields.encoded import NUM_FEATURES, EncodedField
 from framework.fields.normals import NormalHead, density_normals, normal_penalties
 from framework.kernels.compositing import ray_sum
+from framework.rendering.volume import VolumeRenderer, scaled_up_to
 from framework.samplers.choice import make_sampler
 from framework.scene.few_images import FewImagesConfig, decide_few_images
 from framework.scene.reasons import LIGHT_REASONS
-from methods._captures import CaptureConfig, CaptureModel, CaptureRenderer, decide_capture, scaled_up_to
+from methods._captures import CaptureConfig, CaptureModel, decide_capture
 
 APPEARANCE_SIZE = 16
 """Default length of appearance vectors where the appearance varies."""
@@ -64,7 +65,7 @@ class NerfactoConfig(
     """Features per hidden layer of the two networks."""
 
 
-class NerfactoRenderer(CaptureRenderer):
+class NerfactoRenderer(VolumeRenderer):
     """Volume rendering with optional gradient scaling near cameras and optional predicted normals.
 
     Args:

@@ -26,7 +26,7 @@ from framework.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, 
 from framework.samplers.choice import make_sampler
 from framework.samplers.proposal import ProposalSampler
 from framework.scene.reasons import LIGHT_REASONS
-from methods._captures import CaptureConfig, CaptureModel, capture_renderer, decide_capture
+from methods._captures import CaptureConfig, CaptureModel, decide_capture
 
 DECAY, DECAY_OF_OBJECTS = 0.1, 10.0
 """Default weight of the grids' decay, of captures and of objects before no background: the paper's."""
@@ -167,7 +167,6 @@ METHOD = Method(
     paper="arXiv:2304.06706",
     field=make_field,
     sampler=sampler,
-    renderer=capture_renderer,
     model=ZipNeRF,
     decide=decide,
 )

@@ -79,7 +79,7 @@ class TrainedRun:
         return self.model.render_view(camera, evaluation_background(self.model))
 
     def evaluate(self, split: Split = "test", max_images: int | None = None) -> dict[str, Any]:
-        """Return PSNR in dB, SSIM, LPIPS and rendering speed, by their names in eval.json.
+        """Return PSNR in dB, SSIM, at five scales too, LPIPS and rendering speed, by their names in eval.json.
 
         Args:
             split: the images to compare with: train, val or test.

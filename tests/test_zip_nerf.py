@@ -16,8 +16,8 @@ from framework.geometry.multisamples import Pattern
 from framework.geometry.points import Frustums, Points
 from framework.kernels.multisampled_grid import multisampled_grid_reference
 from framework.kernels.multisamples import unit_multisamples_reference
+from framework.rendering.volume import VolumeRenderer
 from framework.training.trainer import Trainer
-from methods._captures import CaptureRenderer
 from methods.zip_nerf import ZipNeRFConfig
 from tests.training.helpers import chosen, said_otherwise, tiny_run, tiny_trainer
 
@@ -46,7 +46,7 @@ def test_a_capture_gets_what_it_needs(shared_tiny: Path, tmp_path: Path) -> None
     assert (found["pose refinement"], found["decay of the grids"]) == ("SO3xR3", "0.1")
     trainer.train()
     model = trainer.model
-    assert isinstance(model.renderer, CaptureRenderer)
+    assert isinstance(model.renderer, VolumeRenderer)
     assert model.renderer.unit_length is not None
     assert bool((model.poses.tangents != 0).any())
     assert bool((model.appearance.vectors != 0).any())

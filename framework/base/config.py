@@ -246,6 +246,9 @@ class RayConfig(TrainConfig):
     """Samples whose gradient is below this times the mean take part in a step at random, in proportion to it, and count
     as many times more, so that the mean over steps stays; 0 for all. It needs compiled kernels, and has an effect where
     errors of traced rays are learnt in one call (instant-ngp)."""
+    gradient_scaling: bool = False
+    """Whether gradients near cameras are scaled down, by squared distance up to half of the box's edge, against
+    floaters."""
     eval_num_rays_per_chunk: int = 8_192
     """Rays rendered at once in evaluation. This changes memory and speed, never the result."""
 

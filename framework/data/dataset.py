@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -220,8 +221,13 @@ def load_dataset(
         masks: meaning of masked-out pixels; auto: decided by `cuts_out`.
 
     Raises:
-        DataError: if an image's size differs from its camera's, or no image is readable.
+        DataError: if an image's size differs from its camera's, no image is readable, or rays have no length.
     """
+    if not 0 <= parsed.near < parsed.far < math.inf:
+        raise DataError(
+            f"split '{split}': the scene is from {parsed.near} to {parsed.far} away from cameras; --near must be at "
+            "least 0 and less than --far, which must be finite"
+        )
     count = len(parsed.image_paths)
     reductions = 2 ** torch.arange(parsed.num_scales).repeat_interleave(count)  # all images at one size, then the next
     if parsed.num_scales > 1:

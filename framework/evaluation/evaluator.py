@@ -22,7 +22,7 @@ from framework.data.dataset import Dataset
 from framework.data.pixels import composite
 from framework.evaluation.appearance import appearance_of, fitted_appearance, right_half
 from framework.evaluation.images import write_image
-from framework.evaluation.metrics import load_lpips, psnr, quick_ssim
+from framework.evaluation.metrics import SMALLEST_OF_SCALES, load_lpips, ms_ssim, psnr, quick_ssim
 from framework.evaluation.panels import composed, view_panels
 from framework.model import Model, RendersFromImages
 from framework.rendering.rendered import Picture
@@ -139,8 +139,8 @@ class Evaluation:
     """Metrics of a set of images."""
 
     per_image: list[dict[str, Any]]
-    """Name, psnr, ssim, lpips, floaters and rendering seconds of each image, and its reduction if images have several
-    sizes."""
+    """Name, psnr, ssim, ms_ssim, lpips, floaters and rendering seconds of each image, and its reduction if images have
+    several sizes."""
     results: dict[str, Any]
     """Means, standard deviations and rendering speed, with nerfstudio's keys; by_size, those of images of each size."""
     lpips_note: str
@@ -154,12 +154,13 @@ class Evaluation:
         """Return the results as a line of text."""
         r = self.results
         ssim, lpips = ("absent" if r[name] is None else f"{r[name]:.4f}" for name in ("ssim", "lpips"))
+        scales = "" if r["ms_ssim"] is None else f"  MS-SSIM {r['ms_ssim']:.4f}"
         before = "" if r["floaters"] is None else f"  floaters {r['floaters']:.1f} %"
         rays = r["num_rays_per_sec"]  # 0 of a method that casts none
         speed = f"{rays / 1e3:.1f}k rays/s  {1 / r['fps']:.2f} s/image" if rays else f"{r['fps']:.1f} images/s"
         sizes = ", ".join(f"{size}: {found['psnr']:.2f}" for size, found in r.get("by_size", {}).items())
         sizes = f" ({sizes})" if sizes else ""
-        quality = f"PSNR {r['psnr']:.2f} dB{sizes}  SSIM {ssim}  LPIPS {lpips}{before}"
+        quality = f"PSNR {r['psnr']:.2f} dB{sizes}  SSIM {ssim}{scales}  LPIPS {lpips}{before}"
         return f"{quality}  {speed}  ({r['num_images']} images)"
 
 
@@ -177,7 +178,8 @@ def evaluate(
 
     Images that are given to the method (`Dataset.source_images`) are shown to it and not judged. Masked-out pixels do
     not count: PSNR omits them; for SSIM and LPIPS they are copied from the true image. Images without other pixels are
-    skipped. If appearance is fitted to left halves (`eval_appearance`), right halves count.
+    skipped. If appearance is fitted to left halves (`eval_appearance`), right halves count. SSIM is at one scale and at
+    five (`ms_ssim`).
 
     Args:
         model: the trained model.
@@ -212,7 +214,9 @@ def evaluate(
         if round_to_uint8:
             rgb = (rgb * 255).round() / 255
         pair, kept = _judged(rgb, target, dataset.kept_of(index), half)
-        row = _row(dataset, index, measure(*pair, kept), None if lpips is None else lpips(*pair), spent)
+        row = _row(dataset, index, measure(*pair, kept), spent)
+        row["ms_ssim"] = None if min(target.shape[:2]) < SMALLEST_OF_SCALES else ms_ssim(*pair)
+        row["lpips"] = None if lpips is None else lpips(*pair)
         rows.append(row | {"floaters": floaters(picture, dataset, index)})
         seconds += spent
         rays += picture.num_rays
@@ -264,13 +268,12 @@ def spread(total: int, limit: int | None) -> list[int]:
     return [index * total // limit for index in range(limit)]
 
 
-def _row(dataset: Dataset, index: int, measured: Measured, lpips: float | None, seconds: float) -> dict[str, Any]:
+def _row(dataset: Dataset, index: int, measured: Measured, seconds: float) -> dict[str, Any]:
     """Return what is reported of an image."""
     row: dict[str, Any] = {
         "name": dataset.names[index],
         "psnr": measured.psnr,
         "ssim": measured.ssim,
-        "lpips": lpips,
         "seconds": seconds,
     }
     return row if dataset.reductions is None else {**row, "reduction": int(dataset.reductions[index])}
@@ -287,7 +290,7 @@ def _by_size(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def _statistics(rows: list[dict[str, Any]]) -> dict[str, float | None]:
     """Return the mean and the standard deviation of each metric; None if it is absent."""
     statistics: dict[str, float | None] = {}
-    for name in ("psnr", "ssim", "lpips", "floaters"):
+    for name in ("psnr", "ssim", "ms_ssim", "lpips", "floaters"):
         values = [row[name] for row in rows if row[name] is not None]
         statistics[name] = fmean(values) if values else None
         statistics[f"{name}_std"] = (stdev(values) if len(values) > 1 else 0.0) if values else None

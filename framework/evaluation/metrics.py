@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from statistics import fmean
 
 import torch
 from torch import Tensor
@@ -12,10 +13,18 @@ from torch.nn import functional
 
 from framework.base.device import to_float64
 from framework.base.extras import install_command
-from framework.kernels.ssim import PHOTOMETRIC
+from framework.kernels.ssim import PHOTOMETRIC, WINDOW, structure
+from framework.kernels.ssim import ssim as similarity
+from framework.splats.resolution import halved
 
 MAX_PSNR = 100.0
 """PSNR of identical images, dB, instead of infinity, which JSON cannot hold."""
+EXPONENTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
+"""Exponents of SSIM at five scales, from the finest (Wang, Simoncelli and Bovik 2003, section 3.2)."""
+SMALLEST_OF_SCALES = WINDOW << (len(EXPONENTS) - 1)
+"""Minimum width and height of an image that has SSIM at five scales, pixels: 176."""
+FETCH_ALEXNET = "python -c 'import torchvision; torchvision.models.alexnet(weights=\"DEFAULT\")'"
+"""Command that downloads the weights on which LPIPS is built, which come in no package."""
 
 
 def psnr(prediction: Tensor, target: Tensor) -> float:
@@ -76,6 +85,35 @@ def quick_ssim(prediction: Tensor, target: Tensor) -> float:
     return 1 - float(chosen.run(*pair, 1.0))
 
 
+def ms_ssim(prediction: Tensor, target: Tensor) -> float:
+    """Compute SSIM at five scales (Wang, Simoncelli and Bovik 2003), the mean over channels.
+
+    A coarser scale has half the width and height, by means of 2 x 2 pixels; an odd last row or column is left out. Of
+    all scales but the coarsest contrast and structure alone count. Factors below 0 count as 0. Of float32 images it is
+    computed by a kernel, if the device has one.
+
+    Args:
+        prediction, target: (H, W, 3) colours in [0, 1], of at least 176 x 176 pixels.
+
+    Raises:
+        ValueError: if the window does not fit into the image at the coarsest scale.
+    """
+    if min(prediction.shape[:2]) < SMALLEST_OF_SCALES:
+        height, width = prediction.shape[:2]
+        least = SMALLEST_OF_SCALES
+        raise ValueError(f"SSIM at five scales needs at least {least}x{least} pixels, not {width}x{height}")
+    channels = (each.detach().split(1, dim=-1) for each in (prediction, target))
+    return fmean(_ms_ssim_of_channel(x, y) for x, y in zip(*channels, strict=True))
+
+
+def _ms_ssim_of_channel(x: Tensor, y: Tensor) -> float:
+    product = 1.0
+    for exponent in EXPONENTS[:-1]:
+        product *= max(float(structure(x, y)), 0.0) ** exponent  # a NaN stays one
+        x, y = halved(x), halved(y)
+    return product * max(float(similarity(x, y)), 0.0) ** EXPONENTS[-1]
+
+
 def load_lpips() -> tuple[Callable[[Tensor, Tensor], float] | None, str]:
     """Load LPIPS with AlexNet (Zhang et al. 2018), if the `lpips` extra and the network's weights are installed.
 
@@ -86,7 +124,7 @@ def load_lpips() -> tuple[Callable[[Tensor, Tensor], float] | None, str]:
         return None, f"absent: {advice}"
     weights = Path(torch.hub.get_dir()) / "checkpoints"
     if not list(weights.glob("alexnet-*.pth")):
-        return None, f"absent: AlexNet's weights are not in {weights}"
+        return None, f"absent: AlexNet's weights, which no package has, are not in {weights}: {FETCH_ALEXNET}"
     import lpips
 
     with warnings.catch_warnings():

@@ -56,14 +56,18 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
         ValueError: The shapes differ or are not those of images, or a side is shorter than the window.
     """
     _check(image, target)
-    if min(image.shape[:2]) < WINDOW:
-        raise ValueError(f"SSIM needs at least {WINDOW}x{WINDOW} pixels, not {image.shape[1]}x{image.shape[0]}")
+    _check_window(image)
     return 1 - PHOTOMETRIC((image, target), image, target, 1.0)
 
 
 def _check(image: Tensor, target: Tensor) -> None:
     if image.ndim != 3 or image.shape != target.shape or image.shape[2] < 1:
         raise ValueError(f"SSIM needs two images (H, W, C), not {tuple(image.shape)} and {tuple(target.shape)}")
+
+
+def _check_window(image: Tensor) -> None:
+    if min(image.shape[:2]) < WINDOW:
+        raise ValueError(f"SSIM needs at least {WINDOW}x{WINDOW} pixels, not {image.shape[1]}x{image.shape[0]}")
 
 
 def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
@@ -110,11 +114,47 @@ def ssim_reference(image: Tensor, target: Tensor) -> Tensor:
     Returns:
         The mean over channels and windows, a tensor without dimensions.
     """
+    of_means, of_variances = _similarities(image, target)
+    return (of_means * of_variances).mean()
+
+
+def structure(image: Tensor, target: Tensor) -> Tensor:
+    """Return the mean of S without its first factor, which compares means: what is left of contrast and structure.
+
+    SSIM at several scales (Wang, Simoncelli and Bovik 2003) takes it of all scales but the coarsest. With NaN the
+    result is NaN.
+
+    Args:
+        image, target: (H, W, C) values whose range is taken to be [0, 1]. Compiled without a derivative.
+
+    Returns:
+        The mean over channels and over all windows that lie inside the image, a tensor without dimensions.
+
+    Raises:
+        ValueError: The shapes differ or are not those of images, or a side is shorter than the window.
+    """
+    _check(image, target)
+    _check_window(image)
+    return STRUCTURE((image, target), image, target)
+
+
+def structure_reference(image: Tensor, target: Tensor) -> Tensor:
+    """Compute `structure` in torch, on any device, in any float type, with derivatives of any order by both images.
+
+    Args:
+        image: (H, W, C) values.
+        target: (H, W, C) values to compare with.
+    """
+    return _similarities(image, target)[1].mean()
+
+
+def _similarities(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the two factors of S, by means and by variances, of each window and channel."""
     maps = torch.cat([image, target, image * image, target * target, image * target], dim=-1)
     mean_x, mean_y, square_x, square_y, product = _blurred(maps).chunk(5, dim=-1)
     variance_x, variance_y, covariance = square_x - mean_x**2, square_y - mean_y**2, product - mean_x * mean_y
-    similarity = (2 * mean_x * mean_y + C1) * (2 * covariance + C2)
-    return (similarity / ((mean_x**2 + mean_y**2 + C1) * (variance_x + variance_y + C2))).mean()
+    of_means = (2 * mean_x * mean_y + C1) / (mean_x**2 + mean_y**2 + C1)
+    return of_means, (2 * covariance + C2) / (variance_x + variance_y + C2)
 
 
 def _blurred(values: Tensor) -> Tensor:
@@ -131,7 +171,8 @@ def _blurred(values: Tensor) -> Tensor:
 
 
 PHOTOMETRIC = Operation("photometric", photometric_reference)
-_photometric = native.Function("photometric", "ppqqqfpi", "d")
+STRUCTURE = Operation("structure", structure_reference)
+_photometric = native.Function("photometric", "ppqqqffpi", "d")
 
 
 class _Photometric(torch.autograd.Function):
@@ -142,7 +183,7 @@ class _Photometric(torch.autograd.Function):
         derivative = torch.empty_like(image) if learned else None
         value = _photometric(
             native.pointer(image, "the image", image.shape), native.pointer(target, "the target", image.shape),
-            *image.shape, ssim_weight, None if derivative is None else derivative.data_ptr(), native.threads(),
+            *image.shape, ssim_weight, C1, None if derivative is None else derivative.data_ptr(), native.threads(),
         )  # fmt: skip
         if derivative is not None:
             ctx.save_for_backward(derivative)
@@ -161,6 +202,16 @@ def _compiled(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
     learned = image.requires_grad and torch.is_grad_enabled()
     out: Tensor = _Photometric.apply(image.contiguous(), target.contiguous(), ssim_weight, learned)
     return out
+
+
+@STRUCTURE.implementation(CPP, order=0)
+def _compiled_structure(image: Tensor, target: Tensor) -> Tensor:
+    image, target = image.contiguous(), target.contiguous()
+    value = _photometric(
+        native.pointer(image, "the image", image.shape), native.pointer(target, "the target", image.shape),
+        *image.shape, 1.0, math.inf, None, native.threads(),
+    )  # fmt: skip
+    return image.new_tensor(1 - value)
 
 
 PHOTOMETRIC.implementation(TRITON, differentiable=1)(later("ssim", "photometric_loss"))

@@ -15,7 +15,7 @@ from framework.geometry.rays import Rays, Samples
 from framework.geometry.spheres import InvertedRays, distances_behind
 from framework.rendering.rendered import Rendered
 from framework.rendering.renderer import Renderer
-from framework.rendering.volume import VolumeRenderer
+from framework.rendering.volume import VolumeRenderer, volume_renderer
 from framework.samplers.background import BackgroundConfig, foreground_sphere
 from framework.samplers.base import Sampler
 from framework.samplers.choice import HierarchicalConfig
@@ -122,9 +122,9 @@ def background_renderer(
         config: the settings, decided.
         scene: properties of the scene; not of its foreground.
         make_field: creates a field outside, from settings and scene.
-        renderer: renders what is inside; a `VolumeRenderer` if None.
+        renderer: renders what is inside; that of `volume_renderer` if None.
     """
-    renderer = renderer or VolumeRenderer()
+    renderer = renderer or volume_renderer(config, scene)
     if config.background_model != "sphere":
         return renderer
     sampler: Sampler = UniformSampler(config.num_background_samples)

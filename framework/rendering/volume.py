@@ -1,10 +1,16 @@
-"""Volume rendering: NeRF (Mildenhall et al. 2020), equation 3."""
+"""Volume rendering: NeRF (Mildenhall et al. 2020), equation 3; gradients scaled down near cameras.
+
+The scaling is that of Philip and Deschaintre 2023, "Gradient Scaling for Floater-Free Neural Radiance Fields": what is
+near a camera is seen by few others, at a higher density of samples, so that it would learn faster than what is far.
+"""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
+from framework.base.config import RayConfig
+from framework.data.scene import Scene
 from framework.fields.base import Field, HasAlpha
 from framework.geometry.points import sample_points
 from framework.geometry.rays import Rays, Samples
@@ -13,13 +19,22 @@ from framework.kernels.compositing import Composited, composite
 from framework.kernels.math import scale_gradient
 from framework.rendering.rendered import Rendered
 from framework.rendering.renderer import Renderer
+from framework.samplers.proposal import half_edge
 
 
 class VolumeRenderer(Renderer):
     """A renderer that composites densities, or alphas if the field has them (`HasAlpha`): NeRF, equation 3.
 
     Subclasses can override `shade`, which computes colours and weights of samples, or `render`, which calls it.
+
+    Args:
+        unit_length: distance from the camera up to which gradients are scaled down in training, by squared distance,
+            scene units; None for no scaling.
     """
+
+    def __init__(self, unit_length: float | None = None) -> None:
+        super().__init__()
+        self.unit_length = unit_length
 
     def render(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
         rendered = self.shade(rays, evaluated(rays, samples, field), field, background)
@@ -40,7 +55,30 @@ class VolumeRenderer(Renderer):
         Raises:
             ValueError: if the samples have no density or no features.
         """
-        return shade(rays, samples, field, background)
+        factors = None
+        if self.training and self.unit_length is not None:
+            factors = (samples.t / self.unit_length).square().clamp(max=1)
+        return shade(rays, samples, field, background, factors)
+
+
+def volume_renderer(config: RayConfig, scene: Scene) -> VolumeRenderer:
+    """Return the renderer of most methods, with gradients scaled near cameras if the settings say so.
+
+    Args:
+        config: the method's settings, none left open.
+        scene: properties of the scene.
+    """
+    return VolumeRenderer(scaled_up_to(config, scene))
+
+
+def scaled_up_to(config: RayConfig, scene: Scene) -> float | None:
+    """Return the distance from cameras up to which gradients are scaled, scene units; None if they are not.
+
+    Args:
+        config: the method's settings, none left open.
+        scene: properties of the scene.
+    """
+    return half_edge(scene.box) if config.gradient_scaling else None
 
 
 def evaluated(rays: Rays, samples: Samples, field: Field) -> Samples:

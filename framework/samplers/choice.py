@@ -233,5 +233,5 @@ def _moving_proposal(scene: Scene, resolution: int) -> DensityField:
 
 def _levels(config: SamplingConfig, scene: Scene) -> int:
     """Return the number of nested boxes: enough to reach the far end, but no more than `config` allows."""
-    reach = math.ceil(math.log2(max(scene.far / half_edge(scene.box), 1.0)))
-    return min(1 + reach, config.grid_levels)
+    reach = math.log2(max(scene.far / half_edge(scene.box), 1.0))  # infinite where the far end is
+    return 1 + math.ceil(min(reach, config.grid_levels - 1))

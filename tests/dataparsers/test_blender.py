@@ -188,6 +188,13 @@ def test_no_folder_and_bad_flags(tiny: Path) -> None:
         dataclasses.replace(Blender(), downscale_factor=0).parse(tiny, "train")
 
 
+@pytest.mark.parametrize(("near", "far"), [(2.0, math.inf), (2.0, 2.0), (-1.0, 6.0), (math.nan, 6.0)])
+def test_a_scene_ends_somewhere_behind_its_start(tiny: Path, near: float, far: float) -> None:
+    parsed = dataclasses.replace(Blender(), near=near, far=far).parse(tiny, "train")
+    with pytest.raises(DataError, match="--near must be at least 0 and less than --far, which must be finite"):
+        load_dataset(parsed, "train")
+
+
 @pytest.mark.medium
 @pytest.mark.data
 @pytest.mark.parametrize(("split", "count"), [("train", 100), ("val", 25), ("test", 50)])

@@ -2,11 +2,14 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from scipy.ndimage import correlate1d
 from skimage.metrics import structural_similarity
+from torch.nn import functional
 
-from framework.evaluation.metrics import psnr, quick_ssim, ssim
+from framework.evaluation.metrics import ms_ssim, psnr, quick_ssim, ssim
 from framework.kernels.ssim import PHOTOMETRIC
 
 
@@ -61,3 +64,63 @@ def test_without_a_kernel_quick_ssim_is_ssim(monkeypatch: pytest.MonkeyPatch) ->
     torch.manual_seed(0)
     image, target = torch.rand(2, 20, 20, 3)
     assert quick_ssim(image, target) == ssim(image, target)
+
+
+# -- SSIM at five scales ----------------------------------------------------------------------------------------------
+
+
+def five_scales(image: np.ndarray, target: np.ndarray) -> float:
+    """Wang, Simoncelli and Bovik 2003, in float64: scipy's filters on one channel after the other."""
+    taps = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
+    taps /= taps.sum()
+
+    def blur(values: np.ndarray) -> np.ndarray:
+        return correlate1d(correlate1d(values, taps, 0), taps, 1)[5:-5, 5:-5]
+
+    found = []
+    for x, y in zip(np.moveaxis(image, -1, 0), np.moveaxis(target, -1, 0), strict=True):
+        product = 1.0
+        for scale, exponent in enumerate((0.0448, 0.2856, 0.3001, 0.2363, 0.1333)):
+            mean_x, mean_y = blur(x), blur(y)
+            covariance = blur(x * y) - mean_x * mean_y
+            variances = blur(x * x) - mean_x**2 + blur(y * y) - mean_y**2
+            similar = (2 * covariance + 0.03**2) / (variances + 0.03**2)
+            if scale == 4:
+                similar *= (2 * mean_x * mean_y + 0.01**2) / (mean_x**2 + mean_y**2 + 0.01**2)
+            product *= max(similar.mean(), 0.0) ** exponent
+            rows, columns = (side // 2 * 2 for side in x.shape)
+            x, y = (
+                (each[:rows:2, :columns:2] + each[1:rows:2, :columns:2]
+                 + each[:rows:2, 1:columns:2] + each[1:rows:2, 1:columns:2]) / 4
+                for each in (x, y)
+            )  # fmt: skip
+        found.append(product)
+    return float(np.mean(found))
+
+
+@pytest.mark.parametrize("size", [(176, 176), (191, 243)])
+@pytest.mark.parametrize("amount", [0.01, 0.2, 3.0])
+def test_similarity_at_five_scales_is_the_papers(size: tuple[int, int], amount: float) -> None:
+    torch.manual_seed(0)
+    target = functional.interpolate(torch.rand(1, 3, 20, 20, dtype=torch.float64), size, mode="bicubic")
+    target = target[0].permute(1, 2, 0).clamp(0, 1)
+    image = (target + amount * torch.randn_like(target)).clamp(0, 1)
+    expected = five_scales(image.numpy(), target.numpy())
+    assert ms_ssim(image, target) == pytest.approx(expected, abs=1e-12)
+    assert ms_ssim(image.float(), target.float()) == pytest.approx(expected, abs=2e-6)
+
+
+def test_blur_costs_less_at_five_scales_and_a_negative_is_nothing() -> None:
+    torch.manual_seed(0)
+    target = torch.rand(180, 180, 3)
+    assert ms_ssim(target, target) == pytest.approx(1, abs=1e-6)
+    blurred = functional.avg_pool2d(target.permute(2, 0, 1), 3, 1, 1).permute(1, 2, 0)
+    assert ms_ssim(blurred, target) > ssim(blurred, target)
+    assert ms_ssim(1 - target, target) == 0
+    target[0, 0, 0] = torch.nan
+    assert math.isnan(ms_ssim(target, blurred))
+
+
+def test_images_too_small_for_five_scales_are_refused() -> None:
+    with pytest.raises(ValueError, match="at least 176x176 pixels, not 300x175"):
+        ms_ssim(torch.rand(175, 300, 3), torch.rand(175, 300, 3))

@@ -10,7 +10,15 @@ from torch import Tensor
 from framework.evaluation import metrics
 from framework.kernels import native
 from framework.kernels.dispatch import derivatives
-from framework.kernels.ssim import WINDOW, photometric_loss, photometric_reference, ssim, ssim_reference
+from framework.kernels.ssim import (
+    WINDOW,
+    photometric_loss,
+    photometric_reference,
+    ssim,
+    ssim_reference,
+    structure,
+    structure_reference,
+)
 from tests.kernels.compiled import needs_kernels, relative_error
 
 SIZES = [(11, 11, 1), (11, 11, 3), (11, 64, 3), (90, 11, 4), (12, 27, 1), (23, 16, 3), (70, 53, 3), (41, 37, 4)]
@@ -278,6 +286,29 @@ def test_the_loss_as_a_part_of_another() -> None:
 @needs_kernels
 @pytest.mark.parametrize("size", [(10, 11, 3), (11, 10, 3), (11, 11, 0)])
 def test_the_kernel_refuses_too_small_images_itself(size: tuple[int, int, int]) -> None:
-    kernel = native.Function("photometric", "ppqqqfpi", "d")
+    kernel = native.Function("photometric", "ppqqqffpi", "d")
     with pytest.raises(ValueError, match="SSIM needs 11x11 pixels"):
-        kernel(None, None, *size, 1, None, 1)
+        kernel(None, None, *size, 1, 1e-4, None, 1)
+
+
+@pytest.mark.parametrize("size", SIZES, ids=str)
+@pytest.mark.parametrize("amount", [0.0, 0.02, 0.5])
+def test_structure_is_similarity_without_the_means(size: tuple[int, int, int], amount: float) -> None:
+    """Against scikit-image with its first constant so large that means, far below it, are all alike."""
+    torch.manual_seed(0)
+    target = smooth(*size)
+    image = noisy(target, amount)
+    expected = structural_similarity(
+        target.double().numpy(), image.double().numpy(), channel_axis=-1, data_range=1.0,
+        gaussian_weights=True, sigma=1.5, use_sample_covariance=False, K1=1e6,
+    )  # fmt: skip
+    assert structure_reference(image.double(), target.double()).item() == pytest.approx(expected, abs=1e-9)
+    assert structure(image, target).item() == pytest.approx(expected, abs=1e-6)
+
+
+def test_structure_does_not_see_another_brightness_and_sees_nan() -> None:
+    target = smooth(40, 50, 3).double()
+    assert structure(0.5 * target + 0.4, 0.5 * target).item() == pytest.approx(1, abs=1e-11)
+    assert ssim(0.5 * target + 0.4, 0.5 * target).item() < 0.9
+    target[3, 4, 1] = torch.nan
+    assert structure(torch.rand(40, 50, 3), target.float()).isnan()

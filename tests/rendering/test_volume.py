@@ -1,22 +1,31 @@
 """The volume renderer: what it asks a field, that it asks nothing twice, and density and opacity shown alike."""
 
+from dataclasses import replace
 from typing import ClassVar
 
 import pytest
 import torch
 from torch import Tensor
 
+from framework.base.registry import load_method, registered
+from framework.data.scene import Scene
 from framework.fields.base import Field
 from framework.geometry.points import Footprint, Points
 from framework.geometry.rays import Rays
+from framework.ray_model import RayModel
+from framework.rendering.background import SphereRenderer
 from framework.rendering.rendered import Rendered
 from framework.rendering.volume import VolumeRenderer, shade
 from framework.samplers.base import Sampler
 from framework.samplers.occupancy import OccupancySampler
 from framework.samplers.proposal import ProposalSampler
 from framework.samplers.uniform import UniformSampler
+from tests.training.helpers import TINY
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
+CAPTURE = Scene(0.5 * BOX, 0.05, 100.0, num_cameras=3, has_alpha=False, moving=False, image_size=32)
+BUILT_IN = [name for name, entry in registered("methods").items() if entry.module.startswith("methods.")]
+RAY_METHODS = [name for name in BUILT_IN if name != "gaussian-splatting"]
 
 
 class Cloud(Field):
@@ -141,6 +150,53 @@ def test_each_sample_has_the_camera_of_its_ray_and_is_seen_along_it() -> None:
     assert field.cameras.tolist() == [0, 0, 1, 1, 2, 2, 0, 0]
     assert field.directions is not None
     assert torch.equal(field.directions, rays.directions.repeat_interleave(2, 0))
+
+
+class Listed(Cloud):
+    """Density and colour of each sample are parameters of their own."""
+
+    def __init__(self, count: int) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(3)
+        self.sigmas = torch.nn.Parameter(torch.rand(count, generator=generator, dtype=torch.float64))
+        self.rgbs = torch.nn.Parameter(torch.rand(count, 3, generator=generator, dtype=torch.float64))
+
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        return self.sigmas, self.rgbs
+
+    def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
+        return features
+
+
+def test_gradients_are_scaled_near_cameras_in_training_and_values_are_not() -> None:
+    """By the squared distance in units of `unit_length`, and not at all beyond it."""
+    rays = some_rays(5, near=0.0, far=4.0)
+    samples = UniformSampler(8).sample(rays, Cloud(), False)
+    outcome = {}
+    for unit, training in ((None, True), (2.5, True), (2.5, False)):
+        field, renderer = Listed(len(samples)), VolumeRenderer(unit).train(training)
+        rgb = renderer.render(rays, samples, field, torch.ones(3)).rgb
+        outcome[unit, training] = rgb, *torch.autograd.grad((rgb**2).sum(), (field.sigmas, field.rgbs))
+    plain, scaled, shown = outcome.values()
+    factors = (samples.t / 2.5).clamp(max=1) ** 2
+    assert 0 < int((factors < 1).sum()) < len(factors)
+    torch.testing.assert_close(scaled[0], plain[0])
+    torch.testing.assert_close(scaled[1], factors * plain[1], check_dtype=False)
+    torch.testing.assert_close(scaled[2], factors[:, None] * plain[2], check_dtype=False)
+    for found, expected in zip(shown, plain, strict=True):
+        torch.testing.assert_close(found, expected)
+
+
+@pytest.mark.parametrize("name", RAY_METHODS)
+def test_every_ray_method_scales_gradients_if_asked(name: str) -> None:
+    method = load_method(name)
+    for scaled in (True, False):
+        config = replace(method.config, **TINY.get(name, {}), gradient_scaling=scaled)
+        model = method.build(config, replace(CAPTURE, unbounded=name != "pixel-nerf"))
+        assert isinstance(model, RayModel)
+        renderer = model.renderer.renderer if isinstance(model.renderer, SphereRenderer) else model.renderer
+        assert isinstance(renderer, VolumeRenderer)
+        assert renderer.unit_length == (0.5 if scaled else None)
 
 
 def test_samples_that_nobody_evaluated_are_refused() -> None:

@@ -210,6 +210,14 @@ def test_the_choice_for_a_capture() -> None:
     assert (made.levels, made.endless) == (3, False)
 
 
+@pytest.mark.parametrize(("far", "levels"), [(0.5, 1), (1.0, 1), (2.0, 2), (1000.0, 11), (1e30, 12), (math.inf, 12)])
+def test_boxes_reach_the_far_end_as_far_as_there_may_be_boxes(far: float, levels: int) -> None:
+    config = SamplingConfig(sampler="occupancy", nested_resolution=4, grid_levels=12)
+    made = make_sampler(config, dataclasses.replace(CAPTURE, far=far))
+    assert isinstance(made, OccupancySampler)
+    assert made.levels == levels
+
+
 def test_cells_that_no_camera_shows() -> None:
     """One camera at the origin that looks along -z: what is behind it is not seen, nor what is too near before it."""
     pose = torch.eye(3, 4)[None]

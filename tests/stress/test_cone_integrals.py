@@ -8,12 +8,17 @@ from torch import Tensor
 
 from framework.encodings.integrated import IntegratedEncoding, icosahedron_directions
 from framework.geometry.bounds import contract, contract_gaussians, contraction_scale
-from framework.geometry.points import Points, frames, sample_points
+from framework.geometry.multisamples import Pattern
+from framework.geometry.points import Frustums, Points, frames, sample_points
 from framework.geometry.rays import Rays, Samples
 from framework.kernels.downweighting import level_weights
 from framework.kernels.frequency import frequency_encoding_reference
+from framework.kernels.hash_grid_layout import HashGridLayout
 from framework.kernels.integrated import integrated_encoding
+from framework.kernels.multisampled_grid import multisampled_grid
+from framework.kernels.multisamples import unit_multisamples
 from framework.samplers.proposal import FARTHEST
+from tests.stress.backends import backends
 from tests.stress.test_cones import assert_like, drawn_in_frustum, two_rays
 
 F64 = torch.float64
@@ -111,6 +116,7 @@ def test_contracted_gaussians_have_the_moments_of_contracted_draws(distance: flo
     scale = sampled.diagonal(dim1=1, dim2=2).sum(-1)
     assert ((draws.mean(1) - found).norm(dim=-1) < 5 * (scale / DRAWS).sqrt() + 1e-6 * scale.sqrt()).all()
     error = (contracted @ contracted.mT - sampled).abs().amax((1, 2))
+    print(f"contracted covariances: off those of {DRAWS:,} draws by {(error / scale).max():.1e} of their traces")
     assert (error < (6 / math.sqrt(DRAWS) + 1e-3) * scale).all()
 
 
@@ -148,6 +154,7 @@ def test_the_encoding_is_the_mean_over_draws_and_so_is_its_gradient() -> None:
     count = DRAWS // 4
     each = [values.detach().expand(count, 2, 3).clone().requires_grad_() for values in (means, deviations)]
     drawn = frequency_encoding_reference(each[0] + each[1] * normal(count, 2, 3), 5, include_input=False)
+    print(f"integrated encoding: off the mean of {count:,} draws by {(found - drawn.mean(0)).abs().max():.1e}")
     assert_like(found, drawn, drawn.std(0) + 1e-12)
     seeds = torch.where(normal(*found.shape, seed=2) > 0, 1.0, -1.0).to(F64)
     exact = torch.autograd.grad((found * seeds).sum(), (means, deviations))
@@ -201,7 +208,9 @@ def test_the_encoding_of_cones_is_the_mean_over_points_in_them(contracted: bool,
         unit = (drawn - BOX.mean(0)) / (BOX[1] - BOX[0]) * 2
         unit = contract(unit) if contracted else unit
         waves = frequency_encoding_reference(unit if along is None else unit @ along.mT, 2, include_input=False)
-        assert (waves.mean(0) - found[index]).abs().max() < 0.03
+        error = (waves.mean(0) - found[index]).abs().max()
+        print(f"encoding of a cone: off the mean over points drawn in it by {error:.1e}")
+        assert error < 0.03
 
 
 @pytest.mark.entry(10)
@@ -238,4 +247,71 @@ def test_levels_of_a_grid_count_by_the_share_of_draws_in_a_cell() -> None:
     found = level_weights(deviations, resolutions)
     for level, cells in enumerate(resolutions.tolist()):
         within = (draws.abs() < 0.5 / cells).double()
+        error = (found[:, level] - within.mean(0)).abs().max()
+        print(f"weights of a level of {cells} cells: off the share of draws by {error:.1e}")
         assert_like(found[:, level], within, within.std(0) + 1e-9)
+
+
+# -- compiled: the points of a cone, and a grid that is looked up at them ----------------------------------------------
+
+
+def some_cones(count: int, generator: torch.Generator) -> Frustums:
+    """Frustums (float32) in the box, short and long, narrow and wide."""
+    axes = directions(count + 6)[6:]
+    starts = 0.2 + 0.3 * torch.rand(count, generator=generator, dtype=F64)
+    ends = starts * (1 + torch.rand(count, generator=generator, dtype=F64))
+    radii = 10 ** (-3 + 2.5 * torch.rand(count, generator=generator, dtype=F64))
+    origins = torch.tensor([0.0, 0.0, 1.0], dtype=F64) - 0.5 * axes
+    return Frustums(*(values.float() for values in (origins, axes, starts, ends, radii)))
+
+
+def drawn_in(cones: Frustums, index: int, generator: torch.Generator) -> Tensor:
+    """Points (N, 3) drawn evenly in one of the frustums, in the unit cube of BOX, float64."""
+    double = [values[index].double() for values in (cones.origins, cones.directions, cones.t_starts, cones.t_ends)]
+    local = drawn_in_frustum(double[2].item(), double[3].item(), cones.radii[index].item(), generator)
+    across = local[:, :2] @ torch.linalg.svd(double[1][None]).Vh[1:]
+    return (double[0] + across + local[:, 2:] * double[1] - BOX[0]) / (BOX[1] - BOX[0])
+
+
+@pytest.mark.entry(10)
+@backends()
+def test_the_points_of_a_cone_have_the_moments_of_draws(backend: str) -> None:
+    """Mean and covariance over all rotations of the pattern; float32 beside five standard errors."""
+    generator = torch.Generator().manual_seed(4)
+    cones, turns = some_cones(6, generator), 8
+    each = [Pattern(torch.full((6,), 2 * math.pi * turn / turns), torch.ones(6)) for turn in range(turns)]
+    found = torch.stack([unit_multisamples(cones, pattern, BOX.float(), False)[..., :3] for pattern in each], 1)
+    points = found.flatten(1, 2).double()
+    mean = points.mean(1)
+    apart = points - mean[:, None]
+    for index in range(6):
+        draws = drawn_in(cones, index, generator)
+        around = draws - draws.mean(0)
+        products, error = around[:, :, None] * around[:, None], 5 / math.sqrt(len(draws))
+        covariance = apart[index].mT @ apart[index] / len(apart[index])
+        off = (mean[index] - draws.mean(0)).abs(), (covariance - products.mean(0)).abs()
+        print(f"{backend}: points of a cone: mean off draws by {off[0].max():.1e}, covariance by {off[1].max():.1e}")
+        assert bool((off[0] < error * draws.std(0) + 1e-6).all())
+        assert bool((off[1] < error * products.std(0) + 1e-7).all())
+
+
+@pytest.mark.entry(10)
+@backends()
+def test_a_grid_of_a_linear_function_shows_its_mean_over_a_cone(backend: str) -> None:
+    """Value, and gradient by the function: interpolation is exact there, and a coarse level's weight is 1."""
+    generator = torch.Generator().manual_seed(5)
+    cones, layout = some_cones(5, generator), HashGridLayout.build(1, 2, 2, 8)
+    vertices = torch.cartesian_prod(*[torch.arange(3) / 2] * 3)
+    slope = torch.tensor([[0.5, -1.0, 2.0], [1.0, 3.0, -0.3]], requires_grad=True)
+    points = unit_multisamples(cones, Pattern(torch.rand(5, generator=generator), torch.ones(5)), BOX.float(), False)
+    points[..., 3] *= 1e-3
+    table = torch.zeros(layout.num_entries, 2)
+    table[: len(vertices)] = vertices @ slope.T
+    found = multisampled_grid(points, table, layout)
+    sums = [torch.autograd.grad(values.sum(), slope, retain_graph=True)[0] for values in found]
+    for index in range(5):
+        draws = drawn_in(cones, index, generator)
+        shown = draws @ slope.detach().double().T
+        error = 5 / math.sqrt(len(draws))
+        assert bool(((found[index] - shown.mean(0)).abs() < error * shown.std(0) + 1e-5).all())
+        assert bool(((sums[index] - draws.mean(0)).abs() < error * draws.std(0) + 1e-5).all())

@@ -16,7 +16,7 @@ namespace {
 constexpr int TAPS = 11, REACH = TAPS - 1;
 constexpr int ROWS = 8;  // blurred down at once: each input row is read once for all of them
 constexpr int KEPT = ROWS + REACH;
-constexpr float C1 = 1e-4f, C2 = 9e-4f;
+constexpr float C2 = 9e-4f;
 
 // The window along one axis: exp(-k^2 / (2 * 1.5^2)), for k = 0 to 5, divided by the sum over all taps.
 constexpr float TAP[REACH / 2 + 1] = {
@@ -70,6 +70,7 @@ struct Rows {
 struct Images {
     const float *image, *target;
     int64_t height, width, channels;
+    float c1;  // of the means; where it is infinite, variances alone are compared
 };
 
 inline int64_t whole_vectors(int64_t floats) { return (floats + LANES - 1) / LANES * LANES; }
@@ -163,7 +164,7 @@ class Band {
                 const Floats square = difference * difference;
                 const Floats of_sum = positive(moment[2][r] - sum * sum);
                 const Floats of_difference = positive(moment[3][r] - square);
-                const Floats light = 0.5f * (full * full + square) + C1;
+                const Floats light = 0.5f * (full * full + square) + images.c1;
                 const Floats contrast = 0.5f * (of_sum + of_difference) + C2;
                 const Floats per_light = 1.0f / light, per_contrast = 1.0f / contrast;
                 const Floats darker = square * per_light, flatter = of_difference * per_contrast;
@@ -238,10 +239,10 @@ class Band {
 // (height, width, channels), of 11 pixels at least along each side; gradient (height, width, channels): its derivative by
 // the image, unless null.
 EXPORT int photometric(const float* image, const float* target, int64_t height, int64_t width, int64_t channels,
-                       float ssim_weight, float* gradient, int threads, double* out) {
+                       float ssim_weight, float c1, float* gradient, int threads, double* out) {
     return guarded([&] {
         if (std::min(height, width) < TAPS || channels < 1) throw std::invalid_argument("SSIM needs 11x11 pixels");
-        const Images images{image, target, height, width, channels};
+        const Images images{image, target, height, width, channels, c1};
         const double count = double(height - REACH) * double(width - REACH) * double(channels);
         const double values = double(height) * double(width) * double(channels);
         // Neighbours both read the rows between them, so there are no more bands than threads have use for. What a row

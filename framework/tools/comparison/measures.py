@@ -28,6 +28,7 @@ class Measured:
         method: name of the method.
         seed: seed of the run.
         ssim: mean SSIM over all evaluated views.
+        ms_ssim: mean SSIM at five scales; None of small images.
         lpips: mean LPIPS over all evaluated views; None if it was not computed.
         floaters: mean share, in per cent, of sparse points with something before them; None without sparse points.
         steps: steps of training.
@@ -46,6 +47,7 @@ class Measured:
     psnr: float
     """Mean PSNR of the final model over all evaluated views, dB."""
     ssim: float | None
+    ms_ssim: float | None
     lpips: float | None
     floaters: float | None
     views: int
@@ -105,6 +107,7 @@ def measure(job: Job, conditions: Conditions) -> Measured | None:
         seed=job.seed,
         psnr=results["psnr"],
         ssim=results["ssim"],
+        ms_ssim=results.get("ms_ssim"),
         lpips=results["lpips"],
         floaters=results.get("floaters"),
         views=results["num_images"],

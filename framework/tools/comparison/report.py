@@ -45,6 +45,7 @@ class Column:
 COLUMNS = (
     Column("PSNR, dB", "psnr", "{:.2f}".format, max),
     Column("SSIM", "ssim", "{:.4f}".format, max),
+    Column("MS-SSIM", "ms_ssim", "{:.4f}".format, max),
     Column("LPIPS", "lpips", "{:.4f}".format, min),
     Column("floaters, %", "floaters", "{:.1f}".format, min),
     Column("training, s", "seconds", "{:.1f}".format, min, SAME_TIME),
@@ -283,7 +284,7 @@ def _markdown_table(head: list[str], rows: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
-QUALITY = ("psnr", "ssim", "lpips", "floaters")
+QUALITY = ("psnr", "ssim", "ms_ssim", "lpips", "floaters")
 """Measures of the rendered views."""
 CSV_FIGURES = ("label", "method", "seed", *QUALITY, "views", "steps", "seconds", "rays_per_second")
 """First columns of results.csv."""

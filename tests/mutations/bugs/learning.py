@@ -254,7 +254,7 @@ BUGS = (
     Bug(
         "gradient-scaling-inverted",
         "losses",
-        "methods/_captures.py",
+        "framework/rendering/volume.py",
         "factors = (samples.t / self.unit_length).square().clamp(max=1)",
         "factors = (self.unit_length / samples.t).square().clamp(max=1)",
         "what is near cameras learns most: floaters",

@@ -1,0 +1,116 @@
+"""Settings by which Gaussians start, grow and move, and what a budget decides of them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, Literal, TypeVar
+
+from framework.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
+from framework.base.decisions import Choice, Decision, fill
+from framework.data.scene import Scene
+from framework.splats.learning import number_for, rate_factor
+
+PIXELS_PER_SECOND = 25 * 400 * 400
+"""Pixels that training draws in a second, about, on two cores; for what is decided by the budget."""
+MOST_STEPS_PER_SECOND = 100
+"""However small the images are."""
+MOST_GAUSSIANS, MOST_RATE = 1_000_000, 8.0
+"""Maximum number of Gaussians, and factor of learning rates, that are chosen by the budget."""
+LARGE_IMAGE = 250_000
+"""Pixels from which training begins with images of half the size."""
+LONG_RUN, NEVER = 15_000, 10**9
+"""Steps of a run in which opacity is reset, which it takes a thousand steps to recover from."""
+RESET_WORDS = {
+    True: ("the run is long", "resets of opacity", "every 3,000 steps"),
+    False: ("the run is too short to recover from one", "resets of opacity", "none"),
+}
+
+
+@dataclass(frozen=True)
+class SplattingConfig(
+    AppearanceConfig, max_num_iterations=30_000, learning_rate=5e-3, lr_final=0.1, adam_beta2=0.99, adam_eps=1e-15
+):
+    """Settings of a method whose Gaussians start somewhere, grow and move."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        "num_gaussians": (1, 10_000_000),
+        "start_gaussians": (1, 10_000_000),
+        "field_steps": (1, math.inf),
+        "rate_factor": AT_LEAST_0,
+        "position_rate": AT_LEAST_0,
+        "steps_per_reset": (1, 10**9),
+        "growth_end": (0, 1),
+        "steps_per_move": (1, 10**9),
+        "noise": AT_LEAST_0,
+        "opacity_penalty": AT_LEAST_0,
+        "scale_penalty": AT_LEAST_0,
+        "reduced_until": (0, 1),
+    }
+    """Allowed range of each numeric setting."""
+    num_gaussians: Auto[int] = AUTO
+    """Maximum number of Gaussians; by the budget if not given."""
+    start: Literal["auto", "points", "field", "silhouettes", "random"] = "auto"
+    """Where Gaussians start: at the points of a reconstruction, on surfaces that a short run of a field finds, in
+    the visual hull of the images' silhouettes, or anywhere in the box. auto: the first of points and field that there
+    is."""
+    start_gaussians: Auto[int] = AUTO
+    """Gaussians at the start, except at the points of a reconstruction; two thirds of the maximum if not given."""
+    field_steps: Auto[int] = AUTO
+    """Maximum number of training steps of that field; by the budget if not given. They end after a fifth of
+    --max-seconds."""
+    rate_factor: Auto[float] = AUTO
+    """Factor of all learning rates; by the budget if not given, as fewer steps have to go farther."""
+    position_rate: float = 8e-5
+    """Learning rate of centres before that factor, in sizes of the scene."""
+    reduced_until: Auto[float] = AUTO
+    """Share of the budget in which images are half as wide and high. If not given: 0.4 of large images, else 0."""
+    strategy: Literal["adc", "mcmc"] = "adc"
+    """How Gaussians come and go. adc: transparent ones are dropped, and those whose image positions have large
+    gradients are cloned or split (adaptive density control of 3DGS). mcmc: transparent ones are moved to opaque ones
+    (3DGS-MCMC)."""
+    growth_end: float = 0.8
+    """Share of the budget after which no Gaussian is added or moved."""
+    steps_per_move: int = 100
+    """Steps between two changes of the Gaussians' number."""
+    steps_per_reset: Auto[int] = AUTO
+    """Steps after which strategy adc makes all Gaussians nearly transparent; by the budget if not given."""
+    noise: float | None = None
+    """Noise of nearly transparent Gaussians, times the learning rate of centres; by the start if not given."""
+    opacity_penalty: float | None = None
+    """Weight of the mean opacity in the loss; by the start if not given."""
+    scale_penalty: float | None = None
+    """Weight of the mean scale, in scene extents, in the loss; by the start if not given."""
+
+
+SplattingConfigT = TypeVar("SplattingConfigT", bound=SplattingConfig)
+
+
+def decide_splatting(config: SplattingConfigT, scene: Scene) -> tuple[SplattingConfigT, list[Decision]]:
+    """Decide how many Gaussians there are and how fast they learn, by the budget and the size of the images.
+
+    Args:
+        config: the method's settings; those left open are filled in.
+        scene: properties of the data.
+
+    Returns:
+        The settings, and a record of each that was filled in.
+    """
+    speed = min(PIXELS_PER_SECOND / (scene.image_pixels or scene.image_size**2), MOST_STEPS_PER_SECOND)
+    seconds = min(config.max_seconds or math.inf, config.max_num_iterations / speed)
+    count, factor = number_for(seconds, MOST_GAUSSIANS), rate_factor(speed * seconds, MOST_RATE)
+    why = "that suits the time"
+    config, made = fill(config, Choice("num_gaussians", count, why, "Gaussians", f"up to {count:,}"))
+    large = PIXELS_PER_SECOND / speed > LARGE_IMAGE
+    detail = "large images can wait" if large else "the images are small"
+    first, most = max(config.num_gaussians * 2 // 3, 1), 800 if scene.unbounded else 400
+    resets = speed * seconds >= LONG_RUN
+    config, more = fill(
+        config,
+        Choice("start_gaussians", first, "the others are added", "Gaussians at the start", f"{first:,}"),
+        Choice("field_steps", int(min(max(2 * seconds, 120), most)), why, "steps of a field to start from"),
+        Choice("reduced_until", 0.4 if large else 0.0, detail, "share of the budget with images of half the size"),
+        Choice("steps_per_reset", 3_000 if resets else NEVER, *RESET_WORDS[resets]),
+        Choice("rate_factor", round(factor, 2), "fewer steps have to go farther", "factor of learning rates"),
+    )
+    return config, made + more

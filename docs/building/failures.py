@@ -37,6 +37,8 @@ from framework.kernels.math import cross_matrix
 SIZE, NUM_TRAIN, NUM_TEST = 128, 48, 6
 TILE = 200
 """Edge of a tile of the pictures, pixels."""
+BALL = 0.35
+"""Radius of the balloon of `motion`, scene units."""
 Photographs = list[np.ndarray]
 """(SIZE, SIZE, 3) float in [0, 1] each."""
 
@@ -78,18 +80,25 @@ def write(path: Path, image: np.ndarray) -> None:
     iio.imwrite(path, (image * 255).round().clip(0, 255).astype(np.uint8))
 
 
+def placed(split: str, count: int, nearer: float = 1.0) -> list[np.ndarray]:
+    """Return poses (4, 4) of cameras around the scene, at `nearer` times the usual distance."""
+    scale = np.ones((4, 4))
+    scale[:3, 3] = nearer
+    return [pose * scale for pose in camera_poses(split, count, 0)]
+
+
 @functools.cache
-def taken(split: str, count: int, index: int, time: float) -> np.ndarray:
+def taken(split: str, count: int, index: int, nearer: float) -> np.ndarray:
     """Return a view (SIZE, SIZE, 4) of the scene alone, with alpha; kept, since several captures begin with it."""
-    pose = camera_poses(split, count, 0)[index]
-    return render_view(pose, CAMERA_ANGLE, SIZE, SIZE, time, supersample=2, geometry=False)[0] / 255.0
+    pose = placed(split, count, nearer)[index]
+    return render_view(pose, CAMERA_ANGLE, SIZE, SIZE, supersample=2, geometry=False)[0] / 255.0
 
 
 def photograph(
-    split: str, count: int, index: int, time: float = 0.0, plain: bool = False
+    split: str, count: int, index: int, plain: bool = False, nearer: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a photograph of the scene, and its alpha (SIZE, SIZE), before a pattern at infinity or a plain white."""
-    rgba, pose = taken(split, count, index, time), camera_poses(split, count, 0)[index]
+    rgba, pose = taken(split, count, index, nearer), placed(split, count, nearer)[index]
     alpha = rgba[..., 3:]
     return rgba[..., :3] * alpha + (1.0 if plain else pattern(pose)) * (1 - alpha), alpha[..., 0]
 
@@ -106,7 +115,7 @@ def pattern(pose: np.ndarray) -> np.ndarray:
 
 def still() -> Capture:
     """Return a capture without a fault."""
-    poses = camera_poses("train", NUM_TRAIN, 0)
+    poses = placed("train", NUM_TRAIN)
     return Capture([photograph("train", NUM_TRAIN, index)[0] for index in range(NUM_TRAIN)], poses)
 
 
@@ -129,18 +138,29 @@ def exposure() -> tuple[Capture, Capture]:
     )
 
 
+def balloon(pose: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a violet ball at `place` as a camera sees it: colour (SIZE, SIZE, 3), and where it is, (SIZE, SIZE)."""
+    focal = 0.5 * SIZE / math.tan(CAMERA_ANGLE / 2)
+    rows, columns = (np.mgrid[:SIZE, :SIZE] + 0.5 - SIZE / 2) / focal
+    directions = np.stack([columns, -rows, -np.ones_like(rows)], -1) @ pose[:3, :3].T
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    along = directions @ (place - pose[:3, 3])
+    nearest = pose[:3, 3] + along[..., None] * directions - place
+    inside = np.clip(1 - (nearest**2).sum(-1) / BALL**2, 0, None)
+    return np.array([0.6, 0.2, 0.8]) * (0.4 + 0.6 * np.sqrt(inside))[..., None], inside > 0
+
+
 def motion() -> tuple[Capture, Capture]:
-    """A part moves between photographs; what helps is to mask it."""
-    poses = camera_poses("train", NUM_TRAIN, 0)
-    times = np.random.default_rng(0).choice([0.0, 0.33, 0.67], NUM_TRAIN)
-    images = [photograph("train", NUM_TRAIN, index, time)[0] for index, time in enumerate(times)]
-    masks = []
-    for index, image in enumerate(images):
-        others = [photograph("train", NUM_TRAIN, index, time)[0] for time in (0.0, 0.33, 0.67)]
-        changed = np.max([np.abs(other - image).max(-1) for other in others], axis=0)
-        grown = np.max([np.roll(changed, (i, j), (0, 1)) for i in (-2, 0, 2) for j in (-2, 0, 2)], axis=0)
-        masks.append(grown < 0.06)
-    return Capture(images, poses), Capture(images, poses, masks, {"masks": "ignored"})
+    """A balloon drifts between camera and scene, in two of three photographs; what helps is to mask it."""
+    good, random = still(), np.random.default_rng(0)
+    images, masks = [], []
+    for index, (image, pose) in enumerate(zip(good.images, good.poses, strict=True)):
+        place = 0.45 * pose[:3, 3] + random.uniform(-0.4, 0.4, 3)
+        colour, covered = balloon(pose, place)
+        covered &= index % 3 < 2
+        images.append(np.where(covered[..., None], colour, image))
+        masks.append(~covered)
+    return Capture(images, good.poses), Capture(images, good.poses, masks, {"masks": "ignored"})
 
 
 def few() -> tuple[Capture, Capture]:
@@ -164,11 +184,11 @@ def poses() -> tuple[Capture, Capture]:
 
 
 def texture() -> tuple[Capture, Capture]:
-    """The surroundings are plain white; what helps is to cut the object out."""
-    where = camera_poses("train", NUM_TRAIN, 0)
+    """The surroundings are plain white, and held-out views come nearer; what helps is to cut the object out."""
+    where = placed("train", NUM_TRAIN)
     shown = [photograph("train", NUM_TRAIN, index, plain=True) for index in range(NUM_TRAIN)]
     images, masks = [image for image, _ in shown], [alpha > 0.5 for _, alpha in shown]
-    return Capture(images, where), Capture(images, where, masks, {"masks": "empty"})
+    return Capture(images, where), Capture(images, where, masks, {"masks": "empty", "background": "white"})
 
 
 KINDS: dict[str, Callable[[], tuple[Capture, Capture]]] = {
@@ -196,8 +216,9 @@ def tile(image: np.ndarray) -> Image.Image:
 def draw(kind: str, steps: int, folder: Path) -> dict[str, float]:
     """Train on the faulty capture and with what helps, and write the picture; the PSNRs of both."""
     faulty, helped = KINDS[kind]()
-    where = camera_poses("test", NUM_TEST, 0)
-    views = [photograph("test", NUM_TEST, index, plain=kind == "texture")[0] for index in range(NUM_TEST)]
+    plain, nearer = kind == "texture", 0.65 if kind == "texture" else 1.0
+    where = placed("test", NUM_TEST, nearer)
+    views = [photograph("test", NUM_TEST, index, plain, nearer)[0] for index in range(NUM_TEST)]
     truth = Capture(views, where)
     with tempfile.TemporaryDirectory() as temporary:
         results = [learn(c, truth, steps, Path(temporary) / n) for n, c in (("faulty", faulty), ("helped", helped))]
@@ -219,9 +240,9 @@ def main() -> None:
     results = flags.folder / "psnr.json"
     found = json.loads(results.read_text())["psnr"] if results.is_file() else {}
     for kind in flags.kinds or KINDS:
-        found[kind] = draw(kind, flags.steps, flags.folder)
+        found[kind] = {**draw(kind, flags.steps, flags.folder), "steps": flags.steps}
         print(kind, found[kind], flush=True)
-        results.write_text(json.dumps({"method": "nerfacto", "steps": flags.steps, "psnr": found}, indent=1) + "\n")
+        results.write_text(json.dumps({"method": "nerfacto", "psnr": found}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -82,7 +82,8 @@ def _marched(values: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     function: Any = marching_cubes
     vertices, faces, _, _ = function(filled, 0.0, gradient_direction="ascent", allow_degenerate=True)
     if any_unknown:
-        cells = np.floor(vertices[faces].mean(1)).astype(np.int64)
+        last = np.array(values.shape) - 2  # of a triangle in the block's last face, where no cell begins
+        cells = np.minimum(np.floor(vertices[faces].mean(1)).astype(np.int64), last)
         faces = faces[~_beside(unknown)[tuple(cells.T)]]
         used, faces = np.unique(faces, return_inverse=True)
         vertices, faces = vertices[used], faces.reshape(-1, 3)

@@ -105,3 +105,20 @@ def test_noise_ends_with_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.manual_seed(0)
     with pytest.raises(ConfigError, match="more than 5,000 vertices: it is noise"):
         mesh_of(lattice_of(CUBE, 30), lambda points: torch.rand(len(points)) - 0.5)
+
+
+@pytest.mark.parametrize("seed", [32, 75])
+def test_beside_unknown_points_only_their_cells_are_left_out(seed: int) -> None:
+    """Of these seeds' noise some triangles lie in the block's last face, where no cell begins."""
+    noise = torch.from_numpy(np.random.default_rng(seed).uniform(-0.5, 0.5, (9, 9, 9)).astype(np.float32))
+    lattice = lattice_of(torch.tensor([[0.0, 0, 0], [8, 8, 8]]), 8)
+
+    def middles(corner: float) -> Tensor:
+        noise[0, 0, 0] = corner
+        mesh = mesh_of(lattice, lambda positions: noise[tuple(positions.round().long().T)], edge=8)
+        return mesh.vertices[mesh.faces].mean(1)
+
+    whole, holed = middles(-1.0), middles(math.nan)
+    kept = whole[~(whole < 1).all(-1)]
+    assert 0 < len(kept) < len(whole)
+    assert torch.equal(holed, kept)

@@ -3,6 +3,11 @@
 import os
 import re
 import shutil
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
 from importlib import import_module
 from pathlib import Path
 
@@ -36,12 +41,14 @@ ADDED = {
 """Flags that are added to a command, or to one of its kinds, where they are not given."""
 
 
-def shown() -> list[str]:
-    """The commands to run, each once."""
-    names = ("ns-train ", "ns-eval ", "ns-render ", "ns-export ")
+def shown(*names: str) -> list[str]:
+    """The commands of these names to run, each once."""
     pages = [page for page in PAGES if page.is_relative_to(ROOT / "docs") and page.stem != "figures"]
     found = {command.split("  ")[0] for page in pages for _, command in commands(page)}
-    return sorted(c for c in found if c.startswith(names) and not LEFT_OUT.search(c) and "--data DIR" not in c)
+    return sorted(c for c in found if c.split()[0] in names and not LEFT_OUT.search(c) and "--data DIR" not in c)
+
+
+RUNNING = shown("ns-train", "ns-eval", "ns-render", "ns-export")
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +86,7 @@ def in_small(command: str) -> list[str]:
     return words
 
 
-@pytest.mark.parametrize("command", shown())
+@pytest.mark.parametrize("command", RUNNING)
 def test_it_runs_to_its_end(command: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     words = in_small(command)
@@ -97,5 +104,35 @@ def test_it_runs_to_its_end(command: str, folder: Path, monkeypatch: pytest.Monk
         assert (folder / "outputs/all").exists()
 
 
+
+@pytest.mark.parametrize("command", shown("ns-viewer"))
+def test_the_viewer_answers(command: str, folder: Path) -> None:
+    """It serves its page until it is told to stop."""
+    pytest.importorskip("viser", reason="the extra viewer is not installed")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    words = [word for word in words_of(RUN.sub(r"outputs/all/\1/TIME", command)) if not word.startswith("--websocket")]
+    words = [word for word in words if word not in ("0.0.0.0", "8080")]
+    program = [sys.executable, "-m", "framework.cli.viewer", *words[1:], "--websocket-port", port]
+    viewer = subprocess.Popen(
+        program, cwd=folder, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
+    try:
+        for _ in range(240):
+            time.sleep(0.25)
+            assert viewer.poll() is None, viewer.stdout and viewer.stdout.read().decode()
+            try:
+                with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=5) as page:
+                    assert page.status == 200
+                    return
+            except OSError:
+                continue
+        pytest.fail("no answer after a minute")
+    finally:
+        viewer.terminate()
+        viewer.wait(30)
+
+
 def test_enough_is_run() -> None:
-    assert len(shown()) > 35
+    assert len(RUNNING) > 35

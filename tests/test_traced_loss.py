@@ -39,6 +39,7 @@ def test_steps_are_those_of_single_operations(
         {"unseen_loss_mult": 0.1, "few_images": True},
         {"open_levels_until": 1.0, "few_images": True},
         {"background_model": "contraction"},
+        {"gradient_scaling": True},
     ],
     ids=str,
 )

@@ -198,9 +198,7 @@ def check_flags(flags: Flags) -> None:
     if not outputs or len(set(outputs)) < len(outputs):
         raise FlagError(f"--rendered-output-names {' '.join(outputs)}: name at least one output, and each once")
     if not isinstance(flags, DatasetFlags) and (unknown := {"error", "gt-rgb"} & set(outputs)):
-        raise FlagError(
-            f"--rendered-output-names {min(unknown)}: the true image is known to 'ns-render dataset' alone"
-        )
+        raise FlagError(f"--rendered-output-names {min(unknown)}: the true image is known to 'ns-render dataset' alone")
     if isinstance(flags, SpiralFlags) and flags.radius is not None and not 0 < flags.radius < 1e9:
         raise FlagError(f"--radius is {flags.radius:g}; it must be above zero")
     near, far = shown.depth_near_plane, shown.depth_far_plane

@@ -30,8 +30,9 @@ def error_of_traced(
     if type(sampler) is not OccupancySampler or sampler.endless or not (sampler.training and len(rays)):
         return None
     changed = vars(sampler).keys() & {"sample"} | vars(renderer).keys() & {"render", "shade"}
-    scaled = not isinstance(renderer, VolumeRenderer) or renderer.unit_length is not None
-    if type(renderer) is not VolumeRenderer or scaled or changed or not isinstance(field, HasGridColor):
+    if type(renderer) is not VolumeRenderer or renderer.unit_length is not None or changed:
+        return None
+    if not isinstance(field, HasGridColor):
         return None
     density, color = field.grid_density(), field.grid_color()
     if density is None or color is None:

@@ -104,7 +104,6 @@ def test_it_runs_to_its_end(command: str, folder: Path, monkeypatch: pytest.Monk
         assert (folder / "outputs/all").exists()
 
 
-
 @pytest.mark.parametrize("command", shown("ns-viewer"))
 def test_the_viewer_answers(command: str, folder: Path) -> None:
     """It serves its page until it is told to stop."""
@@ -116,7 +115,11 @@ def test_the_viewer_answers(command: str, folder: Path) -> None:
     words = [word for word in words if word not in ("0.0.0.0", "8080")]
     program = [sys.executable, "-m", "framework.cli.viewer", *words[1:], "--websocket-port", port]
     viewer = subprocess.Popen(
-        program, cwd=folder, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        program,
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
     )
     try:
         for _ in range(240):

@@ -1,4 +1,4 @@
-"""What planted bugs showed that no other test holds: how cells fade, when they are full, and what unit disparity has."""
+"""What planted bugs showed that no other test holds: how cells fade, when they are full, what unit disparity has."""
 
 import pytest
 import torch

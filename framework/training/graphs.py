@@ -61,7 +61,7 @@ class CudaRecorder:
     """
 
     def __init__(self, device: torch.device) -> None:
-        self.stream = torch.cuda.Stream(device)
+        self.device, self.stream = device, torch.cuda.Stream(device)
 
     def run(self, function: Callable[[], T]) -> T:
         """Call `function` on the stream, and return its result."""
@@ -72,10 +72,22 @@ class CudaRecorder:
         return result
 
     def record(self, function: Callable[[], T]) -> tuple[T, Callable[[], None]]:
-        """Record `function` as a graph, and return its result, with the graph's memory, and what replays it."""
+        """Record `function` as a graph, and return its result, with the graph's memory, and what replays it.
+
+        Raises:
+            ConfigError: if that fails, and leaves the GPU or its generator in a state from which nothing can go on.
+        """
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, stream=self.stream):
-            result = function()
+        try:
+            with torch.cuda.graph(graph, stream=self.stream):
+                result = function()
+        except Exception as failure:
+            try:
+                torch.rand((), device=self.device)
+                torch.cuda.synchronize(self.device)
+            except RuntimeError:
+                raise ConfigError(f"recording a CUDA graph failed ({_one_line(failure)}); use {FLAG} off") from failure
+            raise
         return result, graph.replay
 
 
@@ -155,8 +167,10 @@ class StepGraphs(Generic[T]):
     def _record(self, kept: _Kind[T], step: Callable[[], T]) -> None:
         try:
             kept.recorded = self._recorder.record(step)
+        except ConfigError:
+            raise
         except Exception as error:  # of torch, CUDA or Triton: any of them may find what cannot be recorded
-            self._give_up(f"recording one failed ({' '.join(str(error).split())[:200]})")
+            self._give_up(f"recording one failed ({_one_line(error)})")
 
     def _test(self, kept: _Kind[T], seed: Callable[[], None], step: Callable[[], T]) -> T:
         """Take a step without and with its recording, and drop the latter if they differ."""
@@ -193,6 +207,10 @@ class StepGraphs(Generic[T]):
         if why not in self._told:
             self._told.add(why)
             say(f"note: steps are not repeated as CUDA graphs, because {why}")
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]
 
 
 def _copies(tensors: Sequence[Tensor]) -> list[Tensor]:

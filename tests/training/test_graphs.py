@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -342,3 +343,31 @@ def test_graphs_are_recorded_on_the_stream_on_which_steps_warmed_up(monkeypatch:
     repeat()
     assert result == 4
     assert calls == [f"begin graph {own}", "step", f"end graph {own}", "replay"]
+
+
+@pytest.mark.parametrize("usable", [True, False])
+def test_a_recording_that_breaks_the_gpu_ends_the_run_in_a_line(
+    usable: bool, monkeypatch: pytest.MonkeyPatch, said: list[str]
+) -> None:
+    def draw(*size: object, device: object) -> None:
+        if not usable:
+            raise RuntimeError("operation not permitted when stream is capturing")
+
+    monkeypatch.setattr(torch.cuda, "Stream", lambda device: None)
+    monkeypatch.setattr(torch.cuda, "CUDAGraph", lambda: None)
+    monkeypatch.setattr(torch.cuda, "graph", lambda graph, stream: nullcontext())
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda device: None)
+    monkeypatch.setattr(CudaRecorder, "run", lambda self, function: function())
+    steps = StepGraphs[None](CudaRecorder(torch.device("cuda", 0)), list)
+    taken: list[int] = []
+
+    def step() -> None:
+        taken.append(1)
+        if len(taken) == WARM_UP + 1:  # while it is recorded
+            raise RuntimeError("invalidated\nby a wait")
+
+    monkeypatch.setattr(torch, "rand", draw)
+    with nullcontext() if usable else pytest.raises(ConfigError, match=r"invalidated by a wait.*cuda-graphs off"):
+        for _ in range(WARM_UP):
+            steps.run(StepKind(), lambda: None, step)
+    assert [line.split("because ")[1] for line in said] == ["recording one failed (invalidated by a wait)"] * usable

@@ -1,4 +1,4 @@
-"""What methods for captures share: settings, decisions, refined poses, the distortion of rays (Barron et al. 2022)."""
+"""Settings, decisions, poses and the distortion of rays (Barron et al. 2022) that methods for captures share."""
 
 from __future__ import annotations
 

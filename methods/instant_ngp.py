@@ -33,8 +33,8 @@ diagonal, samples per training step, cells of the finest level per pixel. Small 
 ones reach a higher PSNR."""
 
 THIN = 0.5
-"""Share of the mean gradient below which samples are thinned. On Lego, two seeds gave 28.34 and 28.52 dB after 800 steps
-without it, 28.36 and 28.48 dB with it, in 0.78 of the processor time."""
+"""Share of the mean gradient below which samples are thinned. On Lego, two seeds gave 28.34 and 28.52 dB after 800
+steps without it, 28.36 and 28.48 dB with it, in 0.78 of the processor time."""
 
 SPARSE_FROM = 17
 """log2 of the table size from which updates are sparse. On Lego, three runs of 45 s with 2^16 entries were 0.06, 0.23

@@ -21,7 +21,7 @@ from framework.geometry.points import Points
 from framework.geometry.rays import Rays
 from framework.kernels.math import safe_normalize
 from framework.kernels.native import torch_on_one_thread
-from framework.kernels.traced_error import Pixels, TracedError
+from framework.kernels.traced_error import PixelTargets, TracedError
 from framework.model import Loss, Model, parts
 from framework.rendering.losses import (
     density_before,
@@ -126,7 +126,7 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
         others = type(self.sampler).losses is not Sampler.losses or isinstance(config, MotionConfig)
         if not own or few or depths or others or batch.clear is not None:
             return None
-        pixels = Pixels(batch.background.repeat_interleave(batch.rays_per_pixel, 0), batch.rgb, batch.weights)
+        pixels = PixelTargets(batch.background.repeat_interleave(batch.rays_per_pixel, 0), batch.rgb, batch.weights)
         return error_of_traced(batch.rays, pixels, self.sampler, self.field, self.renderer, config.thin_gradients)
 
     def _depth_terms(self, rendered: Rendered, batch: PixelBatch) -> dict[str, Tensor]:

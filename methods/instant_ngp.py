@@ -32,6 +32,10 @@ PLANS = (
 diagonal, samples per training step, cells of the finest level per pixel. Small tables and batches learn fastest; large
 ones reach a higher PSNR."""
 
+THIN = 0.5
+"""Share of the mean gradient below which samples are thinned. On Lego, two seeds gave 28.34 and 28.52 dB after 800
+steps without it, 28.36 and 28.48 dB with it, in 0.78 of the processor time."""
+
 SPARSE_FROM = 17
 """log2 of the table size from which updates are sparse. On Lego, three runs of 45 s with 2^16 entries were 0.06, 0.23
 and 0.25 dB better with dense updates, which move rarely used entries further; after 300 s with 2^18 entries, sparse
@@ -53,7 +57,7 @@ class InstantNGPConfig(
     adam_beta2=0.95,
     adam_eps=1e-15,
     num_steps=AUTO,
-    thin_gradients=0.5,
+    thin_gradients=THIN,
 ):
     """Settings of instant-ngp."""
 

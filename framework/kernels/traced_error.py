@@ -55,8 +55,8 @@ class TracedError(NamedTuple):
     """Number of samples that light reached."""
 
 
-class Pixels(NamedTuple):
-    """What P pixels should show, of R / P consecutive rays each, whose colours are averaged."""
+class PixelTargets(NamedTuple):
+    """Colours of P pixels, each the mean of R / P consecutive rays."""
 
     background: Tensor
     """(R, 3) colour behind each ray."""
@@ -67,7 +67,7 @@ class Pixels(NamedTuple):
 
 
 def traced_error(
-    marched: March, density: GridDensity, color: GridColor, pixels: Pixels, thin: float = 0.0
+    marched: March, density: GridDensity, color: GridColor, pixels: PixelTargets, thin: float = 0.0
 ) -> TracedError:
     """Return the mean squared error of the colours of traced rays.
 
@@ -84,7 +84,7 @@ def traced_error(
 
 
 def traced_error_reference(
-    marched: March, density: GridDensity, color: GridColor, pixels: Pixels, thin: float = 0.0
+    marched: March, density: GridDensity, color: GridColor, pixels: PixelTargets, thin: float = 0.0
 ) -> TracedError:
     """Compute `traced_error` in PyTorch and single operations, on any device.
 
@@ -107,7 +107,7 @@ def traced_error_reference(
 TRACED_ERROR = Operation("traced_error", traced_error_reference)
 
 
-def _fits(marched: March, density: GridDensity, color: GridColor, pixels: Pixels, thin: float = 0.0) -> bool:
+def _fits(marched: March, density: GridDensity, color: GridColor, pixels: PixelTargets, thin: float = 0.0) -> bool:
     """Return whether all single operations would run compiled, and gradients go to table and weights alone."""
     if not torch.is_grad_enabled() or any(tensor is not None and tensor.requires_grad for tensor in pixels):
         return False
@@ -119,7 +119,9 @@ def _fits(marched: March, density: GridDensity, color: GridColor, pixels: Pixels
 
 
 @TRACED_ERROR.implementation(CPP, fits=_fits)
-def _compiled(marched: March, density: GridDensity, color: GridColor, pixels: Pixels, thin: float = 0.0) -> TracedError:
+def _compiled(
+    marched: March, density: GridDensity, color: GridColor, pixels: PixelTargets, thin: float = 0.0
+) -> TracedError:
     background, target, weights = (None if tensor is None else tensor.contiguous() for tensor in pixels)
     assert background is not None
     assert target is not None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from framework.fields.base import Field, HasGridColor
 from framework.geometry.rays import Rays
-from framework.kernels.traced_error import Pixels, TracedError, traced_error
+from framework.kernels.traced_error import PixelTargets, TracedError, traced_error
 from framework.rendering.renderer import Renderer
 from framework.rendering.volume import VolumeRenderer
 from framework.samplers.base import Sampler
@@ -12,7 +12,7 @@ from framework.samplers.occupancy import OccupancySampler
 
 
 def error_of_traced(
-    rays: Rays, pixels: Pixels, sampler: Sampler, field: Field, renderer: Renderer, thin: float = 0.0
+    rays: Rays, pixels: PixelTargets, sampler: Sampler, field: Field, renderer: Renderer, thin: float = 0.0
 ) -> TracedError | None:
     """Return the mean squared error of pixels in training mode, by `traced_error`.
 

@@ -221,7 +221,16 @@ class OccupancySampler(Sampler):
         return _attached(samples, surface, *evaluated.choose(order, chosen))
 
     def begin(self, rays: Rays, jitter: bool, early_stop: float) -> March:
-        """Return the march of `rays`, before its first wave; parameters and errors are as in `sample`."""
+        """Return a march before its first wave.
+
+        Args:
+            rays: R rays; they must not require a gradient.
+            jitter: True to start each ray at a random fraction of a step, False to start at 0.
+            early_stop: transmittance below which the rest of a ray is dropped.
+
+        Raises:
+            ValueError: if the rays require a gradient, which marched samples do not have.
+        """
         if is_followed(rays.origins, rays.directions):
             raise ValueError("marched samples carry no gradient to rays: detach these, or take a ProposalSampler")
         shift = torch.rand(len(rays), device=rays.origins.device) if jitter else None

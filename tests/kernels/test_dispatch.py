@@ -48,7 +48,7 @@ from framework.kernels.splat_tiles import TILES, tile_lists
 from framework.kernels.ssim import PHOTOMETRIC, STRUCTURE
 from framework.kernels.step_functions import BLURRED_EXCESS
 from framework.kernels.trace import TRACE, GridDensity
-from framework.kernels.traced_error import TRACED_ERROR, GridColor, Pixels
+from framework.kernels.traced_error import TRACED_ERROR, GridColor, PixelTargets
 from tests.kernels.compiled import needs_kernels
 
 GRID = HashGridLayout.build(3, 4, 20, 8)
@@ -164,7 +164,7 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     SORT_BY_RAY: lambda: (torch.randint(5, (30,)), torch.randint(2, (30,), dtype=torch.uint8), 5),
     MARCH: lambda: (rays(), Occupancy(torch.rand(16**3) < 0.1, BOX, 16), 0.05, 0.0, None, 1e-3),
     TRACE: lambda: (marched(), grid_density()),
-    TRACED_ERROR: lambda: (marched(), grid_density(), grid_color(), Pixels(rand(100, 3), rand(25, 3), rand(25))),
+    TRACED_ERROR: lambda: (marched(), grid_density(), grid_color(), PixelTargets(rand(100, 3), rand(25, 3), rand(25))),
     REFRESH_OCCUPANCY: lambda: (torch.rand(200) * 0.4, torch.zeros(200, dtype=torch.bool), 0.9, 0.05, 0.01),
     OPAQUE_SUMS: lambda: (torch.rand(7, 9) > 0.5,),
     HOLD_BALLS: lambda: (photograph(), torch.rand(200, 3) * 2 - 1, 0.05, torch.rand(200) > 0.5, True),

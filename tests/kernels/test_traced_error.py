@@ -17,7 +17,7 @@ from framework.kernels.trace import GridDensity, trace
 from framework.kernels.traced_error import (
     TRACED_ERROR,
     GridColor,
-    Pixels,
+    PixelTargets,
     TracedError,
     traced_error,
     traced_error_reference,
@@ -75,10 +75,10 @@ def marched(case: Case, lines: Rays) -> March:
     return march(lines, occupancy, 0.02, 0.01 if case.levels > 1 else 0.0, torch.rand(len(lines)), case.stop)
 
 
-def pixels_of(case: Case) -> Pixels:
+def pixels_of(case: Case) -> PixelTargets:
     torch.manual_seed(5)
     count = case.rays // case.rays_per_pixel
-    return Pixels(torch.rand(case.rays, 3), torch.rand(count, 3), torch.rand(count) if case.weighted else None)
+    return PixelTargets(torch.rand(case.rays, 3), torch.rand(count, 3), torch.rand(count) if case.weighted else None)
 
 
 def parts(field: EncodedField) -> tuple[GridDensity, GridColor]:

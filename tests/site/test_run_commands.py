@@ -104,7 +104,6 @@ def test_it_runs_to_its_end(command: str, folder: Path, monkeypatch: pytest.Monk
         assert (folder / "outputs/all").exists()
 
 
-
 @pytest.mark.parametrize("command", shown("ns-viewer"))
 def test_the_viewer_answers(command: str, folder: Path) -> None:
     """It serves its page until it is told to stop."""

@@ -114,13 +114,8 @@ def test_the_viewer_answers(command: str, folder: Path) -> None:
     words = [word for word in words_of(RUN.sub(r"outputs/all/\1/TIME", command)) if not word.startswith("--websocket")]
     words = [word for word in words if word not in ("0.0.0.0", "8080")]
     program = [sys.executable, "-m", "framework.cli.viewer", *words[1:], "--websocket-port", port]
-    viewer = subprocess.Popen(
-        program,
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-    )
+    where = {**os.environ, "PYTHONPATH": str(ROOT)}
+    viewer = subprocess.Popen(program, cwd=folder, env=where, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     try:
         for _ in range(240):
             time.sleep(0.25)

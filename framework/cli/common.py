@@ -8,7 +8,7 @@ import platform
 import sys
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import framework
 from framework.base.console import console, say
@@ -96,9 +96,10 @@ def with_format(command: str, arguments: list[str]) -> tuple[list[str], tuple[st
         return arguments, None
     from framework.base.registry import load_dataparser
 
-    parser, others = read_flags(
+    found: Any = read_flags(
         load_dataparser(word), f"{command} {word}", arguments[index + 1 :], return_unknown_args=True
     )
+    parser, others = found
     return arguments[:index] + others, (word, parser)
 
 

@@ -48,7 +48,8 @@ def _command(arguments: list[str]) -> None:
         raise FlagError(answer)
     words, named = with_format(f"ns-render {name}", with_run(rest, {"--rendered-output-names": get_args(OutputName)}))
     options = (tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes)
-    _render(name, read_flags(path, f"ns-render {name}", words, config=options), named)
+    flags: Any = read_flags(path, f"ns-render {name}", words, config=options)
+    _render(name, flags, named)
 
 
 def _render(name: str, flags: Flags, named: DataFormat | None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from contextlib import nullcontext
@@ -293,5 +294,12 @@ def _statistics(rows: list[dict[str, Any]]) -> dict[str, float | None]:
     for name in ("psnr", "ssim", "ms_ssim", "lpips", "floaters"):
         values = [row[name] for row in rows if row[name] is not None]
         statistics[name] = fmean(values) if values else None
-        statistics[f"{name}_std"] = (stdev(values) if len(values) > 1 else 0.0) if values else None
+        statistics[f"{name}_std"] = _deviation(values) if values else None
     return statistics
+
+
+def _deviation(values: list[float]) -> float:
+    """Return the standard deviation, NaN if a value is not finite, of which `stdev` fails with another error."""
+    if not all(map(math.isfinite, values)):
+        return math.nan
+    return stdev(values) if len(values) > 1 else 0.0

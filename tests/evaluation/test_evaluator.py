@@ -1,5 +1,6 @@
 """Pictures: pixels as means over their area, whatever the chunks."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -171,3 +172,19 @@ def test_pictures_are_of_views_evenly_spaced(shared_tiny: Path, tmp_path: Path) 
     assert written == {0, len(images) // 2}
     evaluate(trainer.model, images, max_images=2, pictures=tmp_path / "none", max_pictures=0)
     assert not (tmp_path / "none").exists()
+
+
+def test_a_picture_that_is_not_finite_has_metrics_that_are_not(shared_tiny: Path, tmp_path: Path) -> None:
+    """As of a pose that is NaN: the evaluation ends, and says so in its figures."""
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", evaluated=True)
+    assert trainer.eval_set is not None
+    poses = trainer.eval_set.cameras.camera_to_worlds.clone()
+    poses[0] = torch.nan
+    pictures = trainer.model.render_view
+    trainer.model.render_view = lambda view, background: (  # type: ignore[method-assign]
+        replace(found := pictures(view, background), rgb=found.rgb + view.camera.camera_to_worlds.sum() * 0)
+    )
+    cameras = replace(trainer.eval_set.cameras, camera_to_worlds=poses)
+    found = evaluate(trainer.model, replace(trainer.eval_set, cameras=cameras)).results
+    assert math.isnan(found["psnr"])
+    assert math.isnan(found["psnr_std"])

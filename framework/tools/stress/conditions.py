@@ -102,7 +102,13 @@ CONDITIONS = (
     Condition("all-white", "white opaque photographs", _both(lambda d: plain_colored(d, 255))),
     Condition("all-black", "black opaque photographs", _both(lambda d: plain_colored(d, 0))),
     Condition("all-transparent", "photographs of nothing, alpha 0", _both(transparent)),
-    Condition("one-image", "a single photograph", _train(first_image), reason="it says little of the other sides"),
+    Condition(
+        "one-image",
+        "a single photograph",
+        _train(first_image),
+        reason="it says little of the other sides",
+        may_refuse=True,
+    ),
     Condition(
         "one-pixel-images",
         "photographs of one pixel",

@@ -103,7 +103,8 @@ def test_a_long_run_of_equal_gradients_takes_equal_steps(backend: str, seen: flo
 
 @pytest.mark.entry(3)
 def test_counts_and_means_after_a_hundred_thousand_steps() -> None:
-    run, error = SimpleNamespace(state=State(), _unread=[]), torch.tensor(0.01, dtype=torch.float64)
+    run = SimpleNamespace(state=State(), _unread=[], _count_bad=lambda step, finite: None)
+    error = torch.tensor([0.01, 1], dtype=torch.float64)  # and that it is finite
     for done in range(1, 100_001):
         Trainer._account(run, 4097, 3 * 4097, 1e-3)  # type: ignore[arg-type]
         run._unread.append(error)

@@ -264,7 +264,7 @@ def test_what_is_near_a_camera_learns_little(
         given.append((samples, factors))
         return shade(rays, samples, field, background, factors)
 
-    monkeypatch.setattr("methods._captures.shade", noted)
+    monkeypatch.setattr("framework.rendering.volume.shade", noted)
     trainer.train_step()
     ((samples, factors),) = given
     half = float((trainer.model.scene.box[1] - trainer.model.scene.box[0])[0]) / 2

@@ -26,7 +26,7 @@ torch.set_num_threads(1)
 
 
 def pytest_configure() -> None:
-    """What is imported and collected stays: looking for garbage in it would take half of the time."""
+    """What is imported and collected stays: looking for garbage in it would take a third of the time."""
     gc.disable()
 
 

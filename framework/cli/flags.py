@@ -5,13 +5,12 @@ from __future__ import annotations
 import io
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import redirect_stderr
-from typing import Any, TypeVar
+from typing import Any
 
 from framework.base.errors import FlagError
 
-K = TypeVar("K")
 FRAME = "╭╮╰╯│─"
 """What tyro draws boxes and rules with, unless the terminal has only ASCII."""
 EDGE = re.compile("^[╭│ ][─ ]")
@@ -28,11 +27,11 @@ PHRASES = (
 """What tyro says of a value, and how it is said here."""
 
 
-def read_flags(kind: type[K] | Callable[..., K], prog: str, arguments: list[str], **options: Any) -> K:
+def read_flags(kind: Any, prog: str, arguments: list[str], **options: Any) -> Any:
     """Return settings that are read from the arguments of a command.
 
     Args:
-        kind: the class of the settings.
+        kind: the class of the settings, or several joined by `|`.
         prog: the command with what it does, for its help: "ns-render orbit".
         arguments: the arguments, without what `prog` names.
         options: further arguments of `tyro.cli`. Flags of booleans have a value if `config` is not among them.

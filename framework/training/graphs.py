@@ -93,7 +93,7 @@ class CudaRecorder:
 
 @dataclass
 class _Kind(Generic[T]):
-    """What is known of a kind of step."""
+    """A kind of step: how many of it were taken, and its recording."""
 
     taken: int = 0
     """Number of steps that were taken to warm up."""

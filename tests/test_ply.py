@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from framework.base.errors import DataError
-from framework.data.ply import read_points
+from framework.data.ply import read_points, write_points
 
 POINTS = [(1.0, 2.0, 3.0), (-0.5, 0.25, 1e3)]
 EXPECTED = torch.tensor(POINTS, dtype=torch.float64)
@@ -82,3 +82,25 @@ def test_bad_files_are_refused_in_one_line(tmp_path: Path, name: str) -> None:
 def test_no_file(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="cannot read"):
         read_points(tmp_path / "none.ply")
+
+
+@pytest.mark.parametrize("normals", [None, torch.tensor([[0.0, 0.6, -0.8], [1.0, 0.0, 0.0]])])
+def test_written_numbers_stand_under_their_own_names(tmp_path: Path, normals: torch.Tensor | None) -> None:
+    """By the format's definition: a line of the header for each property, in the order of the numbers."""
+    colors = torch.tensor([[1.0, 0.5, 0.0], [-0.1, 0.2, 1.3]])
+    file = tmp_path / "points.ply"
+    write_points(file, EXPECTED.float(), colors, normals)
+    head, _, body = file.read_bytes().partition(b"end_header\n")
+    lines = [line.split() for line in head.decode().splitlines()]
+    assert lines[:3] == [["ply"], ["format", "binary_little_endian", "1.0"], ["element", "vertex", "2"]]
+    properties = [words[1:] for words in lines[3:]]
+    row = struct.Struct("<" + "".join({"float": "f", "uchar": "B"}[kind] for kind, _ in properties))
+    assert len(body) == 2 * row.size
+    rows = [dict(zip([name for _, name in properties], values, strict=True)) for values in row.iter_unpack(body)]
+    bytes_of = [(255, 128, 0), (0, 51, 255)]
+    for number, found in enumerate(rows):
+        expected = dict(zip("xyz", POINTS[number], strict=True))
+        expected |= dict(zip(("red", "green", "blue"), bytes_of[number], strict=True))
+        if normals is not None:
+            expected |= dict(zip(("nx", "ny", "nz"), normals[number].tolist(), strict=True))
+        assert found == expected

@@ -55,6 +55,22 @@ def gradients(field: EncodedField, samples: Samples, factors: Tensor) -> list[Te
     return [own, *(weight.grad for weight in field.density_head.parameters())]
 
 
+def rounding(field: EncodedField, lines: Rays, samples: Samples) -> Tensor:
+    """(N, 17) by how much the logarithm of the density and the features may differ in bfloat16.
+
+    Traces and waves round positions differently, in the last bit of float32: one multiplies and adds in C++, which
+    rounds once or twice as the compiler likes, the other in torch. So an input or an activation that stands near the
+    middle between two numbers of bfloat16 can become either, and these are up to 2^-7 of it apart. The bound is that
+    all of them do, and all add up. Most values are no such case and agree far better.
+    """
+    with torch.no_grad():
+        first, second = field.density_head.parameters()
+        inputs = field.encode(samples.positions(lines), None)
+        hidden = (inputs @ first.T).relu()
+        apart = 2**-7 * (inputs.abs() @ first.abs().T + hidden) @ second.abs().T
+        return torch.cat([apart[:, :1], apart], -1)
+
+
 @needs_kernels
 @pytest.mark.parametrize("bfloat16", [False, True])
 @pytest.mark.parametrize(
@@ -72,13 +88,16 @@ def test_a_trace_is_what_waves_give(count: int, stop: float, sparse: bool, featu
             samples = sampler.sample(lines, field, jitter=True)
         found.append((samples, gradients(field, samples, factors)))
     (traced, own), (waves, expected) = found
-    for name in ("t_starts", "t_ends", "offsets", "owners", "sigma", "features"):
-        torch.testing.assert_close(
-            getattr(traced, name),
-            getattr(waves, name),
-            rtol=2e-2 if bfloat16 else 2e-4,
-            atol=1e-3 if bfloat16 else 2e-5,
-        )
+    for name in ("t_starts", "t_ends", "offsets", "owners"):
+        torch.testing.assert_close(getattr(traced, name), getattr(waves, name), rtol=2e-4, atol=2e-5)
+    ours, theirs = (torch.cat([s.sigma.log()[:, None], s.features], -1).detach() for s in (traced, waves))
+    off = (ours - theirs).abs()
+    close = off <= (1e-3 + 2e-2 * theirs.abs() if bfloat16 else 2e-5 + 2e-4 * theirs.abs())
+    if bfloat16:
+        assert bool((off <= rounding(fields(sparse, features)[0], lines, waves)).all())
+        assert float((~close).double().mean()) < 1e-4  # 4e-5 where the compiler multiplies and adds in two steps
+    else:
+        assert bool(close.all())
     for ours, theirs in zip(own, expected, strict=True):
         assert float((ours - theirs).norm()) <= (1e-2 if bfloat16 else 1e-4) * float(theirs.norm())
     assert len(traced) > count / 2

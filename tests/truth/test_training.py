@@ -26,6 +26,7 @@ from framework.rendering.rendered import Rendered
 from framework.rendering.volume import shade, volume_render
 from framework.samplers.choice import SamplingConfig, make_sampler
 from framework.samplers.occupancy import OccupancySampler
+from framework.training.checkpoint import load_checkpoint
 from framework.training.trainer import Trainer
 from tests.test_nerfacto import captured
 from tests.training.helpers import tiny_trainer
@@ -58,6 +59,26 @@ def test_the_rate_falls_over_the_budget_that_is_further_spent(
     }[schedule]
     assert [group["lr"] for group in trainer.optimizer.param_groups] == pytest.approx(
         [0.02 * factor] * len(trainer.optimizer.param_groups), rel=1e-4
+    )
+
+
+@pytest.mark.parametrize("given", [0.02, 0.005])
+def test_a_resumed_run_goes_on_from_the_first_rate_that_its_settings_say(
+    given: float, shared_tiny: Path, tmp_path: Path
+) -> None:
+    """Not from the rate that had fallen when it was saved; and a rate given anew counts from there on."""
+    settings: dict[str, Any] = {
+        "max_num_iterations": 100, "lr_schedule": "exponential", "lr_final": 0.01, "silhouette_cells": False,
+        "samples_per_batch": 256,
+    }  # fmt: skip
+    saved = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "saved", learning_rate=0.02, **settings)
+    saved.state.step = 59
+    saved.train_step()
+    resumed = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "resumed", learning_rate=given, **settings)
+    resumed.restore(load_checkpoint(saved.save()))
+    resumed.train_step()
+    assert [group["lr"] for group in resumed.optimizer.param_groups] == pytest.approx(
+        [given * 0.01**0.6] * len(resumed.optimizer.param_groups), rel=1e-5
     )
 
 

@@ -11,11 +11,15 @@ import torch
 from scipy.linalg import expm
 from torch import Tensor
 
+from dataparsers.polycam import Polycam
 from framework.export.points import joined, surface_points
 from framework.geometry.rays import Rays
 from framework.rendering.volume import Rendered
-from framework.training.checkpoint import FOLDER, load_newest
-from tests.training.helpers import tiny_trainer
+from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest
+from framework.training.datasets import load_split
+from framework.training.run import create_folder
+from framework.training.trainer import Trainer
+from tests.training.helpers import tiny_run, tiny_trainer
 from tests.truth.ball import COUNT, HELD_OUT, NAMES, pose_of
 from tests.truth.formats import write_polycam
 from tests.truth.test_run import command
@@ -53,6 +57,21 @@ def test_refined_cameras_are_exported_where_they_are_believed_to_be(tmp_path: Pa
         turn = placed.T @ expm(generator(tangent[3:])) @ placed
         np.testing.assert_allclose(found[:, :3], turn @ given[:3, :3], atol=1e-5)
         np.testing.assert_allclose(found[:, 3], given[:3, 3] + placed.T @ tangent[:3] / scale, atol=1e-5)
+
+
+def test_a_checkpoint_tells_where_its_scene_lies_in_the_captures_frame(tmp_path: Path) -> None:
+    """By its transform and scale, with which every export begins, the cameras stand where the photographs were taken."""
+    still = tiny_run("instant-ngp", write_polycam(tmp_path / "ball"), tmp_path / "run")
+    run = replace(still, dataparser="polycam", parser=Polycam())
+    create_folder(run)
+    trainer = Trainer(run, load_split(run, "train"), None)
+    content = load_checkpoint(trainer.save())
+    transform, scale = content["transform"].double().numpy(), content["scale"]
+    places = trainer.train_set.cameras.camera_to_worlds[:, :, 3].double().numpy()
+    found = (places / scale - transform[:, 3]) @ transform[:, :3]
+    truth = np.stack([pose_of(NAMES.index(name))[:3, 3] for name in trainer.train_set.names])
+    np.testing.assert_allclose(found, truth, atol=1e-5)
+    assert abs(scale - 1) > 0.1
 
 
 @pytest.mark.parametrize("reach", [None, 0.5])

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from framework.base.config import TrainConfig
+from framework.encodings.hash_grid import HashGrid
 from framework.training.optim import Adam, learning_rate_factor
 
 
@@ -86,3 +87,21 @@ def test_a_state_of_other_groups_is_refused_and_changes_nothing() -> None:
     with pytest.raises(KeyError):
         optimizer.load_state_dict({**optimizer.state_dict(), "state": {}})
     assert optimizer.state is before
+
+
+def test_a_gradient_that_no_step_took_is_gone_at_the_next() -> None:
+    """Of a step that was dropped, also where the gradient of a table is kept for the optimiser."""
+    torch.manual_seed(0)
+    encoding = HashGrid(3, 2, 4, 16, 8, True)
+    deferred = {} if encoding.deferred is None else {encoding.table: encoding.deferred}
+    optimizer = Adam([{"params": [encoding.table], "sparse": True}], deferred, 0.1, (0.9, 0.99), 1e-8)
+    encoding(torch.rand(20, 3)).sum().backward()
+    assert optimizer.has_gradient(encoding.table)
+    before = encoding.table.detach().clone()
+    optimizer.zero_grad()
+    assert not optimizer.has_gradient(encoding.table)
+    optimizer.step()
+    assert torch.equal(encoding.table, before)
+    encoding(torch.rand(20, 3)).sum().backward()
+    optimizer.step()
+    assert not torch.equal(encoding.table, before)

@@ -24,7 +24,9 @@ from framework.data.pixel_cache import PixelMemory
 from framework.data.pixel_stream import PixelStream
 from framework.data.pixels import draw_batch
 from framework.data.sources import Request, ViewSource
+from framework.training import mean_gradients as averaging
 from framework.training.checkpoint import FOLDER, load_newest
+from framework.training.optim import Adam
 from framework.training.run import read_run
 from tests.cli.helpers import command
 from tests.faults import runs
@@ -100,6 +102,22 @@ def two(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory, forks: Fork
     said = [process.stderr for process in both]
     assert [process.returncode for process in both] == [0, 0], said
     return Two(folder, [torch.load(folder / f"{rank}.pt", weights_only=True) for rank in range(COUNT)], said)
+
+
+def test_large_gradients_are_averaged_as_small_ones_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Adam takes no notice of a factor, so that no run would tell; the other process has three times our gradients."""
+    torch.manual_seed(0)
+    small, large = (torch.nn.Parameter(torch.zeros(shape)) for shape in ((3,), (8, 2)))
+    optimizer = Adam([{"params": [small, large]}], {}, 1e-2, (0.9, 0.99), 1e-8)
+    own = [torch.randn_like(parameter) for parameter in (small, large)]
+    small.grad, large.grad = (gradient.clone() for gradient in own)
+    monkeypatch.setattr(averaging, "LARGE", 16)
+    monkeypatch.setattr(averaging, "processes", lambda: Processes(0, COUNT))
+    monkeypatch.setattr(averaging, "gathered", lambda ours: [ours] * COUNT)
+    monkeypatch.setattr(averaging, "add_up", lambda ours: ours.mul_(4))
+    assert averaging.mean_gradients(optimizer, True)
+    for parameter, gradient in zip((small, large), own, strict=True):
+        torch.testing.assert_close(parameter.grad, 2 * gradient)
 
 
 @pytest.mark.medium

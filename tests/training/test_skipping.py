@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from framework.training.skipping import Rung, lines, skip_report
+from tests.conftest import write_tiny
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 
 
@@ -53,6 +54,26 @@ def test_every_switch_switches(shared_tiny: Path, tmp_path: Path) -> None:
     cells_only.train()
     assert bool(cells_only.model.sampler.carved.any())
     assert cells_only.train_set.drawn is None
+
+
+def test_pixels_that_are_not_drawn_see_cells_alone_that_are_empty(tmp_path: Path) -> None:
+    """Along their rays, step by step, there is no cell left; and what is opaque is drawn."""
+    data = write_tiny(tmp_path / "ball", 64)
+    trainer = tiny_trainer("instant-ngp", data, tmp_path / "run", grid_resolution=64)
+    trainer.prepare()
+    dataset, sampler, drawn = trainer.train_set, trainer.model.sampler, trainer.train_set.drawn
+    assert drawn is not None
+    left = torch.ones(len(dataset.pixels), dtype=torch.bool)
+    left[drawn.pixels()] = False
+    assert not bool((left & (dataset.pixels[:, 3] == 255)).any())
+    assert 0.01 < float(left.float().mean()) < 0.5
+    rays = dataset.cameras.pixel_rays(left.nonzero().squeeze(-1), 2.0, 6.0)
+    points = rays.origins[:, None] + torch.linspace(2, 6, 800)[:, None] * rays.directions[:, None]
+    unit = (points - sampler.box[0]) / (sampler.box[1] - sampler.box[0])
+    inside = ((unit >= 0) & (unit < 1)).all(-1)
+    cells = (unit[inside] * 64).long()
+    assert len(cells) > 1000
+    assert bool(sampler.carved[(cells[:, 0] * 64 + cells[:, 1]) * 64 + cells[:, 2]].all())
 
 
 def test_methods_that_skip_nothing_report_nothing(shared_tiny: Path, tmp_path: Path) -> None:

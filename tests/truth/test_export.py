@@ -12,23 +12,19 @@ from scipy.linalg import expm
 from torch import Tensor
 
 from dataparsers.polycam import Polycam
-from framework.export.points import joined, surface_points
+from framework.export.points import SurfacePoints, joined, surface_points
 from framework.geometry.rays import Rays
 from framework.rendering.volume import Rendered
-from framework.training.checkpoint import FOLDER, load_checkpoint, load_newest
+from framework.training.checkpoint import load_checkpoint
 from framework.training.datasets import load_split
 from framework.training.run import create_folder
 from framework.training.trainer import Trainer
 from tests.training.helpers import tiny_run, tiny_trainer
-from tests.truth.ball import COUNT, HELD_OUT, NAMES, pose_of
+from tests.truth.ball import CENTRE, COUNT, HELD_OUT, NAMES, RADIUS, pose_of, surface
 from tests.truth.formats import write_polycam
-from tests.truth.test_run import command
+from tests.truth.test_run import command, read_cloud
 
-TINY = (
-    "--num-levels", 3, "--max-resolution", 32, "--log2-table-size", 10, "--num-proposal-samples", 12,
-    "--num-nerf-samples", 8, "--num-rays-per-batch", 128, "--max-num-iterations", 6, "--max-eval-images", 0,
-    "--camera-learning-rate", 0.01, "--vis", "none",
-)  # fmt: skip
+CHANNELS = ("red", "green", "blue")
 
 
 def generator(vector: np.ndarray) -> np.ndarray:
@@ -37,21 +33,35 @@ def generator(vector: np.ndarray) -> np.ndarray:
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
-@pytest.mark.medium
-def test_refined_cameras_are_exported_where_they_are_believed_to_be(tmp_path: Path) -> None:
-    """A device's poses, in its own frame and metres, each with the motion that the run has learnt for it."""
-    data = write_polycam(tmp_path / "ball")
-    command("ns-train", "nerfacto", "--data", data, "--output-dir", tmp_path, "--timestamp", "t", *TINY)
-    run = tmp_path / "ball" / "nerfacto" / "t"
-    command("ns-export", "cameras", "--load-config", run / "config.yml", "--output-dir", tmp_path)
+@pytest.fixture
+def untrained(tmp_path: Path) -> Trainer:
+    """A run of no step on the ball as a device has it, in another frame and unit than its scene."""
+    still = tiny_run("nerfacto", write_polycam(tmp_path / "ball"), tmp_path / "run")
+    run = replace(still, dataparser="polycam", parser=Polycam())
+    create_folder(run)
+    return Trainer(run, load_split(run, "train"), None)
+
+
+def test_a_checkpoint_tells_where_its_scene_lies_in_the_captures_frame(untrained: Trainer) -> None:
+    """By its transform and scale, with which every export begins, cameras stand where photographs were taken."""
+    content = load_checkpoint(untrained.save())
+    transform, scale = content["transform"].double().numpy(), content["scale"]
+    places = untrained.train_set.cameras.camera_to_worlds[:, :, 3].double().numpy()
+    found = (places / scale - transform[:, 3]) @ transform[:, :3]
+    truth = np.stack([pose_of(NAMES.index(name))[:3, 3] for name in untrained.train_set.names])
+    np.testing.assert_allclose(found, truth, atol=1e-5)
+    assert abs(scale - 1) > 0.1
+
+
+def test_refined_cameras_are_exported_where_they_are_believed_to_be(untrained: Trainer, tmp_path: Path) -> None:
+    """In the device's frame and metres, each with the motion in the scene that was learnt for it."""
+    tangents = 0.1 * torch.randn(COUNT - len(HELD_OUT), 6, generator=torch.Generator().manual_seed(0))
+    untrained.model.load_state_dict({"poses.tangents": tangents}, strict=False)
+    untrained.save()
+    command("ns-export", "cameras", "--load-config", tmp_path / "run" / "config.yml", "--output-dir", tmp_path)
     listed = json.loads((tmp_path / "transforms_train.json").read_text())
-    content = load_newest(run / FOLDER)
-    assert content is not None
-    placed, scale = content["transform"].double().numpy()[:, :3], content["scale"]
-    tangents = content["model"]["poses.tangents"].double().numpy()
-    assert np.abs(tangents).min() > 1e-3
-    assert len(listed) == len(tangents) == COUNT - len(HELD_OUT)
-    for row, tangent in zip(listed, tangents, strict=True):
+    placed, scale = untrained.train_set.transform.double().numpy()[:, :3], untrained.train_set.scale
+    for row, tangent in zip(listed, tangents.double().numpy(), strict=True):
         given = pose_of(NAMES.index(row["file_path"]))
         found = np.array(row["transform"])
         turn = placed.T @ expm(generator(tangent[3:])) @ placed
@@ -59,19 +69,28 @@ def test_refined_cameras_are_exported_where_they_are_believed_to_be(tmp_path: Pa
         np.testing.assert_allclose(found[:, 3], given[:3, 3] + placed.T @ tangent[:3] / scale, atol=1e-5)
 
 
-def test_a_checkpoint_tells_where_its_scene_lies_in_the_captures_frame(tmp_path: Path) -> None:
-    """By its transform and scale, with which every export begins, the cameras stand where the photographs were taken."""
-    still = tiny_run("instant-ngp", write_polycam(tmp_path / "ball"), tmp_path / "run")
-    run = replace(still, dataparser="polycam", parser=Polycam())
-    create_folder(run)
-    trainer = Trainer(run, load_split(run, "train"), None)
-    content = load_checkpoint(trainer.save())
-    transform, scale = content["transform"].double().numpy(), content["scale"]
-    places = trainer.train_set.cameras.camera_to_worlds[:, :, 3].double().numpy()
-    found = (places / scale - transform[:, 3]) @ transform[:, :3]
-    truth = np.stack([pose_of(NAMES.index(name))[:3, 3] for name in trainer.train_set.names])
-    np.testing.assert_allclose(found, truth, atol=1e-5)
-    assert abs(scale - 1) > 0.1
+def test_exported_points_normals_and_colours_are_in_the_captures_frame(
+    untrained: Trainer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a run that finds the ball, in its scene's frame and unit: a point is its normal times the radius away."""
+    truth = surface(50)
+    normals = (truth - CENTRE) / RADIUS
+    transform, scale = untrained.train_set.transform.double().numpy(), untrained.train_set.scale
+    in_scene = scale * (truth @ transform[:, :3].T + transform[:, 3])
+    as_tensors = [torch.from_numpy(x).float() for x in (in_scene, 0.5 + 0.4 * normals, normals @ transform[:, :3].T)]
+    found = SurfacePoints(*as_tensors, -as_tensors[2], torch.arange(50))
+    monkeypatch.setattr("framework.export.points.surface_points", lambda *_: iter([found]))
+    untrained.save()
+    command(
+        "ns-export", "pointcloud", "--load-config", tmp_path / "run" / "config.yml", "--output-dir", tmp_path,
+        "--remove-outliers", False, "--estimate-normals", False,
+    )  # fmt: skip
+    cloud = read_cloud(tmp_path / "point_cloud.ply")
+    columns = [[cloud[name].astype(float) for name in names] for names in ("xyz", ("nx", "ny", "nz"), CHANNELS)]
+    positions, directions, colors = (np.stack(column, -1) for column in columns)
+    np.testing.assert_allclose(positions, truth, atol=1e-5)
+    np.testing.assert_allclose(directions, normals, atol=1e-5)
+    np.testing.assert_allclose(colors / 255, 0.5 + 0.4 * normals, atol=0.51 / 255)
 
 
 @pytest.mark.parametrize("reach", [None, 0.5])

@@ -188,3 +188,12 @@ def test_a_picture_that_is_not_finite_has_metrics_that_are_not(shared_tiny: Path
     found = evaluate(trainer.model, replace(trainer.eval_set, cameras=cameras)).results
     assert math.isnan(found["psnr"])
     assert math.isnan(found["psnr_std"])
+
+
+def test_speeds_are_of_images_and_of_their_rays(shared_tiny: Path, tmp_path: Path) -> None:
+    """In the same time: an image has 20 x 20 pixels of four rays."""
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", evaluated=True, rays_per_pixel=4)
+    found = evaluate(trainer.model, trainer.eval_set)
+    seconds = sum(row["seconds"] for row in found.per_image)
+    assert found.results["fps"] == pytest.approx(len(found.per_image) / seconds, rel=1e-3)
+    assert found.results["num_rays_per_sec"] == pytest.approx(1600 * found.results["fps"], rel=1e-3)

@@ -167,6 +167,26 @@ def test_light_is_found_on_the_half_that_is_not_judged(lit: Trainer) -> None:
         assert torch.equal(shown(lit, masked[0]), shown(lit, masked[1]))
 
 
+def test_light_is_looked_for_left_of_the_middle_where_no_mask_is(lit: Trainer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """NeRF-W's protocol: the right half is judged."""
+    given: list[Tensor] = []
+
+    def noted(model: object, dataset: object, pixels: Tensor, background: Tensor) -> None:
+        given.append(pixels)
+
+    monkeypatch.setattr("framework.evaluation.appearance.fit_appearance", noted)
+    columns = torch.arange(len(lit.train_set.pixels)) % 20  # of images of 20 x 20 pixels
+    left, unmasked = columns < 10, (columns < 3) | (columns >= 5) & (columns < 10)
+    masked = changed(lit.train_set, 3, 5, kept=True)
+    for index, dataset, wanted in ((0, lit.train_set, left), (2, lit.train_set, left), (0, masked, unmasked)):
+        with fitted_appearance(lit.model, dataset, index, torch.ones(3)):
+            pass
+        seen = torch.zeros(len(columns), dtype=torch.bool)
+        seen[given[-1]] = True
+        of_image = torch.arange(len(columns)) // 400 == index
+        assert torch.equal(seen, of_image & wanted)
+
+
 @pytest.mark.usefixtures("_soon_fitted")
 def test_the_half_on_which_light_is_found_is_not_judged(lit: Trainer) -> None:
     """The figure is that of the right half of the very picture shown."""

@@ -291,6 +291,22 @@ def test_a_pixel_is_several_rays_from_the_share_of_the_budget_on_that_is_asked_f
     assert counts == [128] * 10  # fewer pixels, of as many rays
 
 
+def test_the_coarse_network_learns_by_its_own_colours(shared_tiny: Path, tmp_path: Path) -> None:
+    """NeRF, equation 6: the squared errors of both levels are added; what is drawn by the coarse one is no way back."""
+    trainer = tiny_trainer("vanilla-nerf", shared_tiny, tmp_path / "run")
+    model, batch = trainer.model.train(), draw_batch(trainer.train_set, 32, "black")
+    parameters = list(model.sampler.parameters())
+    torch.manual_seed(1)
+    found = torch.autograd.grad(model.loss(batch, 0).total, parameters)
+    torch.manual_seed(1)
+    coarse = model.render(batch.rays, batch.background).coarse
+    assert coarse is not None
+    expected = torch.autograd.grad((coarse.rgb - batch.rgb).square().mean(), parameters)
+    for ours, theirs in zip(found, expected, strict=True):
+        assert theirs.abs().max() > 0
+        torch.testing.assert_close(ours, theirs)
+
+
 # -- what nerfacto adds -------------------------------------------------------------------------------------------
 
 

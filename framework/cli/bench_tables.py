@@ -29,7 +29,7 @@ class TablesFlags:
     """Run none. rows: list them, and how long those that are missing will take. markdown: print the tables, with means
     over seeds."""
     seconds_scale: float = 1.0
-    """Factor of all budgets, such as 0.02 to try a table."""
+    """Factor of all budgets, such as 0.02 to try a table; then three held-out images of each row are judged."""
     run_dir: Path = Path("outputs/tables")
     """Folder of the runs, with the last checkpoint and some pictures of each."""
     output_dir: Path = RESULTS
@@ -58,7 +58,8 @@ def measure_tables(flags: TablesFlags) -> None:
     if flags.show == "markdown":
         print("\n\n".join(markdown(table, flags.output_dir, wanted) for table in tables))
         return
-    rows = [row for table in tables for row in table.rows if wanted.search(row.name)]
+    named = {row.name: row for table in tables for row in table.rows}  # tables may share rows
+    rows = [row for row in named.values() if wanted.search(row.name)]
     if not rows:
         raise FlagError(f"--only {shown(flags.only)}: no row has such a name; --show rows lists them")
     if flags.show == "rows":

@@ -83,7 +83,10 @@ def test_a_row_for_each_data_set_method_budget_and_seed(tmp_path: Path) -> None:
     assert words[words.index("--max-seconds") + 1] == "1.0"
     assert words[words.index("--machine.seed") + 1] == "42"
     assert words[-4:] == ["--num-scales", "2", "--downscale-factor", "2"]
-    assert "--max-images" not in planes.job.eval_command(planes.conditions)
+    assert planes.job.eval_command(planes.conditions)[-2:] == ["--max-images", "3"]
+    whole = read_table(tmp_path / "table.yml", tmp_path, tmp_path).rows[0]
+    assert whole.name == "ball-ngp-10s"
+    assert "--max-images" not in whole.job.eval_command(whole.conditions)
     assert "--data" not in embedded.job.train_command(embedded.conditions)
     assert len({row.job.folder for row in table.rows}) == 16
 

@@ -24,6 +24,8 @@ from framework.tools.comparison.plan import FIRST_SEED, Conditions, Contender, J
 from framework.training.report import SUMMARY
 from framework.training.run import write_json
 
+TRIED = 3
+"""Number of held-out images on which a trial, with other budgets than the table's, is judged."""
 Result = dict[str, Any]
 """The content of a row's file: what ns-eval writes, and how it was made, as `run`."""
 
@@ -87,7 +89,7 @@ def read_table(path: Path, root: Path, runs: Path, scale: float = 1.0) -> Table:
         path: its YAML file.
         root: folder of the folders of all data.
         runs: folder in which runs are kept.
-        scale: factor of all budgets.
+        scale: factor of all budgets; if not 1, the rows are trials.
 
     Raises:
         ConfigError: if the file is not a table, or names an unknown method.
@@ -122,9 +124,9 @@ def _rows(block: Any, where: str, root: Path, runs: Path, scale: float) -> Itera
         for data_name, place in data.items():
             for seconds in numbers.seconds:
                 for method_name, method in methods.items():
-                    conditions = _conditions(place, root, seconds * scale)
+                    conditions = _conditions(place, root, seconds * scale, None if scale == 1 else TRIED)
                     # Its label makes the folder of a run another one if flags of the method or of the data differ.
-                    contender = replace(Contender.of(method), label=f"{method} on {place}")
+                    contender = replace(Contender.of(method), label=f"{method} on {place or 'the embedded scene'}")
                     job = Job(contender, seed, runs / f"{seconds * scale:g}s")
                     yield Row(data_name, method_name, job, conditions)
 
@@ -136,8 +138,8 @@ def _texts(value: Any, where: str) -> dict[str, str]:
     raise ConfigError(f"{where} is {shown(value)}; it must have names with a text each")
 
 
-def _conditions(place: str, root: Path, seconds: float) -> Conditions:
-    """Return the conditions of a row: all cores, no learning curve, every held-out image."""
+def _conditions(place: str, root: Path, seconds: float, views: int | None) -> Conditions:
+    """Return the conditions of a row: all cores, and no learning curve."""
     words = split_words(place, "data")
     folder = words[0] if words and not words[0].startswith("--") else None
     return Conditions(
@@ -149,7 +151,7 @@ def _conditions(place: str, root: Path, seconds: float) -> Conditions:
         num_threads=None,
         device_type="auto",
         curve_images=0,
-        max_eval_images=None,
+        max_eval_images=views,
     )
 
 

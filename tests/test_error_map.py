@@ -66,6 +66,8 @@ def test_large_errors_are_drawn_more_often_as_stated(dataset: Dataset) -> None:
     expected = EVENLY * share + (1 - EVENLY)  # half evenly, half to the one square that is wrong
     assert bad[pixels].double().mean().item() == pytest.approx(expected, abs=0.01)
     assert weights.mean().item() == pytest.approx(1, abs=0.02)
+    by_hand = torch.where(bad[pixels], 1 / (EVENLY + (1 - EVENLY) / share), 1 / EVENLY)
+    torch.testing.assert_close(weights, by_hand.to(weights), rtol=1e-4, atol=0)
 
 
 def test_figures_follow_what_is_learnt_and_pass_over_what_is_not_finite(dataset: Dataset) -> None:

@@ -263,6 +263,25 @@ def test_a_camera_path_is_rendered_at_its_times_and_speed(
     assert iio.immeta(tmp_path / "a.gif")["duration"] == 250
 
 
+def test_pictures_of_another_camera_path_are_left_alone(ball_run: Path, tmp_path: Path) -> None:
+    """A path of as many frames, of the same size, under the same name."""
+    file, output = tmp_path / "path.json", tmp_path / "pictures"
+    words = ("camera-path", ball_run, "--camera-path-filename", file, "--output-path", output)
+
+    def done(away: float) -> int:
+        cameras = torch.eye(4, dtype=torch.float64)[:3].repeat(2, 1, 1)
+        cameras[:, 2, 3] = away
+        write_camera_path(file, CameraPath("perspective", 12, 8, cameras, torch.full((2,), 50.0), 0.5))
+        return called("ns-render", *words).returncode
+
+    assert done(4.0) == 0
+    before = {path.name: path.read_bytes() for path in output.iterdir() if path.is_file()}
+    assert len([name for name in before if name.endswith(".png")]) == 2
+    assert done(4.0) == 0
+    assert done(3.0) == 1
+    assert {path.name: path.read_bytes() for path in output.iterdir() if path.is_file()} == before
+
+
 def test_what_cannot_be_rendered_is_refused_at_once(ball_run: Path, tmp_path: Path, refused: Refused) -> None:
     def said(*words: object, status: int = 2) -> str:
         return refused(render_command.main, *words, "--output-path", tmp_path / "a.gif", status=status)

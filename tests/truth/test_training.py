@@ -18,6 +18,7 @@ from framework.data.pixels import PixelBatch, draw_batch
 from framework.data.scene import Scene
 from framework.data.sources import PixelSource, Request
 from framework.evaluation.appearance import fitted_appearance
+from framework.evaluation.error_bound import limited_error
 from framework.evaluation.evaluator import evaluate
 from framework.fields.base import Field
 from framework.geometry.points import Points
@@ -112,6 +113,22 @@ def test_rays_end_where_the_mode_says(training: bool, stop: float) -> None:
     samples = sampler.sample(rays, Fog(), False)
     tau = 10 * sampler.step_size
     assert samples.counts.tolist() == [math.ceil(-math.log(stop) / tau)] * count
+
+
+def test_rays_of_pictures_end_at_the_error_that_is_allowed() -> None:
+    """As many steps of a thick fog as let through more light than that; and as before afterwards."""
+    config = dataclasses.replace(load_method("instant-ngp").config, early_stop=1e-4, train_early_stop=1e-2)
+    config, _ = load_method("instant-ngp").decided(config, SCENE)
+    assert isinstance(config, SamplingConfig)
+    sampler = make_sampler(dataclasses.replace(config, num_steps=400, grid_resolution=8), SCENE).eval()
+    assert isinstance(sampler, OccupancySampler)
+    rays = Rays(torch.tensor([[-3.0, 0.1, 0.2]]), torch.tensor([[1.0, 0, 0]]), torch.zeros(1), torch.full((1,), 9.0))
+    model: Any = torch.nn.ModuleList([sampler])
+    for bound in (0.2, 1 / 255):
+        with limited_error(model, bound):
+            count = len(sampler.sample(rays, Fog(), False))
+        assert count == math.ceil(-math.log(bound) / (10 * sampler.step_size))
+    assert len(sampler.sample(rays, Fog(), False)) == math.ceil(-math.log(1e-4) / (10 * sampler.step_size))
 
 
 # -- light --------------------------------------------------------------------------------------------------------

@@ -127,7 +127,7 @@ def _probe(model: RayModel[Any], rays: Rays) -> tuple[float, int]:
     wait_for(model.device)
     seconds = time.perf_counter() - start
     model.train(was_training)
-    return seconds, rendered.num_samples
+    return seconds, int(rendered.num_samples)
 
 
 @contextmanager

@@ -24,6 +24,7 @@ from framework.kernels.triton_kernels import (
     adam,
     compositing,
     encodings,
+    fixed_march,
     hash_grid,
     intervals,
     launch,
@@ -122,6 +123,8 @@ def marching() -> None:
             wave = marched.wave(4)
         assert wave is not None
         marched.advance(torch.ones(len(wave.owners)))
+    filled = fixed_march.fill(random_rays(33), occupancy(8, 0.5), 0.1, 30, torch.rand(33), (0, 512))
+    fixed_march.reach(filled.placed, torch.rand(512), 4.6, 30)
 
 
 if __name__ == "__main__":

@@ -28,6 +28,8 @@ from framework.kernels.intervals import (
 )
 from framework.tools.benchmarks.ceilings import Ceilings, Work
 from framework.tools.benchmarks.compared import Kernel, of_function
+from framework.tools.benchmarks.kernel_errors import as_table
+from framework.tools.benchmarks.kernel_errors import measured as errors_of_all
 from framework.tools.benchmarks.kernels import Row, measured, on_any_device, table
 from framework.tools.comparison.measures import Curve
 from framework.tools.comparison.measures import Row as Compared
@@ -71,7 +73,14 @@ def measured_kernels(device: torch.device, samples: int, repeats: int) -> dict[s
             rows += measured(kernel, ceilings, repeats, 1)
     torch.set_num_threads(threads)
     console.print(table(rows))
-    return {"machine": machine(device), "ceilings": asdict(ceilings), "kernels": [_plain(row) for row in rows]}
+    found = errors_of_all(device)
+    console.print(as_table(found))
+    return {
+        "machine": machine(device),
+        "ceilings": asdict(ceilings),
+        "kernels": [_plain(row) for row in rows],
+        "errors": [asdict(error) for error in found],
+    }
 
 
 def _plain(row: Row) -> dict[str, Any]:

@@ -32,7 +32,7 @@ class GpuFlags:
     repeats: int = 9
     """Number of runs of each kernel, of which medians are reported."""
     steps: int = 200
-    """Number of training steps of nerfacto that are timed, as they are and as CUDA graphs."""
+    """Number of training steps of nerfacto and of instant-ngp that are timed, as they are and as CUDA graphs."""
     run_dir: Path | None = None
     """Folder of runs and report; outputs/bench-gpu-DATA if not given."""
     output_dir: Path = RESULTS

@@ -61,7 +61,8 @@ def share_out(counts: Tensor, capacity: int) -> Slots:
 
 @dataclass(frozen=True)
 class Placed:
-    """Intervals along rays in slots; those of empty slots have the length 0, at the end of the ray's last interval."""
+    """Intervals along rays in slots; those of empty slots have the length 0, at the end of the ray's last interval, or
+    at the start of a ray that has none."""
 
     slots: Slots
     """What the slots are for."""
@@ -83,7 +84,7 @@ class Placed:
         held = slots.counts.index_select(0, slots.owners)
         places = firsts.index_select(0, slots.owners) + torch.minimum(slots.ranks, held - 1).clamp(min=0)
         places = places.clamp(max=len(starts) - 1)
-        its_ends = ends.index_select(0, places)
+        its_ends = torch.where(held > 0, ends.index_select(0, places), 0)
         its_starts = torch.where(slots.ranks < held, starts.index_select(0, places), its_ends)
         return cls(slots, its_starts, its_ends)
 
@@ -201,10 +202,10 @@ def reach_reference(placed: Placed, sigma: Tensor, budget: float, num_steps: int
     `placed`, `sigma` and `num_steps` are as in `reach`; `budget` is the optical depth at which a ray ends.
     """
     slots = placed.slots
-    tau = optical_depth(sigma, placed.t_ends - placed.t_starts)
+    tau = optical_depth(sigma, placed.t_ends - placed.t_starts).nan_to_num(nan=0.0)  # a broken sample hides nothing
     longest = longest_ray(slots, num_steps)
     before = bounded_sum(tau, slots.owners, slots.ranks, len(slots.counts), longest)
-    reached = (slots.ranks < slots.counts.index_select(0, slots.owners)) & ~(before >= budget)  # NaN must be seen
+    reached = (slots.ranks < slots.counts.index_select(0, slots.owners)) & (before < budget)
     return torch.zeros_like(slots.counts).index_add_(0, slots.owners, reached.long())
 
 

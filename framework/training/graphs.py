@@ -14,6 +14,7 @@ still have held on to has changed. Whatever fails, training goes on without reco
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
@@ -86,6 +87,9 @@ class CudaRecorder:
             ConfigError: if that fails, and leaves the GPU or its generator in a state from which nothing can go on.
         """
         graph = torch.cuda.CUDAGraph()
+        gc.collect()
+        collecting = gc.isenabled()
+        gc.disable()  # to free a kernel or another graph while one is recorded would spoil it
         try:
             with torch.cuda.graph(graph, stream=self.stream):
                 result = function()
@@ -96,6 +100,9 @@ class CudaRecorder:
             except RuntimeError:
                 raise ConfigError(f"recording a CUDA graph failed ({_one_line(failure)}); use {FLAG} off") from failure
             raise
+        finally:
+            if collecting:
+                gc.enable()
         return result, graph.replay
 
 
@@ -256,8 +263,9 @@ def _close(loss: Tensor, wanted: Tensor | None) -> bool:
 
 @torch.no_grad()
 def _distance(some: Sequence[Tensor], others: Sequence[Tensor]) -> Tensor:
-    """Return the Euclidean distance between each two tensors, (K,) float64."""
-    return torch.stack([(a.double() - b.double()).norm() for a, b in zip(some, others, strict=True)])
+    """Return the Euclidean distance between each two tensors, (K,) float64; what is infinite in both is alike."""
+    pairs = zip(some, others, strict=True)
+    return torch.stack([torch.where(a == b, 0.0, a.double() - b.double()).norm() for a, b in pairs])
 
 
 def make_graphs(

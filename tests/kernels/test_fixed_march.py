@@ -82,14 +82,13 @@ def test_slots_have_the_candidates_of_the_march(resolution: int, share: float, s
     assert int(empty.sum()) == len(empty) - int(found.candidates)
     assert torch.equal(placed.t_starts[empty], placed.t_ends[empty])
     assert bool(placed.t_ends.isfinite().all())
-    last = torch.tensor([each[-1][1] if each else math.inf for each in expected])
-    known = empty & last.isfinite()[slots.owners]
-    assert torch.equal(placed.t_ends[known], last[slots.owners][known])
+    last = torch.tensor([each[-1][1] if each else 0.0 for each in expected])
+    assert torch.equal(placed.t_ends[empty], last[slots.owners][empty])
 
 
 @pytest.mark.parametrize("room", [(4096, 100), (40, 8192), (10, 50), (1, 1)])
 def test_rays_without_room_are_left_out_whole_and_counted(room: tuple[int, int]) -> None:
-    rays, grid = random_rays(60), occupancy(16, 0.05)
+    rays, grid = random_rays(60), occupancy(16, 0.3)
     expected = truth(rays, grid, None)
     everything = fill_reference(rays, grid, SIZE, STEPS, None, ROOMY)
     found = fill_reference(rays, grid, SIZE, STEPS, None, room)
@@ -123,8 +122,8 @@ def test_light_ends_rays_where_the_definition_says() -> None:
                     break
                 reached += 1
                 length = float(placed.t_ends[slot] - placed.t_starts[slot])
-                depth += min(float(sigma[slot]) * length, 1e3) if not math.isnan(float(sigma[slot])) else math.nan
-            if clear and not math.isnan(depth):  # NaN is seen by both; where a ray ends behind it tells nothing
+                depth += 0 if math.isnan(float(sigma[slot])) else min(float(sigma[slot]) * length, 1e3)
+            if clear:  # of rounding
                 assert found[ray] == reached
             assert 0 <= found[ray] <= count
 

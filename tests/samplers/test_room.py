@@ -78,6 +78,9 @@ def test_evaluation_and_no_rays_are_marched() -> None:
 def test_what_is_derived_from_the_grid_stays_where_it_is() -> None:
     """Recorded steps look for it there; it follows the cells all the same."""
     made, field, rays = sampler(True), CountingField(), random_rays(100)
+    made.occupied.fill_(False)
+    made.occupied[:300] = True
+    made.forget()
     made.sample(rays, field, jitter=False)
     (near,) = made.occupancy._near.values()
     before, grid = near.clone(), made.occupancy
@@ -93,7 +96,7 @@ def test_what_is_derived_from_the_grid_stays_where_it_is() -> None:
     samples = [each.sample(rays, field, jitter=False) for each in (made, fresh)]
     assert torch.equal(samples[0].t_starts, samples[1].t_starts)
     usual = sampler(False)
-    usual.occupied.logical_not_()
+    usual.occupied.copy_(made.occupied)
     usual.forget()
     assert samples[0].num_evaluated == len(usual.sample(rays, field, jitter=False))
 

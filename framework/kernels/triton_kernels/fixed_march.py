@@ -45,9 +45,10 @@ def _reach(sigma, starts, ends, offsets, counts, reached, budget, rays, BLOCK: t
     while tl.max(going.to(tl.int32), 0) > 0:
         n = first + found
         length = tl.load(ends + n, mask=going, other=0.0) - tl.load(starts + n, mask=going, other=0.0)
-        depth += optical_depth(tl.load(sigma + n, mask=going, other=0.0), length)
+        tau = optical_depth(tl.load(sigma + n, mask=going, other=0.0), length)
+        depth += tl.where(tau == tau, tau, 0.0)  # what is NaN hides nothing
         found += going.to(tl.int64)
-        going = going & (found < count) & (tl.where(depth >= budget, 0, 1) != 0)  # NaN must be seen
+        going = going & (found < count) & (depth < budget)
     tl.store(reached + r, found, mask=here)
 
 

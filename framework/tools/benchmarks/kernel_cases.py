@@ -287,7 +287,7 @@ def _of_images() -> Iterator[Family]:
         own = records[:, 0].div(16).floor().long() + 3 * records[:, 1].div(16).floor().long()
         there = torch.zeros(len(sizes), len(records), device=records.device)
         there[tiles, lists.ids.long()] = 1.0
-        return sorted_.float(), there.gather(0, own.clamp(0, len(sizes) - 1)[None])
+        return sorted_.all().float(), there.gather(0, own.clamp(0, len(sizes) - 1)[None])
 
     walls = records(30)
     walls[:, :2], walls[:, [2, 4]], walls[:, DISTANCE] = torch.tensor([8.5, 7.5]), 0.05, 1.0

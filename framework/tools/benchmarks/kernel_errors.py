@@ -129,7 +129,7 @@ def interpreted() -> list[Error]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "errors.json"
         given = {**os.environ, "TRITON_INTERPRET": "1", "NERFLOOM_KERNELS": "triton"}
-        if subprocess.run(python_command(__spec__.name, path), env=given).returncode:
+        if subprocess.run(python_command("framework.tools.benchmarks.kernel_errors", path), env=given).returncode:
             raise ConfigError("Triton's interpreter failed; the lines above say why")
         return [Error(**row) for row in json.loads(path.read_text(encoding="utf-8"))]
 

@@ -104,7 +104,7 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
         """
         return StepKind(varies="the method does not say that its steps repeat each other")
 
-    def read_counts(self) -> None:  # noqa: B027, most count nothing
+    def read_counts(self) -> None:
         """Read what was counted on the device, and decide on sizes by it; called where the device is waited for."""
 
     def after_step(self, step: int, progress: float) -> Sequence[RowChange]:

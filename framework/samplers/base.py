@@ -51,7 +51,7 @@ class Sampler(nn.Module, ABC):
         """
         return StepKind(varies="the sampler decides how many samples a ray has")
 
-    def read_counts(self) -> None:  # noqa: B027, most count nothing
+    def read_counts(self) -> None:
         """Read what was counted on the device, and decide on sizes by it; called where the device is waited for."""
 
     def losses(self, samples: Samples, weights: Tensor) -> dict[str, Tensor]:

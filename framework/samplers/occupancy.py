@@ -10,7 +10,6 @@ that a ray skips what is empty at its own time.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 

@@ -214,7 +214,9 @@ class StepGraphs(Generic[T]):
         repeat()
         moved = _distance(before, after)
         apart = _distance(tensors, after)
-        fault = None if bool((apart <= TOLERANCE * moved).all()) else "change what the step itself changes"  # NaN is not
+        fault = None
+        if not bool((apart <= TOLERANCE * moved).all()):  # NaN is not
+            fault = "change what the step itself changes"
         if self._loss is not None and not _close(self._loss(result), wanted):
             fault = "have the loss of the step itself"
         if fault is not None:

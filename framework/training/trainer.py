@@ -274,13 +274,15 @@ class Trainer:
         finite = result.finite if isinstance(result.finite, Tensor) else torch.full_like(mse, result.finite)
         num_rays = len(batch) * getattr(batch, "rays_per_pixel", 1)  # about as many in each process
         per_ray = result.loss.num_samples / max(num_rays, 1)
-        counted = isinstance(per_ray, Tensor)  # on the device alone
-        self._unread.append(torch.stack([mse, finite.to(mse), per_ray if counted else torch.full_like(mse, math.nan)]))
         done = state.step + 1
-        if done % self.steps_per_read == 0 or (counted and done < self.steps_per_read and done & (done - 1) == 0):
+        unread = per_ray if isinstance(per_ray, Tensor) else torch.full_like(mse, math.nan)
+        self._unread.append(torch.stack([mse, finite.to(mse), unread]))
+        if done % self.steps_per_read == 0 or (
+            unread is per_ray and done < self.steps_per_read and done & (done - 1) == 0
+        ):
             self._read_errors(done)
         seconds = time.perf_counter() - start
-        self._account(num_rays, math.nan if counted else per_ray, seconds)
+        self._account(num_rays, math.nan if isinstance(per_ray, Tensor) else per_ray, seconds)
         return StepReport(
             step=state.step,
             seconds=state.seconds,

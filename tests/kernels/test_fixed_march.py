@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
@@ -53,7 +54,7 @@ def of_rays(placed: Placed) -> list[list[tuple[float, float]]]:
 def truth(rays: Rays, grid: Occupancy, shift: Tensor | None) -> list[list[tuple[float, float]]]:
     starts, ends, _, offsets, _ = candidates(rays, grid, SIZE, 0.0, shift)
     pairs, bounds = list(zip(starts.tolist(), ends.tolist(), strict=True)), offsets.tolist()
-    return [pairs[first:last] for first, last in zip(bounds, bounds[1:], strict=False)]
+    return [pairs[first:last] for first, last in pairwise(bounds)]
 
 
 def moving(grid: Occupancy, rays: Rays) -> tuple[Rays, Occupancy]:
@@ -129,7 +130,7 @@ def test_light_ends_rays_where_the_definition_says() -> None:
 
 
 def test_empty_slots_show_nothing_and_learn_nothing() -> None:
-    """Composited colours are those of the samples alone, and so is the gradient, whatever the density in empty slots."""
+    """Composited colours are those of the samples alone, and so are gradients, whatever the density in empty slots."""
     torch.manual_seed(1)
     rays, grid = random_rays(30), occupancy(8, 0.4)
     placed = fill(rays, grid, SIZE, STEPS, None, (4096, 2048)).placed

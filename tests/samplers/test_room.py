@@ -1,4 +1,4 @@
-"""Training samples in a fixed number of slots: the same pictures and gradients, and room that follows what is needed."""
+"""Training samples in a fixed number of slots: the same pictures and gradients, and room for what is needed."""
 
 from dataclasses import replace
 

@@ -154,9 +154,7 @@ def timed_steps(device: torch.device, before: int, steps: int, **settings: Any) 
         A row for each, as plain data: milliseconds a step, how many steps were repeated, and the PSNR of batches, which
         should agree.
     """
-    return [
-        _timed(method, mode, device, before, steps, settings) for method in SCENES for mode in ("off", "auto")
-    ]
+    return [_timed(method, mode, device, before, steps, settings) for method in SCENES for mode in ("off", "auto")]
 
 
 def _timed(
@@ -164,7 +162,7 @@ def _timed(
 ) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         config = replace(load_method(method).config, vis="none", **settings)
-        config = replace(config, machine=replace(config.machine, cuda_graphs=mode))
+        config = replace(config, machine=replace(config.machine, cuda_graphs=mode))  # type: ignore[arg-type]
         run = Run(method, config, "blender", load_dataparser("blender")(), Path(folder))
         trainer = Trainer(run, SCENES[method](SIZE).to(device), None)
         for _ in range(before):

@@ -88,7 +88,7 @@ def _samples(starts: Tensor, ends: Tensor, offsets: Tensor) -> Samples:
 def _along_rays() -> Iterator[Family]:
     """Compositing, distortion, histograms."""
 
-    def composited(  # noqa: PLR0913, as many inputs as the operation has
+    def composited(
         sigma: Tensor, rgb: Tensor, starts: Tensor, ends: Tensor, background: Tensor, fars: Tensor, offsets: Tensor
     ) -> Sequence[Tensor]:
         found = composite(_samples(starts, ends, offsets), sigma, rgb, background, fars)
@@ -312,4 +312,3 @@ def _of_images() -> Iterator[Family]:
         for size, factor, other in ((17, 1.0, 0.3), (13, 100.0, 0.0), (11, 0.0, 0.0))
     )
     yield "photometric", photometric, "image", (usual, hard, none)
-

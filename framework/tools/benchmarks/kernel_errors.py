@@ -117,7 +117,8 @@ def largest_error(value: Tensor, truth: Tensor) -> float:
     odd = ~truth.isfinite()
     if not torch.equal(odd, ~value.isfinite()):
         return float("inf")
-    return float((value - truth).masked_fill(odd, 0).abs().max() / truth.masked_fill(odd, 0).abs().max().clamp(min=LEAST))
+    error, largest = ((each.masked_fill(odd, 0)).abs().max() for each in (value - truth, truth))
+    return float(error / largest.clamp(min=LEAST))
 
 
 def interpreted() -> list[Error]:

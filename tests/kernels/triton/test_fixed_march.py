@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from framework.kernels.fixed_march import Placed, fill, fill_reference, reach, reach_reference, share_out
+from framework.kernels.fixed_march import Placed, Slots, fill, fill_reference, reach, reach_reference, share_out
 from tests.kernels.test_fixed_march import ROOMY, SIZE, STEPS, of_rays
 from tests.kernels.test_march import occupancy, random_rays
 from tests.kernels.triton.compared import DEVICE, backends
@@ -67,7 +67,7 @@ def test_light_reaches_as_many_as_in_the_reference(density: str, stop: float) ->
     budget = -math.log(stop) if stop else math.inf
     truth = reach_reference(exact, sigma.double(), budget, STEPS)
     there = Placed(
-        type(slots)(*(getattr(slots, name).to(DEVICE) for name in ("owners", "ranks", "offsets", "counts", "left_out"))),
+        Slots(*(part.to(DEVICE) for part in vars(slots).values())),
         placed.t_starts.to(DEVICE),
         placed.t_ends.to(DEVICE),
     )  # fmt: skip

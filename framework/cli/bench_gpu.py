@@ -17,8 +17,10 @@ BEFORE = 300
 
 @dataclass(frozen=True)
 class GpuFlags:
-    """Measure kernels and training steps on a GPU, and its limits; train instant-ngp and gaussian-splatting. Without a
-    GPU, --interpreter computes the kernels' errors on the CPU."""
+    """Measure kernels and training steps on a GPU, and its limits; train instant-ngp and gaussian-splatting.
+
+    Without a GPU, --interpreter True computes the kernels' errors on the CPU.
+    """
 
     interpreter: bool = False
     """Compute the largest errors of Triton's kernels in Triton's interpreter, on the CPU, and nothing else."""

@@ -61,8 +61,10 @@ def share_out(counts: Tensor, capacity: int) -> Slots:
 
 @dataclass(frozen=True)
 class Placed:
-    """Intervals along rays in slots; those of empty slots have the length 0, at the end of the ray's last interval, or
-    at the start of a ray that has none."""
+    """Intervals along rays in slots.
+
+    Those of empty slots have the length 0, at the end of the ray's last interval, or at 0 on a ray that has none.
+    """
 
     slots: Slots
     """What the slots are for."""

@@ -1,4 +1,4 @@
-"""How much room a march is given: numbers of slots that are chosen from the steps before.
+"""A march is given as much room as the steps before have needed.
 
 A device that runs ahead of Python notes how much room each step would have needed. When the device is waited for
 anyway, these numbers are read, and decide on the room of the steps that follow. It changes only where it has become too

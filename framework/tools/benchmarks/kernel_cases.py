@@ -63,7 +63,7 @@ class Case:
 def cases() -> Iterator[Case]:
     """Yield all cases, those of an operation one after another."""
     torch.manual_seed(0)
-    for kernel, run, followed, inputs in (*_along_rays(), *_at_points(), *_marched(), *_of_images()):
+    for kernel, run, followed, inputs in (*_along_rays(), *_at_points(), *_marched(), *_projected(), *_on_images()):
         for kind, given in zip(KINDS, inputs, strict=True):
             yield Case(kernel, kind, run, given, followed if kind != "empty" else "")
 
@@ -246,8 +246,8 @@ def _marched() -> Iterator[Family]:
     yield "sort_by_ray", sorted_, "", (usual, hard, none)
 
 
-def _of_images() -> Iterator[Family]:
-    """Gaussians and the loss of pictures."""
+def _projected() -> Iterator[Family]:
+    """Projection of Gaussians."""
     names = "means log_scales rotations logits colors harmonics pose"
 
     def gaussians(count: int) -> Inputs:
@@ -267,6 +267,10 @@ def _of_images() -> Iterator[Family]:
     hard["logits"][4], hard["logits"][5], hard["logits"][6] = -100.0, 100.0, math.inf
     hard["rotations"][8], hard["rotations"][10] = 0.0, hard["rotations"][10] * 1e-6
     yield "project_gaussians", projected, names, (gaussians(60), hard, gaussians(0))
+
+
+def _on_images() -> Iterator[Family]:
+    """Gaussians on the image, and the loss of pictures."""
 
     def records(count: int) -> Tensor:
         """Gaussians on the image, each with a circle of radius 4 around it."""

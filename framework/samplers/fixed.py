@@ -39,6 +39,7 @@ def sample_into_slots(
     evaluate: Callable[[Wave], tuple[Tensor, Tensor]],
     surface: HasAlpha | None,
     early_stop: float,
+    usual: int | None = None,
 ) -> Samples:
     """Return samples in occupied cells, up to the early stop, without a wait for the device.
 
@@ -52,8 +53,9 @@ def sample_into_slots(
         evaluate: density or opacity, and features, of intervals.
         surface: the field, if it has opacities.
         early_stop: transmittance below which the rest of a ray is dropped.
+        usual: number of samples that a step should have; None for any.
     """
-    count, sizes = len(rays), room.of(len(rays))
+    count, sizes = len(rays), room.of(len(rays), usual)
     with torch.no_grad():
         found = fill(rays, *steps, (sizes.runs, sizes.candidates))
         placed = found.placed

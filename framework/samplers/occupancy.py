@@ -203,7 +203,7 @@ class OccupancySampler(Sampler):
 
         if self.is_fixed(rays):
             steps = Steps(self.occupancy, self.step_size, self.num_steps, self._shift(rays, jitter))
-            return sample_into_slots(rays, steps, self.room, evaluate, surface, stop)
+            return sample_into_slots(rays, steps, self.room, evaluate, surface, stop, self.samples_per_step)
         marched = self.begin(rays, jitter, stop)
         if isinstance(field, HasGridDensity) and not self.endless:
             known = field.grid_density()

@@ -19,6 +19,8 @@ LEAST, MOST = 1.08, 2.0
 """Room, in the same units, below which more is given, and above which less is."""
 PIECE, LIMIT = 256, 2**21
 """Numbers of slots are multiples of the former, and at most the latter."""
+MOST_KEPT = 4
+"""Maximum number of kept samples, in units of the number that a step should have."""
 
 
 class Sizes(NamedTuple):
@@ -48,9 +50,16 @@ class Room:
         self._needed: Tensor | None = None
         self._counted: Tensor | None = None
 
-    def of(self, rays: int) -> Sizes:
-        """Return the numbers of slots for a number of `rays`."""
-        return Sizes(*(min(PIECE * math.ceil(each * rays / PIECE), LIMIT) for each in self.per_ray))
+    def of(self, rays: int, usual: int | None = None) -> Sizes:
+        """Return the numbers of slots for some rays.
+
+        Args:
+            rays: number of rays.
+            usual: number of samples that a step should have, which bounds those that are kept, as before anything is
+                known of a run that goes on; None for no bound but `LIMIT`.
+        """
+        runs, candidates, kept = (min(PIECE * math.ceil(each * rays / PIECE), LIMIT) for each in self.per_ray)
+        return Sizes(runs, candidates, kept if usual is None else min(kept, MOST_KEPT * max(usual, PIECE)))
 
     def note(self, rays: int, needed: tuple[Tensor, Tensor, Tensor], left_out: Tensor) -> None:
         """Note on the device what a step has needed, without a wait.
@@ -71,7 +80,7 @@ class Room:
         """Read what steps have needed since the last time, and decide on the room of those that follow."""
         if self._needed is None or self._counted is None:
             return
-        *needed, rays, left_out = torch.cat([self._needed.double(), self._counted.double()]).tolist()
+        *needed, rays, left_out = torch.cat([self._needed, self._counted.float()]).tolist()  # no device lacks float32
         if rays == 0:
             return
         self.per_ray = tuple(map(_enough, self.per_ray, needed))  # type: ignore[assignment]

@@ -124,3 +124,11 @@ def test_room_follows_the_most_that_was_needed_and_mostly_stays() -> None:
     assert (room.rays, room.left_out) == (4000, 30)
     assert all(size % PIECE == 0 and size <= LIMIT for rays in (1, 999, 2**17) for size in room.of(rays))
     assert min(room.of(1)) == PIECE
+
+
+def test_nothing_is_known_of_a_run_that_goes_on() -> None:
+    """Its first step must not need the memory of all steps of all its rays."""
+    room = Room(runs=65, steps=514)
+    assert room.of(10_000) == (650_240, LIMIT, LIMIT)
+    assert room.of(10_000, usual=2**15) == (650_240, LIMIT, 2**17)
+    assert room.of(128, usual=2**15).kept == 65_792  # the first of a new run

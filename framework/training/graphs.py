@@ -43,7 +43,7 @@ LOSS_TOLERANCE = 0.01
 TESTED = 0, 64
 """Numbers of repetitions of a recording before it is tested. In 64 steps an occupancy grid has been updated four times
 and more, learning rates have changed, and other tensors may have moved."""
-MOST_KINDS = 6
+MOST_KINDS = 4
 """Number of kinds of steps whose recordings are kept, with the memory that each holds: those that were taken last."""
 FLAG = "--machine.cuda-graphs"
 

@@ -16,6 +16,7 @@ from framework.base.console import console, say
 from framework.base.device import wait_for
 from framework.base.registry import load_dataparser, load_method
 from framework.geometry.rays import Samples
+from framework.kernels import triton_kernels
 from framework.kernels.compositing import distortion, distortion_reference
 from framework.kernels.contraction import contract_to_unit, contract_to_unit_reference
 from framework.kernels.intervals import (
@@ -75,7 +76,7 @@ def measured_kernels(device: torch.device, samples: int, repeats: int) -> dict[s
             rows += measured(kernel, ceilings, repeats, 1)
     torch.set_num_threads(threads)
     console.print(table(rows))
-    found = errors_of_all(device)
+    found = errors_of_all(device) if triton_kernels.available() else []
     console.print(as_table(found))
     return {
         "machine": machine(device),

@@ -89,7 +89,7 @@ class CudaRecorder:
         graph = torch.cuda.CUDAGraph()
         gc.collect()
         collecting = gc.isenabled()
-        gc.disable()  # to free a kernel or another graph while one is recorded would spoil it
+        gc.disable()  # to free a kernel or another graph while one is recorded spoils it; torch collects up to 2.8 alone
         try:
             with torch.cuda.graph(graph, stream=self.stream):
                 result = function()

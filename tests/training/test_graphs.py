@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import gc
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -453,6 +454,8 @@ def test_graphs_are_recorded_on_the_stream_on_which_steps_warmed_up(monkeypatch:
     repeat()
     assert result == 4
     assert calls == [f"begin graph {own}", "step", f"end graph {own}", "replay"]
+    assert recorder.record(gc.isenabled)[0] is False  # what is freed meanwhile would spoil the recording
+    assert gc.isenabled()
 
 
 @pytest.mark.parametrize("usable", [True, False])

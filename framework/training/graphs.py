@@ -87,9 +87,9 @@ class CudaRecorder:
             ConfigError: if that fails, and leaves the GPU or its generator in a state from which nothing can go on.
         """
         graph = torch.cuda.CUDAGraph()
-        gc.collect()
+        gc.collect()  # as torch itself does up to 2.8
         collecting = gc.isenabled()
-        gc.disable()  # to free a kernel or another graph while one is recorded spoils it; torch collects up to 2.8 alone
+        gc.disable()  # to free a kernel or another graph while one is recorded would spoil it
         try:
             with torch.cuda.graph(graph, stream=self.stream):
                 result = function()

@@ -109,7 +109,7 @@ def test_repeated_steps_with_an_occupancy_grid_learn_what_steps_learn(
 ) -> None:
     """Across updates of the grid, which are not recorded, and changes of the room that samples are given."""
     ahead(monkeypatch)
-    sizes = {"samples_per_batch": 2**10, "num_steps": 64}
+    sizes = {"samples_per_batch": 2**11, "num_steps": 64}
     usual, repeating = (small(tmp_path / name, "instant-ngp", **sizes) for name in ("usual", "repeating"))
     usual.graphs, recorder = Unrepeated(FakeRecorder(), usual._learnt), recorded(repeating)
     rooms, steps = set(), 34

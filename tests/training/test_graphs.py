@@ -112,7 +112,7 @@ def test_repeated_steps_with_an_occupancy_grid_learn_what_steps_learn(
     sizes = {"samples_per_batch": 2**11, "num_steps": 64}
     usual, repeating = (small(tmp_path / name, "instant-ngp", **sizes) for name in ("usual", "repeating"))
     usual.graphs, recorder = Unrepeated(FakeRecorder(), usual._learnt), recorded(repeating)
-    rooms, steps = set(), 34
+    rooms, steps = {repeating.model.sampler.room.per_ray}, 34
     for trainer in (usual, repeating):
         trainer.steps_per_read = 8
     for _ in range(steps):

@@ -38,8 +38,6 @@ COMMANDS = {
     "zip-nerf": "zip-nerf {}",
 }
 """Method -> what ns-train is given, as one would on a CPU; the budget stands at {}."""
-HEIGHT = 160
-"""Height of a picture, pixels."""
 
 
 def train(words: list[str], folder: Path) -> None:
@@ -59,9 +57,7 @@ def draw(name: str, seconds: float, target: Path) -> dict[str, Any]:
         results = json.loads((run / "eval.json").read_text())["results"]
         summary = json.loads((run / "summary.json").read_text())
         with Image.open(min((run / "pictures").glob("*_comparison.png"))) as comparison:
-            enlarged = Image.Resampling.NEAREST if comparison.height < HEIGHT else Image.Resampling.LANCZOS
-            size = (round(comparison.width * HEIGHT / comparison.height), HEIGHT)
-            comparison.convert("RGB").resize(size, enlarged).save(target / f"{name}.jpg", quality=88)
+            comparison.convert("RGB").save(target / f"{name}.jpg", quality=88)
     return {
         "command": shlex.join(["ns-train", *words]),
         "psnr": round(results["psnr"], 2),

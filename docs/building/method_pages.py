@@ -54,7 +54,8 @@ def page(name: str, text: str | None) -> str:
 
 def picture(name: str) -> str:
     """Return the section with the method's picture, and what the run that made it reached; '' if there is none."""
-    made = json.loads((PICTURES / "psnr.json").read_text(encoding="utf-8"))
+    file = PICTURES / "psnr.json"
+    made = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
     if name not in made:
         return ""
     run = made[name]

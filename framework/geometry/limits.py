@@ -16,5 +16,5 @@ def at_least(x: Tensor, low: float) -> Tensor:
 
 
 def between(x: Tensor, low: float, high: float) -> Tensor:
-    """Return `x` where it lies between two limits, and the nearer limit elsewhere; NaN stays NaN."""
+    """Return `x` where it lies between `low` and `high`, and the nearer of them elsewhere; NaN stays NaN."""
     return torch.where(x > high, high, torch.where(x < low, low, x))

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from framework.base.config import TrainConfig
 from framework.base.device import has_bfloat16
 from framework.base.optimised import ParameterGroup, RowChange, parameter_groups
+from framework.base.protocols import SeesRegistered
 from framework.base.step_kind import StepKind
 from framework.cameras.cameras import Cameras
 from framework.cameras.view import View
@@ -187,7 +188,7 @@ class RendersFromImages(Protocol):
 
 
 @runtime_checkable
-class HasAppearance(Protocol):
+class HasAppearance(Protocol, metaclass=SeesRegistered):
     """A model that can learn an appearance vector for each image."""
 
     appearance: Appearance | None

@@ -8,6 +8,7 @@ from typing import Protocol, runtime_checkable
 from torch import Tensor, nn
 
 from framework.base.optimised import Optimised
+from framework.base.protocols import SeesRegistered
 from framework.base.step_kind import StepKind
 from framework.fields.base import DensityFunction, Field
 from framework.geometry.rays import Rays, Samples
@@ -65,7 +66,7 @@ class Sampler(nn.Module, ABC):
 
 
 @runtime_checkable
-class StopsEarly(Protocol):
+class StopsEarly(Protocol, metaclass=SeesRegistered):
     """A sampler that ends a ray where its transmittance is low."""
 
     early_stop: float
@@ -73,7 +74,7 @@ class StopsEarly(Protocol):
 
 
 @runtime_checkable
-class SkipsCells(Protocol):
+class SkipsCells(Protocol, metaclass=SeesRegistered):
     """A sampler that skips the empty cells of a grid over a box, or over L nested boxes (`Occupancy`)."""
 
     box: Tensor

@@ -1,4 +1,4 @@
-"""The command `ns-bench`: repeatable measurements of kernels, samplers, methods, caching, poses and the viewer."""
+"""The command `ns-bench`: repeatable measurements of kernels, methods, caching, poses and the viewer."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from framework.cli.bench_flags import (
     PosesFlags,
     ProfileFlags,
     QuadratureFlags,
-    SamplersFlags,
     StartsFlags,
     ViewerBenchFlags,
 )
 from framework.cli.bench_gpu import GpuFlags, measure_gpu
 from framework.cli.bench_processes import ProcessesFlags, measure_processes
 from framework.cli.bench_results import write_results
+from framework.cli.bench_tables import TablesFlags, measure_tables
 from framework.cli.common import chosen_kind, make_room, run_command
 from framework.cli.flags import read_flags
 
@@ -44,8 +44,8 @@ usage: ns-bench WHAT [flags]
   quadrature       error of every sampler against field evaluations per ray, on scenes with a known integral
   methods          time to each PSNR of every built-in method, on the embedded scene or on --data
   curves           PSNR against seconds of every method: a run for each of several budgets and seeds, in one picture
+  tables           rows of published tables, each a run judged on every held-out image; goes on where it was stopped
   ablation         effect of each part of instant-ngp: training with one part switched off, or on, in turn
-  samplers         an occupancy grid in nested boxes against proposals, on a capture, after the same times
   starts           where Gaussians start: time to a PSNR from points, a field's surfaces, silhouettes, or anywhere
   processes        time to each PSNR with one process and with several, started by torchrun, on the same cores
   profile-step     time of a training step: of each compiled kernel, and of Python and torch
@@ -150,14 +150,6 @@ def _ablation(flags: AblationFlags) -> None:
     path = flags.output_dir / f"ablation-{flags.data.resolve().name}.json"
     make_room(path)
     write_results(path, measure(flags.data, flags.seconds, flags.seeds, flags.target))
-
-
-def _samplers(flags: SamplersFlags) -> None:
-    from framework.tools.benchmarks.samplers import measure
-
-    path = flags.output_dir / f"samplers-{flags.data.resolve().name}.json"
-    make_room(path)
-    write_results(path, measure(flags.data, flags.methods, flags.seconds, flags.seed, tuple(flags.flags.split())))
 
 
 def _starts(flags: StartsFlags) -> None:
@@ -273,8 +265,8 @@ KINDS: dict[str, tuple[type, Any]] = {
     "quadrature": (QuadratureFlags, _quadrature),
     "methods": (MethodFlags, _methods),
     "curves": (CurvesFlags, _curves),
+    "tables": (TablesFlags, measure_tables),
     "ablation": (AblationFlags, _ablation),
-    "samplers": (SamplersFlags, _samplers),
     "starts": (StartsFlags, _starts),
     "processes": (ProcessesFlags, measure_processes),
     "profile-step": (ProfileFlags, _profile),

@@ -130,24 +130,6 @@ class AblationFlags:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SamplersFlags:
-    """Train methods on a capture with proposals and with an occupancy grid in nested boxes, for the same time."""
-
-    data: Path
-    """Folder of the data set."""
-    methods: tuple[str, ...] = ("nerfacto", "instant-ngp")
-    """Names of the methods."""
-    seconds: tuple[float, ...] = (60.0, 150.0, 600.0)
-    """Seconds of training of the runs."""
-    seed: int = 0
-    """Random seed."""
-    flags: str = ""
-    """Further flags of ns-train, as in --flags="--downscale-factor 4 --num-steps 256"."""
-    output_dir: Path = RESULTS
-    """Folder of samplers-DATA.json."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class StartsFlags:
     """Train gaussian-splatting from each kind of start in turn; report the time to a PSNR and the final PSNR."""
 

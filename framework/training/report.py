@@ -67,6 +67,7 @@ def write_summary(trainer: Trainer, outcome: Outcome) -> None:
             "seconds": state.seconds,
             "rays": state.rays,
             "rays_per_second": state.rays / max(state.seconds, 1e-9),
+            "samples_per_ray": state.samples_per_ray,  # of the last steps, without proposals' own
             "skipped_steps": state.skipped,
             "peak_memory_bytes": peak_memory(trainer.device),
             "parameters": trainer.model.size(),

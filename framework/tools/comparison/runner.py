@@ -54,8 +54,7 @@ def run_jobs(plan: Plan, jobs_at_once: int = 1) -> dict[Job, Failure]:
     devices: Queue[str | None] = Queue()
     for device in _devices(plan.conditions, jobs_at_once):
         devices.put(device)
-    jobs, failures = plan.jobs(), {}
-    stopped, signals = threading.Event(), list[int]()
+    jobs, failures = plan.jobs(), dict[Job, Failure]()
 
     def work(number: int) -> None:
         job = jobs[number]
@@ -74,24 +73,29 @@ def run_jobs(plan: Plan, jobs_at_once: int = 1) -> dict[Job, Failure]:
             failures[job] = failure
             say(f"  {job.title} failed: {failure.reason} (full output: {failure.log})")
 
-    with ThreadPoolExecutor(jobs_at_once) as pool, _recorded(stopped, signals):
+    with stoppable() as stopped, ThreadPoolExecutor(jobs_at_once) as pool:
         for future in [pool.submit(work, number) for number in range(len(jobs))]:
             future.result()
-    if signals:
-        raise Stopped(signals[0], "stopped; run the same command to continue")
     return failures
 
 
 @contextmanager
-def _recorded(stopped: threading.Event, signals: list[int]) -> Iterator[None]:
-    """Make Ctrl-C and SIGTERM set `stopped`, so that running jobs are ended properly."""
+def stoppable() -> Iterator[threading.Event]:
+    """Make Ctrl-C and SIGTERM set the event that it gives, so that running jobs can save; then raise `Stopped`.
+
+    Raises:
+        Stopped: at the end of the block, if there was such a signal.
+    """
+    stopped, signals = threading.Event(), list[int]()
 
     def record(number: int, frame: object) -> None:
         signals.append(number)
         stopped.set()
 
     with handled(NUMBERS, record):
-        yield
+        yield stopped
+    if signals:
+        raise Stopped(signals[0], "stopped; run the same command to continue")
 
 
 def _devices(conditions: Conditions, jobs_at_once: int) -> Sequence[str | None]:

@@ -1,0 +1,259 @@
+"""Tables of results: their rows, what is run and what is kept, and the figures that they show."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from statistics import fmean, stdev
+from threading import Event
+from typing import Any
+
+import pytest
+
+from framework.base.errors import ConfigError
+from framework.cli.bench import main
+from framework.cli.train import run_of
+from framework.tools.benchmarks.table_text import LOADING, estimate
+from framework.tools.benchmarks.tables import Row, read_table
+from framework.tools.comparison import runner
+from framework.tools.comparison.plan import Conditions, Job
+from framework.tools.comparison.runner import Failure
+from tests.comparison.runs import finish
+from tests.conftest import Refused
+from tests.site.commands import found
+
+TABLES = sorted((Path(__file__).parents[2] / "configs" / "tables").glob("*.yml"))
+ROWS = """
+images: {first: r_0.png}
+rows:
+  - data: {ball: shapes/ball --downscale-factor 2, embedded: ""}
+    methods: {ngp: instant-ngp, planes: kplanes --num-scales 2}
+    seconds: [10, 45]
+    seeds: 2
+"""
+
+
+def write(folder: Path, text: str = ROWS) -> Path:
+    path = folder / "table.yml"
+    path.write_text(text)
+    return path
+
+
+def psnr_of(job: Job, seconds: float) -> float:
+    """A PSNR that differs between rows."""
+    return 20 + len(job.contender.label) / 10 + seconds / 100 + (job.seed - 42) / 4
+
+
+@pytest.fixture
+def ran(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, float, int]]:
+    """Label, seconds and seed of each run; they end at once, with the PSNR of `psnr_of`; kplanes fails after 45 s."""
+    asked: list[tuple[str, float, int]] = []
+
+    def run_job(job: Job, conditions: Conditions, device: str | None, stopped: Event) -> Failure | None:
+        assert conditions.max_seconds is not None
+        asked.append((job.contender.label, conditions.max_seconds, job.seed))
+        if job.contender.method == "kplanes" and conditions.max_seconds == 45:
+            return Failure("its planes have crashed", job.log)
+        finish(job, psnr_of(job, conditions.max_seconds), conditions.max_seconds + 0.5)
+        return None
+
+    monkeypatch.setattr(runner, "run_job", run_job)
+    return asked
+
+
+def bench(monkeypatch: pytest.MonkeyPatch, folder: Path, *flags: object) -> None:
+    """Run ns-bench tables with all of its folders in `folder`."""
+    folders = ("--data-root", folder / "data", "--run-dir", folder / "runs", "--output-dir", folder / "results")
+    words = ("ns-bench", "tables", "--tables", folder / "table.yml", *folders, *flags)
+    monkeypatch.setattr(sys, "argv", list(map(str, words)))
+    main()
+
+
+def test_a_row_for_each_data_set_method_budget_and_seed(tmp_path: Path) -> None:
+    table = read_table(write(tmp_path), tmp_path / "data", tmp_path / "runs", 0.1)
+    names = [row.name for row in table.rows]
+    assert len(names) == len(set(names)) == 16
+    assert names[:5] == ["ball-ngp-1s", "ball-planes-1s", "ball-ngp-4.5s", "ball-planes-4.5s", "embedded-ngp-1s"]
+    assert names[8] == "ball-ngp-1s-seed43"
+    planes, embedded = table.rows[1], table.rows[4]
+    words = planes.job.train_command(planes.conditions)
+    assert words[words.index("--data") + 1] == str(tmp_path / "data" / "shapes" / "ball")
+    assert words[words.index("--max-seconds") + 1] == "1.0"
+    assert words[words.index("--machine.seed") + 1] == "42"
+    assert words[-4:] == ["--num-scales", "2", "--downscale-factor", "2"]
+    assert planes.job.eval_command(planes.conditions)[-2:] == ["--max-images", "3"]
+    whole = read_table(tmp_path / "table.yml", tmp_path, tmp_path).rows[0]
+    assert whole.name == "ball-ngp-10s"
+    assert "--max-images" not in whole.job.eval_command(whole.conditions)
+    assert "--data" not in embedded.job.train_command(embedded.conditions)
+    assert len({row.job.folder for row in table.rows}) == 16
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("rows: 3", "has a list of 'rows'"),
+        ("rows: []\nextra: 1", "and nothing else"),
+        ("rows: [7]", "it must have data, methods"),
+        ("rows: [{data: {a: b}, methods: {c: kplanes}}]", "has no rows"),
+        ("rows: [{data: {a: b}, methods: [kplanes], seconds: [1]}]", "must have names with a text each"),
+        ("rows: [{data: {a: b}, methods: {c: kplanez}, seconds: [1]}]", "Did you mean 'kplanes'"),
+        ("rows: [{data: {../a: b}, methods: {c: kplanes}, seconds: [1]}]", "names no file"),
+        ("rows: [{data: {a: b}, methods: {c: kplanes}, seconds: [1, 1]}]", "two rows are called a-c-1s"),
+        ("rows: [{data: {a: b}, methods: {c: kplanes}, second: [1]}]", "unknown key"),
+    ],
+)
+def test_what_is_no_table(text: str, reason: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        read_table(write(tmp_path, text), tmp_path, tmp_path)
+
+
+@pytest.mark.parametrize("path", TABLES, ids=lambda path: path.stem)
+def test_every_row_of_our_tables_is_understood(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the commands that are run, which are parsed as they will be; the data need not be there."""
+    formats = {"fern": "llff", "statue_of_liberty": "llff", "record3d_door": "record3d", "lego": "blender"}
+    formats |= {"bouncingballs": "dnerf", "standup": "dnerf"}
+
+    def here(data: Path | None, named: str | None = None) -> tuple[Path | None, str]:
+        return (data, named or formats[data.name]) if data and data.name in formats else found(data, named)
+
+    monkeypatch.setattr("framework.data.data_folder.find_data", here)
+    rows = read_table(path, Path("data"), Path("runs")).rows
+    understood: dict[str, Row] = {row.job.contender.label: row for row in rows}
+    for row in understood.values():
+        _, _, _, method, *flags = row.job.train_command(row.conditions)
+        run = run_of(method, flags)
+        assert run.config.max_seconds == row.seconds
+        assert run.config.machine.seed == row.job.seed
+    assert rows
+
+
+def test_rows_that_are_there_are_not_run_again(
+    ran: list[tuple[str, float, int]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    write(tmp_path)
+    bench(monkeypatch, tmp_path, "--only", "^ball-ngp")
+    assert [seconds for _, seconds, _ in ran] == [10, 45, 10, 45]
+    with pytest.raises(SystemExit):
+        bench(monkeypatch, tmp_path, "--only", "ball")
+    assert "2 rows failed, first ball-planes-45s: its planes have crashed" in capsys.readouterr().err
+    assert len(ran) == 8
+    content = json.loads((tmp_path / "results" / "ball-planes-10s-seed43.json").read_text())
+    assert content["run"]["command"].startswith(
+        "ns-train kplanes --num-scales 2 --downscale-factor 2 --machine.seed 43"
+    )
+    assert content["run"]["command"].endswith("--data shapes/ball --max-seconds 10.0")
+    assert content["run"]["steps"] == 1000
+    assert content["run"]["machine"]["processor"] == "abacus"
+    assert content["experiment_name"] == "ball"
+    assert str(tmp_path) not in json.dumps(content)
+    bench(monkeypatch, tmp_path, "--show", "rows")
+    listed = capsys.readouterr().out
+    assert "10 of 16 rows are to be run" in listed
+    assert len(ran) == 8
+    write(tmp_path, ROWS.replace("--num-scales 2", "--num-scales 3"))
+    with pytest.raises(SystemExit):
+        bench(monkeypatch, tmp_path)
+    assert "is of 'kplanes --num-scales 2 on" in capsys.readouterr().err
+
+
+def test_a_finished_run_without_its_file_is_only_written(
+    ran: list[tuple[str, float, int]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(tmp_path)
+    bench(monkeypatch, tmp_path, "--only", "^embedded-ngp-10s$")
+    file = tmp_path / "results" / "embedded-ngp-10s.json"
+    before = file.read_text()
+    file.unlink()
+    bench(monkeypatch, tmp_path, "--only", "^embedded-ngp-10s$")
+    assert len(ran) == 1
+    assert file.read_text() == before
+
+
+def test_means_and_spreads_over_seeds(
+    ran: list[tuple[str, float, int]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = write(tmp_path)
+    bench(monkeypatch, tmp_path, "--only", "ngp")
+    for file in (tmp_path / "results").glob("*.json"):
+        content = json.loads(file.read_text())
+        content["per_image"] = [{"name": "r_0.png", "psnr": content["results"]["psnr"] - 1}]
+        content["results"]["by_size"] = {"1/2": {"psnr": 30.0}, "1": {"psnr": 29.0}}
+        file.write_text(json.dumps(content))
+    bench(monkeypatch, tmp_path, "--show", "markdown", "--only", "^ball")
+    head, _, *lines = capsys.readouterr().out.splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in (head, *lines)]
+    titles = ["run", "test PSNR", "SSIM", "size 1", "size 1/2", "first", "steps"]
+    assert cells[0] == [*titles, "training rays/s", "peak memory", "render", "file"]
+    assert [row[0] for row in cells[1:]] == [
+        f"ball, {method}, {seconds} s" for seconds in (10, 45) for method in ("ngp", "planes")
+    ]
+    (row,) = [row for row in read_table(path, tmp_path, tmp_path).rows if row.name == "ball-ngp-45s"]
+    psnrs = [psnr_of(Job(row.job.contender, seed, tmp_path), 45.0) for seed in (42, 43)]
+    spread = f"{stdev(psnrs):.2f} dB"
+    assert cells[3][1] == f"{fmean(psnrs):.2f} ± {spread}"
+    assert cells[3][2:6] == ["0.900", "29.00 ± 0.00 dB", "30.00 ± 0.00 dB", f"{fmean(psnrs) - 1:.2f} ± {spread}"]
+    assert cells[3][6:] == [
+        "1,000", f"{1e6 / 45.5:,.0f}", "1.0 GiB", "0.25 s/image", "`ball-ngp-45s.json`, `ball-ngp-45s-seed43.json`"
+    ]  # fmt: skip
+    assert cells[2][1:] == [""] * 10
+
+
+def test_a_row_is_expected_to_take_as_long_as_those_like_it(tmp_path: Path) -> None:
+    rows = {row.name: row for row in read_table(write(tmp_path), tmp_path, tmp_path).rows}
+    result: dict[str, Any] = {"results": {"num_images": 30, "fps": 0.5}}
+    quick: dict[str, Any] = {"results": {"num_images": 30, "fps": 3.0}}
+    done = [(rows["ball-ngp-10s"], result), (rows["ball-planes-10s"], quick)]
+    assert estimate(rows["ball-ngp-45s"], done) == LOADING + 45 + 60
+    assert estimate(rows["ball-planes-45s"], done) == LOADING + 45 + 10
+    assert estimate(rows["ball-planes-45s"], done[:1]) == LOADING + 45 + 60
+
+
+def test_bad_flags_are_refused_in_a_line(tmp_path: Path, refused: Refused) -> None:
+    table = ("tables", "--tables", write(tmp_path), "--output-dir", tmp_path / "results")
+    assert "no row has such a name" in refused(main, *table, "--only", "castle", status=2)
+    assert "is no regular expression" in refused(main, *table, "--only", "(", status=2)
+    assert "it must be more than 0" in refused(main, *table, "--seconds-scale", 0, status=2)
+    assert "cannot read" in refused(main, "tables", "--tables", tmp_path / "none.yml")
+
+
+@pytest.mark.slow  # processes of their own
+def test_a_table_that_is_stopped_goes_on(tmp_path: Path) -> None:
+    small = "--num-levels 4 --max-resolution 64 --log2-table-size 12 --grid-resolution 16 --num-steps 64"
+    method = f"instant-ngp {small} --samples-per-batch 4096"
+    block = f"{{data: {{tiny: --size 24 --num-train 8}}, methods: {{ngp: {method}}}, seconds: [8]}}"
+    folders = ("--run-dir", str(tmp_path / "runs"), "--output-dir", str(tmp_path))
+    words = [
+        sys.executable,
+        "-m",
+        "framework.cli.bench",
+        "tables",
+        "--tables",
+        str(write(tmp_path, f"rows: [{block}]")),
+    ]
+    first = subprocess.Popen([*words, *folders], stderr=subprocess.PIPE, text=True)
+    while not list(tmp_path.rglob("config.yml")):
+        assert first.poll() is None
+        time.sleep(0.1)
+    time.sleep(3)
+    first.send_signal(signal.SIGTERM)
+    assert "run the same command to continue" in first.communicate()[1]
+    assert not (tmp_path / "tiny-ngp-8s.json").exists()
+    (log,) = tmp_path.rglob("seed-42.log")
+    subprocess.run([*words, *folders], check=True)
+    assert "resuming" in log.read_text()
+    content = json.loads((tmp_path / "tiny-ngp-8s.json").read_text())
+    assert content["run"]["seconds"] == pytest.approx(8, abs=1)
+    assert content["run"]["samples_per_ray"] > 1
+    assert content["results"]["psnr"] > 12
+    assert all(image["psnr"] > 10 for image in content["per_image"])
+    shown = subprocess.run([*words, *folders, "--show", "markdown"], check=True, capture_output=True, text=True).stdout
+    assert f"| tiny, ngp, 8 s | {content['results']['psnr']:.2f} dB | " in shown

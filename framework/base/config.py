@@ -60,7 +60,7 @@ class MachineConfig:
     """CPU threads; all cores if not given."""
     cuda_graphs: Literal["auto", "on", "off"] = "auto"
     """Record training steps on a GPU as CUDA graphs and repeat them, which saves the time to start each operation.
-    auto: where all steps are alike, as of nerfacto; a line says why not."""
+    auto: where steps are alike, if a repeated step has the loss and the effect of one without; a line says why not."""
 
     def __post_init__(self) -> None:
         if not -(2**63) <= self.seed < 2**63:

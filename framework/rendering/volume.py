@@ -160,7 +160,7 @@ def volume_render(
         depth=depth,
         median_depth=sums.median,
         accumulation=sums.opacity,
-        num_samples=len(samples),
+        num_samples=samples.num_evaluated,
         weights=sums.weights,
         samples=samples,
         error_bound=samples.early_stop,

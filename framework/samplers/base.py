@@ -51,6 +51,9 @@ class Sampler(nn.Module, ABC):
         """
         return StepKind(varies="the sampler decides how many samples a ray has")
 
+    def read_counts(self) -> None:
+        """Read what was counted on the device, and decide on sizes by it; called where the device is waited for."""
+
     def losses(self, samples: Samples, weights: Tensor) -> dict[str, Tensor]:
         """Return the losses that train the sampler itself, by name, each a scalar.
 

@@ -58,6 +58,7 @@ class InstantNGPConfig(
     adam_beta2=0.95,
     adam_eps=1e-15,
     num_steps=AUTO,
+    eval_num_rays_per_chunk=32_768,
     thin_gradients=THIN,
 ):
     """Settings of instant-ngp."""

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from framework.base.config import TrainConfig
 from framework.base.device import has_bfloat16
 from framework.base.optimised import ParameterGroup, RowChange, parameter_groups
+from framework.base.protocols import SeesRegistered
 from framework.base.step_kind import StepKind
 from framework.cameras.cameras import Cameras
 from framework.cameras.view import View
@@ -34,8 +35,8 @@ class Loss:
     """Named scalars; their sum is minimised."""
     rgb: Tensor
     """Rendered colours, with the shape of the batch's; for the running error and the choice of pixels."""
-    num_samples: int = 0
-    """Number of evaluations of the field; 0 for a model without a field."""
+    num_samples: int | Tensor = 0
+    """Number of evaluations of the field, () int64 if the device alone knows it; 0 for a model without a field."""
 
     @property
     def total(self) -> Tensor:
@@ -103,6 +104,9 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
             step: number of training steps done.
         """
         return StepKind(varies="the method does not say that its steps repeat each other")
+
+    def read_counts(self) -> None:
+        """Read what was counted on the device, and decide on sizes by it; called where the device is waited for."""
 
     def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
         """Return rows of parameters to add, drop or reorder; called after each training step, with gradients in place.
@@ -184,7 +188,7 @@ class RendersFromImages(Protocol):
 
 
 @runtime_checkable
-class HasAppearance(Protocol):
+class HasAppearance(Protocol, metaclass=SeesRegistered):
     """A model that can learn an appearance vector for each image."""
 
     appearance: Appearance | None

@@ -228,6 +228,9 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
             return StepKind(varies="levels are still opening")
         return self.sampler.step_kind(step)
 
+    def read_counts(self) -> None:
+        self.sampler.read_counts()
+
     def before_step(self, step: int, progress: float) -> None:
         """Open levels of encodings up to `progress`, and update the sampler for `step`."""
         if isinstance(self.config, FewImagesConfig) and self.config.open_levels_until:

@@ -17,6 +17,7 @@ from framework.base.decisions import Choice, fill
 from framework.encodings.hash_grid import HashGrid, HashGridConfig
 from framework.fields.encoded import EncodedField
 from framework.fields.inverted import InvertedField
+from framework.ray_model import RayModel
 from framework.rendering.background import background_renderer
 from framework.samplers.background import BackgroundConfig, decide_background, foreground
 from framework.samplers.choice import contracted_box
@@ -57,6 +58,7 @@ class InstantNGPConfig(
     adam_beta2=0.95,
     adam_eps=1e-15,
     num_steps=AUTO,
+    eval_num_rays_per_chunk=32_768,
     thin_gradients=THIN,
 ):
     """Settings of instant-ngp."""
@@ -146,11 +148,18 @@ def make_background(config: InstantNGPConfig, scene: Scene) -> InvertedField:
     return InvertedField(grid, config.hidden_width, 4 if config.view_dependence else 0)
 
 
+class InstantNGP(RayModel[InstantNGPConfig]):
+    """A model whose steps depend on their number by the values of tensors alone, so that a GPU may repeat them."""
+
+    steps_repeat = True
+
+
 METHOD = Method(
     InstantNGPConfig(),
     paper="arXiv:2201.05989",
     field=make_field,
     sampler=make_foreground_sampler,
     renderer=partial(background_renderer, make_field=make_background),
+    model=InstantNGP,
     decide=decide,
 )

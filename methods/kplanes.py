@@ -44,6 +44,7 @@ class KPlanesConfig(
     lr_final=0.02,
     adam_beta2=0.99,
     adam_eps=1e-12,
+    thin_gradients=0.5,
 ):
     """Settings of kplanes."""
 

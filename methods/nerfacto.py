@@ -71,10 +71,11 @@ class NerfactoRenderer(VolumeRenderer):
     Args:
         unit_length: distance from the camera up to which gradients are scaled, scene units; None for no scaling.
         normals: the network that predicts normals; None for no normals.
+        thin: share of the mean gradient below which samples are thinned; 0 for none.
     """
 
-    def __init__(self, unit_length: float | None, normals: NormalHead | None) -> None:
-        super().__init__(unit_length)
+    def __init__(self, unit_length: float | None, normals: NormalHead | None, thin: float = 0.0) -> None:
+        super().__init__(unit_length, thin)
         self.normals = normals
 
     def shade(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
@@ -171,7 +172,7 @@ def renderer(config: NerfactoConfig, scene: Scene) -> Renderer:
         scene: properties of the data.
     """
     normals = NormalHead(NUM_FEATURES, config.hidden_width) if config.predict_normals else None
-    return NerfactoRenderer(scaled_up_to(config, scene), normals)
+    return NerfactoRenderer(scaled_up_to(config, scene), normals, config.thin_gradients)
 
 
 METHOD = Method(

@@ -193,7 +193,8 @@ class PixelNeRF(RayModel[PixelNeRFConfig]):
         """
         assert batch.rays.camera_indices is not None
         images = batch.rays.camera_indices[:: batch.rays_per_pixel]
-        rgb, num_samples, terms = torch.empty_like(batch.rgb), 0, dict[str, Tensor]()
+        num_samples: int | Tensor = 0
+        rgb, terms = torch.empty_like(batch.rgb), dict[str, Tensor]()
         for image in images.unique().tolist():
             chosen = images == image
             with self.looking_at(self.drawn_views(image)):

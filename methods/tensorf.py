@@ -67,6 +67,7 @@ class TensoRFConfig(
     lr_schedule="exponential",
     lr_final=0.1,
     adam_beta2=0.99,
+    thin_gradients=0.5,
 ):
     """Settings of tensorf."""
 

@@ -51,7 +51,7 @@ def test_every_flag_that_is_named_exists() -> None:
         (["--trainer.max-num-iterations", "3"], "here it is --max-num-iterations"),
         (["--viewer.quit-on-train-completion", "True"], "there are --viewer.websocket-host"),
         (["--vis", "viewer+wandb"], "nerfstudio's; leave it out; the choice here is --vis viewer, tensorboard"),
-        (["--machine.num-devices", "2"], "a run is one process on one device"),
+        (["--machine.num-devices", "2"], "torchrun starts several"),
         (["--load-step", "1000"], "here it is --load-checkpoint"),
         (["blender-data"], "here the data format is called 'blender'"),
         (["nuscenes-data"], "is not supported here"),

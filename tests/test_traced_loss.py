@@ -64,10 +64,11 @@ def test_other_losses_and_fields_are_not_left_out(
     assert found is None
 
 
-def test_thinned_steps_learn_as_well(shared_tiny: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("method", ["instant-ngp", "kplanes", "nerfacto"])
+def test_thinned_steps_learn_as_well(method: str, shared_tiny: Path, tmp_path: Path) -> None:
     means = []
     for thin in (0.0, 0.5):
-        trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / str(thin), thin_gradients=thin)
+        trainer = tiny_trainer(method, shared_tiny, tmp_path / str(thin), thin_gradients=thin)
         found = losses(trainer, 40)
         assert sum(found[-5:]) < sum(found[:5]) / 2
         means.append(sum(found[-10:]))

@@ -29,6 +29,7 @@ import imageio.v3 as iio
 import numpy as np
 import torch
 from PIL import Image
+from torch.nn.functional import grid_sample
 
 import nerfloom
 from dataparsers.procedural.views import CAMERA_ANGLE, camera_poses, render_view
@@ -39,6 +40,8 @@ TILE = 200
 """Edge of a tile of the pictures, pixels."""
 BALL = 0.35
 """Radius of the balloon of `motion`, scene units."""
+K1, MARGIN = -0.45, 14
+"""Coefficient of the wide lens, and by how many pixels more it sees on each side than a pinhole."""
 Photographs = list[np.ndarray]
 """(SIZE, SIZE, 3) float in [0, 1] each."""
 
@@ -52,6 +55,8 @@ class Capture:
     masks: list[np.ndarray] | None = None
     settings: dict[str, Any] = field(default_factory=dict)
     """Settings of the run that learns from it."""
+    lens: dict[str, Any] = field(default_factory=dict)
+    """What transforms.json says of the lens of its photographs; nothing of a pinhole."""
 
     def write(self, folder: Path, truth: Capture) -> None:
         """Write nerfstudio's transforms.json, with the images of `truth` held out."""
@@ -61,17 +66,21 @@ class Capture:
             for index, (image, pose) in enumerate(zip(capture.images, capture.poses, strict=True)):
                 name = f"images/{split}_{index:03d}.png"
                 write(folder / name, image)
-                frame: dict[str, Any] = {"file_path": name, "transform_matrix": pose.tolist()}
+                frame: dict[str, Any] = {"file_path": name, "transform_matrix": pose.tolist(), **capture.lens}
                 if split == "train" and self.masks is not None:
                     frame["mask_path"] = f"masks/{index:03d}.png"
                     write(folder / frame["mask_path"], self.masks[index].astype(float))
                 frames.append(frame)
                 names[split].append(name)
-        focal = 0.5 * SIZE / math.tan(CAMERA_ANGLE / 2)
-        content = {"camera_model": "PINHOLE", "fl_x": focal, "fl_y": focal, "cx": SIZE / 2, "cy": SIZE / 2}
+        content = {"camera_model": "OPENCV", "fl_x": focal(), "fl_y": focal(), "cx": SIZE / 2, "cy": SIZE / 2}
         content |= {"w": SIZE, "h": SIZE, "frames": frames}
         content |= {"train_filenames": names["train"], "val_filenames": names["test"], "test_filenames": names["test"]}
         (folder / "transforms.json").write_text(json.dumps(content))
+
+
+def focal() -> float:
+    """Return the focal length in pixels."""
+    return 0.5 * SIZE / math.tan(CAMERA_ANGLE / 2)
 
 
 def write(path: Path, image: np.ndarray) -> None:
@@ -88,28 +97,36 @@ def placed(split: str, count: int, nearer: float = 1.0) -> list[np.ndarray]:
 
 
 @functools.cache
-def taken(split: str, count: int, index: int, nearer: float) -> np.ndarray:
-    """Return a view (SIZE, SIZE, 4) of the scene alone, with alpha; kept, since several captures begin with it."""
-    pose = placed(split, count, nearer)[index]
-    return render_view(pose, CAMERA_ANGLE, SIZE, SIZE, supersample=2, geometry=False)[0] / 255.0
+def taken(split: str, count: int, index: int, nearer: float, margin: int) -> np.ndarray:
+    """Return a view of the scene alone, with alpha; kept, since several captures begin with it.
+
+    Its edge is SIZE and `margin` pixels more on each side, seen by the same focal length.
+    """
+    pose, size = placed(split, count, nearer)[index], SIZE + 2 * margin
+    return render_view(pose, 2 * math.atan(0.5 * size / focal()), size, size, supersample=2, geometry=False)[0] / 255.0
 
 
 def photograph(
-    split: str, count: int, index: int, plain: bool = False, nearer: float = 1.0
+    split: str, count: int, index: int, plain: bool = False, nearer: float = 1.0, margin: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a photograph of the scene, and its alpha (SIZE, SIZE), before a pattern at infinity or a plain white."""
-    rgba, pose = taken(split, count, index, nearer), placed(split, count, nearer)[index]
+    """Return a photograph of the scene, and its alpha (H, W), before a pattern at infinity or a plain white."""
+    rgba, pose = taken(split, count, index, nearer, margin), placed(split, count, nearer)[index]
     alpha = rgba[..., 3:]
-    return rgba[..., :3] * alpha + (1.0 if plain else pattern(pose)) * (1 - alpha), alpha[..., 0]
+    behind = 1.0 if plain else pattern(directions(pose, margin))
+    return rgba[..., :3] * alpha + behind * (1 - alpha), alpha[..., 0]
 
 
-def pattern(pose: np.ndarray) -> np.ndarray:
-    """Return a pattern of directions (SIZE, SIZE, 3): soft patches of different colours and sizes."""
-    focal = 0.5 * SIZE / math.tan(CAMERA_ANGLE / 2)
-    rows, columns = (np.mgrid[:SIZE, :SIZE] + 0.5 - SIZE / 2) / focal
-    directions = np.stack([columns, -rows, -np.ones_like(rows)], -1) @ pose[:3, :3].T
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    waves = [np.sin(9 * directions @ axis) + np.sin(23 * directions @ axis[::-1] + 1) for axis in np.eye(3) + 0.3]
+def directions(pose: np.ndarray, margin: int = 0) -> np.ndarray:
+    """Return the unit direction of each pixel's ray (H, W, 3)."""
+    size = SIZE + 2 * margin
+    rows, columns = (np.mgrid[:size, :size] + 0.5 - size / 2) / focal()
+    rays = np.stack([columns, -rows, -np.ones_like(rows)], -1) @ pose[:3, :3].T
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+def pattern(rays: np.ndarray) -> np.ndarray:
+    """Return colours of directions: soft patches of different colours and sizes."""
+    waves = [np.sin(9 * rays @ axis) + np.sin(23 * rays @ axis[::-1] + 1) for axis in np.eye(3) + 0.3]
     return 0.55 + 0.12 * np.stack(waves, -1)
 
 
@@ -140,12 +157,9 @@ def exposure() -> tuple[Capture, Capture]:
 
 def balloon(pose: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return a violet ball at `place` as a camera sees it: colour (SIZE, SIZE, 3), and where it is, (SIZE, SIZE)."""
-    focal = 0.5 * SIZE / math.tan(CAMERA_ANGLE / 2)
-    rows, columns = (np.mgrid[:SIZE, :SIZE] + 0.5 - SIZE / 2) / focal
-    directions = np.stack([columns, -rows, -np.ones_like(rows)], -1) @ pose[:3, :3].T
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    along = directions @ (place - pose[:3, 3])
-    nearest = pose[:3, 3] + along[..., None] * directions - place
+    rays = directions(pose)
+    along = rays @ (place - pose[:3, 3])
+    nearest = pose[:3, 3] + along[..., None] * rays - place
     inside = np.clip(1 - (nearest**2).sum(-1) / BALL**2, 0, None)
     return np.array([0.6, 0.2, 0.8]) * (0.4 + 0.6 * np.sqrt(inside))[..., None], inside > 0
 
@@ -191,9 +205,49 @@ def texture() -> tuple[Capture, Capture]:
     return Capture(images, where), Capture(images, where, masks, {"masks": "empty", "background": "white"})
 
 
+def cutout() -> tuple[Capture, Capture]:
+    """Masks cut the object out, and what they hide is taken for unknown; what helps is to take it for empty."""
+    shown, where = [photograph("train", NUM_TRAIN, index) for index in range(NUM_TRAIN)], placed("train", NUM_TRAIN)
+    images, masks = [image for image, _ in shown], [alpha > 0.5 for _, alpha in shown]
+    unknown, empty = ({"masks": name, "background": "white"} for name in ("ignored", "empty"))
+    return Capture(images, where, masks, unknown), Capture(images, where, masks, empty)
+
+
+def repeats() -> tuple[Capture, Capture]:
+    """Cameras of one half of the circle are taken for opposite ones; what helps are the right poses."""
+    good, half_a_turn = still(), np.diag([-1.0, -1.0, 1.0, 1.0])
+    folded = [pose if pose[1, 3] >= 0 else half_a_turn @ pose for pose in good.poses]
+    return Capture(good.images, folded), good
+
+
+def pinhole_of(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where a pinhole would show what a lens with the coefficient K1 shows at x, y, at a distance of 1."""
+    wide_x, wide_y = x, y
+    for _ in range(50):  # each step leaves less than half of the error
+        scale = 1 + K1 * (wide_x**2 + wide_y**2)
+        wide_x, wide_y = x / scale, y / scale
+    return wide_x, wide_y
+
+
+def lens() -> tuple[Capture, Capture]:
+    """A wide lens bends lines, and is taken for a pinhole; what helps is to say which lens it is."""
+    images, half = [], SIZE / 2 + MARGIN
+    rows, columns = (np.mgrid[:SIZE, :SIZE] + 0.5 - SIZE / 2) / focal()
+    grid = np.stack(pinhole_of(columns, rows), -1) * focal() / half  # where it is in the wider image, in [-1, 1]
+    for index in range(NUM_TRAIN):
+        wider = torch.from_numpy(photograph("train", NUM_TRAIN, index, margin=MARGIN)[0]).permute(2, 0, 1)[None]
+        seen = grid_sample(wider, torch.from_numpy(grid)[None], align_corners=False)
+        images.append(seen[0].permute(1, 2, 0).numpy())
+    where = placed("train", NUM_TRAIN)
+    return Capture(images, where), Capture(images, where, lens={"k1": K1})
+
+
 KINDS: dict[str, Callable[[], tuple[Capture, Capture]]] = {
     "blur": blur, "exposure": exposure, "motion": motion, "few": few, "poses": poses, "texture": texture,
+    "cutout": cutout, "repeats": repeats, "lens": lens,
 }  # fmt: skip
+ON_WHITE = ("texture", "cutout")
+"""Kinds whose held-out views have plain white behind the scene."""
 
 
 def learn(capture: Capture, truth: Capture, steps: int, folder: Path) -> tuple[np.ndarray, float]:
@@ -216,7 +270,7 @@ def tile(image: np.ndarray) -> Image.Image:
 def draw(kind: str, steps: int, folder: Path) -> dict[str, float]:
     """Train on the faulty capture and with what helps, and write the picture; the PSNRs of both."""
     faulty, helped = KINDS[kind]()
-    plain, nearer = kind == "texture", 0.65 if kind == "texture" else 1.0
+    plain, nearer = kind in ON_WHITE, 0.65 if kind == "texture" else 1.0
     where = placed("test", NUM_TEST, nearer)
     views = [photograph("test", NUM_TEST, index, plain, nearer)[0] for index in range(NUM_TEST)]
     truth = Capture(views, where)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import inspect
+import json
 import re
 import sys
 import typing
+from pathlib import Path
 from typing import Any
 
 from flags import flag_tables, help_texts
@@ -13,6 +15,9 @@ from flags import flag_tables, help_texts
 from framework.base.config import LEFT_TO_DATA
 from framework.base.registry import Entry, load_method, registered
 from framework.method import Method
+
+PICTURES = Path(__file__).parents[1] / "pictures" / "methods"
+"""What `method_pictures.py` has made."""
 
 
 def methods() -> dict[str, Entry]:
@@ -43,7 +48,23 @@ def page(name: str, text: str | None) -> str:
         f"| summary | {documentation.splitlines()[0] if documentation else ''} |",
     ]
     head, _, rest = start.partition("\n\n")
-    return "\n\n".join([head, rest.strip(), "\n".join(facts), decided(method), flags(name, method)]) + "\n"
+    parts = [head, rest.strip(), picture(name), "\n".join(facts), decided(method), flags(name, method)]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def picture(name: str) -> str:
+    """Return the section with the method's picture, and what the run that made it reached; '' if there is none."""
+    file = PICTURES / "psnr.json"
+    made = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    if name not in made:
+        return ""
+    run = made[name]
+    return (
+        f"## Picture\n\n![photograph, render, error, depth and opacity](../pictures/methods/{name}.jpg)\n\n"
+        "From left to right: a photograph that training never saw, the render, the error, depth and opacity. "
+        f"`{run['command']}` on two cores beside other programs: {run['psnr']:.2f} dB on {run['images']} held-out "
+        f"images after {run['steps']:,} steps, one run. The figures above are of a quiet machine and more time."
+    )
 
 
 def paper_link(paper: str) -> str:

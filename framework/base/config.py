@@ -60,7 +60,7 @@ class MachineConfig:
     """CPU threads; all cores if not given."""
     cuda_graphs: Literal["auto", "on", "off"] = "auto"
     """Record training steps on a GPU as CUDA graphs and repeat them, which saves the time to start each operation.
-    auto: where all steps are alike, as of nerfacto; a line says why not."""
+    auto: where steps are alike, if a repeated step has the loss and the effect of one without; a line says why not."""
 
     def __post_init__(self) -> None:
         if not -(2**63) <= self.seed < 2**63:
@@ -244,8 +244,7 @@ class RayConfig(TrainConfig):
     any other camera sees; 0 for none."""
     thin_gradients: float = 0.0
     """Samples whose gradient is below this times the mean take part in a step at random, in proportion to it, and count
-    as many times more, so that the mean over steps stays; 0 for all. It needs compiled kernels, and has an effect where
-    errors of traced rays are learnt in one call (instant-ngp)."""
+    as many times more, so that the mean over steps stays; 0 for all. It has an effect on the CPU alone."""
     gradient_scaling: bool = False
     """Whether gradients near cameras are scaled down, by squared distance up to half of the box's edge, against
     floaters."""

@@ -32,6 +32,7 @@ ELSEWHERE: dict[str, str] = {
     "instant-ngp-bounded": "here it is called 'instant-ngp', and the scene's profile says whether it is bounded",
     "nerfacto-big": f"{_LARGER} --max-resolution 4096 --log2-table-size 21 --hidden-width 128",
     "nerfacto-huge": f"{_LARGER} --max-resolution 8192 --log2-table-size 21 --hidden-width 256",
+    "phototourism": "here it is 'nerfacto'; data of the format phototourism is recognised",
     "semantic-nerfw": "here 'nerfacto' learns appearance if the light differs between images; none learns semantics",
     "nerfplayer-nerfacto": "for moving scenes there are 'kplanes' and 'dnerf'",
     "nerfplayer-ngp": "for moving scenes there are 'kplanes' and 'dnerf'",

@@ -46,7 +46,7 @@ SECTIONS = {
     "optimizers": "Adam is the only optimiser, with --learning-rate, --lr-schedule and --lr-final",
     "pipeline": "there is no equivalent flag; ns-train {method} --help lists all flags",
     "trainer": "there is no equivalent flag; ns-train {method} --help lists all flags",
-    "machine": "a run is one process on one device: --machine.device-type",
+    "machine": "a process has one device, --machine.device-type; torchrun starts several (docs/guides/processes.md)",
     "steps-per-eval-batch": "leave it out; --steps-per-eval-all-images evaluates whole images",
     "use-grad-scaler": "leave it out; bfloat16 needs no gradient scaling",
     "gradient-accumulation-steps": "a larger --num-rays-per-batch has the same effect",

@@ -6,6 +6,8 @@ import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
+from framework.base.protocols import SeesRegistered
+
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
@@ -65,7 +67,7 @@ class RowChange:
 
 
 @runtime_checkable
-class DefersGradient(Protocol):
+class DefersGradient(Protocol, metaclass=SeesRegistered):
     """A module with a table whose gradient is accumulated by the optimiser instead of autograd."""
 
     table: nn.Parameter

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 
 from framework.base.errors import ConfigError
@@ -15,7 +17,13 @@ BEFORE = 300
 
 @dataclass(frozen=True)
 class GpuFlags:
-    """Measure kernels and training steps on a GPU, and its limits; train instant-ngp and gaussian-splatting."""
+    """Measure kernels and training steps on a GPU, and its limits; train instant-ngp and gaussian-splatting.
+
+    Without a GPU, --interpreter True computes the kernels' errors on the CPU.
+    """
+
+    interpreter: bool = False
+    """Compute the largest errors of Triton's kernels in Triton's interpreter, on the CPU, and nothing else."""
 
     data: Path | None = None
     """Folder of the data set; the embedded scene if not given."""
@@ -26,11 +34,11 @@ class GpuFlags:
     repeats: int = 9
     """Number of runs of each kernel, of which medians are reported."""
     steps: int = 200
-    """Number of training steps of nerfacto that are timed, as they are and as CUDA graphs."""
+    """Number of training steps of nerfacto and of instant-ngp that are timed, as they are and as CUDA graphs."""
     run_dir: Path | None = None
     """Folder of runs and report; outputs/bench-gpu-DATA if not given."""
     output_dir: Path = RESULTS
-    """Folder of gpu-DATA.json."""
+    """Folder of gpu-DATA.json; of gpu-interpreter.json with --interpreter."""
 
 
 def measure_gpu(flags: GpuFlags) -> None:
@@ -42,10 +50,13 @@ def measure_gpu(flags: GpuFlags) -> None:
     Raises:
         ConfigError: if there is no GPU that this PyTorch can use.
     """
+    if flags.interpreter:
+        _interpret(flags.output_dir / "gpu-interpreter.json")
+        return
     import torch
 
     if not torch.cuda.is_available():
-        raise ConfigError("ns-bench gpu: this machine or this PyTorch has no GPU; ns-bench kernels needs none")
+        raise ConfigError("ns-bench gpu: this machine or this PyTorch has no GPU; --interpreter needs none")
     from framework.cli.compare import compare
     from framework.tools.benchmarks.gpu import gpu_plan, measured_kernels, reached, timed_steps
 
@@ -57,3 +68,16 @@ def measure_gpu(flags: GpuFlags) -> None:
     content["steps"] = timed_steps(device, BEFORE, flags.steps)
     plan = gpu_plan(flags.data, flags.seconds, flags.run_dir or Path("outputs") / f"bench-gpu-{name}")
     write_results(path, {**content, "training": reached(compare(plan))})
+
+
+def _interpret(path: Path) -> None:
+    if find_spec("triton") is None:
+        raise ConfigError("ns-bench gpu --interpreter: Triton is not installed: pip install triton")
+    from framework.base.console import console
+    from framework.tools.benchmarks.kernel_errors import as_table, interpreted
+    from framework.training.machine import machine
+
+    make_room(path)
+    rows = interpreted()
+    console.print(as_table(rows))
+    write_results(path, {"machine": machine(), "triton": version("triton"), "errors": [asdict(row) for row in rows]})

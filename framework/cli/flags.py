@@ -22,7 +22,7 @@ PHRASES = (
     (r"(--\S+): invalid literal for int\(\) with base 10: ('.*')", r"\1 is \2; it must be a whole number"),
     (r"(--\S+): could not convert string to float: ('.*')", r"\1 is \2; it must be a number"),
     (r"invalid choice ('.*') for argument '(--\S+)'\. Expected one of \((.*)\)", r"\2 is \1; it must be one of \3"),
-    (r"Missing value for argument '(--\S+)'.*", r"\1 needs a value"),
+    (r"Missing value for argument '(?:\(')?(--[\w.-]+).*", r"\1 needs a value"),  # tyro 1.0 writes ('--flag',)
 )
 """What tyro says of a value, and how it is said here."""
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from framework.geometry.limits import at_least
+
 
 def intersect_box(origins: Tensor, directions: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
     """Return the distances at which rays enter and leave an axis-aligned box (slab method, Kay and Kajiya 1986).
@@ -117,5 +119,5 @@ def _inverted(positions: Tensor) -> tuple[Tensor, Tensor]:
         finite.detach().abs().amax(-1, keepdim=True).clamp(min=1)
     )  # detached: the result does not depend on the divisor
     scaled = finite / largest
-    norm = (scaled * scaled).sum(-1, keepdim=True).clamp(min=1).sqrt()
+    norm = at_least((scaled * scaled).sum(-1, keepdim=True), 1.0).sqrt()
     return scaled / norm, 1 / (largest * norm)

@@ -114,6 +114,8 @@ class Samples:
     """(N,) `ray_indices`, if the sampler has them."""
     longest: int | None = None
     """Upper bound of the number of samples on a ray, if the sampler knows one."""
+    filled: Tensor | None = None
+    """() int64 number of samples that are not of length 0 for want of others; None if all are."""
     sigma: Tensor | None = None
     """(N,) density, if the sampler evaluated it."""
     features: Tensor | None = None
@@ -145,6 +147,11 @@ class Samples:
 
     def __len__(self) -> int:
         return self.t_starts.shape[0]
+
+    @property
+    def num_evaluated(self) -> int | Tensor:
+        """The number of samples that count as evaluated; () int64 if the device alone knows it."""
+        return len(self) if self.filled is None else self.filled
 
     @property
     def num_rays(self) -> int:

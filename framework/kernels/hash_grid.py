@@ -14,6 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from framework.geometry.limits import between
 from framework.kernels import native
 from framework.kernels.dispatch import FEW_OPERATIONS, TRITON
 from framework.kernels.hash_grid_layout import HashGridLayout as HashGridLayout
@@ -39,7 +40,7 @@ def corners(positions: Tensor, layout: HashGridLayout, level: int) -> tuple[Tens
         cell (3, N) in [0, 1]. Corner c is at (c >> 2 & 1, c >> 1 & 1, c & 1) along x, y, z.
     """
     resolution = layout.resolutions[level]
-    scaled = positions.t().clamp(0, 1) * resolution
+    scaled = between(positions.t(), 0.0, 1.0) * resolution
     cell = scaled.detach().nan_to_num().floor().clamp(max=resolution - 1)  # x = 1 belongs to the last cell
     fractions = scaled - cell
     if layout.is_dense(level):
@@ -172,7 +173,7 @@ def _all_levels(positions: Tensor, table: Tensor, layout: HashGridLayout, deferr
 
 def _at_all_levels(positions: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
     levels = _levels(layout, positions.dtype, positions.device)
-    scaled = positions.t().clamp(0, 1) * levels.cells  # (L, 3, N)
+    scaled = between(positions.t(), 0.0, 1.0) * levels.cells  # (L, 3, N)
     cell = torch.minimum(scaled.detach().nan_to_num().floor(), levels.cells - 1)
     fractions, low = scaled - cell, cell.int() * levels.strides
     x, y, z = _spread(torch.stack([low, low + levels.strides], 2))

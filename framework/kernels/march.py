@@ -306,6 +306,29 @@ def step_start(first: Tensor, k: Tensor, step: float, cone: float) -> Tensor:
     return torch.where(k <= turn, even, (first + turn * step) * (1 + cone) ** (k - turn))
 
 
+def step_range(
+    rays: Rays, occupancy: Occupancy, step: float, cone: float, shift: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return where rays enter and leave the grid, where their first step starts, and how many steps they have.
+
+    `rays`, `occupancy`, `step`, `cone` and `shift` are as in `march`.
+
+    Returns:
+        Three distances (R,), and numbers (R,) int64, 0 for rays that miss the grid.
+    """
+    enter, leave = intersect_box(rays.origins, rays.directions, occupancy.outer)
+    enter, leave = torch.maximum(enter, rays.nears), torch.minimum(leave, rays.fars)
+    first = enter if shift is None else enter - shift * step
+    counts = ((leave - first) / step).ceil()
+    if cone:
+        turn = ((step / cone - first).clamp(min=0) / step).ceil()
+        base = first + turn * step
+        grown = turn + ((leave / base).clamp(min=1).log() / math.log1p(cone)).ceil() + 1
+        counts = torch.where(counts > turn, torch.minimum(counts, grown), counts)
+    counts = torch.where(leave > enter, counts.clamp(min=0), torch.zeros_like(counts)).long()
+    return enter, leave, first, counts
+
+
 @torch.no_grad()
 def candidates(
     rays: Rays, occupancy: Occupancy, step: float, cone: float, shift: Tensor | None
@@ -318,16 +341,7 @@ def candidates(
         Starts (N,), ends (N,) and rays (N,) of the steps, sorted by ray; offsets (R + 1,) of the rays; and the maximum
         number of steps on a ray.
     """
-    enter, leave = intersect_box(rays.origins, rays.directions, occupancy.outer)
-    enter, leave = torch.maximum(enter, rays.nears), torch.minimum(leave, rays.fars)
-    first = enter if shift is None else enter - shift * step
-    counts = ((leave - first) / step).ceil()
-    if cone:
-        turn = ((step / cone - first).clamp(min=0) / step).ceil()
-        base = first + turn * step
-        grown = turn + ((leave / base).clamp(min=1).log() / math.log1p(cone)).ceil() + 1
-        counts = torch.where(counts > turn, torch.minimum(counts, grown), counts)
-    counts = torch.where(leave > enter, counts.clamp(min=0), torch.zeros_like(counts)).long()
+    enter, leave, first, counts = step_range(rays, occupancy, step, cone, shift)
     runs_together = cone == 0 and occupancy.levels == 1
     run = RUN if runs_together else 1
     # The device is waited for three times: for the number of runs, of those near an occupied cell, and of candidates.

@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from framework.geometry.limits import at_least
+
 MAX_LOG_DENSITY = 15.0
 """Maximum log-density; larger ones are clipped."""
 
@@ -89,7 +91,7 @@ def safe_normalize(v: Tensor, eps: float = 1e-12) -> Tensor:
     least = max(eps, torch.finfo(v.dtype).tiny)  # 1e-12 would be 0 in float16
     scaled = v / v.detach().abs().amax(-1, keepdim=True).clamp(min=least)  # shorter than 1 where |v| < least
     squared = (scaled * scaled).sum(-1, keepdim=True)
-    return (scaled / squared.clamp(min=1).sqrt()).masked_fill(squared < 1, 0)
+    return (scaled / at_least(squared, 1.0).sqrt()).masked_fill(squared < 1, 0)
 
 
 def cross_matrix(v: Tensor) -> Tensor:

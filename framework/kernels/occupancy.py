@@ -83,8 +83,23 @@ class Occupancy:
     @cached_property
     def distances(self) -> Tensor:
         """(L or T times ceil(n / 4)^3,) uint8 distances of blocks, as in `packed`, up to 16, for the march on a GPU."""
+        return self._distances()
+
+    def _distances(self) -> Tensor:
         find = later("march", "block_distances")
         return torch.cat([find(cells.flatten(), self.resolution) for cells in self.filled])
+
+    def refresh(self) -> None:
+        """Compute again what was computed from `occupied`, which has changed.
+
+        What is on a device that runs ahead of Python stays where it is, for recorded steps look for it there.
+        """
+        for name in ("filled", "packed"):
+            vars(self).pop(name, None)
+        if "distances" in vars(self):
+            self.distances.copy_(self._distances())
+        for radius, cells in self._near.items():
+            cells.copy_(dilated(self, radius))
 
     def slices_of(self, times: Tensor | None) -> Tensor | None:
         """Return the slice (R,) int64 of each of `times` (R,); None if there is only one.

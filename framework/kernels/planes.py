@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from framework.geometry.limits import between
 from framework.kernels import kept, memory, native
 from framework.kernels.adam import sparse_adam
 from framework.kernels.deferred import Parts, waiting
@@ -42,7 +43,7 @@ def planes_reference(positions: Tensor, table: Tensor, layout: PlanesLayout) -> 
     Returns:
         (N, G * F) features, group by group.
     """
-    clamped, features = positions.clamp(0, 1), []
+    clamped, features = between(positions, 0.0, 1.0), []
     for group, resolution in enumerate(layout.resolutions):
         vertices = torch.tensor(resolution, device=positions.device)
         scaled = clamped * (vertices - 1).to(positions)
@@ -363,7 +364,7 @@ def _all_factors(positions: Tensor, table: Tensor, layout: PlanesLayout, deferre
 
 def _at_all_factors(positions: Tensor, table: Tensor, layout: PlanesLayout) -> Tensor:
     constants = _factors(layout, positions.dtype, positions.device)
-    scaled = positions.t().clamp(0, 1).index_select(0, constants.axes) * constants.cells  # (2 P, N)
+    scaled = between(positions.t(), 0.0, 1.0).index_select(0, constants.axes) * constants.cells  # (2 P, N)
     cell = torch.minimum(scaled.detach().nan_to_num().floor(), constants.cells - 1)
     first, second = (scaled - cell).chunk(2)
     across, up = cell.long()[:, None].chunk(2)  # (P, 1, N)

@@ -19,9 +19,13 @@ from framework.kernels import kept, native
 from framework.kernels.dispatch import CPP, Operation
 from framework.kernels.hash_grid import HASH_GRID, HashGridLayout, hash_grid
 from framework.kernels.hash_grid_lookup import TableGradient
-from framework.kernels.march import WAVES, CompiledMarch, March
+from framework.kernels.march import CompiledMarch, March
 from framework.kernels.mlp import DENSITY_NETWORK, density_mlp, multiplies_bf16
 from framework.kernels.rows import gather_rows
+
+WAVES = (4, 4, 4, 4, 8, 16, 32, 128)
+"""Samples per ray in each wave of a trace; the last size repeats. They begin smaller than those of a march, since within
+one call a wave costs next to nothing, and less is evaluated behind a surface."""
 
 
 @dataclass(frozen=True)

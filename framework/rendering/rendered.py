@@ -38,8 +38,9 @@ class Rendered:
     """(R,) distance at which the transmittance falls to 0.5, scene units; the far end of the ray if it does not."""
     accumulation: Tensor
     """(R,) opacity, the sum of the weights."""
-    num_samples: int
-    """Number of evaluations of the field on these rays, without those of proposals."""
+    num_samples: int | Tensor
+    """Number of evaluations of the field on these rays, without those of proposals; () int64 in training steps that do
+    not wait for the device."""
     weights: Tensor | None = None
     """(N,) weight of each sample."""
     samples: Samples | None = None

@@ -29,6 +29,8 @@ def error_of_traced(
     """
     if type(sampler) is not OccupancySampler or sampler.endless or not (sampler.training and len(rays)):
         return None
+    if sampler.is_fixed(rays):
+        return None
     changed = vars(sampler).keys() & {"sample"} | vars(renderer).keys() & {"render", "shade"}
     if type(renderer) is not VolumeRenderer or renderer.unit_length is not None or changed:
         return None

@@ -17,6 +17,7 @@ from framework.geometry.rays import Rays, Samples
 from framework.kernels.alpha import composite_alpha
 from framework.kernels.compositing import Composited, composite
 from framework.kernels.math import scale_gradient
+from framework.kernels.thinning import thinned
 from framework.rendering.rendered import Rendered
 from framework.rendering.renderer import Renderer
 from framework.samplers.proposal import half_edge
@@ -30,11 +31,12 @@ class VolumeRenderer(Renderer):
     Args:
         unit_length: distance from the camera up to which gradients are scaled down in training, by squared distance,
             scene units; None for no scaling.
+        thin: share of the mean gradient below which samples are thinned in training on the CPU; 0 for none.
     """
 
-    def __init__(self, unit_length: float | None = None) -> None:
+    def __init__(self, unit_length: float | None = None, thin: float = 0.0) -> None:
         super().__init__()
-        self.unit_length = unit_length
+        self.unit_length, self.thin = unit_length, thin
 
     def render(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
         rendered = self.shade(rays, evaluated(rays, samples, field), field, background)
@@ -58,17 +60,18 @@ class VolumeRenderer(Renderer):
         factors = None
         if self.training and self.unit_length is not None:
             factors = (samples.t / self.unit_length).square().clamp(max=1)
-        return shade(rays, samples, field, background, factors)
+        thin = self.thin if self.training and rays.origins.device.type == "cpu" else 0.0
+        return shade(rays, samples, field, background, factors, thin)
 
 
 def volume_renderer(config: RayConfig, scene: Scene) -> VolumeRenderer:
-    """Return the renderer of most methods, with gradients scaled near cameras if the settings say so.
+    """Return the renderer of most methods, with gradients scaled near cameras and thinned as the settings say.
 
     Args:
         config: the method's settings, none left open.
         scene: properties of the scene.
     """
-    return VolumeRenderer(scaled_up_to(config, scene))
+    return VolumeRenderer(scaled_up_to(config, scene), config.thin_gradients)
 
 
 def scaled_up_to(config: RayConfig, scene: Scene) -> float | None:
@@ -100,7 +103,12 @@ def evaluated(rays: Rays, samples: Samples, field: Field) -> Samples:
 
 
 def shade(
-    rays: Rays, samples: Samples, field: Field, background: Tensor, gradient_factors: Tensor | None = None
+    rays: Rays,
+    samples: Samples,
+    field: Field,
+    background: Tensor,
+    gradient_factors: Tensor | None = None,
+    thin: float = 0.0,
 ) -> Rendered:
     """Compute the colours of samples and composite them.
 
@@ -110,6 +118,7 @@ def shade(
         field: the field, which computes colours from features and directions.
         background: (R, 3) or (3,) colour in [0, 1] of the background.
         gradient_factors: (N,) factors of the gradients of density (or alpha) and colour; None for 1.
+        thin: share of the mean gradient below which samples are thinned, if they have densities; 0 for none.
 
     Raises:
         ValueError: if the samples have no density or no features.
@@ -120,6 +129,8 @@ def shade(
     owners = samples.ray_indices
     cameras = None if rays.camera_indices is None else rays.camera_indices.index_select(0, owners)
     rgb = field.color(samples.features, rays.directions.index_select(0, owners), cameras)
+    if thin and samples.alpha is None:
+        stopping, rgb = thinned(stopping, rgb, thin)
     if gradient_factors is not None:
         stopping, rgb = scale_gradient(stopping, gradient_factors), scale_gradient(rgb, gradient_factors)
     return volume_render(rays, samples, stopping, rgb, background, is_alpha=samples.alpha is not None)
@@ -149,7 +160,7 @@ def volume_render(
         depth=depth,
         median_depth=sums.median,
         accumulation=sums.opacity,
-        num_samples=len(samples),
+        num_samples=samples.num_evaluated,
         weights=sums.weights,
         samples=samples,
         error_bound=samples.early_stop,

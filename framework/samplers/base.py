@@ -8,6 +8,7 @@ from typing import Protocol, runtime_checkable
 from torch import Tensor, nn
 
 from framework.base.optimised import Optimised
+from framework.base.protocols import SeesRegistered
 from framework.base.step_kind import StepKind
 from framework.fields.base import DensityFunction, Field
 from framework.geometry.rays import Rays, Samples
@@ -51,6 +52,9 @@ class Sampler(nn.Module, ABC):
         """
         return StepKind(varies="the sampler decides how many samples a ray has")
 
+    def read_counts(self) -> None:
+        """Read what was counted on the device, and decide on sizes by it; called where the device is waited for."""
+
     def losses(self, samples: Samples, weights: Tensor) -> dict[str, Tensor]:
         """Return the losses that train the sampler itself, by name, each a scalar.
 
@@ -62,7 +66,7 @@ class Sampler(nn.Module, ABC):
 
 
 @runtime_checkable
-class StopsEarly(Protocol):
+class StopsEarly(Protocol, metaclass=SeesRegistered):
     """A sampler that ends a ray where its transmittance is low."""
 
     early_stop: float
@@ -70,7 +74,7 @@ class StopsEarly(Protocol):
 
 
 @runtime_checkable
-class SkipsCells(Protocol):
+class SkipsCells(Protocol, metaclass=SeesRegistered):
     """A sampler that skips the empty cells of a grid over a box, or over L nested boxes (`Occupancy`)."""
 
     box: Tensor

@@ -16,19 +16,24 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from framework.base import device as devices
 from framework.base.errors import ConfigError, shown
+from framework.base.step_kind import StepKind
 from framework.fields.base import DensityFunction, Field, HasAlpha, HasGridDensity
 from framework.geometry.bounds import nested_boxes
 from framework.geometry.points import Points, interval_points
 from framework.geometry.rays import Rays, Samples
 from framework.kernels.alpha import alpha_depth
+from framework.kernels.fixed_march import most_steps
 from framework.kernels.given import is_followed
 from framework.kernels.kept import Waves
-from framework.kernels.march import March, Occupancy, Wave, march, refresh_occupancy
+from framework.kernels.march import RUN, March, Occupancy, Wave, march, refresh_occupancy
 from framework.kernels.occupancy import own_cells
 from framework.kernels.rows import gather_rows
 from framework.kernels.trace import trace
 from framework.samplers.base import Sampler
+from framework.samplers.fixed import Steps, attached, sample_into_slots
+from framework.samplers.room import Room
 
 MAX_CELLS = 512
 """Maximum number of cells along an axis; the state of 512^3 cells takes 0.8 GB."""
@@ -118,7 +123,10 @@ class OccupancySampler(Sampler):
                 f"{MAX_CELLS}^3 cells in all"
             )
         self.resolution, self.levels, self.endless, self.slices = resolution, levels, endless, slices
-        self.step_size = (box[1] - box[0]).norm().item() / num_steps
+        self.step_size, self.num_steps = (box[1] - box[0]).norm().item() / num_steps, num_steps
+        self.room = Room(math.ceil(most_steps(num_steps) / RUN), most_steps(num_steps))
+        self.always_fixed = False
+        """Whether training steps have a fixed number of samples on the CPU too, for tests and counts."""
         self.early_stop = early_stop
         self.train_early_stop = early_stop if train_early_stop is None else train_early_stop
         self.alpha_threshold = alpha_threshold
@@ -153,7 +161,16 @@ class OccupancySampler(Sampler):
 
     def forget(self) -> None:
         """Discard `occupancy`, which is computed again on demand; to be called after `occupied` has changed."""
-        self._packed = None
+        if self._packed is not None and self._has_fixed_sizes:
+            self._packed.refresh()
+        else:
+            self._packed = None
+
+    @property
+    def _has_fixed_sizes(self) -> bool:
+        """Whether training steps take a fixed number of samples, for which Python need not wait for the device."""
+        ahead = self.always_fixed or devices.runs_ahead(self.occupied.device)
+        return ahead and self.levels == 1 and not self.cone and not self.endless
 
     # -- sampling ---------------------------------------------------------------------------------------------
 
@@ -176,8 +193,18 @@ class OccupancySampler(Sampler):
         """
         own = self.train_early_stop if self.training else self.early_stop
         stop = own if early_stop is None else early_stop
-        marched = self.begin(rays, jitter, stop)
+        surface = field if isinstance(field, HasAlpha) else None
 
+        def evaluate(wave: Wave) -> tuple[Tensor, Tensor]:
+            points = interval_points(rays, wave.owners, wave, wave.positions, field.footprint)
+            if surface is None:
+                return field.density(points)
+            return surface.alpha(points, rays.directions.index_select(0, wave.owners), wave.t_ends - wave.t_starts)
+
+        if self.is_fixed(rays):
+            steps = Steps(self.occupancy, self.step_size, self.num_steps, self._shift(rays, jitter))
+            return sample_into_slots(rays, steps, self.room, evaluate, surface, stop, self.samples_per_step)
+        marched = self.begin(rays, jitter, stop)
         if isinstance(field, HasGridDensity) and not self.endless:
             known = field.grid_density()
             if known is not None:
@@ -186,13 +213,6 @@ class OccupancySampler(Sampler):
                 samples = Samples(*intervals, owners=found.owners, longest=found.longest, early_stop=stop)
                 return samples.evaluated(found.sigma, found.features)
 
-        def evaluate(wave: Wave) -> tuple[Tensor, Tensor]:
-            points = interval_points(rays, wave.owners, wave, wave.positions, field.footprint)
-            if surface is None:
-                return field.density(points)
-            return surface.alpha(points, rays.directions.index_select(0, wave.owners), wave.t_ends - wave.t_starts)
-
-        surface = field if isinstance(field, HasAlpha) else None
         evaluated = Waves()
         while (wave := marched.wave(marched.next_limit)) is not None:
             stopping = evaluated.evaluate(len(wave.owners), partial(evaluate, wave))[0]
@@ -206,7 +226,7 @@ class OccupancySampler(Sampler):
         if not marched.waves:  # no occupied cell on any ray: empty tensors with the field's shapes and types
             empty = rays.nears[:0]
             samples = Samples(empty, empty, offsets, owners=order, early_stop=stop)
-            return _attached(samples, surface, *evaluate(Wave(empty, empty, order, rays.origins[:0])))
+            return attached(samples, surface, *evaluate(Wave(empty, empty, order, rays.origins[:0])))
         waves = marched.waves
         columns = [[w.t_starts for w in waves], [w.t_ends for w in waves], [w.owners for w in waves]]
         starts, ends, owners = gather_rows(columns, order)
@@ -218,7 +238,17 @@ class OccupancySampler(Sampler):
         samples = Samples(starts, ends, offsets, owners=owners, longest=marched.longest, early_stop=stop)
         if rest is not None:
             samples = _opened(samples, rest.owners)
-        return _attached(samples, surface, *evaluated.choose(order, chosen))
+        return attached(samples, surface, *evaluated.choose(order, chosen))
+
+    def is_fixed(self, rays: Rays) -> bool:
+        """Return whether `sample` returns a number of samples of `rays` that does not depend on what is on them."""
+        return self.training and len(rays) > 0 and self._has_fixed_sizes
+
+    def step_kind(self, step: int) -> StepKind:
+        return StepKind(self.room.per_ray) if self._has_fixed_sizes else super().step_kind(step)
+
+    def read_counts(self) -> None:
+        self.room.read()
 
     def begin(self, rays: Rays, jitter: bool, early_stop: float) -> March:
         """Return a march before its first wave.
@@ -231,11 +261,13 @@ class OccupancySampler(Sampler):
         Raises:
             ValueError: if the rays require a gradient, which marched samples do not have.
         """
+        stride, shift = self._stride if self.training else 1.0, self._shift(rays, jitter)
+        return march(rays, self.occupancy, stride * self.step_size, stride * self.cone, shift, early_stop)
+
+    def _shift(self, rays: Rays, jitter: bool) -> Tensor | None:
         if is_followed(rays.origins, rays.directions):
             raise ValueError("marched samples carry no gradient to rays: detach these, or take a ProposalSampler")
-        shift = torch.rand(len(rays), device=rays.origins.device) if jitter else None
-        stride = self._stride if self.training else 1.0
-        return march(rays, self.occupancy, stride * self.step_size, stride * self.cone, shift, early_stop)
+        return torch.rand(len(rays), device=rays.origins.device) if jitter else None
 
     # -- updating the grid ------------------------------------------------------------------------------------
 
@@ -358,11 +390,6 @@ def _opened(samples: Samples, rays: Tensor) -> Samples:
     ends = samples.t_ends.clone()
     ends[samples.offsets[rays + 1] - 1] = FARTHEST
     return replace(samples, t_ends=ends, points=samples.t)
-
-
-def _attached(samples: Samples, surface: HasAlpha | None, stopping: Tensor, features: Tensor) -> Samples:
-    """Return samples with features, and with their density or, for a surface, their opacity."""
-    return samples.evaluated(stopping, features) if surface is None else samples.with_alpha(stopping, features)
 
 
 def _in_chunks(density: DensityFunction, positions: Tensor, times: Tensor | None = None) -> Tensor:

@@ -26,6 +26,7 @@ from framework.encodings.hash_grid import HashGrid
 from framework.fields.base import DensityFunction, Field
 from framework.fields.encoded import DensityField
 from framework.geometry.bounds import intersect_box
+from framework.geometry.limits import at_least
 from framework.geometry.points import Footprint, Points, sample_points
 from framework.geometry.rays import Histogram, Rays, Samples
 from framework.kernels.intervals import interval_weights, proposal_excess, resample
@@ -239,7 +240,7 @@ def half_edge(box: Tensor) -> float:
 
 def to_disparity(t: Tensor) -> Tensor:
     """Map distances `t` in [0, inf) to [0, 1): t / 2 up to t = 1, and 1 - 1 / (2 t) beyond."""
-    return torch.where(t < 1, t / 2, 1 - 1 / (2 * t.clamp(min=1)))
+    return torch.where(t < 1, t / 2, 1 - 1 / (2 * at_least(t, 1.0)))
 
 
 def from_disparity(s: Tensor) -> Tensor:

@@ -8,11 +8,13 @@ differs between steps is in tensors that stay where they are: parameters, Adam's
 that was not.
 
 A recording is believed only after a test: in the step after it was made, the step is also taken without it, and both
-must change all that is learnt alike. Whatever fails, training goes on without recordings, and a line says why.
+must have the same loss and change all that is learnt alike. It is tested once more later, when what a recording might
+still have held on to has changed. Whatever fails, training goes on without recordings, and a line says why.
 """
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
@@ -36,6 +38,13 @@ TOLERANCE = 0.1
 """Largest difference between a repeated step's change of a tensor and that of the step without it, relative to the
 latter. The two are not the same to the bit, since sums are added up in any order on a GPU; a step with another draw,
 learning rate or number differs by its whole size."""
+LOSS_TOLERANCE = 0.01
+"""Largest difference between the losses of both, relative to that of the step without a recording."""
+TESTED = 0, 64
+"""Numbers of repetitions of a recording before it is tested. In 64 steps an occupancy grid has been updated four times
+and more, learning rates have changed, and other tensors may have moved."""
+MOST_KINDS = 4
+"""Number of kinds of steps whose recordings are kept, with the memory that each holds: those that were taken last."""
 FLAG = "--machine.cuda-graphs"
 
 
@@ -78,6 +87,9 @@ class CudaRecorder:
             ConfigError: if that fails, and leaves the GPU or its generator in a state from which nothing can go on.
         """
         graph = torch.cuda.CUDAGraph()
+        gc.collect()  # as torch itself does up to 2.8
+        collecting = gc.isenabled()
+        gc.disable()  # to free a kernel or another graph while one is recorded would spoil it
         try:
             with torch.cuda.graph(graph, stream=self.stream):
                 result = function()
@@ -88,6 +100,9 @@ class CudaRecorder:
             except RuntimeError:
                 raise ConfigError(f"recording a CUDA graph failed ({_one_line(failure)}); use {FLAG} off") from failure
             raise
+        finally:
+            if collecting:
+                gc.enable()
         return result, graph.replay
 
 
@@ -99,8 +114,10 @@ class _Kind(Generic[T]):
     """Number of steps that were taken to warm up."""
     recorded: tuple[T, Callable[[], None]] | None = None
     """The result of the recorded step, and what repeats it."""
-    tested: bool = False
-    """True if repeating it has changed what the step itself would have changed."""
+    repeated: int = 0
+    """Number of steps that were taken by repeating it."""
+    passed: int = 0
+    """Number of tests in which repeating it has done what the step itself does."""
 
 
 class StepGraphs(Generic[T]):
@@ -110,10 +127,17 @@ class StepGraphs(Generic[T]):
         recorder: records them.
         learnt: returns all tensors that a step changes for good: parameters, and the optimiser's state.
         must: whether a step that cannot be recorded is an error.
+        loss: returns the loss () of a step's result, which is tested too; None if there is none.
     """
 
-    def __init__(self, recorder: Recorder, learnt: Callable[[], Sequence[Tensor]], must: bool = False) -> None:
-        self._recorder, self._learnt, self._must = recorder, learnt, must
+    def __init__(
+        self,
+        recorder: Recorder,
+        learnt: Callable[[], Sequence[Tensor]],
+        must: bool = False,
+        loss: Callable[[T], Tensor] | None = None,
+    ) -> None:
+        self._recorder, self._learnt, self._must, self._loss = recorder, learnt, must, loss
         self.repeated = 0
         """Number of steps that were taken by repeating one."""
         self._kinds: dict[Hashable, _Kind[T]] = {}
@@ -148,7 +172,9 @@ class StepGraphs(Generic[T]):
         Raises:
             ConfigError: if the step cannot be recorded, and must be.
         """
-        kept = self._kinds.setdefault(kind.of, _Kind())
+        kept = self._kinds[kind.of] = self._kinds.pop(kind.of, _Kind())  # the last one taken is the last in the table
+        if len(self._kinds) > MOST_KINDS:
+            self._kinds.pop(next(iter(self._kinds)))
         if kept.recorded is None:
             seed()
             result = self._recorder.run(step)
@@ -157,10 +183,11 @@ class StepGraphs(Generic[T]):
                 self._record(kept, step)
             return result
         result, repeat = kept.recorded
-        if not kept.tested:
+        if kept.passed < len(TESTED) and kept.repeated >= TESTED[kept.passed]:
             return self._test(kept, seed, step)
         seed()
         repeat()
+        kept.repeated += 1
         self.repeated += 1
         return result
 
@@ -180,18 +207,25 @@ class StepGraphs(Generic[T]):
         before = _copies(tensors)
         seed()
         expected = self._recorder.run(step)
+        wanted = None if self._loss is None else self._loss(expected).clone()
         after = _copies(tensors)
         _restore(tensors, before)
         seed()
         repeat()
         moved = _distance(before, after)
         apart = _distance(tensors, after)
+        fault = None
         if not bool((apart <= TOLERANCE * moved).all()):  # NaN is not
+            fault = "change what the step itself changes"
+        if self._loss is not None and not _close(self._loss(result), wanted):
+            fault = "have the loss of the step itself"
+        if fault is not None:
             _restore(tensors, after)
-            self._give_up("a repeated step did not change what the step itself changes")
+            self._give_up(f"a repeated step did not {fault}")
             return expected
-        kept.tested = bool((moved > 0).any())  # a step that was dropped tells nothing
-        if kept.tested and not self._announced:
+        tells = bool((moved > 0).any())  # a step that was dropped tells nothing
+        kept.passed += tells
+        if tells and not self._announced:
             self._announced = True
             say("training steps are recorded as CUDA graphs and repeated")
         return result
@@ -223,19 +257,32 @@ def _restore(tensors: Sequence[Tensor], values: Sequence[Tensor]) -> None:
         tensor.copy_(value)
 
 
+def _close(loss: Tensor, wanted: Tensor | None) -> bool:
+    """Return whether a loss is that which is wanted, or neither is finite."""
+    assert wanted is not None
+    return bool(torch.isclose(loss, wanted, LOSS_TOLERANCE, 0.0) | ~(loss.isfinite() | wanted.isfinite()))
+
+
 @torch.no_grad()
 def _distance(some: Sequence[Tensor], others: Sequence[Tensor]) -> Tensor:
-    """Return the Euclidean distance between each two tensors, (K,) float64."""
-    return torch.stack([(a.double() - b.double()).norm() for a, b in zip(some, others, strict=True)])
+    """Return the Euclidean distance between each two tensors, (K,) float64; what is infinite in both is alike."""
+    pairs = zip(some, others, strict=True)
+    return torch.stack([torch.where(a == b, 0.0, a.double() - b.double()).norm() for a, b in pairs])
 
 
-def make_graphs(mode: str, device: torch.device, learnt: Callable[[], Sequence[Tensor]]) -> StepGraphs[Any] | None:
+def make_graphs(
+    mode: str,
+    device: torch.device,
+    learnt: Callable[[], Sequence[Tensor]],
+    loss: Callable[[Any], Tensor] | None = None,
+) -> StepGraphs[Any] | None:
     """Return the recorded steps of a run; None if they are switched off or the device has no graphs.
 
     Args:
         mode: auto, on or off, as configured.
         device: the device of training.
         learnt: returns all tensors that a step changes for good.
+        loss: returns the loss () of a step's result; None if there is none.
 
     Raises:
         ConfigError: if they are switched on, and the device has none.
@@ -244,7 +291,7 @@ def make_graphs(mode: str, device: torch.device, learnt: Callable[[], Sequence[T
         raise ConfigError(f"{FLAG} on: only GPUs that PyTorch names cuda have graphs, and this run is on {device.type}")
     if mode == "off" or device.type != "cuda":
         return None
-    return StepGraphs(CudaRecorder(device), learnt, must=mode == "on")
+    return StepGraphs(CudaRecorder(device), learnt, mode == "on", loss)
 
 
 def kind_of_step(model: Model[Any], source: BatchSource, step: int, batch: tuple[Hashable, ...]) -> StepKind:

@@ -17,6 +17,7 @@ from framework.kernels.occupancy import own_cells
 from framework.model import parts
 from framework.ray_model import RayModel
 from framework.samplers.base import SkipsCells
+from framework.samplers.occupancy import OccupancySampler
 
 if TYPE_CHECKING:
     from framework.training.trainer import Trainer
@@ -56,6 +57,11 @@ def skip_report(trainer: Trainer) -> list[Rung]:
     samplers = parts(model, SkipsCells)
     if samplers and isinstance(model, RayModel):
         rungs += _sampling_rungs(trainer, model, samplers)
+    rooms = [sampler.room for sampler in parts(model, OccupancySampler)]
+    if (rays := sum(room.rays for room in rooms)) > 0:
+        share = sum(room.left_out for room in rooms) / rays
+        says = f"rays of batches for whose samples there was no room on the device: {share:.1%}"
+        rungs.append(Rung("rays of batches, for want of room", share, None, "no switch", says))
     updated, there = trainer.optimizer.entries
     if there:
         share = updated / there
@@ -127,7 +133,7 @@ def _probe(model: RayModel[Any], rays: Rays) -> tuple[float, int]:
     wait_for(model.device)
     seconds = time.perf_counter() - start
     model.train(was_training)
-    return seconds, rendered.num_samples
+    return seconds, int(rendered.num_samples)
 
 
 @contextmanager

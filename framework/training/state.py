@@ -34,6 +34,11 @@ class State:
     looks: tuple[Entry, ...] = ()
     """Evaluations of a few held-out images."""
 
+    def learn_samples_per_ray(self, found: float) -> None:
+        """Take the samples per ray that a step has `found` into their mean; NaN if they are not known, or not yet."""
+        if not math.isnan(found):
+            self.samples_per_ray += 0.2 * (found - self.samples_per_ray)
+
 
 def agree(state: State, received: Sequence[int]) -> Sequence[int]:
     """Take over what decides on the next step from the first process: clock, samples per ray and last evaluation.

@@ -17,7 +17,7 @@ from torch import Tensor
 from framework.base.checked import checked
 from framework.base.config import RayConfig, TrainConfig, to_plain
 from framework.base.console import say
-from framework.base.device import seed_step
+from framework.base.device import BEFORE_STEP, seed_step
 from framework.base.errors import CheckpointError, DivergenceError
 from framework.base.processes import alone, from_first, processes
 from framework.data.dataset import Dataset
@@ -47,6 +47,8 @@ MAX_BAD_STEPS = 10
 """Number of consecutive non-finite steps after which a run stops."""
 SMALLEST_BATCH, LARGEST_BATCH = 64, 2**17
 """Minimum and maximum number of rays per step, if it depends on the number of samples."""
+BATCH_CHANGES = 1.2
+"""Factor by which the wanted number of rays must have changed where steps are recorded, which holds for their sizes."""
 BetweenSteps = Callable[[StepReport, Sequence[int]], None]
 """Function of a step's report and of the signals received so far, which grow while it runs."""
 
@@ -83,8 +85,10 @@ class Trainer:
         self.steps_per_read = 1 if self.device.type == "cpu" else STEPS_PER_LOG
         """Steps after which the errors of batches are read from the device, which is waited for."""
         self._unread: list[Tensor] = []
-        self.graphs = make_graphs(self.config.machine.cuda_graphs, self.device, self._learnt)
+        mode = self.config.machine.cuda_graphs
+        self.graphs = make_graphs(mode, self.device, self._learnt, lambda taken: taken[1].loss.total)
         self.held_out = HeldOut(self.run, self.model, eval_set)
+        self._rays_a_step = 0
         self._bad_in_a_row = 0
         self._prepared = False
         self._saved_step: int | None = None
@@ -268,12 +272,17 @@ class Trainer:
         weights = getattr(batch, "weights", None)
         mse = (result.squared_errors if weights is None else result.squared_errors * weights).mean()
         finite = result.finite if isinstance(result.finite, Tensor) else torch.full_like(mse, result.finite)
-        self._unread.append(torch.stack([mse, finite.to(mse)]))
-        if (state.step + 1) % self.steps_per_read == 0:
-            self._read_errors(state.step + 1)
-        seconds = time.perf_counter() - start
         num_rays = len(batch) * getattr(batch, "rays_per_pixel", 1)  # about as many in each process
-        self._account(num_rays, result.loss.num_samples, seconds)
+        per_ray = result.loss.num_samples / max(num_rays, 1)
+        done = state.step + 1
+        unread = per_ray if isinstance(per_ray, Tensor) else torch.full_like(mse, math.nan)
+        self._unread.append(torch.stack([mse, finite.to(mse), unread]))
+        if done % self.steps_per_read == 0 or (
+            unread is per_ray and done < self.steps_per_read and done & (done - 1) == 0
+        ):
+            self._read_errors(done)
+        seconds = time.perf_counter() - start
+        self._account(num_rays, math.nan if isinstance(per_ray, Tensor) else per_ray, seconds)
         return StepReport(
             step=state.step,
             seconds=state.seconds,
@@ -291,6 +300,7 @@ class Trainer:
         if self.graphs is not None:
             kind = kind_of_step(model, source, step, (request.num_pixels, request.rays_per_pixel))
             if self.graphs.take(kind):
+                seed_step(seed, step, BEFORE_STEP)  # for updates of the sampler; what is recorded is seeded anew
                 schedule(model, optimizer, step, progress)
 
                 def taken() -> tuple[Any, StepResult]:
@@ -320,7 +330,10 @@ class Trainer:
         if samples is None:
             return config.num_rays_per_batch
         wanted = round(samples / max(self.state.samples_per_ray, 0.1))
-        return min(max(wanted, SMALLEST_BATCH), LARGEST_BATCH)
+        wanted = min(max(wanted, SMALLEST_BATCH), LARGEST_BATCH)
+        if self.graphs is None or not wanted / BATCH_CHANGES <= self._rays_a_step <= wanted * BATCH_CHANGES:
+            self._rays_a_step = wanted
+        return self._rays_a_step
 
     def _count_bad(self, step: int, finite: bool) -> None:
         """Count dropped steps; raise DivergenceError after too many in a row."""
@@ -333,18 +346,20 @@ class Trainer:
                 f"the last good checkpoint is in {self.checkpoint_folder}. Lower --learning-rate, or check the data"
             )
 
-    def _account(self, num_rays: int, num_samples: int, seconds: float) -> None:
+    def _account(self, num_rays: int, samples_per_ray: float, seconds: float) -> None:
         state = self.state
         state.step += 1
         state.seconds += seconds
         state.rays += num_rays * processes().count
-        state.samples_per_ray += 0.2 * (num_samples / max(num_rays, 1) - state.samples_per_ray)
+        state.learn_samples_per_ray(samples_per_ray)
 
     def _read_errors(self, done: int) -> None:
         """Read of the last of `done` steps what was left on the device: errors, and whether they were finite."""
         unread = torch.stack(self._unread).tolist() if self._unread else []
         self._unread.clear()
-        for step, (mse, finite) in enumerate(unread, done - len(unread) + 1):
+        self.model.read_counts()
+        for step, (mse, finite, samples_per_ray) in enumerate(unread, done - len(unread) + 1):
+            self.state.learn_samples_per_ray(samples_per_ray)
             if math.isfinite(mse):  # a dropped step's may be NaN, which would stay in the mean
                 self.state.train_mse += max(0.02, 1 / step) * (mse - self.state.train_mse)
             else:

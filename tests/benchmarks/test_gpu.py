@@ -32,13 +32,15 @@ def test_kernels_of_rays_are_right() -> None:
 
 def test_steps_are_timed_as_they_are_and_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
     """On the CPU, which has no graphs, they are the same steps."""
-    monkeypatch.setattr("framework.tools.benchmarks.gpu.SKY_SIZE", 16)
+    monkeypatch.setattr("framework.tools.benchmarks.gpu.SIZE", 16)
     small = {"num_rays_per_batch": 16, "log2_table_size": 8, "num_levels": 2}
-    off, auto = timed_steps(torch.device("cpu"), 1, 2, **small)
-    assert [off["CUDA graphs"], auto["CUDA graphs"]] == ["off", "auto"]
-    assert off["PSNR of batches, dB"] == auto["PSNR of batches, dB"]
-    assert off["repeated"] == auto["repeated"] == 0
-    assert min(off["ms a step"], auto["ms a step"]) > 0
+    rows = timed_steps(torch.device("cpu"), 1, 2, **small)
+    assert [row["method"] for row in rows] == ["nerfacto", "nerfacto", "instant-ngp", "instant-ngp"]
+    for off, auto in (rows[:2], rows[2:]):
+        assert [off["CUDA graphs"], auto["CUDA graphs"]] == ["off", "auto"]
+        assert off["PSNR of batches, dB"] == auto["PSNR of batches, dB"]
+        assert off["repeated"] == auto["repeated"] == 0
+        assert min(off["ms a step"], auto["ms a step"]) > 0
 
 
 def test_the_psnr_after_some_seconds_is_that_of_the_last_evaluation_until_then() -> None:

@@ -147,6 +147,12 @@ def test_what_is_not_known_is_said_as_it_is() -> None:
     assert in_one_line("mistake", "ns-eval") == "mistake; ns-eval --help shows the flags"
 
 
+@pytest.mark.parametrize("flag", ["'--max-images'", "'('--max-images',)'"], ids=["tyro 1.0.17", "tyro 1.0.0"])
+def test_a_flag_without_its_value_as_each_tyro_names_it(flag: str) -> None:
+    box = f"╭ Parsing error ─────╮\n│ Missing value for argument {flag}. Expected 1 values. │\n╰────────────────────╯\n"
+    assert in_one_line(box, "ns-eval") == "--max-images needs a value; ns-eval --help shows the flags"
+
+
 def test_help_is_no_error() -> None:
     done = called("ns-eval", "--help")
     assert (done.returncode, done.stderr) == (0, "")

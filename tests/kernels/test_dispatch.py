@@ -19,6 +19,7 @@ from framework.kernels.adam import ALL_FINITE, DENSE_ADAM, SPARSE_ADAM
 from framework.kernels.compositing import COMPOSITE, DISTORTION
 from framework.kernels.contraction import CONTRACT
 from framework.kernels.dispatch import TRITON, Backend, Operation, derivatives
+from framework.kernels.fixed_march import FILL, REACH, fill
 from framework.kernels.frequency import FREQUENCY_ENCODING
 from framework.kernels.hash_grid import HASH_GRID, HashGridLayout, hash_grid
 from framework.kernels.intervals import INTERVAL_WEIGHTS, PROPOSAL_EXCESS, RESAMPLE
@@ -163,6 +164,8 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     GATHER_ROWS: lambda: ([[rand(4, 3), rand(5, 3)], [torch.arange(4), torch.arange(5)]], torch.tensor([8, 0, 4, 3])),
     SORT_BY_RAY: lambda: (torch.randint(5, (30,)), torch.randint(2, (30,), dtype=torch.uint8), 5),
     MARCH: lambda: (rays(), Occupancy(torch.rand(16**3) < 0.1, BOX, 16), 0.05, 0.0, None, 1e-3),
+    FILL: lambda: (rays(), Occupancy(torch.rand(16**3) < 0.1, BOX, 16), 0.05, 100, None, (2048, 2048)),
+    REACH: lambda: (fill(*CASES[FILL]()).placed, rand(2048), 4.6, 100),
     TRACE: lambda: (marched(), grid_density()),
     TRACED_ERROR: lambda: (marched(), grid_density(), grid_color(), PixelTargets(rand(100, 3), rand(25, 3), rand(25))),
     REFRESH_OCCUPANCY: lambda: (torch.rand(200) * 0.4, torch.zeros(200, dtype=torch.bool), 0.9, 0.05, 0.01),

@@ -188,15 +188,15 @@ def test_gradients_are_scaled_near_cameras_in_training_and_values_are_not() -> N
 
 
 @pytest.mark.parametrize("name", RAY_METHODS)
-def test_every_ray_method_scales_gradients_if_asked(name: str) -> None:
+def test_every_ray_method_scales_and_thins_gradients_if_asked(name: str) -> None:
     method = load_method(name)
     for scaled in (True, False):
-        config = replace(method.config, **TINY.get(name, {}), gradient_scaling=scaled)
+        config = replace(method.config, **TINY.get(name, {}), gradient_scaling=scaled, thin_gradients=scaled / 4)
         model = method.build(config, replace(CAPTURE, unbounded=name != "pixel-nerf"))
         assert isinstance(model, RayModel)
         renderer = model.renderer.renderer if isinstance(model.renderer, SphereRenderer) else model.renderer
         assert isinstance(renderer, VolumeRenderer)
-        assert renderer.unit_length == (0.5 if scaled else None)
+        assert (renderer.unit_length, renderer.thin) == ((0.5, 0.25) if scaled else (None, 0))
 
 
 def test_samples_that_nobody_evaluated_are_refused() -> None:

@@ -4,7 +4,10 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+import torch
 
+from framework import Cameras
+from framework.geometry.lenses import LENSES
 from tests.site.pages import ROOT
 
 pytestmark = pytest.mark.medium
@@ -63,3 +66,44 @@ def test_plain_surroundings_are_white_outside_of_the_masks(failures: ModuleType)
     for image, mask in zip(faulty.images, helped.masks, strict=True):
         assert image[~mask].min() > 0.4  # half covered pixels of a dark solid at the least
         assert np.mean(image[~mask]) > 0.95
+
+
+def test_the_lens_shows_what_a_pinhole_shows_elsewhere(failures: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a scene whose colours are directions: each pixel has the colour of the direction that its lens gives it."""
+    x, y = failures.pinhole_of(np.array([0.2, 0.36]), np.array([-0.3, 0.36]))
+    squared = x * x + y * y
+    np.testing.assert_allclose(x * (1 + failures.K1 * squared), [0.2, 0.36], atol=1e-12)
+    np.testing.assert_allclose(y * (1 + failures.K1 * squared), [-0.3, 0.36], atol=1e-12)
+
+    def of_directions(split: str, count: int, index: int, margin: int = 0) -> tuple[np.ndarray, None]:
+        return failures.directions(np.eye(4), margin), None
+
+    monkeypatch.setattr(failures, "photograph", of_directions)
+    faulty, helped = failures.lens()
+    assert (faulty.lens, helped.lens) == ({}, {"k1": failures.K1})
+    square = torch.full((1,), failures.focal()), torch.full((1,), 16.0), torch.full((1,), 32)
+    coefficients = torch.tensor([[failures.K1, *[0.0] * (len(LENSES["opencv"]) - 1)]])
+    intrinsics = [value for value in square for _ in "xy"]
+    camera = Cameras(torch.eye(4)[None, :3], *intrinsics, model="opencv", lens=coefficients)
+    columns, rows, _ = camera.project(torch.from_numpy(faulty.images[0]).float().view(-1, 3), 0)
+    expected = torch.arange(32.0)
+    torch.testing.assert_close(columns.view(32, 32), expected.expand(32, 32), atol=0.02, rtol=0)
+    torch.testing.assert_close(rows.view(32, 32), expected[:, None].expand(32, 32), atol=0.02, rtol=0)
+
+
+def test_folded_cameras_stand_on_one_half_of_the_circle(failures: ModuleType) -> None:
+    faulty, helped = failures.repeats()
+    there = np.array([pose[:3, 3] for pose in faulty.poses])
+    before = np.array([pose[:3, 3] for pose in helped.poses])
+    assert (there[:, 1] >= 0).all()
+    assert 0 < (before[:, 1] < 0).sum() < 6
+    np.testing.assert_allclose(np.linalg.norm(there, axis=1), np.linalg.norm(before, axis=1))
+    for pose in faulty.poses:  # and look at the middle, upright
+        np.testing.assert_allclose(pose[:3, 2], pose[:3, 3] / np.linalg.norm(pose[:3, 3]), atol=1e-6)
+
+
+def test_what_is_cut_out_differs_in_the_masks_meaning_alone(failures: ModuleType) -> None:
+    faulty, helped = failures.cutout()
+    assert (faulty.settings["masks"], helped.settings["masks"]) == ("ignored", "empty")
+    assert all(np.array_equal(a, b) for a, b in zip(faulty.masks, helped.masks, strict=True))
+    assert 0.1 < np.mean(faulty.masks) < 0.5

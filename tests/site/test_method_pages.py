@@ -1,17 +1,21 @@
 """The page of each method says of every flag what the command line does."""
 
 import dataclasses
+import json
 import re
 from collections.abc import Callable, Iterator
 from functools import cache
+from pathlib import Path
 from types import ModuleType
 
 import pytest
+from PIL import Image
 
 from framework.base.config import ConfigError
 from framework.base.registry import load_method, registered
 from framework.cli.train import _flag_names
-from tests.site.pages import ROOT
+from tests.site.commands import Checker
+from tests.site.pages import ROOT, words_of
 
 BUILT_IN = [name for name, entry in registered("methods").items() if entry.module.startswith("methods.")]
 ROW = re.compile(r"^\| `--([\w.-]+)` \| (.*?) \| (.*?) \| (.*) \|$", re.MULTILINE)
@@ -84,3 +88,27 @@ def test_a_method_without_a_text_of_its_own_has_a_page(method_pages: ModuleType)
 def test_a_text_of_its_own_comes_first(method_pages: ModuleType) -> None:
     page = method_pages.page("kplanes", "# kplanes\n\nSix planes.\n")
     assert page.index("Six planes.") < page.index("## In short") < page.index("## Flags")
+
+
+def test_a_picture_is_shown_with_the_run_that_made_it(
+    method_pages: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = method_pages.PICTURES / "psnr.json"
+    made = json.loads(file.read_text()) if file.is_file() else {}
+    checker = Checker(monkeypatch, tmp_path)
+    assert set(made) <= set(BUILT_IN)
+    for name, run in made.items():
+        checker.check(words_of(run["command"]))
+        with Image.open(method_pages.PICTURES / f"{name}.jpg") as shown:
+            assert shown.width > 3.5 * shown.height  # five tiles side by side, and their scales
+        page = method_pages.page(name, None)
+        assert f"](../pictures/methods/{name}.jpg)" in page
+        assert f"{run['psnr']:.2f} dB" in page
+
+
+def test_a_method_without_a_picture_has_a_page(
+    method_pages: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "psnr.json").write_text("{}")
+    monkeypatch.setattr(method_pages, "PICTURES", tmp_path)
+    assert "## Picture" not in method_pages.page("kplanes", None)

@@ -1,5 +1,6 @@
 """Commands of the documents that take a run or make one do so, from end to end, on a tiny scene and in few steps."""
 
+import json
 import os
 import re
 import shutil
@@ -49,6 +50,21 @@ def shown(*names: str) -> list[str]:
 
 
 RUNNING = shown("ns-train", "ns-eval", "ns-render", "ns-export")
+RUNS = "outputs/all/instant-ngp/TIME outputs/all/gaussian-splatting/TIME"
+MEASURED = {
+    "kernels": "--samples 512 --repeats 1",
+    "methods": "--data path/to/lego --max-seconds 1",
+    "curves": "--data path/to/lego --methods instant-ngp kplanes --budgets 1 2 --seeds 1 --views 1 --plot-dir plots",
+    "ablation": "--data path/to/lego --seconds 1 --seeds 1",
+    "starts": "--data path/to/lego --seconds 1",
+    "profile-step": "--data path/to/lego --steps 3 --max-seconds 2",
+    "operations": "--methods instant-ngp --before 2 --steps 2 --output results/operations.json",
+    "pose-refinement": "--seconds 1",
+    "meshes": "--load-config outputs/all/instant-ngp/TIME --exports tsdf --resolutions 16 --output results/meshes.json",
+    "frames": f"--runs {RUNS} --widths 20 --threads 1 --pictures 2 --output results/frames.json",
+    "viewer": f"--runs {RUNS} --widths 32 --pictures 2",
+}
+"""Benchmark -> its flags for a second's work. The others run in tests/benchmarks."""
 
 
 @pytest.fixture(scope="module")
@@ -132,5 +148,22 @@ def test_the_viewer_answers(command: str, folder: Path) -> None:
         viewer.wait(30)
 
 
+@pytest.mark.parametrize("what", MEASURED)
+def test_a_benchmark_writes_what_it_measured(what: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    (folder / "results").mkdir(exist_ok=True)
+    for file in (folder / "results").iterdir():
+        file.unlink()
+    where = [] if "--output" in MEASURED[what] else ["--output-dir", "results"]
+    execute(["ns-bench", what, *MEASURED[what].split(), *where])
+    (written,) = (folder / "results").glob("*.json")
+    content = json.loads(written.read_text())
+    assert content
+    assert str(folder) not in written.read_text()  # nothing of this machine's folders
+
+
 def test_enough_is_run() -> None:
     assert len(RUNNING) > 35
+    benchmarks = re.findall(r"^  ([a-z-]+)  ", import_module("framework.cli.bench").USAGE, re.MULTILINE)
+    elsewhere = {"gpu", "quadrature", "processes", "contention", "cache", "poses"}
+    assert set(benchmarks) - elsewhere <= set(MEASURED) | {"tables"}

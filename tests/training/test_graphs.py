@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import gc
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -18,6 +19,7 @@ from framework.samplers import proposal
 from framework.tools.benchmarks.operations import trainer_of
 from framework.training import graphs
 from framework.training.graphs import WARM_UP, CudaRecorder, StepGraphs, kind_of_step, make_graphs
+from framework.training.state import State
 from framework.training.trainer import MAX_BAD_STEPS, Trainer
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 from tests.training.recorded import FakeRecorder, ahead
@@ -91,6 +93,54 @@ def test_repeated_steps_learn_what_steps_learn(
     assert recorder.repeated == STEPS - kinds * WARM_UP
     assert said == ["training steps are recorded as CUDA graphs and repeated"]
     assert (usual.optimizer.entries[0] > 0) == ("nerfacto" in usual.run.method or "zip" in usual.run.method)
+
+
+class Unrepeated(StepGraphs[Any]):
+    """Takes every step as it is, with the same seeds."""
+
+    def run(self, kind: StepKind, seed: Callable[[], None], step: Callable[[], Any]) -> Any:
+        seed()
+        return step()
+
+
+@pytest.mark.medium
+def test_repeated_steps_with_an_occupancy_grid_learn_what_steps_learn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: list[str]
+) -> None:
+    """Across updates of the grid, which are not recorded, and changes of the room that samples are given."""
+    ahead(monkeypatch)
+    sizes = {"samples_per_batch": 2**11, "num_steps": 64}
+    usual, repeating = (small(tmp_path / name, "instant-ngp", **sizes) for name in ("usual", "repeating"))
+    usual.graphs, recorder = Unrepeated(FakeRecorder(), usual._learnt), recorded(repeating)
+    kinds, steps = set(), 34
+    for trainer in (usual, repeating):
+        trainer.steps_per_read = 8
+    for _ in range(steps):
+        reports = [trainer.train_step() for trainer in (usual, repeating)]
+        assert reports[0].losses == reports[1].losses
+        kinds.add((repeating._request().num_pixels, repeating.model.sampler.room.per_ray))
+    assert_same_bits(tensors(usual), tensors(repeating))
+    assert usual.state.samples_per_ray == repeating.state.samples_per_ray
+    assert usual.state.train_mse == repeating.state.train_mse
+    assert usual.state.samples_per_ray != State().samples_per_ray  # was read
+    assert len(kinds) > 1
+    assert recorder.repeated > steps / 4
+    assert len(recorder.tapes) <= len(kinds) + 1  # that of the first step
+    assert said == ["training steps are recorded as CUDA graphs and repeated"]
+    assert repeating.model.sampler.room.left_out == 0
+
+
+@pytest.mark.medium
+def test_the_number_of_rays_holds_for_a_while(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It follows the samples a ray, in steps, so that most steps have the sizes of the one before."""
+    ahead(monkeypatch)
+    trainer = small(tmp_path, "instant-ngp", samples_per_batch=2**10)
+    recorded(trainer)
+    numbers = []
+    for samples_per_ray in (10.0, 10.9, 11.5, 12.5, 12.0, 11.0, 9.0, 5.0):
+        trainer.state.samples_per_ray = samples_per_ray
+        numbers.append(trainer._request().num_pixels)
+    assert numbers == [102, 102, 102, 82, 82, 82, 114, 205]
 
 
 @pytest.mark.medium
@@ -241,6 +291,66 @@ def test_what_cannot_be_repeated_is_found_and_said(fault: str, said: list[str]) 
             steps_of(toy, 9, step, toy.seed, must=True)
 
 
+def test_another_loss_is_found(said: list[str]) -> None:
+    """Though what is learnt is the same."""
+    toy = Toy()
+
+    def step() -> Tensor:
+        return toy.step() + 0.1 * toy.steps  # a number of Python's
+
+    def taken(loss: Callable[[Tensor], Tensor] | None) -> int:
+        toy.weight.zero_()
+        steps = StepGraphs[Tensor](recorder := FakeRecorder(), lambda: [toy.weight], loss=loss)
+        for toy.steps in range(9):
+            toy.rate.fill_(1.0 + toy.steps)
+            steps.run(StepKind(), toy.seed, step) if steps.take(StepKind()) else step()
+        return recorder.repeated
+
+    assert taken(None) > 3
+    assert taken(torch.sum) == 1
+    assert said[-1].endswith("because a repeated step did not have the loss of the step itself")
+
+
+def test_what_moves_later_is_found(said: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tensor that is replaced after the first test: a recording still reads the old one."""
+    monkeypatch.setattr(graphs, "TESTED", (0, 3))
+    toy, held = Toy(), [torch.ones(5)]
+
+    def step() -> Tensor:
+        toy.weight.add_(held[0] * toy.rate)
+        return toy.weight * 2
+
+    steps = StepGraphs[Tensor](FakeRecorder(), lambda: [toy.weight])
+    for toy.steps in range(12):
+        if toy.steps == WARM_UP + 2:
+            held[0] = torch.full((5,), 7.0)
+        if steps.take(StepKind()):
+            steps.run(StepKind(), toy.seed, step)
+    assert steps.repeated == 3
+    assert "did not change what the step itself changes" in said[-1]
+
+
+def test_what_stays_infinite_is_alike(said: list[str]) -> None:
+    """As the density of cells that no step has looked at."""
+    toy = Toy()
+    toy.weight[0] = torch.inf
+    steps_of(toy, 9, toy.step, toy.seed)
+    assert said == ["training steps are recorded as CUDA graphs and repeated"]
+
+
+def test_few_kinds_are_kept(said: list[str]) -> None:
+    """Each holds memory: those that were taken last."""
+    toy = Toy()
+    steps = StepGraphs[Tensor](recorder := FakeRecorder(), lambda: [toy.weight])
+    for turn in range(2):
+        for number in range(graphs.MOST_KINDS):
+            for _ in range(WARM_UP + 1):
+                steps.run(StepKind((number,)), toy.seed, toy.step)
+        assert len(recorder.tapes) == graphs.MOST_KINDS, turn
+    steps.run(StepKind((99,)), toy.seed, toy.step)
+    assert set(steps._kinds) == {(number,) for number in range(1, graphs.MOST_KINDS)} | {(99,)}
+
+
 def test_draws_of_another_step_are_found(said: list[str]) -> None:
     toy, seeded = Toy(), [0]
 
@@ -269,7 +379,8 @@ def test_reasons_are_said_once_each(said: list[str]) -> None:
         ("nerfacto", {"sampler": "occupancy"}, "how many samples a ray has"),
         ("nerfacto", {"few_images": True, "unseen_loss_mult": 0.1}, "the weight of unseen views changes"),
         ("nerfacto", {"few_images": True, "open_levels_until": 0.5}, "levels are still opening"),
-        ("instant-ngp", {}, "the method does not say"),
+        ("instant-ngp", {}, "how many samples a ray has"),  # on the CPU
+        ("kplanes", {}, "the method does not say"),
         ("gaussian-splatting", {}, "batches are made on the host"),
     ],
 )
@@ -343,6 +454,8 @@ def test_graphs_are_recorded_on_the_stream_on_which_steps_warmed_up(monkeypatch:
     repeat()
     assert result == 4
     assert calls == [f"begin graph {own}", "step", f"end graph {own}", "replay"]
+    assert recorder.record(gc.isenabled)[0] is False  # what is freed meanwhile would spoil the recording
+    assert gc.isenabled()
 
 
 @pytest.mark.parametrize("usable", [True, False])

@@ -31,6 +31,15 @@ def test_the_report_tells_what_was_skipped(shared_tiny: Path, tmp_path: Path) ->
     assert all(rung.switch not in said and rung.name not in said for rung in rungs.values())
 
 
+def test_rays_without_room_are_told(shared_tiny: Path, tmp_path: Path) -> None:
+    """Off the CPU, where samples have a fixed number of slots."""
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run")
+    trainer.model.sampler.room.rays, trainer.model.sampler.room.left_out = 4000, 100
+    (rung,) = (rung for rung in skip_report(trainer) if "room" in rung.name)
+    assert rung.skipped == 0.025
+    assert "rays of batches for whose samples there was no room on the device: 2.5%" in "\n".join(lines([rung]))
+
+
 def test_what_saved_nothing_is_not_told() -> None:
     nothing = Rung("cells", 0.001, None, "--off", "empty space: 0% of the box")
     assert lines([nothing]) == []

@@ -42,28 +42,46 @@ void scatter_level(const Level& level, const float* positions, int64_t count, co
     }
 }
 
-// Samples that come in parts, put together: positions, and the incoming gradient level by level.
+// Where samples with a gradient stand: in their order, those of which some feature's is not zero.
+struct Live {
+    std::vector<const float*> points, grads;
+
+    // `ends` holds the number of samples up to the end of each part, whose gradients are `stride` wide.
+    Live(const float* const* positions, const float* const* all, const int64_t* ends, int parts, int64_t stride) {
+        const size_t most = parts ? size_t(ends[parts - 1]) : 0;
+        points.reserve(most);
+        grads.reserve(most);
+        for (int part = 0; part < parts; part++) {
+            const int64_t count = ends[part] - (part ? ends[part - 1] : 0);
+            for (int64_t n = 0; n < count; n++) {
+                const float* grad = all[part] + n * stride;
+                int64_t f = 0;
+                while (f < stride && grad[f] == 0) f++;
+                if (f == stride) continue;
+                points.push_back(positions[part] + n * 3);
+                grads.push_back(grad);
+            }
+        }
+    }
+};
+
+// Samples with a gradient, which come in parts, put together: positions, and the incoming gradient level by level.
 template <int F>
 struct Gathered {
+    Live live;
     int64_t count;
     int levels;
     std::unique_ptr<float[]> points, by_level;  // not std::vector, which would fill them with zeros first
 
-    // `ends` holds the number of samples up to the end of each part.
     Gathered(const float* const* positions, const float* const* grads, const int64_t* ends, int parts, int levels,
              int threads)
-        : count(parts ? ends[parts - 1] : 0), levels(levels), points(new float[size_t(count) * 3]),
-          by_level(new float[size_t(count) * levels * F]) {
-        const int64_t stride = int64_t(levels) * F;
+        : live(positions, grads, ends, parts, int64_t(levels) * F), count(int64_t(live.points.size())), levels(levels),
+          points(new float[size_t(count) * 3]), by_level(new float[size_t(count) * levels * F]) {
         for_ranges(threads, count, CHUNK, [&](int64_t begin, int64_t end) {
-            int part = 0;
             for (int64_t n = begin; n < end; n++) {
-                while (n >= ends[part]) part++;
-                const int64_t within = part ? n - ends[part - 1] : n;
-                std::memcpy(points.get() + n * 3, positions[part] + within * 3, sizeof(float) * 3);
-                const float* from = grads[part] + within * stride;
+                std::memcpy(points.get() + n * 3, live.points[size_t(n)], sizeof(float) * 3);
                 for (int l = 0; l < levels; l++)
-                    std::memcpy(by_level.get() + (l * count + n) * F, from + l * F, sizeof(float) * F);
+                    std::memcpy(by_level.get() + (l * count + n) * F, live.grads[size_t(n)] + l * F, sizeof(float) * F);
             }
         });
     }

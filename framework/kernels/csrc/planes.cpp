@@ -142,6 +142,20 @@ inline void scatter(const Place& at, float* corner, int features, V grad) {
     put<V>(above + features, get<V>(above + features) + high * at.a);
 }
 
+// The next sample from n on with a gradient, whose vectors stand `width` apart; end if there is none.
+template <typename V>
+inline int64_t next_live(const float* grad, int64_t width, int64_t n, int64_t end) {
+    for (; n < end; n++) {
+        uint32_t any = 0, bits;
+        for (int i = 0; i < size_of<V>(); i++) {
+            std::memcpy(&bits, grad + n * width + i, sizeof bits);
+            any |= bits;
+        }
+        if (any & 0x7fffffff) break;  // a zero has a sign
+    }
+    return n;
+}
+
 // Scales and vectors of features are shared out over threads, so that no two write to the same place and the order of
 // sums never changes.
 template <typename V>
@@ -161,11 +175,14 @@ void backward_table(const Layout& layout, const float* positions, int64_t count,
                     for (const int64_t i : {first, first + F, above, above + F}) __builtin_prefetch(of + i);
             }
         };
-        if (count) find(0, at[0]);
-        for (int64_t n = 0, turn = 0; n < count; n++, turn ^= 1) {
-            if (n + 1 < count) find(n + 1, at[turn ^ 1]);
+        const float* own = grad + s * F + c;
+        int64_t n = next_live<V>(own, width, 0, count), next = n;
+        if (n < count) find(n, at[0]);
+        for (int64_t turn = 0; n < count; n = next, turn ^= 1) {
+            next = next_live<V>(own, width, n + 1, count);
+            if (next < count) find(next, at[turn ^ 1]);
             V others[MAX_PLANES];
-            factors<V>(layout, at[turn], table, c, get<V>(grad + n * width + s * F + c), others);
+            factors<V>(layout, at[turn], table, c, get<V>(own + n * width), others);
             for (int p = 0; p < P; p++) scatter<V>(at[turn][p], table_grad + at[turn][p].first * F + c, F, others[p]);
         }
     });

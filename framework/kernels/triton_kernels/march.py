@@ -123,8 +123,8 @@ def _leave(position, direction, cell, size, more, resolution):
 
 @triton.jit(do_not_specialize=["rays", "levels"])
 def _wave(
-    origins, directions, box, enters, leaves, firsts, slices, alive, nexts, occupied, distances, counts, starts, ends,
-    rays, limit, resolution, levels, step, growth, turn, BLOCK: tl.constexpr,
+    origins, directions, box, enters, leaves, firsts, slices, alive, nexts, occupied, distances, counts, places, limits,
+    starts, ends, rays, limit, resolution, levels, step, growth, turn, BLOCK: tl.constexpr,
 ):  # fmt: skip
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = r < rays
@@ -143,11 +143,15 @@ def _wave(
     dy = tl.load(directions + r * 3 + 1, mask=here, other=0.0) * scale_y
     dz = tl.load(directions + r * 3 + 2, mask=here, other=0.0) * scale_z
     k, found = tl.load(nexts + r, mask=here, other=0), tl.zeros([BLOCK], tl.int32)
+    place, most = r * limit, found + limit  # where a ray's samples are written, and how many at most
+    if places is not None:
+        place = tl.load(places + r, mask=here, other=0)
+        most = tl.load(limits + r, mask=here, other=0).to(tl.int32)
     side, half = (resolution + EDGE - 1) // EDGE, resolution / 2
     before = tl.zeros([BLOCK], tl.int64)  # slices of time before the ray's, of a grid of one box
     if slices is not None:
         before = tl.load(slices + r, mask=here, other=0)
-    going = here & (tl.load(alive + r, mask=here, other=0) != 0)
+    going = here & (tl.load(alive + r, mask=here, other=0) != 0) & (most > 0)
     while tl.max(going.to(tl.int32), 0) > 0:
         start, end = _start(first, k, step, even, growth), _start(first, k + 1, step, even, growth)
         middle = (start + end) / 2
@@ -163,8 +167,9 @@ def _wave(
         cell = ((box_of * resolution + i) * resolution + j) * resolution + m
         full = going & (distance == 0) & (tl.load(occupied + cell, mask=going, other=0) != 0)
         taken = full & (middle >= enter)
-        tl.store(starts + r * limit + found, start, mask=taken)
-        tl.store(ends + r * limit + found, end, mask=taken)
+        if starts is not None:  # else they are counted alone
+            tl.store(starts + place + found, start, mask=taken)
+            tl.store(ends + place + found, end, mask=taken)
         found += taken.to(tl.int32)
         cube, more = tl.where(distance == 0, 1, EDGE), tl.maximum(distance - 1, 0) * EDGE
         clear = _leave(px, dx * size, i, cube, more, resolution)
@@ -176,7 +181,7 @@ def _wave(
             steps = tl.where(steps > even, even + tl.log2(tl.maximum(clear / base, 1e-30)) / growth, steps)
         skipped = tl.minimum(steps, 2e9).to(tl.int32) - 1
         k = tl.where(going, tl.where(full, k + 1, tl.maximum(k + 1, skipped)), k)
-        going = going & (found < limit)
+        going = going & (found < most)
     tl.store(nexts + r, k, mask=here)
     tl.store(counts + r, found, mask=here)
 
@@ -249,11 +254,7 @@ class TritonMarch(March):
         rays, like = len(self.spent), self.spent
         counts = torch.empty_like(self.next)
         padded_starts, padded_ends = like.new_empty(rays, limit), like.new_empty(rays, limit)
-        launch(
-            _wave, (blocks(rays, RAYS),), self.origins, self.directions, self.box, self.enter, self.leave, self.first,
-            self.slices, self.alive, self.next, self.occupied, self.distances, counts, padded_starts, padded_ends, rays,
-            limit, self.resolution, self.levels, self.step, self.growth, self.turn, BLOCK=RAYS, num_warps=1,
-        )  # fmt: skip
+        self.go_on(limit, counts, padded_starts, padded_ends)
         offsets = functional.pad(counts.cumsum(0), (1, 0))
         count = int(offsets[-1])
         if count == 0:
@@ -268,6 +269,26 @@ class TritonMarch(March):
         wave = Wave(starts, ends, owners, positions)
         self.waves.append(wave)
         return wave
+
+    def go_on(
+        self, limit: int, counts: Tensor, starts: Tensor | None = None, ends: Tensor | None = None,
+        places: Tensor | None = None, limits: Tensor | None = None,
+    ) -> None:  # fmt: skip
+        """March on with each ray that has not ended, and write down its samples.
+
+        Args:
+            limit: most samples of a ray.
+            counts: (R,) int32, is given the number of samples of each ray.
+            starts, ends: where samples begin and end; None to count them alone.
+            places: (R,) int64 where the samples of a ray are written to; if None, `limit` places a ray.
+            limits: (R,) int64 most samples of each ray, in place of `limit`; with `places`.
+        """
+        rays = len(self.spent)
+        launch(
+            _wave, (blocks(rays, RAYS),), self.origins, self.directions, self.box, self.enter, self.leave, self.first,
+            self.slices, self.alive, self.next, self.occupied, self.distances, counts, places, limits, starts, ends,
+            rays, limit, self.resolution, self.levels, self.step, self.growth, self.turn, BLOCK=RAYS, num_warps=1,
+        )  # fmt: skip
 
     def advance(self, sigma: Tensor) -> None:
         wave, rays = self.waves[-1], len(self.spent)

@@ -16,6 +16,7 @@ from framework.base.console import console, say
 from framework.base.device import wait_for
 from framework.base.registry import load_dataparser, load_method
 from framework.geometry.rays import Samples
+from framework.kernels import triton_kernels
 from framework.kernels.compositing import distortion, distortion_reference
 from framework.kernels.contraction import contract_to_unit, contract_to_unit_reference
 from framework.kernels.intervals import (
@@ -28,11 +29,13 @@ from framework.kernels.intervals import (
 )
 from framework.tools.benchmarks.ceilings import Ceilings, Work
 from framework.tools.benchmarks.compared import Kernel, of_function
+from framework.tools.benchmarks.kernel_errors import as_table
+from framework.tools.benchmarks.kernel_errors import measured as errors_of_all
 from framework.tools.benchmarks.kernels import Row, measured, on_any_device, table
 from framework.tools.comparison.measures import Curve
 from framework.tools.comparison.measures import Row as Compared
 from framework.tools.comparison.plan import Conditions, Contender, Plan
-from framework.tools.testing.scenes import ball_under_a_sky
+from framework.tools.testing.scenes import ball_in_a_box, ball_under_a_sky
 from framework.training.machine import machine
 from framework.training.run import Run
 from framework.training.trainer import Trainer
@@ -45,8 +48,10 @@ MOMENTS = (2, 5, 15, 60)
 """Seconds of training after which the PSNR is reported."""
 BINS = 64
 """Intervals of a ray."""
-SKY_SIZE = 200
-"""Width of the images of the scene on which steps are timed, pixels."""
+SCENES = {"nerfacto": ball_under_a_sky, "instant-ngp": ball_in_a_box}
+"""Methods whose steps are timed as CUDA graphs, and the scene of each."""
+SIZE = 200
+"""Width of the images of these scenes, pixels."""
 
 
 def measured_kernels(device: torch.device, samples: int, repeats: int) -> dict[str, Any]:
@@ -71,7 +76,14 @@ def measured_kernels(device: torch.device, samples: int, repeats: int) -> dict[s
             rows += measured(kernel, ceilings, repeats, 1)
     torch.set_num_threads(threads)
     console.print(table(rows))
-    return {"machine": machine(device), "ceilings": asdict(ceilings), "kernels": [_plain(row) for row in rows]}
+    found = errors_of_all(device) if triton_kernels.available() else []
+    console.print(as_table(found))
+    return {
+        "machine": machine(device),
+        "ceilings": asdict(ceilings),
+        "kernels": [_plain(row) for row in rows],
+        "errors": [asdict(error) for error in found],
+    }
 
 
 def _plain(row: Row) -> dict[str, Any]:
@@ -131,40 +143,43 @@ def along_rays(count: int) -> Iterator[Kernel]:
 
 
 def timed_steps(device: torch.device, before: int, steps: int, **settings: Any) -> list[dict[str, Any]]:
-    """Time training steps of nerfacto on an unbounded scene, as they are and repeated as CUDA graphs.
+    """Time training steps of nerfacto and instant-ngp, as they are and repeated as CUDA graphs.
 
     Args:
         device: the device.
         before: steps before those that are timed, in which kernels are compiled and steps are recorded.
         steps: steps that are timed.
-        settings: settings of the method other than its defaults.
+        settings: settings of the methods other than their defaults.
 
     Returns:
         A row for each, as plain data: milliseconds a step, how many steps were repeated, and the PSNR of batches, which
         should agree.
     """
-    rows = []
-    for mode in ("off", "auto"):
-        with tempfile.TemporaryDirectory() as folder:
-            config = replace(load_method("nerfacto").config, vis="none", **settings)
-            config = replace(config, machine=replace(config.machine, cuda_graphs=mode))
-            run = Run("nerfacto", config, "blender", load_dataparser("blender")(), Path(folder))
-            trainer = Trainer(run, ball_under_a_sky(SKY_SIZE).to(device), None)
-            for _ in range(before):
-                trainer.train_step()
-            wait_for(device)
-            start = time.perf_counter()
-            for _ in range(steps):
-                report = trainer.train_step()
-            wait_for(device)
-            milliseconds = (time.perf_counter() - start) / steps * 1e3
-        repeated = 0 if trainer.graphs is None else trainer.graphs.repeated
-        say(f"nerfacto, CUDA graphs {mode}: {milliseconds:.2f} ms a step, {repeated} of {before + steps} repeated")
-        rows.append({
-            "method": "nerfacto", "CUDA graphs": mode, "ms a step": milliseconds, "steps": before + steps,
-            "repeated": repeated, "PSNR of batches, dB": report.psnr,
-        })  # fmt: skip
-    return rows
+    return [_timed(method, mode, device, before, steps, settings) for method in SCENES for mode in ("off", "auto")]
+
+
+def _timed(
+    method: str, mode: str, device: torch.device, before: int, steps: int, settings: dict[str, Any]
+) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory() as folder:
+        config = replace(load_method(method).config, vis="none", **settings)
+        config = replace(config, machine=replace(config.machine, cuda_graphs=mode))  # type: ignore[arg-type]
+        run = Run(method, config, "blender", load_dataparser("blender")(), Path(folder))
+        trainer = Trainer(run, SCENES[method](SIZE).to(device), None)
+        for _ in range(before):
+            trainer.train_step()
+        wait_for(device)
+        start = time.perf_counter()
+        for _ in range(steps):
+            report = trainer.train_step()
+        wait_for(device)
+        milliseconds = (time.perf_counter() - start) / steps * 1e3
+    repeated = 0 if trainer.graphs is None else trainer.graphs.repeated
+    say(f"{method}, CUDA graphs {mode}: {milliseconds:.2f} ms a step, {repeated} of {before + steps} repeated")
+    return {
+        "method": method, "CUDA graphs": mode, "ms a step": milliseconds, "steps": before + steps,
+        "repeated": repeated, "PSNR of batches, dB": report.psnr,
+    }  # fmt: skip
 
 
 def gpu_plan(data: Path | None, seconds: float, folder: Path) -> Plan:

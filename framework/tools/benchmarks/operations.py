@@ -27,6 +27,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from framework.base.console import say
 from framework.base.registry import load_dataparser, load_method
 from framework.data.dataset import Dataset
+from framework.model import parts
+from framework.samplers.occupancy import OccupancySampler
 from framework.tools.testing.scenes import ball_in_a_box, ball_under_a_sky, moving_ball
 from framework.training.machine import machine
 from framework.training.run import Run
@@ -160,6 +162,8 @@ def counted(trainer: Trainer, before: int, steps: int) -> Counted:
         steps: steps that are counted.
     """
     trainer.steps_per_read = STEPS_PER_LOG  # as on other devices than the CPU
+    for sampler in parts(trainer.model, OccupancySampler):
+        sampler.always_fixed = True  # likewise
     for _ in range(before):
         trainer.train_step()
     with Counting() as counting:

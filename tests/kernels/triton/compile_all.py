@@ -6,6 +6,7 @@ The interpreter accepts what the compiler does not, such as a variable whose typ
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 from unittest.mock import patch
 
@@ -16,6 +17,7 @@ from triton.runtime.driver import driver
 from triton.runtime.jit import JITFunction
 
 from framework.geometry.rays import Samples
+from framework.kernels.fixed_march import share_out
 from framework.kernels.hash_grid import HashGridLayout
 from framework.kernels.planes import PlanesLayout
 from framework.kernels.splat_project import SplatCamera, project_reference
@@ -24,6 +26,7 @@ from framework.kernels.triton_kernels import (
     adam,
     compositing,
     encodings,
+    fixed_march,
     hash_grid,
     intervals,
     launch,
@@ -122,6 +125,10 @@ def marching() -> None:
             wave = marched.wave(4)
         assert wave is not None
         marched.advance(torch.ones(len(wave.owners)))
+    nothing = partial(share_out, torch.zeros(33, dtype=torch.int64))
+    with patch.object(fixed_march, "share_out", lambda counts, capacity: nothing(capacity)):  # nothing was counted
+        filled = fixed_march.fill(random_rays(33), occupancy(8, 0.5), 0.1, 30, torch.rand(33), (0, 512))
+    fixed_march.reach(filled.placed, torch.rand(512), 4.6, 30)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,53 @@
+"""Thinning of gradients: of samples with small gradients, a random share goes on, enlarged so that the mean stays.
+
+After the first steps most samples along rays have gradients that are small in relation to the mean: those in empty
+space, behind surfaces, and of pixels that are right already. Networks and tables skip samples whose gradient is zero
+(`mlp`, `hash_grid`, `planes`), so that a step takes less time. The roulette is that of Arvo and Kirk 1990, "Particle
+Transport and Image Synthesis".
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+class _Thinned(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, sigma: Tensor, rgb: Tensor, floor: float) -> tuple[Tensor, Tensor]:
+        ctx.floor = floor
+        ctx.save_for_backward(sigma, torch.rand_like(sigma))
+        ctx.set_materialize_grads(False)
+        return sigma.view_as(sigma), rgb.view_as(rgb)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, of_sigma: Tensor | None, of_rgb: Tensor | None) -> tuple[Tensor | None, ...]:
+        sigma, draws = ctx.saved_tensors
+        size = torch.zeros_like(sigma) if of_sigma is None else (of_sigma * sigma).abs()
+        if of_rgb is not None:
+            size = size + torch.linalg.vector_norm(of_rgb, 1, -1)
+        chance = (size / (ctx.floor * size.mean())).clamp(max=1)
+        # NaN, of a gradient or where all are 0, is never below a chance; times 0 it stays NaN, which must be seen.
+        factor = torch.where(draws < chance, 1 / chance, torch.zeros_like(chance))
+        sigma_grad = None if of_sigma is None else of_sigma * factor
+        return sigma_grad, None if of_rgb is None else of_rgb * factor[:, None], None
+
+
+def thinned(sigma: Tensor, rgb: Tensor, floor: float) -> tuple[Tensor, Tensor]:
+    """Return density and colour of samples unchanged, with the gradients of most small ones set to zero.
+
+    The size of a sample's gradient is that of the logarithm of its density, plus the sum over colour channels. A sample
+    below the bound is kept with a probability in proportion to its size, and its gradients are divided by that; the
+    expected gradients are those without thinning. Where a density is 0 its own gradient counts as 0: no density is
+    less, so that what it is computed from has none.
+
+    Args:
+        sigma: (N,) density in 1/length.
+        rgb: (N, 3) colour.
+        floor: the bound, in relation to the mean size of all N; more than 0.
+    """
+    found: tuple[Tensor, Tensor] = _Thinned.apply(sigma, rgb, floor)
+    return found

@@ -1,0 +1,100 @@
+"""Samples of an occupancy grid in a fixed number of slots, for devices that run ahead of Python."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from framework.fields.base import HasAlpha
+from framework.geometry.rays import Rays, Samples
+from framework.kernels.alpha import alpha_depth
+from framework.kernels.fixed_march import Placed, fill, longest_ray, reach
+from framework.kernels.march import Occupancy, Wave
+from framework.samplers.room import Room
+
+SHORTEST = 1e-10
+"""Length by which the optical depth of an empty slot is divided, scene units."""
+
+
+class Steps(NamedTuple):
+    """Steps of rays through a grid, as `framework.kernels.fixed_march.fill` takes them."""
+
+    occupancy: Occupancy
+    """The grid, of one box."""
+    size: float
+    """Length of a step, scene units."""
+    number: int
+    """Number of steps along the diagonal of the box."""
+    shift: Tensor | None
+    """(R,) fraction of a step by which the first step starts in front of the box; None for 0."""
+
+
+def sample_into_slots(
+    rays: Rays,
+    steps: Steps,
+    room: Room,
+    evaluate: Callable[[Wave], tuple[Tensor, Tensor]],
+    surface: HasAlpha | None,
+    early_stop: float,
+    usual: int | None = None,
+) -> Samples:
+    """Return samples in occupied cells, up to the early stop, without a wait for the device.
+
+    The density is evaluated at all candidates, and again, with gradient, where light reaches. What a step has needed is
+    noted in `room`.
+
+    Args:
+        rays: R rays, R > 0.
+        steps: the steps along them.
+        room: numbers of slots.
+        evaluate: density or opacity, and features, of intervals.
+        surface: the field, if it has opacities.
+        early_stop: transmittance below which the rest of a ray is dropped.
+        usual: number of samples that a step should have; None for any.
+    """
+    count, sizes = len(rays), room.of(len(rays), usual)
+    with torch.no_grad():
+        found = fill(rays, *steps, (sizes.runs, sizes.candidates))
+        placed = found.placed
+        stopping = evaluate(_wave(rays, placed))[0]
+        if surface is not None:  # the density with the same opacity in each interval
+            stopping = alpha_depth(stopping) / (placed.t_ends - placed.t_starts).clamp(min=SHORTEST)
+        reached = reach(placed, stopping, early_stop, steps.number)
+        kept = placed.first(reached, sizes.kept)
+        slots, filled = kept.slots, kept.slots.counts.sum()
+        room.note(count, (found.runs, found.candidates, reached.sum()), found.left_out + slots.left_out)
+    wave, longest = _wave(rays, kept), longest_ray(slots, steps.number)
+    stopping, features = evaluate(wave)
+    if surface is not None:
+        stopping = torch.where(wave.t_ends > wave.t_starts, stopping, 0)
+    samples = Samples(
+        wave.t_starts,
+        wave.t_ends,
+        slots.offsets,
+        owners=slots.owners,
+        longest=longest,
+        filled=filled,
+        early_stop=early_stop,
+    )
+    return attached(samples, surface, stopping, features)
+
+
+def attached(samples: Samples, surface: HasAlpha | None, stopping: Tensor, features: Tensor) -> Samples:
+    """Return samples with features, and with their density or, for a surface, their opacity.
+
+    Args:
+        samples: N samples.
+        surface: the field, if it has opacities.
+        stopping: (N,) density or opacity.
+        features: (N, F) features.
+    """
+    return samples.evaluated(stopping, features) if surface is None else samples.with_alpha(stopping, features)
+
+
+def _wave(rays: Rays, placed: Placed) -> Wave:
+    """Return intervals in slots with their positions on `rays`."""
+    owners = placed.slots.owners
+    return Wave(placed.t_starts, placed.t_ends, owners, rays.points(owners, (placed.t_starts + placed.t_ends) / 2))

@@ -1,0 +1,21 @@
+"""Every operation that Triton has, at random, extreme and no inputs: what `ns-bench gpu` prints."""
+
+from framework.tools.benchmarks.kernel_cases import KINDS
+from framework.tools.benchmarks.kernel_errors import as_table, measured
+from tests.kernels.triton.compared import DEVICE
+
+LARGEST = 1e-5
+
+
+def test_errors_of_every_kernel_are_of_rounding() -> None:
+    """Those of differences that cancel are larger than others."""
+    rows = measured(DEVICE)
+    for row in rows:
+        print(row)
+        assert row.value < LARGEST
+        assert row.gradient is None or row.gradient < LARGEST
+    kernels = {row.kernel for row in rows}
+    assert len(rows) == len(kernels) * len(KINDS)
+    assert len(kernels) > 15
+    assert any(row.gradient for row in rows)
+    assert as_table(rows).row_count == len(kernels)

@@ -1,0 +1,87 @@
+"""What a module can is told from what it registers, on every Python."""
+
+import importlib
+import inspect
+import pkgutil
+from typing import Any, Protocol, runtime_checkable
+
+import pytest
+import torch
+from torch import nn
+
+import framework
+from framework.base.optimised import DefersGradient
+from framework.base.protocols import SeesRegistered
+from framework.encodings.hash_grid import HashGrid
+from framework.fields.appearance import Appearance
+from framework.model import HasAppearance
+from framework.samplers.base import SkipsCells, StopsEarly
+from framework.samplers.occupancy import OccupancySampler
+
+CUBE = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
+WITH_ATTRIBUTES = (SkipsCells, StopsEarly, HasAppearance, DefersGradient)
+
+
+class WithAppearance(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.appearance = Appearance(3, 4)
+
+
+def members(kind: Any) -> set[str]:
+    """What Python 3.12 and newer look for, as they name it."""
+    annotated = {name for base in kind.__mro__ for name in inspect.get_annotations(base)}
+    return annotated | {name for name, value in vars(kind).items() if callable(value) and not name.startswith("_")}
+
+
+@pytest.fixture(params=["as this Python asks", "as Python 3.12 and newer ask"])
+def asked(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if request.param.endswith("ask"):
+        for kind in WITH_ATTRIBUTES:
+            monkeypatch.setattr(kind, "__protocol_attrs__", members(kind), raising=False)
+
+
+@pytest.mark.usefixtures("asked")
+def test_buffers_parameters_and_parts_are_seen() -> None:
+    grid = OccupancySampler(CUBE, resolution=4)
+    assert isinstance(grid, SkipsCells)
+    assert isinstance(grid, StopsEarly)
+    assert isinstance(WithAppearance(), HasAppearance)
+    assert isinstance(HashGrid(num_levels=2, log2_table_size=8), DefersGradient)
+
+
+@pytest.mark.usefixtures("asked")
+def test_what_lacks_one_is_none_of_the_kind() -> None:
+    assert not isinstance(nn.Linear(2, 2), SkipsCells)
+    assert not isinstance(nn.Linear(2, 2), HasAppearance)
+    grid = OccupancySampler(CUBE, resolution=4)
+    del grid.carved
+    assert not isinstance(grid, SkipsCells)
+    assert isinstance(grid, StopsEarly)
+
+
+@pytest.mark.medium
+def test_every_protocol_with_attributes_sees_what_is_registered() -> None:
+    """A new one that does not would be blind from Python 3.12 on."""
+    kinds = {}
+    for module in pkgutil.walk_packages(framework.__path__, "framework."):
+        if ".templates" in module.name or "triton_kernels" in module.name or ".integrations" in module.name:
+            continue
+        for value in vars(importlib.import_module(module.name)).values():
+            if getattr(value, "_is_runtime_protocol", False) and str(value.__module__).startswith("framework."):
+                kinds[value.__qualname__] = value
+    annotated = {name for name, kind in kinds.items() if any(map(inspect.get_annotations, kind.__mro__))}
+    assert annotated == {kind.__qualname__ for kind in WITH_ATTRIBUTES}
+    assert all(isinstance(kinds[name], SeesRegistered) for name in annotated)
+
+
+def test_a_class_that_derives_from_a_protocol_is_told_as_any_other() -> None:
+    @runtime_checkable
+    class Named(Protocol, metaclass=SeesRegistered):
+        name: str
+
+    class Derived(Named):
+        pass
+
+    assert isinstance(Derived(), Derived)
+    assert not isinstance(nn.Linear(2, 2), Derived)

@@ -77,6 +77,7 @@ class OccupancySampler(Sampler):
         endless: whether rays have a last sample for all that is behind the largest box, which any density makes opaque:
             for images without an alpha channel.
         slices: number T of equal parts of the time from 0 to 1, each of which has cells of its own.
+        eval_step_scale: length of a step outside of training, in those of training.
 
     Raises:
         ConfigError: if the number of cells, boxes, slices or steps is out of range.
@@ -100,6 +101,7 @@ class OccupancySampler(Sampler):
         levels: int = 1,
         endless: bool = False,
         slices: int = 1,
+        eval_step_scale: float = 1.0,
     ) -> None:
         super().__init__()
         if not 1 <= resolution <= MAX_CELLS or not num_steps >= 1:
@@ -124,7 +126,7 @@ class OccupancySampler(Sampler):
         self.alpha_threshold = alpha_threshold
         self.cone = cone
         self.moving = moving
-        self._stride = 1.0
+        self._stride, self._eval_stride = 1.0, eval_step_scale
         self.register_buffer("box", box.clone())
         self.register_buffer("occupied", own_cells(levels, resolution).repeat(slices).to(box.device))
         self.register_buffer("carved", ~self.occupied)
@@ -234,7 +236,7 @@ class OccupancySampler(Sampler):
         if is_followed(rays.origins, rays.directions):
             raise ValueError("marched samples carry no gradient to rays: detach these, or take a ProposalSampler")
         shift = torch.rand(len(rays), device=rays.origins.device) if jitter else None
-        stride = self._stride if self.training else 1.0
+        stride = self._stride if self.training else self._eval_stride
         return march(rays, self.occupancy, stride * self.step_size, stride * self.cone, shift, early_stop)
 
     # -- updating the grid ------------------------------------------------------------------------------------

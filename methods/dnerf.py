@@ -37,6 +37,7 @@ class DNeRFConfig(
     lr_final=0.1,
     adam_eps=1e-7,
     num_steps=192,
+    eval_step_scale=AUTO,
 ):
     """Settings of dnerf; the defaults of networks, samples and learning rate are the paper's.
 
@@ -129,6 +130,9 @@ def decide(config: DNeRFConfig, scene: Scene) -> tuple[DNeRFConfig, list[Decisio
     )
     config, slices = fill(config, slices_choice(scene, config.sampler))
     made += slices * (config.time_slices > 1)
+    shorter = Choice("eval_step_scale", 0.5 if grid else 1.0, "edges are sharper so", "length of a step in rendering")
+    config, steps = fill(config, shorter)
+    made += steps * (grid and config.sampler == "occupancy")
     if config.sampler == "occupancy":
         samples = HASH_SAMPLES_PER_BATCH if small else OCCUPANCY_SAMPLES_PER_BATCH
         config, more = decide_samples(config, samples)

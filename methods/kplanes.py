@@ -41,6 +41,7 @@ class KPlanesConfig(
     learning_rate=1e-2,
     lr_schedule="hold-exponential",
     num_steps=AUTO,
+    eval_step_scale=AUTO,
     lr_final=0.02,
     adam_beta2=0.99,
     adam_eps=1e-12,
@@ -175,7 +176,12 @@ def decide(config: KPlanesConfig, scene: Scene) -> tuple[KPlanesConfig, list[Dec
     config, few = decide_few_images(config, scene)
     samples = MOVING_SAMPLES_PER_BATCH if scene.moving else SAMPLES_PER_BATCH
     steps = Choice("num_steps", MOVING_NUM_STEPS if scene.moving else NUM_STEPS, "the scene moves")
-    config, count = fill(config, Choice("samples_per_batch", samples, "the scene moves", "samples a step"), steps)
+    shorter = Choice(
+        "eval_step_scale", 0.5 if scene.moving else 1.0, "edges are sharper so", "length of a step in rendering"
+    )
+    config, count = fill(
+        config, Choice("samples_per_batch", samples, "the scene moves", "samples a step"), steps, shorter
+    )
     config, slices = fill(config, slices_choice(scene, config.sampler))
     sliced = config.time_slices > 1
     config, coarser = fill(config, Choice("grid_resolution", 64 if sliced else 128, "each slice has cells of its own"))

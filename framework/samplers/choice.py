@@ -41,6 +41,7 @@ class SamplingConfig(RayConfig):
         "grid_levels": (1, MAX_LEVELS),
         "cone_angle": (0, 1),
         "num_steps": (1, 2**20),
+        "eval_step_scale": (0.01, 100),
         "early_stop": (0, 1),
         "train_early_stop": (0, 1),
         "num_proposal_samples": (1, 2**14),
@@ -70,6 +71,8 @@ class SamplingConfig(RayConfig):
     known to show (occupancy, beyond the box)."""
     num_steps: Auto[int] = 512
     """Steps along the diagonal of the box (occupancy)."""
+    eval_step_scale: Auto[float] = 1.0
+    """Length of a step in rendering, in those of training (occupancy)."""
     early_stop: float = 1e-4
     """Transmittance below which the rest of a ray is dropped: the maximum error of a colour channel (occupancy)."""
     train_early_stop: float = 1e-2
@@ -222,6 +225,7 @@ def _sampler(
         levels=levels,
         endless=not scene.has_alpha and scene.unbounded,
         slices=config.time_slices if isinstance(config, MotionConfig) and sees_time and levels == 1 else 1,
+        eval_step_scale=config.eval_step_scale,
     )
 
 

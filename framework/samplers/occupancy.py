@@ -82,6 +82,7 @@ class OccupancySampler(Sampler):
         endless: whether rays have a last sample for all that is behind the largest box, which any density makes opaque:
             for images without an alpha channel.
         slices: number T of equal parts of the time from 0 to 1, each of which has cells of its own.
+        eval_step_scale: length of a step outside of training, in those of training.
 
     Raises:
         ConfigError: if the number of cells, boxes, slices or steps is out of range.
@@ -105,6 +106,7 @@ class OccupancySampler(Sampler):
         levels: int = 1,
         endless: bool = False,
         slices: int = 1,
+        eval_step_scale: float = 1.0,
     ) -> None:
         super().__init__()
         if not 1 <= resolution <= MAX_CELLS or not num_steps >= 1:
@@ -132,7 +134,7 @@ class OccupancySampler(Sampler):
         self.alpha_threshold = alpha_threshold
         self.cone = cone
         self.moving = moving
-        self._stride = 1.0
+        self._stride, self._eval_stride = 1.0, eval_step_scale
         self.register_buffer("box", box.clone())
         self.register_buffer("occupied", own_cells(levels, resolution).repeat(slices).to(box.device))
         self.register_buffer("carved", ~self.occupied)
@@ -261,7 +263,7 @@ class OccupancySampler(Sampler):
         Raises:
             ValueError: if the rays require a gradient, which marched samples do not have.
         """
-        stride, shift = self._stride if self.training else 1.0, self._shift(rays, jitter)
+        stride, shift = self._stride if self.training else self._eval_stride, self._shift(rays, jitter)
         return march(rays, self.occupancy, stride * self.step_size, stride * self.cone, shift, early_stop)
 
     def _shift(self, rays: Rays, jitter: bool) -> Tensor | None:

@@ -57,6 +57,18 @@ def test_a_full_grid_covers_each_rays_chord(jitter: bool) -> None:
     assert bool((samples.t <= leave[samples.ray_indices] + 1e-5).all())
 
 
+def test_steps_may_be_shorter_outside_of_training() -> None:
+    """Then the samples are those of a grid with as many more steps, and in training they are as without."""
+    rays = random_rays(50)
+    both = OccupancySampler(BOX, resolution=16, num_steps=60, eval_step_scale=0.5)
+    grids = {True: OccupancySampler(BOX, resolution=16, num_steps=60), False: OccupancySampler(BOX, 16, num_steps=120)}
+    for training, alone in grids.items():
+        found, expected = (grid.train(training).sample(rays, Transparent(), False) for grid in (both, alone))
+        assert len(found.t) > 100
+        torch.testing.assert_close(found.t, expected.t)
+        torch.testing.assert_close(found.deltas, expected.deltas)
+
+
 @pytest.mark.parametrize(("resolution", "num_steps"), [(8, 64), (32, 128), (64, 64), (16, 512)])
 def test_skipping_finds_exactly_the_occupied_steps(resolution: int, num_steps: int) -> None:
     """Brute force over every step; only steps within rounding of a cell's face may differ."""

@@ -13,12 +13,12 @@ from tests.training.helpers import assert_same_bits, tensors, tiny_run, tiny_tra
 
 
 def decisions(trainer: Trainer) -> dict[str, tuple[str, str]]:
-    return {d.option: (d.choice, d.reason) for d in trainer.profile().decisions}
+    return {d.option: (d.choice, d.reason) for d in trainer.profile.decisions}
 
 
 def test_facts_and_decisions_of_photographs_with_alpha(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=1, max_resolution=None)
-    profile, data = trainer.profile(), trainer.train_set
+    profile, data = trainer.profile, trainer.train_set
     assert profile.images == len(data)
     assert (profile.width, profile.height) == (int(data.cameras.widths[0]), int(data.cameras.heights[0]))
     assert profile.transparent == pytest.approx((data.pixels[:, 3].numpy() == 0).mean(), abs=1e-6)
@@ -54,7 +54,7 @@ def test_without_alpha_the_background_is_black_and_no_silhouette_used(shared_tin
     found = Trainer(trainer.run, opaque, None)
     assert decisions(found)["background"] == ("black", "no photograph has alpha")
     assert decisions(found)["silhouettes"] == ("not used", "no photograph has alpha")
-    assert found.profile().transparent is None
+    assert found.profile.transparent is None
     found.train_step()
     assert not bool(found.model.sampler.carved.any())  # as announced
 

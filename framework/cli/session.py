@@ -125,8 +125,9 @@ def _train(trainer: Trainer, between_steps: BetweenSteps | None = None) -> Outco
 def _finish(run: Run, trainer: Trainer) -> None:
     # Also when a run is resumed, as it may have been killed before.
     write_transforms(run, trainer.train_set)
-    if trainer.first_step == 0:  # a resumed run has no open settings left
-        write_report(run.folder / "scene_profile.json", trainer.profile.as_plain())
+    profile = run.folder / "scene_profile.json"
+    if trainer.first_step == 0 or not profile.exists():  # a resumed run has no open settings left, and keeps its own
+        write_report(profile, trainer.profile.as_plain())
     with _noted_stop(lambda: _saved_note(trainer)), _viewer(trainer) as between_steps:
         outcome = _train(trainer, between_steps)
     state = trainer.state

@@ -153,7 +153,7 @@ class Evaluation:
 
     @property
     def warning(self) -> str | None:
-        """What is wrong with rendered images that are not finite; None if all are."""
+        """The warning that some rendered images are not finite; None if all are finite."""
         bad = [row["name"] for row in self.per_image if not math.isfinite(row["psnr"])]
         if not bad:
             return None

@@ -140,32 +140,37 @@ struct Float {  // as mlp_calls.h wants a form
         input.read(block.layer[0], net.rows[0], rows, size);
     }
 
-    static void run_forward(const Network& net, Block& block) {
-        for (int l = 0; l < net.layers; l++) {
-            const int in = net.rows[l], out = net.rows[l + 1];
-            product(block.layer[l], in, net.forward[l].data(), net.width[l], out, block.layer[l + 1], out);
-            if (l + 1 < net.layers || net.bias_of(l))
-                add_bias(block.layer[l + 1], net.bias_of(l), out, l + 1 < net.layers);
-        }
-    }
-
+    // Not inline: they are called from several places.
+    static void run_forward(const Network& net, Block& block);
     static const float* run_backward(const Network& net, const Block& block, Gradient& gradient, const Sums& places,
-                                     float* sums) {
-        float *grad = gradient.first, *other = gradient.second;
-        for (int l = net.layers - 1; l >= 0; l--) {
-            const int in = net.rows[l], out = net.rows[l + 1];
-            float* sum = sums + places.first[l];
-            outer_product(block.layer[l], in, grad, out, in, sum, out);
-            if (net.bias_of(l)) add_rows(grad, out, sum + in * out);
-            product(grad, out, net.backward[l].data(), net.width[l + 1], in, other, in);
-            if (l > 0)
-                for (int i = 0; i < BLOCK * in; i += LANES)
-                    store(other + i, load(block.layer[l] + i) > 0 ? load(other + i) : splat(0));
-            std::swap(grad, other);
-        }
-        return grad;
-    }
+                                     float* sums);
 };
+
+void Float::run_forward(const Network& net, Block& block) {
+    for (int l = 0; l < net.layers; l++) {
+        const int in = net.rows[l], out = net.rows[l + 1];
+        product(block.layer[l], in, net.forward[l].data(), net.width[l], out, block.layer[l + 1], out);
+        if (l + 1 < net.layers || net.bias_of(l))
+            add_bias(block.layer[l + 1], net.bias_of(l), out, l + 1 < net.layers);
+    }
+}
+
+const float* Float::run_backward(const Network& net, const Block& block, Gradient& gradient, const Sums& places,
+                                 float* sums) {
+    float *grad = gradient.first, *other = gradient.second;
+    for (int l = net.layers - 1; l >= 0; l--) {
+        const int in = net.rows[l], out = net.rows[l + 1];
+        float* sum = sums + places.first[l];
+        outer_product(block.layer[l], in, grad, out, in, sum, out);
+        if (net.bias_of(l)) add_rows(grad, out, sum + in * out);
+        product(grad, out, net.backward[l].data(), net.width[l + 1], in, other, in);
+        if (l > 0)
+            for (int i = 0; i < BLOCK * in; i += LANES)
+                store(other + i, load(block.layer[l] + i) > 0 ? load(other + i) : splat(0));
+        std::swap(grad, other);
+    }
+    return grad;
+}
 
 }  // namespace
 

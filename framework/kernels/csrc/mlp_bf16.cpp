@@ -213,37 +213,42 @@ struct Bfloat16 {  // as mlp_calls.h wants a form
         to_halves(block.scratch, columns, block.layer[0], net.rows[0], false, nullptr);
     }
 
-    static void run_forward(const Network& net, Block& block) {
-        for (int l = 0; l < net.layers; l++) {
-            const bool last = l + 1 == net.layers;
-            float* out = last ? block.last : block.scratch;
-            product(block.layer[l], net.rows[l], net.forward[l].data(), net.columns[l + 1], net.inner(l), out,
-                    net.columns[l + 1]);
-            if (net.bias_of(l)) add_bias(out, net.bias_of(l), net.columns[l + 1], false);
-            if (!last) to_halves(out, net.columns[l + 1], block.layer[l + 1], net.rows[l + 1], true, nullptr);
-        }
-    }
-
+    // Not inline: they are called from several places.
+    static void run_forward(const Network& net, Block& block);
     static const float* run_backward(const Network& net, Block& block, Gradient& grad, const Sums& places,
-                                     float* sums) {
-        const int layers = net.layers;
-        to_halves(block.scratch, net.columns[layers], grad.current, net.rows[layers], false, nullptr);
-        for (int l = layers - 1; l >= 0; l--) {
-            float* sum = sums + places.first[l];
-            if (net.bias_of(l))
-                add_halves(grad.current, net.rows[l + 1], net.columns[l + 1],
-                           sum + net.columns[l] * net.columns[l + 1]);
-            interleave(block.layer[l], net.rows[l], grad.pairs_x);
-            interleave(grad.current, net.rows[l + 1], grad.pairs_dy);
-            outer_product(grad.pairs_x, net.rows[l], grad.pairs_dy, net.rows[l + 1], net.columns[l], sum,
-                          net.columns[l + 1]);
-            product(grad.current, net.rows[l + 1], net.backward[l].data(), net.columns[l], net.inner(l + 1),
-                    block.scratch, net.columns[l]);
-            if (l > 0) to_halves(block.scratch, net.columns[l], grad.current, net.rows[l], false, block.layer[l]);
-        }
-        return block.scratch;
-    }
+                                     float* sums);
 };
+
+void Bfloat16::run_forward(const Network& net, Block& block) {
+    for (int l = 0; l < net.layers; l++) {
+        const bool last = l + 1 == net.layers;
+        float* out = last ? block.last : block.scratch;
+        product(block.layer[l], net.rows[l], net.forward[l].data(), net.columns[l + 1], net.inner(l), out,
+                net.columns[l + 1]);
+        if (net.bias_of(l)) add_bias(out, net.bias_of(l), net.columns[l + 1], false);
+        if (!last) to_halves(out, net.columns[l + 1], block.layer[l + 1], net.rows[l + 1], true, nullptr);
+    }
+}
+
+const float* Bfloat16::run_backward(const Network& net, Block& block, Gradient& grad, const Sums& places,
+                                 float* sums) {
+    const int layers = net.layers;
+    to_halves(block.scratch, net.columns[layers], grad.current, net.rows[layers], false, nullptr);
+    for (int l = layers - 1; l >= 0; l--) {
+        float* sum = sums + places.first[l];
+        if (net.bias_of(l))
+            add_halves(grad.current, net.rows[l + 1], net.columns[l + 1],
+                       sum + net.columns[l] * net.columns[l + 1]);
+        interleave(block.layer[l], net.rows[l], grad.pairs_x);
+        interleave(grad.current, net.rows[l + 1], grad.pairs_dy);
+        outer_product(grad.pairs_x, net.rows[l], grad.pairs_dy, net.rows[l + 1], net.columns[l], sum,
+                      net.columns[l + 1]);
+        product(grad.current, net.rows[l + 1], net.backward[l].data(), net.columns[l], net.inner(l + 1),
+                block.scratch, net.columns[l]);
+        if (l > 0) to_halves(block.scratch, net.columns[l], grad.current, net.rows[l], false, block.layer[l]);
+    }
+    return block.scratch;
+}
 
 }  // namespace
 

@@ -141,7 +141,7 @@ def test_with_many_images_not_a_bit_changes(shared_tiny: Path, tmp_path: Path) -
 
 def test_a_profile_says_it(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer("vanilla-nerf", shared_tiny, tmp_path / "run", max_train_images=3)
-    said = "\n".join(trainer.profile().lines())
+    said = "\n".join(trainer.profile.lines())
     assert "scene: 3 images" in said
     assert "regularisers for few images: on, as there are 3 training images" in said
     assert "open levels until: 0.5, as few images are explained by coarse shapes first" in said

@@ -103,9 +103,9 @@ def test_without_times_what_they_need_is_left_out(name: str, what: str, shared_t
     method, settings = VARIANTS[name]
     still = tiny_trainer(method, shared_tiny, tmp_path / "alone", **settings)
     moving = moving_trainer(name, shared_tiny, tmp_path)
-    said = {decision.option: decision.choice for decision in still.profile().decisions}
+    said = {decision.option: decision.choice for decision in still.profile.decisions}
     assert said[what] == "left out"
-    assert what not in {decision.option for decision in moving.profile().decisions}
+    assert what not in {decision.option for decision in moving.profile.decisions}
     assert still.model.size() < moving.model.size()
 
 

@@ -122,7 +122,7 @@ def test_a_run_from_a_file_is_the_run_from_memory(shared_tiny: Path, tmp_path: P
     here = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "here", **settings)
     there = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "there", cache_limit=0.0, **settings)
     assert there.train_set.mapped is not None
-    assert here.profile().as_plain() == there.profile().as_plain()
+    assert here.profile.as_plain() == there.profile.as_plain()
     here.train()
     there.train()
     assert_same_bits(tensors(here), tensors(there))

@@ -139,7 +139,7 @@ def still() -> Capture:
 def blur() -> tuple[Capture, Capture]:
     """Half of the photographs were taken in motion; what helps is to leave them out."""
     good = still()
-    blurred = [sum(np.roll(image, shift, axis=1) for shift in range(-6, 7)) / 13 for image in good.images]
+    blurred = [np.mean([np.roll(image, shift, axis=1) for shift in range(-6, 7)], axis=0) for image in good.images]
     mixed = [(blurred, good.images)[index % 2][index] for index in range(NUM_TRAIN)]
     sharp = {"train_image_indices": tuple(range(1, NUM_TRAIN, 2))}
     return Capture(mixed, good.poses), Capture(mixed, good.poses, settings=sharp)
@@ -253,7 +253,12 @@ ON_WHITE = ("texture", "cutout")
 def learn(capture: Capture, truth: Capture, steps: int, folder: Path) -> tuple[np.ndarray, float]:
     """Return a held-out view as `nerfacto` renders it after some steps, and the mean PSNR of all held-out views, dB."""
     capture.write(folder / "data", truth)
-    settings = {"max_num_iterations": steps, "num_rays_per_batch": 1024, "output_dir": str(folder), "vis": "none"}
+    settings: dict[str, Any] = {
+        "max_num_iterations": steps,
+        "num_rays_per_batch": 1024,
+        "output_dir": str(folder),
+        "vis": "none",
+    }
     settings |= {"steps_per_eval_image": steps, "steps_per_eval_all_images": steps, "max_eval_images": 1}
     run = nerfloom.train("nerfacto", data=folder / "data", **settings, **capture.settings)
     rgb = [run.render(view).rgb.clamp(0, 1).numpy() for view in run.views("test")]

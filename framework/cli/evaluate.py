@@ -99,8 +99,8 @@ def _command(arguments: list[str]) -> None:
     )
     write_evaluation(output, trained.run, trained.checkpoint, evaluation, trained.model.device)
     say(f"written to {output}")
-    if evaluation.pictures_note is not None:
-        raise ConfigError(evaluation.pictures_note)
+    if (wrong := evaluation.pictures_note or evaluation.warning) is not None:
+        raise ConfigError(wrong)
 
 
 if __name__ == "__main__":

@@ -92,7 +92,7 @@ def _prepare(run: Run) -> Trainer:
     if images is not None:
         say(images)
     trainer = Trainer(run, train_set, None if eval_set is None else eval_set.to(device, with_pixels=False))
-    for line in trainer.profile().lines():
+    for line in trainer.profile.lines():
         say(line)
     if train_set.scene.image_size < FEW_PIXELS:
         say(f"warning: images of {train_set.scene.image_size} pixels show next to nothing; are they thumbnails?")
@@ -125,8 +125,9 @@ def _train(trainer: Trainer, between_steps: BetweenSteps | None = None) -> Outco
 def _finish(run: Run, trainer: Trainer) -> None:
     # Also when a run is resumed, as it may have been killed before.
     write_transforms(run, trainer.train_set)
-    if trainer.first_step == 0:  # a resumed run has no open settings left
-        write_report(run.folder / "scene_profile.json", trainer.profile().as_plain())
+    profile = run.folder / "scene_profile.json"
+    if trainer.first_step == 0 or not profile.exists():  # a resumed run has no open settings left, and keeps its own
+        write_report(profile, trainer.profile.as_plain())
     with _noted_stop(lambda: _saved_note(trainer)), _viewer(trainer) as between_steps:
         outcome = _train(trainer, between_steps)
     state = trainer.state
@@ -173,6 +174,8 @@ def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:
         say(f"pictures (photograph, render, error, depth, opacity): {run.folder / 'pictures'}")
     else:
         say(f"warning: {evaluation.pictures_note}")
+    if evaluation.warning is not None:
+        say(f"warning: {evaluation.warning}")
     write_evaluation(run.folder / "eval.json", run, outcome.checkpoint, evaluation, trainer.device)
     say(f"evaluate again with: ns-eval --load-config {run.config_path}")
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from framework.base.errors import ConfigError, FlagError, NerfloomError
 from framework.base.registry import registered
-from framework.cli.common import run_command
+from framework.cli.common import make_room, run_command
 from framework.cli.flags import read_flags
 
 if TYPE_CHECKING:
@@ -103,6 +103,8 @@ def stress(methods: Sequence[str], flags: StressFlags) -> list[Result]:
     runs, conditions = [_run(method, flags) for method in methods], _conditions(flags)
     budget, path = _budget(flags), _path(runs, flags)
     views = ball_views() if flags.data is None else data_views(runs[0].parser, flags.data)
+    make_room(path)
+    make_room(path.with_suffix(".md"))
     results: list[Result] = []
     for method, run in zip(methods, runs, strict=True):
         say(f"{method}:")
@@ -183,7 +185,6 @@ def _write(path: Path, flags: StressFlags, conditions: Sequence[Condition], resu
         "conditions": {hard.name: {"what": hard.what, "allowed": hard.allowed} for hard in conditions},
         "methods": [asdict(result) for result in results],
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, content)
 
 

@@ -151,6 +151,18 @@ class Evaluation:
     pictures_note: str | None = None
     """Reason why rendered images could not be written; None if there is none."""
 
+    @property
+    def warning(self) -> str | None:
+        """The warning that some rendered images are not finite; None if all are finite."""
+        bad = [row["name"] for row in self.per_image if not math.isfinite(row["psnr"])]
+        if not bad:
+            return None
+        return (
+            f"{len(bad)} of {len(self.per_image)} rendered images are not finite, first {bad[0]}: their metrics are "
+            "null, and so are the means; see whether a pose of the data or the checkpoint is, or evaluate an older "
+            "checkpoint (ns-eval --load-checkpoint)"
+        )
+
     def line(self) -> str:
         """Return the results as a line of text."""
         r = self.results

@@ -19,6 +19,7 @@ from framework.data.dataset import Dataset
 from framework.evaluation.evaluator import Measured, evaluation_background, measure_view, spread, views_to_judge
 from framework.model import Model
 from framework.training.progress import StepReport
+from framework.training.run import finite_or_null
 
 FEW = 3
 """Maximum number of images that are evaluated between evaluations of all images."""
@@ -76,8 +77,8 @@ def in_order(*curves: Sequence[Entry]) -> list[Point]:
 
 
 def rows(points: Sequence[Point]) -> list[dict[str, Any]]:
-    """Return `points` as the rows of learning_curve.json; a PSNR that is not finite is None, as JSON lacks infinity."""
-    return [{**asdict(point), "psnr": point.psnr if math.isfinite(point.psnr) else None} for point in points]
+    """Return `points` as the rows of learning_curve.json; a metric that is not finite is None, as JSON lacks NaN."""
+    return [finite_or_null(asdict(point)) for point in points]
 
 
 def num_rays(sizes: Sequence[tuple[int, int]], stride: int, rays_per_pixel: int) -> int:

@@ -11,7 +11,7 @@ from framework.base.errors import ConfigError
 from framework.evaluation.evaluator import Evaluation
 from framework.training.machine import kernels, machine
 from framework.training.outcome import Outcome
-from framework.training.run import Run, write_json, write_report
+from framework.training.run import Run, finite_or_null, write_json, write_report
 from framework.training.trainer import Trainer
 
 SUMMARY = "summary.json"
@@ -20,6 +20,8 @@ SUMMARY = "summary.json"
 
 def write_evaluation(path: Path, run: Run, checkpoint: Path, found: Evaluation, device: torch.device) -> None:
     """Write the metrics of an evaluation as JSON: nerfstudio's keys, and the metrics of each image.
+
+    Metrics that are not finite are null, and so are the means over them.
 
     Args:
         path: file to write; its folder is created if missing.
@@ -38,9 +40,9 @@ def write_evaluation(path: Path, run: Run, checkpoint: Path, found: Evaluation, 
         "kernels": kernels(device),
         "rays_per_pixel": getattr(run.config, "rays_per_pixel", 1),
         "eval_appearance": found.eval_appearance,
-        "results": found.results,
+        "results": finite_or_null(found.results),
         "lpips": found.lpips_note,
-        "per_image": found.per_image,
+        "per_image": finite_or_null(found.per_image),
     }
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 from dataclasses import dataclass
 from datetime import datetime
@@ -172,6 +173,19 @@ def write_json(path: Path, content: Any) -> None:
     """
     text = json.dumps(content, indent=2, allow_nan=False) + "\n"
     write_atomically(path, lambda file: file.write(text.encode()))
+
+
+def finite_or_null(content: Any) -> Any:
+    """Return plain data with None, JSON's null, for each number that is not finite, of which JSON has none.
+
+    Args:
+        content: plain data.
+    """
+    if isinstance(content, dict):
+        return {name: finite_or_null(value) for name, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [finite_or_null(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
 def write_report(path: Path, content: Any) -> None:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -227,8 +228,9 @@ class Trainer:
             done = max(done, self.state.seconds / self.config.max_seconds)
         return min(done, 1.0)
 
+    @cached_property
     def profile(self) -> SceneProfile:
-        """Return the profile of the scene, with the settings chosen by it."""
+        """The scene's profile, with the settings chosen by it; computed once, as it looks at every image."""
         return profile_of(self.run.method, self.config, self.model, self.train_set, self.decisions)
 
     def prepare(self) -> None:

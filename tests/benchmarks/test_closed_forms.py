@@ -87,7 +87,7 @@ def test_truth_is_what_dense_quadrature_finds(name: str) -> None:
     truth, found = scene.truth(rays, BACKGROUND), by_quadrature(scene, rays, jumps=isinstance(scene, Solids))
     errors = [(a - b).abs().max().item() for a, b in zip(truth, found, strict=True)]
     print(f"{name}: colour off by at most {errors[0]:.1e}, opacity by {errors[1]:.1e}")
-    assert max(errors) < 1e-6
+    assert all(error < 1e-6 for error in errors)
     assert truth.color.dtype == truth.opacity.dtype == F64
     past = slice(30, 40)
     torch.testing.assert_close(truth.color[past], BACKGROUND.expand(10, 3), rtol=0, atol=1e-12)

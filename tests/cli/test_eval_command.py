@@ -5,6 +5,7 @@ import pickle
 import shutil
 import statistics
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -13,8 +14,12 @@ import pytest
 import torch
 import yaml
 from PIL import Image
+from torch import Tensor
 
+from framework.cameras.view import View
 from framework.cli.evaluate import main
+from framework.ray_model import RayModel
+from framework.rendering.rendered import Picture
 from tests.cli.helpers import called, train
 from tests.conftest import Refused
 
@@ -69,6 +74,26 @@ def test_rays_per_pixel_are_as_the_run_says_or_as_asked(finished: Path, monkeypa
     assert [found["rays_per_pixel"] for found in (usual, same, fewer)] == [4, 4, 1]
     assert usual["results"]["psnr"] == same["results"]["psnr"]
     assert usual["results"]["psnr"] != fewer["results"]["psnr"]
+
+
+def test_an_image_that_is_not_finite_is_named_and_the_others_are_measured(
+    finished: Path, monkeypatch: pytest.MonkeyPatch, refused: Refused
+) -> None:
+    good, render, seen = evaluate(monkeypatch, finished), RayModel.render_view, list[View]()
+
+    def broken_once(model: RayModel[Any], view: View, background: Tensor) -> Picture:
+        picture = render(model, view, background)
+        seen.append(view)
+        return replace(picture, rgb=picture.rgb * torch.nan) if len(seen) == 2 else picture
+
+    monkeypatch.setattr(RayModel, "render_view", broken_once)
+    said = refused(main, "--load-config", finished / "config.yml", "--output-path", finished / "new" / "e.json")
+    assert f"1 of {len(seen)} rendered images are not finite, first {good['per_image'][1]['name']}" in said
+    found = json.loads((finished / "new" / "e.json").read_text(), parse_constant=no_constant)
+    assert [row["psnr"] for row in found["per_image"]] == [
+        None if rank == 1 else row["psnr"] for rank, row in enumerate(good["per_image"])
+    ]
+    assert (found["results"]["psnr"], found["results"]["num_images"]) == (None, len(seen))
 
 
 def test_lpips_that_is_absent_is_null_with_a_reason(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -273,5 +273,5 @@ def test_a_capture_is_learnt_and_its_grid_kept(method: str, shared_tiny: Path, t
 
 def test_the_profile_of_a_marched_capture(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = captured("nerfacto", shared_tiny, tmp_path)
-    found = {d.option: d.choice for d in trainer.profile().decisions}
+    found = {d.option: d.choice for d in trainer.profile.decisions}
     assert (found["contraction"], found["distortion loss"]) == ("on", "0.002")

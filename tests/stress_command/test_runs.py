@@ -198,6 +198,15 @@ def test_what_cannot_be_begun_is_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_place_that_cannot_be_written_is_named_before_anything_is_trained(
+    tmp_path: Path, refused: Refused, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("framework.tools.stress.verdict.verdicts", None)
+    (tmp_path / "file").touch()
+    said = refused(main, "instant-ngp", "--output-path", tmp_path / "file" / "table.json")
+    assert f"cannot write {tmp_path / 'file' / 'table.json'}: Not a directory; name another place" in said
+
+
 def test_help_without_a_method(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     stress(monkeypatch, "--help")
     assert "usage: ns-stress METHOD" in capsys.readouterr().out

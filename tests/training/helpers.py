@@ -204,7 +204,7 @@ def said_otherwise(method: str, data: Path, folder: Path, facts: dict[str, Any],
 
 def chosen(trainer: Trainer) -> dict[str, str]:
     """What was decided by the data, by name."""
-    return {decision.option: decision.choice for decision in trainer.profile().decisions}
+    return {decision.option: decision.choice for decision in trainer.profile.decisions}
 
 
 def differences(first: Path, second: Path) -> list[str]:

@@ -163,8 +163,8 @@ def test_it_goes_on_after_a_resume_and_with_points_of_early_versions(shared_tiny
 
 
 def test_what_json_cannot_hold_is_null() -> None:
-    (row,) = rows(in_order([(1.0, 2, math.nan)]))
-    assert row["psnr"] is None
+    (row,) = rows(in_order([Point(1.0, 2, math.nan, ssim=math.inf, images=3).entry()]))
+    assert (row["seconds"], row["psnr"], row["ssim"], row["images"]) == (1.0, None, None, 3)
     assert [point.step for point in in_order([(9.0, 8, 1.0)], [(1.0, 2, 1.0), (2.0, 9, 1.0)])] == [2, 8, 9]
 
 

@@ -3,22 +3,27 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
 from framework.cli.session import start
+from framework.scene.profile import SceneProfile
+from framework.training import trainer as trainer_module
+from framework.training.checkpoint import FOLDER
+from framework.training.preparation import profile_of
 from framework.training.trainer import Trainer
 from tests.training.helpers import assert_same_bits, tensors, tiny_run, tiny_trainer
 
 
 def decisions(trainer: Trainer) -> dict[str, tuple[str, str]]:
-    return {d.option: (d.choice, d.reason) for d in trainer.profile().decisions}
+    return {d.option: (d.choice, d.reason) for d in trainer.profile.decisions}
 
 
 def test_facts_and_decisions_of_photographs_with_alpha(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=1, max_resolution=None)
-    profile, data = trainer.profile(), trainer.train_set
+    profile, data = trainer.profile, trainer.train_set
     assert profile.images == len(data)
     assert (profile.width, profile.height) == (int(data.cameras.widths[0]), int(data.cameras.heights[0]))
     assert profile.transparent == pytest.approx((data.pixels[:, 3].numpy() == 0).mean(), abs=1e-6)
@@ -54,7 +59,7 @@ def test_without_alpha_the_background_is_black_and_no_silhouette_used(shared_tin
     found = Trainer(trainer.run, opaque, None)
     assert decisions(found)["background"] == ("black", "no photograph has alpha")
     assert decisions(found)["silhouettes"] == ("not used", "no photograph has alpha")
-    assert found.profile().transparent is None
+    assert found.profile.transparent is None
     found.train_step()
     assert not bool(found.model.sampler.carved.any())  # as announced
 
@@ -107,15 +112,33 @@ def test_what_the_user_decided_is_not_called_a_decision(shared_tiny: Path, tmp_p
     assert decisions(trainer) == {}
 
 
-def test_it_is_printed_and_saved(shared_tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_it_is_computed_once_printed_and_saved(
+    shared_tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = list[SceneProfile]()
+
+    def counted(*parts: Any) -> SceneProfile:
+        found.append(profile_of(*parts))
+        return found[-1]
+
+    monkeypatch.setattr(trainer_module, "profile_of", counted)
     run = tiny_run("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=1, max_eval_images=0)
     start(run)
+    assert len(found) == 1
     printed = capsys.readouterr()
     saved = json.loads((tmp_path / "run" / "scene_profile.json").read_text())
     text = " ".join((printed.out + printed.err).split())
     for decision in saved["decisions"]:
         assert f"{decision['option']}: {decision['choice']}" in text
     assert f"{saved['images']} images of {saved['width']} x {saved['height']}" in text
+
+
+def test_a_run_that_begins_with_a_checkpoint_has_one_too(shared_tiny: Path, tmp_path: Path) -> None:
+    settings = {"max_num_iterations": 1, "max_eval_images": 0}
+    start(tiny_run("instant-ngp", shared_tiny, tmp_path / "first", **settings))
+    start(tiny_run("instant-ngp", shared_tiny, tmp_path / "second", load_dir=tmp_path / "first" / FOLDER, **settings))
+    first, second = (json.loads((tmp_path / name / "scene_profile.json").read_text()) for name in ("first", "second"))
+    assert second == first
 
 
 def test_drawing_by_error_is_resumed_with_the_same_bits(shared_tiny: Path, tmp_path: Path) -> None:

@@ -3,8 +3,9 @@
 // Samples go through all layers in blocks that stay in cache; nothing but the result leaves it. The backward pass
 // computes a block's hidden layers again, which costs less than writing them to memory and reading them back. Samples
 // whose incoming gradient is zero (hidden ones) are left out of it.
-#include "mlp.h"
+#include "mlp_calls.h"
 
+#include <utility>
 #include <vector>
 
 using namespace mlp;
@@ -93,49 +94,72 @@ void outer_product(const float* x, int ldx, const float* dy, int ldy, int inner,
         outer_columns<LANES == 16 ? 16 : LANES == 8 ? 8 : 4, 1>(x, ldx, dy + column, ldy, inner, dw + column, width);
 }
 
-struct Network {
-    int layers;
-    int width[MAX_LAYERS + 1] = {}, wide[MAX_LAYERS + 1] = {};  // of the input and each layer; padded to whole vectors
-    std::vector<float> forward[MAX_LAYERS];   // (wide inputs, wide outputs), zeros outside
-    std::vector<float> backward[MAX_LAYERS];  // (wide outputs, wide inputs)
-    std::vector<float> bias[MAX_LAYERS];      // (wide outputs), or none
+struct Float {  // as mlp_calls.h wants a form
+    typedef float Value;
 
-    Network(const int64_t* widths, int count, const float* const* weights, const float* const* biases)
-        : layers(count) {
-        for (int l = 0; l <= layers; l++) width[l] = int(widths[l]), wide[l] = padded(width[l]);
-        for (int l = 0; l < layers; l++) {
-            const int in = wide[l], out = wide[l + 1];
-            forward[l].assign(size_t(in) * out, 0);
-            backward[l].assign(size_t(in) * out, 0);
-            if (biases[l]) {
-                bias[l].assign(out, 0);
-                std::memcpy(bias[l].data(), biases[l], sizeof(float) * width[l + 1]);
+    struct Network {
+        int layers;
+        int width[MAX_LAYERS + 1] = {};
+        int rows[MAX_LAYERS + 1] = {}, columns[MAX_LAYERS + 1] = {};  // width in whole vectors, both
+        std::vector<float> forward[MAX_LAYERS];   // (padded inputs, padded outputs), zeros outside
+        std::vector<float> backward[MAX_LAYERS];  // (padded outputs, padded inputs)
+        std::vector<float> bias[MAX_LAYERS];      // (padded outputs), or none
+
+        Network(const int64_t* widths, int count, const float* const* weights, const float* const* biases)
+            : layers(count) {
+            for (int l = 0; l <= layers; l++) width[l] = int(widths[l]), rows[l] = columns[l] = padded(width[l]);
+            for (int l = 0; l < layers; l++) {
+                const int in = rows[l], out = rows[l + 1];
+                forward[l].assign(size_t(in) * out, 0);
+                backward[l].assign(size_t(in) * out, 0);
+                if (biases[l]) {
+                    bias[l].assign(out, 0);
+                    std::memcpy(bias[l].data(), biases[l], sizeof(float) * width[l + 1]);
+                }
+                for (int o = 0; o < width[l + 1]; o++)
+                    for (int i = 0; i < width[l]; i++)
+                        forward[l][i * out + o] = backward[l][o * in + i] = weights[l][o * width[l] + i];
             }
-            for (int o = 0; o < width[l + 1]; o++)
-                for (int i = 0; i < width[l]; i++)
-                    forward[l][i * out + o] = backward[l][o * in + i] = weights[l][o * width[l] + i];
         }
+        const float* bias_of(int l) const { return bias[l].empty() ? nullptr : bias[l].data(); }
+    };
+
+    struct Block {
+        alignas(64) float layer[MAX_LAYERS + 1][BLOCK * MAX_WIDTH];
+
+        float* output(const Network& net) { return layer[net.layers]; }
+    };
+
+    struct Gradient {  // of one layer and of that before it, in turns
+        alignas(64) float first[BLOCK * MAX_WIDTH], second[BLOCK * MAX_WIDTH];
+    };
+
+    static float* start(Block&, Gradient& gradient) { return gradient.first; }
+
+    static void read_input(const Network& net, const Inputs& input, const int64_t* rows, int size, Block& block) {
+        input.read(block.layer[0], net.rows[0], rows, size);
     }
-    const float* bias_of(int l) const { return bias[l].empty() ? nullptr : bias[l].data(); }
+
+    // Not inline: they are called from several places.
+    static void run_forward(const Network& net, Block& block);
+    static const float* run_backward(const Network& net, const Block& block, Gradient& gradient, const Sums& places,
+                                     float* sums);
 };
 
-// A block's activations: layer[0] is the input, layer[L] the output before its activation function.
-struct Block {
-    alignas(64) float layer[MAX_LAYERS + 1][BLOCK * MAX_WIDTH];
-};
-
-void run_forward(const Network& net, Block& block) {
+void Float::run_forward(const Network& net, Block& block) {
     for (int l = 0; l < net.layers; l++) {
-        const int in = net.wide[l], out = net.wide[l + 1];
+        const int in = net.rows[l], out = net.rows[l + 1];
         product(block.layer[l], in, net.forward[l].data(), net.width[l], out, block.layer[l + 1], out);
-        if (l + 1 < net.layers || net.bias_of(l)) add_bias(block.layer[l + 1], net.bias_of(l), out, l + 1 < net.layers);
+        if (l + 1 < net.layers || net.bias_of(l))
+            add_bias(block.layer[l + 1], net.bias_of(l), out, l + 1 < net.layers);
     }
 }
 
-// One block's backward pass: adds to `sums`, leaves the input's gradient in the returned buffer.
-float* run_backward(const Network& net, const Block& block, float* grad, float* other, const Sums& places, float* sums) {
+const float* Float::run_backward(const Network& net, const Block& block, Gradient& gradient, const Sums& places,
+                                 float* sums) {
+    float *grad = gradient.first, *other = gradient.second;
     for (int l = net.layers - 1; l >= 0; l--) {
-        const int in = net.wide[l], out = net.wide[l + 1];
+        const int in = net.rows[l], out = net.rows[l + 1];
         float* sum = sums + places.first[l];
         outer_product(block.layer[l], in, grad, out, in, sum, out);
         if (net.bias_of(l)) add_rows(grad, out, sum + in * out);
@@ -143,87 +167,15 @@ float* run_backward(const Network& net, const Block& block, float* grad, float* 
         if (l > 0)
             for (int i = 0; i < BLOCK * in; i += LANES)
                 store(other + i, load(block.layer[l] + i) > 0 ? load(other + i) : splat(0));
-        float* swap = grad;
-        grad = other;
-        other = swap;
+        std::swap(grad, other);
     }
     return grad;
 }
 
-// The rows [begin, end) of the input to those of the output, and of the density, which may be null. each(first, size,
-// block) sees every block.
-template <typename Each>
-void take_through(const Network& net, const Inputs& input, int64_t begin, int64_t end, int activation, float* out,
-                  float* density, const Each& each) {
-    const int outputs = net.width[net.layers], columns = net.wide[net.layers];
-    Block block;
-    for (int64_t first = begin; first < end; first += BLOCK) {
-        const int size = int(std::min<int64_t>(end - first, BLOCK));
-        int64_t rows[BLOCK];
-        for (int r = 0; r < size; r++) rows[r] = first + r;
-        input.read(block.layer[0], net.wide[0], rows, size);
-        run_forward(net, block);
-        each(first, size, block);
-        float* last = block.layer[net.layers];
-        if (density) write_density(last, columns, size, density + first);
-        activate(last, BLOCK * columns, activation);
-        for (int r = 0; r < size; r++)
-            std::memcpy(out + rows[r] * outputs, last + r * columns, sizeof(float) * outputs);
-    }
-}
-
-struct Whole final : Layers {
-    Network net;
-    Sums places;
-    size_t wide = 0;  // floats of a record
-
-    Whole(const int64_t* widths, int layers, const float* const* weights, const float* const* biases)
-        : net(widths, layers, weights, biases), places(layers, net.wide) {
-        for (int l = 0; l < layers; l++) wide += size_t(net.wide[l]);
-    }
-    size_t record() const override { return wide * sizeof(float); }
-    size_t sums() const override { return places.size; }
-
-    void forward(const float* in, int64_t count, int activation, float* out, float* density,
-                 char* records) const override {
-        const int64_t width = net.width[0];
-        take_through(net, Inputs{1, &in, &width}, 0, count, activation, out, density,
-                     [&](int64_t first, int size, const Block& block) {
-                         for (int r = 0; records && r < size; r++) {
-                             float* to = (float*)records + size_t(first + r) * wide;
-                             for (int l = 0; l < net.layers; to += net.wide[l++])
-                                 std::memcpy(to, block.layer[l] + r * net.wide[l], sizeof(float) * net.wide[l]);
-                         }
-                     });
-    }
-    void backward(const char* records, const int64_t* rows, int count, const float* grad, float* sums,
-                  float* input_grad) const override {
-        const int outputs = net.width[net.layers], columns = net.wide[net.layers], inputs = net.width[0];
-        Block block;
-        alignas(64) float first[BLOCK * MAX_WIDTH], second[BLOCK * MAX_WIDTH];
-        for (int l = 0; l < net.layers; l++) std::memset(block.layer[l], 0, sizeof(float) * BLOCK * net.wide[l]);
-        std::memset(first, 0, sizeof(float) * BLOCK * columns);
-        for (int r = 0; r < count; r++) {
-            const float* from = (const float*)records + size_t(rows[r]) * wide;
-            for (int l = 0; l < net.layers; from += net.wide[l++])
-                std::memcpy(block.layer[l] + r * net.wide[l], from, sizeof(float) * net.wide[l]);
-            std::memcpy(first + r * columns, grad + r * outputs, sizeof(float) * outputs);
-        }
-        const float* dx = run_backward(net, block, first, second, places, sums);
-        for (int r = 0; r < count; r++)
-            std::memcpy(input_grad + r * inputs, dx + r * net.wide[0], sizeof(float) * inputs);
-    }
-    void write(float* sums, int64_t parts, int threads, float* const* weight_grads) const override {
-        places.write(sums, parts, threads, net.width, weight_grads, nullptr);
-    }
-};
-
 }  // namespace
 
 std::unique_ptr<Layers> mlp::layers_of(const int64_t* widths, int layers, const float* const* weights) {
-    check_sizes(widths, layers);
-    const float* none[MAX_LAYERS] = {};
-    return std::make_unique<Whole>(widths, layers, weights, none);
+    return without_biases<Float>(widths, layers, weights);
 }
 
 #if !defined(__AVX512BF16__)
@@ -238,12 +190,8 @@ EXPORT int mlp_forward(const float* const* inputs, const int64_t* part_widths, i
                        const int64_t* widths, int layers, const float* const* weights, const float* const* biases,
                        int activation, float* out, float* density, int threads) {
     return guarded([&] {
-        check_sizes(widths, layers);
-        const Network net(widths, layers, weights, biases);
-        const Inputs input{parts, inputs, part_widths};
-        for_ranges(threads, count, FORWARD_ROWS, [&](int64_t begin, int64_t end) {
-            take_through(net, input, begin, end, activation, out, density, [](int64_t, int, const Block&) {});
-        });
+        forward<Float>({parts, inputs, part_widths}, count, widths, layers, weights, biases, activation, out, density,
+                       threads);
     });
 }
 
@@ -254,26 +202,7 @@ EXPORT int mlp_backward(const float* const* inputs, const int64_t* part_widths, 
                         int activation, const float* grad, const float* density, const float* density_grad,
                         float* const* input_grads, float* const* weight_grads, float* const* bias_grads, int threads) {
     return guarded([&] {
-        check_sizes(widths, layers);
-        const Network net(widths, layers, weights, biases);
-        const Inputs input{parts, inputs, part_widths};
-        const Incoming incoming{grad, density, density_grad, net.width[layers]};
-        WeightSums sums(count, layers, net.wide, threads);
-        for_chunks(threads, sums.parts, [&](int64_t p, int) {
-            sums.clear(p);
-            Block block;
-            alignas(64) float first[BLOCK * MAX_WIDTH], second[BLOCK * MAX_WIDTH];
-            for (int64_t next = sums.begin(p); next < sums.end(p);) {
-                int64_t rows[BLOCK];
-                const int size = live_rows(incoming, input_grads, input, next, sums.end(p), rows);
-                if (size == 0) break;
-                input.read(block.layer[0], net.wide[0], rows, size);
-                run_forward(net, block);
-                read_output_gradient(incoming, net.wide[layers], rows, size, activation, block.layer[layers], first);
-                const float* dx = run_backward(net, block, first, second, sums, sums.of(p));
-                write_input_gradient(dx, net.wide[0], input, rows, size, input_grads);
-            }
-        });
-        sums.write(net.width, weight_grads, bias_grads);
+        backward<Float>({parts, inputs, part_widths}, count, widths, layers, weights, biases, activation, grad, density,
+                        density_grad, input_grads, weight_grads, bias_grads, threads);
     });
 }

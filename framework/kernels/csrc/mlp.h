@@ -1,4 +1,4 @@
-// What the two forms of the small networks share (mlp.cpp in float32, mlp_bf16.cpp in bfloat16).
+// The parts of both forms of the small networks: mlp.cpp in float32, mlp_bf16.cpp in bfloat16. mlp_calls.h joins them.
 #pragma once
 
 #include "common.h"

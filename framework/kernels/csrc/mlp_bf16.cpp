@@ -2,7 +2,7 @@
 //
 // Activations are rows of bfloat16, weights pairs of rows interleaved, as VDPBF16PS wants them: one instruction adds
 // two products to each of 16 sums.
-#include "mlp.h"
+#include "mlp_calls.h"
 
 #if defined(__AVX512BF16__)
 
@@ -136,46 +136,6 @@ void add_halves(const Half* grad, int rows, int columns, float* sums) {
         }
 }
 
-struct Network {
-    int layers;
-    int width[MAX_LAYERS + 1] = {};
-    int rows[MAX_LAYERS + 1] = {};     // width in whole pairs of vectors: of a row of activations
-    int columns[MAX_LAYERS + 1] = {};  // width in whole vectors: of what is summed
-    std::vector<Half> forward[MAX_LAYERS], backward[MAX_LAYERS];
-    std::vector<float> bias[MAX_LAYERS];  // of whole vectors, or none
-
-    Network(const int64_t* widths, int count, const float* const* weights, const float* const* biases)
-        : layers(count) {
-        for (int l = 0; l <= layers; l++) {
-            width[l] = int(widths[l]);
-            rows[l] = wide(width[l]);
-            columns[l] = (width[l] + 15) / 16 * 16;
-        }
-        for (int l = 0; l < layers; l++) {
-            forward[l].assign(size_t(rows[l]) * columns[l + 1], 0);
-            backward[l].assign(size_t(rows[l + 1]) * columns[l], 0);
-            if (biases[l]) {
-                bias[l].assign(size_t(columns[l + 1]), 0);
-                std::memcpy(bias[l].data(), biases[l], sizeof(float) * width[l + 1]);
-            }
-            for (int o = 0; o < width[l + 1]; o++)
-                for (int i = 0; i < width[l]; i++) {
-                    const Half w = half(weights[l][o * width[l] + i]);
-                    forward[l][i / 2 * columns[l + 1] * 2 + o * 2 + i % 2] = w;
-                    backward[l][o / 2 * columns[l] * 2 + i * 2 + o % 2] = w;
-                }
-        }
-    }
-    int inner(int l) const { return (width[l] + 1) / 2 * 2; }
-    const float* bias_of(int l) const { return bias[l].empty() ? nullptr : bias[l].data(); }
-};
-
-struct Block {
-    alignas(64) Half layer[MAX_LAYERS][BLOCK * MAX_WIDTH];  // the input and hidden activations
-    alignas(64) float output[BLOCK * MAX_WIDTH];            // of the last layer, before its activation function
-    alignas(64) float scratch[BLOCK * MAX_WIDTH];
-};
-
 // Rows of float (columns wide) to rows of bf16 (rows wide), where `keep` is positive if it is given.
 void to_halves(const float* from, int columns, Half* to, int rows, bool relu, const Half* keep) {
     const __m512 zero = _mm512_setzero_ps();
@@ -196,10 +156,73 @@ void to_halves(const float* from, int columns, Half* to, int rows, bool relu, co
         }
 }
 
-void run_forward(const Network& net, Block& block) {
+struct Bfloat16 {  // as mlp_calls.h wants a form
+    typedef Half Value;
+
+    struct Network {
+        int layers;
+        int width[MAX_LAYERS + 1] = {};
+        int rows[MAX_LAYERS + 1] = {};     // width in whole pairs of vectors: of a row of activations
+        int columns[MAX_LAYERS + 1] = {};  // width in whole vectors: of what is summed
+        std::vector<Half> forward[MAX_LAYERS], backward[MAX_LAYERS];
+        std::vector<float> bias[MAX_LAYERS];  // of whole vectors, or none
+
+        Network(const int64_t* widths, int count, const float* const* weights, const float* const* biases)
+            : layers(count) {
+            for (int l = 0; l <= layers; l++) {
+                width[l] = int(widths[l]);
+                rows[l] = wide(width[l]);
+                columns[l] = (width[l] + 15) / 16 * 16;
+            }
+            for (int l = 0; l < layers; l++) {
+                forward[l].assign(size_t(rows[l]) * columns[l + 1], 0);
+                backward[l].assign(size_t(rows[l + 1]) * columns[l], 0);
+                if (biases[l]) {
+                    bias[l].assign(size_t(columns[l + 1]), 0);
+                    std::memcpy(bias[l].data(), biases[l], sizeof(float) * width[l + 1]);
+                }
+                for (int o = 0; o < width[l + 1]; o++)
+                    for (int i = 0; i < width[l]; i++) {
+                        const Half w = half(weights[l][o * width[l] + i]);
+                        forward[l][i / 2 * columns[l + 1] * 2 + o * 2 + i % 2] = w;
+                        backward[l][o / 2 * columns[l] * 2 + i * 2 + o % 2] = w;
+                    }
+            }
+        }
+        int inner(int l) const { return (width[l] + 1) / 2 * 2; }
+        const float* bias_of(int l) const { return bias[l].empty() ? nullptr : bias[l].data(); }
+    };
+
+    struct Block {
+        alignas(64) Half layer[MAX_LAYERS][BLOCK * MAX_WIDTH];  // the input and hidden activations
+        alignas(64) float last[BLOCK * MAX_WIDTH];              // the output
+        alignas(64) float scratch[BLOCK * MAX_WIDTH];           // what a layer gives, on both ways
+
+        float* output(const Network&) { return last; }
+    };
+
+    struct Gradient {  // of a block
+        alignas(64) Half current[BLOCK * MAX_WIDTH], pairs_x[BLOCK * MAX_WIDTH], pairs_dy[BLOCK * MAX_WIDTH];
+    };
+
+    static float* start(Block& block, Gradient&) { return block.scratch; }
+
+    static void read_input(const Network& net, const Inputs& input, const int64_t* rows, int size, Block& block) {
+        const int columns = net.columns[0];
+        input.read(block.scratch, columns, rows, size);
+        to_halves(block.scratch, columns, block.layer[0], net.rows[0], false, nullptr);
+    }
+
+    // Not inline: they are called from several places.
+    static void run_forward(const Network& net, Block& block);
+    static const float* run_backward(const Network& net, Block& block, Gradient& grad, const Sums& places,
+                                     float* sums);
+};
+
+void Bfloat16::run_forward(const Network& net, Block& block) {
     for (int l = 0; l < net.layers; l++) {
         const bool last = l + 1 == net.layers;
-        float* out = last ? block.output : block.scratch;
+        float* out = last ? block.last : block.scratch;
         product(block.layer[l], net.rows[l], net.forward[l].data(), net.columns[l + 1], net.inner(l), out,
                 net.columns[l + 1]);
         if (net.bias_of(l)) add_bias(out, net.bias_of(l), net.columns[l + 1], false);
@@ -207,108 +230,30 @@ void run_forward(const Network& net, Block& block) {
     }
 }
 
-void read_input(const Network& net, const Inputs& input, const int64_t* rows, int size, Block& block) {
-    const int columns = net.columns[0];
-    input.read(block.scratch, columns, rows, size);
-    to_halves(block.scratch, columns, block.layer[0], net.rows[0], false, nullptr);
-}
-
-// The rows [begin, end) of the input to those of the output, and of the density, which may be null. each(first, size,
-// block) sees every block.
-template <typename Each>
-void take_through(const Network& net, const Inputs& input, int64_t begin, int64_t end, int activation, float* out,
-                  float* density, const Each& each) {
-    const int outputs = net.width[net.layers], columns = net.columns[net.layers];
-    Block block;
-    for (int64_t first = begin; first < end; first += BLOCK) {
-        const int size = int(std::min<int64_t>(end - first, BLOCK));
-        int64_t rows[BLOCK];
-        for (int r = 0; r < size; r++) rows[r] = first + r;
-        read_input(net, input, rows, size, block);
-        run_forward(net, block);
-        each(first, size, block);
-        float* last = block.output;
-        if (density) write_density(last, columns, size, density + first);
-        activate(last, BLOCK * columns, activation);
-        for (int r = 0; r < size; r++)
-            std::memcpy(out + rows[r] * outputs, last + r * columns, sizeof(float) * outputs);
-    }
-}
-
-struct Gradient {  // of a block
-    alignas(64) Half current[BLOCK * MAX_WIDTH], pairs_x[BLOCK * MAX_WIDTH], pairs_dy[BLOCK * MAX_WIDTH];
-};
-
-// One block's backward pass: from the gradient of the output in `scratch` to that of the input there; adds to `sums`.
-void run_backward(const Network& net, Block& block, Gradient& grad, const Sums& places, float* sums) {
+const float* Bfloat16::run_backward(const Network& net, Block& block, Gradient& grad, const Sums& places,
+                                 float* sums) {
     const int layers = net.layers;
     to_halves(block.scratch, net.columns[layers], grad.current, net.rows[layers], false, nullptr);
     for (int l = layers - 1; l >= 0; l--) {
         float* sum = sums + places.first[l];
         if (net.bias_of(l))
-            add_halves(grad.current, net.rows[l + 1], net.columns[l + 1], sum + net.columns[l] * net.columns[l + 1]);
+            add_halves(grad.current, net.rows[l + 1], net.columns[l + 1],
+                       sum + net.columns[l] * net.columns[l + 1]);
         interleave(block.layer[l], net.rows[l], grad.pairs_x);
         interleave(grad.current, net.rows[l + 1], grad.pairs_dy);
         outer_product(grad.pairs_x, net.rows[l], grad.pairs_dy, net.rows[l + 1], net.columns[l], sum,
                       net.columns[l + 1]);
-        product(grad.current, net.rows[l + 1], net.backward[l].data(), net.columns[l], net.inner(l + 1), block.scratch,
-                net.columns[l]);
+        product(grad.current, net.rows[l + 1], net.backward[l].data(), net.columns[l], net.inner(l + 1),
+                block.scratch, net.columns[l]);
         if (l > 0) to_halves(block.scratch, net.columns[l], grad.current, net.rows[l], false, block.layer[l]);
     }
+    return block.scratch;
 }
-
-struct Whole final : Layers {
-    Network net;
-    Sums places;
-    size_t wide = 0;  // halves of a record
-
-    Whole(const int64_t* widths, int layers, const float* const* weights, const float* const* biases)
-        : net(widths, layers, weights, biases), places(layers, net.columns) {
-        for (int l = 0; l < layers; l++) wide += size_t(net.rows[l]);
-    }
-    size_t record() const override { return wide * sizeof(Half); }
-    size_t sums() const override { return places.size; }
-
-    void forward(const float* in, int64_t count, int activation, float* out, float* density,
-                 char* records) const override {
-        const int64_t width = net.width[0];
-        take_through(net, Inputs{1, &in, &width}, 0, count, activation, out, density,
-                     [&](int64_t first, int size, const Block& block) {
-                         for (int r = 0; records && r < size; r++) {
-                             Half* to = (Half*)records + size_t(first + r) * wide;
-                             for (int l = 0; l < net.layers; to += net.rows[l++])
-                                 std::memcpy(to, block.layer[l] + r * net.rows[l], sizeof(Half) * net.rows[l]);
-                         }
-                     });
-    }
-    void backward(const char* records, const int64_t* rows, int count, const float* grad, float* sums,
-                  float* input_grad) const override {
-        const int outputs = net.width[net.layers], columns = net.columns[net.layers], inputs = net.width[0];
-        Block block;
-        Gradient gradient;
-        for (int l = 0; l < net.layers; l++) std::memset(block.layer[l], 0, sizeof(Half) * BLOCK * net.rows[l]);
-        std::memset(block.scratch, 0, sizeof(float) * BLOCK * columns);
-        for (int r = 0; r < count; r++) {
-            const Half* from = (const Half*)records + size_t(rows[r]) * wide;
-            for (int l = 0; l < net.layers; from += net.rows[l++])
-                std::memcpy(block.layer[l] + r * net.rows[l], from, sizeof(Half) * net.rows[l]);
-            std::memcpy(block.scratch + r * columns, grad + r * outputs, sizeof(float) * outputs);
-        }
-        run_backward(net, block, gradient, places, sums);
-        for (int r = 0; r < count; r++)
-            std::memcpy(input_grad + r * inputs, block.scratch + r * net.columns[0], sizeof(float) * inputs);
-    }
-    void write(float* sums, int64_t parts, int threads, float* const* weight_grads) const override {
-        places.write(sums, parts, threads, net.width, weight_grads, nullptr);
-    }
-};
 
 }  // namespace
 
 std::unique_ptr<Layers> mlp::layers_bf16_of(const int64_t* widths, int layers, const float* const* weights) {
-    check_sizes(widths, layers);
-    const float* none[MAX_LAYERS] = {};
-    return std::make_unique<Whole>(widths, layers, weights, none);
+    return without_biases<Bfloat16>(widths, layers, weights);
 }
 
 // As mlp_forward and mlp_backward.
@@ -316,12 +261,8 @@ EXPORT int mlp_forward_bf16(const float* const* inputs, const int64_t* part_widt
                             const int64_t* widths, int layers, const float* const* weights,
                             const float* const* biases, int activation, float* out, float* density, int threads) {
     return guarded([&] {
-        check_sizes(widths, layers);
-        const Network net(widths, layers, weights, biases);
-        const Inputs input{parts, inputs, part_widths};
-        for_ranges(threads, count, FORWARD_ROWS, [&](int64_t begin, int64_t end) {
-            take_through(net, input, begin, end, activation, out, density, [](int64_t, int, const Block&) {});
-        });
+        forward<Bfloat16>({parts, inputs, part_widths}, count, widths, layers, weights, biases, activation, out,
+                          density, threads);
     });
 }
 
@@ -331,28 +272,8 @@ EXPORT int mlp_backward_bf16(const float* const* inputs, const int64_t* part_wid
                              const float* density_grad, float* const* input_grads, float* const* weight_grads,
                              float* const* bias_grads, int threads) {
     return guarded([&] {
-        check_sizes(widths, layers);
-        const Network net(widths, layers, weights, biases);
-        const Inputs input{parts, inputs, part_widths};
-        const Incoming incoming{grad, density, density_grad, net.width[layers]};
-        WeightSums sums(count, layers, net.columns, threads);
-        for_chunks(threads, sums.parts, [&](int64_t p, int) {
-            sums.clear(p);
-            Block block;
-            Gradient gradient;
-            for (int64_t next = sums.begin(p); next < sums.end(p);) {
-                int64_t rows[BLOCK];
-                const int size = live_rows(incoming, input_grads, input, next, sums.end(p), rows);
-                if (size == 0) break;
-                read_input(net, input, rows, size, block);
-                run_forward(net, block);
-                read_output_gradient(incoming, net.columns[layers], rows, size, activation, block.output,
-                                     block.scratch);
-                run_backward(net, block, gradient, sums, sums.of(p));
-                write_input_gradient(block.scratch, net.columns[0], input, rows, size, input_grads);
-            }
-        });
-        sums.write(net.width, weight_grads, bias_grads);
+        backward<Bfloat16>({parts, inputs, part_widths}, count, widths, layers, weights, biases, activation, grad,
+                           density, density_grad, input_grads, weight_grads, bias_grads, threads);
     });
 }
 

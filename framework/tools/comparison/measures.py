@@ -82,7 +82,7 @@ class Measured:
 
 
 def measure(job: Job, conditions: Conditions) -> Measured | None:
-    """Return the measurements of a job, or None if it is not finished.
+    """Return the measurements of a job, or None if it is not finished, or its images are not finite.
 
     Args:
         job: the job.
@@ -92,6 +92,8 @@ def measure(job: Job, conditions: Conditions) -> Measured | None:
     if not isinstance(summary, dict) or not isinstance(evaluation, dict):
         return None
     results = evaluation["results"]
+    if results["psnr"] is None:
+        return None
     points = read_json(job.folder / "learning_curve.json") or []
     full = [
         p for p in points if p.get("full", True) and p["psnr"] is not None

@@ -306,7 +306,7 @@ def _begin(
     if saved is not None:
         trainer.restore(saved.content)
         return trainer, frame, saved.background
-    for line in trainer.profile().lines():
+    for line in trainer.profile.lines():
         say(line)
     return trainer, frame, background if has_alpha else evaluation_background(trainer.model)
 

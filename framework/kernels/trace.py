@@ -24,8 +24,8 @@ from framework.kernels.mlp import DENSITY_NETWORK, density_mlp, multiplies_bf16
 from framework.kernels.rows import gather_rows
 
 WAVES = (4, 4, 4, 4, 8, 16, 32, 128)
-"""Samples per ray in each wave of a trace; the last size repeats. They begin smaller than those of a march, since within
-one call a wave costs next to nothing, and less is evaluated behind a surface."""
+"""Samples per ray in each wave of a trace; the last size repeats. They begin smaller than those of a march: within one
+call a wave costs next to nothing, and less is evaluated behind a surface."""
 
 
 @dataclass(frozen=True)

@@ -225,11 +225,10 @@ class OccupancySampler(Sampler):
         if rest is not None:
             evaluated.evaluate(len(rest.owners), partial(evaluate, rest))
         order, offsets = marched.finish()
-        if not marched.waves:  # no occupied cell on any ray: empty tensors with the field's shapes and types
+        if not (waves := marched.waves):  # no occupied cell on any ray: empty tensors with the field's shapes and types
             empty = rays.nears[:0]
             samples = Samples(empty, empty, offsets, owners=order, early_stop=stop)
             return attached(samples, surface, *evaluate(Wave(empty, empty, order, rays.origins[:0])))
-        waves = marched.waves
         columns = [[w.t_starts for w in waves], [w.t_ends for w in waves], [w.owners for w in waves]]
         starts, ends, owners = gather_rows(columns, order)
 

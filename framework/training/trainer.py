@@ -279,9 +279,8 @@ class Trainer:
         done = state.step + 1
         unread = per_ray if isinstance(per_ray, Tensor) else torch.full_like(mse, math.nan)
         self._unread.append(torch.stack([mse, finite.to(mse), unread]))
-        if done % self.steps_per_read == 0 or (
-            unread is per_ray and done < self.steps_per_read and done & (done - 1) == 0
-        ):
+        early = unread is per_ray and done < self.steps_per_read and done & (done - 1) == 0  # 1, 2, 4, 8, 16
+        if early or done % self.steps_per_read == 0:
             self._read_errors(done)
         seconds = time.perf_counter() - start
         self._account(num_rays, math.nan if isinstance(per_ray, Tensor) else per_ray, seconds)

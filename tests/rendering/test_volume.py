@@ -1,7 +1,7 @@
 """The volume renderer: what it asks a field, that it asks nothing twice, and density and opacity shown alike."""
 
 from dataclasses import replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import pytest
 import torch
@@ -191,7 +191,8 @@ def test_gradients_are_scaled_near_cameras_in_training_and_values_are_not() -> N
 def test_every_ray_method_scales_and_thins_gradients_if_asked(name: str) -> None:
     method = load_method(name)
     for scaled in (True, False):
-        config = replace(method.config, **TINY.get(name, {}), gradient_scaling=scaled, thin_gradients=scaled / 4)
+        changed: dict[str, Any] = {"gradient_scaling": scaled, "thin_gradients": scaled / 4}
+        config = replace(method.config, **TINY.get(name, {}), **changed)
         model = method.build(config, replace(CAPTURE, unbounded=name != "pixel-nerf"))
         assert isinstance(model, RayModel)
         renderer = model.renderer.renderer if isinstance(model.renderer, SphereRenderer) else model.renderer

@@ -103,10 +103,15 @@ def test_a_long_run_of_equal_gradients_takes_equal_steps(backend: str, seen: flo
 
 @pytest.mark.entry(3)
 def test_counts_and_means_after_a_hundred_thousand_steps() -> None:
-    run = SimpleNamespace(state=State(), _unread=[], _count_bad=lambda step, finite: None)
-    error = torch.tensor([0.01, 1], dtype=torch.float64)  # and that it is finite
+    run = SimpleNamespace(
+        state=State(),
+        model=SimpleNamespace(read_counts=lambda: None),
+        _unread=[],
+        _count_bad=lambda step, finite: None,
+    )
+    error = torch.tensor([0.01, 1, math.nan], dtype=torch.float64)  # finite, and its samples are known
     for done in range(1, 100_001):
-        Trainer._account(run, 4097, 3 * 4097, 1e-3)  # type: ignore[arg-type]
+        Trainer._account(run, 4097, 3, 1e-3)  # type: ignore[arg-type]
         run._unread.append(error)
         if done % 1000 == 0:
             Trainer._read_errors(run, done)  # type: ignore[arg-type]

@@ -53,7 +53,7 @@ class PartSource(PixelSource):
 
 def trainer_of_parts(data: Path, folder: Path) -> Trainer:
     """A trainer without any random number but those that draw batches; its grid stays as it is."""
-    trainer = tiny_trainer("instant-ngp", data, folder, adam_eps=1e-5, mixed_precision=False)
+    trainer = tiny_trainer("instant-ngp", data, folder, adam_eps=1e-5, mixed_precision=False, thin_gradients=0)
     trainer.source = PartSource(trainer.train_set, "random", 7)
     sampler = trainer.model.sampler
     sample = sampler.sample

@@ -334,9 +334,9 @@ def test_what_is_near_a_camera_learns_little(
     trainer = captured(shared_tiny, tmp_path, {"unbounded": True, "near": 0.05})
     given: list[tuple[Samples, Tensor]] = []
 
-    def noted(rays: Rays, samples: Samples, field: Field, background: Tensor, factors: Tensor) -> Rendered:
+    def noted(rays: Rays, samples: Samples, field: Field, background: Tensor, factors: Tensor, thin: float) -> Rendered:
         given.append((samples, factors))
-        return shade(rays, samples, field, background, factors)
+        return shade(rays, samples, field, background, factors, thin)
 
     monkeypatch.setattr("framework.rendering.volume.shade", noted)
     trainer.train_step()

@@ -1,5 +1,6 @@
 """Figures of runs, and of several seeds together."""
 
+import json
 import math
 from pathlib import Path
 from statistics import stdev
@@ -7,6 +8,7 @@ from statistics import stdev
 import pytest
 
 from framework.tools.comparison.measures import measure, pareto, rows_of, whole_levels
+from framework.tools.comparison.runner import is_done
 from tests.comparison.runs import CONDITIONS, finish, plan
 
 
@@ -31,6 +33,19 @@ def test_figures_come_from_the_runs_files(tmp_path: Path) -> None:
     assert found.decisions == ("background: random, as there is <alpha>",)
     (job.folder / "summary.json").write_text("{")
     assert measure(job, CONDITIONS) is None
+
+
+def test_a_run_is_done_once_it_was_judged_and_is_finite(tmp_path: Path) -> None:
+    whole, stopped, blown_up = plan(tmp_path, "tensorf", "kplanes", "nerfacto").jobs()
+    assert not is_done(whole)
+    finish(whole, 30.0)
+    finish(stopped, 30.0, interrupted=True)
+    finish(blown_up, 30.0)
+    evaluation = json.loads(blown_up.evaluation.read_text())
+    evaluation["results"]["psnr"] = None
+    blown_up.evaluation.write_text(json.dumps(evaluation))
+    assert [is_done(job) for job in (whole, stopped, blown_up)] == [True, False, False]
+    assert measure(blown_up, CONDITIONS) is None
 
 
 def test_seeds_are_put_together(tmp_path: Path) -> None:

@@ -118,9 +118,11 @@ def _devices(conditions: Conditions, jobs_at_once: int) -> Sequence[str | None]:
 
 
 def is_done(job: Job) -> bool:
-    """Return whether `job` has been trained to its end and evaluated."""
-    summary = read_json(job.folder / "summary.json")
-    return isinstance(summary, dict) and summary.get("interrupted") is False and job.evaluation.exists()
+    """Return whether `job` has been trained to its end and evaluated, with images that are finite."""
+    summary, evaluation = read_json(job.folder / "summary.json"), read_json(job.evaluation)
+    if not isinstance(summary, dict) or summary.get("interrupted") is not False or not isinstance(evaluation, dict):
+        return False
+    return evaluation.get("results", {}).get("psnr") is not None
 
 
 def run_job(job: Job, conditions: Conditions, device: str | None, stopped: threading.Event) -> Failure | None:

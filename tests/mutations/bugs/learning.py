@@ -127,8 +127,8 @@ BUGS = (
         "errors-read-late",
         "trainer",
         "framework/training/trainer.py",
-        "for step, (mse, finite) in enumerate(unread, done - len(unread) + 1):",
-        "for step, (mse, finite) in enumerate(unread, done):",
+        "for step, (mse, finite, samples_per_ray) in enumerate(unread, done - len(unread) + 1):",
+        "for step, (mse, finite, samples_per_ray) in enumerate(unread, done):",
         "on a GPU the running error of the first steps is off",
     ),
     Bug(

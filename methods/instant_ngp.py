@@ -14,6 +14,7 @@ from typing import ClassVar
 from framework import Decision, Method, Scene
 from framework.base.config import AUTO, Auto, Range
 from framework.base.decisions import Choice, fill
+from framework.base.device import relative_speed
 from framework.encodings.hash_grid import HashGrid, HashGridConfig
 from framework.fields.encoded import EncodedField
 from framework.fields.inverted import InvertedField
@@ -24,14 +25,9 @@ from framework.samplers.choice import contracted_box
 from framework.samplers.inside import make_foreground_sampler
 from framework.scene.few_images import FewImagesConfig, decide_few_images
 
-PLANS = (
-    (60.0, 16, 512, 2**15, 1),
-    (150.0, 17, 512, 2**15, 2),
-    (math.inf, 18, 1024, 2**16, 2),
-)
-"""Settings by time budget: maximum seconds of training, log2 of the table size, marching steps along the box's
-diagonal, samples per training step, cells of the finest level per pixel. Small tables and batches learn fastest; large
-ones reach a higher PSNR."""
+FITTED_SECONDS, FITTED_PIXELS = 150.0, 400
+"""Seconds of training on two threads of a CPU, and pixels of the longer side of the images, from which `plan` counts.
+Its settings were found by trials on Lego, 400 x 400, after 15, 45, 150 and 300 s."""
 
 THIN = 0.5
 """Share of the mean gradient below which samples are thinned. On Lego, two seeds gave 28.34 and 28.52 dB after 800
@@ -82,6 +78,43 @@ class InstantNGPConfig(
     """Whether colour depends on the viewing direction. Most scenes need it; False saves a few per cent of the time."""
 
 
+@dataclass(frozen=True)
+class Plan:
+    """Settings that suit a time. Small tables and batches learn fastest; large ones reach a higher PSNR."""
+
+    log2_table_size: int
+    """log2 of the number of table entries per level."""
+    num_steps: int
+    """Marching steps along the box's diagonal."""
+    samples: int
+    """Samples per training step."""
+    detail: int
+    """Cells of the finest level per pixel of the longer side of the images."""
+
+
+def plan(seconds: float, image_size: int, speed: float = 1.0) -> Plan:
+    """Return the settings that suit a time and a size of images.
+
+    With twice the time each setting doubles, from a lower to an upper limit: 2^17 entries, 512 steps, 2^15 samples and
+    2 cells a pixel after 150 s on two threads, from 2^16, 512, 2^15 and 1 to 2^18, 1024, 2^16 and 2. Images larger than
+    400 pixels, up to twice as large, have more for tables to hold, and need as many times longer before they get 2
+    cells a pixel.
+
+    Args:
+        seconds: maximum seconds of training; infinity without a maximum.
+        image_size: longer side of the largest image, pixels.
+        speed: speed of this machine, relative to two threads of a CPU.
+    """
+    time, size = seconds * speed / FITTED_SECONDS, min(max(image_size / FITTED_PIXELS, 1.0), 2.0)
+    longer = min(max(time, 1.0), 2.0)
+    return Plan(
+        log2_table_size=17 + round(math.log2(min(max(time, 0.5), 2 * size))),
+        num_steps=32 * round(16 * longer),
+        samples=1024 * round(32 * longer),
+        detail=round(min(max(2 * time / size, 1.0), 2.0)),
+    )
+
+
 def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, list[Decision]]:
     """Fill in the settings that depend on the time budget and the scene.
 
@@ -93,16 +126,16 @@ def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, li
         Settings without open ones, and a record of each that was filled in.
     """
     seconds = math.inf if config.max_seconds is None else config.max_seconds
-    limit, log2_table_size, num_steps, samples, detail = next(plan for plan in PLANS if seconds <= plan[0])
-    suits = "that suits the time" if limit < math.inf else "there is time for it"
+    suited = plan(seconds, scene.image_size, relative_speed(config.machine))
+    suits = "that suits the time" if seconds < math.inf else "there is time for it"
     config, made = decide_background(config, scene)
     config, sizes = fill(
         config,
-        Choice("log2_table_size", log2_table_size, suits),
-        Choice("num_steps", num_steps, suits, "steps along the box's diagonal"),
-        Choice("samples_per_batch", samples, suits, "samples a step"),
+        Choice("log2_table_size", suited.log2_table_size, suits),
+        Choice("num_steps", suited.num_steps, suits, "steps along the box's diagonal"),
+        Choice("samples_per_batch", suited.samples, suits, "samples a step"),
     )
-    config, _ = fill(config, Choice("detail", detail, suits))  # reported with the resolution that follows from it
+    config, _ = fill(config, Choice("detail", suited.detail, suits))  # reported with the resolution that follows
     finest = 2 ** (config.detail * scene.image_size - 1).bit_length()
     pays = config.log2_table_size >= SPARSE_FROM
     config, more = fill(

@@ -303,8 +303,8 @@ BUGS = (
         "ngp-plan-of-longest",
         "methods",
         "methods/instant_ngp.py",
-        "next(plan for plan in PLANS if seconds <= plan[0])",
-        "next(plan for plan in reversed(PLANS) if seconds <= plan[0])",
+        "seconds * speed / FITTED_SECONDS",
+        "FITTED_SECONDS / (seconds * speed)",
         "short runs get tables for long ones",
     ),
     Bug(

@@ -1,0 +1,82 @@
+"""Settings of instant-ngp that follow from the time, the images and the machine."""
+
+import dataclasses
+import itertools
+import math
+
+import pytest
+import torch
+
+from framework.base.config import MachineConfig
+from framework.base.device import relative_speed
+from framework.base.processes import Processes
+from methods.instant_ngp import Plan, plan
+
+SECONDS = [10 * 360 ** (step / 60) for step in range(61)]  # 10 s to 1 h
+SIZES = (200, 400, 500, 800, 1600)
+SPEEDS = [1 / (0.25 + 1.5 / threads) for threads in (1, 2, 3, 4, 8, 16)]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "size", "found"),
+    [
+        (15, 400, Plan(16, 512, 2**15, 1)),
+        (45, 400, Plan(16, 512, 2**15, 1)),
+        (60, 400, Plan(16, 512, 2**15, 1)),
+        (150, 400, Plan(17, 512, 2**15, 2)),
+        (300, 400, Plan(18, 1024, 2**16, 2)),
+        (math.inf, 400, Plan(18, 1024, 2**16, 2)),
+        (300, 800, Plan(18, 1024, 2**16, 2)),
+    ],
+)
+def test_where_trials_were_made_their_settings_are_taken(seconds: float, size: int, found: Plan) -> None:
+    assert plan(seconds, size) == found
+
+
+def test_settings_stay_within_what_was_tried_on_a_processor() -> None:
+    for seconds, size, speed in itertools.product([*SECONDS, math.inf], SIZES, SPEEDS):
+        found = plan(seconds, size, speed)
+        assert 16 <= found.log2_table_size <= (18 if size <= 400 else 19)
+        assert 512 <= found.num_steps <= 1024
+        assert 2**15 <= found.samples <= 2**16
+        assert found.detail in (1, 2)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_more_time_never_makes_a_setting_smaller_nor_more_than_as_many_times_larger(size: int) -> None:
+    for before, after in itertools.pairwise(SECONDS):
+        less, more = plan(before, size), plan(after, size)
+        for name, value in vars(less).items():
+            assert value <= getattr(more, name), (before, after, name)
+        # Sizes of tables and cells a pixel have whole steps; what has not follows the time, but for rounding.
+        assert more.num_steps <= less.num_steps * after / before + 32
+        assert more.samples <= less.samples * after / before + 1024
+        assert more.log2_table_size <= less.log2_table_size + 1
+
+
+@pytest.mark.parametrize("seconds", [10, 45, 100, 150, 200, 300, 600, 3600])
+def test_larger_images_get_larger_tables_and_wait_for_small_cells(seconds: float) -> None:
+    for small, large in itertools.pairwise(plan(seconds, size) for size in SIZES):
+        assert large.log2_table_size >= small.log2_table_size
+        assert large.detail <= small.detail
+        assert (large.num_steps, large.samples) == (small.num_steps, small.samples)
+
+
+@pytest.mark.parametrize("speed", SPEEDS)
+def test_a_faster_machine_decides_as_a_slower_one_with_more_time(speed: float) -> None:
+    for seconds, size in itertools.product(SECONDS, SIZES):
+        assert plan(seconds, size, speed) == plan(seconds * speed, size)
+
+
+def test_speed_grows_with_threads_but_less_than_they_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    speeds = []
+    for threads in range(1, 17):
+        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
+        speeds.append(relative_speed(MachineConfig(device_type="cpu")))
+    assert speeds[1] == 1
+    assert 0.55 <= speeds[0] <= 0.58  # as measured
+    for threads, (less, more) in enumerate(itertools.pairwise(speeds), 1):
+        assert less < more < less * (threads + 1) / threads
+    assert relative_speed(MachineConfig(device_type="cuda")) == 1
+    monkeypatch.setattr("framework.base.device.processes", lambda: dataclasses.replace(Processes(), count=2))
+    assert relative_speed(MachineConfig(device_type="cpu")) == 1

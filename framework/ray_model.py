@@ -35,7 +35,9 @@ from framework.rendering.losses import (
 from framework.rendering.rendered import Picture, Rendered
 from framework.rendering.renderer import Renderer
 from framework.rendering.traced import error_of_traced
+from framework.rendering.volume import VolumeRenderer
 from framework.samplers.base import Sampler
+from framework.samplers.in_view import pixels_in_view
 from framework.scene.few_images import FewImagesConfig, unseen_weight
 from framework.scene.motion import MotionConfig
 
@@ -182,28 +184,34 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
 
     @torch.no_grad()
     def render_view(self, view: View, background: Tensor) -> Picture:
-        """Render `view` over `background` (3,) in chunks of `eval_num_rays_per_chunk` rays, in evaluation mode."""
+        """Render `view` over `background` (3,) in chunks of `eval_num_rays_per_chunk` rays, in evaluation mode.
+
+        Pixels that are known to show the background alone (`pixels_in_view`) are not rendered.
+        """
         was_training, per_pixel = self.training, view.rays_per_pixel or self.rays_per_pixel
         offsets, grid, times = subpixels(per_pixel, self.device), view.pixels(), view.times()
         chunk, count = max(self.config.eval_num_rays_per_chunk // per_pixel, 1), grid.numel()
-        pixels = grid.reshape(-1)
+        pixels, seen = grid.reshape(-1), self._seen(view)
+        places = None if seen is None else seen.reshape(-1).nonzero().squeeze(-1)
         self.eval()
         # Written into as they come: small results kept between a chunk's large ones would break up the heap.
-        rgb, normals = torch.empty(count, 3, device=self.device), None
-        depth, median, accumulation = torch.empty(3, count, device=self.device)
+        rgb, normals = background.to(self.device, torch.float32).repeat(count, 1), None
+        depth, median, accumulation = torch.full((3, count), self.scene.far, device=self.device)
+        accumulation.zero_()
         with (
             torch_on_one_thread(self.runs_on_kernels),
             torch.autocast(self.device.type, torch.bfloat16, enabled=self.uses_bfloat16),
         ):
-            for start in range(0, count, chunk):
-                part = slice(start, start + chunk)
+            for start in range(0, count if places is None else len(places), chunk):
+                part: slice | Tensor = slice(start, start + chunk)
+                part = part if places is None else places[part]
                 rays = view.camera.pixel_rays(pixels[part], self.scene.near, self.scene.far, times, offsets)
                 # Index 0 of the view's one camera must not be taken for the index of a training camera.
                 rendered = self.render(replace(rays, camera_indices=None), background).to_pixels(per_pixel)
                 rgb[part], depth[part], median[part] = rendered.rgb, rendered.depth, rendered.median_depth
                 accumulation[part] = rendered.accumulation
                 if rendered.normals is not None:
-                    normals = torch.empty_like(rgb) if normals is None else normals
+                    normals = torch.zeros_like(rgb) if normals is None else normals
                     normals[part] = safe_normalize(rendered.normals.float())
         self.train(was_training)
         size = tuple(grid.shape)
@@ -215,6 +223,11 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
             None if normals is None else normals.view(*size, 3),
             num_rays=count * per_pixel,
         )
+
+    def _seen(self, view: View) -> Tensor | None:
+        """Return the pixels of a view that may show anything but the background; None if that is not known."""
+        own = getattr(self.render, "__func__", None) is RayModel.render and type(self.renderer) is VolumeRenderer
+        return pixels_in_view(self.sampler, view) if own else None
 
     def step_kind(self, step: int) -> StepKind:
         config = self.config

@@ -207,12 +207,33 @@ def _under_cut_balls(photograph: Photograph, centers: Tensor, radius: float) -> 
     (x0, x1, y0, y1), whole = footprint(photograph, centers, radius)
     depth = photograph.depth(centers)
     cut = ~whole & (x1 > x0) & (y1 > y0) & (depth > -radius)
-    height, width = photograph.height, photograph.width
     if bool((cut & (depth <= radius)).any()):  # the camera may be inside the ball
-        return torch.ones(height, width, dtype=torch.bool, device=centers.device)
-    marks = torch.zeros((height + 1) * (width + 1), dtype=torch.int32, device=centers.device)
-    ones = torch.ones(int(cut.sum()), dtype=torch.int32, device=centers.device)
+        return torch.ones(photograph.height, photograph.width, dtype=torch.bool, device=centers.device)
+    return _covered(photograph, x0, x1, y0, y1, cut)
+
+
+def pixels_under_balls(photograph: Photograph, centers: Tensor, radius: float) -> Tensor:
+    """Return the pixels (H, W) bool in the `footprint` of a ball, on any device: all whose rays meet one, and more.
+
+    If a ball reaches through the camera's plane, these are all pixels.
+
+    Args:
+        photograph: a camera; its image does not matter.
+        centers: (N, 3) centres of the balls, scene coordinates.
+        radius: radius of the balls, scene units.
+    """
+    (x0, x1, y0, y1), _ = footprint(photograph, centers, radius)
+    depth = photograph.depth(centers)
+    if not bool((depth.abs() > radius).all()):
+        return torch.ones(photograph.height, photograph.width, dtype=torch.bool, device=centers.device)
+    return _covered(photograph, x0, x1, y0, y1, depth > 0)
+
+
+def _covered(photograph: Photograph, x0: Tensor, x1: Tensor, y0: Tensor, y1: Tensor, chosen: Tensor) -> Tensor:
+    """Return the pixels (H, W) bool in any of those rectangles (N,) that are `chosen` (N,)."""
+    height, width = photograph.height, photograph.width
+    marks = torch.zeros((height + 1) * (width + 1), dtype=torch.int32, device=chosen.device)
     for x, y, sign in ((x0, y0, 1), (x1, y0, -1), (x0, y1, -1), (x1, y1, 1)):
-        marks.index_add_(0, (y * (width + 1) + x)[cut], ones * sign)
+        marks.index_add_(0, y * (width + 1) + x, chosen.to(torch.int32) * sign)
     count = marks.view(height + 1, width + 1).cumsum(0).cumsum(1)
     return count[:height, :width] > 0

@@ -6,7 +6,7 @@ no opaque pixel can be skipped for good, and so can the pixels whose ray meets n
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -113,7 +113,7 @@ class Silhouettes:
     def photograph(self, image: int) -> Photograph:
         """Return camera and sums of image `image`."""
         cameras = self.dataset.cameras
-        fx, fy, cx, cy = (float(values[image]) for values in (cameras.fx, cameras.fy, cameras.cx, cameras.cy))
+        fx, fy, cx, cy = cameras.intrinsics[image]
         return Photograph(cameras.camera_to_worlds[image].contiguous(), fx, fy, cx, cy, self.sums[image])
 
 
@@ -152,19 +152,13 @@ def moving_hulls(silhouettes: Silhouettes, box: Tensor, resolution: int, times: 
     Returns:
         (T n^3,) bool; the index of cell (x, y, z) of slice s is ((s n + x) n + y) n + z.
     """
-    images = silhouettes.at_full_size
-    taken = times.cpu()[images]
-    parts = max(round(min(len(taken.unique()), MOST_MOMENTS) / slices), 1)
-    speed, half = FASTEST * float((box[1] - box[0]).max()), 0.5 / (slices * parts)
     hulls = torch.zeros(slices, resolution**3, dtype=torch.bool, device=box.device)
-    for part in range(slices * parts):
-        apart = (taken - (2 * part + 1) * half).abs()
-        near = (apart <= max(REACH / FASTEST, float(apart.min()))).nonzero().squeeze(-1).tolist()
-        margins = [speed * (float(apart[i]) + half) for i in near]
-        hulls[part // parts] |= _held(silhouettes, [images[i] for i in near], box, resolution, margins)
+    for number, images, margins in _moments(silhouettes, box, times, slices):
+        hulls[number] |= _held(silhouettes, images, box, resolution, margins, known=hulls[number])
     return hulls.view(-1)
 
 
+@torch.no_grad()
 def moving_box(silhouettes: Silhouettes, box: Tensor, times: Tensor) -> Tensor:
     """Return the smallest box (2, 3), inside `box`, of all that may be occupied at any time, of a scene that moves.
 
@@ -178,12 +172,35 @@ def moving_box(silhouettes: Silhouettes, box: Tensor, times: Tensor) -> Tensor:
     if not any(silhouettes.touch_border(image) for image in silhouettes.at_full_size):
         silhouettes = silhouettes.widened()
     for _ in range(3):  # each time with smaller cells
-        cells = moving_hulls(silhouettes, box, BOX_CELLS, times).view(BOX_CELLS, BOX_CELLS, BOX_CELLS).nonzero()
-        if len(cells) == 0:
+        inside = torch.zeros((BOX_CELLS,) * 3, dtype=torch.bool, device=box.device)
+        ends = None
+        for _, images, margins in _moments(silhouettes, box, times, 1):
+            inside |= _held(silhouettes, images, box, BOX_CELLS, margins, known=inside.view(-1)).view_as(inside)
+            if len(cells := inside.nonzero()):
+                ends = torch.stack([cells.amin(0), cells.amax(0) + 1])
+                (x0, y0, z0), (x1, y1, z1) = ends.tolist()
+                inside[x0:x1, y0:y1, z0:z1] = True  # what is in the middle does not change the box
+        if ends is None:
             return box
-        ends = torch.stack([cells.amin(0), cells.amax(0) + 1])
         box = box[0] + (box[1] - box[0]) * ends / BOX_CELLS
     return box
+
+
+def _moments(
+    silhouettes: Silhouettes, box: Tensor, times: Tensor, slices: int
+) -> Iterator[tuple[int, list[int], list[float]]]:
+    """Yield the slice of each moment, the images about it, and for each how far matter may move meanwhile.
+
+    `silhouettes`, `box`, `times` and `slices` are as in `moving_hulls`.
+    """
+    images = silhouettes.at_full_size
+    taken = times.cpu()[images]
+    parts = max(round(min(len(taken.unique()), MOST_MOMENTS) / slices), 1)
+    speed, half = FASTEST * float((box[1] - box[0]).max()), 0.5 / (slices * parts)
+    for part in range(slices * parts):
+        apart = (taken - (2 * part + 1) * half).abs()
+        near = (apart <= max(REACH / FASTEST, float(apart.min()))).nonzero().squeeze(-1).tolist()
+        yield part // parts, [images[i] for i in near], [speed * (float(apart[i]) + half) for i in near]
 
 
 def _held(
@@ -192,6 +209,7 @@ def _held(
     box: Tensor,
     resolution: int,
     margins: Sequence[float] | None = None,
+    known: Tensor | None = None,
 ) -> Tensor:
     """Return the cells (n^3,) bool that none of `images` shows to be empty.
 
@@ -200,11 +218,14 @@ def _held(
     Args:
         margins: distance, for each image, up to which around a cell all must be shown to be empty; `WITNESSES` must
             then show matter in the cell's direction, too. None for a still scene, without either.
+        known: (n^3,) bool, cells that need not be found; None for none.
     """
     size = min(COARSEST, 1 << (resolution - 1).bit_length())
     count = -(-resolution // size)
     cubes = torch.cartesian_prod(*[torch.arange(count, device=box.device)] * 3) * size
     while True:
+        if known is not None and resolution % size == 0:
+            cubes = cubes[~_whole_cubes(known, resolution, size)[tuple((cubes // size).unbind(1))]]
         low = box[0] + (box[1] - box[0]) * cubes / resolution
         edge = (box[1] - box[0]) * size / resolution
         centers, radius = (low + edge / 2).contiguous(), float(edge.norm()) / 2
@@ -226,14 +247,24 @@ def _held(
     return hull
 
 
+def _whole_cubes(cells: Tensor, resolution: int, size: int) -> Tensor:
+    """Return of which cubes, `size` cells wide and counted along each axis, all of `cells` (n^3,) bool are true."""
+    count = resolution // size
+    return cells.view(count, size, count, size, count, size).all(5).all(3).all(1)
+
+
 def _witnessed(silhouettes: Silhouettes, images: Sequence[int], centers: Tensor, reach: Sequence[float]) -> Tensor:
     """Return in the direction of which balls (N,) `WITNESSES` of `images` show matter, or all if they are fewer."""
+    wanted = min(WITNESSES, len(images))
     count = torch.zeros(len(centers), dtype=torch.int32, device=centers.device)
     for image, radius in zip(images, reach, strict=True):
-        shown = torch.zeros(len(centers), dtype=torch.bool, device=centers.device)
+        enough = count >= wanted
+        if bool(enough.all()):
+            break
+        shown = enough.clone()  # these are not looked at again
         hold_balls(silhouettes.photograph(image), centers, radius, shown, every=False)
-        count += shown
-    return count >= min(WITNESSES, len(images))
+        count += shown & ~enough
+    return count >= wanted
 
 
 @torch.no_grad()

@@ -1,0 +1,42 @@
+"""The pixels of a view through which an occupancy grid is seen: all others show the background alone."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from framework.cameras.cameras import Cameras
+from framework.cameras.view import View, every
+from framework.kernels.silhouettes import Photograph, pixels_under_balls
+from framework.samplers.base import Sampler
+from framework.samplers.occupancy import OccupancySampler
+
+LEAST = 2**14
+"""Minimum number of pixels of a view; to find those of a smaller one takes as long as their rays."""
+
+
+def pixels_in_view(sampler: Sampler, view: View) -> Tensor | None:
+    """Return the pixels of a view whose rays may meet an occupied cell, and some more around these.
+
+    Args:
+        sampler: the sampler.
+        view: the view, on the sampler's device.
+
+    Returns:
+        (height, width) bool; None if that is not known: of other samplers, of grids that space does not end at, of
+        lenses, and of small views.
+    """
+    camera, small = view.camera, view.height * view.width < LEAST
+    if type(sampler) is not OccupancySampler or sampler.levels > 1 or sampler.endless:
+        return None
+    if small or type(camera) is not Cameras or camera.model != "pinhole":
+        return None
+    slices, times = sampler.occupancy.slices_of(view.times()), sampler.occupied.view(sampler.slices, -1)
+    n, (low, high) = sampler.resolution, sampler.box
+    cells = times[0 if slices is None else int(slices[0])].nonzero().squeeze(-1)
+    corners = torch.stack([cells // n**2, cells // n % n, cells % n], dim=-1)
+    edges = (high - low) / n
+    (height, width), (fx, fy, cx, cy) = camera.sizes[0], camera.intrinsics[0]
+    nothing = cells.new_zeros(1, 1, dtype=torch.int32).expand(height + 1, width + 1)
+    seen_by = Photograph(camera.camera_to_worlds[0], fx, fy, cx, cy, nothing)
+    return every(pixels_under_balls(seen_by, low + (corners + 0.5) * edges, float(edges.norm()) / 2), view.stride)

@@ -54,8 +54,8 @@ if os.environ.get("NERFLOOM_VARIANTS") == "native":
 # GCC for Windows aligns the stack to 16 bytes, and stores wider vectors there as if it were to more (GCC bug 54412).
 MINGW_FLAGS = ["-Wa,-muse-unaligned-vector-move"]
 FLAGS = ["-std=c++17", "-O3", "-g0", "-fno-math-errno", "-fno-trapping-math", "-fvisibility=hidden", "-pthread"]
-# Python's own flags, which setuptools puts before these, let signed integers wrap around (-fwrapv). Compilers then do not
-# know that a row's elements follow each other, and address each anew: the small networks take 3 to 7 % longer, with the
+# Python's own flags, which setuptools puts before these, let signed integers wrap around (-fwrapv). Compilers then do
+# not know that a row's elements follow each other, and address each anew: small networks take 3 to 7 % longer, with the
 # same bits. No sum in these files leaves its type, which `make sanitize` watches.
 NETWORK_FLAGS = ["-fno-wrapv"]
 

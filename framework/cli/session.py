@@ -15,11 +15,13 @@ from framework.base.device import choose_device, peak_memory
 from framework.base.errors import ConfigError, LostProcessError
 from framework.base.extras import install_command
 from framework.base.processes import from_first, joined_processes, processes
+from framework.data.dataset import Dataset
 from framework.data.residence import on_device
 from framework.evaluation.evaluator import evaluate
 from framework.model import StartsFromImages
 from framework.splats.gaussians import HasGaussians
 from framework.training.checkpoint import FOLDER, list_checkpoints, load_newest
+from framework.training.curve import FEW
 from framework.training.datasets import first_split, load_split
 from framework.training.lock import sole_user
 from framework.training.machine import kernels
@@ -81,7 +83,7 @@ def _prepare(run: Run) -> Trainer:
         raise ConfigError(f"--vis {run.config.vis} needs viser: {command}")
     device = choose_device(run.config.machine)
     train_set, images = on_device(load_split(run, "train"), device)
-    eval_set = first_split(run, ("val", "test")) if processes().first else None
+    eval_set = _held_out(run, device, FEW) if processes().first else None
     source = run.config.data or ("the embedded scene" if train_set.scene.num_scenes == 1 else "random scenes")
     say(f"{run.method} on {source} ({run.dataparser}), on {device.type}, kernels: {kernels(device)}")
     if processes().count > 1:
@@ -91,7 +93,8 @@ def _prepare(run: Run) -> Trainer:
             say("note: on the cores of one CPU, several processes learn more slowly than one (docs/benchmarks.md)")
     if images is not None:
         say(images)
-    trainer = Trainer(run, train_set, None if eval_set is None else eval_set.to(device, with_pixels=False))
+    trainer = Trainer(run, train_set, eval_set)
+    trainer.held_out.load_all = lambda: _held_out(run, device)
     for line in trainer.profile.lines():
         say(line)
     if train_set.scene.image_size < FEW_PIXELS:
@@ -99,6 +102,12 @@ def _prepare(run: Run) -> Trainer:
     by_images = isinstance(trainer.model, StartsFromImages)
     say(f"{'' if by_images else f'{trainer.model.size():,} parameters; '}writing to {run.folder}")
     return trainer
+
+
+def _held_out(run: Run, device: torch.device, most: int | None = None) -> Dataset | None:
+    """Return the held-out images that are looked at during training, or at `most` so many of them; None without any."""
+    found = first_split(run, ("val", "test"), most)
+    return None if found is None else found.to(device, with_pixels=False)
 
 
 def _follow(trainer: Trainer) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
 from framework.base.console import say
@@ -28,14 +30,21 @@ class HeldOut:
     Args:
         run: the run, with its settings decided.
         model: the model that is trained.
-        dataset: the held-out images; None if nothing is to be evaluated.
+        dataset: the held-out images, or a few of them; None if nothing is to be evaluated.
     """
 
     def __init__(self, run: Run, model: Model[Any], dataset: Dataset | None) -> None:
-        self.run, self.model, self.dataset = run, model, dataset
+        self.run, self.model, self._given = run, model, dataset
+        self.load_all: Callable[[], Dataset | None] | None = None
+        """Loads all held-out images, when they are first needed; None if `dataset` has them all."""
         limit = run.config.max_eval_images
         self._few = None if dataset is None else FewImages(dataset, limit, model.rays_per_pixel)
         self._last = self._picture_seconds = 0.0
+
+    @cached_property
+    def dataset(self) -> Dataset | None:
+        """All held-out images; None if nothing is to be evaluated."""
+        return self._given if self.load_all is None or self._given is None else self.load_all()
 
     def resume(self, state: State) -> None:
         """Go on after the last evaluation of a restored `state`."""
@@ -49,16 +58,17 @@ class HeldOut:
             board: where pictures and results are shown.
         """
         config, step = self.run.config, state.step
-        if self.dataset is None or config.max_eval_images == 0:
+        if self._given is None or config.max_eval_images == 0:
             return
         affordable = self._picture_seconds <= PICTURE_SHARE * state.seconds
-        if step % config.steps_per_eval_image == 0 and "tensorboard" in config.vis and affordable:
+        shown = step % config.steps_per_eval_image == 0 and "tensorboard" in config.vis and affordable
+        if shown and self.dataset is not None:
             self._show((step // config.steps_per_eval_image - 1) % len(self.dataset), self.dataset, step, board)
         every = config.seconds_per_eval_all_images
         if every is None and config.target_psnr is not None:
             every = SECONDS_TO_A_TARGET
         due = every is not None and state.seconds - self._last >= every
-        if due or step % config.steps_per_eval_all_images == 0:
+        if (due or step % config.steps_per_eval_all_images == 0) and self.dataset is not None:
             self._last, start = state.seconds, time.perf_counter()
             evaluation = evaluate(self.model, self.dataset, max_images=config.max_eval_images, title="Evaluating")
             psnr, ssim, images = (evaluation.results[name] for name in ("psnr", "ssim", "num_images"))

@@ -303,8 +303,8 @@ BUGS = (
         "moving-hull-without-margin",
         "occupancy",
         "framework/scene/silhouettes.py",
-        "margins = [speed * (float(apart[i]) + half) for i in near]",
-        "margins = [0.0 for i in near]",
+        "[speed * (float(apart[i]) + half) for i in near]",
+        "[0.0 for i in near]",
         "what has moved to a place since the image was taken is skipped there",
     ),
     Bug(

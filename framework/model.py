@@ -128,7 +128,7 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
         return type(self).after_step is not Model.after_step
 
     def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
-        """Return rows of parameters to add, drop or reorder; called after `after_every_step`, where `changes_rows` says so.
+        """Return rows of parameters to add, drop or reorder; called after a training step if `changes_rows` says so.
 
         Args:
             step: number of training steps done before this one.

@@ -144,7 +144,7 @@ def project_reference(
     gaussians = means, log_scales, rotations, logits, colors, harmonics
     in_front, finite = _in_front(*gaussians, camera)
     kept = in_front.nonzero()[:, 0]
-    sound, table = _projected(*(values[kept] for values in gaussians), camera)
+    sound, table = _projected(camera, *(values[kept] for values in gaussians))
     records = means.new_zeros(len(means), RECORD).index_copy_(0, kept, torch.where(sound[:, None], table, 0))
     return records, (~finite).sum()
 
@@ -163,8 +163,8 @@ def _in_front(
 
 
 def _projected(
-    means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
-    camera: SplatCamera,
+    camera: SplatCamera, means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor,
+    harmonics: Tensor,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Return which of K Gaussians in front of the camera the image shows, (K,), and their records (K, RECORD)."""
     pose, basis = camera.pose.to(means), harmonics.shape[2]
@@ -316,7 +316,7 @@ def _in_the_place_of_others(
     pose, others = camera.pose.detach().to(means), ~in_front
     middle = pose[2, :3] - pose[:, :3].T @ pose[:, 3]  # of the image, at depth 1
     ones = [values.masked_fill(others.view(-1, *[1] * (values.ndim - 1)), 1.0) for values in gaussians[1:]]
-    sound, table = _projected(torch.where(others[:, None], middle, means), *ones, camera)
+    sound, table = _projected(camera, torch.where(others[:, None], middle, means), *ones)
     return torch.where((in_front & sound)[:, None], table, 0), (~finite).sum()
 
 

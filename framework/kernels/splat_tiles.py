@@ -33,7 +33,7 @@ class TileLists(NamedTuple):
     firsts: Tensor
     """(N + 1,) int32; Gaussian g has the slots from firsts[g] to firsts[g + 1] - 1."""
     needed: Tensor | None = None
-    """() int64 number of entries that there are with room for all; None where only the host knows it."""
+    """() int64 number of entries that there would be with room for all; None if there was."""
 
 
 def tile_lists(
@@ -75,9 +75,9 @@ def tile_lists_reference(
         return after & ((center - reach)[:, None] <= edges + TILE - 0.5)
 
     touched = (met(y, high, edges_y)[:, :, None] & met(x, wide, edges_x)[:, None]).flatten(1)
-    needed = touched.sum()
+    needed = None
     if room is not None:
-        touched = touched & (touched.sum(1).cumsum(0) <= room)[:, None]
+        needed, touched = touched.sum(), touched & (touched.sum(1).cumsum(0) <= room)[:, None]
     place, tile = touched.nonzero().unbind(-1)  # by Gaussian in order of distance, then by tile
     return _dealt(order.index_select(0, place), tile, columns * rows, len(records))._replace(needed=needed)
 
@@ -119,9 +119,11 @@ def _by_entries(
     top, bottom = _met(y, high, rows)
     across, down = (right - left).clamp(min=0), (bottom - top).clamp(min=0)
     counts = (across * down).masked_fill(sorted_records[:, CUT] <= 0, 0)
-    ends, needed = counts.cumsum(0), counts.sum()
-    room = int(needed) if room is None else room
-    counts = counts.masked_fill(ends > room, 0)
+    needed = None if room is None else counts.sum()
+    if room is None:
+        room = int(counts.sum())
+    else:
+        counts = counts.masked_fill(counts.cumsum(0) > room, 0)
     ends = counts.cumsum(0)
     place = torch.arange(room, device=device)
     owners = torch.searchsorted(ends, place, right=True)
@@ -160,14 +162,14 @@ def _compiled(
     tiles = -(-width // TILE) * -(-height // TILE)
     address = native.pointer(records, "the records", (count, RECORD))
 
-    def room(size: int) -> Tensor:
+    def whole(size: int) -> Tensor:
         return torch.empty(size, dtype=torch.int32)
 
-    order = room(count)
+    order = whole(count)
     visible = _sort(address, count, order.data_ptr())
     bound = _bound(address, count, width, height, threads)
-    offsets, ids, firsts = room(tiles + 1), room(bound), room(count + 1)
-    slots = room(bound if for_gradients else 0)
+    offsets, ids, firsts = whole(tiles + 1), whole(bound), whole(count + 1)
+    slots = whole(bound if for_gradients else 0)
     entries = _bin(
         address, count, order.data_ptr(), visible, width, height, bound, firsts.data_ptr(), offsets.data_ptr(),
         ids.data_ptr(), slots.data_ptr() if for_gradients else None, threads,

@@ -104,7 +104,7 @@ def draw(
     given = None if room is None else room.of(records, camera.width * camera.height)
     lists = tile_lists(records, camera.width, camera.height, torch.is_grad_enabled(), given)
     if room is not None:
-        room.note(records, camera.width * camera.height, lists.needed, given)
+        room.note(records, camera.width * camera.height, lists)
     return blend(records, lists, camera.width, camera.height, background, channels)
 
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from framework.base import device as devices
+from framework.kernels.splat_tiles import TileLists
 
 HEADROOM = 1.3
 """Room that is given, in units of the most that an image has needed."""
@@ -44,25 +45,25 @@ class Room:
             return None
         return PIECE * math.ceil(HEADROOM * self._per_gaussian * len(records) / PIECE)
 
-    def note(self, records: Tensor, pixels: int, needed: Tensor | None, given: int | None) -> None:
+    def note(self, records: Tensor, pixels: int, lists: TileLists) -> None:
         """Note on the device what an image has needed, without a wait.
 
         Args:
             records: (N, RECORD) Gaussians on the image.
             pixels: size of the image.
-            needed: () int64 number of entries of all Gaussians; None where the host knows it, which then needs no note.
-            given: number of entries for which there was room; None for as many as were needed.
+            lists: its lists.
         """
-        if needed is None or not len(records):
+        if not devices.runs_ahead(records.device) or not len(records):
             return
+        room = len(lists.ids)
+        needed = torch.full((), room, device=records.device) if lists.needed is None else lists.needed
         self._largest = max(self._largest, pixels)
         if self._noted is None or self._noted.device != needed.device:
             self._noted = torch.zeros(3, device=needed.device)
         most, entries, left_out = self._noted.unbind()
         most.copy_(torch.maximum(most, needed / len(records)))
         entries.add_(needed)
-        if given is not None:
-            left_out.add_((needed - given).clamp(min=0))
+        left_out.add_((needed - room).clamp(min=0))
 
     def read(self) -> None:
         """Read what images have needed since the last time, and decide on the room of those that follow."""

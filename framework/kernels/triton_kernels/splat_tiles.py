@@ -105,11 +105,14 @@ def tile_lists(
     columns, rows = blocks(width, splat_tiles.TILE), blocks(height, splat_tiles.TILE)
     counts, programs = torch.empty(count, dtype=torch.int32, device=device), (blocks(count, BLOCK),)
     launch(_list, programs, records, counts, None, None, None, count, columns, rows, BLOCK=BLOCK, num_warps=1)
-    ends, needed = counts.cumsum(0), counts.sum()
-    room = int(needed) if room is None else room
+    needed = None if room is None else counts.sum()
+    if room is None:
+        room = int(counts.sum())
+    else:
+        counts = counts.masked_fill(counts.cumsum(0) > room, 0)
     if room >= 2**31:
         raise ValueError("more than 2^31 Gaussians on the image's tiles")
-    firsts = torch.nn.functional.pad(counts.masked_fill(ends > room, 0).cumsum(0), (1, 0))
+    firsts = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
     keys = torch.full((room,), LAST, dtype=torch.int64, device=device)
     owners = torch.zeros(room, dtype=torch.int32, device=device)
     launch(_list, programs, records, None, firsts, keys, owners, count, columns, rows, BLOCK=BLOCK, num_warps=1)

@@ -300,8 +300,7 @@ class Trainer:
         step, progress, seed, rank = self.state.step, self.progress, self.config.machine.seed, processes().rank
         if self.graphs is None:
             seed_step(seed, step, rank)
-            batch = source.draw(request)
-            return batch, train_step(model, optimizer, batch, step, progress)
+            return (batch := source.draw(request)), train_step(model, optimizer, batch, step, progress)
         seed_step(seed, step, BEFORE_STEP)  # for updates of the sampler; what is recorded is seeded anew
         schedule(model, optimizer, step, progress)
 
@@ -309,9 +308,8 @@ class Trainer:
             batch = source.draw(request)
             return batch, learn(model, optimizer, batch, step, progress).detached()
 
-        # After the schedules, since these may change sizes.
         kind = kind_of_step(model, source, step, (request.num_pixels, request.rays_per_pixel))
-        if self.graphs.take(kind):
+        if self.graphs.take(kind):  # known after the schedules, which may change sizes
             return self.graphs.run(kind, lambda: seed_step(seed, step, rank), taken)
         seed_step(seed, step, rank)
         return taken()

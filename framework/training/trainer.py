@@ -305,8 +305,7 @@ class Trainer:
         schedule(model, optimizer, step, progress)
 
         def taken() -> tuple[Any, StepResult]:
-            batch = source.draw(request)
-            return batch, learn(model, optimizer, batch, step, progress).detached()
+            return (batch := source.draw(request)), learn(model, optimizer, batch, step, progress).detached()
 
         kind = kind_of_step(model, source, step, (request.num_pixels, request.rays_per_pixel))
         if self.graphs.take(kind):  # known after the schedules, which may change sizes

@@ -108,8 +108,27 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
     def read_counts(self) -> None:
         """Read what was counted on the device, and decide on sizes by it; called where the device is waited for."""
 
+    def after_every_step(self, step: int, progress: float, finite: bool | Tensor) -> None:
+        """Do what follows each training step, with its gradients in place, such as to add up what they say.
+
+        Args:
+            step: number of training steps done before this one.
+            progress: fraction of the training budget that is spent.
+            finite: whether the step counts; if this is still on the device, () bool, nothing may change where it is
+                False. Steps that Python knows not to count are not followed by anything.
+        """
+
+    def changes_rows(self, step: int, progress: float) -> bool:
+        """Return whether `after_step` may have something to do, for which Python must know whether the step counts.
+
+        Args:
+            step: number of training steps done before this one.
+            progress: fraction of the training budget that is spent.
+        """
+        return type(self).after_step is not Model.after_step
+
     def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
-        """Return rows of parameters to add, drop or reorder; called after each training step, with gradients in place.
+        """Return rows of parameters to add, drop or reorder; called after a training step if `changes_rows` says so.
 
         Args:
             step: number of training steps done before this one.

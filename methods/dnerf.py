@@ -102,6 +102,8 @@ class DNeRFConfig(
 class DNeRF(RayModel[DNeRFConfig], LearnsMotion):
     """A model of a scene that moves; of a scene without times, the canonical field alone."""
 
+    steps_repeat = True
+
 
 def decide(config: DNeRFConfig, scene: Scene) -> tuple[DNeRFConfig, list[Decision]]:
     """Fill in the settings that depend on the scene.

@@ -35,6 +35,7 @@ from framework.splats.learning import as_gaussians, as_tables, open_degree, row_
 from framework.splats.mcmc import moved, shaken
 from framework.splats.redrawn import Redrawn
 from framework.splats.resolution import doubled, halved, halved_distances
+from framework.splats.room import Room
 from framework.splats.settings import SplattingConfig, decide_splatting
 from framework.splats.start import PLACES, first_points, from_points, scene_size, seen_colors
 from framework.splats.table import Table
@@ -144,6 +145,7 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
             self.poses = PoseRefinement(scene.num_cameras, config.camera_optimizer, scene.camera_to_worlds)
             self.poses.optimised = Optimised("poses", config.camera_learning_rate, schedule="exponential")
         self.gradients, self.found_distances = GradientMean(), FoundDistances()
+        self.room = Room()
         self._near = max(0.2 * scene.near, 1e-3)
         self._on_image: Tensor | None = None
         self._longer_side = scene.image_size
@@ -236,7 +238,8 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
             records.retain_grad()
             self._on_image, self._longer_side = records, max(camera.width, camera.height)
         known, trust = self.found_distances.known(batch, self.progress, config.depth_loss_mult, config.field_depth_mult)
-        drawn = draw(records, camera, self._behind(batch), CHANNELS["rgb" if known is None else "distance"])
+        content = CHANNELS["rgb" if known is None else "distance"]
+        drawn = draw(records, camera, self._behind(batch), content, self.room)
         rgb = self._lit(drawn.image if known is None else drawn.image[..., :3], batch.index)
         if batch.kept is not None:  # what does not count is as it should be
             kept = batch.kept if reduced == 1 else halved(batch.kept[..., None].float())[..., 0] == 1
@@ -266,16 +269,23 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         return affine_colors(rgb, self.appearance(which, 1)[0])
 
     @torch.no_grad()
-    def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
+    def after_every_step(self, step: int, progress: float, finite: bool | Tensor) -> None:
         config = self.config
-        self.gradients.add(self._on_image, self._longer_side)
+        self.gradients.add(self._on_image, self._longer_side, finite)
         self._on_image = None
         if (noise := self._chosen(config.noise, NOISE)) > 0:
             rate = self.position_rate * self._extent.of(self.extent) * learning_rate_factor(config, step, progress)
-            which, by = shaken(self.gaussians(), noise * rate)
+            size = noise * rate * finite if isinstance(finite, Tensor) else noise * rate
+            which, by = shaken(self.gaussians(), size)
             self.means.values.data[which] += by / self.extent
-        if step % config.steps_per_move != config.steps_per_move - 1 or progress > config.growth_end:
-            return ()
+
+    def changes_rows(self, step: int, progress: float) -> bool:
+        config = self.config
+        return step % config.steps_per_move == config.steps_per_move - 1 and progress <= config.growth_end
+
+    @torch.no_grad()
+    def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
+        config = self.config
         if config.strategy == "adc":
             return self._densify(step, config.num_gaussians)
         here = len(self.means.values)
@@ -290,6 +300,9 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
             return [RowChange(self.logits.values, none, lowered)]  # new rows, as Adam's state is reset too
         change = grown(self.gaussians(), mean, most, self._extent.of(self.extent))
         return [] if change is None else row_changes(self.parameters_of_gaussians(), *change, self.extent)
+
+    def read_counts(self) -> None:
+        self.room.read()
 
     def refined_cameras(self, cameras: Cameras) -> Cameras:
         """Return the training cameras with refined poses.

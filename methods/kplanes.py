@@ -5,7 +5,7 @@ Fridovich-Keil et al., "K-Planes: Explicit Radiance Fields in Space, Time, and A
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import torch
@@ -14,6 +14,7 @@ from torch import Tensor
 from framework import Decision, LearnsMotion, Method, PixelBatch, Points, RayModel, Rendered, Scene
 from framework.base.config import AT_LEAST_0, AUTO, Auto, Range
 from framework.base.decisions import Choice, fill
+from framework.base.step_kind import StepKind
 from framework.encodings.planes import FeaturePlanes
 from framework.fields.base import MLP
 from framework.fields.encoded import BoxField, EncodedField
@@ -113,6 +114,12 @@ class ExplicitField(BoxField):
 
 class KPlanes(RayModel[KPlanesConfig], LearnsMotion):
     """A model of feature planes in space and, if the scene moves, in time, with the paper's regularisers."""
+
+    steps_repeat = True
+
+    def step_kind(self, step: int) -> StepKind:
+        kind = super().step_kind(step)
+        return replace(kind, varies="planes of time take turns") if self.scene.moving and not kind.varies else kind
 
     def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
         turn = int(torch.randint(2**31, ())) if self.scene.moving else 0  # which plane of time

@@ -104,5 +104,6 @@ METHOD = Method(
     field=make_field,
     sampler=sampler,
     renderer=partial(background_renderer, make_field=make_background),
+    model=vanilla_nerf.VanillaNeRF,
     decide=decide,
 )

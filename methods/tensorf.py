@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import torch
@@ -30,6 +30,7 @@ from framework.base.config import AT_LEAST_0, AUTO, Auto, Range
 from framework.base.decisions import Choice, fill
 from framework.base.device import HostValue
 from framework.base.optimised import Optimised
+from framework.base.step_kind import StepKind
 from framework.encodings.planes import FeaturePlanes
 from framework.fields.base import MLP
 from framework.geometry.bounds import to_unit_box
@@ -171,6 +172,7 @@ class TensoRF(RayModel[TensoRFConfig]):
 
     growths: Tensor
     """Number of times that the grid has grown."""
+    steps_repeat = True
 
     def __init__(self, config: TensoRFConfig, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer) -> None:
         super().__init__(config, scene, field, sampler, renderer)
@@ -190,6 +192,10 @@ class TensoRF(RayModel[TensoRFConfig]):
         if due > self._growths.of(self.growths):
             self.growths.fill_(due)
             self._grow(due / len(self.config.upsample_at))
+
+    def step_kind(self, step: int) -> StepKind:
+        kind = super().step_kind(step)
+        return replace(kind, of=(*kind.of, self._growths.of(self.growths)))  # factors of another size
 
     def _shares(self) -> tuple[float, ...]:
         """Return when the grid grows; with few images, the last time when the levels of other encodings are open."""

@@ -14,7 +14,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from framework import Decision, Method, Sampler, Scene
+from framework import Decision, Method, RayModel, Sampler, Scene
 from framework.base.config import Range
 from framework.base.optimised import Optimised
 from framework.fields.nerf import NeRFField
@@ -130,11 +130,18 @@ def sampler(config: VanillaNeRFConfig, scene: Scene) -> Sampler:
     return make_foreground_sampler(config, scene, partial(make_field, config, scene))
 
 
+class VanillaNeRF(RayModel[VanillaNeRFConfig]):
+    """A model whose steps depend on their number by the values of tensors alone, so that a GPU may repeat them."""
+
+    steps_repeat = True
+
+
 METHOD = Method(
     VanillaNeRFConfig(),
     paper="arXiv:2003.08934",
     field=make_field,
     sampler=sampler,
     renderer=partial(background_renderer, make_field=make_background),
+    model=VanillaNeRF,
     decide=decide,
 )

@@ -8,8 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from framework.base import device as devices
 from framework.base.optimised import Optimised
 from framework.encodings.opening import Opening
+from framework.kernels.drawn_bands import drawn_bands
 from framework.kernels.memory import table
 from framework.kernels.planes import PlanesGradient, PlanesLayout, plane_bands, planes
 
@@ -76,7 +78,8 @@ class FeaturePlanes(nn.Module):
         """Return a random band of consecutive rows of each of several factors, for regularisers.
 
         Reading all of a large table in every step would be slow. A band may extend beyond the factor, where it is cut
-        off, so that all rows are equally likely.
+        off, so that all rows are equally likely. A device that runs ahead of Python draws the places itself, and moves
+        such a band into the factor instead, so that its size is always the same.
 
         Args:
             factors: group, and index in the group, of each factor.
@@ -85,10 +88,17 @@ class FeaturePlanes(nn.Module):
         Returns:
             (B, vertices along the first axis, F) values of each, where B is at most 1/16 of the rows, or 2.
         """
+        heights = [self.layout.shape(group, index)[0] for group, index in factors]
+        entire = [any(axis in whole for axis in self.layout.axes[group][index]) for group, index in factors]
+        if devices.runs_ahead(self.table.device):
+            sizes = [
+                h if everything else min(max(h // BANDS, 2), h) for h, everything in zip(heights, entire, strict=True)
+            ]
+            drawn = [(*factor, rows) for factor, rows in zip(factors, sizes, strict=True)]
+            return drawn_bands(self.table, self.layout, drawn)
         chosen = []
-        for group, index in factors:
-            height, _ = self.layout.shape(group, index)
-            if any(axis in whole for axis in self.layout.axes[group][index]):
+        for (group, index), height, everything in zip(factors, heights, entire, strict=True):
+            if everything:
                 chosen.append((group, index, 0, height))
                 continue
             rows = max(height // BANDS, 2)

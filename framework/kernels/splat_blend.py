@@ -212,7 +212,7 @@ class _Blend(torch.autograd.Function):
             native.pointer(background, "the background", (3,)), image.data_ptr(), through.data_ptr(),
             None if middle is None else middle.data_ptr(), used.data_ptr(), native.threads(),
         )  # fmt: skip
-        ctx.save_for_backward(records, *lists, image, through, used)
+        ctx.save_for_backward(records, *lists[:4], image, through, used)
         if middle is not None:
             ctx.mark_non_differentiable(middle)
         ctx.set_materialize_grads(False)

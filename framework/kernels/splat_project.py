@@ -24,7 +24,7 @@ from torch import Tensor
 
 from framework.geometry.lenses import Distortion, distort
 from framework.kernels import native
-from framework.kernels.dispatch import CPP, TRITON, Operation
+from framework.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
 from framework.kernels.spherical_harmonics import spherical_harmonics_reference
 from framework.kernels.triton_kernels import later
 
@@ -140,17 +140,38 @@ def project_reference(
     Returns:
         Records (N, RECORD), and the number of Gaussians that are left out.
     """
-    pose = camera.pose.to(means)
-    with torch.no_grad():  # apart from `at`, since the gradient of the pose would be NaN times 0
-        depth = means @ pose[2, :3] + pose[2, 3]
     harmonics = harmonics[..., :basis]
+    gaussians = means, log_scales, rotations, logits, colors, harmonics
+    in_front, finite = _in_front(*gaussians, camera)
+    kept = in_front.nonzero()[:, 0]
+    sound, table = _projected(camera, *(values[kept] for values in gaussians))
+    records = means.new_zeros(len(means), RECORD).index_copy_(0, kept, torch.where(sound[:, None], table, 0))
+    return records, (~finite).sum()
+
+
+def _in_front(
+    means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
+    camera: SplatCamera,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Return which Gaussians (N,) can be projected and lie in front of the camera, and which can be."""
+    pose = camera.pose.to(means)
+    with torch.no_grad():  # apart from the projection, since the gradient of the pose would be NaN times 0
+        depth = means @ pose[2, :3] + pose[2, 3]
     everything = torch.cat([means, log_scales, rotations, logits[:, None], colors, harmonics.flatten(1)], 1)
     finite = everything.isfinite().all(1) & (rotations.square().sum(1) > 1e-24)
-    kept = (finite & (depth > camera.near)).nonzero()[:, 0]
-    at = means[kept] @ pose[:, :3].T + pose[:, 3]
-    axes = rotation_matrices(rotations[kept])
+    return finite & (depth > camera.near), finite
+
+
+def _projected(
+    camera: SplatCamera, means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor,
+    harmonics: Tensor,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Return which of K Gaussians in front of the camera the image shows, (K,), and their records (K, RECORD)."""
+    pose, basis = camera.pose.to(means), harmonics.shape[2]
+    at = means @ pose[:, :3].T + pose[:, 3]
+    axes = rotation_matrices(rotations)
     center_x, center_y, to_image, within = _onto_image(at, camera)
-    rows = to_image @ pose[:, :3] @ axes * log_scales[kept].exp()[:, None]  # (K, 2, 3)
+    rows = to_image @ pose[:, :3] @ axes * log_scales.exp()[:, None]  # (K, 2, 3)
     first, second = rows.unbind(1)
     b = (first * second).sum(-1)
     spread_x, spread_y = first.square().sum(-1), second.square().sum(-1)
@@ -158,20 +179,20 @@ def project_reference(
     a, c = spread_x + blur, spread_y + blur
     det_0 = torch.linalg.cross(first, second).square().sum(-1)
     det = det_0 + blur * (spread_x + spread_y) + blur * blur
-    opacity = torch.sigmoid(logits[kept])
+    opacity = torch.sigmoid(logits)
     if camera.antialiased:
         opacity = opacity * (det_0 / det).clamp(min=1e-30).sqrt()
     cut = (opacity / MIN_ALPHA).log()
     reach_x, reach_y = ((2 * cut.clamp(min=0) * variance).sqrt() for variance in (a, c))
     u_x = (c / (2 * det)).sqrt()
     center = -pose[:, :3].T @ pose[:, 3]
-    directions = torch.nn.functional.normalize(means[kept] - center, dim=-1)
-    rgb = 0.5 + DC * colors[kept]
+    directions = torch.nn.functional.normalize(means - center, dim=-1)
+    rgb = 0.5 + DC * colors
     if basis:
         values = spherical_harmonics_reference(directions, {3: 2, 8: 3, 15: 4}[basis])[:, 1:]
-        rgb = rgb + (harmonics[kept] * values[:, None]).sum(-1)
+        rgb = rgb + (harmonics * values[:, None]).sum(-1)
     with torch.no_grad():
-        normals = axes[torch.arange(len(kept), device=kept.device), :, log_scales[kept].argmin(-1)]
+        normals = axes[torch.arange(len(means), device=means.device), :, log_scales.argmin(-1)]
         normals = torch.where((normals * directions).sum(-1, keepdim=True) > 0, -normals, normals)
         visible = within & (cut > 0) & (center_x + reach_x > 0) & (center_x - reach_x < camera.width)
         visible &= (center_y + reach_y > 0) & (center_y - reach_y < camera.height)
@@ -180,9 +201,7 @@ def project_reference(
         *rgb.clamp(min=0).unbind(-1), at.norm(dim=-1), *normals.unbind(-1), reach_y.detach(),
     ]  # fmt: skip
     table = torch.stack(columns, -1)
-    sound = visible & table.isfinite().all(1)
-    records = means.new_zeros(len(means), RECORD).index_copy_(0, kept, torch.where(sound[:, None], table, 0))
-    return records, (~finite).sum()
+    return visible & table.isfinite().all(1), table
 
 
 def _onto_image(at: Tensor, camera: SplatCamera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -283,6 +302,22 @@ def _is_pinhole(
     camera: SplatCamera, basis: int,
 ) -> bool:  # fmt: skip
     return camera.lens is None
+
+
+@PROJECT.implementation(FEW_OPERATIONS, types=None, order=torch.inf)
+def _in_the_place_of_others(
+    means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
+    camera: SplatCamera, basis: int,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Compute `project_gaussians` without a wait: in the place of Gaussians that are not in front of the camera, others
+    are projected, and left out."""
+    gaussians = means, log_scales, rotations, logits, colors, harmonics[..., :basis]
+    in_front, finite = _in_front(*gaussians, camera)
+    pose, others = camera.pose.detach().to(means), ~in_front
+    middle = pose[2, :3] - pose[:, :3].T @ pose[:, 3]  # of the image, at depth 1
+    ones = [values.masked_fill(others.view(-1, *[1] * (values.ndim - 1)), 1.0) for values in gaussians[1:]]
+    sound, table = _projected(camera, torch.where(others[:, None], middle, means), *ones)
+    return torch.where((in_front & sound)[:, None], table, 0), (~finite).sum()
 
 
 PROJECT.implementation(TRITON, fits=_is_pinhole)(later("splat_project", "project_gaussians"))

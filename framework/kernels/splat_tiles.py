@@ -13,7 +13,6 @@ from torch import Tensor
 
 from framework.kernels import native
 from framework.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
-from framework.kernels.march import ranges
 from framework.kernels.splat_project import CUT, DISTANCE, REACH_X, REACH_Y, RECORD, X, Y
 from framework.kernels.triton_kernels import later
 
@@ -27,33 +26,42 @@ class TileLists(NamedTuple):
     offsets: Tensor
     """(T + 1,) int32; tile t has the entries from offsets[t] to offsets[t + 1] - 1, from front to back."""
     ids: Tensor
-    """(E,) int32 index of each entry's Gaussian."""
+    """(E,) int32 index of each entry's Gaussian. Behind the last tile's there may be some without a meaning."""
     slots: Tensor
     """(E,) int32 place of each entry if all are sorted by Gaussian, and those of a Gaussian by tile; (0,) if lists are
     not `for_gradients`."""
     firsts: Tensor
     """(N + 1,) int32; Gaussian g has the slots from firsts[g] to firsts[g + 1] - 1."""
+    needed: Tensor | None = None
+    """() int64 number of entries that there would be with room for all; None if there was."""
 
 
-def tile_lists(records: Tensor, width: int, height: int, for_gradients: bool = True) -> TileLists:
+def tile_lists(
+    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None
+) -> TileLists:
     """Return lists of the Gaussians that each tile of an image may show, nearest first, those as near by their index.
 
     Args:
         records: (N, RECORD) Gaussians on the image, from `project_gaussians`.
         width, height: size of the image, pixels.
         for_gradients: whether a gradient will be asked for; without one the lists may have no slots.
+        room: number of entries for which there is room, so that the device need not be waited for; Gaussians beyond it
+            are left out whole. None for room for all.
     """
     records = records.detach()
-    return TILES((records,), records, width, height, for_gradients)
+    return TILES((records,), records, width, height, for_gradients, room)
 
 
-def tile_lists_reference(records: Tensor, width: int, height: int, for_gradients: bool = True) -> TileLists:
+def tile_lists_reference(
+    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None
+) -> TileLists:
     """Compute `tile_lists` in torch. A Gaussian is listed in every tile that the box around it touches.
 
     Args:
         records: (N, RECORD) Gaussians on the image, from `project_gaussians`.
         width, height: size of the image, pixels.
         for_gradients: makes no difference here.
+        room: number of entries for which there is room; the nearest Gaussians have it.
     """
     columns, rows = -(-width // TILE), -(-height // TILE)
     device = records.device
@@ -66,22 +74,26 @@ def tile_lists_reference(records: Tensor, width: int, height: int, for_gradients
         after = (center + reach)[:, None] >= edges + 0.5
         return after & ((center - reach)[:, None] <= edges + TILE - 0.5)
 
-    touched = met(y, high, edges_y)[:, :, None] & met(x, wide, edges_x)[:, None]
-    place, tile = touched.flatten(1).nonzero().unbind(-1)  # by Gaussian in order of distance, then by tile
-    return _dealt(order.index_select(0, place), tile, columns * rows, len(records))
+    touched = (met(y, high, edges_y)[:, :, None] & met(x, wide, edges_x)[:, None]).flatten(1)
+    needed = None
+    if room is not None:
+        needed, touched = touched.sum(), touched & (touched.sum(1).cumsum(0) <= room)[:, None]
+    place, tile = touched.nonzero().unbind(-1)  # by Gaussian in order of distance, then by tile
+    return _dealt(order.index_select(0, place), tile, columns * rows, len(records))._replace(needed=needed)
 
 
 def _dealt(ids: Tensor, tiles: Tensor, num_tiles: int, num_gaussians: int) -> TileLists:
-    """Return the lists of entries (E,) of a Gaussian and a tile each, sorted by distance and then by tile."""
+    """Return the lists of entries (E,) of a Gaussian and a tile each, sorted by distance and then by tile; those of no
+    Gaussian and no tile, which have the number behind the last of each, come last."""
     by_tile = tiles.sort(stable=True).indices
     ids = ids.index_select(0, by_tile)
     slots = torch.empty_like(ids)
     slots[ids.sort(stable=True).indices] = torch.arange(len(ids), device=ids.device)
     starts = [
-        torch.nn.functional.pad(counts.cumsum(0), (1, 0)).int()
-        for counts in (_counts(tiles, num_tiles), _counts(ids, num_gaussians))
+        torch.nn.functional.pad(counts[:-1].cumsum(0), (1, 0)).int()
+        for counts in (_counts(tiles, num_tiles + 1), _counts(ids, num_gaussians + 1))
     ]
-    return TileLists(starts[0], ids.int(), slots.int(), starts[1])
+    return TileLists(starts[0], ids.clamp(max=max(num_gaussians - 1, 0)).int(), slots.int(), starts[1])
 
 
 def _counts(values: Tensor, count: int) -> Tensor:
@@ -93,8 +105,12 @@ TILES = Operation("tile_lists", tile_lists_reference)
 
 
 @TILES.implementation(FEW_OPERATIONS, types=None)
-def _by_entries(records: Tensor, width: int, height: int, for_gradients: bool = True) -> TileLists:
-    """Compute `tile_lists` without a table of all Gaussians and tiles; the device is waited for once."""
+def _by_entries(
+    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None
+) -> TileLists:
+    """Compute `tile_lists` without a table of all Gaussians and tiles; the device is waited for once, if no room is
+    given. The nearest Gaussians have it."""
+    count, device = len(records), records.device
     columns, rows = -(-width // TILE), -(-height // TILE)
     order = torch.sort(records[:, DISTANCE], stable=True).indices
     sorted_records = records.index_select(0, order)
@@ -102,11 +118,23 @@ def _by_entries(records: Tensor, width: int, height: int, for_gradients: bool = 
     left, right = _met(x, wide, columns)
     top, bottom = _met(y, high, rows)
     across, down = (right - left).clamp(min=0), (bottom - top).clamp(min=0)
-    owners, number = ranges((across * down).masked_fill(sorted_records[:, CUT] <= 0, 0))
+    counts = (across * down).masked_fill(sorted_records[:, CUT] <= 0, 0)
+    needed = None if room is None else counts.sum()
+    if room is None:
+        room = int(counts.sum())
+    else:
+        counts = counts.masked_fill(counts.cumsum(0) > room, 0)
+    ends = counts.cumsum(0)
+    place = torch.arange(room, device=device)
+    owners = torch.searchsorted(ends, place, right=True)
+    none, owners = owners == count, owners.clamp(max=count - 1)
+    number = place - (ends - counts).index_select(0, owners)
     along = across.index_select(0, owners).clamp(min=1)
     column = left.index_select(0, owners) + number % along
     row = top.index_select(0, owners) + number // along
-    return _dealt(order.index_select(0, owners), row * columns + column, columns * rows, len(records))
+    ids = order.index_select(0, owners).masked_fill(none, count)
+    tiles = (row * columns + column).masked_fill(none, columns * rows)
+    return _dealt(ids, tiles, columns * rows, count)._replace(needed=needed)
 
 
 def _met(centers: Tensor, reaches: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -121,21 +149,27 @@ _bound = native.Function("splat_bound", "pqiii", "q")
 _bin = native.Function("splat_bin", "pqpqiiqppppi", "q")
 
 
-@TILES.implementation(CPP)
-def _compiled(records: Tensor, width: int, height: int, for_gradients: bool = True) -> TileLists:
+def _for_all(records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None) -> bool:
+    return room is None
+
+
+@TILES.implementation(CPP, fits=_for_all)
+def _compiled(
+    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None
+) -> TileLists:
     records = records.contiguous()  # kept until the kernels have read it
     count, threads = len(records), native.threads()
     tiles = -(-width // TILE) * -(-height // TILE)
     address = native.pointer(records, "the records", (count, RECORD))
 
-    def room(size: int) -> Tensor:
+    def whole(size: int) -> Tensor:
         return torch.empty(size, dtype=torch.int32)
 
-    order = room(count)
+    order = whole(count)
     visible = _sort(address, count, order.data_ptr())
     bound = _bound(address, count, width, height, threads)
-    offsets, ids, firsts = room(tiles + 1), room(bound), room(count + 1)
-    slots = room(bound if for_gradients else 0)
+    offsets, ids, firsts = whole(tiles + 1), whole(bound), whole(count + 1)
+    slots = whole(bound if for_gradients else 0)
     entries = _bin(
         address, count, order.data_ptr(), visible, width, height, bound, firsts.data_ptr(), offsets.data_ptr(),
         ids.data_ptr(), slots.data_ptr() if for_gradients else None, threads,

@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from framework.base.step_kind import StepKind
 from framework.data.scene import Scene
 from framework.fields.base import DensityFunction, Field
 from framework.geometry.rays import Rays, Samples
@@ -45,6 +46,12 @@ class InsideSphere(Sampler):
     def update(self, step: int, density: DensityFunction) -> None:
         """Update the other sampler."""
         self.sampler.update(step, density)
+
+    def step_kind(self, step: int) -> StepKind:
+        return self.sampler.step_kind(step)
+
+    def read_counts(self) -> None:
+        self.sampler.read_counts()
 
     def losses(self, samples: Samples, weights: Tensor) -> dict[str, Tensor]:
         return self.sampler.losses(samples, weights)

@@ -46,19 +46,23 @@ class GradientMean(nn.Module):
         super().__init__()
         self.register_buffer("sums", torch.zeros(0, 2))
 
-    def add(self, records: Tensor | None, longer_side: int) -> None:
+    def add(self, records: Tensor | None, longer_side: int, finite: bool | Tensor = True) -> None:
         """Add an image; without effect if there is none, or it has no gradient.
 
         Args:
             records: (N, RECORD) Gaussians on the image, which retain their gradient.
             longer_side: of the image, pixels.
+            finite: whether the step counts, possibly () bool on the device, where nothing is added if it does not.
         """
         if records is None or records.grad is None:
             return
         if len(self.sums) != len(records):
             self.sums = records.new_zeros(len(records), 2)
-        self.sums[:, 0] += image_gradients(records, records.grad, longer_side)
-        self.sums[:, 1] += records[:, OPACITY] > 0
+        sizes, shown = image_gradients(records, records.grad, longer_side), records[:, OPACITY] > 0
+        if isinstance(finite, Tensor):
+            sizes, shown = torch.where(finite, sizes, 0), shown & finite
+        self.sums[:, 0] += sizes
+        self.sums[:, 1] += shown
 
     def take(self, count: int) -> Tensor:
         """Return the means (count,) over the images of all processes, 0 of what none has shown, and begin anew.

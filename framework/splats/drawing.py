@@ -16,6 +16,7 @@ from framework.kernels.splat_project import SplatCamera, project_gaussians
 from framework.kernels.splat_tiles import tile_lists
 from framework.rendering.rendered import Picture
 from framework.splats.gaussians import MAX_DEGREE, Gaussians
+from framework.splats.room import Room
 
 DRAWN = ("pinhole", "opencv", "fisheye")
 """Camera models that Gaussians can be drawn for."""
@@ -84,7 +85,13 @@ def on_image(gaussians: Gaussians, camera: SplatCamera, degree: int = MAX_DEGREE
     )[0]
 
 
-def draw(records: Tensor, camera: SplatCamera, background: Tensor, channels: int = CHANNELS["rgb"]) -> Blended:
+def draw(
+    records: Tensor,
+    camera: SplatCamera,
+    background: Tensor,
+    channels: int = CHANNELS["rgb"],
+    room: Room | None = None,
+) -> Blended:
     """Blend Gaussians on an image, with a gradient.
 
     Args:
@@ -92,8 +99,12 @@ def draw(records: Tensor, camera: SplatCamera, background: Tensor, channels: int
         camera: the image.
         background: (3,) colour behind everything.
         channels: number of channels, a value of `CHANNELS`.
+        room: how many entries of lists a device that runs ahead of Python gets, which would be waited for otherwise.
     """
-    lists = tile_lists(records, camera.width, camera.height, torch.is_grad_enabled())
+    given = None if room is None else room.of(records, camera.width * camera.height)
+    lists = tile_lists(records, camera.width, camera.height, torch.is_grad_enabled(), given)
+    if room is not None:
+        room.note(records, camera.width * camera.height, lists)
     return blend(records, lists, camera.width, camera.height, background, channels)
 
 

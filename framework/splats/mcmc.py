@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.base.device import to_float64
+from framework.base import device as devices
 from framework.kernels.splat_project import rotation_matrices
 from framework.splats.gaussians import Gaussians
 
@@ -65,7 +65,7 @@ def shared(logits: Tensor, log_scales: Tensor, counts: Tensor) -> tuple[Tensor, 
         (K,) logits and (K, 3) logarithms of scales of each of the n.
     """
     # In float64: the sum alternates, and its terms are up to ten thousand times as large as what is left of them.
-    alpha = torch.sigmoid(to_float64(logits)).clamp(1e-6, 1 - 1e-6)
+    alpha = torch.sigmoid(devices.to_float64(logits)).clamp(1e-6, 1 - 1e-6)
     n = counts.to(alpha)[:, None]
     each = -torch.expm1(torch.log1p(-alpha) / n[:, 0])
     most = int(counts.max()) if len(counts) else 1
@@ -79,20 +79,26 @@ def shared(logits: Tensor, log_scales: Tensor, counts: Tensor) -> tuple[Tensor, 
 
 
 @torch.no_grad()
-def shaken(gaussians: Gaussians, size: float) -> tuple[Tensor, Tensor]:
+def shaken(gaussians: Gaussians, size: float | Tensor) -> tuple[Tensor | slice, Tensor]:
     """Return noise for the centres of those that are nearly transparent (the paper's equation 7).
+
+    On a device that runs ahead of Python, it is noise for all of them, as nobody waits to know which these are; that of
+    the others is hardly any.
 
     Args:
         gaussians: all of them.
-        size: the noise of a transparent Gaussian, in its standard deviations squared per scene unit.
+        size: the noise of a transparent Gaussian, in its standard deviations squared per scene unit; possibly () on the
+            device.
 
     Returns:
         which (K,), and by how much (K, 3), scene units.
     """
     opacity = torch.sigmoid(gaussians.logits)
-    chosen = (opacity < NOISE_FROM + 6 / NOISE_SHARPNESS).nonzero()[:, 0]
+    chosen: Tensor | slice = slice(None)
+    if not devices.runs_ahead(opacity.device):
+        chosen = (opacity < NOISE_FROM + 6 / NOISE_SHARPNESS).nonzero()[:, 0]
     some = gaussians[chosen]
     gate = torch.sigmoid(-NOISE_SHARPNESS * (opacity[chosen] - NOISE_FROM))
     axes = rotation_matrices(some.rotations) * some.log_scales.exp()[:, None]
-    noise = torch.randn(len(chosen), 3, device=opacity.device) * (size * gate)[:, None]
+    noise = torch.randn(len(gate), 3, device=opacity.device) * (size * gate)[:, None]
     return chosen, (axes @ (axes.transpose(1, 2) @ noise[:, :, None]))[:, :, 0]

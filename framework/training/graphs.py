@@ -28,7 +28,6 @@ from framework.base.processes import processes
 from framework.base.step_kind import StepKind
 from framework.data.sources import BatchSource
 from framework.model import Model
-from framework.training.step import changes_rows
 
 T = TypeVar("T")
 WARM_UP = 3
@@ -307,7 +306,7 @@ def kind_of_step(model: Model[Any], source: BatchSource, step: int, batch: tuple
         return StepKind(varies="several processes exchange their gradients")
     if source.varies is not None:
         return StepKind(varies=source.varies)
-    if changes_rows(model):
-        return StepKind(varies="the model changes after each step")
+    if type(model).after_step is not Model.after_step:
+        return StepKind(varies="the number of parameters changes")
     own = model.step_kind(step)
     return StepKind((*batch, *own.of), own.varies)

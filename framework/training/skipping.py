@@ -18,6 +18,7 @@ from framework.model import parts
 from framework.ray_model import RayModel
 from framework.samplers.base import SkipsCells
 from framework.samplers.occupancy import OccupancySampler
+from framework.splats.room import Room as SplatRoom
 
 if TYPE_CHECKING:
     from framework.training.trainer import Trainer
@@ -62,6 +63,11 @@ def skip_report(trainer: Trainer) -> list[Rung]:
         share = sum(room.left_out for room in rooms) / rays
         says = f"rays of batches for whose samples there was no room on the device: {share:.1%}"
         rungs.append(Rung("rays of batches, for want of room", share, None, "no switch", says))
+    splats = getattr(model, "room", None)
+    if isinstance(splats, SplatRoom) and splats.entries:
+        share = splats.left_out / splats.entries
+        says = f"entries of lists of Gaussians for which there was no room on the device: {share:.1%}"
+        rungs.append(Rung("entries of tiles' lists, for want of room", share, None, "no switch", says))
     updated, there = trainer.optimizer.entries
     if there:
         share = updated / there

@@ -76,25 +76,17 @@ def learn(model: Model[Any], optimizer: Adam, batch: Any, step: int, progress: f
     """
     loss = _loss(model, batch, step, model.uses_bfloat16)
     finite = mean_gradients(optimizer, backward(loss.total, optimizer))
-    if changes_rows(model):
+    if changes := model.changes_rows(step, progress):
         finite = bool(finite)
     if finite is not False:
         optimizer.step(finite)
         with shared_stream(model.config.machine.seed, step, AFTER_STEP):
-            changes = model.after_step(step, progress)
-        for change in changes:
+            model.after_every_step(step, progress, finite)
+            rows = model.after_step(step, progress) if changes else ()
+        for change in rows:
             optimizer.change_rows(change)
     squared_errors = (loss.rgb - batch.rgb).square().mean(-1)
     return StepResult(loss, squared_errors, finite)
-
-
-def changes_rows(model: Model[Any]) -> bool:
-    """Return whether a model has something to do after each step, for which Python must know if the step counts.
-
-    Args:
-        model: any model.
-    """
-    return type(model).after_step is not Model.after_step
 
 
 def forward(model: Model[Any], batch: Any, step: int, progress: float, bfloat16: bool = False) -> Loss:

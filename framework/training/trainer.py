@@ -298,20 +298,20 @@ class Trainer:
         """Return a batch and the result of a step on it; both are written to by the next step."""
         model, source, optimizer, request = self.model, self.source, self.optimizer, self._request()
         step, progress, seed, rank = self.state.step, self.progress, self.config.machine.seed, processes().rank
-        if self.graphs is not None:
-            kind = kind_of_step(model, source, step, (request.num_pixels, request.rays_per_pixel))
-            if self.graphs.take(kind):
-                seed_step(seed, step, BEFORE_STEP)  # for updates of the sampler; what is recorded is seeded anew
-                schedule(model, optimizer, step, progress)
+        if self.graphs is None:
+            seed_step(seed, step, rank)
+            return (batch := source.draw(request)), train_step(model, optimizer, batch, step, progress)
+        seed_step(seed, step, BEFORE_STEP)  # for updates of the sampler; what is recorded is seeded anew
+        schedule(model, optimizer, step, progress)
 
-                def taken() -> tuple[Any, StepResult]:
-                    batch = source.draw(request)
-                    return batch, learn(model, optimizer, batch, step, progress).detached()
+        def taken() -> tuple[Any, StepResult]:
+            return (batch := source.draw(request)), learn(model, optimizer, batch, step, progress).detached()
 
-                return self.graphs.run(kind, lambda: seed_step(seed, step, rank), taken)
+        kind = kind_of_step(model, source, step, (request.num_pixels, request.rays_per_pixel))
+        if self.graphs.take(kind):  # known after the schedules, which may change sizes
+            return self.graphs.run(kind, lambda: seed_step(seed, step, rank), taken)
         seed_step(seed, step, rank)
-        batch = source.draw(request)
-        return batch, train_step(model, optimizer, batch, step, progress)
+        return taken()
 
     def _learnt(self) -> list[Tensor]:
         """Return all tensors that a step changes for good."""

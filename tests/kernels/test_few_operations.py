@@ -17,7 +17,16 @@ from framework.kernels.rigid_motion import RIGID_MOTIONS
 from framework.kernels.rows import gather_rows
 from framework.kernels.spherical_harmonics import SPHERICAL_HARMONICS
 from framework.kernels.splat_blend import BLEND, CHANNELS, blend_reference
-from framework.kernels.splat_project import SplatCamera, project_reference
+from framework.kernels.splat_project import (
+    CUT,
+    DISTANCE,
+    NORMAL,
+    OPACITY,
+    PROJECT,
+    RGB,
+    SplatCamera,
+    project_reference,
+)
 from framework.kernels.splat_tiles import TILES, TileLists, tile_lists_reference
 from tests.kernels.test_march import occupancy, random_rays
 
@@ -152,8 +161,51 @@ def test_lists_of_tiles() -> None:
     records, camera = splats()
     for given in (records, records[:0], records * 0):
         found, truth = (form(given, camera.width, camera.height) for form in (few(TILES), tile_lists_reference))
-        assert all(torch.equal(one, other) for one, other in zip(found, truth, strict=True))
+        assert all(torch.equal(one, other) for one, other in zip(found[:4], truth[:4], strict=True))
     assert len(tile_lists_reference(records, camera.width, camera.height).ids) > 400
+
+
+@pytest.mark.parametrize("room", [0, 100, 400, 5000])
+def test_lists_of_tiles_with_little_room(room: int) -> None:
+    """The lists of the nearest Gaussians; what is behind them has no meaning, and is not seen."""
+    records, camera = splats()
+    found = few(TILES)(records, camera.width, camera.height, True, room)
+    truth = tile_lists_reference(records, camera.width, camera.height, True, room)
+    entries = len(truth.ids)
+    assert entries <= room == len(found.ids) == len(found.slots)
+    assert torch.equal(found.offsets, truth.offsets)
+    assert torch.equal(found.firsts, truth.firsts)
+    assert torch.equal(found.ids[:entries], truth.ids)
+    assert torch.equal(found.slots[:entries], truth.slots)
+    assert found.needed == truth.needed == len(tile_lists_reference(records, camera.width, camera.height).ids)
+    assert (entries == truth.needed) == (room == 5000)
+    distances = records[:, DISTANCE][records[:, CUT] > 0].sort().values
+    listed = records[truth.ids.long().unique(), DISTANCE].sort().values
+    assert torch.equal(listed, distances[: len(listed)])
+    pictures = [few(BLEND)(records, lists, 70, 50, torch.ones(3), 3, False).image for lists in (found, truth)]
+    same(*([picture] for picture in pictures))
+
+
+@pytest.mark.parametrize("basis", [0, 8])
+def test_projection(basis: int) -> None:
+    """With Gaussians behind the camera, without a size, and that are not finite, and a pose that learns."""
+    torch.manual_seed(5)
+    means = 2 * torch.randn(60, 3).double()
+    rows = [torch.randn(60, 3) - 2, torch.randn(60, 4), torch.randn(60), torch.rand(60, 3), torch.rand(60, 3, 8)]
+    given = [means, *(row.double() for row in rows)]
+    given[0][3, 1], given[1][4, 0], given[2][5], given[5][6, 2, 7] = torch.nan, torch.inf, 0.0, torch.nan
+    found = []
+    for form in (few(PROJECT), project_reference):
+        leaves = [values.clone().requires_grad_() for values in (*given, torch.eye(3, 4).double())]
+        camera = SplatCamera(leaves[-1], (60.0, 62.0, 35.0, 25.0), 70, 50, antialiased=True)
+        records, dropped = form(*leaves[:-1], camera, basis)
+        columns = torch.cat([records[:, :CUT], records[:, RGB:NORMAL]], 1)
+        (columns * torch.linspace(-1, 1, 10).double().cos()).square().sum().backward()
+        found.append([records, torch.as_tensor(dropped), *(leaf.grad for leaf in leaves)])
+    assert bool((found[1][0][:, OPACITY] > 0).any())
+    assert bool((found[1][0][:, OPACITY] == 0).any())
+    assert int(found[0][1]) == (4 if basis else 3)
+    same(*found)
 
 
 @pytest.mark.parametrize("pairs", [2**24, 2**12])

@@ -45,8 +45,8 @@ def check(lists: TileLists, records: Tensor, width: int, height: int) -> Tensor:
     """Check the lists' form and order. Returns (N, T) bool: what is listed."""
     count, entries = len(records), len(lists.ids)
     tiles = -(-width // TILE) * -(-height // TILE)
-    assert all(part.dtype == torch.int32 for part in lists)
-    assert [len(part) for part in lists] == [tiles + 1, entries, entries, count + 1]
+    assert all(part.dtype == torch.int32 for part in lists[:4])
+    assert [len(part) for part in lists[:4]] == [tiles + 1, entries, entries, count + 1]
     for starts in (lists.offsets, lists.firsts):
         assert starts[0] == 0
         assert starts[-1] == entries
@@ -129,7 +129,7 @@ def test_the_same_lists_on_any_number_of_threads() -> None:
             found.append(tile_lists(records, 150, 100))
     finally:
         torch.set_num_threads(before)
-    assert all(torch.equal(a, b) for lists in found[1:] for a, b in zip(lists, found[0], strict=True))
+    assert all(torch.equal(a, b) for lists in found[1:] for a, b in zip(lists[:4], found[0][:4], strict=True))
 
 
 @needs_kernels
@@ -138,7 +138,7 @@ def test_records_in_another_order_in_memory() -> None:
     records = records_of(scene(3000), 100, 80)
     expected = tile_lists(records, 100, 80)
     found = tile_lists(records.t().contiguous().t(), 100, 80)
-    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(found[:4], expected[:4], strict=True))
 
 
 @FORMS

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_map_only
 
 from framework.kernels import given
 from framework.tools.benchmarks.operations import _place, _tensors, _waits
@@ -24,6 +25,7 @@ class Tape(TorchDispatchMode):
     def __init__(self) -> None:
         super().__init__()
         self.operations: list[tuple[Any, tuple[Any, ...], dict[str, Any], Any]] = []
+        """Functions, arguments and results, by their memory: a graph of autograd's is not kept."""
         self.own: set[int] = set()
         """Memory that operations on the tape have made."""
         self.before: dict[int, tuple[Tensor, Tensor]] = {}
@@ -42,7 +44,7 @@ class Tape(TorchDispatchMode):
         out = func(*args, **kwargs)
         if not func.is_view:
             self.own |= {memory(tensor) for tensor in _tensors([out])} if not func._schema.is_mutable else set()
-            self.operations.append((func, args, kwargs, out))
+            self.operations.append((func, *tree_map_only(Tensor, Tensor.detach, (args, kwargs, out))))
         return out
 
     def undo(self) -> None:

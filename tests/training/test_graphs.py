@@ -64,6 +64,10 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "mip-nerf": {"method": "mip-nerf", "num_layers": 3, "sampler": "hierarchical"},
     "mip-nerf-360": {"method": "mip-nerf-360", "num_layers": 3, "encoding": "integrated"},
     "zip-nerf": {"method": "zip-nerf", "exposure": True},
+    "vanilla-nerf": {"method": "vanilla-nerf", "num_layers": 3, "sampler": "hierarchical"},
+    "dnerf": {"method": "dnerf", "num_layers": 3, "sampler": "hierarchical", "transparent_share": 1.0},
+    "nerf-plus-plus": {"method": "nerf-plus-plus", "num_layers": 3},
+    "tensorf": {"method": "tensorf", "sampler": "proposal"},
     "captures": {"appearance_embedding_dim": 4, "camera_optimizer": "SO3xR3", "lr_warmup_steps": 9},
     "screws, by error": {"camera_optimizer": "SE3", "draw_by_error": True, "lr_schedule": "exponential"},
     "normals, four rays": {"predict_normals": True, "rays_per_pixel": 4, "train_rays_per_pixel_from": 0.0},
@@ -88,11 +92,12 @@ def test_repeated_steps_learn_what_steps_learn(
         assert reports[0].losses == reports[1].losses
     assert_same_bits(tensors(usual), tensors(repeating))
     assert usual.state.train_mse == repeating.state.train_mse
-    kinds = 1 if "mip" in variant else 2  # steps in which proposals learn, and others
+    hierarchical = any(name in variant for name in ("mip", "vanilla", "dnerf", "plus"))
+    kinds = 1 if hierarchical else 2  # steps in which proposals learn, and others
     assert len(recorder.tapes) == kinds
     assert recorder.repeated == STEPS - kinds * WARM_UP
     assert said == ["training steps are recorded as CUDA graphs and repeated"]
-    assert (usual.optimizer.entries[0] > 0) == ("nerfacto" in usual.run.method or "zip" in usual.run.method)
+    assert (usual.optimizer.entries[0] > 0) == (not hierarchical)
 
 
 class Unrepeated(StepGraphs[Any]):
@@ -104,13 +109,16 @@ class Unrepeated(StepGraphs[Any]):
 
 
 @pytest.mark.medium
+@pytest.mark.parametrize("method", ["instant-ngp", "kplanes", "tensorf"])
 def test_repeated_steps_with_an_occupancy_grid_learn_what_steps_learn(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: list[str]
+    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: list[str]
 ) -> None:
-    """Across updates of the grid, which are not recorded, and changes of the room that samples are given."""
+    """Across updates of the grid, which are not recorded, changes of the room that samples are given, and growth."""
     ahead(monkeypatch)
-    sizes = {"samples_per_batch": 2**11, "num_steps": 64}
-    usual, repeating = (small(tmp_path / name, "instant-ngp", **sizes) for name in ("usual", "repeating"))
+    sizes: dict[str, Any] = {"samples_per_batch": 2**11, "num_steps": 64}
+    if method == "tensorf":
+        sizes |= {"max_num_iterations": 100, "upsample_at": (0.22,), "first_voxels": 8**3, "last_voxels": 16**3}
+    usual, repeating = (small(tmp_path / name, method, **sizes) for name in ("usual", "repeating"))
     usual.graphs, recorder = Unrepeated(FakeRecorder(), usual._learnt), recorded(repeating)
     kinds, steps = set(), 34
     for trainer in (usual, repeating):
@@ -380,7 +388,7 @@ def test_reasons_are_said_once_each(said: list[str]) -> None:
         ("nerfacto", {"few_images": True, "unseen_loss_mult": 0.1}, "the weight of unseen views changes"),
         ("nerfacto", {"few_images": True, "open_levels_until": 0.5}, "levels are still opening"),
         ("instant-ngp", {}, "how many samples a ray has"),  # on the CPU
-        ("kplanes", {}, "the method does not say"),
+        ("kplanes", {}, "how many samples a ray has"),
         ("gaussian-splatting", {}, "batches are made on the host"),
     ],
 )

@@ -232,7 +232,7 @@ class _Blend(torch.autograd.Function):
             _forward, (tiles,), records, lists.offsets, lists.ids, background, image, through, middle, used, width,
             height, blocks(width, splat_tiles.TILE), CHANNELS=channels, BATCH=BATCH, num_warps=8,
         )  # fmt: skip
-        ctx.save_for_backward(records, *lists, image, through, used)
+        ctx.save_for_backward(records, *lists[:4], image, through, used)
         if middle is not None:
             ctx.mark_non_differentiable(middle)
         ctx.set_materialize_grads(False)

@@ -2,7 +2,7 @@
 
 Each entry's key is its tile, above the bits of the distance, which rise with it as those of all positive floats do. So
 one stable sort puts the entries in order, those of the same distance by Gaussian. The host waits once, for the number
-of entries.
+of entries, unless it says for how many there is room; keys of what is left of it come last.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from framework.kernels.triton_kernels.launch import blocks, launch
 
 BLOCK = 32
 """Gaussians that are taken together, by one warp."""
+LAST = 2**63 - 1
+"""Key behind those of all entries."""
 RECORD, TILE = tl.constexpr(splat_project.RECORD), tl.constexpr(splat_tiles.TILE)
 CUT, DISTANCE = tl.constexpr(splat_project.CUT), tl.constexpr(splat_project.DISTANCE)
 REACH_X, REACH_Y = tl.constexpr(splat_project.REACH_X), tl.constexpr(splat_project.REACH_Y)
@@ -63,6 +65,10 @@ def _list(records, counts, firsts, keys, owners, count, columns, rows, BLOCK: tl
     here = g < count
     record = records + g * RECORD
     here = here & (tl.load(record + CUT, mask=here, other=0.0) > 0)
+    if firsts is not None:
+        first = tl.load(firsts + g, mask=here, other=0)
+        here = here & (tl.load(firsts + g + 1, mask=here, other=0) > first)  # else there is no room
+        distance = tl.load(record + DISTANCE, mask=here, other=0.0).to(tl.int32, bitcast=True).to(tl.int64)
     x = tl.load(record, mask=here, other=0.0)
     y = tl.load(record + 1, mask=here, other=0.0)
     left, right = _span(x, tl.load(record + REACH_X, mask=here, other=0.0), columns)
@@ -70,9 +76,6 @@ def _list(records, counts, firsts, keys, owners, count, columns, rows, BLOCK: tl
     wide = tl.where(here, tl.maximum(right - left, 0), 0)
     spanned = wide * tl.maximum(bottom - top, 0)
     found = tl.zeros([BLOCK], tl.int32)
-    if firsts is not None:
-        first = tl.load(firsts + g, mask=here, other=0)
-        distance = tl.load(record + DISTANCE, mask=here, other=0.0).to(tl.int32, bitcast=True).to(tl.int64)
     for k in range(tl.max(spanned, 0)):
         inside = k < spanned
         across = tl.maximum(wide, 1)
@@ -87,10 +90,13 @@ def _list(records, counts, firsts, keys, owners, count, columns, rows, BLOCK: tl
         tl.store(counts + g, found, mask=g < count)
 
 
-def tile_lists(records: Tensor, width: int, height: int, for_gradients: bool = True) -> TileLists:
+def tile_lists(
+    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None
+) -> TileLists:
     """Compute `framework.kernels.splat_tiles.tile_lists` of `records`, `width` and `height`; `for_gradients` or not.
 
-    A Gaussian is listed in a tile only if its ellipse reaches it, not its box alone.
+    A Gaussian is listed in a tile only if its ellipse reaches it, not its box alone. The first Gaussians have the
+    `room`.
 
     Raises:
         ValueError: if there are 2^31 entries or more.
@@ -99,13 +105,18 @@ def tile_lists(records: Tensor, width: int, height: int, for_gradients: bool = T
     columns, rows = blocks(width, splat_tiles.TILE), blocks(height, splat_tiles.TILE)
     counts, programs = torch.empty(count, dtype=torch.int32, device=device), (blocks(count, BLOCK),)
     launch(_list, programs, records, counts, None, None, None, count, columns, rows, BLOCK=BLOCK, num_warps=1)
-    firsts = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
-    entries = int(firsts[-1])
-    if entries >= 2**31:
+    needed = None if room is None else counts.sum()
+    if room is None:
+        room = int(counts.sum())
+    else:
+        counts = counts.masked_fill(counts.cumsum(0) > room, 0)
+    if room >= 2**31:
         raise ValueError("more than 2^31 Gaussians on the image's tiles")
-    keys, owners = (torch.empty(entries, dtype=kind, device=device) for kind in (torch.int64, torch.int32))
+    firsts = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
+    keys = torch.full((room,), LAST, dtype=torch.int64, device=device)
+    owners = torch.zeros(room, dtype=torch.int32, device=device)
     launch(_list, programs, records, None, firsts, keys, owners, count, columns, rows, BLOCK=BLOCK, num_warps=1)
     keys, slots = keys.sort(stable=True)
     tiles = torch.arange(columns * rows + 1, device=device) << 32
     offsets = torch.searchsorted(keys, tiles, out_int32=True)
-    return TileLists(offsets, owners.index_select(0, slots), slots.int(), firsts.int())
+    return TileLists(offsets, owners.index_select(0, slots), slots.int(), firsts.int(), needed)

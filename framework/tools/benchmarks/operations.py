@@ -18,17 +18,17 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from framework.base import device as devices
 from framework.base.console import say
 from framework.base.registry import load_dataparser, load_method
 from framework.data.dataset import Dataset
-from framework.model import parts
-from framework.samplers.occupancy import OccupancySampler
 from framework.tools.testing.scenes import ball_in_a_box, ball_under_a_sky, moving_ball
 from framework.training.machine import machine
 from framework.training.run import Run
@@ -162,15 +162,15 @@ def counted(trainer: Trainer, before: int, steps: int) -> Counted:
         steps: steps that are counted.
     """
     trainer.steps_per_read = STEPS_PER_LOG  # as on other devices than the CPU
-    for sampler in parts(trainer.model, OccupancySampler):
-        sampler.always_fixed = True  # likewise
-    for _ in range(before):
-        trainer.train_step()
-    with Counting() as counting:
-        for _ in range(steps):
-            report = trainer.train_step()
-            if report.step % STEPS_PER_LOG == 0:
-                sum(report.losses.values())
+    with patch.object(devices, "runs_ahead", lambda device: True):  # likewise
+        for _ in range(before):
+            trainer.train_step()
+        trainer.model.read_counts()  # as after every so many steps
+        with Counting() as counting:
+            for _ in range(steps):
+                report = trainer.train_step()
+                if report.step % STEPS_PER_LOG == 0:
+                    sum(report.losses.values())
     return Counted(steps, counting.count, counting.waits)
 
 

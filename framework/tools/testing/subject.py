@@ -136,8 +136,10 @@ class Learner:
         set_learning_rate(self.optimizer, self.config, self.done, self.done / BUDGET)
         if self.has_gradient:
             self.optimizer.step()
-        for change in self.model.after_step(self.done, self.done / BUDGET):
-            self.optimizer.change_rows(change)
+        self.model.after_every_step(self.done, self.done / BUDGET, True)
+        if self.model.changes_rows(self.done, self.done / BUDGET):
+            for change in self.model.after_step(self.done, self.done / BUDGET):
+                self.optimizer.change_rows(change)
         self.done += 1
 
     # -- rendering --------------------------------------------------------------------------------------------

@@ -96,11 +96,27 @@ def records_of(given: dict[str, Tensor], width: int = WIDTH, height: int = HEIGH
 def test_lists(count: int, width: int, height: int) -> None:
     records = records_of(gaussians(count), width, height)
     records[: count // 5, CUT] = 0  # not visible
-    found = TileLists(*(part.cpu() for part in tile_lists(records.to(DEVICE), width, height)))
+    found = TileLists(*(part.cpu() for part in tile_lists(records.to(DEVICE), width, height)[:4]))
     listed = check(found, records, width, height)
     assert not (needed(records, width, height) & (records[:, CUT:] > 0)[:, :1] & ~listed).any()
     boxes = check(tile_lists_reference(records, width, height), records, width, height)
     assert not (listed & ~boxes).any()
+
+
+@pytest.mark.parametrize("room", [0, 40, 400])
+def test_lists_with_little_room(room: int) -> None:
+    """The first Gaussians are listed as they are with room for all; nothing is written beyond it."""
+    records = records_of(gaussians(50))
+    full, found = (tile_lists(records.to(DEVICE), WIDTH, HEIGHT, True, given) for given in (None, room))
+    entries = int(found.offsets[-1])
+    assert len(found.ids) == len(found.slots) == room
+    assert found.needed == len(full.ids)
+    assert (entries == len(full.ids)) == (room == 400)
+    part = TileLists(found.offsets.cpu(), found.ids[:entries].cpu(), found.slots[:entries].cpu(), found.firsts.cpu())
+    check(part, records, WIDTH, HEIGHT)
+    last = int((full.firsts <= room).sum()) - 1
+    assert torch.equal(found.firsts, full.firsts.clamp(max=full.firsts[last]))
+    assert torch.equal(part.ids, full.ids[full.ids < last].cpu())
 
 
 def blended(width: int, height: int, channels: int, median: bool):

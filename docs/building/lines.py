@@ -12,7 +12,7 @@ TAG = re.compile(r"(<[^>]*>)")
 CODE = re.compile(r"<(/?)(?:pre|code)\b")
 HYPHENED = re.compile(r"[^\s]*-[^\s]*")
 FIRST = re.compile(r"(--\w+|)(.*)", re.DOTALL)
-UNIT = re.compile(r"(?<=\d) (?=(?:dB|s|ms|min|h|GB|MB|GiB|MiB)\b|%)|(?<=±) ")
+UNIT = re.compile(r"(?<=\d) (?=(?:dB|s|ms|min|h|GB|MB|GiB|MiB)\b(?!/)|%)|(?<=±) ")
 LONGEST = 18
 """Characters of a word that is kept whole; in a longer one, which a phone's columns do not hold, only `--first` is."""
 

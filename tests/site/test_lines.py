@@ -36,7 +36,7 @@ def lines() -> ModuleType:
         ("<pre><span></span><code>a-b 3 s\n</code></pre>", "<pre><span></span><code>a-b 3 s\n</code></pre>"),
         ("<pre><code>a-b</code>c-d</pre><code>e-f</code>", "<pre><code>a-b</code>c-d</pre><code>{e-f}</code>"),
         ("<td>27.60 ± 0.25 dB</td><td>30 s, 10 %</td>", "<td>27.60 ±_0.25_dB</td><td>30_s, 10_%</td>"),
-        ("<code>sleep 30 s</code> 3 steps, 2 hours", "<code>sleep 30 s</code> 3 steps, 2 hours"),
+        ("<code>sleep 30 s</code> 3 steps, 2 s/image", "<code>sleep 30 s</code> 3 steps, 2 s/image"),
         ('<img alt="3 s a-b">', '<img alt="3 s a-b">'),
     ],
 )  # fmt: skip

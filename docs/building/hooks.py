@@ -10,6 +10,7 @@ from typing import Any
 import method_pages
 import notebook_pages
 from latex2mathml.converter import convert
+from lines import keep_together
 from mkdocs.structure.files import File, Files
 
 EQUATION = re.compile(r'<(span|div) class="arithmatex">(.*?)</\1>', re.DOTALL)
@@ -47,8 +48,8 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_content(content: str, **_: Any) -> str:
-    """Write equations as MathML."""
-    return EQUATION.sub(lambda found: _mathml(html.unescape(found[2]), found[1] == "div"), content)
+    """Write equations as MathML, and keep together what is read as one."""
+    return keep_together(EQUATION.sub(lambda found: _mathml(html.unescape(found[2]), found[1] == "div"), content))
 
 
 def _mathml(text: str, block: bool) -> str:

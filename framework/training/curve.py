@@ -39,8 +39,8 @@ LEAST_SIDE = 16
 """Minimum number of evaluated pixels along the shorter side of an image; SSIM needs 11."""
 
 Entry: TypeAlias = (
-    "tuple[float, int, float] | tuple[float, int, float, float | None, int | None, int, float | None, bool]"
-)
+    tuple[float, int, float] | tuple[float, int, float, float | None, int | None, int, float | None, bool]
+)  # not quoted: Python 3.10 leaves a text within tuple[...] as it is, and checkpoints are checked against this type
 """A point in a checkpoint; points of early versions have the first three values only."""
 
 

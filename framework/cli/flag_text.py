@@ -1,4 +1,4 @@
-"""How the help of a command shows a flag: its text without the source's line breaks, and no "None" that says nothing."""
+"""Flags as the help of a command shows them: without the source's line breaks, and without a None that says nothing."""
 
 from __future__ import annotations
 

@@ -18,7 +18,10 @@ STYLE = re.compile(r"\033\[[\d;]*m")
 NAME = re.compile(r" {4}(--[\w.-]+)")
 """A flag in tyro's list of those that are missing, or that may have been meant."""
 PHRASES = (
-    (r"(--\S+): no type matching (?:\{None\}\|)?(\S+) could be instantiated from \['(.*)'\]", r"\1 is '\3'; it must be \2"),
+    (
+        r"(--\S+): no type matching (?:\{None\}\|)?(\S+) could be instantiated from \['(.*)'\]",
+        r"\1 is '\3'; it must be \2",
+    ),
     (r"; it must be INT\b", "; it must be a whole number"),
     (r"; it must be FLOAT\b", "; it must be a number"),
     (r"(--\S+): invalid literal for int\(\) with base 10: ('.*')", r"\1 is \2; it must be a whole number"),

@@ -1,4 +1,4 @@
-"""What one does next with a trained run, as commands to copy."""
+"""Commands to copy at the end of a training: look at the run, film it, judge it."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from framework.base.console import say
 from framework.base.errors import ConfigError, FlagError
 from framework.cameras.camera_path import read_camera_path, read_transforms
 from framework.cameras.cameras import Cameras
-from framework.cameras.poses import Placement
+from framework.cameras.poses import Placement, looked_at
 from framework.cli.render_flags import (
     CameraPathFlags,
     DatasetFlags,
@@ -32,7 +32,6 @@ from framework.evaluation.evaluator import evaluation_background
 from framework.evaluation.paths import (
     focus_distance,
     interpolate,
-    looked_at,
     middle_pose,
     orbit,
     replace_poses,
@@ -124,8 +123,9 @@ def _circle(flags: OrbitFlags, trained: Trained, parsed: ParsedScene) -> tuple[C
     scene = trained.model.scene
     if scene.warped:
         raise ConfigError("ns-render orbit: this run knows what its cameras look at from the front only (--ndc)")
-    center = looked_at(parsed.cameras) if scene.unbounded else None  # of a capture; an object is in the box's middle
-    middle = scene.box.mean(0).cpu() if center is None else center.float()
+    # The middle of the box is an object's; a capture's is what it looks at.
+    middle = looked_at(parsed.cameras.camera_to_worlds) if scene.unbounded else None
+    middle = scene.box.mean(0).cpu() if middle is None else middle.float()
     cameras = orbit(parsed.cameras, middle, flags.num_frames)
     if flags.time is None:
         return cameras, torch.linspace(0, 1, flags.num_frames) if scene.moving else None

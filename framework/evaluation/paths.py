@@ -10,7 +10,6 @@ from torch import Tensor
 
 from framework.cameras.cameras import Cameras
 from framework.cameras.ndc import NdcCameras
-from framework.cameras.poses import nearest_point
 from framework.cameras.view import View
 from framework.geometry.alignment import nearest_rotations
 from framework.kernels.math import safe_normalize
@@ -97,19 +96,6 @@ def stretches(cameras: Cameras) -> list[Tensor]:
     jumps = (steps > JUMP * usual).nonzero()[:, 0] + 1 if usual > 0 else torch.zeros(0, dtype=torch.long)
     parts = torch.tensor_split(torch.arange(len(cameras)), jumps)
     return [part for part in parts if len(part) >= FEWEST] or [torch.arange(len(cameras))]
-
-
-def looked_at(cameras: Cameras) -> Tensor | None:
-    """Return the point (3,) float64 that cameras look at, nearest to all their axes; None if it is behind most of them.
-
-    Args:
-        cameras: M cameras.
-    """
-    poses = cameras.camera_to_worlds.double().cpu()
-    centers, forward = poses[:, :, 3], -poses[:, :, 2]
-    point = nearest_point(centers, forward)
-    ahead = ((point - centers) * forward).sum(-1) > 0
-    return point if bool(point.isfinite().all()) and float(ahead.double().mean()) >= 0.5 else None
 
 
 def spiral(cameras: Cameras, num_frames: int, focus: float, radius: float | None = None) -> Cameras:

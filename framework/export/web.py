@@ -24,8 +24,7 @@ from torch import Tensor
 import framework
 from framework.base.errors import ConfigError, DataError, FlagError
 from framework.cameras.cameras import Cameras
-from framework.cameras.poses import rotation_between
-from framework.evaluation.paths import looked_at
+from framework.cameras.poses import looked_at, rotation_between
 from framework.splats.budget import fitted_spz
 from framework.splats.gaussians import Gaussians
 from framework.splats.spz import encoded, out_of_range, read_spz
@@ -126,7 +125,7 @@ def focus_of(cameras: Cameras, turn: Tensor) -> list[float]:
         cameras: M cameras.
         turn: (3, 3) rotation of the scene.
     """
-    point = looked_at(cameras)
+    point = looked_at(cameras.camera_to_worlds)
     if point is None:
         poses = cameras.camera_to_worlds.double().cpu()
         centers, forward = poses[:, :, 3], -poses[:, :, 2]

@@ -79,7 +79,8 @@ def test_the_terminal_s_table_fits_eighty_columns() -> None:
 
 
 def test_what_nobody_has_measured_has_no_column(compared: Plan) -> None:
-    head = next(line for line in (compared.folder / "report.md").read_text().splitlines() if line.startswith("| method"))
+    lines = (compared.folder / "report.md").read_text().splitlines()
+    head = next(line for line in lines if line.startswith("| method"))
     assert "PSNR, dB" in head
     assert "floaters" not in head  # no run has sparse points
 

@@ -66,6 +66,10 @@ def claim(output: Path, data: Path, overwrite: bool) -> None:
 
 
 def ready(output: Path) -> str:
-    """Return the last line of a command: where the data folder is, and how to train on it."""
+    """Return the last line of a command: where the data folder is, and how to train on it.
+
+    Args:
+        output: the data folder.
+    """
     words = ("ns-train", "gaussian-splatting", "--data", str(output), "--max-seconds", "300")
     return f"data folder: {output}; next: {shlex.join(words)}"

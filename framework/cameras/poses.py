@@ -131,6 +131,19 @@ def nearest_point(origins: Tensor, directions: Tensor) -> Tensor:
     return torch.linalg.solve(matrix, right)
 
 
+def looked_at(poses: Tensor) -> Tensor | None:
+    """Return the point (3,) float64 that cameras look at, nearest to all their axes; None if it is behind most of them.
+
+    Args:
+        poses: (M, 3, 4) camera-to-world, OpenGL axes.
+    """
+    precise = poses.double().cpu()
+    origins, ahead = precise[:, :, 3], -precise[:, :, 2]
+    point = nearest_point(origins, ahead)
+    is_ahead = ((point - origins) * ahead).sum(-1) > 0
+    return point if bool(point.isfinite().all()) and float(is_ahead.double().mean()) >= 0.5 else None
+
+
 def _principal_axes(points: Tensor, up: Tensor) -> Tensor:
     """Return the rotation (3, 3) whose rows are the axes of most to least spread, the last turned towards `up`."""
     centred = points - points.mean(0)

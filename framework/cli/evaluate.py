@@ -17,7 +17,7 @@ class EvalFlags:
     """Compute PSNR, SSIM and LPIPS of a trained run on held-out views."""
 
     load_config: Path
-    """Folder of the run, its config.yml, or a file of Gaussians (.ply, .spz); the flag's name may be omitted."""
+    """RUN_FOLDER, its config.yml, or a file of Gaussians (.ply, .spz); the flag's name may be left out."""
     output_path: Path | None = None
     """JSON file to write. If not given: eval.json beside config.yml, or NAME.eval.json beside a file of Gaussians."""
     render_output_path: Path | None = None
@@ -52,7 +52,7 @@ def main() -> None:
 
 def _command(arguments: list[str]) -> None:
     words, named = with_format("ns-eval", with_run(arguments))
-    flags = read_flags(EvalFlags, "ns-eval", words)
+    flags = read_flags(EvalFlags, "ns-eval", words, takes="RUN_FOLDER")
     if flags.max_images is not None and flags.max_images < 1:
         raise FlagError(f"--max-images is {flags.max_images}; it must be at least 1")
     if flags.max_pictures is not None and flags.max_pictures < 0:

@@ -21,14 +21,16 @@ if TYPE_CHECKING:
 USAGE = """\
 usage: ns-export WHAT RUN_FOLDER --output-dir DIR [flags]
 
+  tsdf            mesh.ply, .obj or .glb: a mesh of what the training cameras see; for captures, and every method
+  marching-cubes  mesh.ply, .obj or .glb: a mesh of where a field is dense; for objects, closed; not of Gaussians
   pointcloud      point_cloud.ply: points on surfaces, with colours and normals
-  marching-cubes  mesh.ply, .obj or .glb: where the density of a field passes a level
-  tsdf            mesh.ply, .obj or .glb: what the depth images of the training views agree on; for every method
-  gaussian-splat  splat.ply or splat.spz: the Gaussians of a method that has them, for viewers
-  cameras         nerfstudio/transforms.json and colmap/sparse/0: the cameras of all splits, refined if the run has
-                  refined them; transforms_train.json: those of training, as nerfstudio writes it
-  occupancy       occupancy.npz and occupancy.ply: the cells that the method samples, if it has a grid
+  gaussian-splat  splat.ply or splat.spz: the Gaussians of gaussian-splatting, for other programs
   web             scene.html: one file that shows the scene in any browser with WebGL 2, from disk, offline
+  cameras         nerfstudio/transforms.json and colmap/sparse/0: the cameras of all photographs, refined if the run
+                  has refined them; transforms_train.json: those of training, as nerfstudio writes it
+  occupancy       occupancy.npz and occupancy.ply: the cells that the method samples, if it has a grid
+
+  ns-export tsdf RUN_FOLDER --output-dir exports
 
 ns-export WHAT --help shows its flags. Everything is written in the frame and units of the run's input.
 """
@@ -97,7 +99,7 @@ def _command(arguments: list[str]) -> None:
     if (chosen := chosen_kind(arguments, KINDS, USAGE, "nothing is exported as")) is None:
         return
     name, (kind, file, run), rest = chosen
-    flags = read_flags(kind, f"ns-export {name}", with_run(rest))
+    flags = read_flags(kind, f"ns-export {name}", with_run(rest), takes="RUN_FOLDER")
     from framework.training.trained import load_trained
 
     path = flags.output_dir / file.format_map(vars(flags))

@@ -12,7 +12,7 @@ class ExportFlags:
     """Flags of every export."""
 
     load_config: Path
-    """Folder of the run, or its config.yml; the flag's name may be omitted."""
+    """RUN_FOLDER, or its config.yml; the flag's name may be left out."""
     output_dir: Path
     """Folder to write to."""
     load_checkpoint: Path | None = None

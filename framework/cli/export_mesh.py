@@ -29,13 +29,14 @@ class MeshFlags(ExportFlags):
     resolution: int = 256
     """Number of cells along the longest edge of the box, up to 1024."""
     bounding_box_min: tuple[float, float, float] | None = None
-    """Least corner of the box that is searched, in the frame and units of the input; the scene's box if not given."""
+    """Least corner x y z of the box that is searched, in the frame and units of the input; the scene's box if not
+    given."""
     bounding_box_max: tuple[float, float, float] | None = None
-    """Greatest corner of the box that is searched, in the frame and units of the input."""
+    """Greatest corner x y z of that box."""
     num_components: int = 0
-    """Maximum number of connected components, the largest; 0 for any."""
+    """Keep at most this many separate pieces, the largest; 0 keeps all."""
     min_component_share: float = 0.001
-    """Minimum number of faces of a component, as a fraction of those of the largest one."""
+    """Leave out pieces that have fewer faces than this fraction of those of the largest one."""
     target_num_faces: int | None = None
     """Number of faces that the mesh is simplified to; it is not simplified if not given."""
     texture_size: int | None = None
@@ -56,7 +57,7 @@ class MarchingCubesFlags(MeshFlags):
 
 @dataclass(frozen=True)
 class TsdfFlags(MeshFlags):
-    """Write a mesh of the surface that the depth images of the training views agree on; works for every method."""
+    """Write a mesh of what the training cameras see: the surface that their depth images agree on; for every method."""
 
     truncation: float = 4.0
     """Distance from the surface up to which depth images count, in cells: more is smoother, less keeps thin parts."""

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-import re
 from collections.abc import Callable, Iterator
-from functools import partial
 from typing import Annotated, Any
 
 import tyro
@@ -24,6 +22,7 @@ from tyro.constructors import (
 
 from framework.base.config import LEFT_TO_DATA, AppearanceConfig, RayConfig, TrainConfig
 from framework.base.errors import ConfigError
+from framework.cli.flag_text import hide_none, plain
 from framework.data.dataset import DataParser
 from framework.samplers.background import BackgroundConfig
 from framework.samplers.choice import HierarchicalConfig, SamplingConfig
@@ -79,6 +78,7 @@ def grouped_flags(method: str, config: TrainConfig, data_format: str, parser: Da
     _divide(rules, parser, [(f"{data_format} data", of_format)])
     registry = ConstructorRegistry()
     registry.struct_rule(lambda info: rules.get(info.type))
+    hide_none(registry)
     return registry
 
 
@@ -109,7 +109,8 @@ def _divide(rules: dict[type, StructConstructorSpec], settings: Any, groups: lis
         if dataclasses.is_dataclass(field.default) and not isinstance(field.default, type):
             kind = type(field.default)
             nested: Any = ConstructorRegistry.get_struct_spec(StructTypeInfo.make(kind, field.default, False))
-            rules[kind] = dataclasses.replace(nested, instantiate=_checked(nested.instantiate))
+            flags_of_it = tuple(map(plain, nested.fields))
+            rules[kind] = dataclasses.replace(nested, fields=flags_of_it, instantiate=_checked(nested.instantiate))
     boxes = []
     for index, (title, names) in enumerate(groups):
         group = type("Group", (), {})
@@ -138,13 +139,4 @@ def _checked(make: Callable[..., Any]) -> Callable[..., Any]:
 def _flag(field: StructFieldSpec) -> StructFieldSpec:
     """Return a field whose flag has no prefix, and whose default is not shown as None if it depends on the data."""
     is_open = field.default is None and LEFT_TO_DATA in getattr(field.type, "__metadata__", ())
-    annotated: Any = Annotated[
-        field.type, tyro.conf.arg(prefix_name=False, help_behavior_hint=DECIDED if is_open else None)
-    ]
-    return dataclasses.replace(field, type=annotated, helptext=partial(_unwrapped, field.helptext))
-
-
-def _unwrapped(text: str | Callable[[], str | None] | None) -> str | None:
-    """Return a help text without the line breaks of the source, which is read only when the text is shown."""
-    text = text() if callable(text) else text
-    return text and re.sub(r"(?<!\n)\n(?=\w)", " ", text)
+    return plain(field, prefix_name=False, **{"help_behavior_hint": DECIDED} if is_open else {})

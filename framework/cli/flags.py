@@ -18,7 +18,12 @@ STYLE = re.compile(r"\033\[[\d;]*m")
 NAME = re.compile(r" {4}(--[\w.-]+)")
 """A flag in tyro's list of those that are missing, or that may have been meant."""
 PHRASES = (
-    (r"(--\S+): no type matching (\S+) could be instantiated from \['(.*)'\]", r"\1 is '\3'; it must be \2"),
+    (
+        r"(--\S+): no type matching (?:\{None\}\|)?(\S+) could be instantiated from \['(.*)'\]",
+        r"\1 is '\3'; it must be \2",
+    ),
+    (r"; it must be INT\b", "; it must be a whole number"),
+    (r"; it must be FLOAT\b", "; it must be a number"),
     (r"(--\S+): invalid literal for int\(\) with base 10: ('.*')", r"\1 is \2; it must be a whole number"),
     (r"(--\S+): could not convert string to float: ('.*')", r"\1 is \2; it must be a number"),
     (r"invalid choice ('.*') for argument '(--\S+)'\. Expected one of \((.*)\)", r"\2 is \1; it must be one of \3"),
@@ -27,13 +32,14 @@ PHRASES = (
 """What tyro says of a value, and how it is said here."""
 
 
-def read_flags(kind: Any, prog: str, arguments: list[str], **options: Any) -> Any:
+def read_flags(kind: Any, prog: str, arguments: list[str], takes: str = "", **options: Any) -> Any:
     """Return settings that are read from the arguments of a command.
 
     Args:
         kind: the class of the settings, or several joined by `|`.
         prog: the command with what it does, for its help: "ns-render orbit".
         arguments: the arguments, without what `prog` names.
+        takes: what stands before the flags, for the help: "RUN_FOLDER".
         options: further arguments of `tyro.cli`. Flags of booleans have a value if `config` is not among them.
 
     Raises:
@@ -42,11 +48,13 @@ def read_flags(kind: Any, prog: str, arguments: list[str], **options: Any) -> An
     """
     import tyro
 
-    options = {"config": (tyro.conf.FlagConversionOff,), **options}
+    from framework.cli.flag_text import plain_flags
+
+    options = {"config": (tyro.conf.FlagConversionOff,), "registry": plain_flags(), **options}
     said = io.StringIO()
     try:
         with redirect_stderr(said):
-            settings = tyro.cli(kind, prog=prog, args=arguments, **options)
+            settings = tyro.cli(kind, prog=f"{prog} {takes}".rstrip(), args=arguments, **options)
     except SystemExit as end:
         if not end.code:
             raise

@@ -48,7 +48,7 @@ def _command(arguments: list[str]) -> None:
         raise FlagError(answer)
     words, named = with_format(f"ns-render {name}", with_run(rest, {"--rendered-output-names": get_args(OutputName)}))
     options = (tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes)
-    flags: Any = read_flags(path, f"ns-render {name}", words, config=options)
+    flags: Any = read_flags(path, f"ns-render {name}", words, "RUN_FOLDER", config=options)
     _render(name, flags, named)
 
 

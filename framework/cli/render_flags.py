@@ -14,12 +14,14 @@ USAGE = """\
 usage: ns-render PATH RUN_FOLDER --output-path FILE_OR_FOLDER [flags]
 
 paths:
-  camera-path     the cameras of a file, camera_path.json, as nerfstudio's viewer writes it
-  interpolate     a smooth path past the training cameras, in the order of their images' names
-  spiral          a spiral around the mean camera, for cameras that look the same way
-  orbit           a horizontal circle around the scene, with the mean height and distance of the training cameras
-  time            one of the cameras, while time runs from 0 to 1
-  dataset         each camera of a split, beside its true image
+  interpolate     for captures: a smooth walk past the photographs' cameras, in the order of their names
+  orbit           for objects: a horizontal circle around them, as high and as far as the cameras on average
+  spiral          for cameras that all look the same way: a spiral in front of what they see
+  time            for scenes that move: one camera, while time runs from 0 to 1
+  camera-path     the cameras of a file: camera_path.json, as ns-viewer and nerfstudio's viewer write it
+  dataset         the held-out photographs and their renders, one image each; --split train: those of training
+
+  ns-render interpolate RUN_FOLDER --output-path walk.mp4
 
 A file of Gaussians stands for a run: ns-render PATH splat.ply --data DIR [flags] [FORMAT [format flags]]
 
@@ -32,7 +34,7 @@ class RunFlags:
     """The trained run."""
 
     load_config: Path
-    """Folder of the run, its config.yml, or a file of Gaussians (.ply, .spz); the flag's name may be omitted."""
+    """RUN_FOLDER, its config.yml, or a file of Gaussians (.ply, .spz); the flag's name may be left out."""
     load_checkpoint: Path | None = None
     """Checkpoint to load; the newest if not given."""
     data: Path | None = None
@@ -46,8 +48,9 @@ class ViewFlags:
     """Outputs of a view, and their colours."""
 
     rendered_output_names: tuple[OutputName, ...] = ("rgb",)
-    """What is shown, from left to right: rgb, depth, median_depth, accumulation, normals; with 'dataset' also error and
-    gt-rgb, the true image."""
+    """What is shown, from left to right. rgb: colours; depth: mean distance; median_depth: distance at which half of
+    the light is stopped; accumulation: opacity; normals: directions of surfaces; with 'dataset' also gt-rgb, the
+    photograph, and error, the difference from it."""
     depth_near_plane: float | None = None
     """Distance at the dark end of the colours of depth, units of the input; found in all frames if not given."""
     depth_far_plane: float | None = None
@@ -101,7 +104,7 @@ class CameraPathFlags(PathFlags):
 
 @dataclass(frozen=True)
 class InterpolateFlags(PathFlags):
-    """Render a smooth path past the training cameras, in the order of their images' names."""
+    """Render a smooth walk past the training cameras, in the order of their images' names: 2.jpg before 10.jpg."""
 
     output_path: Path = Path("interpolate.gif")
     """File to write; its extension (.mp4, .gif, .webp, .png) is the format. Without one: a folder of images."""

@@ -15,7 +15,7 @@ from framework.base.console import say
 from framework.base.errors import ConfigError, FlagError
 from framework.cameras.camera_path import read_camera_path, read_transforms
 from framework.cameras.cameras import Cameras
-from framework.cameras.poses import Placement
+from framework.cameras.poses import Placement, looked_at
 from framework.cli.render_flags import (
     CameraPathFlags,
     DatasetFlags,
@@ -25,10 +25,19 @@ from framework.cli.render_flags import (
     TimeFlags,
 )
 from framework.data.dataset import Dataset, ParsedScene
+from framework.data.folds import in_order
 from framework.data.image_files import reduce_image
 from framework.data.pixels import composite
 from framework.evaluation.evaluator import evaluation_background
-from framework.evaluation.paths import focus_distance, interpolate, middle_pose, orbit, replace_poses, spiral
+from framework.evaluation.paths import (
+    focus_distance,
+    interpolate,
+    middle_pose,
+    orbit,
+    replace_poses,
+    spiral,
+    stretches,
+)
 from framework.training.datasets import load_split
 from framework.training.trained import Trained
 
@@ -96,7 +105,7 @@ def path_views(flags: InterpolateFlags | SpiralFlags | OrbitFlags | TimeFlags, t
     elif isinstance(flags, SpiralFlags):
         cameras = _spiral(flags, trained, parsed)
     else:
-        cameras = interpolate(parsed.cameras, count)
+        cameras = walk_past(parsed, count)
     cameras = cameras.scaled(1 / (flags.outputs.downscale_factor * parsed.downscale_factor))
     return Views(cameras.to(trained.model.device), times, flags.fps)
 
@@ -114,7 +123,10 @@ def _circle(flags: OrbitFlags, trained: Trained, parsed: ParsedScene) -> tuple[C
     scene = trained.model.scene
     if scene.warped:
         raise ConfigError("ns-render orbit: this run knows what its cameras look at from the front only (--ndc)")
-    cameras = orbit(parsed.cameras, scene.box.mean(0).cpu(), flags.num_frames)
+    # The middle of the box is an object's; a capture's is what it looks at.
+    middle = looked_at(parsed.cameras.camera_to_worlds) if scene.unbounded else None
+    middle = scene.box.mean(0).cpu() if middle is None else middle.float()
+    cameras = orbit(parsed.cameras, middle, flags.num_frames)
     if flags.time is None:
         return cameras, torch.linspace(0, 1, flags.num_frames) if scene.moving else None
     if not scene.moving:
@@ -122,6 +134,24 @@ def _circle(flags: OrbitFlags, trained: Trained, parsed: ParsedScene) -> tuple[C
     if not 0 <= flags.time <= 1:
         raise FlagError(f"--time is {flags.time:g}; it must be from 0 to 1")
     return cameras, torch.full((flags.num_frames,), flags.time)
+
+
+def walk_past(parsed: ParsedScene, num_frames: int) -> Cameras:
+    """Return a smooth path past the cameras in the order of their images' names, and say where it jumps.
+
+    Args:
+        parsed: the photographs.
+        num_frames: number of cameras on the path.
+    """
+    order = in_order([str(file) for file in parsed.image_paths])  # data formats sort 10.jpg before 2.jpg
+    cameras = parsed.cameras[torch.tensor(order)]
+    parts = stretches(cameras)
+    if left := len(cameras) - sum(map(len, parts)):
+        say(f"{left} of {len(cameras)} photographs stand apart from those before and after them, and are not passed")
+    if jumps := len(parts) - 1:
+        times = "once" if jumps == 1 else f"{jumps} times"
+        say(f"the photographs' walk jumps {times}; there the path jumps too, like a cut in a film")
+    return interpolate(cameras, num_frames)
 
 
 def _spiral(flags: SpiralFlags, trained: Trained, parsed: ParsedScene) -> Cameras:

@@ -15,6 +15,7 @@ from framework.base.device import choose_device, peak_memory
 from framework.base.errors import ConfigError, LostProcessError
 from framework.base.extras import install_command
 from framework.base.processes import from_first, joined_processes, processes
+from framework.cli.next_steps import after_training
 from framework.data.dataset import Dataset
 from framework.data.residence import on_device
 from framework.evaluation.evaluator import evaluate
@@ -158,6 +159,8 @@ def _finish(run: Run, trainer: Trainer) -> None:
         raise Stopped(outcome.stopped_by, f"continue with: ns-train --resume {run.folder}")
     with _noted_stop(lambda: f"stopped while evaluating; the trained run is saved: ns-eval {run.folder}"):
         _evaluate(run, trainer, outcome)
+    for line in after_training(trainer.model.scene, run.folder):
+        say(line)
 
 
 def _count(model: HasGaussians) -> str:
@@ -186,7 +189,6 @@ def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:
     if evaluation.warning is not None:
         say(f"warning: {evaluation.warning}")
     write_evaluation(run.folder / "eval.json", run, outcome.checkpoint, evaluation, trainer.device)
-    say(f"evaluate again with: ns-eval --load-config {run.config_path}")
 
 
 def _viewer(trainer: Trainer) -> AbstractContextManager[BetweenSteps | None]:

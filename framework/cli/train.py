@@ -23,6 +23,9 @@ usage: ns-train METHOD [--data DIR] [flags] [FORMAT [format flags]]
        ns-train --load-config FILE [flags]     train with the settings of a recipe or an earlier run
        ns-train --resume RUN_FOLDER [flags]    continue a run that was stopped
        ns-train --version --environment        print what a report of an error needs
+
+  ns-train instant-ngp --max-seconds 60                               the scene that comes with Nerfloom
+  ns-train gaussian-splatting --data data/mine --max-seconds 300      a phone capture, after ns-process-data
 """
 
 
@@ -68,10 +71,14 @@ def _take(arguments: list[str], flag: str) -> tuple[str | None, list[str]]:
 
 
 def _overview() -> str:
-    lines = [USAGE, "methods:"]
-    lines += [f"  {name:<16}{summary(entry)}" for name, entry in registered("methods").items()]
-    lines += ["", "data formats (recognised automatically, or named after the flags):"]
-    lines += [f"  {name:<16}{summary(entry)}" for name, entry in registered("dataparsers").items()]
+    kinds = {kind: registered(kind) for kind in ("methods", "dataparsers")}
+    width = 2 + max(len(name) for entries in kinds.values() for name in entries)
+    listed = {
+        kind: [f"  {name:<{width}}{summary(entry)}" for name, entry in entries.items()]
+        for kind, entries in kinds.items()
+    }
+    lines = [USAGE, "methods:", *listed["methods"]]
+    lines += ["", "data formats (recognised automatically, or named after the flags):", *listed["dataparsers"]]
     lines += ["", "ns-train METHOD --help shows the method's flags."]
     return "\n".join(lines)
 

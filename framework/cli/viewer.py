@@ -18,7 +18,7 @@ class ViewerFlags:
     """Look at a trained run in a browser. It shows newer checkpoints as they are written; Ctrl-C ends it."""
 
     load_config: Path
-    """Folder of the run, its config.yml, or a file of Gaussians (.ply, .spz); the flag's name may be omitted."""
+    """RUN_FOLDER, its config.yml, or a file of Gaussians (.ply, .spz); the flag's name may be left out."""
     load_checkpoint: Path | None = None
     """Checkpoint to load; if not given, the newest, and each that is written later."""
     data: Path | None = None
@@ -38,7 +38,7 @@ def main() -> None:
 
 def _command(arguments: list[str]) -> None:
     words, named = with_format("ns-viewer", with_run([_without_prefix(word) for word in arguments]))
-    flags = read_flags(ViewerFlags, "ns-viewer", words)
+    flags = read_flags(ViewerFlags, "ns-viewer", words, takes="RUN_FOLDER")
     if (command := install_command("viewer")) is not None:
         raise ConfigError(f"the viewer needs viser: {command}")
     from framework.training.splat_files import is_splat_file, load_run_or_splats

@@ -42,7 +42,7 @@ def thumbnail(image: np.ndarray) -> np.ndarray:
     starts = [np.arange(SIDE) * size // SIDE for size in light.shape]
     sums = np.add.reduceat(np.add.reduceat(light, starts[0], axis=0), starts[1], axis=1)
     counts = np.outer(*(np.diff(start, append=size) for start, size in zip(starts, light.shape, strict=True)))
-    small = (sums / counts).ravel()
+    small = (sums / np.maximum(counts, 1)).ravel()  # an image of fewer rows or columns repeats some
     small -= small.mean()
     return (small / max(float(small.std()), 1e-6)).astype(np.float32)
 

@@ -15,6 +15,10 @@ from framework.geometry.alignment import nearest_rotations
 from framework.kernels.math import safe_normalize
 from framework.model import Model
 
+JUMP = 5.0
+"""Ratio of the step between two neighbours to the median step from which a walk is said to jump."""
+FEWEST = 3
+"""Minimum number of cameras between two jumps; fewer are left out of an interpolated path."""
 STOPS = 24
 """Ratio of the number of cameras to the standard deviation, in cameras, of the weights of an interpolated path."""
 SAME_WAY = 0.7
@@ -61,19 +65,37 @@ def interpolate(cameras: Cameras, num_frames: int) -> Cameras:
     """Return cameras along a smooth path past given cameras, in their order, without the shaking of a hand.
 
     A pose is the mean of poses nearby in that order, weighted by a Gaussian; its rotation is the one closest to the
-    mean of the matrices. Intrinsics are those of the first camera.
+    mean of the matrices. No mean is taken across a jump of the walk, as it could lie inside of what both sides look at:
+    the path jumps there too. Intrinsics are those of the first camera.
 
     Args:
         cameras: M cameras.
         num_frames: number of cameras on the path.
     """
-    count = len(cameras)
-    width = max(count / STOPS, 0.5)
-    positions = torch.linspace(0, count - 1, num_frames, dtype=torch.float64)
-    weights = torch.exp(-0.5 * ((positions[:, None] - torch.arange(count)) / width).square())
+    parts = stretches(cameras)
+    kept = torch.cat(parts)
+    part = torch.repeat_interleave(torch.arange(len(parts)), torch.tensor([len(each) for each in parts]))
+    width = max(len(kept) / STOPS, 0.5)
+    positions = torch.linspace(0, len(kept) - 1, num_frames, dtype=torch.float64)
+    weights = torch.exp(-0.5 * ((positions[:, None] - torch.arange(len(kept))) / width).square())
+    weights = weights * (part == part[positions.round().long(), None])
     weights = weights / weights.sum(-1, keepdim=True)
-    means = torch.einsum("fm,mij->fij", weights, cameras.camera_to_worlds.double())
+    means = torch.einsum("fm,mij->fij", weights, cameras.camera_to_worlds[kept].double())
     return replace_poses(cameras, torch.cat([nearest_rotations(means[:, :, :3]), means[:, :, 3:]], dim=-1).float())
+
+
+def stretches(cameras: Cameras) -> list[Tensor]:
+    """Return the indices of the cameras of each stretch of a walk between its jumps; too short ones are left out.
+
+    Args:
+        cameras: M cameras, in the order of the walk.
+    """
+    centers = cameras.camera_to_worlds[:, :, 3].double().cpu()
+    steps = (centers[1:] - centers[:-1]).norm(dim=-1)
+    usual = float(steps.median()) if len(steps) else 0.0
+    jumps = (steps > JUMP * usual).nonzero()[:, 0] + 1 if usual > 0 else torch.zeros(0, dtype=torch.long)
+    parts = torch.tensor_split(torch.arange(len(cameras)), jumps)
+    return [part for part in parts if len(part) >= FEWEST] or [torch.arange(len(cameras))]
 
 
 def spiral(cameras: Cameras, num_frames: int, focus: float, radius: float | None = None) -> Cameras:

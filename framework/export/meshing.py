@@ -154,7 +154,7 @@ def _finished(
     if not len(mesh.faces):
         raise ConfigError("the surface bounds nothing but hollows; another --isosurface-threshold may find one")
     if dropped:
-        say(f"{dropped:,} small or hidden components are left out (--num-components, --min-component-share)")
+        say(f"{dropped:,} small or hidden pieces are left out (--num-components, --min-component-share)")
     if cleaning.target_num_faces is not None:
         mesh = simplified(mesh, cleaning.target_num_faces)
     normals = vertex_normals(mesh)

@@ -12,6 +12,7 @@ from framework.base.console import say, track
 from framework.base.errors import ConfigError, FlagError, printable
 from framework.cameras.view import View
 from framework.data.dataset import Dataset
+from framework.data.folds import in_order
 from framework.data.pixels import composite
 from framework.evaluation.evaluator import evaluation_background, measure, spread, views_to_judge
 from framework.evaluation.metrics import psnr
@@ -97,6 +98,7 @@ def export_page(trained: Trained, path: Path, max_megabytes: float, fit_seconds:
     if not len(good):
         raise ConfigError("there are no Gaussians to show; train the run again")
     turn = upright(cameras)
+    order = in_order(dataset.names)  # data formats sort 10.jpg before 2.jpg
     facts = PageFacts(
         title=_title(trained),
         about=_about(trained, moment),
@@ -104,7 +106,7 @@ def export_page(trained: Trained, path: Path, max_megabytes: float, fit_seconds:
         near=near,
         antialiased=antialiased,
         focus=focus_of(cameras, turn),
-        cameras=camera_rows(cameras, [printable(name) for name in dataset.names], turn),
+        cameras=camera_rows(cameras[torch.tensor(order)], [printable(dataset.names[i]) for i in order], turn),
     )
     text, costs = make_page(transformed(good, turn, 1.0, torch.zeros(3)), facts, max_megabytes)
     for cost in costs:

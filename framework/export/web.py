@@ -24,7 +24,7 @@ from torch import Tensor
 import framework
 from framework.base.errors import ConfigError, DataError, FlagError
 from framework.cameras.cameras import Cameras
-from framework.cameras.poses import nearest_point, rotation_between
+from framework.cameras.poses import looked_at, rotation_between
 from framework.splats.budget import fitted_spz
 from framework.splats.gaussians import Gaussians
 from framework.splats.spz import encoded, out_of_range, read_spz
@@ -125,14 +125,13 @@ def focus_of(cameras: Cameras, turn: Tensor) -> list[float]:
         cameras: M cameras.
         turn: (3, 3) rotation of the scene.
     """
-    poses = turn @ cameras.camera_to_worlds.double().cpu()
-    centers, forward = poses[:, :, 3], -poses[:, :, 2]
-    point = nearest_point(centers, forward)
-    ahead = ((point - centers) * forward).sum(-1) > 0
-    if not bool(point.isfinite().all()) or float(ahead.double().mean()) < 0.5:
+    point = looked_at(cameras.camera_to_worlds)
+    if point is None:
+        poses = cameras.camera_to_worlds.double().cpu()
+        centers, forward = poses[:, :, 3], -poses[:, :, 2]
         size = float((centers - centers.mean(0)).norm(dim=-1).max()) or 1.0
         point = centers.mean(0) + size * forward.mean(0)
-    return [round(value, 6) for value in point.tolist()]
+    return [round(value, 6) for value in (turn @ point).tolist()]
 
 
 def make_page(gaussians: Gaussians, facts: PageFacts, max_megabytes: float) -> tuple[str, list[str]]:

@@ -150,7 +150,8 @@ def out_of_range(gaussians: Gaussians) -> list[str]:
     seen = (gaussians.log_scales < -10) & (largest < -10 + FLAT)
     outside = (seen | (largest > 6)).any(-1)
     if count := int(outside.sum()):
-        lost.append(f"SPZ has no sizes below {math.exp(-10):.2g} or above {math.exp(6):.0f}: {count:,} are clipped")
+        sizes = f"{math.exp(-10):.2g} to {math.exp(6):.0f}"
+        lost.append(f"SPZ holds sizes from {sizes}: {count:,} of the Gaussians get the nearest of these")
     return lost
 
 

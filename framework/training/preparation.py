@@ -117,7 +117,8 @@ def _warning_of_folds(dataset: Dataset) -> list[Decision]:
     reason = (
         f"{dataset.names[first]} and {dataset.names[second]} look alike, but their cameras look "
         f"{angle_between(ahead[first], ahead[second]):.0f} degrees apart (such pairs: {len(pairs)}): something that "
-        "repeats, like a label printed twice, was taken for one. ns-process-data finds poses without the fold"
+        "repeats, like a label printed twice, was taken for one. ns-process-data finds poses without the fold, "
+        "if enough photographs lie between these two"
     )
     return [Decision("warning, poses", "they seem to be folded", reason)]
 

@@ -32,7 +32,9 @@ class CameraPanel:
         self._shown = client.gui.add_checkbox(
             "Show cameras", False, hint="Cameras of the training images; a click on one of them goes there."
         )
-        self._number = client.gui.add_number("Photograph", 0, min=0, step=1)
+        self._number = client.gui.add_number(
+            "Photograph", 0, min=0, step=1, hint="Number of a training image, from 0; its name is shown below."
+        )
         self._go = client.gui.add_button("Go to the photograph")
         self._note = client.gui.add_markdown("")
         self._shown.on_update(lambda _: self._show())

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from framework.base.console import say
+from framework.cameras.poses import looked_at
 from framework.viewer.browser import Browser
 from framework.viewer.camera_panel import CameraPanel
 from framework.viewer.drawing import draw
@@ -120,7 +121,8 @@ class Page:
         else:
             pose, mean = poses[0].cpu(), poses[:, :, 1].mean(0).cpu()
             up = torch.tensor([0.0, 0.0, 1.0]) if float(mean[2]) > 0.5 * float(mean.norm()) else mean
-            middle = scene.box.mean(0).cpu() - pose[:, 3]
+            seen = looked_at(poses) if scene.unbounded else None  # a capture turns about what it looks at
+            middle = (scene.box.mean(0).cpu() if seen is None else seen.float()) - pose[:, 3]
             distance = max(float(-(middle @ pose[:, 2])), 0.1 * float(middle.norm()), 1e-3)
             position, center = pose[:, 3], pose[:, 3] - distance * pose[:, 2]
         self._server.scene.set_up_direction(tuple(up.tolist()))

@@ -55,7 +55,7 @@ def test_an_unknown_flag(name: str) -> None:
         (
             "ns-eval",
             ["--load-config", "x", "--max-images", "many"],
-            "--max-images is 'many'; it must be {None}|INT; ns-eval --help shows the flags",
+            "--max-images is 'many'; it must be a whole number; ns-eval --help shows the flags",
         ),
         (
             "ns-eval",

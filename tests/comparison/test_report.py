@@ -78,6 +78,13 @@ def test_the_terminal_s_table_fits_eighty_columns() -> None:
     assert any("PSNR, dB" in line for line in lines)
 
 
+def test_what_nobody_has_measured_has_no_column(compared: Plan) -> None:
+    lines = (compared.folder / "report.md").read_text().splitlines()
+    head = next(line for line in lines if line.startswith("| method"))
+    assert "PSNR, dB" in head
+    assert "floaters" not in head  # no run has sparse points
+
+
 def test_all_may_have_failed(tmp_path: Path) -> None:
     comparison = plan(tmp_path, "tensorf")
     page = write_report(comparison, rows_of(["tensorf"], [], {"tensorf": ["no luck"]})).read_text()

@@ -11,6 +11,7 @@ from torch import Tensor
 from framework import Picture, View
 from framework.cameras.cameras import Cameras, check_pose
 from framework.cameras.ndc import Ndc, NdcCameras
+from framework.cameras.poses import looked_at
 from framework.evaluation.paths import (
     focus_distance,
     interpolate,
@@ -20,6 +21,7 @@ from framework.evaluation.paths import (
     orbit,
     replace_poses,
     spiral,
+    stretches,
 )
 
 UP = torch.tensor([0.0, 0.0, 1.0])
@@ -148,3 +150,41 @@ def test_the_distance_of_what_is_seen(warped: bool) -> None:
 
     model: Any = SimpleNamespace(render_view=render_view, scene=SimpleNamespace(moving=False, near=0.1))
     assert focus_distance(model, camera, torch.zeros(3)) == pytest.approx(5.0, rel=1e-3)
+
+
+def along(places: list[float]) -> Cameras:
+    """Cameras at these places of the x axis, which look along -z."""
+    poses = torch.eye(4)[:3].repeat(len(places), 1, 1)
+    poses[:, 0, 3] = torch.tensor(places)
+    ones = torch.ones(len(places))
+    return Cameras(poses, ones, ones, ones, ones, ones.long(), ones.long())
+
+
+def test_a_path_does_not_fly_from_one_stretch_of_a_walk_to_the_next() -> None:
+    near, far = [float(place) for place in range(10)], [50.0 + place for place in range(10)]
+    places = interpolate(along(near + far), 100).camera_to_worlds[:, 0, 3]
+    assert bool(((places < 9.01) | (places > 49.99)).all())
+    assert float(places[0]) == pytest.approx(0, abs=1)
+    assert float(places[-1]) == pytest.approx(59, abs=1)
+    assert bool((places.diff() >= 0).all())
+
+
+def test_what_stands_alone_between_two_jumps_is_not_passed() -> None:
+    near, far = [float(place) for place in range(5)], [50.0 + place for place in range(5)]
+    assert [part.tolist() for part in stretches(along([*near, 30.0, *far]))] == [[0, 1, 2, 3, 4], [6, 7, 8, 9, 10]]
+
+
+@pytest.mark.parametrize("places", [[0.0], [0.0, 7.0], [0.0, 100.0, 0.0, 200.0], [0.0, 0.0, 0.0, 1.0]])
+def test_few_cameras_are_one_stretch(places: list[float]) -> None:
+    assert [part.tolist() for part in stretches(along(places))] == [list(range(len(places)))]
+
+
+def test_cameras_look_at_one_point() -> None:
+    point = torch.tensor([0.5, -2.0, 1.0])
+    around = [torch.tensor([3 * math.cos(a), 3 * math.sin(a), 1.0]) + point for a in (0.0, 0.7, 1.9, 2.5)]
+    towards = torch.stack([look_at(place, point, UP) for place in around])
+    away = torch.stack([look_at(place, 2 * place - point, UP) for place in around])
+    found = looked_at(towards)
+    assert found is not None
+    torch.testing.assert_close(found.float(), point, atol=1e-4, rtol=0)
+    assert looked_at(away) is None

@@ -324,7 +324,7 @@ def test_what_is_out_of_range_is_said(tmp_path: Path) -> None:
     gaussians.log_scales[5:9] = torch.tensor([-3.0, -3.0, -12.0])  # flat: how thin is not seen
     first, second = write_gaussians(tmp_path / "a.spz", gaussians)
     assert "rounds positions to 0.25" in first
-    assert "5 are clipped" in second
+    assert "5 of the Gaussians get the nearest" in second
     assert bool(read_gaussians(tmp_path / "a.spz").log_scales[:5].eq(-10).all())
 
 

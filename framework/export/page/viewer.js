@@ -192,7 +192,7 @@ function show(gl, gaussians, facts) {
   function jump(index) {
     camera = (index + cameras.length) % cameras.length;
     element("slider").value = camera;
-    element("name").textContent = `${camera + 1} · ${cameras[camera][0]}`;
+    element("name").textContent = `${camera + 1} of ${cameras.length}: ${cameras[camera][0]}`;
     element("slider").setAttribute("aria-valuetext", cameras[camera][0]);
     state.camera = camera;
     look(viewOf(cameras[camera], facts.focus));

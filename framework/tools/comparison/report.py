@@ -50,7 +50,7 @@ COLUMNS = (
     Column("floaters, %", "floaters", "{:.1f}".format, min),
     Column("training, s", "seconds", "{:.1f}".format, min, SAME_TIME),
     Column("steps", "steps", "{:,.0f}".format, None),
-    Column("training, rays/s", "rays_per_second", "{:,.0f}".format, max),
+    Column("training, rays/s", "rays_per_second", "{:,.0f}".format, None),  # of methods that draw images: pixels
     Column("rendering, s/image", "render_seconds", "{:.2f}".format, min),
     Column("peak memory, GiB", "peak_memory_bytes", lambda value: f"{value / 2**30:.2f}", min),
     Column("parameters", "parameters", "{:,.0f}".format, min),
@@ -112,7 +112,7 @@ def _content(plan: Plan, rows: Sequence[Row], runs: Sequence[Measured]) -> dict[
         "when": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
         "budget": plan.conditions.budget(),
         "conditions": condition_lines(plan.conditions, plan.repeats, runs),
-        "columns": [column.title for column in COLUMNS],
+        "columns": [column.title for column in measured(rows)],
         "rows": table(rows),
         "levels": levels(rows),
         "level_rows": level_table(rows),
@@ -168,6 +168,15 @@ def _of_all(conditions: Conditions) -> str:
     return "" if most is None else f" (at most {most}, evenly spaced; --max-eval-images sets how many)"
 
 
+def measured(rows: Sequence[Row]) -> list[Column]:
+    """Return the columns that have a value for some contender; all of them if no contender has finished.
+
+    Args:
+        rows: results of the contenders.
+    """
+    return [c for c in COLUMNS if any(row.mean(c.figure) is not None for row in rows)] or list(COLUMNS)
+
+
 def table(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Return the rows of the table of results: label, colour, whether on the Pareto front, and a cell for each column.
 
@@ -179,7 +188,7 @@ def table(rows: Sequence[Row]) -> list[dict[str, Any]]:
     on_front = {row.label for row, best in zip(finished, front, strict=True) if best}
     result = []
     for index, row in enumerate(rows):
-        cells = [_cell(column, row, finished) for column in COLUMNS] if row.runs else []
+        cells = [_cell(column, row, finished) for column in measured(rows)] if row.runs else []
         result.append(
             {"label": row.label, "color": plots.color_of(index), "front": row.label in on_front, "cells": cells}
         )
@@ -193,8 +202,9 @@ def console_table(rows: Sequence[Row]) -> Table:
         rows: results of the contenders.
     """
     result = Table("", *(row.label for row in rows))
-    cells = [row["cells"] or [Cell("failed")] * len(COLUMNS) for row in table(rows)]
-    for column, figures in zip(COLUMNS, zip(*cells, strict=True), strict=True):
+    columns = measured(rows)
+    cells = [row["cells"] or [Cell("failed")] * len(columns) for row in table(rows)]
+    for column, figures in zip(columns, zip(*cells, strict=True), strict=True):
         result.add_row(column.title, *(cell.text for cell in figures))
     return result
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import shutil
 from pathlib import Path
 
@@ -62,3 +63,13 @@ def claim(output: Path, data: Path, overwrite: bool) -> None:
         else:
             path.unlink()
     output.mkdir(parents=True, exist_ok=True)
+
+
+def ready(output: Path) -> str:
+    """Return the last line of a command: where the data folder is, and how to train on it.
+
+    Args:
+        output: the data folder.
+    """
+    words = ("ns-train", "gaussian-splatting", "--data", str(output), "--max-seconds", "300")
+    return f"data folder: {output}; next: {shlex.join(words)}"

@@ -13,7 +13,7 @@ import numpy as np
 from framework.base.console import say
 from framework.base.errors import DataError
 from framework.data.image_files import one_line
-from framework.tools.processing.output import FINISHED
+from framework.tools.processing.output import FINISHED, ready
 from framework.tools.processing.pipeline import prepare_and_report
 from framework.tools.processing.pyramid import write_pyramid
 from framework.tools.processing.transforms import Frame, Lens, content, write
@@ -111,7 +111,7 @@ def write_folder(
     # The phone measures gravity, so the frame is upright and need not be estimated from the poses.
     write(output / FINISHED, content(frames, applied, None, {"orientation_override": "none"}))
     say(f"{len(frames)} images with the phone's poses")
-    say(f"data folder: {output}")
+    say(ready(output))
 
 
 def cropped(lens: Lens, crop: int) -> Lens:

@@ -14,7 +14,7 @@ from framework.base.console import say
 from framework.base.errors import DataError
 from framework.tools.processing import colmap, retrieval, transforms, unfolding
 from framework.tools.processing.images import PreparedImage, prepare_all, write_masks
-from framework.tools.processing.output import FINISHED
+from framework.tools.processing.output import FINISHED, ready
 from framework.tools.processing.pyramid import write_pyramid
 from framework.tools.processing.settings import ColmapFlags
 from framework.tools.processing.summary import Summary, advice, lines
@@ -92,7 +92,7 @@ def process(
     transforms.write(output / FINISHED, transforms.content(frames, transforms.Z_UP, "sparse_pc.ply", {}))
     for line in lines(summary):
         say(line)
-    say(f"data folder: {output}")
+    say(ready(output))
 
 
 def prepare_and_report(

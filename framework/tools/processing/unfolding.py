@@ -113,7 +113,11 @@ def unfold(
             if angle_between(_ahead(made, first), _ahead(made, second)) <= SAME_WAY
         }
     if best is None:
-        say("the photographs could not be placed by their neighbours alone: the reconstruction stays folded")
+        say(
+            "the photographs could not be placed by their neighbours alone, so the poses stay as they are, and some of "
+            f"them are wrong: take more photographs on the way from {pairs[0][0]} to {pairs[0][1]}, or leave out those "
+            "that have little in common with the others"
+        )
     else:
         say(f"unfolded: {len(best.model.images)} images, from {used} pairs that look the same way")
     return best

@@ -1,0 +1,27 @@
+"""Commands to copy at the end of a training: look at the run, film it, judge it."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+from framework.base.extras import install_command
+from framework.data.scene import Scene
+
+
+def after_training(scene: Scene, folder: Path) -> list[str]:
+    """Return lines that say how to look at a run, film it and judge it.
+
+    Args:
+        scene: properties of its data, which decide on the camera path that suits them.
+        folder: folder of the run.
+    """
+    run = shlex.quote(str(folder))
+    path = "spiral" if scene.warped else "interpolate" if scene.unbounded else "orbit"
+    video = f"{path}.gif" if install_command("video") else f"{path}.mp4"
+    lines = ["next:"]
+    if scene.num_scenes == 1:
+        lines.append(f"  look at it in a browser:  ns-viewer {run}")
+        lines.append(f"  make a video:             ns-render {path} {run} --output-path {video}")
+    lines.append(f"  evaluate it again:        ns-eval {run}")
+    return lines

@@ -183,15 +183,15 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
     @torch.no_grad()
     def render_view(self, view: View, background: Tensor) -> Picture:
         """Render `view` over `background` (3,) in chunks of `eval_num_rays_per_chunk` rays, in evaluation mode."""
-        was_training, per_pixel = self.training, view.rays_per_pixel or self.rays_per_pixel
+        per_pixel = view.rays_per_pixel or self.rays_per_pixel
         offsets, grid, times = subpixels(per_pixel, self.device), view.pixels(), view.times()
         chunk, count = max(self.config.eval_num_rays_per_chunk // per_pixel, 1), grid.numel()
         pixels = grid.reshape(-1)
-        self.eval()
         # Written into as they come: small results kept between a chunk's large ones would break up the heap.
         rgb, normals = torch.empty(count, 3, device=self.device), None
         depth, median, accumulation = torch.empty(3, count, device=self.device)
         with (
+            evaluating(self),
             torch_on_one_thread(self.runs_on_kernels),
             torch.autocast(self.device.type, torch.bfloat16, enabled=self.uses_bfloat16),
         ):
@@ -205,7 +205,6 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
                 if rendered.normals is not None:
                     normals = torch.empty_like(rgb) if normals is None else normals
                     normals[part] = safe_normalize(rendered.normals.float())
-        self.train(was_training)
         size = tuple(grid.shape)
         return Picture(
             rgb.view(*size, 3),

@@ -123,16 +123,14 @@ def _along_rays(place: str, before: int, after: int, faster: float) -> str:
 
 def _probe(model: RayModel[Any], rays: Rays) -> tuple[float, int]:
     """Return the seconds to render the rays and the number of evaluated samples."""
-    was_training = model.training
-    model.eval()
     background = torch.zeros(3, device=model.device)
-    model.render(rays[:WARM_UP_RAYS], background)
-    wait_for(model.device)
-    start = time.perf_counter()
-    rendered = model.render(rays, background)
-    wait_for(model.device)
-    seconds = time.perf_counter() - start
-    model.train(was_training)
+    with evaluating(model):
+        model.render(rays[:WARM_UP_RAYS], background)
+        wait_for(model.device)
+        start = time.perf_counter()
+        rendered = model.render(rays, background)
+        wait_for(model.device)
+        seconds = time.perf_counter() - start
     return seconds, int(rendered.num_samples)
 
 

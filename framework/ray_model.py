@@ -22,7 +22,7 @@ from framework.geometry.rays import Rays
 from framework.kernels.math import safe_normalize
 from framework.kernels.native import torch_on_one_thread
 from framework.kernels.traced_error import PixelTargets, TracedError
-from framework.model import Loss, Model, parts
+from framework.model import Loss, Model, evaluating, parts
 from framework.rendering.losses import (
     density_before,
     depth_error,
@@ -188,17 +188,17 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
 
         Pixels that are known to show the background alone (`pixels_in_view`) are not rendered.
         """
-        was_training, per_pixel = self.training, view.rays_per_pixel or self.rays_per_pixel
+        per_pixel = view.rays_per_pixel or self.rays_per_pixel
         offsets, grid, times = subpixels(per_pixel, self.device), view.pixels(), view.times()
         chunk, count = max(self.config.eval_num_rays_per_chunk // per_pixel, 1), grid.numel()
         pixels, seen = grid.reshape(-1), self._seen(view)
         places = None if seen is None else seen.reshape(-1).nonzero().squeeze(-1)
-        self.eval()
         # Written into as they come: small results kept between a chunk's large ones would break up the heap.
         rgb, normals = background.to(self.device, torch.float32).repeat(count, 1), None
         depth, median, accumulation = torch.full((3, count), self.scene.far, device=self.device)
         accumulation.zero_()
         with (
+            evaluating(self),
             torch_on_one_thread(self.runs_on_kernels),
             torch.autocast(self.device.type, torch.bfloat16, enabled=self.uses_bfloat16),
         ):
@@ -213,7 +213,6 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
                 if rendered.normals is not None:
                     normals = torch.zeros_like(rgb) if normals is None else normals
                     normals[part] = safe_normalize(rendered.normals.float())
-        self.train(was_training)
         size = tuple(grid.shape)
         return Picture(
             rgb.view(*size, 3),

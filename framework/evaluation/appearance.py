@@ -17,7 +17,7 @@ from torch import Tensor
 from framework.data.dataset import Dataset
 from framework.data.pixels import gather_batch
 from framework.fields.appearance import Appearance
-from framework.model import HasAppearance, Model
+from framework.model import HasAppearance, Model, evaluating
 from framework.ray_model import RayModel
 from framework.rendering.losses import mean_squared_error
 
@@ -107,32 +107,26 @@ def _left_pixels(dataset: Dataset, index: int) -> Tensor:
 
 
 def _fit(model: RayModel[Any], dataset: Dataset, pixels: Tensor, vector: Tensor, background: Tensor) -> None:
-    was_training = model.training
-    model.eval()
     optimizer = torch.optim.Adam([vector], lr=RATE)
     generator = torch.Generator().manual_seed(0)
-    with torch.enable_grad(), torch.autocast(model.device.type, torch.bfloat16, enabled=False):
+    with evaluating(model), torch.enable_grad(), torch.autocast(model.device.type, torch.bfloat16, enabled=False):
         for _ in range(STEPS):
             chosen = pixels[torch.randint(len(pixels), (PIXELS,), generator=generator).to(pixels.device)]
             batch = gather_batch(dataset, chosen, background.repeat(len(chosen), 1))
             rendered = model.render(replace(batch.rays, camera_indices=None), batch.background)
             (vector.grad,) = torch.autograd.grad(mean_squared_error(rendered.rgb, batch.rgb), [vector])
             optimizer.step()
-    model.train(was_training)
 
 
 def _fit_view(model: Model[Any], dataset: Dataset, pixels: Tensor, vector: Tensor, background: Tensor) -> None:
     """Fit the vector of a model that draws whole images, by pixels of one image."""
-    was_training = model.training
-    model.eval()
     optimizer = torch.optim.Adam([vector], lr=RATE)
     index = int(torch.searchsorted(dataset.cameras.offsets.to(pixels), pixels[0], right=True)) - 1
     pixels_there = pixels - dataset.cameras.offsets[index].to(pixels)
     view = dataset.view(index)
     true = gather_batch(dataset, pixels, background.repeat(len(pixels), 1)).rgb
-    with torch.enable_grad():
+    with evaluating(model), torch.enable_grad():
         for _ in range(STEPS):
             shown = model.render_view(view, background).rgb.reshape(-1, 3)[pixels_there]
             (vector.grad,) = torch.autograd.grad(mean_squared_error(shown, true), [vector])
             optimizer.step()
-    model.train(was_training)

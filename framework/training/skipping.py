@@ -14,7 +14,7 @@ from framework.base.device import wait_for
 from framework.data.pixels import draw_batch
 from framework.geometry.rays import Rays
 from framework.kernels.occupancy import own_cells
-from framework.model import parts
+from framework.model import evaluating, parts
 from framework.ray_model import RayModel
 from framework.samplers.base import SkipsCells
 from framework.samplers.occupancy import OccupancySampler
@@ -129,16 +129,14 @@ def _along_rays(place: str, before: int, after: int, faster: float) -> str:
 
 def _probe(model: RayModel[Any], rays: Rays) -> tuple[float, int]:
     """Return the seconds to render the rays and the number of evaluated samples."""
-    was_training = model.training
-    model.eval()
     background = torch.zeros(3, device=model.device)
-    model.render(rays[:WARM_UP_RAYS], background)
-    wait_for(model.device)
-    start = time.perf_counter()
-    rendered = model.render(rays, background)
-    wait_for(model.device)
-    seconds = time.perf_counter() - start
-    model.train(was_training)
+    with evaluating(model):
+        model.render(rays[:WARM_UP_RAYS], background)
+        wait_for(model.device)
+        start = time.perf_counter()
+        rendered = model.render(rays, background)
+        wait_for(model.device)
+        seconds = time.perf_counter() - start
     return seconds, int(rendered.num_samples)
 
 

@@ -36,10 +36,11 @@ from framework.rendering.rendered import Picture, Rendered
 from framework.rendering.renderer import Renderer
 from framework.rendering.traced import error_of_traced
 from framework.rendering.volume import VolumeRenderer
-from framework.samplers.base import Sampler
+from framework.samplers.base import Sampler, SkipsCells
 from framework.samplers.in_view import pixels_in_view
 from framework.scene.few_images import FewImagesConfig, unseen_weight
 from framework.scene.motion import MotionConfig
+from framework.scene.shared_space import SharedSpace
 
 RayConfigT = TypeVar("RayConfigT", bound=RayConfig)
 PATCH = 8
@@ -73,6 +74,8 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
     def __init__(self, config: RayConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer) -> None:
         super().__init__(config, scene)
         self.field, self.sampler, self.renderer = field, sampler, renderer
+        starts = config.rays_shared_by and scene.unbounded and not scene.warped and not isinstance(sampler, SkipsCells)
+        self.shared_space = SharedSpace(scene.box) if starts else None
 
     def render(self, rays: Rays, background: Tensor) -> Rendered:
         """Render R rays.
@@ -81,6 +84,7 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
             rays: the rays; R may be 0.
             background: (R, 3) or (3,) colour in [0, 1] of the background.
         """
+        rays = rays if self.shared_space is None else self.shared_space(rays)
         samples = self.sampler.sample(rays, self.field, self.training)
         return self.renderer.render(rays, samples, self.field, background)
 

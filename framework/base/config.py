@@ -223,6 +223,7 @@ class RayConfig(TrainConfig):
         "train_rays_per_pixel_from": (0, 1),
         "depth_loss_mult": AT_LEAST_0,
         "free_space_loss_mult": AT_LEAST_0,
+        "rays_shared_by": (0, 100),
         "thin_gradients": (0, 16),
     }
     """Allowed ranges."""
@@ -242,6 +243,10 @@ class RayConfig(TrainConfig):
     free_space_loss_mult: float = 0.0
     """Weight of the penalty on matter right before cameras: nearer than most of the points that a camera sees, or than
     any other camera sees; 0 for none."""
+    rays_shared_by: int = 2
+    """Rays start at the first place that at least this many training images show, if there is one: what a single image
+    shows could be at any distance. It is for scenes that may extend beyond their box, except in nested boxes (see
+    --seen-cells); 0 for the near end."""
     thin_gradients: float = 0.0
     """Samples whose gradient is below this times the mean take part in a step at random, in proportion to it, and count
     as many times more, so that the mean over steps stays; 0 for all. It has an effect on the CPU alone."""

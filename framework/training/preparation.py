@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.base.config import TrainConfig
+from framework.base.config import RayConfig, TrainConfig
 from framework.base.console import say
 from framework.base.decisions import Decision
 from framework.base.registry import load_method
@@ -22,6 +22,7 @@ from framework.data.pixel_set import PixelSet
 from framework.data.pixels import training_background
 from framework.geometry.bounds import nested_boxes
 from framework.model import HasAppearance, LearnsMotion, Model, RefinesPoses, RendersFromImages, parts
+from framework.ray_model import RayModel
 from framework.samplers.base import SkipsCells
 from framework.samplers.choice import SamplingConfig
 from framework.scene.motion import MotionConfig
@@ -95,6 +96,10 @@ def profile_of(
         outside = "what is outside all of them" if scene.moving else "space outside them"
         choice = "not used" if obstacle else f"{outside} is skipped from the start"
         decisions.append(Decision("silhouettes", choice, obstacle or "alpha shows them"))
+    if isinstance(config, RayConfig) and isinstance(model, RayModel) and model.shared_space is not None:
+        where = f"where at least {config.rays_shared_by} photographs look"
+        reason = "what one shows could be at any distance (else: --rays-shared-by 0)"
+        decisions.append(Decision("rays start", where, reason))
     if scene.moving and not isinstance(model, LearnsMotion):
         decisions.append(Decision("times", "ignored", f"{method} learns a still scene: moving objects are blurred"))
     if scene.appearance_varies and not isinstance(model, HasAppearance):
@@ -152,6 +157,8 @@ def skip_empty(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: 
     dataset = skip_by_silhouettes(config, model, dataset, fresh)
     if fresh:
         skip_unseen(config, model, dataset)
+        if isinstance(config, RayConfig) and isinstance(model, RayModel) and model.shared_space is not None:
+            model.shared_space.leave_out(dataset.cameras, config.rays_shared_by)
     return dataset
 
 

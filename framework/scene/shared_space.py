@@ -1,0 +1,132 @@
+"""Space that several training images show: where rays start.
+
+What a single image shows could be at any distance, so matter that only one camera sees, mostly right before it, is not
+where anything is, and hides what lies behind it from other viewpoints. (Instant-NGP, Mueller et al. 2022, leaves out
+what no camera at all sees: `mark_untrained_density_grid` of the authors' code.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+
+from framework.base.device import runs_ahead
+from framework.cameras.cameras import Cameras
+from framework.geometry.bounds import nested_boxes
+from framework.geometry.rays import Rays
+from framework.kernels.native import torch_on_one_thread
+
+LEVELS, CELLS = 3, 32
+"""Nested boxes, each twice as large as the one before, and cells along an axis of each; beyond, nothing is left out."""
+BLOCK = 4
+"""Cells along an edge of the cubes that are tested before their cells are."""
+STEPS, REACH = 64, 4.0
+"""Places along a ray that are looked up, and the distance of the last from its near end, in half edges of the box."""
+
+
+class SharedSpace(nn.Module):
+    """The cells of nested boxes that too few training images show; none before `leave_out`.
+
+    Args:
+        box: (2, 3) corners of the smallest box, scene units.
+    """
+
+    box: Tensor
+    unshared: Tensor
+    """(L n^3 + 1,) bool, box by box; the last one stands for all of space beyond the boxes, which is not left out."""
+
+    def __init__(self, box: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("box", box.clone())
+        self.register_buffer("unshared", torch.zeros(LEVELS * CELLS**3 + 1, dtype=torch.bool, device=box.device))
+
+    def leave_out(self, cameras: Cameras, least: int) -> None:
+        """Leave out the cells that are within the images of fewer than `least` cameras, or of all if there are fewer.
+
+        Args:
+            cameras: M training cameras.
+            least: minimum number of cameras, at least 1.
+        """
+        least = min(least, len(cameras))
+        with torch_on_one_thread():  # whose operations are small
+            seen = [times_seen(cameras, box, CELLS, least) for box in nested_boxes(self.box, LEVELS)]
+        self.unshared[:-1] = torch.cat(seen) < least
+
+    def forward(self, rays: Rays) -> Rays:
+        """Return rays that start at the first place that enough images show; as they were where there is none.
+
+        Args:
+            rays: R rays; R may be 0.
+        """
+        if runs_ahead(rays.nears.device):  # every ray, since to count those that need it would wait for the device
+            return replace(rays, nears=self._starts(rays))
+        first = self._place(rays.origins.detach() + rays.directions.detach() * rays.nears[:, None])
+        late = self.unshared[first].nonzero().squeeze(-1)
+        if not len(late):
+            return rays
+        return replace(rays, nears=rays.nears.index_copy(0, late, self._starts(rays[late])))
+
+    def _starts(self, rays: Rays) -> Tensor:
+        """Return the distance (R,) of the first place along each ray that is not left out."""
+        half = (self.box[1] - self.box[0]).amax() / 2
+        ends = torch.minimum(rays.nears + REACH * half, rays.fars)
+        steps = torch.linspace(0, 1, STEPS, device=ends.device)
+        t = torch.lerp(rays.nears[:, None], ends[:, None], steps)
+        positions = torch.addcmul(rays.origins.detach()[:, None], rays.directions.detach()[:, None], t[..., None])
+        shared = ~self.unshared[self._place(positions.view(-1, 3))].view(t.shape)
+        return t.gather(1, shared.int().argmax(1, keepdim=True)).squeeze(1)  # index 0 if there is no other
+
+    def _place(self, positions: Tensor) -> Tensor:
+        """Return the index (N,) in `unshared` of the smallest box's cell around each of `positions` (N, 3)."""
+        unit = (positions - self.box.mean(0)) / ((self.box[1] - self.box[0]) / 2)
+        level = unit.abs().amax(-1).clamp(min=1).log2().ceil().clamp(max=LEVELS)
+        x, y, z = ((unit * torch.exp2(-level)[:, None] + 1) * (CELLS / 2)).long().clamp(0, CELLS - 1).unbind(-1)
+        return (((level.long() * CELLS + x) * CELLS + y) * CELLS + z).clamp(max=LEVELS * CELLS**3)
+
+
+@torch.no_grad()
+def times_seen(cameras: Cameras, box: Tensor, resolution: int, most: int) -> Tensor:
+    """Return by how many cameras each cell of a box is seen, as far as it is at most `most`.
+
+    A cell is seen if the ball around it meets the image.
+
+    Args:
+        cameras: M cameras.
+        box: (2, 3) minimum and maximum corner, scene units.
+        resolution: number n of cells along each axis, a multiple of `BLOCK`.
+        most: number from which on cameras are not counted.
+
+    Returns:
+        (n^3,) uint8; the index of a cell is (x n + y) n + z.
+    """
+    side, edge = resolution // BLOCK, (box[1] - box[0]) / resolution
+    cubes = torch.cartesian_prod(*[torch.arange(side, device=box.device)] * 3)
+    within = torch.cartesian_prod(*[torch.arange(BLOCK, device=box.device)] * 3)
+    centers = box[0] + (cubes[:, None] * BLOCK + within + 0.5) * edge
+    middles, radius = box[0] + (cubes + 0.5) * BLOCK * edge, float(edge.norm()) / 2
+    counts = torch.zeros(centers.shape[:2], dtype=torch.uint8, device=box.device)
+    for index in range(len(cameras)):
+        perhaps = _meets(cameras, index, middles, BLOCK * radius) & (counts < most).any(1)
+        some = perhaps.nonzero().squeeze(-1)
+        counts[some] += _meets(cameras, index, centers[some].view(-1, 3), radius).view(-1, BLOCK**3)
+    return counts.view(side, side, side, BLOCK, BLOCK, BLOCK).permute(0, 3, 1, 4, 2, 5).reshape(-1).clamp(max=most)
+
+
+def _meets(cameras: Cameras, index: int, centers: Tensor, radius: float) -> Tensor:
+    """Return whether the balls around `centers` (N, 3) meet the image of a camera, (N,) bool, or are around it.
+
+    A ball at the angle a from the axis is 1 + tan(a)^2 times as large on a plane's image as in the image's middle.
+    """
+    one = cameras[index : index + 1]
+    distances = (centers - one.camera_to_worlds[0, :, 3]).norm(dim=-1)
+    columns, rows, ahead = one.project(centers, 0)
+    focal = torch.maximum(one.fx, one.fy)
+    corner = (
+        torch.maximum(one.cx, one.widths - one.cx) ** 2 + torch.maximum(one.cy, one.heights - one.cy) ** 2
+    ) / focal**2
+    tangent = ((columns - one.cx) ** 2 + (rows - one.cy) ** 2) / focal**2
+    reach = (1 + torch.minimum(tangent, corner)) * focal * radius / distances.clamp(min=radius)
+    inside = ahead & (columns > -reach) & (columns < one.widths + reach)
+    return inside & (rows > -reach) & (rows < one.heights + reach) | (distances < radius)

@@ -1,0 +1,120 @@
+"""Where rays start: at the first place that several training images show."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from framework.cameras.cameras import Cameras
+from framework.geometry.bounds import nested_boxes
+from framework.geometry.rays import Rays
+from framework.scene import shared_space
+from framework.scene.shared_space import CELLS, LEVELS, REACH, STEPS, SharedSpace, times_seen
+from tests.test_free_space import row
+from tests.training.test_graphs import small
+
+BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+CELL, STEP = 2 / CELLS, REACH / (STEPS - 1)
+
+
+def fan(*slopes: float, near: float = 0.05, far: float = 100.0) -> Rays:
+    """Rays from the origin in the plane y = 0, by their slopes x / -z."""
+    slope = torch.tensor(slopes)
+    directions = torch.stack([slope, 0 * slope, 0 * slope - 1], -1)
+    directions = directions / directions.norm(dim=-1, keepdim=True)
+    ends = torch.ones(len(slopes))
+    return Rays(torch.zeros(len(slopes), 3), directions, near * ends, far * ends)
+
+
+def shared(cameras: Cameras, least: int) -> SharedSpace:
+    found = SharedSpace(BOX)
+    found.leave_out(cameras, least)
+    return found
+
+
+def test_a_ray_starts_where_a_second_camera_sees_it() -> None:
+    """The camera at x = 0.5 sees |x - 0.5| < -z: of a ray with slope a, all from the depth 0.5 / (1 + a) on."""
+    slopes = torch.tensor([-0.5, -0.2, 0.0, 0.3, 0.8])
+    rays = fan(*slopes.tolist())
+    starts = shared(row(0.0, 0.5), 2)(rays).nears
+    expected = 0.5 / (1 + slopes) * (1 + slopes**2).sqrt()
+    assert bool((starts > rays.nears).all())
+    assert bool((starts <= expected + STEP).all())
+    assert bool((starts >= expected - 4 * CELL).all())  # cells count as seen when a part of them is
+
+
+@pytest.mark.parametrize("least", [1, 2, 3])
+def test_a_ray_stays_as_it_is_where_that_many_see_it_from_the_start_or_none_ever_does(least: int) -> None:
+    together = shared(row(0.0, 0.0, 0.0), least)
+    rays = fan(-0.5, 0.0, 0.5)
+    assert torch.equal(together(rays).nears, rays.nears)
+    turned = row(0.0, 0.0)
+    turned.camera_to_worlds[1, :, 0] *= -1
+    turned.camera_to_worlds[1, :, 2] *= -1
+    rays = dataclasses.replace(rays, fars=torch.full((3,), 1.5))
+    assert torch.equal(shared(turned, least)(rays).nears, rays.nears)
+
+
+def test_a_single_camera_shares_with_itself() -> None:
+    rays = fan(0.0, 0.4)
+    assert torch.equal(shared(row(0.0), 2)(rays).nears, rays.nears)
+
+
+def test_nothing_is_left_out_before_the_cameras_are_known_and_none_beyond_the_boxes() -> None:
+    rays = fan(0.0, 0.4)
+    assert torch.equal(SharedSpace(BOX)(rays).nears, rays.nears)
+    outside = dataclasses.replace(rays, origins=rays.origins + torch.tensor([0.0, 50.0, 0.0]))
+    assert torch.equal(shared(row(0.0, 9.0), 2)(outside).nears, rays.nears)
+    assert len(SharedSpace(BOX)(fan()).nears) == 0
+
+
+def test_cells_are_counted_as_points_within_them_are_seen() -> None:
+    """Random points of each box, projected in float64: a cell with a point on k images is seen at least k times."""
+    cameras = row(0.0, 0.4, -0.7)
+    generator = torch.Generator().manual_seed(0)
+    wrong = total = 0
+    for box in nested_boxes(BOX, LEVELS):
+        counts = times_seen(cameras, box, CELLS, 3)
+        points = box[0].double() + torch.rand(20_000, 3, generator=generator, dtype=torch.float64) * (box[1] - box[0])
+        x, y, z = ((points - box[0]) / (box[1] - box[0]) * CELLS).long().unbind(-1)
+        found = counts[(x * CELLS + y) * CELLS + z].long()
+        across = points[:, 0, None] - cameras.camera_to_worlds[:, 0, 3].double()
+        down, depth = points[:, 1, None], -points[:, 2, None]
+        exact = ((depth > 0) & (across.abs() < depth) & (down.abs() < depth)).sum(-1)
+        assert bool((found >= exact).all())
+        wrong, total = wrong + int((found > exact).sum()), total + len(points)
+    assert wrong < 0.2 * total  # those at the edges of the images
+
+
+def test_without_waiting_for_the_device_the_starts_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, rays = shared(row(0.0, 0.5), 2), fan(-0.5, -0.2, 0.0, 0.3, 0.8)
+    usual = found(rays).nears
+    monkeypatch.setattr(shared_space, "runs_ahead", lambda device: True)
+    assert torch.equal(found(rays).nears, usual)
+
+
+def test_training_leaves_out_what_one_image_shows_and_says_so(tmp_path: Path) -> None:
+    trainer = small(tmp_path)
+    trainer.prepare()
+    space, dataset = trainer.model.shared_space, trainer.train_set
+    assert isinstance(space, SharedSpace)
+    expected = SharedSpace(dataset.scene.box)
+    expected.leave_out(dataset.cameras, 2)
+    assert torch.equal(space.unshared, expected.unshared)
+    assert 0 < int(space.unshared.sum()) < len(space.unshared)
+    assert "shared_space.unshared" in trainer.model.state_dict()  # which checkpoints keep
+    assert [d.choice for d in trainer.profile.decisions if d.option == "rays start"] == [
+        "where at least 2 photographs look"
+    ]
+
+
+@pytest.mark.parametrize("settings", [{"rays_shared_by": 0}, {"sampler": "occupancy"}])
+def test_rays_start_at_the_near_end_where_one_says_so_and_in_nested_boxes(
+    settings: dict[str, Any], tmp_path: Path
+) -> None:
+    trainer = small(tmp_path, **settings)
+    trainer.prepare()
+    assert trainer.model.shared_space is None
+    assert not [d for d in trainer.profile.decisions if d.option == "rays start"]

@@ -88,7 +88,7 @@ class PosedImages:
     times: Tensor | None = None
     """(M,) time of each image in [0, 1]; None for a static scene."""
     points: Tensor | None = None
-    """(K, 3) sparse points in the input's frame."""
+    """(K, 3) sparse points in the input's frame; None for those of `tracks`."""
     tracks: Tracks | None = None
     """Which images see which sparse points, in the input's frame; None if that is not known."""
 
@@ -303,9 +303,9 @@ def _sparse_points(
 ) -> tuple[Tensor | None, Sightings | None]:
     """Return the sparse points (K, 3) in the scene's frame, and how images see them; None if there are none.
 
-    Points beyond the range of float32 are left out. So are those that fewer than two of the `known` images see, as far
-    as tracks say so: only held-out images know of them. (The others' positions were found by all images together, as
-    all poses were.)
+    Points beyond the range of float32 are left out. So are those of tracks that fewer than two of the `known` images
+    see: only held-out images know of them. (The others' positions were found by all images together, as all poses
+    were.)
 
     Args:
         images: M images.
@@ -313,19 +313,20 @@ def _sparse_points(
         cameras: M cameras in the scene's frame.
         known: the images that may be learned from; all if None.
     """
-    if images.points is None:
-        return None, None
-    precise = _in_float64(placement)
-    tracks = None if images.tracks is None else images.tracks.at(precise.points(images.tracks.points).float())
-    if tracks is None:
+    precise, points, sightings = _in_float64(placement), None, None
+    if images.tracks is not None:
+        tracks = images.tracks.at(precise.points(images.tracks.points).float())
+        if known is not None:
+            others = torch.ones(len(cameras), dtype=torch.bool)
+            others[known] = False
+            tracks = tracks.without(others)
+        confirmed = tracks.points[tracks.confirmed()]
+        if len(confirmed):
+            points, sightings = confirmed, tracks.sightings(cameras.camera_to_worlds[:, :, 3])
+    if images.points is not None:
         points = precise.points(images.points.double()).float()
-        return points[points.isfinite().all(-1)], None
-    if known is not None:
-        others = torch.ones(len(cameras), dtype=torch.bool)
-        others[known] = False
-        tracks = tracks.without(others)
-    points = tracks.points[tracks.confirmed()]
-    return (points, tracks.sightings(cameras.camera_to_worlds[:, :, 3])) if len(points) else (None, None)
+        points = points[points.isfinite().all(-1)]
+    return points, sightings
 
 
 def _in_float64(placement: Placement) -> Placement:

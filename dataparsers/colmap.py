@@ -64,7 +64,6 @@ def read_images(path: Path, model: Path, images: str, masks: str) -> PosedImages
         model=optics.model,
         lens=optics.lens,
         masks=find_masks(path / masks, sparse.names),
-        points=sparse.points if len(sparse.points) else None,
         tracks=tracks_of(sparse, optics.intrinsics),
     )
 

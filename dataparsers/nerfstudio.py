@@ -20,12 +20,14 @@ from dataparsers.captured import (
     from_original,
     image_sizes,
 )
+from dataparsers.colmap_beside import names_in_model, tracks_beside
 from dataparsers.reading import file_name, number, numbers, read_json, read_pose, read_times, rigid, shown, side
 from framework import DataError, ParsedScene
 from framework.base.console import say
 from framework.base.errors import nearest
 from framework.data.dataset import Split
 from framework.data.ply import read_points
+from framework.data.tracks import Tracks
 
 TRANSFORMS = "transforms.json"
 """File by which the format is recognised."""
@@ -110,12 +112,13 @@ def _posed_images(file: Path, content: dict[str, Any]) -> PosedImages:
         _intrinsics(frame, content, size, model, label)
         for frame, size, label in zip(frames, sizes.tolist(), labels, strict=True)
     ]
+    poses = torch.stack([read_pose(frame, label, torch.float64) for frame, label in placed])
     lens = [[_number(frame, content, key, label) or 0.0 for key in keys] for frame, label in placed]
     return PosedImages(
         folder=file.parent,
         paths=tuple(paths),
         names=tuple(str(PurePosixPath(name)) for name in written),
-        poses=torch.stack([read_pose(frame, label, torch.float64) for frame, label in placed]),
+        poses=poses,
         intrinsics=torch.tensor(cameras, dtype=torch.float64),
         sizes=sizes,
         model=model,
@@ -124,6 +127,7 @@ def _posed_images(file: Path, content: dict[str, Any]) -> PosedImages:
         depths=_companions(file.parent, frames, "depth_file_path", labels),
         times=read_times(frames, labels),
         points=_points(file, content),
+        tracks=_tracks(file, content, placed, poses),
     )
 
 
@@ -230,6 +234,17 @@ def _points(file: Path, content: dict[str, Any]) -> Tensor | None:
     return read_points(path)
 
 
+def _tracks(
+    file: Path, content: dict[str, Any], placed: list[tuple[dict[str, Any], str]], poses: Tensor
+) -> Tracks | None:
+    """Return which images see which points of the COLMAP model beside the file, in the frame of the poses."""
+    names = [
+        names_in_model(file_name(frame["file_path"], "file_path", label), frame.get("source_path"))
+        for frame, label in placed
+    ]
+    return tracks_beside(file.parent, names, poses, *_applied(content, file))
+
+
 def _lists(file: Path, content: dict[str, Any], names: tuple[str, ...]) -> dict[str, set[str]]:
     """Return split -> names of its images, for the splits that the file lists."""
     lists = {}
@@ -300,10 +315,14 @@ def _from_original(scene: ParsedScene, content: dict[str, Any], file: Path) -> P
 
     The file's frame is `applied_scale * (applied_transform @ x)` of the original.
     """
-    matrix, scale, name = content.get("applied_transform"), content.get("applied_scale"), f"{file}: 'applied_transform'"
-    applied = torch.eye(4, dtype=torch.float64) if matrix is None else rigid(matrix, name, name)
-    scale = 1.0 if scale is None else number(scale, "applied_scale", str(file), positive=True)
-    scene = from_original(scene, applied, scale)
+    scene = from_original(scene, *_applied(content, file))
     if scene.transform is None or not bool(scene.transform.isfinite().all()) or not 0 < scene.scale < math.inf:
         raise DataError(f"{file}: 'applied_transform' and 'applied_scale' give a transform out of range")
     return scene
+
+
+def _applied(content: dict[str, Any], file: Path) -> tuple[Tensor, float]:
+    """Return rotation and translation (4, 4) float64, and then the scale, that led to the file's frame."""
+    matrix, scale, name = content.get("applied_transform"), content.get("applied_scale"), f"{file}: 'applied_transform'"
+    applied = torch.eye(4, dtype=torch.float64) if matrix is None else rigid(matrix, name, name)
+    return applied, 1.0 if scale is None else number(scale, "applied_scale", str(file), positive=True)

@@ -146,8 +146,7 @@ class TrainConfig:
     viewer: ViewerConfig = field(default_factory=ViewerConfig)
     """Address of the viewer."""
     mixed_precision: bool | None = None
-    """Networks in bfloat16, density and compositing in float32. If not given: if the device multiplies bfloat16
-    fast."""
+    """Networks in bfloat16, density and compositing in float32; if not given, where the device multiplies it fast."""
     load_dir: Path | None = None
     """Start from the newest checkpoint in this folder."""
     load_checkpoint: Path | None = None
@@ -171,8 +170,7 @@ class TrainConfig:
     around an object that was cut out; auto: empty if masks remove over half of all pixels, not the same of each
     image."""
     background: Literal["auto", "random", "white", "black"] = "auto"
-    """Colour behind transparent pixels in training; auto: random if images have alpha. Evaluation uses white or
-    black."""
+    """Colour behind transparent pixels in training; auto: random if images have alpha. Evaluation: white or black."""
     machine: MachineConfig = field(default_factory=MachineConfig)
     """Seed, device and threads."""
 
@@ -244,9 +242,8 @@ class RayConfig(TrainConfig):
     """Weight of the penalty on matter right before cameras: nearer than most of the points that a camera sees, or than
     any other camera sees; 0 for none."""
     rays_shared_by: int = 2
-    """Rays start at the first place that at least this many training images show, if there is one: what a single image
-    shows could be at any distance. It is for scenes that may extend beyond their box, except in nested boxes (see
-    --seen-cells); 0 for the near end."""
+    """Rays start at the first place that at least this many training images show, as what one image shows could be at
+    any distance; 0 for the near end. It has no effect in a box, and in nested boxes (see --seen-cells)."""
     thin_gradients: float = 0.0
     """Samples whose gradient is below this times the mean take part in a step at random, in proportion to it, and count
     as many times more, so that the mean over steps stays; 0 for all. It has an effect on the CPU alone."""

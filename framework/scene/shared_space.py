@@ -42,16 +42,17 @@ class SharedSpace(nn.Module):
         self.register_buffer("box", box.clone())
         self.register_buffer("unshared", torch.zeros(LEVELS * CELLS**3 + 1, dtype=torch.bool, device=box.device))
 
-    def leave_out(self, cameras: Cameras, least: int) -> None:
-        """Leave out the cells that are within the images of fewer than `least` cameras, or of all if there are fewer.
+    def leave_out(self, cameras: Cameras, nearest: Tensor, least: int) -> None:
+        """Leave out the cells that fewer than `least` images show, or fewer than all if there are fewer images.
 
         Args:
             cameras: M training cameras.
-            least: minimum number of cameras, at least 1.
+            nearest: (M,) distance from each camera before which its image shows nothing, scene units.
+            least: minimum number of images, at least 1.
         """
         least = min(least, len(cameras))
         with torch_on_one_thread():  # whose operations are small
-            seen = [times_seen(cameras, box, CELLS, least) for box in nested_boxes(self.box, LEVELS)]
+            seen = [times_seen(cameras, nearest, box, CELLS, least) for box in nested_boxes(self.box, LEVELS)]
         self.unshared[:-1] = torch.cat(seen) < least
 
     def forward(self, rays: Rays) -> Rays:
@@ -87,13 +88,15 @@ class SharedSpace(nn.Module):
 
 
 @torch.no_grad()
-def times_seen(cameras: Cameras, box: Tensor, resolution: int, most: int) -> Tensor:
-    """Return by how many cameras each cell of a box is seen, as far as it is at most `most`.
+def times_seen(cameras: Cameras, nearest: Tensor, box: Tensor, resolution: int, most: int) -> Tensor:
+    """Return how many images show each cell of a box, as far as it is at most `most`.
 
-    A cell is seen if the ball around it meets the image.
+    An image shows a cell if the whole ball around it is within the image: at the edges of images, no ray of theirs may
+    meet what lies in the rest of a cell. And its middle is beyond the distance before which the image shows nothing.
 
     Args:
         cameras: M cameras.
+        nearest: (M,) distance from each camera before which its image shows nothing, scene units.
         box: (2, 3) minimum and maximum corner, scene units.
         resolution: number n of cells along each axis, a multiple of `BLOCK`.
         most: number from which on cameras are not counted.
@@ -108,25 +111,32 @@ def times_seen(cameras: Cameras, box: Tensor, resolution: int, most: int) -> Ten
     middles, radius = box[0] + (cubes + 0.5) * BLOCK * edge, float(edge.norm()) / 2
     counts = torch.zeros(centers.shape[:2], dtype=torch.uint8, device=box.device)
     for index in range(len(cameras)):
-        perhaps = _meets(cameras, index, middles, BLOCK * radius) & (counts < most).any(1)
+        camera, start = cameras[index : index + 1], nearest[index]
+        perhaps = _within(camera, middles, BLOCK * radius) & (counts < most).any(1)
         some = perhaps.nonzero().squeeze(-1)
-        counts[some] += _meets(cameras, index, centers[some].view(-1, 3), radius).view(-1, BLOCK**3)
+        tested = centers[some].view(-1, 3)
+        beyond = (tested - camera.camera_to_worlds[0, :, 3]).norm(dim=-1) > start
+        counts[some] += (_within(camera, tested, -radius) & beyond).view(-1, BLOCK**3)
     return counts.view(side, side, side, BLOCK, BLOCK, BLOCK).permute(0, 3, 1, 4, 2, 5).reshape(-1).clamp(max=most)
 
 
-def _meets(cameras: Cameras, index: int, centers: Tensor, radius: float) -> Tensor:
-    """Return whether the balls around `centers` (N, 3) meet the image of a camera, (N,) bool, or are around it.
+def _within(camera: Cameras, centers: Tensor, margin: float) -> Tensor:
+    """Return which of `centers` (N, 3) are within one camera's image, which grows by a margin there, (N,) bool.
 
     A ball at the angle a from the axis is 1 + tan(a)^2 times as large on a plane's image as in the image's middle.
+
+    Args:
+        camera: the camera.
+        centers: places.
+        margin: radius of the balls around them of which a part is enough, scene units; if negative, of which all is
+            needed.
     """
-    one = cameras[index : index + 1]
-    distances = (centers - one.camera_to_worlds[0, :, 3]).norm(dim=-1)
-    columns, rows, ahead = one.project(centers, 0)
-    focal = torch.maximum(one.fx, one.fy)
-    corner = (
-        torch.maximum(one.cx, one.widths - one.cx) ** 2 + torch.maximum(one.cy, one.heights - one.cy) ** 2
-    ) / focal**2
-    tangent = ((columns - one.cx) ** 2 + (rows - one.cy) ** 2) / focal**2
-    reach = (1 + torch.minimum(tangent, corner)) * focal * radius / distances.clamp(min=radius)
-    inside = ahead & (columns > -reach) & (columns < one.widths + reach)
-    return inside & (rows > -reach) & (rows < one.heights + reach) | (distances < radius)
+    distances = (centers - camera.camera_to_worlds[0, :, 3]).norm(dim=-1)
+    columns, rows, ahead = camera.project(centers, 0)
+    focal = torch.maximum(camera.fx, camera.fy)
+    sides = torch.maximum(camera.cx, camera.widths - camera.cx), torch.maximum(camera.cy, camera.heights - camera.cy)
+    corner = (sides[0].square() + sides[1].square()) / focal.square()
+    tangent = ((columns - camera.cx).square() + (rows - camera.cy).square()) / focal.square()
+    reach = (1 + torch.minimum(tangent, corner)) * focal * margin / distances.clamp(min=abs(margin))
+    inside = ahead & (columns > -reach) & (columns < camera.widths + reach)
+    return inside & (rows > -reach) & (rows < camera.heights + reach) | (distances < margin)

@@ -158,7 +158,7 @@ def skip_empty(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: 
     if fresh:
         skip_unseen(config, model, dataset)
         if isinstance(config, RayConfig) and isinstance(model, RayModel) and model.shared_space is not None:
-            model.shared_space.leave_out(dataset.cameras, config.rays_shared_by)
+            model.shared_space.leave_out(dataset.cameras, _nearest(dataset), config.rays_shared_by)
     return dataset
 
 
@@ -173,14 +173,17 @@ def skip_unseen(config: TrainConfig, model: Model[Any], dataset: Dataset) -> Non
     nested = [sampler for sampler in parts(model, SkipsCells) if sampler.levels > 1]
     if not nested or not isinstance(config, SamplingConfig) or not config.seen_cells:
         return
-    cameras, known = dataset.cameras, dataset.sparse_depth
-    nearest = torch.full_like(cameras.fx, dataset.scene.near)
-    if known is not None:
-        nearest = nearest.maximum(before_points(cameras, known))
+    cameras, nearest = dataset.cameras, _nearest(dataset)
     for sampler in nested:
         boxes = nested_boxes(sampler.box, sampler.levels)
         seen = torch.cat([seen_cells(cameras, nearest, box, sampler.resolution) for box in boxes])
         sampler.carve(seen & ~sampler.carved)
+
+
+def _nearest(dataset: Dataset) -> Tensor:
+    """Return the distance (M,) from each camera before which its image shows nothing, as far as points tell."""
+    near = torch.full_like(dataset.cameras.fx, dataset.scene.near)
+    return near if dataset.sparse_depth is None else near.maximum(before_points(dataset.cameras, dataset.sparse_depth))
 
 
 def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: bool) -> Dataset:

@@ -1,0 +1,102 @@
+"""The COLMAP model that lies beside a transforms.json which was made from it: which images see which points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+import torch
+from torch import Tensor
+
+from dataparsers.colmap import tracks_of
+from dataparsers.colmap_lens import lenses_of
+from dataparsers.colmap_model import choose_model, find_models, read_model
+from framework import DataError
+from framework.base.console import say
+from framework.data.tracks import Tracks
+
+LARGEST_ANGLE = 0.2
+"""Largest angle between an image's rotations in the model and in the file, degrees: about two pixels of a phone's
+image at 800 pixels."""
+LARGEST_SHIFT = 0.002
+"""Largest distance between its positions, as a share of the largest distance of a camera from the cameras' mean."""
+FEWEST_ALIKE = 0.5
+"""Share of the images in both that must have the same pose, else the model is not what the file was made from."""
+
+
+def tracks_beside(
+    folder: Path, names: Sequence[Sequence[str]], poses: Tensor, applied: Tensor, scale: float
+) -> Tracks | None:
+    """Return the tracks of the model beside a transforms.json, in the file's frame and for its images.
+
+    A model that cannot be read, or that has other poses than the file, is left out, and said to be. So are images whose
+    own pose is another one.
+
+    Args:
+        folder: the data folder.
+        names: of each of the file's M images, the paths under which the model may have it.
+        poses: (M, 3 or 4, 4) camera-to-world of the file.
+        applied: (4, 4) rotation and translation from the model's frame to the file's.
+        scale: factor of positions, applied last.
+
+    Returns:
+        The tracks; None if there is no model, or none that fits.
+    """
+    if not find_models(folder):
+        return None
+    try:
+        path = choose_model(folder, None)
+        model = read_model(path)
+        tracks = tracks_of(model, lenses_of(model.cameras, model.names, str(path)).intrinsics)
+    except DataError as error:
+        say(f"{error}; continuing without the distances of its points")
+        return None
+    if tracks is None:
+        return None
+    places = {name: place for place, name in enumerate(model.names)}
+    pairs = [
+        (image, next(places[name] for name in known if name in places))
+        for image, known in enumerate(names)
+        if any(name in places for name in known)
+    ]
+    ours, theirs = torch.tensor(pairs, dtype=torch.int64).view(-1, 2).unbind(-1)
+    alike = _same_poses(poses[ours].double(), _moved(model.poses[theirs], applied.double(), scale))
+    if int(alike.sum()) < max(FEWEST_ALIKE * len(pairs), 1):
+        say(
+            f"{path}: {int(alike.sum())} of {len(poses)} images have the pose that they have in transforms.json, so it "
+            "is of another reconstruction; continuing without the distances of its points"
+        )
+        return None
+    number = torch.full((len(model.names),), -1, dtype=torch.int64)
+    number[theirs[alike]] = ours[alike]
+    kept = number[tracks.images] >= 0
+    points = scale * (tracks.points @ applied[:3, :3].T.double() + applied[:3, 3].double())
+    return Tracks(points, number[tracks.images[kept]], tracks.seen[kept], tracks.angles[kept])
+
+
+def names_in_model(file_path: str, source_path: object) -> list[str]:
+    """Return the paths under which a model may have a frame's image, the likeliest first.
+
+    Args:
+        file_path: the frame's image, as in 'images/a/1.jpg', where a model has 'a/1.jpg'.
+        source_path: the file that the image was made from; anything but text is left out.
+    """
+    parts = PurePosixPath(file_path).parts
+    endings = ["/".join(parts[start:]) for start in range(len(parts))]
+    return [*endings, source_path] if isinstance(source_path, str) else endings
+
+
+def _moved(poses: Tensor, applied: Tensor, scale: float) -> Tensor:
+    """Return poses (M, 4, 4) in the file's frame."""
+    moved = applied @ poses
+    moved[:, :3, 3] *= scale
+    return moved
+
+
+def _same_poses(ours: Tensor, theirs: Tensor) -> Tensor:
+    """Return which of M poses are the same, up to `LARGEST_ANGLE` and `LARGEST_SHIFT`, (M,) bool."""
+    centers = ours[:, :3, 3]
+    spread = (centers - centers.mean(0)).norm(dim=-1).max() if len(ours) else 0.0
+    apart = (ours[:, :3, :3] - theirs[:, :3, :3]).flatten(1).norm(dim=-1) / 8**0.5  # the sine of half the angle
+    turned = torch.rad2deg(2 * torch.asin(apart.clamp(max=1)))
+    return (turned <= LARGEST_ANGLE) & ((centers - theirs[:, :3, 3]).norm(dim=-1) <= LARGEST_SHIFT * spread)

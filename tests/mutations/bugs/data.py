@@ -129,8 +129,8 @@ BUGS = (
         "applied-scale-left-out",
         "poses",
         "dataparsers/nerfstudio.py",
-        "scene = from_original(scene, applied, scale)",
-        "scene = from_original(scene, applied)",
+        "scene = from_original(scene, *_applied(content, file))",
+        "scene = from_original(scene, _applied(content, file)[0])",
         "exports of data with applied_scale come out in another unit than the original's",
     ),
     Bug(

@@ -10,7 +10,6 @@ import torch
 from framework.cameras.cameras import Cameras
 from framework.geometry.bounds import nested_boxes
 from framework.geometry.rays import Rays
-from framework.scene import shared_space
 from framework.scene.shared_space import CELLS, LEVELS, REACH, STEPS, SharedSpace, times_seen
 from tests.test_free_space import row
 from tests.training.test_graphs import small
@@ -96,7 +95,7 @@ def test_cells_are_counted_whose_points_are_all_seen() -> None:
 def test_without_waiting_for_the_device_the_starts_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     found, rays = shared(row(0.0, 0.5), 2), fan(-0.5, -0.2, 0.0, 0.3, 0.8)
     usual = found(rays).nears
-    monkeypatch.setattr(shared_space, "runs_ahead", lambda device: True)
+    monkeypatch.setattr("framework.base.device.runs_ahead", lambda device: True)
     assert torch.equal(found(rays).nears, usual)
 
 

@@ -11,6 +11,8 @@ from framework.base.errors import ConfigError
 from framework.cli.bench_results import RESULTS, write_results
 from framework.cli.common import make_room
 
+AROUND, STEPS_SECONDS = 30.0, 60.0
+"""Seconds that a method's start and evaluation are expected to take, and the timed steps."""
 BEFORE = 300
 """Training steps before those that are timed: steps of both kinds are recorded in them."""
 
@@ -35,6 +37,8 @@ class GpuFlags:
     """Number of runs of each kernel, of which medians are reported."""
     steps: int = 200
     """Number of training steps of nerfacto and of instant-ngp that are timed, as they are and as CUDA graphs."""
+    limit: float = 480.0
+    """Seconds after which nothing new begins: kernels are left out first, then whole parts, which the report names."""
     run_dir: Path | None = None
     """Folder of runs and report; outputs/bench-gpu-DATA if not given."""
     output_dir: Path = RESULTS
@@ -58,16 +62,24 @@ def measure_gpu(flags: GpuFlags) -> None:
     if not torch.cuda.is_available():
         raise ConfigError("ns-bench gpu: this machine or this PyTorch has no GPU; --interpreter needs none")
     from framework.cli.compare import compare
-    from framework.tools.benchmarks.gpu import gpu_plan, measured_kernels, reached, timed_steps
+    from framework.tools.benchmarks.gpu import METHODS, Part, gpu_plan, in_time, measured_kernels, reached, timed_steps
 
     name = "procedural" if flags.data is None else flags.data.resolve().name
     path = flags.output_dir / f"gpu-{name}.json"
     make_room(path)
     device = torch.device("cuda")
-    content = measured_kernels(device, flags.samples, flags.repeats)
-    content["steps"] = timed_steps(device, BEFORE, flags.steps)
     plan = gpu_plan(flags.data, flags.seconds, flags.run_dir or Path("outputs") / f"bench-gpu-{name}")
-    write_results(path, {**content, "training": reached(compare(plan))})
+    training = len(METHODS) * (flags.seconds + AROUND)
+    parts = (
+        Part(
+            "kernels",
+            0,
+            lambda left: measured_kernels(device, flags.samples, flags.repeats, left - training - STEPS_SECONDS),
+        ),
+        Part("training", training, lambda left: {"training": reached(compare(plan))}),
+        Part("CUDA graphs", STEPS_SECONDS, lambda left: {"steps": timed_steps(device, BEFORE, flags.steps)}),
+    )
+    in_time(parts, flags.limit, lambda found: write_results(path, found))
 
 
 def _interpret(path: Path) -> None:

@@ -12,7 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from framework.base.device import runs_ahead
+from framework.base import device as devices
 from framework.cameras.cameras import Cameras
 from framework.geometry.bounds import nested_boxes
 from framework.geometry.rays import Rays
@@ -61,7 +61,7 @@ class SharedSpace(nn.Module):
         Args:
             rays: R rays; R may be 0.
         """
-        if runs_ahead(rays.nears.device):  # every ray, since to count those that need it would wait for the device
+        if devices.runs_ahead(rays.nears.device):  # all rays, since to choose among them waits
             return replace(rays, nears=self._starts(rays))
         first = self._place(rays.origins.detach() + rays.directions.detach() * rays.nears[:, None])
         late = self.unshared[first].nonzero().squeeze(-1)

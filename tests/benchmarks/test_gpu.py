@@ -1,12 +1,24 @@
 """ns-bench gpu: what can be tested of it without a GPU."""
 
+import copy
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
 from framework.cli.bench import main
-from framework.tools.benchmarks.gpu import METHODS, along_rays, gpu_plan, psnr_at, reached, timed_steps
+from framework.tools.benchmarks.gpu import (
+    METHODS,
+    Part,
+    along_rays,
+    gpu_plan,
+    in_time,
+    measured_kernels,
+    psnr_at,
+    reached,
+    timed_steps,
+)
 from framework.tools.comparison.measures import Row
 from tests.conftest import Refused
 
@@ -41,6 +53,34 @@ def test_steps_are_timed_as_they_are_and_repeated(monkeypatch: pytest.MonkeyPatc
         assert off["PSNR of batches, dB"] == auto["PSNR of batches, dB"]
         assert off["repeated"] == auto["repeated"] == 0
         assert min(off["ms a step"], auto["ms a step"]) > 0
+
+
+def test_parts_for_which_too_little_time_is_left_are_left_out_and_named(capsys: pytest.CaptureFixture[str]) -> None:
+    """Of 100 s, the first part takes 30; the second would need 80, and the third has the 70 that it needs."""
+    now, given, kept = [0.0], dict[str, float](), list[dict[str, Any]]()
+
+    def part(name: str, least: float, takes: float) -> Part:
+        def measure(left: float) -> dict[str, Any]:
+            given[name] = left
+            now[0] += takes
+            return {name: takes}
+
+        return Part(name, least, measure)
+
+    parts = [part("kernels", 0, 30), part("training", 80, 80), part("graphs", 70, 5), part("more", 66, 1)]
+    in_time(parts, 100.0, lambda found: kept.append(copy.deepcopy(found)), lambda: now[0])
+    assert given == {"kernels": 100.0, "graphs": 70.0}
+    assert kept[0] == {"kernels": 30, "left out for want of time": []}
+    assert kept[-1] == {"kernels": 30, "graphs": 5, "left out for want of time": ["training"]}
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split(";")[0] for line in lines if ";" in line] == ["left out: training", "left out: more"]
+
+
+def test_kernels_are_not_timed_after_their_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("framework.tools.benchmarks.gpu.triton_kernels.available", lambda: False)
+    found = measured_kernels(torch.device("cpu"), 64, 1, -1.0)
+    assert found["kernels"] == []
+    assert "contraction" in found["kernels not timed"]
 
 
 def test_the_psnr_after_some_seconds_is_that_of_the_last_evaluation_until_then() -> None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -54,34 +55,76 @@ SIZE = 200
 """Width of the images of these scenes, pixels."""
 
 
-def measured_kernels(device: torch.device, samples: int, repeats: int) -> dict[str, Any]:
-    """Measure every kernel on a device, and print a table.
+@dataclass(frozen=True)
+class Part:
+    """A part of a benchmark that has a limit of time."""
+
+    name: str
+    """What it measures, in words."""
+    least: float
+    """Seconds that must be left for it to begin."""
+    measure: Callable[[float], dict[str, Any]]
+    """Function from the seconds that are left to its results, as plain data."""
+
+
+def in_time(
+    parts: Sequence[Part],
+    limit: float,
+    keep: Callable[[dict[str, Any]], None],
+    clock: Callable[[], float] = time.monotonic,
+) -> None:
+    """Measure parts in their order, and leave out those for which too little time is left.
+
+    Args:
+        parts: the parts, the most important first.
+        limit: seconds for all of them.
+        keep: called with all results so far after each part, so that an error later on loses none.
+        clock: seconds since any moment.
+    """
+    start, found, late = clock(), dict[str, Any](), list[str]()
+    for part in parts:
+        left = limit - (clock() - start)
+        if left < part.least:
+            say(f"left out: {part.name}; {max(left, 0):.0f} of {limit:.0f} s are left, and it takes {part.least:.0f}")
+            late.append(part.name)
+            continue
+        found |= part.measure(left)
+        keep({**found, "left out for want of time": late})
+
+
+def measured_kernels(device: torch.device, samples: int, repeats: int, seconds: float = math.inf) -> dict[str, Any]:
+    """Measure every kernel on a device, and print a table; the errors first, as they matter most.
 
     Args:
         device: the device.
         samples: number of samples in a batch.
         repeats: number of runs, of which medians are taken.
+        seconds: after which no further kernel is timed.
 
     Returns:
-        The machine, its limits and a row for each kernel, as plain data.
+        The machine, its limits, the names of kernels that were not timed, and a row for each kernel, as plain data.
     """
-    rows: list[Row] = []
+    rows, late, start = list[Row](), list[str](), time.monotonic()
     threads = torch.get_num_threads()
+    found = errors_of_all(device) if triton_kernels.available() else []
+    console.print(as_table(found))
     with torch.device(device):
         ceilings = Ceilings.measured(COPIED, EDGE) if device.type == "cuda" else Ceilings.measured()
         for line in ceilings.lines():
             say(f"ceiling: {line}")
         for kernel in (*on_any_device(samples), *along_rays(samples)):
+            if time.monotonic() - start > seconds:
+                late.append(kernel.name)
+                continue
             say(f"measuring {kernel.name}")
             rows += measured(kernel, ceilings, repeats, 1)
     torch.set_num_threads(threads)
     console.print(table(rows))
-    found = errors_of_all(device) if triton_kernels.available() else []
-    console.print(as_table(found))
     return {
         "machine": machine(device),
         "ceilings": asdict(ceilings),
         "kernels": [_plain(row) for row in rows],
+        "kernels not timed": late,
         "errors": [asdict(error) for error in found],
     }
 

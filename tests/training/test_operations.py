@@ -18,7 +18,7 @@ BOUNDS = {
     "nerfacto": (840, 0),
     "kplanes": (1030, 0.3),
     "tensorf": (770, 0.3),
-    "gaussian-splatting": (1170, 5),
+    "gaussian-splatting": (1170, 1),
     "vanilla-nerf": (555, 0),
     "dnerf": (740, 0),
     "mip-nerf": (735, 0),

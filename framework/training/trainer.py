@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import signal
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -27,6 +26,7 @@ from framework.evaluation.metrics import MAX_PSNR
 from framework.kernels.native import torch_on_one_thread
 from framework.model import StartsFromImages
 from framework.scene.profile import SceneProfile
+from framework.training.budget import reason_to_stop, spent
 from framework.training.checkpoint import FOLDER, checkpoint_path, load_checkpoint, load_newest, save_checkpoint
 from framework.training.graphs import kind_of_step, make_graphs
 from framework.training.held_out import HeldOut
@@ -190,14 +190,14 @@ class Trainer:
             closing(TensorBoard(self.run.folder, first and "tensorboard" in self.config.vis)) as board,
             ProgressBar(self.run.method) as bar,
         ):
-            while (reason := self._reason_to_stop(stopped := agree(self.state, received))) is None:
+            while (reason := reason_to_stop(self.config, self.state, stopped := agree(self.state, received))) is None:
                 report = self.train_step()
                 bar.show(report)
                 self._log(report, board)
                 self.held_out.evaluate_if_due(
                     self.state, board
                 )  # before saving, so that a resumed run does not repeat it
-                ends = not stopped and self._reason_to_stop(stopped) is not None
+                ends = not stopped and reason_to_stop(self.config, self.state, stopped) is not None
                 self.held_out.look_if_due(self.state, report, board, last=ends)
                 if self._due_to_save():
                     self._try_to_save()
@@ -208,25 +208,10 @@ class Trainer:
                 self.save()  # a first Ctrl-C does not interrupt it
         return Outcome(reason, next(iter(stopped), None), checkpoint_path(self.checkpoint_folder, self.state.step))
 
-    def _reason_to_stop(self, stopped: Sequence[int]) -> str | None:
-        if stopped:
-            return "stopped by " + signal.Signals(stopped[0]).name
-        if self.state.step >= self.config.max_num_iterations:
-            return f"{self.config.max_num_iterations} steps done"
-        if self.config.max_seconds is not None and self.state.seconds >= self.config.max_seconds:
-            return f"{self.config.max_seconds:g} s of training spent"
-        target, curve = self.config.target_psnr, self.state.curve
-        if target is not None and curve and curve[-1][2] >= target:
-            return f"{target:g} dB reached"
-        return None
-
     @property
     def progress(self) -> float:
         """Fraction of the budget spent, 0 to 1: of steps or seconds, whichever is larger."""
-        done = self.state.step / self.config.max_num_iterations
-        if self.config.max_seconds is not None:
-            done = max(done, self.state.seconds / self.config.max_seconds)
-        return min(done, 1.0)
+        return spent(self.config, self.state)
 
     @cached_property
     def profile(self) -> SceneProfile:

@@ -1,0 +1,42 @@
+"""How much of a run's budget is spent, and why it ends."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Sequence
+
+from framework.base.config import TrainConfig
+from framework.training.state import State
+
+
+def spent(config: TrainConfig, state: State) -> float:
+    """Return the fraction of the budget that is spent, 0 to 1: of steps or seconds, whichever is larger.
+
+    Args:
+        config: settings, with the budget.
+        state: state of the run.
+    """
+    done = state.step / config.max_num_iterations
+    if config.max_seconds is not None:
+        done = max(done, state.seconds / config.max_seconds)
+    return min(done, 1.0)
+
+
+def reason_to_stop(config: TrainConfig, state: State, stopped: Sequence[int]) -> str | None:
+    """Return why training ends before the next step, for people; None if it goes on.
+
+    Args:
+        config: settings, with the budget and the target.
+        state: state of the run.
+        stopped: numbers of the signals received, the first of which counts before all else.
+    """
+    if stopped:
+        return "stopped by " + signal.Signals(stopped[0]).name
+    if state.step >= config.max_num_iterations:
+        return f"{config.max_num_iterations} steps done"
+    if config.max_seconds is not None and state.seconds >= config.max_seconds:
+        return f"{config.max_seconds:g} s of training spent"
+    target, curve = config.target_psnr, state.curve
+    if target is not None and curve and curve[-1][2] >= target:
+        return f"{target:g} dB reached"
+    return None

@@ -1,4 +1,4 @@
-"""How much of a run's budget is spent, and why it ends."""
+"""What part of its budget a run has spent, and why it ends."""
 
 from __future__ import annotations
 

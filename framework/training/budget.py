@@ -1,4 +1,4 @@
-"""What part of its budget a run has spent, and why it ends."""
+"""The part of its budget that a run has spent, and the reason why it ends."""
 
 from __future__ import annotations
 

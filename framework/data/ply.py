@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from framework.base.atomic import write_atomically
 from framework.base.errors import DataError
 
 TYPES = {
@@ -188,7 +189,7 @@ def write_points(file: Path, positions: Tensor, colors: Tensor, normals: Tensor 
 
 
 def write_columns(file: Path, columns: Sequence[tuple[str, np.ndarray]]) -> None:
-    """Write vertices to a binary PLY file, little endian.
+    """Write vertices to a binary PLY file, little endian, as a whole or not at all.
 
     Args:
         file: path of the PLY file.
@@ -201,9 +202,7 @@ def write_columns(file: Path, columns: Sequence[tuple[str, np.ndarray]]) -> None
     table = np.empty(len(columns[0][1]), [(name, {"uchar": "u1", "float": "<f4"}[kind]) for name, kind in kinds])
     for name, values in columns:
         table[name] = values
-    with file.open("wb") as stream:
-        stream.write(header_text(len(table), kinds))
-        stream.write(table.data)
+    write_atomically(file, lambda stream: stream.writelines([header_text(len(table), kinds), table.data]))
 
 
 def header_text(count: int, kinds: Sequence[tuple[str, str]]) -> bytes:

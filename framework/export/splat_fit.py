@@ -268,7 +268,7 @@ def _trained(
     named = zip(vars(first), tables, strict=True)
     groups = [{"params": [table], "name": name, "lr": rates[name], "sparse": True} for name, table in named]
     optimizer = Adam(groups, {}, 1e-3, (0.9, 0.99), 1e-15)
-    start, step = time.perf_counter(), 0
+    start, step, dropped = time.perf_counter(), 0, 0
     for percent in track(range(100), "Fitting Gaussians", total=100):
         while (progress := (time.perf_counter() - start) / seconds) < (percent + 1) / 100:
             optimizer.param_groups[0]["lr"] = rates["means"] * 0.1**progress
@@ -279,10 +279,13 @@ def _trained(
                 shot = shots[int(torch.randint(len(shots), ()))]
             if backward(_loss(as_gaussians(tables), shot, background, progress), optimizer):
                 optimizer.step()
+            else:
+                dropped += 1
             step += 1
             if step % STEPS_PER_MOVE == 0 and progress < MOVES_END:
                 _move(tables, optimizer, most)
-    say(f"{len(tables[0]):,} Gaussians after {step:,} steps")
+    without = f", of which {dropped:,} were dropped, since their gradients were not finite" if dropped else ""
+    say(f"{len(tables[0]):,} Gaussians after {step:,} steps{without}")
     return as_gaussians(tables).map(Tensor.detach)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from framework.base.atomic import write_atomically
 from framework.base.errors import ConfigError, DataError
 from framework.splats.budget import fitted_ply, fitted_spz
 from framework.splats.gaussians import Gaussians
@@ -58,7 +59,7 @@ def write_gaussians(file: Path, gaussians: Gaussians, max_megabytes: float | Non
     elif file.suffix == ".spz":
         content, changes = (encoded(gaussians), "") if most is None else fitted_spz(gaussians, most)
         lost = out_of_range(gaussians)
-        file.write_bytes(content)
+        write_atomically(file, lambda stream: stream.write(content))
     else:
         raise ConfigError(f"{file}: Gaussians are written to {' or '.join(SUFFIXES)} files")
     return [f"{max_megabytes:g} MB hold {changes}", *lost] if changes else lost

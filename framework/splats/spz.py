@@ -37,6 +37,7 @@ import torch
 from torch import Tensor
 
 from framework.base.console import say
+from framework.base.atomic import write_atomically
 from framework.base.errors import ConfigError, DataError
 from framework.splats.gaussians import MAX_DEGREE, Gaussians
 from framework.splats.ply import usable
@@ -75,7 +76,8 @@ def write_spz(file: Path, gaussians: Gaussians, bits: tuple[int, int] = BITS) ->
         ConfigError: if the format cannot hold them.
         OSError: if the file cannot be written.
     """
-    file.write_bytes(encoded(gaussians, bits))
+    content = encoded(gaussians, bits)
+    write_atomically(file, lambda stream: stream.write(content))
 
 
 def encoded(gaussians: Gaussians, bits: tuple[int, int] = BITS) -> bytes:

@@ -204,6 +204,20 @@ def test_damaged_ply_is_refused(tmp_path: Path) -> None:
         read_gaussians(tmp_path)
 
 
+@pytest.mark.parametrize("suffix", (".ply", ".spz"))
+def test_a_full_disk_leaves_the_file_that_was_there(
+    suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / f"a{suffix}"
+    write_gaussians(file, some(20))
+    before = file.read_bytes()
+    monkeypatch.setattr("os.fsync", lambda number: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    with pytest.raises(OSError, match="No space left"):
+        write_gaussians(file, some(30))
+    assert file.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [file]
+
+
 def test_truncated_ply_is_refused_wherever_it_ends(tmp_path: Path) -> None:
     write_ply(tmp_path / "whole.ply", some(100))
     whole = (tmp_path / "whole.ply").read_bytes()

@@ -253,6 +253,7 @@ def test_a_scene_that_moves_is_shown_at_one_moment(
     said = capsys.readouterr().err
     assert "0 photographs" in said
     assert "time 0.25, still" in said
+    assert "dropped" not in said
     assert "against the photographs" not in said
     text = (tmp_path / "out" / "scene.html").read_text(encoding="utf-8")
     assert "this is time 0.25" in json.loads(Elements(text).scripts[0])["about"]

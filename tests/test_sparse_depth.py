@@ -203,6 +203,7 @@ def test_a_source_draws_keypoints_where_they_count(dataset: Dataset, tmp_path: P
         for drawn in (source, source.drawing_from(dataset)):
             distances = drawn.draw(Request(0, 80)).distances
             assert (0 if distances is None else int((distances > 0).sum())) == round(80 * share)
+            assert drawn.draw(Request(0, 80, points=False)).distances is None
     measured = dataclasses.replace(dataset, scene=dataclasses.replace(dataset.scene, has_depth=True))
     source = make_source("pixels", measured, dataclasses.replace(run.config, depth_loss_mult=0.01))
     assert isinstance(source, PixelSource)
@@ -232,6 +233,12 @@ def test_every_method_that_casts_rays_learns_from_them(
     assert ("depth_coarse" in report.losses) == (kind in ("vanilla-nerf", "dnerf"))
     off = Trainer(tiny_run(kind, shared_tiny, tmp_path, depth_loss_mult=0.0), dataset, None)
     assert "depth" not in off.train_step().losses
+
+
+def test_points_teach_in_the_first_half_alone(dataset: Dataset, shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = Trainer(tiny_run("nerfacto", shared_tiny, tmp_path, max_num_iterations=6), dataset, None)
+    reports = [trainer.train_step() for _ in range(6)]
+    assert ["depth" in report.losses for report in reports] == [True] * 3 + [False] * 3
 
 
 @pytest.mark.medium

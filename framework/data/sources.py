@@ -42,10 +42,14 @@ class Request:
     """Number of pixels to draw; not used if batches are whole images."""
     rays_per_pixel: int = 1
     """Number of rays through each pixel: 1, through its centre, or another square number."""
+    points: bool = True
+    """Whether pixels with a sparse depth are drawn besides, where they are to be learned from."""
 
 
 KEYPOINTS = 1 / 8
 """Share of a batch's pixels that are drawn from those with a sparse depth, where they are to be learned from."""
+POINTS_UNTIL = 0.5
+"""Share of the budget after which they are not drawn any more, so that colours alone decide where a surface is exactly."""
 
 
 class BatchSource(ABC):
@@ -126,8 +130,8 @@ class PixelSource(BatchSource):
 
     def draw(self, request: Request) -> PixelBatch:
         offsets = subpixels(request.rays_per_pixel, self.dataset.device)
-        look_up, keypoints = self._look_up(request.step), round(self.keypoints * request.num_pixels)
-        count = request.num_pixels
+        look_up, count = self._look_up(request.step), request.num_pixels
+        keypoints = round(self.keypoints * count) if request.points else 0
         batch = draw_batch(
             self.dataset, count, self.background, self.errors, offsets, look_up, keypoints, self.num_images
         )

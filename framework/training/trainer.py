@@ -21,7 +21,7 @@ from framework.base.device import BEFORE_STEP, seed_step
 from framework.base.errors import CheckpointError, DivergenceError
 from framework.base.processes import alone, from_first, processes
 from framework.data.dataset import Dataset
-from framework.data.sources import BatchSource, Request, make_source
+from framework.data.sources import POINTS_UNTIL, BatchSource, Request, make_source
 from framework.evaluation.metrics import MAX_PSNR
 from framework.kernels.native import torch_on_one_thread
 from framework.model import StartsFromImages
@@ -292,7 +292,7 @@ class Trainer:
         def taken() -> tuple[Any, StepResult]:
             return (batch := source.draw(request)), learn(model, optimizer, batch, step, progress).detached()
 
-        kind = kind_of_step(model, source, step, (request.num_pixels, request.rays_per_pixel))
+        kind = kind_of_step(model, source, step, (request.num_pixels, request.rays_per_pixel, request.points))
         if self.graphs.take(kind):  # known after the schedules, which may change sizes
             return self.graphs.run(kind, lambda: seed_step(seed, step, rank), taken)
         seed_step(seed, step, rank)
@@ -303,13 +303,14 @@ class Trainer:
         return [*self.model.parameters(), *self.model.buffers(), *self.optimizer.tensors()]
 
     def _request(self) -> Request:
-        """Return the next batch's size: one ray per pixel at first, later as many as in rendering."""
+        """Return what the next batch is to hold: one ray per pixel at first, later as many as in rendering."""
         config = self.config
         if not isinstance(config, RayConfig):
             return Request(self.state.step, 0)
         late = self.progress >= config.train_rays_per_pixel_from
         rays_per_pixel = config.rays_per_pixel if late else 1
-        return Request(self.state.step, max(self._num_rays(config) // rays_per_pixel, 1), rays_per_pixel)
+        num_pixels = max(self._num_rays(config) // rays_per_pixel, 1)
+        return Request(self.state.step, num_pixels, rays_per_pixel, self.progress < POINTS_UNTIL)
 
     def _num_rays(self, config: RayConfig) -> int:
         samples = self.model.samples_per_step

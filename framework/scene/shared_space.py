@@ -22,8 +22,9 @@ LEVELS, CELLS = 3, 32
 """Nested boxes, each twice as large as the one before, and cells along an axis of each; beyond, nothing is left out."""
 BLOCK = 4
 """Cells along an edge of the cubes that are tested before their cells are."""
-STEPS, REACH = 64, 4.0
-"""Places along a ray that are looked up, and the distance of the last from its near end, in half edges of the box."""
+STEPS, REACH, HALVINGS = 64, 4.0, 4
+"""Places along a ray that are looked up, the distance of the last from its near end in half edges of the box, and how
+often the step before the first that is shared is halved."""
 
 
 class SharedSpace(nn.Module):
@@ -77,7 +78,13 @@ class SharedSpace(nn.Module):
         t = torch.lerp(rays.nears[:, None], ends[:, None], steps)
         positions = torch.addcmul(rays.origins.detach()[:, None], rays.directions.detach()[:, None], t[..., None])
         shared = ~self.unshared[self._place(positions.view(-1, 3))].view(t.shape)
-        return t.gather(1, shared.int().argmax(1, keepdim=True)).squeeze(1)  # index 0 if there is no other
+        first = shared.int().argmax(1, keepdim=True)  # index 0 if there is no other
+        before, start = t.gather(1, (first - 1).clamp(min=0)).squeeze(1), t.gather(1, first).squeeze(1)
+        for _ in range(HALVINGS):  # up to a whole step of what images do show is left out otherwise
+            middle = (before + start) / 2
+            found = ~self.unshared[self._place(rays.origins.detach() + rays.directions.detach() * middle[:, None])]
+            before, start = torch.where(found, before, middle), torch.where(found, middle, start)
+        return start
 
     def _place(self, positions: Tensor) -> Tensor:
         """Return the index (N,) in `unshared` of the smallest box's cell around each of `positions` (N, 3)."""
@@ -91,8 +98,7 @@ class SharedSpace(nn.Module):
 def times_seen(cameras: Cameras, nearest: Tensor, box: Tensor, resolution: int, most: int) -> Tensor:
     """Return how many images show each cell of a box, as far as it is at most `most`.
 
-    An image shows a cell if the whole ball around it is within the image: at the edges of images, no ray of theirs may
-    meet what lies in the rest of a cell. And its middle is beyond the distance before which the image shows nothing.
+    An image shows a cell if it shows its middle, and that beyond the distance before which it shows nothing.
 
     Args:
         cameras: M cameras.
@@ -116,7 +122,7 @@ def times_seen(cameras: Cameras, nearest: Tensor, box: Tensor, resolution: int, 
         some = perhaps.nonzero().squeeze(-1)
         tested = centers[some].view(-1, 3)
         beyond = (tested - camera.camera_to_worlds[0, :, 3]).norm(dim=-1) > start
-        counts[some] += (_within(camera, tested, -radius) & beyond).view(-1, BLOCK**3)
+        counts[some] += (_within(camera, tested, 0.0) & beyond).view(-1, BLOCK**3)
     return counts.view(side, side, side, BLOCK, BLOCK, BLOCK).permute(0, 3, 1, 4, 2, 5).reshape(-1).clamp(max=most)
 
 

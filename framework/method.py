@@ -23,6 +23,9 @@ DEPTH = 0.1
 SPARSE_DEPTH = 0.001
 """Default weight of the depth loss if there are points of a reconstruction."""
 
+SHARED_BY = 2
+"""Default number of images that show where rays start, where points can say whether this cuts anything off."""
+
 
 def nothing_to_decide(config: Any, scene: Scene) -> tuple[Any, list[Decision]]:
     """Return the settings unchanged, and no decisions: `Method.decide` of a method that leaves no setting open.
@@ -86,6 +89,7 @@ class Method:
         if not isinstance(config, RayConfig):
             return config, made
         config, more = fill(config, depth_choice(scene))
+        config, _ = fill(config, Choice("rays_shared_by", SHARED_BY if scene.num_sparse_depths else 0, ""))
         return config, made + more * bool(config.depth_loss_mult)  # nothing to learn from needs no words
 
     def build(self, config: TrainConfig, scene: Scene) -> Model[Any]:

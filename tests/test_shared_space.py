@@ -8,9 +8,12 @@ import pytest
 import torch
 
 from framework.cameras.cameras import Cameras
+from framework.data.dataset import Dataset
+from framework.data.sparse_depth import SparseDepth
 from framework.geometry.bounds import nested_boxes
 from framework.geometry.rays import Rays
-from framework.scene.shared_space import CELLS, LEVELS, REACH, STEPS, SharedSpace, times_seen
+from framework.scene.shared_space import CELLS, LEVELS, REACH, STEPS, SharedSpace, share_cut_off, times_seen
+from framework.training.preparation import decided
 from tests.test_free_space import row
 from tests.training.test_graphs import small
 
@@ -100,7 +103,7 @@ def test_without_waiting_for_the_device_the_starts_are_the_same(monkeypatch: pyt
 
 
 def test_training_leaves_out_what_one_image_shows_and_says_so(tmp_path: Path) -> None:
-    trainer = small(tmp_path)
+    trainer = small(tmp_path, rays_shared_by=2)
     trainer.prepare()
     space, dataset = trainer.model.shared_space, trainer.train_set
     assert isinstance(space, SharedSpace)
@@ -112,6 +115,41 @@ def test_training_leaves_out_what_one_image_shows_and_says_so(tmp_path: Path) ->
     assert [d.choice for d in trainer.profile.decisions if d.option == "rays start"] == [
         "where at least 2 photographs look"
     ]
+
+
+def with_points(dataset: Dataset, distance: float) -> Dataset:
+    """The images, of which every 50th pixel is known to show something at that distance."""
+    pixels = torch.arange(0, dataset.cameras.ends[-1], 50)
+    known = SparseDepth(pixels, torch.full((len(pixels),), distance), torch.full((len(pixels),), 0.01))
+    scene = dataclasses.replace(dataset.scene, num_sparse_depths=len(pixels))
+    return dataclasses.replace(dataset, sparse_depth=known, scene=scene)
+
+
+def test_without_points_rays_start_at_their_near_ends(tmp_path: Path) -> None:
+    assert small(tmp_path).model.shared_space is None
+
+
+@pytest.mark.parametrize(("distance", "least"), [(50.0, 2), (0.06, 0)])
+def test_known_points_decide_whether_rays_start_late(distance: float, least: int, tmp_path: Path) -> None:
+    trainer = small(tmp_path)
+    dataset = with_points(trainer.train_set, distance)
+    config = dataclasses.replace(trainer.run.config, rays_shared_by=None)
+    _, settings, made = decided("nerfacto", config, dataset)
+    assert settings.rays_shared_by == least
+    said = [decision.line() for decision in made if decision.option == "rays start"]
+    assert len(said) == (not least)
+    assert all("at their near ends" in line and "% of the points" in line for line in said)
+    for chosen in (0, 2):  # what one asks for is done
+        asked = dataclasses.replace(config, rays_shared_by=chosen)
+        assert decided("nerfacto", asked, dataset)[1].rays_shared_by == chosen
+
+
+def test_the_share_of_what_is_cut_off() -> None:
+    """Rays of the slopes 0 and 0.8 start behind 0.5 and 0.28, as in the first test."""
+    space, rays = shared(row(0.0, 0.5), 2), fan(0.0, 0.8)
+    assert share_cut_off(space, rays, torch.tensor([5.0, 5.0])) == 0
+    assert share_cut_off(space, rays, torch.tensor([0.4, 5.0])) == 0.5
+    assert share_cut_off(space, rays, torch.tensor([0.4, 0.2])) == 1
 
 
 @pytest.mark.parametrize("settings", [{"rays_shared_by": 0}, {"sampler": "occupancy"}])

@@ -241,9 +241,9 @@ class RayConfig(TrainConfig):
     free_space_loss_mult: float = 0.0
     """Weight of the penalty on matter right before cameras: nearer than most of the points that a camera sees, or than
     any other camera sees; 0 for none."""
-    rays_shared_by: int = 2
-    """Rays start at the first place that at least this many training images show, as what one image shows could be at
-    any distance; 0 for the near end. It has no effect in a box, and in nested boxes (see --seen-cells)."""
+    rays_shared_by: Auto[int] = AUTO
+    """Rays start at the first place that so many training images show; 0 for the near end. If not given: 2 if points of
+    a reconstruction say that this cuts nothing off, else 0. No effect in a box and in nested boxes (--seen-cells)."""
     thin_gradients: float = 0.0
     """Samples whose gradient is below this times the mean take part in a step at random, in proportion to it, and count
     as many times more, so that the mean over steps stays; 0 for all. It has an effect on the CPU alone."""

@@ -49,7 +49,7 @@ class Request:
 KEYPOINTS = 1 / 8
 """Share of a batch's pixels that are drawn from those with a sparse depth, where they are to be learned from."""
 POINTS_UNTIL = 0.5
-"""Share of the budget after which they are not drawn any more, so that colours alone decide where a surface is exactly."""
+"""Share of the budget after which they are not drawn any more: then colours alone decide where a surface is."""
 
 
 class BatchSource(ABC):

@@ -95,10 +95,23 @@ class SharedSpace(nn.Module):
 
 
 @torch.no_grad()
+def share_cut_off(space: SharedSpace, rays: Rays, distances: Tensor) -> float:
+    """Return the share of rays that would start behind what they are known to show.
+
+    Args:
+        space: cells that are left out.
+        rays: R rays.
+        distances: (R,) of what they show, scene units.
+    """
+    return float((space(rays).nears > distances).double().mean())
+
+
+@torch.no_grad()
 def times_seen(cameras: Cameras, nearest: Tensor, box: Tensor, resolution: int, most: int) -> Tensor:
     """Return how many images show each cell of a box, as far as it is at most `most`.
 
-    An image shows a cell if it shows its middle, and that beyond the distance before which it shows nothing.
+    An image shows a cell if the whole ball around it is within the image: at the edges of images, no ray of theirs may
+    meet what lies in the rest of a cell. And its middle is beyond the distance before which the image shows nothing.
 
     Args:
         cameras: M cameras.
@@ -117,32 +130,32 @@ def times_seen(cameras: Cameras, nearest: Tensor, box: Tensor, resolution: int, 
     middles, radius = box[0] + (cubes + 0.5) * BLOCK * edge, float(edge.norm()) / 2
     counts = torch.zeros(centers.shape[:2], dtype=torch.uint8, device=box.device)
     for index in range(len(cameras)):
-        camera, start = cameras[index : index + 1], nearest[index]
-        perhaps = _within(camera, middles, BLOCK * radius) & (counts < most).any(1)
+        perhaps = _within(cameras, index, middles, BLOCK * radius) & (counts < most).any(1)
         some = perhaps.nonzero().squeeze(-1)
         tested = centers[some].view(-1, 3)
-        beyond = (tested - camera.camera_to_worlds[0, :, 3]).norm(dim=-1) > start
-        counts[some] += (_within(camera, tested, 0.0) & beyond).view(-1, BLOCK**3)
+        beyond = (tested - cameras.camera_to_worlds[index, :, 3]).norm(dim=-1) > nearest[index]
+        counts[some] += (_within(cameras, index, tested, -radius) & beyond).view(-1, BLOCK**3)
     return counts.view(side, side, side, BLOCK, BLOCK, BLOCK).permute(0, 3, 1, 4, 2, 5).reshape(-1).clamp(max=most)
 
 
-def _within(camera: Cameras, centers: Tensor, margin: float) -> Tensor:
+def _within(cameras: Cameras, index: int, centers: Tensor, margin: float) -> Tensor:
     """Return which of `centers` (N, 3) are within one camera's image, which grows by a margin there, (N,) bool.
 
     A ball at the angle a from the axis is 1 + tan(a)^2 times as large on a plane's image as in the image's middle.
 
     Args:
-        camera: the camera.
+        cameras: M cameras.
+        index: which of them.
         centers: places.
         margin: radius of the balls around them of which a part is enough, scene units; if negative, of which all is
             needed.
     """
-    distances = (centers - camera.camera_to_worlds[0, :, 3]).norm(dim=-1)
-    columns, rows, ahead = camera.project(centers, 0)
-    focal = torch.maximum(camera.fx, camera.fy)
-    sides = torch.maximum(camera.cx, camera.widths - camera.cx), torch.maximum(camera.cy, camera.heights - camera.cy)
-    corner = (sides[0].square() + sides[1].square()) / focal.square()
-    tangent = ((columns - camera.cx).square() + (rows - camera.cy).square()) / focal.square()
+    distances = (centers - cameras.camera_to_worlds[index, :, 3]).norm(dim=-1)
+    columns, rows, ahead = cameras.project(centers, index)
+    cx, cy, width, height = (values[index] for values in (cameras.cx, cameras.cy, cameras.widths, cameras.heights))
+    focal = torch.maximum(cameras.fx[index], cameras.fy[index])
+    corner = (torch.maximum(cx, width - cx).square() + torch.maximum(cy, height - cy).square()) / focal.square()
+    tangent = ((columns - cx).square() + (rows - cy).square()) / focal.square()
     reach = (1 + torch.minimum(tangent, corner)) * focal * margin / distances.clamp(min=abs(margin))
-    inside = ahead & (columns > -reach) & (columns < camera.widths + reach)
-    return inside & (rows > -reach) & (rows < camera.heights + reach) | (distances < margin)
+    inside = ahead & (columns > -reach) & (columns < width + reach)
+    return inside & (rows > -reach) & (rows < height + reach) | (distances < margin)

@@ -36,8 +36,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.base.console import say
 from framework.base.atomic import write_atomically
+from framework.base.console import say
 from framework.base.errors import ConfigError, DataError
 from framework.splats.gaussians import MAX_DEGREE, Gaussians
 from framework.splats.ply import usable

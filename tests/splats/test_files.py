@@ -204,7 +204,7 @@ def test_damaged_ply_is_refused(tmp_path: Path) -> None:
         read_gaussians(tmp_path)
 
 
-@pytest.mark.parametrize("suffix", (".ply", ".spz"))
+@pytest.mark.parametrize("suffix", [".ply", ".spz"])
 def test_a_full_disk_leaves_the_file_that_was_there(
     suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -22,7 +22,6 @@ DEPTH = 0.1
 """Default weight of the depth loss if there are depth images."""
 SPARSE_DEPTH = 0.001
 """Default weight of the depth loss if there are points of a reconstruction."""
-
 SHARED_BY = 2
 """Default number of images that show where rays start, where points can say whether this cuts anything off."""
 

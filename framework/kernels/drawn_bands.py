@@ -16,7 +16,7 @@ Rows = tuple[int, int, int]
 
 
 class _Bands(NamedTuple):
-    """What is known of K bands of E entries in all before their places are."""
+    """Entries of K bands, E in all, before their places are known."""
 
     entries: Tensor
     """(E,) int64 entries of the table if each band were at its factor's first row."""

@@ -310,7 +310,8 @@ class Trainer:
         late = self.progress >= config.train_rays_per_pixel_from
         rays_per_pixel = config.rays_per_pixel if late else 1
         num_pixels = max(self._num_rays(config) // rays_per_pixel, 1)
-        return Request(self.state.step, num_pixels, rays_per_pixel, self.progress < POINTS_UNTIL)
+        points = self.train_set.sparse_depth is not None and self.progress < POINTS_UNTIL
+        return Request(self.state.step, num_pixels, rays_per_pixel, points)
 
     def _num_rays(self, config: RayConfig) -> int:
         samples = self.model.samples_per_step

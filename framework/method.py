@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from framework.base.config import RayConfig, TrainConfig
-from framework.base.decisions import Choice, Decision, fill
+from framework.base.decisions import Choice, Decision, fill, left_open
 from framework.base.errors import ConfigError
 from framework.data.scene import Scene
 from framework.fields.base import Field
@@ -83,13 +83,18 @@ class Method:
 
         Returns:
             The settings, and the decisions that were made.
+
+        Raises:
+            ConfigError: if a setting is left to the data that the method does not decide by them.
         """
         config, made = self.decide(config, scene)
-        if not isinstance(config, RayConfig):
-            return config, made
-        config, more = fill(config, depth_choice(scene))
-        config, _ = fill(config, Choice("rays_shared_by", SHARED_BY if scene.num_sparse_depths else 0, ""))
-        return config, made + more * bool(config.depth_loss_mult)  # nothing to learn from needs no words
+        if isinstance(config, RayConfig):
+            config, more = fill(config, depth_choice(scene))
+            config, _ = fill(config, Choice("rays_shared_by", SHARED_BY if scene.num_sparse_depths else 0, ""))
+            made = made + more * bool(config.depth_loss_mult)  # nothing to learn from needs no words
+        for name in left_open(config):
+            raise ConfigError(f"--{name.replace('_', '-')} is None, and this method does not decide it; give a value")
+        return config, made
 
     def build(self, config: TrainConfig, scene: Scene) -> Model[Any]:
         """Return the model, with newly initialised parameters.

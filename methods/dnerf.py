@@ -23,7 +23,9 @@ from framework.samplers.choice import HierarchicalConfig, contracted_box, decide
 from framework.scene.motion import MotionConfig, slices_choice
 from methods.vanilla_nerf import OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH
 
-HASH_SAMPLES_PER_BATCH = 2**12
+NUM_STEPS, HASH_NUM_STEPS = 192, 384
+"""Steps along the diagonal of the box: with networks, and with a hash grid."""
+HASH_SAMPLES_PER_BATCH = 2**13
 """Samples of a training step with a hash grid, whose networks are small, and an occupancy grid."""
 
 
@@ -34,10 +36,11 @@ class DNeRFConfig(
     max_num_iterations=800_000,
     num_rays_per_batch=2_048,
     learning_rate=5e-4,
-    lr_final=0.1,
+    lr_schedule=AUTO,
+    lr_final=AUTO,
     adam_eps=1e-7,
-    num_steps=192,
-    eval_step_scale=AUTO,
+    num_steps=AUTO,
+    thin_gradients=AUTO,
 ):
     """Settings of dnerf; the defaults of networks, samples and learning rate are the paper's.
 
@@ -83,7 +86,7 @@ class DNeRFConfig(
     `position_frequencies`, or 4 with a hash grid."""
     ambient_dims: Auto[int] = AUTO
     """Outputs of the deformation network that a hash grid's networks read beside the displaced position. If not given:
-    8 with a hash grid; none otherwise, as in the paper."""
+    4 with a hash grid; none otherwise, as in the paper."""
     grid_learning_rate: float = 1e-2
     """Initial learning rate of the hash grid and of the two networks that read it."""
     max_resolution: int = 512
@@ -115,11 +118,10 @@ def decide(config: DNeRFConfig, scene: Scene) -> tuple[DNeRFConfig, list[Decisio
     Returns:
         Settings without open ones, and a record of each that was filled in.
     """
-    grid = config.canonical == "hash-grid"
+    grid = config.canonical == "hash-grid" and not (scene.moving and config.variant == "t-nerf")
     network = f"the canonical field is a {'hash grid' if grid else 'network'}"
-    small = grid and config.variant == "d-nerf"
     chosen = sampler_choice(config, scene.unbounded)
-    if small and not scene.unbounded:
+    if grid and not scene.unbounded:
         chosen = Choice("sampler", "occupancy", network)
     config, made = fill(
         config,
@@ -128,15 +130,23 @@ def decide(config: DNeRFConfig, scene: Scene) -> tuple[DNeRFConfig, list[Decisio
         Choice("deformation_width", 64 if grid else 256, network),
         Choice("deformation_frequencies", 4 if grid else config.position_frequencies, network),
         Choice("time_frequencies", 6 if grid else 4, network),
-        Choice("ambient_dims", 8 if grid else 0, network),
+        Choice("ambient_dims", 4 if grid else 0, network),
+    )
+    config, rates = fill(
+        config,
+        Choice("lr_schedule", "hold-exponential" if grid else "exponential", network, "learning rate's schedule"),
+        Choice("lr_final", 0.02 if grid else 0.1, network, "learning rate at the end, of the first"),
     )
     config, slices = fill(config, slices_choice(scene, config.sampler))
-    made += slices * (config.time_slices > 1)
-    shorter = Choice("eval_step_scale", 0.5 if grid else 1.0, "edges are sharper so", "length of a step in rendering")
-    config, steps = fill(config, shorter)
+    made += rates * grid + slices * (config.time_slices > 1)
+    config, steps = fill(
+        config,
+        Choice("num_steps", HASH_NUM_STEPS if grid else NUM_STEPS, network, "steps along the box's diagonal"),
+        Choice("thin_gradients", 0.5 if grid else 0.0, network),
+    )
     made += steps * (grid and config.sampler == "occupancy")
     if config.sampler == "occupancy":
-        samples = HASH_SAMPLES_PER_BATCH if small else OCCUPANCY_SAMPLES_PER_BATCH
+        samples = HASH_SAMPLES_PER_BATCH if grid else OCCUPANCY_SAMPLES_PER_BATCH
         config, more = decide_samples(config, samples)
         made += more
     if not scene.moving:

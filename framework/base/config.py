@@ -153,9 +153,9 @@ class TrainConfig:
     """Start from this checkpoint."""
     learning_rate: float = 5e-4
     """Initial learning rate of Adam."""
-    lr_schedule: Literal["constant", "exponential", "cosine", "hold-exponential"] = "exponential"
+    lr_schedule: Auto[Literal["constant", "exponential", "cosine", "hold-exponential"]] = "exponential"
     """Learning rate over the budget (steps or seconds, whichever is further spent); hold-: constant for half of it."""
-    lr_final: float = 0.1
+    lr_final: Auto[float] = 0.1
     """Learning rate at the end of the budget, as a fraction of the initial one."""
     lr_warmup_steps: int = 0
     """Steps over which the learning rate rises from zero."""
@@ -206,7 +206,7 @@ class TrainConfig:
             raise ConfigError(f"--adam-eps is {self.adam_eps}; it must be at least {SMALLEST_EPS}")
         if self.max_seconds is not None and not self.max_seconds > 0:
             raise ConfigError(f"--max-seconds is {self.max_seconds}; it must be more than 0")
-        if not self.learning_rate > 0 or not 0 < self.lr_final <= 1:
+        if not self.learning_rate > 0 or not (self.lr_final is None or 0 < self.lr_final <= 1):
             raise ConfigError("--learning-rate must be more than 0, and --lr-final in (0, 1]")
 
 
@@ -244,7 +244,7 @@ class RayConfig(TrainConfig):
     rays_shared_by: Auto[int] = AUTO
     """Rays start at the first place that so many training images show; 0 for the near end. If not given: 2 if points of
     a reconstruction say that this cuts nothing off, else 0. No effect in a box and in nested boxes (--seen-cells)."""
-    thin_gradients: float = 0.0
+    thin_gradients: Auto[float] = 0.0
     """Samples whose gradient is below this times the mean take part in a step at random, in proportion to it, and count
     as many times more, so that the mean over steps stays; 0 for all. It has an effect on the CPU alone."""
     gradient_scaling: bool = False

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar, get_type_hints
 
-if TYPE_CHECKING:
-    from framework.base.config import TrainConfig
+from framework.base.config import LEFT_TO_DATA, TrainConfig
 
-ConfigT = TypeVar("ConfigT", bound="TrainConfig")
+ConfigT = TypeVar("ConfigT", bound=TrainConfig)
 
 
 @dataclass(frozen=True)
@@ -54,6 +53,17 @@ class Choice:
 def is_open(value: Any) -> bool:
     """Return whether `value` leaves a setting open: None or "auto"."""
     return value is None or value == "auto"
+
+
+def left_open(config: TrainConfig) -> list[str]:
+    """Return the names of the settings that may be left to the data, and still are.
+
+    Args:
+        config: the method's settings.
+    """
+    kinds = get_type_hints(type(config), include_extras=True)
+    marked = (name for name, kind in kinds.items() if LEFT_TO_DATA in getattr(kind, "__metadata__", ()))
+    return [name for name in marked if getattr(config, name) is None]
 
 
 def fill(config: ConfigT, *choices: Choice) -> tuple[ConfigT, list[Decision]]:

@@ -25,18 +25,20 @@ from framework.base.decisions import Choice, fill
 from framework.base.optimised import Optimised
 from framework.cameras.refinement import PoseRefinement
 from framework.rendering.losses import normalised_distortion
-from framework.samplers.choice import SamplingConfig, decide_samples, sampler_choice
+from framework.samplers.choice import PROPOSAL_SAMPLES, SamplingConfig, decide_samples, sampler_choice, samples_choices
 from framework.samplers.proposal import half_edge
 from framework.scene.reasons import MARCHED_REASON, POSE_REASONS
 
 DISTORTION = 2e-3
 """Default weight of the distortion loss in unbounded scenes."""
+PAPER_SAMPLES = 64, 64
+"""Intervals a ray of each proposal in mip-NeRF 360 and in Zip-NeRF."""
 MARCHED_SAMPLES = 2**16
 """Samples a training step with an occupancy grid: as many as 2,048 rays have with proposals."""
 
 
 @dataclass(frozen=True)
-class CaptureConfig(SamplingConfig):
+class CaptureConfig(SamplingConfig, num_proposal_samples=AUTO, num_nerf_samples=AUTO):
     """Settings of a method for captures."""
 
     RANGES: ClassVar[dict[str, Range]] = {"distortion_loss_mult": AT_LEAST_0, "camera_learning_rate": AT_LEAST_0}
@@ -58,13 +60,16 @@ class CaptureConfig(SamplingConfig):
 CaptureConfigT = TypeVar("CaptureConfigT", bound=CaptureConfig)
 
 
-def decide_capture(config: CaptureConfigT, scene: Scene, *own: Choice) -> tuple[CaptureConfigT, list[Decision]]:
+def decide_capture(
+    config: CaptureConfigT, scene: Scene, *own: Choice, proposals: tuple[int, ...] = PROPOSAL_SAMPLES
+) -> tuple[CaptureConfigT, list[Decision]]:
     """Decide the settings that methods for captures share, and a method's own.
 
     Args:
         config: the method's settings; those left open are filled in.
         scene: properties of the data.
         own: choices of the method's own.
+        proposals: intervals of each proposal without a limit of time.
 
     Returns:
         The settings, and a record of each that was filled in.
@@ -86,7 +91,8 @@ def decide_capture(config: CaptureConfigT, scene: Scene, *own: Choice) -> tuple[
         Choice("camera_optimizer", refined, why, "pose refinement"),
     )
     config, samples = decide_samples(config, MARCHED_SAMPLES) if config.contraction else (config, [])
-    return config, made + more + samples
+    config, counts = fill(config, *samples_choices(config, proposals))
+    return config, made + more + samples + counts * (config.sampler == "proposal")
 
 
 def distortion_term(rendered: Rendered, weight: float, scale: float | None = None) -> dict[str, Tensor]:

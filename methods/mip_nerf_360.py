@@ -8,7 +8,7 @@ processor: a grid's levels count less for Gaussians that are larger than their c
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 from torch import Tensor
@@ -31,9 +31,10 @@ from framework.samplers.choice import (
     decide_samples,
     make_sampler,
     sampler_choice,
+    samples_choices,
 )
 from framework.samplers.proposal import LEARN_EVERY, half_edge
-from methods._captures import MARCHED_SAMPLES, distortion_term
+from methods._captures import MARCHED_SAMPLES, PAPER_SAMPLES, distortion_term
 from methods._grids import GridsConfig, grid_optimiser
 
 DISTORTION = 0.01
@@ -54,8 +55,8 @@ class MipNeRF360Config(
     adam_eps=1e-6,
     eval_num_rays_per_chunk=4_096,
     sampler="proposal",
-    num_proposal_samples=(64, 64),
-    num_nerf_samples=32,
+    num_proposal_samples=AUTO,
+    num_nerf_samples=AUTO,
     max_resolution=4_096,
 ):
     """Settings of mip-nerf-360; the defaults are the paper's, with an eighth of its rays and a quarter of its warm-up.
@@ -131,7 +132,10 @@ def decide(config: MipNeRF360Config, scene: Scene) -> tuple[MipNeRF360Config, li
         Choice("distortion_loss_mult", DISTORTION if scene.unbounded else 0.0, around, "distortion loss"),
     )
     config, samples = decide_samples(config, MARCHED_SAMPLES)
-    return config, made + samples
+    grids = config.encoding == "hash-grid"
+    timed = config if grids else replace(config, max_seconds=None)
+    config, counts = fill(config, *samples_choices(timed, PAPER_SAMPLES))
+    return config, made + samples + counts * (grids and config.sampler == "proposal")
 
 
 def make_field(config: MipNeRF360Config, scene: Scene) -> Field:

@@ -1,4 +1,4 @@
-"""Settings of instant-ngp that follow from the time, the images and the machine."""
+"""Settings that follow from the time, the images and the machine."""
 
 import dataclasses
 import itertools
@@ -10,6 +10,8 @@ import torch
 from framework.base.config import MachineConfig
 from framework.base.device import relative_speed
 from framework.base.processes import Processes
+from framework.base.registry import load_method
+from framework.samplers.choice import samples_choices
 from methods.instant_ngp import Plan, plan
 
 SECONDS = [10 * 360 ** (step / 60) for step in range(61)]  # 10 s to 1 h
@@ -80,3 +82,39 @@ def test_speed_grows_with_threads_but_less_than_they_do(monkeypatch: pytest.Monk
     assert relative_speed(MachineConfig(device_type="cuda")) == 1
     monkeypatch.setattr("framework.base.device.processes", lambda: dataclasses.replace(Processes(), count=2))
     assert relative_speed(MachineConfig(device_type="cpu")) == 1
+
+
+@pytest.mark.parametrize(
+    ("seconds", "device", "proposals", "count"),
+    [
+        (45.0, "cpu", (32, 16), 12),
+        (100.0, "cpu", (32, 16), 12),
+        (600.0, "cpu", (48, 24), 16),
+        (3600.0, "cpu", (80, 40), 24),
+        (1e9, "cpu", (112, 56), 32),
+        (None, "cpu", (128, 64), 32),
+        (45.0, "cuda", (128, 64), 32),
+    ],
+)
+def test_samples_a_ray_grow_with_the_time(
+    seconds: float | None, device: str, proposals: tuple[int, ...], count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    machine = MachineConfig(device_type=device)  # type: ignore[arg-type]
+    config = dataclasses.replace(load_method("nerfacto").config, max_seconds=seconds, machine=machine)
+    first, second = samples_choices(config)
+    assert (first.setting, first.value) == ("num_proposal_samples", proposals)
+    assert (second.setting, second.value) == ("num_nerf_samples", count)
+
+
+def test_samples_a_ray_never_fall_with_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = load_method("nerfacto").config
+    for threads in (1, 2, 16):
+        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
+        machine = MachineConfig(device_type="cpu")
+        found = [
+            samples_choices(dataclasses.replace(config, max_seconds=seconds, machine=machine))[1].value
+            for seconds in (1.0, *SECONDS, 1e6)
+        ]
+        assert found == sorted(found)
+        assert (found[0], found[-1]) == (12, 32)

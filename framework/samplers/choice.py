@@ -11,6 +11,7 @@ from torch import Tensor
 
 from framework.base.config import Auto, Range, RayConfig
 from framework.base.decisions import Choice, Decision, fill
+from framework.base.device import device_kind, relative_speed
 from framework.base.errors import ConfigError
 from framework.data.scene import Scene
 from framework.encodings.planes import FeaturePlanes
@@ -24,6 +25,10 @@ from framework.scene.motion import MotionConfig, vertices_in_time
 
 COARSEST_PROPOSAL = 128
 """Cells along an axis at the finest level of the first proposal; each further proposal has twice as many."""
+PROPOSAL_SAMPLES, NERF_SAMPLES = (128, 64), 32
+"""Intervals a ray of each proposal, and samples a ray, where there is time for them."""
+FITTED_SECONDS, FEWEST_SAMPLES = 150.0, 12
+"""Seconds of training on two threads of a CPU up to which `samples_choices` takes the fewest samples a ray."""
 MOST_PROPOSALS = 8
 """Maximum number of proposals."""
 COARSEST_MOVING, MOVING_FEATURES = 64, 8
@@ -77,14 +82,14 @@ class SamplingConfig(RayConfig):
     """Transmittance below which the rest of a ray is dropped: the maximum error of a colour channel (occupancy)."""
     train_early_stop: float = 1e-2
     """The same threshold during training, where less exact colours are sufficient (occupancy)."""
-    num_proposal_samples: tuple[int, ...] = (128, 64)
+    num_proposal_samples: Auto[tuple[int, ...]] = PROPOSAL_SAMPLES
     """Intervals per ray of each proposal (proposal)."""
-    num_nerf_samples: int = 32
+    num_nerf_samples: Auto[int] = NERF_SAMPLES
     """Samples per ray, placed by the last proposal (proposal)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 1 <= len(self.num_proposal_samples) <= MOST_PROPOSALS:
+        if self.num_proposal_samples is not None and not 1 <= len(self.num_proposal_samples) <= MOST_PROPOSALS:
             raise ConfigError(f"--num-proposal-samples must name 1 to {MOST_PROPOSALS} proposals, as in 128 64")
 
 
@@ -149,6 +154,28 @@ def decide_samples(config: SamplingConfigT, count: int) -> tuple[SamplingConfigT
         return config, []
     reason = "the number of samples on a ray varies a hundredfold"
     return fill(config, Choice("samples_per_batch", count, reason, "samples a step"))
+
+
+def samples_choices(config: SamplingConfig, unlimited: tuple[int, ...] = PROPOSAL_SAMPLES) -> tuple[Choice, Choice]:
+    """Return the intervals of two proposals and the samples of a ray that suit the time on a CPU.
+
+    With few samples more rays are seen in the same time. A cup had 28.3, 28.9, 29.3 and 29.5 dB after 100 s with 32,
+    24, 16 and 12 samples; after 600 s it did not matter whether there were 16 or 12 (docs/notes/captures.md). So there
+    are 12 up to 150 s on two threads, 16 at 600 s, and more by the same power of time, up to 32.
+
+    Args:
+        config: the method's settings, whose time and machine count.
+        unlimited: intervals of each proposal without a limit of time.
+    """
+    proposals, count, suits = unlimited, NERF_SAMPLES, "there is time for it"
+    if config.max_seconds is not None and device_kind(config.machine) == "cpu":
+        time = config.max_seconds * relative_speed(config.machine) / FITTED_SECONDS
+        count = min(4 * round(FEWEST_SAMPLES / 4 * max(time, 1.0) ** 0.2), NERF_SAMPLES)
+        proposals, suits = (4 * count - 16, 2 * count - 8), "that suits the time"
+    return (
+        Choice("num_proposal_samples", proposals, suits, "samples of proposals", " and ".join(map(str, proposals))),
+        Choice("num_nerf_samples", count, suits, "samples a ray"),
+    )
 
 
 def contracted_box(config: SamplingConfig, scene: Scene) -> Tensor | None:

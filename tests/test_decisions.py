@@ -7,7 +7,8 @@ from typing import Any, Literal
 import pytest
 
 from framework.base.config import AUTO, Auto, TrainConfig
-from framework.base.decisions import Choice, Decision, fill, is_open
+from framework.base.decisions import Choice, Decision, fill, is_open, left_open
+from framework.base.errors import ConfigError
 from framework.base.registry import load_method, registered
 from tests.truth.test_training import SCENE
 
@@ -68,10 +69,36 @@ def test_every_method_decides_once(method: str, facts: dict) -> None:
     """What was decided is complete and stands: read from a run's config.yml, it is not decided anew."""
     loaded, scene = load_method(method), dataclasses.replace(SCENE, **facts)
     config, _ = loaded.decided(loaded.config, scene)
-    assert not [
-        name for name in ("sampler", "camera_optimizer", "log2_table_size") if is_open(getattr(config, name, 0))
-    ]
+    assert not [name for name in ("sampler", "camera_optimizer", "few_images") if is_open(getattr(config, name, 0))]
+    assert left_open(config) == []
     changed = dataclasses.replace(config, max_seconds=7.0)
     again, made = loaded.decided(changed, dataclasses.replace(SCENE, unbounded=not scene.unbounded))
     assert again == changed
     assert [decision for decision in made if decision.choice != "left out"] == []
+
+
+def test_what_nobody_decides_is_refused_by_name() -> None:
+    """A setting that one method leaves to the data may be None to the command line of all."""
+    assert left_open(OpenConfig(fancy=True)) == ["num_cells"]
+    for name, setting in {
+        "nerfacto": "num_steps",
+        "vanilla-nerf": "lr_schedule",
+        "gaussian-splatting": "lr_final",
+    }.items():
+        method = load_method(name)
+        config = dataclasses.replace(method.config, **{setting: None})
+        with pytest.raises(ConfigError, match=f"^--{setting.replace('_', '-')} is None, .* give a value$"):
+            method.decided(config, SCENE)
+
+
+def test_rates_and_steps_of_dnerf_follow_its_canonical_field() -> None:
+    method, moving = load_method("dnerf"), dataclasses.replace(SCENE, moving=True, num_times=150)
+    names = ("lr_schedule", "lr_final", "num_steps", "thin_gradients", "ambient_dims")
+    found = {}
+    for canonical, variant in (("network", "d-nerf"), ("hash-grid", "d-nerf"), ("hash-grid", "t-nerf")):
+        config = dataclasses.replace(method.config, canonical=canonical, variant=variant)
+        decided, _ = method.decided(config, moving)
+        found[canonical, variant] = tuple(getattr(decided, name) for name in names)
+    assert found["network", "d-nerf"] == ("exponential", 0.1, 192, 0.0, 0)  # the paper's
+    assert found["hash-grid", "d-nerf"] == ("hold-exponential", 0.02, 384, 0.5, 4)
+    assert found["hash-grid", "t-nerf"] == found["network", "d-nerf"]  # one network, whatever is said of the grid

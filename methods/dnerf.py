@@ -40,6 +40,7 @@ class DNeRFConfig(
     lr_final=AUTO,
     adam_eps=1e-7,
     num_steps=AUTO,
+    eval_step_scale=AUTO,
     thin_gradients=AUTO,
 ):
     """Settings of dnerf; the defaults of networks, samples and learning rate are the paper's.
@@ -142,6 +143,7 @@ def decide(config: DNeRFConfig, scene: Scene) -> tuple[DNeRFConfig, list[Decisio
     config, steps = fill(
         config,
         Choice("num_steps", HASH_NUM_STEPS if grid else NUM_STEPS, network, "steps along the box's diagonal"),
+        Choice("eval_step_scale", 0.5 if grid else 1.0, "edges are sharper so", "length of a step in rendering"),
         Choice("thin_gradients", 0.5 if grid else 0.0, network),
     )
     made += steps * (grid and config.sampler == "occupancy")

@@ -93,12 +93,12 @@ def test_what_nobody_decides_is_refused_by_name() -> None:
 
 def test_rates_and_steps_of_dnerf_follow_its_canonical_field() -> None:
     method, moving = load_method("dnerf"), dataclasses.replace(SCENE, moving=True, num_times=150)
-    names = ("lr_schedule", "lr_final", "num_steps", "thin_gradients", "ambient_dims")
+    names = ("lr_schedule", "lr_final", "num_steps", "eval_step_scale", "thin_gradients", "ambient_dims")
     found = {}
     for canonical, variant in (("network", "d-nerf"), ("hash-grid", "d-nerf"), ("hash-grid", "t-nerf")):
         config = dataclasses.replace(method.config, canonical=canonical, variant=variant)
         decided, _ = method.decided(config, moving)
         found[canonical, variant] = tuple(getattr(decided, name) for name in names)
-    assert found["network", "d-nerf"] == ("exponential", 0.1, 192, 0.0, 0)  # the paper's
-    assert found["hash-grid", "d-nerf"] == ("hold-exponential", 0.02, 384, 0.5, 4)
+    assert found["network", "d-nerf"] == ("exponential", 0.1, 192, 1.0, 0.0, 0)  # the paper's
+    assert found["hash-grid", "d-nerf"] == ("hold-exponential", 0.02, 384, 0.5, 0.5, 4)
     assert found["hash-grid", "t-nerf"] == found["network", "d-nerf"]  # one network, whatever is said of the grid

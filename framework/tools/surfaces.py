@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -43,7 +44,7 @@ def found_surfaces(dataset: Dataset, config: TrainConfig, steps: int, seconds: f
         dataset: the images.
         config: settings of the run that asks; machine and background are taken from it.
         steps: maximum number of training steps of the field.
-        seconds: maximum time of its training, seconds.
+        seconds: maximum time of its training, seconds; infinity for no maximum.
         count: maximum number of points.
 
     Returns:
@@ -55,9 +56,12 @@ def found_surfaces(dataset: Dataset, config: TrainConfig, steps: int, seconds: f
     from framework.training.trainer import Trainer
 
     method = "nerfacto" if dataset.scene.unbounded else "instant-ngp"
+    # instant-ngp's settings and rates are those of its few seconds; nerfacto's are not (docs/notes/splatting.md).
+    limit = seconds if method == "instant-ngp" and seconds < math.inf else None
     settings = replace(
         load_method(method).config,
         max_num_iterations=steps,
+        max_seconds=limit,
         vis="none",
         machine=config.machine,
         background=config.background,

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from framework.data.pixels import ViewBatch as ViewBatch
     from framework.data.scene import Scene as Scene
     from framework.fields.base import Field as Field
+    from framework.gaussian_model import GaussianModel as GaussianModel
     from framework.geometry.points import Points as Points
     from framework.geometry.rays import Rays as Rays
     from framework.geometry.rays import Samples as Samples
@@ -50,6 +51,7 @@ _HOMES = {
     "Dataset": "data.dataset",
     "Decision": "base.decisions",
     "Field": "fields.base",
+    "GaussianModel": "gaussian_model",
     "LearnsMotion": "model",
     "Loss": "model",
     "Method": "method",

@@ -7,14 +7,13 @@ gradients, or are moved as in Kheradmand et al., "3D Gaussian Splatting as Marko
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from framework import Cameras, Decision, Loss, Method, Model, Optimised, Picture, RowChange, Scene, View, ViewBatch
+from framework import Cameras, Decision, GaussianModel, Loss, Method, Optimised, Scene, ViewBatch
 from framework.base.config import AT_LEAST_0, AUTO, Auto, Range
 from framework.base.console import say
 from framework.base.decisions import Choice, fill
@@ -27,26 +26,18 @@ from framework.kernels.splat_project import SplatCamera
 from framework.kernels.ssim import photometric_loss
 from framework.rendering.losses import mean_depth_error
 from framework.scene.reasons import DEPTH_REASONS, LIGHT_REASONS, POSE_REASONS
-from framework.splats.density_control import RESET, GradientMean, grown
-from framework.splats.drawing import draw, draw_view, on_image, splat_camera
-from framework.splats.gaussians import MAX_DEGREE, Gaussians
+from framework.splats.drawing import draw, splat_camera
 from framework.splats.guide import GUIDE, FoundDistances
-from framework.splats.learning import as_gaussians, as_tables, open_degree, row_changes
-from framework.splats.mcmc import moved, shaken
-from framework.splats.redrawn import Redrawn
+from framework.splats.learning import open_degree
 from framework.splats.resolution import doubled, halved, halved_distances
-from framework.splats.room import Room
 from framework.splats.settings import SplattingConfig, decide_splatting
 from framework.splats.start import PLACES, first_points, from_points, scene_size, seen_colors
-from framework.splats.table import Table
 from framework.tools.surfaces import found_surfaces
 from framework.training.optim import learning_rate_factor
 
 NOISE, OPACITY_PENALTY, SCALE_PENALTY = 5e5, 0.002, 0.01
 """Noise and penalties where Gaussians have to find their places: those of Kheradmand et al. 2024, but for the first
 penalty, which at a few hundred steps of a higher rate left too few of them."""
-WITHOUT_IMAGES = 1_000
-"""Maximum number of Gaussians of a model that has seen no images yet."""
 FIELD_SHARE = 0.2
 """Maximum share of a budget in seconds that the training of a field to start from takes."""
 FIELD_OPACITY, FIELD_SIZE = 0.5, 0.7
@@ -58,7 +49,6 @@ class GaussianSplattingConfig(SplattingConfig):
     """Settings of gaussian-splatting."""
 
     RANGES: ClassVar[dict[str, Range]] = {
-        "degree": (0, MAX_DEGREE),
         "appearance_rate": AT_LEAST_0,
         "camera_learning_rate": AT_LEAST_0,
         "depth_loss_mult": AT_LEAST_0,
@@ -66,12 +56,8 @@ class GaussianSplattingConfig(SplattingConfig):
         "ssim_weight": (0, 1),
     }
     """Allowed range of each numeric setting."""
-    degree: int = 3
-    """Highest degree of the spherical harmonics that colours are made of."""
     ssim_weight: float = 0.2
     """Weight of 1 - SSIM in the loss; the absolute error has the rest."""
-    antialiased: bool = False
-    """Compensate the minimum width of a Gaussian on an image by its opacity (Mip-Splatting)."""
     appearance: Auto[bool] = AUTO
     """Whether each training image has a transform of colours of its own. If not given: if light or exposure differ."""
     appearance_rate: float = 1e-3
@@ -105,7 +91,7 @@ def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplat
     return config, made + more
 
 
-class GaussianSplatting(Model[GaussianSplattingConfig]):
+class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
     """Gaussians that are drawn onto whole images.
 
     Args:
@@ -113,29 +99,13 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         scene: facts about the data.
     """
 
-    batches: ClassVar[Literal["pixels", "views"]] = "views"
-    extent: Tensor
-    """Size () of the scene, scene units, in which centres are stored: so their learning rate suits any scene."""
     found: Tensor
     """Whether the first Gaussians lay on surfaces, so that none has to look for its place."""
 
     def __init__(self, config: GaussianSplattingConfig, scene: Scene) -> None:
         super().__init__(config, scene)
-        higher, factor = (config.degree + 1) ** 2 - 1, config.rate_factor
-        rate = factor * config.learning_rate
-
-        def table(width: int, name: str, times: float, schedule: Literal["constant"] | None = "constant") -> Table:
-            return Table(width, Optimised(name, times * rate, schedule=schedule, sparse=True))
-
-        self.position_rate = factor * config.position_rate
-        self.means = table(3, "means", self.position_rate / rate, None)
-        self.log_scales = table(3, "scales", 1.0)
-        self.rotations = table(4, "rotations", 0.2)
-        self.logits = table(1, "opacities", 10.0)
-        self.colors = table(3, "colors", 0.5)
-        self.harmonics = table(3 * higher, "harmonics", 0.025)
         self.register_buffer("found", torch.tensor(False))
-        self.register_buffer("extent", torch.tensor(scene_size(scene)))
+        self._found, self.found_distances = HostValue(), FoundDistances()
         self.progress = 0.0
         self.appearance: Appearance | None = None
         if config.appearance:
@@ -144,43 +114,6 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         if config.camera_optimizer in ("SO3xR3", "SE3"):
             self.poses = PoseRefinement(scene.num_cameras, config.camera_optimizer, scene.camera_to_worlds)
             self.poses.optimised = Optimised("poses", config.camera_learning_rate, schedule="exponential")
-        self.gradients, self.found_distances = GradientMean(), FoundDistances()
-        self.room = Room()
-        self._near = max(0.2 * scene.near, 1e-3)
-        self._on_image: Tensor | None = None
-        self._longer_side = scene.image_size
-        self._redrawn: Redrawn | None = None
-        self._found, self._extent = HostValue(), HostValue()
-        anywhere = torch.lerp(scene.box[0], scene.box[1], torch.rand(min(config.start_gaussians, WITHOUT_IMAGES), 3))
-        self.set_gaussians(from_points(anywhere, torch.full_like(anywhere, 0.5), config.degree))
-
-    @property
-    def runs_on_kernels(self) -> bool:
-        return True
-
-    @property
-    def uses_bfloat16(self) -> bool:
-        return False  # there is no network
-
-    def _chosen(self, given: float | None, otherwise: float) -> float:
-        """Return a setting that is by the start if not given: Gaussians on surfaces need no search for places, but for
-        those far away, where a field that was trained for seconds is mist."""
-        on_surfaces = self._found.of(self.found) and not self.scene.unbounded
-        return given if given is not None else 0.0 if on_surfaces else otherwise
-
-    def parameters_of_gaussians(self) -> list[nn.Parameter]:
-        """Return the six tables."""
-        tables = (self.means, self.log_scales, self.rotations, self.logits, self.colors, self.harmonics)
-        return [table.values for table in tables]
-
-    def _all(self) -> Gaussians:
-        return as_gaussians(self.parameters_of_gaussians(), self.extent)
-
-    def gaussians(self) -> Gaussians:
-        """Return them, without gradient."""
-        return self._all().map(Tensor.detach)
-
-    # -- the start --------------------------------------------------------------------------------------------
 
     @torch.no_grad()
     def start(self, dataset: Dataset) -> None:
@@ -209,38 +142,23 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
         self.found.fill_(kind == "field")
         say(f"  {len(first):,} Gaussians start {PLACES[kind]}")
 
-    def set_gaussians(self, gaussians: Gaussians) -> None:
-        """Replace them.
-
-        Args:
-            gaussians: the new ones, with harmonics of the settings' degree.
-        """
-        for parameter, values in zip(self.parameters_of_gaussians(), as_tables(gaussians, self.extent), strict=True):
-            parameter.data = values.contiguous()
-        self._redrawn = None
-
-    # -- training ---------------------------------------------------------------------------------------------
-
     def before_step(self, step: int, progress: float) -> None:
+        super().before_step(step, progress)
         self.progress = progress
-        self._redrawn = None
 
     def loss(self, batch: ViewBatch, step: int) -> Loss:
         config = self.config
-        reduced = 2 if self.progress < config.reduced_until else 1
         seen, poses = batch.view.camera, self.poses
         pose = None if poses is None else poses.pose(batch.index, seen.camera_to_worlds[0])
-        camera = splat_camera(seen, self._near, config.antialiased, pose, reduced)
+        reduced = 2 if self.progress < config.reduced_until else 1
+        camera = splat_camera(seen, self.near, config.antialiased, pose, reduced)
         target = batch.rgb if reduced == 1 else halved(batch.rgb)
-        gaussians = self._all()
-        records = on_image(gaussians, camera, min(open_degree(self.progress), config.degree))
-        if config.strategy == "adc" and records.requires_grad:
-            records.retain_grad()
-            self._on_image, self._longer_side = records, max(camera.width, camera.height)
+        gaussians = self.learnt_gaussians()
+        records = self.on_image(gaussians, camera, min(open_degree(self.progress), config.degree))
         known, trust = self.found_distances.known(batch, self.progress, config.depth_loss_mult, config.field_depth_mult)
         content = CHANNELS["rgb" if known is None else "distance"]
         drawn = draw(records, camera, self._behind(batch), content, self.room)
-        rgb = self._lit(drawn.image if known is None else drawn.image[..., :3], batch.index)
+        rgb = self.lit(drawn.image if known is None else drawn.image[..., :3], batch.index)
         if batch.kept is not None:  # what does not count is as it should be
             kept = batch.kept if reduced == 1 else halved(batch.kept[..., None].float())[..., 0] == 1
             target = torch.where(kept[..., None], target, rgb.detach())
@@ -261,48 +179,30 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
             return batch.background
         return torch.rand(3, device=batch.rgb.device)
 
-    def _lit(self, rgb: Tensor, index: int | None) -> Tensor:
+    @torch.no_grad()
+    def after_every_step(self, step: int, progress: float, finite: bool | Tensor) -> None:
+        super().after_every_step(step, progress, finite)
+        if (noise := self._chosen(self.config.noise, NOISE)) > 0:
+            rate = self.position_rate * learning_rate_factor(self.config, step, progress)
+            self.shake(noise * rate * finite if isinstance(finite, Tensor) else noise * rate)
+
+    def _chosen(self, given: float | None, otherwise: float) -> float:
+        """Return a setting that is by the start if not given: Gaussians on surfaces need no search for places, but for
+        those far away, where a field that was trained for seconds is mist."""
+        on_surfaces = self._found.of(self.found) and not self.scene.unbounded
+        return given if given is not None else 0.0 if on_surfaces else otherwise
+
+    def lit(self, rgb: Tensor, index: int | None) -> Tensor:
         """Return colours (..., 3) as an image shows them: a training image, or one with the appearance that is set."""
         if self.appearance is None:
             return rgb
         which = None if index is None else torch.arange(index, index + 1, device=rgb.device)
         return affine_colors(rgb, self.appearance(which, 1)[0])
 
-    @torch.no_grad()
-    def after_every_step(self, step: int, progress: float, finite: bool | Tensor) -> None:
-        config = self.config
-        self.gradients.add(self._on_image, self._longer_side, finite)
-        self._on_image = None
-        if (noise := self._chosen(config.noise, NOISE)) > 0:
-            rate = self.position_rate * self._extent.of(self.extent) * learning_rate_factor(config, step, progress)
-            size = noise * rate * finite if isinstance(finite, Tensor) else noise * rate
-            which, by = shaken(self.gaussians(), size)
-            self.means.values.data[which] += by / self.extent
-
-    def changes_rows(self, step: int, progress: float) -> bool:
-        config = self.config
-        return step % config.steps_per_move == config.steps_per_move - 1 and progress <= config.growth_end
-
-    @torch.no_grad()
-    def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
-        config = self.config
-        if config.strategy == "adc":
-            return self._densify(step, config.num_gaussians)
-        here = len(self.means.values)
-        change = moved(self.gaussians(), max(min(config.num_gaussians, int(1.05 * here)) - here, 0))
-        return () if change is None else row_changes(self.parameters_of_gaussians(), *change, self.extent)
-
-    def _densify(self, step: int, most: int) -> list[RowChange]:
-        mean = self.gradients.take(len(self.means.values))
-        if step % self.config.steps_per_reset == self.config.steps_per_reset - 1:
-            lowered = self.logits.values.clamp(max=math.log(RESET / (1 - RESET)))
-            none = torch.zeros(0, dtype=torch.long, device=lowered.device)
-            return [RowChange(self.logits.values, none, lowered)]  # new rows, as Adam's state is reset too
-        change = grown(self.gaussians(), mean, most, self._extent.of(self.extent))
-        return [] if change is None else row_changes(self.parameters_of_gaussians(), *change, self.extent)
-
-    def read_counts(self) -> None:
-        self.room.read()
+    def camera(self, camera: Cameras) -> SplatCamera:
+        """Return the camera of a view that is not trained on, moved by the common drift of the training cameras."""
+        pose = None if self.poses is None else self.poses.carried_pose(camera.camera_to_worlds[0])
+        return splat_camera(camera, self.near, self.config.antialiased, pose)
 
     def refined_cameras(self, cameras: Cameras) -> Cameras:
         """Return the training cameras with refined poses.
@@ -311,30 +211,6 @@ class GaussianSplatting(Model[GaussianSplattingConfig]):
             cameras: M training cameras with the poses of the data.
         """
         return cameras if self.poses is None else self.poses.refined(cameras)
-
-    # -- pictures ---------------------------------------------------------------------------------------------
-
-    def render_view(self, view: View, background: Tensor) -> Picture:
-        return self.render_gaussians(self.gaussians(), view, background)
-
-    def render_gaussians(self, gaussians: Gaussians, view: View, background: Tensor) -> Picture:
-        """Render given Gaussians, such as some of its own, as `render_view` does all of them.
-
-        Args:
-            gaussians: what is drawn, in the frame of the scene.
-            view, background: as in `render_view`.
-        """
-        picture = draw_view(gaussians, self._camera(view), view.stride, background, self.scene.far)
-        return replace(picture, rgb=self._lit(picture.rgb, None))
-
-    def render_rgb(self, view: View, background: Tensor) -> Tensor:
-        self._redrawn = self._redrawn or Redrawn(self.gaussians())
-        return self._lit(self._redrawn.colors(self._camera(view), view.stride, background), None)
-
-    def _camera(self, view: View) -> SplatCamera:
-        """Return the camera of a view that is not trained on."""
-        pose = None if self.poses is None else self.poses.carried_pose(view.camera.camera_to_worlds[0])
-        return splat_camera(view.camera, self._near, self.config.antialiased, pose)
 
 
 METHOD = Method(GaussianSplattingConfig(), paper="arXiv:2308.04079", model=GaussianSplatting, decide=decide)

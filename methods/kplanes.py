@@ -15,7 +15,7 @@ from framework import Decision, LearnsMotion, Method, PixelBatch, Points, RayMod
 from framework.base.config import AT_LEAST_0, AUTO, Auto, Range
 from framework.base.decisions import Choice, fill
 from framework.base.step_kind import StepKind
-from framework.encodings.planes import FeaturePlanes
+from framework.encodings.planes import FeaturePlanes, squared_steps
 from framework.fields.base import MLP
 from framework.fields.encoded import BoxField, EncodedField
 from framework.kernels.math import truncated_exp
@@ -148,18 +148,13 @@ class KPlanes(RayModel[KPlanesConfig], LearnsMotion):
         in_space = [factor for factor in factors if factor not in in_time]
         chosen = [in_time[turn % len(in_time)]] if in_time else []
         bands = planes.bands(in_space + chosen, whole={3})
-        steps = [(_squared_steps(band, 0) + _squared_steps(band, 1)) / 2 for band in bands[: len(in_space)]]
+        steps = [(squared_steps(band, 0) + squared_steps(band, 1)) / 2 for band in bands[: len(in_space)]]
         variation = torch.stack(steps).sum() / len(factors)
         if not in_time:
             return variation, zero, zero
         plane, share = bands[-1], len(in_time) / len(factors)
-        variation = variation + share * _squared_steps(plane, 1)
+        variation = variation + share * squared_steps(plane, 1)
         return variation, plane.diff(n=2, dim=0).square().mean(), (1 - plane).abs().mean()
-
-
-def _squared_steps(plane: Tensor, dim: int) -> Tensor:
-    """Return the mean squared difference of neighbours along `dim`; 0 if there is only one entry."""
-    return plane.diff(dim=dim).square().mean() if plane.shape[dim] > 1 else plane.new_zeros(())
 
 
 def decide(config: KPlanesConfig, scene: Scene) -> tuple[KPlanesConfig, list[Decision]]:

@@ -5,49 +5,28 @@ Chen et al., "TensoRF: Tensorial Radiance Fields", ECCV 2022.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
-from torch.nn.functional import softplus
 
-from framework import (
-    Decision,
-    Field,
-    Method,
-    PixelBatch,
-    Points,
-    RayModel,
-    Rendered,
-    Renderer,
-    Sampler,
-    Scene,
-)
+from framework import Decision, Field, Method, PixelBatch, RayModel, Rendered, Renderer, Sampler, Scene
 from framework.base.config import AT_LEAST_0, AUTO, Auto, Range
 from framework.base.decisions import Choice, fill
 from framework.base.device import HostValue
 from framework.base.optimised import Optimised
 from framework.base.step_kind import StepKind
-from framework.encodings.planes import FeaturePlanes
-from framework.fields.base import MLP
-from framework.geometry.bounds import to_unit_box
-from framework.kernels.contraction import contract_to_unit
+from framework.encodings.planes import FeaturePlanes, squared_steps
+from framework.fields.tensor import CP, VM, TensorField
+from framework.geometry.bounds import box_around_cells, cubic_vertices
 from framework.kernels.memory import require
 from framework.kernels.planes import PlanesLayout
-from framework.kernels.spherical_harmonics import spherical_harmonics
 from framework.samplers.base import SkipsCells
 from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler, sampler_choice
 from framework.scene.few_images import FewImagesConfig, decide_few_images
 
-VM = (((0, 1), (2,)), ((0, 2), (1,)), ((1, 2), (0,)))
-"""Three groups: a plane, and the line across it (equation 4)."""
-CP = (((0,), (1,), (2,)),)
-"""One group: a line along each axis (equation 3)."""
-DENSITY_SHIFT, DENSITY_SCALE = -10.0, 25.0
-"""Density is DENSITY_SCALE * softplus(sum of components + DENSITY_SHIFT), near 0 at first (section 4.4 and code)."""
 BLIND_STEPS = 128
 """Steps before the occupancy grid is updated: the field starts empty, and would mark every cell as empty."""
 FIRST_SIDE, LAST_SIDE = 128, {"vm": 300, "cp": 500}
@@ -109,56 +88,6 @@ class TensoRFConfig(
     """Whether Adam updates only the table entries that a step used."""
 
 
-class TensorField(Field):
-    """A field whose density is a sum of components (section 4.3).
-
-    Colour has components of its own, which a linear basis and a small network turn into RGB.
-
-    Args:
-        box: (2, 3) minimum and maximum corner of the encoded region, scene units.
-        density, appearance: factors of the components.
-        width: features per hidden layer of the colour network.
-        num_features: outputs of the basis (27 in the paper).
-        unbounded: whether the factors cover all of space, contracted around the box.
-    """
-
-    box: Tensor
-    runs_on_kernels = True
-
-    def __init__(
-        self,
-        box: Tensor,
-        density: FeaturePlanes,
-        appearance: FeaturePlanes,
-        width: int,
-        num_features: int = 27,
-        unbounded: bool = False,
-    ) -> None:
-        super().__init__()
-        self.unbounded = unbounded
-        self.register_buffer("box", box.clone())
-        self.density_factors, self.appearance_factors = density, appearance
-        self.basis = torch.nn.Linear(appearance.num_features, num_features, bias=False)
-        self.color_head = MLP(num_features + 16, width, width, 3, activation="sigmoid")
-
-    def density(self, points: Points) -> tuple[Tensor, Tensor]:
-        unit = self._unit(points.positions)
-        return self._sigma(self.density_factors(unit), unit), unit
-
-    @staticmethod
-    def _sigma(components: Tensor, unit: Tensor) -> Tensor:
-        """Return density, the activated sum of `components` (N, K); 0 outside the box, which may have shrunk."""
-        inside = ((unit >= 0) & (unit <= 1)).all(-1)
-        return softplus(components.float().sum(-1) + DENSITY_SHIFT) * DENSITY_SCALE * inside
-
-    def _unit(self, positions: Tensor) -> Tensor:
-        return contract_to_unit(positions, self.box) if self.unbounded else to_unit_box(positions, self.box)
-
-    def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
-        appearance = self.basis(self.appearance_factors(features))
-        return self.color_head(appearance.float(), spherical_harmonics(directions)).float()
-
-
 class TensoRF(RayModel[TensoRFConfig]):
     """A model whose factors grow from coarse to fine; with an occupancy grid, their box shrinks to occupied space.
 
@@ -207,7 +136,7 @@ class TensoRF(RayModel[TensoRFConfig]):
         """Resample the factors over the occupied box, with first^(1 - share) * last^share vertices."""
         voxels = self.config.first_voxels ** (1 - share) * self.config.last_voxels**share
         box, field = self._occupied_box(), self.factors
-        vertices = vertices_of(voxels, box)
+        vertices = cubic_vertices(voxels, box)
         if torch.equal(box, field.box) and vertices == field.density_factors.layout.resolutions[0]:
             return
         size = field.box[1] - field.box[0]
@@ -224,14 +153,9 @@ class TensoRF(RayModel[TensoRFConfig]):
         sampler, box = self.sampler, self.factors.box
         if not isinstance(sampler, SkipsCells) or self.factors.unbounded:
             return box.clone()
-        n = sampler.resolution
-        cells = sampler.occupied.nonzero().squeeze(-1)
-        if len(cells) == 0:
-            return box.clone()
-        corners = torch.stack([cells // n**2, cells // n % n, cells % n], dim=-1)
-        ends = torch.stack([corners.min(0).values - MARGIN, corners.max(0).values + 1 + MARGIN]) / n
-        occupied = torch.lerp(sampler.box[0], sampler.box[1], ends)
-        return torch.stack([occupied[0].maximum(box[0]), occupied[1].minimum(box[1])])
+        cells = sampler.occupied.view((sampler.resolution,) * 3)
+        around = box_around_cells(cells, sampler.box, MARGIN)
+        return box.clone() if around is None else torch.stack([around[0].maximum(box[0]), around[1].minimum(box[1])])
 
     def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
         losses, field = dict[str, Tensor](), self.factors
@@ -252,12 +176,8 @@ def _sum_over_bands(factors: FeaturePlanes, measure: Callable[[Tensor], Tensor])
 
 
 def _variation(band: Tensor) -> Tensor:
-    """Return the mean squared difference of neighbours, summed over the axes that have any."""
-    variation = band.new_zeros(())
-    for dim in (0, 1):
-        if band.shape[dim] > 1:
-            variation = variation + band.diff(dim=dim).square().mean()
-    return variation
+    """Return the mean squared difference of neighbours, summed over both axes."""
+    return squared_steps(band, 0) + squared_steps(band, 1)
 
 
 def decide(config: TensoRFConfig, scene: Scene) -> tuple[TensoRFConfig, list[Decision]]:
@@ -287,18 +207,6 @@ def decide(config: TensoRFConfig, scene: Scene) -> tuple[TensoRFConfig, list[Dec
     return config, made + few
 
 
-def vertices_of(voxels: float, box: Tensor) -> tuple[int, ...]:
-    """Return the number of vertices along each axis of a grid of cubic voxels over a box, at least 2.
-
-    Args:
-        voxels: approximate number of voxels.
-        box: (2, 3) minimum and maximum corner, scene units.
-    """
-    size = (box[1] - box[0]).tolist()
-    edge = (math.prod(size) / voxels) ** (1 / 3)
-    return tuple(max(round(length / edge), 2) for length in size)
-
-
 def make_field(config: TensoRFConfig, scene: Scene) -> TensorField:
     """Return the field with its first, coarsest factors.
 
@@ -312,9 +220,9 @@ def make_field(config: TensoRFConfig, scene: Scene) -> TensorField:
     axes = VM if config.decomposition == "vm" else CP
     counts = config.density_components, config.appearance_components
     for voxels in (config.first_voxels, config.last_voxels):  # check both now: the last is made late in training
-        layout = PlanesLayout.build((vertices_of(voxels, scene.box),) * len(axes), axes)
+        layout = PlanesLayout.build((cubic_vertices(voxels, scene.box),) * len(axes), axes)
         require(4.0 * layout.num_entries * sum(counts), "a grid")
-    vertices = (vertices_of(config.first_voxels, scene.box),) * len(axes)
+    vertices = (cubic_vertices(config.first_voxels, scene.box),) * len(axes)
     density, appearance = (
         FeaturePlanes(vertices, count, axes, config.sparse_updates, resizable=True) for count in counts
     )

@@ -144,6 +144,16 @@ class FeaturePlanes(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
+def squared_steps(band: Tensor, dim: int) -> Tensor:
+    """Return the mean squared difference () of neighbours along an axis; 0 if there is only one entry.
+
+    Args:
+        band: values of a factor, or of some of its rows.
+        dim: the axis.
+    """
+    return band.diff(dim=dim).square().mean() if band.shape[dim] > 1 else band.new_zeros(())
+
+
 def _interpolated(values: Tensor, dim: int, first: float, last: float, count: int) -> Tensor:
     """Interpolate along `dim`, which spans [0, 1], at `count` evenly spaced positions from `first` to `last`."""
     size = values.shape[dim]

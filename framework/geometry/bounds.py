@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -48,6 +50,43 @@ def nested_boxes(box: Tensor, levels: int) -> Tensor:
     half = (box[1] - box[0]) / 2
     grown = torch.tensor([2.0**level - 1 for level in range(levels)], dtype=box.dtype, device=box.device)
     return box + grown[:, None, None] * torch.stack([-half, half])
+
+
+def cell_corners(cells: Tensor, resolution: int) -> Tensor:
+    """Return the lower corners (K, 3) of cells of a grid, in cells along x, y and z.
+
+    Args:
+        cells: (K,) int64 indices; cell (x, y, z) has (x n + y) n + z.
+        resolution: number n of cells along each axis.
+    """
+    return torch.stack([cells // resolution**2, cells // resolution % resolution, cells % resolution], dim=-1)
+
+
+def box_around_cells(inside: Tensor, box: Tensor, margin: int = 0) -> Tensor | None:
+    """Return the smallest box (2, 3) that holds some cells of a grid; None if there are none.
+
+    Args:
+        inside: (n, n, n) bool which cells along x, y and z.
+        box: (2, 3) minimum and maximum corner of the grid.
+        margin: cells that are added on each side.
+    """
+    cells = inside.nonzero()
+    if len(cells) == 0:
+        return None
+    ends = torch.stack([cells.amin(0) - margin, cells.amax(0) + 1 + margin])
+    return torch.lerp(box[0], box[1], ends / len(inside))
+
+
+def cubic_vertices(voxels: float, box: Tensor) -> tuple[int, ...]:
+    """Return the number of vertices along each axis of a grid of cubic voxels over a box, at least 2.
+
+    Args:
+        voxels: approximate number of voxels.
+        box: (2, 3) minimum and maximum corner, scene units.
+    """
+    size = (box[1] - box[0]).tolist()
+    edge = (math.prod(size) / voxels) ** (1 / 3)
+    return tuple(max(round(length / edge), 2) for length in size)
 
 
 def to_unit_box(positions: Tensor, box: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from framework.cameras.cameras import Cameras
 from framework.cameras.view import View, every
+from framework.geometry.bounds import cell_corners
 from framework.kernels.silhouettes import Photograph, pixels_under_balls
 from framework.samplers.base import Sampler
 from framework.samplers.occupancy import OccupancySampler
@@ -34,9 +35,10 @@ def pixels_in_view(sampler: Sampler, view: View) -> Tensor | None:
     slices, times = sampler.occupancy.slices_of(view.times()), sampler.occupied.view(sampler.slices, -1)
     n, (low, high) = sampler.resolution, sampler.box
     cells = times[0 if slices is None else int(slices[0])].nonzero().squeeze(-1)
-    corners = torch.stack([cells // n**2, cells // n % n, cells % n], dim=-1)
     edges = (high - low) / n
     (height, width), (fx, fy, cx, cy) = camera.sizes[0], camera.intrinsics[0]
     nothing = cells.new_zeros(1, 1, dtype=torch.int32).expand(height + 1, width + 1)
     seen_by = Photograph(camera.camera_to_worlds[0], fx, fy, cx, cy, nothing)
-    return every(pixels_under_balls(seen_by, low + (corners + 0.5) * edges, float(edges.norm()) / 2), view.stride)
+    return every(
+        pixels_under_balls(seen_by, low + (cell_corners(cells, n) + 0.5) * edges, float(edges.norm()) / 2), view.stride
+    )

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from framework.data.dataset import Dataset
 from framework.data.pixel_set import PixelSet
+from framework.geometry.bounds import cell_corners
 from framework.kernels.silhouettes import Photograph, hold_balls, opaque_sums, pixels_near_balls
 
 COARSEST = 8
@@ -278,8 +279,7 @@ def pixels_near(silhouettes: Silhouettes, hull: Tensor, box: Tensor, resolution:
         resolution: number n of cells along each axis.
     """
     cells = hull.nonzero().squeeze(-1)
-    corner = torch.stack([cells // resolution**2, cells // resolution % resolution, cells % resolution], dim=-1)
-    centers = box[0] + (corner + 0.5) * (box[1] - box[0]) / resolution
+    centers = box[0] + (cell_corners(cells, resolution) + 0.5) * (box[1] - box[0]) / resolution
     radius = float(((box[1] - box[0]) / resolution).norm()) / 2
     chosen = []
     for image in range(len(silhouettes)):

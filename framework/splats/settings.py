@@ -9,6 +9,7 @@ from typing import ClassVar, Literal, TypeVar
 from framework.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
 from framework.base.decisions import Choice, Decision, fill
 from framework.data.scene import Scene
+from framework.splats.gaussians import MAX_DEGREE
 from framework.splats.learning import number_for, rate_factor
 
 PIXELS_PER_SECOND = 25 * 400 * 400
@@ -31,9 +32,10 @@ RESET_WORDS = {
 class SplattingConfig(
     AppearanceConfig, max_num_iterations=30_000, learning_rate=5e-3, lr_final=0.1, adam_beta2=0.99, adam_eps=1e-15
 ):
-    """Settings of a method whose Gaussians start somewhere, grow and move."""
+    """Settings of a method whose Gaussians start somewhere, grow, move and are drawn."""
 
     RANGES: ClassVar[dict[str, Range]] = {
+        "degree": (0, MAX_DEGREE),
         "num_gaussians": (1, 10_000_000),
         "start_gaussians": (1, 10_000_000),
         "field_steps": (1, math.inf),
@@ -48,6 +50,10 @@ class SplattingConfig(
         "reduced_until": (0, 1),
     }
     """Allowed range of each numeric setting."""
+    degree: int = 3
+    """Highest degree of the spherical harmonics that colours are made of."""
+    antialiased: bool = False
+    """Compensate the minimum width of a Gaussian on an image by its opacity (Mip-Splatting)."""
     num_gaussians: Auto[int] = AUTO
     """Maximum number of Gaussians; by the budget if not given."""
     start: Literal["auto", "points", "field", "silhouettes", "random"] = "auto"

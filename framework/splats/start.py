@@ -12,6 +12,7 @@ from framework.base.errors import ConfigError
 from framework.cameras.cameras import Cameras
 from framework.data.dataset import Dataset
 from framework.data.scene import Scene
+from framework.geometry.bounds import cell_corners
 from framework.kernels.splat_project import DC
 from framework.scene.silhouettes import Silhouettes, visual_hull
 from framework.splats.gaussians import Gaussians
@@ -146,8 +147,7 @@ def hull_points(hull: Tensor, box: Tensor, resolution: int, count: int) -> Tenso
     inner = -torch.nn.functional.max_pool3d(-torch.nn.functional.pad(grid, [1] * 6), 3, stride=1)
     cells = ((grid > 0) & (inner == 0)).view(-1).nonzero()[:, 0]
     chosen = cells[torch.randint(len(cells), (count,), device=cells.device)]
-    corner = torch.stack([chosen // resolution**2, chosen // resolution % resolution, chosen % resolution], -1)
-    at = (corner + torch.rand(count, 3, device=cells.device)) / resolution
+    at = (cell_corners(chosen, resolution) + torch.rand(count, 3, device=cells.device)) / resolution
     return box[0] + at * (box[1] - box[0])
 
 

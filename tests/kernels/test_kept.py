@@ -15,6 +15,7 @@ from framework.fields.base import MLP, Field
 from framework.fields.deformed import DeformedField
 from framework.fields.encoded import DensityField, EncodedField
 from framework.fields.nerf import NeRFField
+from framework.fields.tensor import VM, TensorField
 from framework.geometry.points import Points
 from framework.kernels import kept, native
 from framework.kernels.frequency import frequency_encoding
@@ -22,7 +23,6 @@ from framework.kernels.hash_grid import hash_grid
 from framework.kernels.kept import Waves
 from framework.kernels.mlp import mlp
 from methods.kplanes import ExplicitField
-from methods.tensorf import VM, TensorField
 from tests.kernels.compiled import needs_kernels
 
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])

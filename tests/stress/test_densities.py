@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from framework.encodings.hash_grid import HashGrid
 from framework.fields.encoded import EncodedField
+from framework.fields.tensor import DENSITY_SCALE, DENSITY_SHIFT, TensorField
 from framework.geometry.points import Points
 from framework.kernels.march import refresh_occupancy
 from framework.kernels.math import MAX_LOG_DENSITY, split_density, truncated_exp
 from framework.samplers.occupancy import OccupancySampler
-from methods.tensorf import DENSITY_SCALE, DENSITY_SHIFT, TensorField
 from tests.stress.backends import FEW, backends
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])

@@ -15,14 +15,14 @@ from torch import Tensor
 
 from framework.data.depths import read_depths
 from framework.data.scene import Scene
-from framework.encodings.planes import FeaturePlanes
+from framework.encodings.planes import FeaturePlanes, squared_steps
 from framework.evaluation.metrics import MAX_PSNR, load_lpips, psnr, ssim
 from framework.geometry.rays import Histogram, Samples
 from framework.kernels.compositing import distortion, distortion_by_pairs
 from framework.kernels.planes import PlanesLayout
 from framework.rendering.losses import depth_error, mean_squared_error
 from framework.samplers.proposal import interlevel_loss
-from methods.kplanes import METHOD, KPlanes, KPlanesConfig, _squared_steps
+from methods.kplanes import METHOD, KPlanes, KPlanesConfig
 from methods.tensorf import _variation
 from tests.images import parsed
 from tests.kernels.compiled import relative_error
@@ -143,7 +143,7 @@ def steps_by_hand(plane: list[list[list[float]]], dim: int) -> float:
 def test_total_variation_of_planes_of_any_sides(height: int, width: int, features: int) -> None:
     plane = torch.randn(height, width, features, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     along = [steps_by_hand(plane.tolist(), dim) for dim in (0, 1)]
-    assert [_squared_steps(plane, dim).item() for dim in (0, 1)] == pytest.approx(along, rel=1e-12)
+    assert [squared_steps(plane, dim).item() for dim in (0, 1)] == pytest.approx(along, rel=1e-12)
     assert _variation(plane).item() == pytest.approx(sum(along), rel=1e-12)
 
 

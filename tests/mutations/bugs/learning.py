@@ -278,7 +278,7 @@ BUGS = (
     Bug(
         "tensorf-density-outside",
         "methods",
-        "methods/tensorf.py",
+        "framework/fields/tensor.py",
         "inside = ((unit >= 0) & (unit <= 1)).all(-1)",
         "inside = torch.ones_like(unit[:, 0])",
         "after the box has shrunk, its faces are smeared over all that is outside",
@@ -286,9 +286,9 @@ BUGS = (
     Bug(
         "tensorf-shrinks-to-corner",
         "methods",
-        "methods/tensorf.py",
-        "corners.max(0).values + 1 + MARGIN",
-        "corners.max(0).values - MARGIN",
+        "framework/geometry/bounds.py",
+        "cells.amax(0) + 1 + margin",
+        "cells.amax(0) - margin",
         "the far faces of the object are cut off when the box shrinks",
     ),
     Bug(

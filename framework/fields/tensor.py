@@ -1,0 +1,74 @@
+"""Density and appearance as sums of products of planes and lines, or of lines alone.
+
+Chen et al., "TensoRF: Tensorial Radiance Fields", ECCV 2022.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from framework.encodings.planes import FeaturePlanes
+from framework.fields.base import MLP, Field
+from framework.geometry.bounds import to_unit_box
+from framework.geometry.points import Points
+from framework.kernels.contraction import contract_to_unit
+from framework.kernels.spherical_harmonics import spherical_harmonics
+
+VM = (((0, 1), (2,)), ((0, 2), (1,)), ((1, 2), (0,)))
+"""Three groups: a plane, and the line across it (equation 4)."""
+CP = (((0,), (1,), (2,)),)
+"""One group: a line along each axis (equation 3)."""
+DENSITY_SHIFT, DENSITY_SCALE = -10.0, 25.0
+"""Density is DENSITY_SCALE * softplus(sum of components + DENSITY_SHIFT), near 0 at first (section 4.4 and code)."""
+
+
+class TensorField(Field):
+    """A field whose density is a sum of components (section 4.3).
+
+    Colour has components of its own, which a linear basis and a small network turn into RGB.
+
+    Args:
+        box: (2, 3) minimum and maximum corner of the encoded region, scene units.
+        density, appearance: factors of the components.
+        width: features per hidden layer of the colour network.
+        num_features: outputs of the basis (27 in the paper).
+        unbounded: whether the factors cover all of space, contracted around the box.
+    """
+
+    box: Tensor
+    runs_on_kernels = True
+
+    def __init__(
+        self,
+        box: Tensor,
+        density: FeaturePlanes,
+        appearance: FeaturePlanes,
+        width: int,
+        num_features: int = 27,
+        unbounded: bool = False,
+    ) -> None:
+        super().__init__()
+        self.unbounded = unbounded
+        self.register_buffer("box", box.clone())
+        self.density_factors, self.appearance_factors = density, appearance
+        self.basis = torch.nn.Linear(appearance.num_features, num_features, bias=False)
+        self.color_head = MLP(num_features + 16, width, width, 3, activation="sigmoid")
+
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        unit = self._unit(points.positions)
+        return self._sigma(self.density_factors(unit), unit), unit
+
+    @staticmethod
+    def _sigma(components: Tensor, unit: Tensor) -> Tensor:
+        """Return density, the activated sum of `components` (N, K); 0 outside the box, which may have shrunk."""
+        inside = ((unit >= 0) & (unit <= 1)).all(-1)
+        return softplus(components.float().sum(-1) + DENSITY_SHIFT) * DENSITY_SCALE * inside
+
+    def _unit(self, positions: Tensor) -> Tensor:
+        return contract_to_unit(positions, self.box) if self.unbounded else to_unit_box(positions, self.box)
+
+    def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
+        appearance = self.basis(self.appearance_factors(features))
+        return self.color_head(appearance.float(), spherical_harmonics(directions)).float()

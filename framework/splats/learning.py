@@ -16,7 +16,7 @@ USUAL_STEPS = 30_000
 
 def number_for(seconds: float, most: int) -> int:
     """Return the number of Gaussians, at most `most`, that suits a budget of `seconds`."""
-    return int(min(max(min(8_000 * math.sqrt(seconds), 1_200 * seconds), 20_000), most))
+    return int(min(max(8_000 * math.sqrt(seconds), 20_000), most))
 
 
 def rate_factor(steps: float, most: float) -> float:

@@ -114,7 +114,7 @@ def decide_splatting(config: SplattingConfigT, scene: Scene) -> tuple[SplattingC
     config, more = fill(
         config,
         Choice("start_gaussians", first, "the others are added", "Gaussians at the start", f"{first:,}"),
-        Choice("field_steps", int(min(max(2 * seconds, 60), most)), why, "steps of a field to start from"),
+        Choice("field_steps", int(min(max(2 * seconds, 120), most)), why, "steps of a field to start from"),
         Choice("reduced_until", 0.4 if large else 0.0, detail, "share of the budget with images of half the size"),
         Choice("steps_per_reset", 3_000 if resets else NEVER, *RESET_WORDS[resets]),
         Choice("rate_factor", round(factor, 2), "fewer steps have to go farther", "factor of learning rates"),

@@ -129,6 +129,7 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
         self.gradients.add(self._on_image, self._longer_side, finite)
         self._on_image = None
 
+    @torch.no_grad()
     def shake(self, size: float | Tensor) -> None:
         """Add noise to the centres of Gaussians that are nearly transparent (3DGS-MCMC, equation 7).
 

@@ -2,9 +2,9 @@
 
 Barron et al., "Zip-NeRF: Anti-Aliased Grid-Based Neural Radiance Fields", ICCV 2023. Sizes are for a processor: tables
 of 2^18 entries and grids of up to 2048 cells an axis, where the paper has 2^21 and 8192. The networks are nerfacto's.
-Other than in the paper, the loss of colours is the mean squared error, the networks are not told of levels' weights,
-gradients are scaled down near cameras (Philip and Deschaintre 2023), and an image's exposure is an affine transform of
-its colours.
+Other than in the paper, a scene that ends at its box is sampled by an occupancy grid, the loss of colours is the mean
+squared error, the networks are not told of levels' weights, gradients are scaled down near cameras (Philip and
+Deschaintre 2023), and an image's exposure is an affine transform of its colours.
 """
 
 from __future__ import annotations
@@ -23,10 +23,13 @@ from framework.encodings.multisampled import MultisampledHashGrid
 from framework.fields.appearance import AFFINE, Appearance, exposed
 from framework.fields.multisampled import MultisampledDensity, MultisampledField
 from framework.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
-from framework.samplers.choice import make_sampler
+from framework.samplers.choice import decide_samples, make_sampler
 from framework.samplers.proposal import ProposalSampler
 from framework.scene.reasons import LIGHT_REASONS
 from methods._captures import PAPER_SAMPLES, CaptureConfig, CaptureModel, decide_capture
+
+SAMPLES_PER_BATCH = 2**14
+"""Samples a training step with an occupancy grid over a box."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,8 @@ class ZipNeRFConfig(
     adam_beta2=0.99,
     adam_eps=1e-15,
     eval_num_rays_per_chunk=4_096,
-    sampler="proposal",
+    sampler="auto",
+    num_steps=256,
     num_levels=8,
     features_per_level=4,
 ):
@@ -120,7 +124,9 @@ def decide(config: ZipNeRFConfig, scene: Scene) -> tuple[ZipNeRFConfig, list[Dec
     """Return `config` with the settings filled in that depend on the `scene`, and a record of each."""
     varies = scene.appearance_varies
     exposure = Choice("exposure", varies, LIGHT_REASONS[varies], "affine exposures")
-    return decide_capture(config, scene, exposure, proposals=PAPER_SAMPLES)
+    config, made = decide_capture(config, scene, exposure, proposals=PAPER_SAMPLES)
+    config, samples = decide_samples(config, SAMPLES_PER_BATCH)
+    return config, made + samples
 
 
 def make_field(config: ZipNeRFConfig, scene: Scene) -> MultisampledField:

@@ -39,6 +39,17 @@ def test_an_object_before_no_background_needs_little(shared_tiny: Path, tmp_path
     assert [proposal.encoding.decay for proposal in model.sampler.proposals] == [0.1, 0.1]
 
 
+def test_an_object_is_marched_through_and_a_capture_has_proposals(shared_tiny: Path, tmp_path: Path) -> None:
+    """Through a box by few steps, as cones see all of them; no setting of one is decided for the other."""
+    inside = captured(shared_tiny, tmp_path / "inside", {}, sampler="auto")
+    around = captured(shared_tiny, tmp_path / "around", {"unbounded": True, "has_alpha": False}, sampler="auto")
+    assert chosen(inside)["sampler"] == "occupancy"
+    assert (inside.model.config.samples_per_batch, inside.model.config.num_steps) == (2**14, 256)
+    assert chosen(around)["sampler"] == "proposal"
+    assert around.model.config.samples_per_batch is None
+    assert "samples a step" not in chosen(around)
+
+
 def test_a_capture_gets_what_it_needs(shared_tiny: Path, tmp_path: Path) -> None:
     facts = {"unbounded": True, "poses": "device", "appearance_varies": True, "has_alpha": False}
     trainer = captured(shared_tiny, tmp_path, facts, max_num_iterations=4)

@@ -126,6 +126,7 @@ TINY: dict[str, dict[str, Any]] = {
         "num_rays_per_batch": 256,
     },
     "zip-nerf": {
+        "sampler": "proposal",
         "num_levels": 4,
         "max_resolution": 64,
         "log2_table_size": 12,

@@ -17,9 +17,10 @@ from framework.geometry.points import Frustums, Points
 from framework.kernels.multisampled_grid import multisampled_grid_reference
 from framework.kernels.multisamples import unit_multisamples_reference
 from framework.rendering.volume import VolumeRenderer
+from framework.tools.testing import check_method
 from framework.training.trainer import Trainer
-from methods.zip_nerf import ZipNeRFConfig
-from tests.training.helpers import chosen, said_otherwise, tiny_run, tiny_trainer
+from methods.zip_nerf import METHOD, ZipNeRFConfig
+from tests.training.helpers import TINY, chosen, said_otherwise, tiny_run, tiny_trainer
 
 captured = partial(said_otherwise, "zip-nerf")
 """A trainer on the tiny data set, of whose scene other things are said."""
@@ -48,6 +49,14 @@ def test_an_object_is_marched_through_and_a_capture_has_proposals(shared_tiny: P
     assert chosen(around)["sampler"] == "proposal"
     assert around.model.config.samples_per_batch is None
     assert "samples a step" not in chosen(around)
+
+
+@pytest.mark.slow
+def test_through_a_box_it_keeps_what_every_method_must() -> None:
+    """With proposals it is checked beside all built-in methods in tests/test_check_method.py."""
+    marched = {"sampler": "occupancy", "grid_resolution": 16, "num_steps": 64, "samples_per_batch": 4096}
+    findings = check_method(METHOD, "zip-nerf", dataclasses.replace(METHOD.config, **{**TINY["zip-nerf"], **marched}))
+    assert [finding.line() for finding in findings if not finding.ok] == []
 
 
 def test_a_capture_gets_what_it_needs(shared_tiny: Path, tmp_path: Path) -> None:

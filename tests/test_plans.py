@@ -11,7 +11,8 @@ from framework.base.config import MachineConfig
 from framework.base.device import relative_speed
 from framework.base.processes import Processes
 from framework.base.registry import load_method
-from framework.samplers.choice import samples_choices
+from framework.data.scene import Scene
+from framework.samplers.choice import batch_choice, samples_choices
 from methods.instant_ngp import Plan, plan
 
 SECONDS = [10 * 360 ** (step / 60) for step in range(61)]  # 10 s to 1 h
@@ -119,3 +120,46 @@ def test_samples_a_ray_never_fall_with_the_time(monkeypatch: pytest.MonkeyPatch)
         ]
         assert found == sorted(found)
         assert (found[0], found[-1]) == (12, 32)
+
+
+@pytest.mark.parametrize(
+    ("method", "seconds", "threads", "device", "samples"),
+    [
+        ("tensorf", 45.0, 2, "cpu", 2**13),
+        ("tensorf", 150.0, 2, "cpu", 2**13),
+        ("tensorf", 300.0, 2, "cpu", 2**14),
+        ("tensorf", 600.0, 2, "cpu", 2**15),
+        ("tensorf", 600.0, 1, "cpu", 18 * 1024),  # worth 343 s on two threads
+        ("tensorf", 45.0, 2, "cuda", 2**15),
+        ("tensorf", None, 2, "cpu", 2**15),
+        ("kplanes", 45.0, 2, "cpu", 2**14),
+        ("kplanes", 150.0, 2, "cpu", 2**15),
+        ("kplanes", 600.0, 2, "cpu", 2**15),
+    ],
+)
+def test_samples_a_step_follow_the_time(
+    method: str, seconds: float | None, threads: int, device: str, samples: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    monkeypatch.setattr("framework.samplers.choice.device_kind", lambda machine: machine.device_type)
+    declared = load_method(method)
+    machine = MachineConfig(device_type=device)  # type: ignore[arg-type]
+    config = dataclasses.replace(declared.config, max_seconds=seconds, machine=machine)
+    scene = Scene(torch.tensor([[-1.0] * 3, [1.0] * 3]), 0.1, 4.0, 1, True, False, 400)
+    found, made = declared.decide(config, scene)
+    assert found.samples_per_batch == samples
+    assert [decision.choice for decision in made if decision.option == "samples a step"] == [str(samples)]
+    chosen, made = declared.decide(dataclasses.replace(config, samples_per_batch=5000), scene)
+    assert chosen.samples_per_batch == 5000
+    assert "samples a step" not in [decision.option for decision in made]
+
+
+def test_samples_a_step_never_fall_with_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = load_method("tensorf").config
+    for threads in (1, 2, 16):
+        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
+        machine = MachineConfig(device_type="cpu")
+        timed = [dataclasses.replace(config, max_seconds=seconds, machine=machine) for seconds in (1.0, *SECONDS, 1e6)]
+        found = [batch_choice(config, 2**13, 2**15, 150.0).value for config in timed]
+        assert found == sorted(found)
+        assert (found[0], found[-1]) == (2**13, 2**15)

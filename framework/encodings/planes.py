@@ -13,7 +13,8 @@ from framework.base.optimised import Optimised
 from framework.encodings.opening import Opening
 from framework.kernels.drawn_bands import drawn_bands
 from framework.kernels.memory import table
-from framework.kernels.planes import PlanesGradient, PlanesLayout, plane_bands, planes
+from framework.kernels.plane_bands import Band, band_variation, plane_bands, variation
+from framework.kernels.planes import PlanesGradient, PlanesLayout, planes
 
 BANDS = 16
 """Number of bands into which `FeaturePlanes.bands` divides the rows of a factor."""
@@ -88,24 +89,42 @@ class FeaturePlanes(nn.Module):
         Returns:
             (B, vertices along the first axis, F) values of each, where B is at most 1/16 of the rows, or 2.
         """
-        heights = [self.layout.shape(group, index)[0] for group, index in factors]
-        entire = [any(axis in whole for axis in self.layout.axes[group][index]) for group, index in factors]
         if devices.runs_ahead(self.table.device):
-            sizes = [
-                h if everything else min(max(h // BANDS, 2), h) for h, everything in zip(heights, entire, strict=True)
-            ]
-            drawn = [(*factor, rows) for factor, rows in zip(factors, sizes, strict=True)]
-            return drawn_bands(self.table, self.layout, drawn)
+            return self._drawn_there(factors, whole)
+        return plane_bands(self.table, self.layout, self._drawn(factors, whole), self.deferred)
+
+    def variation(self, factors: Sequence[tuple[int, int]]) -> Tensor:
+        """Return the total variation of a random band of each of K factors: (K,) sums over both axes.
+
+        Args:
+            factors: group, and index in the group, of each factor; the bands are as those of `bands`.
+        """
+        if devices.runs_ahead(self.table.device):
+            return variation(self._drawn_there(factors, ()))
+        return band_variation(self.table, self.layout, self._drawn(factors, ()), self.deferred)
+
+    def _drawn(self, factors: Sequence[tuple[int, int]], whole: Container[int]) -> list[Band]:
+        """Draw a band of each factor on the host."""
         chosen = []
-        for (group, index), height, everything in zip(factors, heights, entire, strict=True):
-            if everything:
+        for group, index in factors:
+            height = self.layout.shape(group, index)[0]
+            if any(axis in whole for axis in self.layout.axes[group][index]):
                 chosen.append((group, index, 0, height))
                 continue
             rows = max(height // BANDS, 2)
             first = int(torch.randint(1 - rows, height, ()))
             first, last = max(first, 0), min(first + rows, height)
             chosen.append((group, index, first, last - first))
-        return plane_bands(self.table, self.layout, chosen, self.deferred)
+        return chosen
+
+    def _drawn_there(self, factors: Sequence[tuple[int, int]], whole: Container[int]) -> list[Tensor]:
+        """Let the device draw a band of each factor."""
+        sizes = []
+        for group, index in factors:
+            height = self.layout.shape(group, index)[0]
+            entire = any(axis in whole for axis in self.layout.axes[group][index])
+            sizes.append((group, index, height if entire else min(max(height // BANDS, 2), height)))
+        return drawn_bands(self.table, self.layout, sizes)
 
     @torch.no_grad()
     def resample(self, resolutions: tuple[tuple[int, ...], ...], lower: Tensor, upper: Tensor) -> None:
@@ -142,16 +161,6 @@ class FeaturePlanes(nn.Module):
         if self.resizable and saved is not None and saved.shape == self.resolutions.shape:
             self._relayout(saved)
         super()._load_from_state_dict(state_dict, prefix, *rest)
-
-
-def squared_steps(band: Tensor, dim: int) -> Tensor:
-    """Return the mean squared difference () of neighbours along an axis; 0 if there is only one entry.
-
-    Args:
-        band: values of a factor, or of some of its rows.
-        dim: the axis.
-    """
-    return band.diff(dim=dim).square().mean() if band.shape[dim] > 1 else band.new_zeros(())
 
 
 def _interpolated(values: Tensor, dim: int, first: float, last: float, count: int) -> Tensor:

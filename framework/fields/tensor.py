@@ -14,6 +14,7 @@ from framework.fields.base import MLP, Field
 from framework.geometry.bounds import to_unit_box
 from framework.geometry.points import Points
 from framework.kernels.contraction import contract_to_unit
+from framework.kernels.mlp import mlp
 from framework.kernels.spherical_harmonics import spherical_harmonics
 
 VM = (((0, 1), (2,)), ((0, 2), (1,)), ((1, 2), (0,)))
@@ -70,5 +71,5 @@ class TensorField(Field):
         return contract_to_unit(positions, self.box) if self.unbounded else to_unit_box(positions, self.box)
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
-        appearance = self.basis(self.appearance_factors(features))
-        return self.color_head(appearance.float(), spherical_harmonics(directions)).float()
+        appearance = mlp([self.appearance_factors(features)], [self.basis.weight])
+        return self.color_head(appearance, spherical_harmonics(directions)).float()

@@ -9,7 +9,6 @@ group of three lines (equations 4 and 3).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -21,13 +20,10 @@ from framework.kernels import kept, memory, native
 from framework.kernels.adam import sparse_adam
 from framework.kernels.deferred import Parts, waiting
 from framework.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
+from framework.kernels.plane_bands import Shape, add_variation_gradient
 from framework.kernels.planes_layout import PlanesLayout as PlanesLayout
 from framework.kernels.triton_kernels import later
 
-Band = tuple[int, int, int, int]
-"""Group, factor in the group, first row, and number of rows."""
-Spans = tuple[tuple[int, int], ...]
-"""Indices of the first entry, and of the one behind the last."""
 MAX_HELD = 2**26
 """Maximum number of features at corners that the form in few operations holds at once; it takes positions in parts."""
 
@@ -89,22 +85,25 @@ class PlanesGradient:
         """Positions (N, D) of each look-up, and gradient (N, G * F) of its result."""
         self.bands: list[tuple[int, Tensor]] = []
         """Index of the first entry, and gradient (B, F), of each band of entries that `plane_bands` has read."""
+        self.variations: list[tuple[tuple[Shape, ...], Tensor]] = []
+        """Bands of which `band_variation` was computed, and gradient (K,) of its result."""
         self._sum: Tensor | None = None
 
     @property
     def gradients(self) -> list[Tensor]:
-        """The collected gradients of look-ups and bands."""
-        return [grad for _, grad in (*self.parts, *self.bands)]
+        """The collected gradients of look-ups, of bands and of their variation."""
+        return [grad for _, grad in (*self.parts, *self.bands, *self.variations)]
 
     @property
     def pending(self) -> bool:
         """True if there is a gradient."""
-        return bool(self.parts or self.bands)
+        return bool(self.parts or self.bands or self.variations)
 
     def clear(self) -> None:
         """Discard the gradient."""
         self.parts.clear()
         self.bands.clear()
+        self.variations.clear()
 
     def relayout(self, layout: PlanesLayout) -> None:
         """Change the layout of the table to `layout`, and discard the gradient."""
@@ -133,6 +132,8 @@ class PlanesGradient:
             _add_to(self._sum[:end], positions, table[:end], grad, self.layout)
         for first, grad in self.bands:
             self._sum[first : first + len(grad)] += grad
+        for shapes, grad in self.variations:
+            add_variation_gradient(self._sum, table, shapes, grad)
         self.clear()
         return self._sum
 
@@ -190,83 +191,6 @@ def _arguments(positions: Tensor, table: Tensor, layout: PlanesLayout) -> tuple[
     entries = native.pointer(table, "the planes", (layout.num_entries, features))
     sizes = layout.dims, features, layout.num_groups, len(layout.axes[0])
     return points, count, entries, *sizes, *layout.arrays
-
-
-class _Band(torch.autograd.Function):
-    """Rows [first, end) of a table, whose gradient is deferred; the table is the only input with a gradient."""
-
-    @staticmethod
-    def forward(ctx: Any, table: Tensor, first: int, end: int, deferred: PlanesGradient) -> Tensor:
-        ctx.first, ctx.deferred = first, deferred
-        return table[first:end].clone()
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[None, None, None, None]:
-        ctx.deferred.bands.append((ctx.first, grad))
-        return None, None, None, None
-
-
-class _Bands(torch.autograd.Function):
-    """Rows [first, end) of a table, for several such spans, with one gradient of the table for all of them."""
-
-    @staticmethod
-    def forward(ctx: Any, table: Tensor, spans: Spans) -> tuple[Tensor, ...]:
-        ctx.spans, ctx.shape = spans, table.shape
-        ctx.set_materialize_grads(False)
-        return tuple(table[first:end].clone() for first, end in spans)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, None]:
-        known = [(span, grad) for span, grad in zip(ctx.spans, grads, strict=True) if grad is not None]
-        if not known:
-            return None, None
-        total = known[0][1].new_zeros(ctx.shape)
-        for (first, end), grad in known:
-            total[first:end] += grad
-        return total, None
-
-
-def _bands_reference(table: Tensor, spans: Spans, deferred: PlanesGradient | None) -> list[Tensor]:
-    return [table[first:end] for first, end in spans]
-
-
-PLANE_BANDS = Operation("plane_bands", _bands_reference)
-
-
-@PLANE_BANDS.implementation(CPP, fits=lambda table, spans, deferred: deferred is not None)
-def _bands_deferred(table: Tensor, spans: Spans, deferred: PlanesGradient | None) -> list[Tensor]:
-    return [_Band.apply(table, first, end, deferred) for first, end in spans]
-
-
-@PLANE_BANDS.implementation(FEW_OPERATIONS, types=None)
-def _bands_at_once(table: Tensor, spans: Spans, deferred: PlanesGradient | None) -> list[Tensor]:
-    return list(_Bands.apply(table, spans))
-
-
-def plane_bands(
-    table: Tensor, layout: PlanesLayout, bands: Sequence[Band], deferred: PlanesGradient | None = None
-) -> list[Tensor]:
-    """Return consecutive rows of factors, for regularisers, for which reading all of a large table is slow.
-
-    Args:
-        table: (E, F) entries of all factors.
-        layout: axes, resolutions and offsets of the factors.
-        bands: group, factor in the group, first row and number of rows of each band; rows are along the second axis.
-        deferred: collects the gradient of the table on the CPU, instead of autograd, as in `planes`; None for autograd.
-
-    Returns:
-        (rows, vertices along the first axis, F) entries of each band.
-    """
-    widths, spans = [], []
-    for group, index, first_row, rows in bands:
-        _, across = layout.shape(group, index)
-        first = layout.offsets[group][index] + first_row * across
-        widths.append(across)
-        spans.append((first, first + rows * across))
-    found = PLANE_BANDS((table,), table, tuple(spans), deferred)
-    return [band.view(-1, across, band.shape[1]) for band, across in zip(found, widths, strict=True)]
 
 
 def planes(

@@ -28,7 +28,8 @@ class _Thinned(torch.autograd.Function):
         sigma, draws = ctx.saved_tensors
         size = torch.zeros_like(sigma) if of_sigma is None else (of_sigma * sigma).abs()
         if of_rgb is not None:
-            size = size + torch.linalg.vector_norm(of_rgb, 1, -1)
+            red, green, blue = of_rgb.abs().unbind(-1)  # torch's norm along an axis of 3 takes fifty times as long
+            size = size + (red + green + blue)
         chance = (size / (ctx.floor * size.mean())).clamp(max=1)
         # NaN, of a gradient or where all are 0, is never below a chance; times 0 it stays NaN, which must be seen.
         factor = torch.where(draws < chance, 1 / chance, torch.zeros_like(chance))

@@ -168,15 +168,38 @@ def samples_choices(config: SamplingConfig, unlimited: tuple[int, ...] = PROPOSA
         config: the method's settings, whose time and machine count.
         unlimited: intervals of each proposal without a limit of time.
     """
-    proposals, count, suits = unlimited, NERF_SAMPLES, "there is time for it"
-    if config.max_seconds is not None and device_kind(config.machine) == "cpu":
-        time = config.max_seconds * relative_speed(config.machine) / FITTED_SECONDS
-        count = min(4 * round(FEWEST_SAMPLES / 4 * max(time, 1.0) ** 0.5), NERF_SAMPLES)
+    seconds, proposals, count, suits = _seconds(config), unlimited, NERF_SAMPLES, "there is time for it"
+    if seconds < math.inf:
+        count = min(4 * round(FEWEST_SAMPLES / 4 * max(seconds / FITTED_SECONDS, 1.0) ** 0.5), NERF_SAMPLES)
         proposals, suits = (4 * count - 16, 2 * count - 8), "that suits the time"
     return (
         Choice("num_proposal_samples", proposals, suits, "samples of proposals", " and ".join(map(str, proposals))),
         Choice("num_nerf_samples", count, suits, "samples a ray"),
     )
+
+
+def batch_choice(config: SamplingConfig, fewest: int, most: int, until: float) -> Choice:
+    """Return the samples of a training step that suit the time on a CPU, for feature planes and an occupancy grid.
+
+    Small steps are more steps, which learn more in a short time; large ones have less noise (docs/notes/learning.md).
+
+    Args:
+        config: the method's settings, whose time and machine count.
+        fewest: samples in a short time.
+        most: maximum, and the samples without a limit of time.
+        until: seconds on two threads from which on the samples grow with the time.
+    """
+    seconds = _seconds(config)
+    count = most if seconds == math.inf else min(1024 * round(fewest / 1024 * max(seconds / until, 1.0)), most)
+    suits = "there is time for it" if seconds == math.inf else "that suits the time"
+    return Choice("samples_per_batch", count, suits, "samples a step")
+
+
+def _seconds(config: SamplingConfig) -> float:
+    """Return the seconds on two threads that are worth the time; infinity without a limit, or not on a CPU."""
+    if config.max_seconds is None or device_kind(config.machine) != "cpu":
+        return math.inf
+    return config.max_seconds * relative_speed(config.machine)
 
 
 def contracted_box(config: SamplingConfig, scene: Scene) -> Tensor | None:

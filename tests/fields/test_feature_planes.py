@@ -66,9 +66,10 @@ def test_every_row_is_as_likely_in_a_band(axes: tuple[tuple[tuple[int, ...], ...
 
 
 def loss(planes: FeaturePlanes, positions: torch.Tensor) -> torch.Tensor:
-    """A look-up and a band."""
+    """A look-up, a band, and how much bands vary."""
     torch.manual_seed(1)
-    return planes(positions).square().mean() + planes.bands([(0, 0)])[0].square().mean()
+    bands = planes.bands([(0, 0)])[0].square().mean() + planes.variation([(0, 1), (1, 2)]).sum()
+    return planes(positions).square().mean() + bands
 
 
 @pytest.mark.parametrize("features", [3, 16, 32])

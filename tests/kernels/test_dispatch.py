@@ -28,7 +28,8 @@ from framework.kernels.mlp import DENSITY_NETWORK, NETWORK
 from framework.kernels.multisampled_grid import MULTISAMPLED_GRID
 from framework.kernels.multisamples import UNIT_MULTISAMPLES
 from framework.kernels.occupancy import REFRESH_OCCUPANCY, Occupancy
-from framework.kernels.planes import PLANE_BANDS, PLANES, PlanesGradient, PlanesLayout
+from framework.kernels.plane_bands import BAND_VARIATION, PLANE_BANDS
+from framework.kernels.planes import PLANES, PlanesGradient, PlanesLayout
 from framework.kernels.rigid_motion import RIGID_MOTIONS
 from framework.kernels.rows import GATHER_ROWS
 from framework.kernels.silhouettes import HOLD_BALLS, OPAQUE_SUMS, PIXELS_NEAR_BALLS, Photograph, opaque_sums
@@ -146,7 +147,8 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     MULTISAMPLED_GRID: lambda: (rand(50, 6, 4), rand(GRID.num_entries, 2), GRID, None),
     UNIT_MULTISAMPLES: lambda: (frustums(), Pattern(6 * rand(50), torch.ones(50)), BOX, True),
     PLANES: lambda: (torch.rand(50, 3), rand(LAYOUT.num_entries, 4), LAYOUT, None),
-    PLANE_BANDS: lambda: (rand(LAYOUT.num_entries, 4), ((10, 30), (50, 55)), PlanesGradient(LAYOUT)),
+    PLANE_BANDS: lambda: (rand(LAYOUT.num_entries, 4), ((10, 4, 5), (50, 1, 5)), PlanesGradient(LAYOUT)),
+    BAND_VARIATION: lambda: (rand(LAYOUT.num_entries, 4), ((10, 4, 5), (50, 1, 5)), PlanesGradient(LAYOUT)),
     NETWORK: lambda: ([rand(9, 5), rand(9, 2)], [rand(8, 7), rand(3, 8)], "sigmoid", [rand(8), rand(3)]),
     DENSITY_NETWORK: lambda: ([rand(40, 5), rand(40, 2)], [rand(8, 7), rand(3, 8) * 9 - 5], [rand(8), rand(3)]),
     FREQUENCY_ENCODING: lambda: (rand(9, 3), 4, True),
@@ -267,7 +269,8 @@ def test_what_is_taken() -> None:
     row = rand(4, 6)
     assert taken(ALL_FINITE, (row,), [row]) == "c++"
     assert taken(ALL_FINITE, (row.t(),), [row.t()]) == "reference"
-    assert taken(PLANE_BANDS, (table,), table, ((0, 1),), None) == "reference"
+    assert taken(PLANE_BANDS, (table,), table, ((0, 1, 1),), None) == "reference"
+    assert taken(BAND_VARIATION, (table,), table, ((0, 1, 1),), None) == "reference"
     image = CASES[BLEND]()
     image[0].requires_grad_()
     for channels, expected in ((3, "c++"), (4, "c++"), (7, "reference")):

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -30,7 +31,8 @@ from framework.kernels.intervals import (
 from framework.kernels.mlp import density_mlp, density_mlp_reference, mlp, mlp_reference
 from framework.kernels.multisampled_grid import multisampled_grid, multisampled_grid_reference
 from framework.kernels.multisamples import unit_multisamples, unit_multisamples_reference
-from framework.kernels.planes import PlanesLayout, planes, planes_reference
+from framework.kernels.plane_bands import Band, band_variation
+from framework.kernels.planes import PlanesGradient, PlanesLayout, planes, planes_reference
 from framework.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
 from framework.kernels.splat_blend import blend, blend_reference
 from framework.kernels.splat_project import SplatCamera, project_gaussians, project_reference
@@ -43,6 +45,7 @@ from tests.kernels.compiled import needs_kernels, relative_error
 pytestmark = needs_kernels
 GRID = HashGridLayout.build(3, 4, 20, 8)
 PLANES = PlanesLayout.build(((5, 6, 7), (8, 9, 10)))
+BANDS: tuple[Band, ...] = ((0, 0, 1, 3), (0, 2, 0, 7), (1, 1, 9, 1), (1, 1, 8, 2))
 OFFSETS = torch.tensor([0, 3, 3, 8, 12])
 Function = Callable[..., Tensor]
 
@@ -57,6 +60,23 @@ class Operation:
     kernels: tuple[str, ...]
     without: frozenset[str] = frozenset()
     """Inputs that are documented to have no gradient, in the reference either."""
+
+
+class DeferredVariation(torch.autograd.Function):
+    """The variation of bands whose gradient is deferred, and is then taken."""
+
+    @staticmethod
+    def forward(ctx: Any, table: Tensor) -> Tensor:
+        ctx.deferred, ctx.table = PlanesGradient(PLANES), table.detach().requires_grad_()
+        with torch.enable_grad():
+            ctx.found = band_variation(ctx.table, PLANES, BANDS, ctx.deferred)
+        return ctx.found.detach()
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        ctx.found.backward(grad)
+        found: Tensor = ctx.deferred.summed(ctx.table.detach())
+        return found
 
 
 def rand(*shape: int) -> Tensor:
@@ -181,6 +201,12 @@ OPERATIONS = {
         lambda positions, table: planes_reference(positions, table, PLANES),
         lambda: {"positions": torch.rand(20, 3), "table": rand(PLANES.num_entries, 4)},
         ("planes_forward", "planes_backward_table", "planes_backward_positions"),
+    ),
+    "band_variation": Operation(
+        lambda table: DeferredVariation.apply(table),
+        lambda table: band_variation(table, PLANES, BANDS),
+        lambda: {"table": rand(PLANES.num_entries, 4)},
+        ("band_variation", "band_variation_backward"),
     ),
     "mlp": Operation(
         network(mlp),

@@ -15,15 +15,15 @@ from torch import Tensor
 
 from framework.data.depths import read_depths
 from framework.data.scene import Scene
-from framework.encodings.planes import FeaturePlanes, squared_steps
+from framework.encodings.planes import FeaturePlanes
 from framework.evaluation.metrics import MAX_PSNR, load_lpips, psnr, ssim
 from framework.geometry.rays import Histogram, Samples
 from framework.kernels.compositing import distortion, distortion_by_pairs
+from framework.kernels.plane_bands import squared_steps, variation
 from framework.kernels.planes import PlanesLayout
 from framework.rendering.losses import depth_error, mean_squared_error
 from framework.samplers.proposal import interlevel_loss
 from methods.kplanes import METHOD, KPlanes, KPlanesConfig
-from methods.tensorf import _variation
 from tests.images import parsed
 from tests.kernels.compiled import relative_error
 from tests.stress.backends import FEW, backends
@@ -144,7 +144,7 @@ def test_total_variation_of_planes_of_any_sides(height: int, width: int, feature
     plane = torch.randn(height, width, features, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     along = [steps_by_hand(plane.tolist(), dim) for dim in (0, 1)]
     assert [squared_steps(plane, dim).item() for dim in (0, 1)] == pytest.approx(along, rel=1e-12)
-    assert _variation(plane).item() == pytest.approx(sum(along), rel=1e-12)
+    assert variation([plane]).item() == pytest.approx(sum(along), rel=1e-12)
 
 
 @pytest.fixture
@@ -157,8 +157,8 @@ def moving_planes(monkeypatch: pytest.MonkeyPatch) -> KPlanes:
     model = METHOD.build(config, scene)
     assert isinstance(model, KPlanes)
 
-    bands = FeaturePlanes.bands
-    monkeypatch.setattr(FeaturePlanes, "bands", lambda planes, factors, whole: bands(planes, factors, range(4)))
+    drawn = FeaturePlanes._drawn
+    monkeypatch.setattr(FeaturePlanes, "_drawn", lambda planes, factors, whole: drawn(planes, factors, range(4)))
     return model
 
 
@@ -198,8 +198,8 @@ def test_regularisers_of_planes_in_space_and_time(backend: str, moving_planes: K
     sum(found).backward()
     sum(truth).backward()
     slope = torch.zeros_like(planes.table) if planes.table.grad is None else planes.table.grad.clone()
-    for first, grad in planes.deferred.bands:
-        slope[first : first + len(grad)] += grad
+    if planes.deferred.pending:
+        slope += planes.deferred.summed(planes.table.detach())
     assert exact.grad is not None
     assert relative_error(slope, exact.grad) < 1e-5
 

@@ -193,9 +193,9 @@ def decide(config: TensoRFConfig, scene: Scene) -> tuple[TensoRFConfig, list[Dec
     first, last = (min(side, resolved) for side in (FIRST_SIDE, LAST_SIDE[config.decomposition]))
     decomposed = f"the decomposition is {config.decomposition}"
     pixels = f"the images have {scene.image_size} pixels along a side"
+    config, sampling = fill(config, sampler_choice(config, scene.unbounded))
     config, made = fill(
         config,
-        sampler_choice(config, scene.unbounded),
         batch_choice(config, FEWEST_SAMPLES, MOST_SAMPLES, FEWEST_UNTIL),
         Choice("density_components", density, decomposed),
         Choice("appearance_components", appearance, decomposed),
@@ -203,7 +203,7 @@ def decide(config: TensoRFConfig, scene: Scene) -> tuple[TensoRFConfig, list[Dec
         Choice("last_voxels", last**3, pixels, shown=f"{last}^3"),
     )
     config, few = decide_few_images(config, scene)
-    return config, made + few
+    return config, sampling + made + few
 
 
 def make_field(config: TensoRFConfig, scene: Scene) -> TensorField:

@@ -152,10 +152,12 @@ def test_samples_a_step_follow_the_time(
     chosen, made = declared.decide(dataclasses.replace(config, samples_per_batch=5000), scene)
     assert chosen.samples_per_batch == 5000
     assert "samples a step" not in [decision.option for decision in made]
+    unbounded, _ = declared.decide(config, dataclasses.replace(scene, unbounded=True))
+    assert (unbounded.sampler, unbounded.samples_per_batch) == ("proposal", 2**15)
 
 
 def test_samples_a_step_never_fall_with_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    config = load_method("tensorf").config
+    config = dataclasses.replace(load_method("tensorf").config, sampler="occupancy")
     for threads in (1, 2, 16):
         monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
         machine = MachineConfig(device_type="cpu")

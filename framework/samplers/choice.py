@@ -179,17 +179,18 @@ def samples_choices(config: SamplingConfig, unlimited: tuple[int, ...] = PROPOSA
 
 
 def batch_choice(config: SamplingConfig, fewest: int, most: int, until: float) -> Choice:
-    """Return the samples of a training step that suit the time on a CPU, for feature planes and an occupancy grid.
+    """Return the samples of a training step that suit the time on a CPU, for feature planes.
 
     Small steps are more steps, which learn more in a short time; large ones have less noise (docs/notes/learning.md).
+    That was measured with an occupancy grid; with proposals there are as many as without a limit of time.
 
     Args:
-        config: the method's settings, whose time and machine count.
+        config: the method's settings, with the sampler decided, whose time and machine count.
         fewest: samples in a short time.
         most: maximum, and the samples without a limit of time.
         until: seconds on two threads from which on the samples grow with the time.
     """
-    seconds = _seconds(config)
+    seconds = _seconds(config) if config.sampler == "occupancy" else math.inf
     count = most if seconds == math.inf else min(1024 * round(fewest / 1024 * max(seconds / until, 1.0)), most)
     suits = "there is time for it" if seconds == math.inf else "that suits the time"
     return Choice("samples_per_batch", count, suits, "samples a step")

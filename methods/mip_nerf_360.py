@@ -18,8 +18,8 @@ from framework.base.config import AT_LEAST_0, AUTO, Auto, Range
 from framework.base.decisions import Choice, fill
 from framework.base.device import device_kind
 from framework.base.optimised import Optimised
-from framework.encodings.hash_grid import HashGrid
 from framework.encodings.integrated import IntegratedEncoding, icosahedron_directions
+from framework.encodings.multisampled import MultisampledHashGrid
 from framework.fields.integrated import IntegratedDensity, IntegratedField
 from framework.fields.sized import SizedDensity, SizedField
 from framework.kernels.frequency import MAX_FREQUENCIES
@@ -154,7 +154,9 @@ def make_field(config: MipNeRF360Config, scene: Scene) -> Field:
             direction_frequencies=config.direction_frequencies,
         )
     unbounded = contracted_box(config, scene) is not None
-    field = SizedField(scene.box, HashGrid.of(config), config.grid_width, unbounded=unbounded)
+    sizes = config.num_levels, config.features_per_level, config.base_resolution, config.max_resolution
+    grid = MultisampledHashGrid(*sizes, config.log2_table_size, config.sparse_updates)
+    field = SizedField(scene.box, grid, config.grid_width, unbounded=unbounded)
     field.optimised = grid_optimiser(config, "grid")
     return field
 
@@ -175,7 +177,7 @@ def make_proposals(config: MipNeRF360Config, scene: Scene) -> Sequence[Field]:
     unbounded = contracted_box(config, scene) is not None
     fields = []
     for level in range(len(config.num_proposal_samples)):
-        grid = HashGrid(PROPOSAL_LEVELS, 2, PROPOSAL_BASE, COARSEST_PROPOSAL << level, PROPOSAL_TABLE)
+        grid = MultisampledHashGrid(PROPOSAL_LEVELS, 2, PROPOSAL_BASE, COARSEST_PROPOSAL << level, PROPOSAL_TABLE)
         fields.append(SizedDensity(scene.box, grid, unbounded=unbounded))
         fields[-1].optimised = grid_optimiser(config, "proposals")
     return fields

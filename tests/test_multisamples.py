@@ -118,9 +118,16 @@ def test_in_evaluation_each_second_pattern_is_the_mirror_image_turned_by_30_degr
         assert difference.abs().max().item() < 1e-9
 
 
-def test_random_patterns_are_evenly_turned_and_half_of_them_mirrored() -> None:
+@pytest.mark.parametrize("starts", ["anywhere", "along a ray", "far"])
+def test_random_patterns_are_evenly_turned_and_half_of_them_mirrored(starts: str) -> None:
+    """Whatever the starts are: of rays that begin anywhere, of small steps from one place, and far away."""
     torch.manual_seed(0)
-    turns, mirrors = random_pattern(torch.empty(40_000))
+    t = {"anywhere": 2 + 4 * torch.rand(40_000), "along a ray": 2.1 + 1e-4 * torch.arange(40_000)}
+    t["far"] = 1e6 * t["anywhere"]
+    empty = torch.empty(40_000, 3)
+    cones = Frustums(empty, empty, t[starts], t[starts], t[starts])
+    turns, mirrors = random_pattern(cones)
+    assert all(torch.equal(again, first) for again, first in zip(random_pattern(cones), (turns, mirrors), strict=True))
     assert set(mirrors.tolist()) == {-1.0, 1.0}
     assert abs(mirrors.mean().item()) < 0.03
     assert bool(((turns >= 0) & (turns <= 2 * math.pi)).all())

@@ -163,12 +163,15 @@ def test_frustums_that_shrink_to_a_point_are_points_without_size(field: Multisam
     assert features.shape == (40, 16)
 
 
-def test_patterns_are_random_in_training_only(field: MultisampledField) -> None:
+def test_patterns_are_turned_in_training_only(field: MultisampledField) -> None:
+    """By the start of a frustum: the same again for the same one."""
     frustums = cones(40)
     points = Points(frustums.origins, frustums=frustums)
-    assert torch.equal(field.density(points)[0], field.density(points)[0])
+    fixed = field.density(points)[0]
     field.train()
-    assert not torch.equal(field.density(points)[0], field.density(points)[0])
+    turned = field.density(points)[0]
+    assert not torch.equal(turned, fixed)
+    assert torch.equal(turned, field.density(points)[0])
 
 
 # -- exposures ----------------------------------------------------------------------------------------------------

@@ -11,6 +11,9 @@ from framework.encodings.hash_grid import HashGrid
 from framework.kernels.hash_grid_lookup import TableGradient
 from framework.kernels.multisampled_grid import LOOK_UP, multisampled_grid
 
+DECAYED = 8
+"""On a CPU, one in this many frustums decays in a step, at a random place, and as many times as much."""
+
 
 class MultisampledHashGrid(HashGrid):
     """A multiresolution hash grid over [0, 1]^3 that is looked up at multisamples (`framework.kernels.multisamples`).
@@ -18,7 +21,8 @@ class MultisampledHashGrid(HashGrid):
     Decay: the paper adds the mean of squares of each level's entries to the loss, so that the few entries of coarse
     levels decay as fast as the many of fine ones. Its gradient touches the whole table in each step. Here it is the
     mean of squares of each level's features at the frustums of a step, whose gradient goes through the look-up's and
-    reaches the entries that the step uses. An entry that is never used stays at its first value of 1e-4 or less.
+    reaches the entries that the step uses. An entry that is never used stays at its first value of 1e-4 or less. On a
+    CPU every eighth frustum stands for all, so that others may be without a gradient, which look-ups skip.
 
     Args:
         num_levels: number L of levels.
@@ -67,4 +71,8 @@ class _Decayed(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
         (values,) = ctx.saved_tensors
-        return torch.add(grad, values, alpha=ctx.rate), None
+        if not grad.is_cpu:  # a recorded step would always take the same rows, and gains nothing from fewer
+            return torch.add(grad, values, alpha=ctx.rate), None
+        first, total = int(torch.randint(DECAYED, ())), grad.clone()
+        total[first::DECAYED].add_(values[first::DECAYED], alpha=DECAYED * ctx.rate)
+        return total, None

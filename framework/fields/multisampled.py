@@ -45,5 +45,5 @@ def encode_frustums(field: BoxField, points: Points) -> Tensor:
     if cones is None:
         unit = field.unit(points.positions)
         return field.encoding(torch.cat([unit, torch.zeros_like(unit[:, :1])], dim=-1)[:, None])
-    pattern = random_pattern(cones.radii) if field.training else fixed_pattern(cones)
+    pattern = random_pattern(cones) if field.training else fixed_pattern(cones)
     return field.encoding(unit_multisamples(cones, pattern, field.box, field.unbounded))

@@ -7,50 +7,43 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from framework.encodings.hash_grid import HashGrid
+from framework.encodings.multisampled import MultisampledHashGrid
 from framework.fields.encoded import BoxField, DensityField, EncodedField
-from framework.geometry.bounds import contraction_scale
 from framework.geometry.points import Footprint, Points
-from framework.kernels.downweighting import level_weights
+from framework.kernels.multisamples import frustum_balls
 
 
 class SizedGrid(BoxField):
     """A field on a hash grid whose features are weighted by the size of points.
 
-    Zip-NeRF (Barron et al. 2023), section 3.1. Unlike there, a Gaussian is asked about at its mean alone, and its size
-    is that of the ball with the same volume. It is made like the class of fields that it is mixed with.
+    Zip-NeRF (Barron et al. 2023), section 3.1. Unlike there, a frustum is looked up at its mean alone, and its size is
+    that of the ball with the same volume. It is made like the class of fields that it is mixed with; its encoding is a
+    `MultisampledHashGrid`.
     """
 
-    footprint: ClassVar[Footprint] = "gaussian"
+    footprint: ClassVar[Footprint] = "frustum"
 
     def encode_points(self, points: Points) -> Tensor:
         """Return the weighted features (N, E) of the encoding.
 
         Args:
-            points: N points, with or without their size.
+            points: N points, with or without their frustums.
         """
-        grid = self.encoding
-        assert isinstance(grid, HashGrid)
-        features = self.encode(points.positions, points.times)
-        weights = level_weights(self.deviations(points), grid.resolutions)
-        return features * weights.repeat_interleave(grid.table.shape[1], dim=-1).to(features.dtype)
+        features: Tensor = self.encoding(self.balls(points)[:, None])
+        return features
 
-    @torch.no_grad()
-    def deviations(self, points: Points) -> Tensor:
-        """Return the standard deviations (N,) in units of the encoding, without a gradient.
+    def balls(self, points: Points) -> Tensor:
+        """Return positions and standard deviations (N, 4) in units of the encoding.
 
         Args:
-            points: N points; those without a size, as exports ask about, get that of half a cell of the finest level.
+            points: N points; those without a frustum, as exports ask about, get half a cell of the finest level.
         """
-        if points.variances is None:
-            assert isinstance(self.encoding, HashGrid)
-            return points.positions.new_full((len(points),), 0.5 / self.encoding.layout.resolutions[-1])
-        along, across = points.variances.log().unbind(-1)  # their product would be too small for float32
-        deviations = torch.exp((along + 2 * across) / 6) * self.scale.prod() ** (1 / 3)
-        if not self.unbounded:
-            return deviations
-        middle, half = (self.box[0] + self.box[1]) / 2, (self.box[1] - self.box[0]) / 2
-        return deviations / 2 * contraction_scale((points.positions - middle) / half)  # the box is half as wide there
+        if points.frustums is not None:
+            return frustum_balls(points.frustums, self.box, self.unbounded)
+        assert isinstance(self.encoding, MultisampledHashGrid)
+        unit = self.unit(points.positions)
+        size = 0.5 / self.encoding.layout.resolutions[-1]
+        return torch.cat([unit, torch.full_like(unit[:, :1], size)], dim=-1)
 
 
 class SizedDensity(SizedGrid, DensityField):

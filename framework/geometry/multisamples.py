@@ -24,6 +24,9 @@ NUM_MULTISAMPLES = len(THIRDS_OF_PI)
 STD_SCALE = 0.5
 """Standard deviation of a point, in units of the distance from the axis at which it lies (`sigma` in the paper)."""
 
+SCATTER = 0x9E3779B1 - 2**32
+"""Factor of the bits of a float that are hashed: 2^32 over the golden ratio (Knuth 1973, section 6.4), as an int32."""
+
 
 class Pattern(NamedTuple):
     """Rotations and mirrorings of the pattern of points in N frustums."""
@@ -34,15 +37,19 @@ class Pattern(NamedTuple):
     """(N,) -1 where it is mirrored, 1 elsewhere."""
 
 
-def random_pattern(like: Tensor) -> Pattern:
-    """Return random rotations, each mirrored with a probability of one half; for training.
+def random_pattern(frustums: Frustums) -> Pattern:
+    """Return rotations that look random, each mirrored with a probability of one half; for training.
+
+    They are a hash of the start of a frustum, which is random itself, so that those of the same frustum are the same
+    again: what a march has evaluated in waves need not be evaluated another time (`framework.kernels.kept`).
 
     Args:
-        like: (N,) tensor whose type and device are taken.
+        frustums: N frustums.
     """
-    u = torch.rand_like(like)
+    bits = frustums.t_starts.detach().float().view(torch.int32) * SCATTER  # wraps around; its upper bits are as random
+    u = ((bits >> 8) & (2**24 - 1)).to(frustums.radii) * 2.0**-24
     mirrored = (u >= 0.5).to(u)
-    return Pattern((2 * u - mirrored) * math.tau, 1 - 2 * mirrored)  # one draw for both
+    return Pattern((2 * u - mirrored) * math.tau, 1 - 2 * mirrored)  # one number for both
 
 
 def fixed_pattern(frustums: Frustums) -> Pattern:

@@ -113,14 +113,14 @@ def sample_points(rays: Rays, samples: Samples, footprint: Footprint = "none") -
         ValueError: if a footprint is to be computed and the rays have no `pixel_radii`.
     """
     ranks = samples.ranks if footprint == "frustum" else None
-    return interval_points(rays, samples.ray_indices, samples, samples.positions(rays), footprint, ranks)
+    return interval_points(rays, samples.ray_indices, samples, None, footprint, ranks)
 
 
 def interval_points(
     rays: Rays,
     owners: Tensor,
     intervals: Intervals,
-    positions: Tensor,
+    positions: Tensor | None,
     footprint: Footprint,
     ranks: Tensor | None = None,
 ) -> Points:
@@ -130,7 +130,7 @@ def interval_points(
         rays: R rays; with `pixel_radii` if a footprint is computed.
         owners: (N,) int64 index of the ray of each interval.
         intervals: N intervals along the rays.
-        positions: (N, 3) positions of the points; not used for Gaussians, whose positions are their means.
+        positions: (N, 3) positions of the points, if known; not used for Gaussians, whose positions are their means.
         footprint: kind of the points' size to compute.
         ranks: (N,) number of intervals in front of each on its ray, for frustums; None if unknown.
 
@@ -139,14 +139,17 @@ def interval_points(
     """
     times = None if rays.times is None else rays.times[owners]
     if footprint == "none":
-        return Points(positions, times)
+        return Points(rays.points(owners, intervals.t) if positions is None else positions, times)
     if rays.pixel_radii is None:
         raise ValueError("this field uses the size of its points: the rays need pixel_radii")
     radii = rays.pixel_radii.index_select(0, owners)
     if footprint == "radius":
-        return Points(positions, times, intervals.t * radii)
+        points = rays.points(owners, intervals.t) if positions is None else positions
+        return Points(points, times, intervals.t * radii)
     if footprint == "frustum":
         origins, directions = (x.index_select(0, owners) for x in (rays.origins, rays.directions))
+        if positions is None:
+            positions = torch.addcmul(origins, directions, intervals.t[:, None])
         frustums = Frustums(origins, directions, intervals.t_starts, intervals.t_ends, radii, ranks)
         return Points(positions, times, intervals.t * radii, frustums=frustums)
     mean_t, along, across = conical_frustums(intervals.t_starts, intervals.t_ends, radii)

@@ -1,16 +1,18 @@
-"""Multisamples of conical frustums in the unit cube of a grid: Zip-NeRF (Barron et al. 2023), section 3.
+"""Conical frustums in the unit cube of a grid, as six points of each, or as one ball: Zip-NeRF (Barron et al. 2023).
 
 Letters: N frustums, J points in each.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
 from framework.geometry.bounds import contract, contraction_scale
 from framework.geometry.multisamples import NUM_MULTISAMPLES, STD_SCALE, Pattern, multisamples
-from framework.geometry.points import Frustums
+from framework.geometry.points import Frustums, conical_frustums
 from framework.kernels import native
 from framework.kernels.dispatch import CPP, Operation
 
@@ -20,7 +22,11 @@ def unit_multisamples_reference(frustums: Frustums, pattern: Pattern, box: Tenso
 
     `frustums`, `pattern`, `box` and `contracted` are as in `unit_multisamples`.
     """
-    positions, deviations = multisamples(frustums, pattern)
+    return _to_unit(*multisamples(frustums, pattern), box, contracted)
+
+
+def _to_unit(positions: Tensor, deviations: Tensor, box: Tensor, contracted: bool) -> Tensor:
+    """Map positions (..., 3) and deviations (...), scene units, to the unit cube; returns (..., 4)."""
     half = (box[1] - box[0]) / 2
     x = (positions - (box[0] + box[1]) / 2) / half
     deviations = deviations.detach() / half.prod() ** (1 / 3)
@@ -57,21 +63,84 @@ UNIT_MULTISAMPLES = Operation("unit_multisamples", unit_multisamples_reference)
 # Without a gradient, which only learnt poses need: then it is torch's.
 @UNIT_MULTISAMPLES.implementation(CPP, differentiable=0)
 def _compiled(frustums: Frustums, pattern: Pattern, box: Tensor, contracted: bool) -> Tensor:
-    count, half = len(frustums), (box[1] - box[0]) / 2
+    count, inputs = len(frustums), _Inputs.of(frustums, box, contracted)
     out = frustums.t_starts.new_empty(count, NUM_MULTISAMPLES, 4)
-    # What is contracted is in half edges from the centre, everything else in edges from the corner.
-    corner, scale = ((box[0] + box[1]) / 2, 1 / half) if contracted else (box[0].clone(), 0.5 / half)
-    deviation = STD_SCALE / (half.prod() ** (1 / 3)).item() / (4 if contracted else 2)
-    rows = [x.contiguous() for x in (frustums.origins, frustums.directions)]
-    numbers = frustums.t_starts, frustums.t_ends, frustums.radii, pattern.turns.cos(), pattern.turns.sin()
-    columns = [x.contiguous() for x in (*numbers, pattern.mirrors)]
+    turned = [x.contiguous() for x in (pattern.turns.cos(), pattern.turns.sin(), pattern.mirrors)]
     _multisamples(
-        *(native.pointer(x, "rays", (count, 3)) for x in rows),
-        *(native.pointer(x, "frustums", (count,)) for x in columns),
-        count, native.pointer(corner, "the centre", (3,)), native.pointer(scale, "the scale", (3,)), deviation,
-        int(contracted), out.data_ptr(), native.threads(),
+        *inputs.frustums(), *(native.pointer(x, "the pattern", (count,)) for x in turned), count,
+        *inputs.map(STD_SCALE), out.data_ptr(), native.threads(),
     )  # fmt: skip
     return out
 
 
+def frustum_balls_reference(frustums: Frustums, box: Tensor, contracted: bool) -> Tensor:
+    """Compute `frustum_balls` of `frustums`, `box` and `contracted` in PyTorch, on any device, for any float type."""
+    mean_t, along, across = conical_frustums(frustums.t_starts, frustums.t_ends, frustums.radii)
+    positions = torch.addcmul(frustums.origins, frustums.directions, mean_t[:, None])
+    # The product of the variances would be too small for float32.
+    deviations = torch.exp((along.log() + 2 * across.log()) / 6)
+    return _to_unit(positions, deviations, box, contracted)
+
+
+def frustum_balls(frustums: Frustums, box: Tensor, contracted: bool) -> Tensor:
+    """Return a ball for each of N conical frustums, mapped to the unit cube, with its standard deviation.
+
+    It is the isotropic Gaussian with the mean and the volume of the frustum's own (Mip-NeRF, equation 7); its deviation
+    is scaled by the cube root of the determinant of the map's Jacobian (`bounds.contraction_scale`).
+
+    Args:
+        frustums: N frustums.
+        box: (2, 3) corners of the scene's box.
+        contracted: whether all of space is contracted into the cube, as in `unit_multisamples`.
+
+    Returns:
+        (N, 4) positions and standard deviations; no gradient goes through the deviations.
+    """
+    tensors = frustums.origins, frustums.directions, frustums.t_starts, frustums.t_ends, frustums.radii, box
+    return FRUSTUM_BALLS(tensors, frustums, box, contracted)
+
+
+FRUSTUM_BALLS = Operation("frustum_balls", frustum_balls_reference)
+
+
+@FRUSTUM_BALLS.implementation(CPP, differentiable=0)
+def _compiled_balls(frustums: Frustums, box: Tensor, contracted: bool) -> Tensor:
+    count, inputs = len(frustums), _Inputs.of(frustums, box, contracted)
+    out = frustums.t_starts.new_empty(count, 4)
+    _balls(*inputs.frustums(), count, *inputs.map(1.0), out.data_ptr(), native.threads())
+    return out
+
+
+class _Inputs(NamedTuple):
+    """What both kernels read."""
+
+    rows: list[Tensor]
+    columns: list[Tensor]
+    centre: Tensor
+    scale: Tensor
+    deviation: float
+    contracted: bool
+
+    @classmethod
+    def of(cls, frustums: Frustums, box: Tensor, contracted: bool) -> _Inputs:
+        half = (box[1] - box[0]) / 2
+        # What is contracted is in half edges from the centre, everything else in edges from the corner.
+        centre, scale = ((box[0] + box[1]) / 2, 1 / half) if contracted else (box[0].clone(), 0.5 / half)
+        deviation = 1 / (half.prod() ** (1 / 3)).item() / (4 if contracted else 2)
+        rows = [x.contiguous() for x in (frustums.origins, frustums.directions)]
+        columns = [x.contiguous() for x in (frustums.t_starts, frustums.t_ends, frustums.radii)]
+        return cls(rows, columns, centre, scale, deviation, contracted)
+
+    def frustums(self) -> list[int]:
+        count = len(self.columns[0])
+        rows = [native.pointer(x, "rays", (count, 3)) for x in self.rows]
+        return rows + [native.pointer(x, "frustums", (count,)) for x in self.columns]
+
+    def map(self, deviation: float) -> tuple[int, int, float, int]:
+        """Return the map to the unit cube, where a deviation is `deviation` times what it is without the map."""
+        centre, scale = native.pointer(self.centre, "the centre", (3,)), native.pointer(self.scale, "the scale", (3,))
+        return centre, scale, deviation * self.deviation, int(self.contracted)
+
+
 _multisamples = native.Function("multisamples", "ppppppppqppfipi")
+_balls = native.Function("frustum_balls", "pppppqppfipi")

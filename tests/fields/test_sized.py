@@ -5,6 +5,7 @@ import torch
 
 from framework.encodings.hash_grid import HashGrid
 from framework.encodings.integrated import IntegratedEncoding
+from framework.encodings.multisampled import MultisampledHashGrid
 from framework.fields.base import Field
 from framework.fields.encoded import EncodedField
 from framework.fields.integrated import IntegratedDensity, IntegratedField
@@ -15,19 +16,19 @@ from framework.geometry.rays import Rays, Samples
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 
 
-def grid(levels: int = 3) -> HashGrid:
+def grid(levels: int = 3) -> MultisampledHashGrid:
     torch.manual_seed(0)
-    made = HashGrid(levels, 2, 4, 64, 12)
+    made = MultisampledHashGrid(levels, 2, 4, 64, 12)
     made.table.data.uniform_(-1, 1)
     return made
 
 
-def cones(radius: float, count: int = 40, length: float = 0.01, far: float = 1.0) -> Points:
+def cones(field: Field, radius: float, count: int = 40, length: float = 0.01, far: float = 1.0) -> Points:
     torch.manual_seed(1)
     directions = torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
     rays = Rays(torch.rand(count, 3) - 0.5, directions, pixel_radii=torch.full((count,), radius))
     starts = far * (0.2 + 0.2 * torch.rand(count, 1))
-    return sample_points(rays, Samples.regular(starts, starts + length * far), "gaussian")
+    return sample_points(rays, Samples.regular(starts, starts + length * far), field.footprint)
 
 
 def fields(unbounded: bool = False) -> list[Field]:
@@ -47,7 +48,7 @@ def test_small_cones_are_points_and_large_ones_are_blurred(unbounded: bool) -> N
     for field in fields(unbounded):
         found = {}
         for radius in (1e-6, 1e-5, 0.3, 30.0):
-            sigma, features = field.density(cones(radius, length=1e-5))
+            sigma, features = field.density(cones(field, radius, length=1e-5))
             assert sigma.shape == (40,)
             assert bool((sigma >= 0).all())
             found[radius] = features.detach() if isinstance(field, (SizedDensity, IntegratedField)) else sigma.detach()
@@ -57,29 +58,28 @@ def test_small_cones_are_points_and_large_ones_are_blurred(unbounded: bool) -> N
 
 @pytest.mark.parametrize("unbounded", [False, True])
 def test_an_unsized_grid_is_the_limit_of_points(unbounded: bool) -> None:
-    sized, plain = SizedField(BOX, grid(), unbounded=unbounded), EncodedField(BOX, grid(), unbounded=unbounded)
+    sized, plain = (
+        SizedField(BOX, grid(), unbounded=unbounded),
+        EncodedField(BOX, HashGrid(3, 2, 4, 64, 12), unbounded=unbounded),
+    )
     plain.load_state_dict(sized.state_dict())
-    points = cones(1e-7, length=1e-7, far=5.0)
+    points = cones(sized, 1e-7, length=1e-7, far=5.0)
     torch.testing.assert_close(sized.density(points)[0], plain.density(points)[0], rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("unbounded", [False, True])
-def test_sizes_in_a_grid_are_in_its_units(unbounded: bool) -> None:
-    """A ball of a tenth of the box's edge in its middle: a tenth of the grid, or a twentieth where all space fits."""
+def test_positions_alone_have_half_a_cell(unbounded: bool) -> None:
     field = SizedField(BOX * 5, grid(), unbounded=unbounded)
-    ball = Points(torch.zeros(1, 3)).sized(1.0)
-    assert field.deviations(ball).item() == pytest.approx(0.05 if unbounded else 0.1)
-    assert field.deviations(Points(torch.zeros(2, 3))).tolist() == pytest.approx([0.5 / 64] * 2)
-    if unbounded:  # at distance 10 of the half edge: (2 - 1/10) / 10 across, 1 / 100 along
-        far = Points(torch.tensor([[50.0, 0.0, 0.0]])).sized(1.0)
-        assert field.deviations(far).item() == pytest.approx(0.05 * (0.19 * 0.19 * 0.01) ** (1 / 3), rel=1e-4)
+    balls = field.balls(Points(torch.tensor([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]])))
+    assert balls[:, :3].flatten().tolist() == pytest.approx([0.5] * 3 + [0.75 if unbounded else 1.0, 0.5, 0.5])
+    assert balls[:, 3].tolist() == pytest.approx([0.5 / 64] * 2)
 
 
 @pytest.mark.parametrize("unbounded", [False, True])
 @pytest.mark.parametrize("far", [1.0, 1e4])
 def test_values_and_gradients_are_finite_and_colours_reach_black_and_white(unbounded: bool, far: float) -> None:
     for field in fields(unbounded):
-        points = cones(0.01, length=1.0, far=far)
+        points = cones(field, 0.01, length=1.0, far=far)
         sigma, features = field.density(points)
         total = sigma.sum()
         if isinstance(field, (IntegratedField, SizedField)):

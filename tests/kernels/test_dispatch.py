@@ -26,7 +26,7 @@ from framework.kernels.intervals import INTERVAL_WEIGHTS, PROPOSAL_EXCESS, RESAM
 from framework.kernels.march import MARCH, SORT_BY_RAY, March, march
 from framework.kernels.mlp import DENSITY_NETWORK, NETWORK
 from framework.kernels.multisampled_grid import MULTISAMPLED_GRID
-from framework.kernels.multisamples import UNIT_MULTISAMPLES
+from framework.kernels.multisamples import FRUSTUM_BALLS, UNIT_MULTISAMPLES
 from framework.kernels.occupancy import REFRESH_OCCUPANCY, Occupancy
 from framework.kernels.plane_bands import BAND_VARIATION, PLANE_BANDS
 from framework.kernels.planes import PLANES, PlanesGradient, PlanesLayout
@@ -146,6 +146,7 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     HASH_GRID: lambda: (torch.rand(50, 3), rand(GRID.num_entries, 2), GRID, None),
     MULTISAMPLED_GRID: lambda: (rand(50, 6, 4), rand(GRID.num_entries, 2), GRID, None),
     UNIT_MULTISAMPLES: lambda: (frustums(), Pattern(6 * rand(50), torch.ones(50)), BOX, True),
+    FRUSTUM_BALLS: lambda: (frustums(), BOX, True),
     PLANES: lambda: (torch.rand(50, 3), rand(LAYOUT.num_entries, 4), LAYOUT, None),
     PLANE_BANDS: lambda: (rand(LAYOUT.num_entries, 4), ((10, 4, 5), (50, 1, 5)), PlanesGradient(LAYOUT)),
     BAND_VARIATION: lambda: (rand(LAYOUT.num_entries, 4), ((10, 4, 5), (50, 1, 5)), PlanesGradient(LAYOUT)),

@@ -30,7 +30,12 @@ from framework.kernels.intervals import (
 )
 from framework.kernels.mlp import density_mlp, density_mlp_reference, mlp, mlp_reference
 from framework.kernels.multisampled_grid import multisampled_grid, multisampled_grid_reference
-from framework.kernels.multisamples import unit_multisamples, unit_multisamples_reference
+from framework.kernels.multisamples import (
+    frustum_balls,
+    frustum_balls_reference,
+    unit_multisamples,
+    unit_multisamples_reference,
+)
 from framework.kernels.plane_bands import Band, band_variation
 from framework.kernels.planes import PlanesGradient, PlanesLayout, planes, planes_reference
 from framework.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
@@ -195,6 +200,20 @@ OPERATIONS = {
             "box": torch.tensor([[-1.0] * 3, [1.0, 2.0, 1.5]]),
         },
         ("multisamples",),
+    ),
+    "frustum balls": Operation(
+        lambda origins, directions, starts, lengths, box: frustum_balls(
+            Frustums(origins, directions, starts, starts + lengths, torch.full_like(starts, 0.1)), box, True
+        ),
+        lambda origins, directions, starts, lengths, box: frustum_balls_reference(
+            Frustums(origins, directions, starts, starts + lengths, torch.full_like(starts, 0.1)), box, True
+        ),
+        lambda: {
+            "origins": torch.randn(20, 3), "directions": torch.nn.functional.normalize(torch.randn(20, 3), dim=-1),
+            "starts": torch.rand(20), "lengths": 0.1 + torch.rand(20),
+            "box": torch.tensor([[-1.0] * 3, [1.0, 2.0, 1.5]]),
+        },
+        ("frustum_balls",),
     ),
     "planes": Operation(
         lambda positions, table: planes(positions, table, PLANES),

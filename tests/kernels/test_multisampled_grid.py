@@ -4,13 +4,20 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.encodings.multisampled import MultisampledHashGrid
+from framework.encodings.multisampled import DECAYED, MultisampledHashGrid, _Decayed
+from framework.geometry.bounds import to_unit_box
 from framework.geometry.multisamples import fixed_pattern, random_pattern
 from framework.geometry.points import Frustums
+from framework.kernels.contraction import contract_to_unit_reference
 from framework.kernels.hash_grid import HashGridLayout, hash_grid_reference
 from framework.kernels.hash_grid_lookup import TableGradient
 from framework.kernels.multisampled_grid import LOOK_UP, multisampled_grid, multisampled_grid_reference
-from framework.kernels.multisamples import unit_multisamples, unit_multisamples_reference
+from framework.kernels.multisamples import (
+    frustum_balls,
+    frustum_balls_reference,
+    unit_multisamples,
+    unit_multisamples_reference,
+)
 from tests.kernels.compiled import needs_kernels, relative_error
 
 LAYOUT = HashGridLayout.build(num_levels=4, base_resolution=4, max_resolution=300, log2_table_size=9)
@@ -103,7 +110,8 @@ def test_a_step_of_adam_moves_the_entries_that_were_used() -> None:
     assert torch.equal(grid.table[~used], before[~used])
 
 
-def test_the_decay_is_the_gradient_of_the_mean_square_of_each_levels_features() -> None:
+def test_the_decay_is_the_gradient_of_the_mean_square_of_each_levels_features(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the mean over the places at which every eighth frustum is taken; one place alone leaves the others be."""
     torch.manual_seed(0)
     grids = [MultisampledHashGrid(4, 2, 4, 300, 9, decay=decay) for decay in (0.0, 0.1)]
     x = points(40, 6, 0.01)
@@ -112,15 +120,22 @@ def test_the_decay_is_the_gradient_of_the_mean_square_of_each_levels_features() 
     plain, decayed = (grid(x) for grid in grids)
     assert torch.equal(plain, decayed)
     (plain.sum() + 0.1 * plain.view(40, 4, 2).square().mean((0, 2)).sum()).backward()
-    decayed.sum().backward()
+    total, places = torch.zeros_like(grids[1].table), iter(range(DECAYED))
+    monkeypatch.setattr(torch, "randint", lambda high, size: torch.tensor(next(places)))
+    for place in range(DECAYED):
+        features = grids[1](x).detach().requires_grad_()
+        weighed = _Decayed.apply(features, 1.0)
+        (grad,) = torch.autograd.grad(weighed, features, torch.zeros_like(features))
+        assert grad.any(-1).nonzero().flatten().tolist() == list(range(place, 40, DECAYED))
+    places = iter(range(DECAYED))
+    for _ in range(DECAYED):
+        (grad,) = torch.autograd.grad(grids[1](x).sum(), grids[1].table)
+        total += grad / DECAYED
     assert grids[0].table.grad is not None
-    assert grids[1].table.grad is not None
-    assert relative_error(grids[1].table.grad, grids[0].table.grad) < 1e-6
+    assert relative_error(total, grids[0].table.grad) < 1e-6
     grids[1].eval()
-    grids[1].table.grad = None
-    grids[1](x).sum().backward()
-    truth = torch.autograd.grad(grids[0](x).sum(), grids[0].table)[0]
-    assert torch.equal(grids[1].table.grad, truth)
+    still, truth = (torch.autograd.grad(grid(x).sum(), grid.table)[0] for grid in grids[::-1])
+    assert torch.equal(still, truth)
 
 
 def test_wrong_shapes_are_named() -> None:
@@ -162,7 +177,7 @@ def frustums(count: int) -> Frustums:
 def test_compiled_points_are_the_references(contracted: bool) -> None:
     torch.manual_seed(0)
     cones = frustums(203)
-    for pattern in (fixed_pattern(cones), random_pattern(cones.radii)):
+    for pattern in (fixed_pattern(cones), random_pattern(cones)):
         found = unit_multisamples(cones, pattern, BOX, contracted)
         double = Frustums(*(x.double() for x in vars(cones).values() if x is not None))
         turned = type(pattern)(*(x.double() for x in pattern))
@@ -172,10 +187,48 @@ def test_compiled_points_are_the_references(contracted: bool) -> None:
         torch.testing.assert_close(found[..., 3].double(), truth[..., 3], rtol=2e-5, atol=1e-30)
 
 
-def test_learnt_rays_have_the_references_gradient() -> None:
+@needs_kernels
+@pytest.mark.parametrize("contracted", [True, False])
+def test_compiled_balls_are_the_references(contracted: bool) -> None:
+    cones = frustums(203)
+    double = Frustums(*(x.double() for x in vars(cones).values() if x is not None))
+    found, truth = frustum_balls(cones, BOX, contracted), frustum_balls_reference(double, BOX.double(), contracted)
+    size = truth[:, :3].abs().amax(1, keepdim=True).clamp(min=1)
+    assert ((found[:, :3] - truth[:, :3]).abs() / size).max().item() < 2e-6
+    torch.testing.assert_close(found[:, 3].double(), truth[:, 3], rtol=2e-5, atol=1e-30)
+
+
+@pytest.mark.parametrize("contracted", [True, False])
+def test_a_ball_has_the_mean_and_the_volume_of_points_in_its_frustum(contracted: bool) -> None:
+    """Against the covariance of a million points, mapped to the cube; the frustum is small where space is bent."""
+    generator = torch.Generator().manual_seed(0)
+    direction = torch.nn.functional.normalize(torch.tensor([1.0, 2.0, -1.0]), dim=0)
+    near, far, radius, count = (3.0, 3.1, 0.02, 1_000_000) if contracted else (0.5, 1.5, 0.3, 1_000_000)
+    cone = Frustums(torch.zeros(1, 3), direction[None], *(torch.tensor([x]) for x in (near, far, radius)))
+    # Uniform in the volume: the cube of the distance, and the square of the distance from the axis.
+    u, v, angle = torch.rand(3, count, dtype=torch.float64, generator=generator)
+    t = (near**3 + (far**3 - near**3) * u) ** (1 / 3)
+    away, turn = radius * t * v.sqrt(), 2 * torch.pi * angle
+    axis = direction.double()
+    first = torch.nn.functional.normalize(torch.linalg.cross(axis, torch.eye(3, dtype=torch.float64)[0]), dim=0)
+    second = torch.linalg.cross(axis, first)
+    x = t[:, None] * axis + (away * turn.cos())[:, None] * first + (away * turn.sin())[:, None] * second
+    to_unit = contract_to_unit_reference if contracted else to_unit_box
+    unit = to_unit(x, BOX.double())
+    deviation = unit.T.cov().det() ** (1 / 6)
+    found = frustum_balls(cone, BOX, contracted)[0].double()
+    torch.testing.assert_close(found[:3], unit.mean(0), rtol=0, atol=1e-3)
+    assert found[3].item() == pytest.approx(deviation.item(), rel=0.01)
+
+
+@pytest.mark.parametrize("form", ["points", "ball"])
+def test_learnt_rays_have_the_references_gradient(form: str) -> None:
     cones = frustums(10)
     origins = cones.origins.clone().requires_grad_()
     learnt = Frustums(origins, cones.directions, cones.t_starts, cones.t_ends, cones.radii)
-    x = unit_multisamples(learnt, fixed_pattern(cones), BOX, False)
+    if form == "ball":
+        x, each = frustum_balls(learnt, BOX, False), 1
+    else:
+        x, each = unit_multisamples(learnt, fixed_pattern(cones), BOX, False), 6
     (grad,) = torch.autograd.grad(x.sum(), origins)
-    torch.testing.assert_close(grad, (6 / (BOX[1] - BOX[0])).expand(10, 3))
+    torch.testing.assert_close(grad, (each / (BOX[1] - BOX[0])).expand(10, 3))

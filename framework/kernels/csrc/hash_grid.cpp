@@ -42,7 +42,7 @@ void scatter_level(const Level& level, const float* positions, int64_t count, co
     }
 }
 
-// Where samples with a gradient stand: in their order, those of which some feature's is not zero.
+// Where samples with a gradient stand, in their order.
 struct Live {
     std::vector<const float*> points, grads;
 
@@ -51,15 +51,12 @@ struct Live {
         const size_t most = parts ? size_t(ends[parts - 1]) : 0;
         points.reserve(most);
         grads.reserve(most);
+        std::vector<int64_t> rows;
         for (int part = 0; part < parts; part++) {
-            const int64_t count = ends[part] - (part ? ends[part - 1] : 0);
-            for (int64_t n = 0; n < count; n++) {
-                const float* grad = all[part] + n * stride;
-                int64_t f = 0;
-                while (f < stride && grad[f] == 0) f++;
-                if (f == stride) continue;
+            rows_with_gradient(all[part], ends[part] - (part ? ends[part - 1] : 0), stride, rows);
+            for (const int64_t n : rows) {
                 points.push_back(positions[part] + n * 3);
-                grads.push_back(grad);
+                grads.push_back(all[part] + n * stride);
             }
         }
     }

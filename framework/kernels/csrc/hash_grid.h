@@ -162,6 +162,17 @@ inline void add_position_gradient(const Level& level, const float* table, const 
     }
 }
 
+// Fills `out` with the numbers of those of `count` rows, `stride` wide, of which some gradient is not zero (or is NaN).
+inline void rows_with_gradient(const float* grads, int64_t count, int64_t stride, std::vector<int64_t>& out) {
+    out.clear();
+    for (int64_t n = 0; n < count; n++) {
+        const float* grad = grads + n * stride;
+        int64_t f = 0;
+        while (f < stride && grad[f] == 0) f++;
+        if (f < stride) out.push_back(n);
+    }
+}
+
 // Adds the gradient of each level to `table`. Levels are shared out over threads, so that no two write to the same entry
 // and the order of sums never changes. samples.scatter_to(level, l, first) adds that of level l, from its first entry on.
 template <int F, typename Samples>

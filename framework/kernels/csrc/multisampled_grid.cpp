@@ -21,17 +21,22 @@ struct Point {
     Floats xyz[3], deviation;
 };
 
-// Fills `out` with the points of samples [first, first + size), `points` being (count, per_sample, 4).
-inline void load_points(const float* points, int per_sample, int64_t first, int size, Point* out) {
+// Fills `out` with the points of `size` samples, `points` being (count, per_sample, 4); `row(s)`: which the s-th is.
+template <typename Row>
+inline void load_points(const float* points, int per_sample, int size, Point* out, const Row& row) {
     for (int j = 0; j < per_sample; j++) {
         alignas(64) float lanes[4][LANES] = {};
         for (int s = 0; s < size; s++) {
-            const float* from = points + ((first + s) * per_sample + j) * 4;
+            const float* from = points + (row(s) * per_sample + j) * 4;
             for (int i = 0; i < 4; i++) lanes[i][s] = from[i];
         }
         for (int axis = 0; axis < 3; axis++) out[j].xyz[axis] = load(lanes[axis]);
         out[j].deviation = load(lanes[3]);
     }
+}
+
+inline void load_points(const float* points, int per_sample, int64_t first, int size, Point* out) {
+    load_points(points, per_sample, size, out, [&](int s) { return first + s; });
 }
 
 // erf of x >= 0: Abramowitz and Stegun 1964, 7.1.26, whose error is at most 1.5e-7, and the series for small x.
@@ -135,20 +140,12 @@ void forward(const float* positions, int64_t count, int per_sample, const float*
     });
 }
 
+// `grad`: that of this level, (count, F).
 template <int F, bool DENSE>
 void scatter_level(const Level& level, const Point* points, int per_sample, int64_t count, const float* grad,
                    float* table) {
-    for (int64_t n = 0; n < count; n += LANES, points += per_sample) {
-        const int size = block(n, count);
-        bool zero[LANES], all_zero = true;
-        for (int s = 0; s < size; s++) {
-            zero[s] = true;
-            for (int f = 0; f < F; f++) zero[s] &= grad[(n + s) * F + f] == 0;
-            all_zero &= zero[s];
-        }
-        if (all_zero) continue;
-        for_runs<F, DENSE>(level, points, per_sample, size, table, [&](const Cell& cell, int s) {
-            if (zero[s]) return;
+    for (int64_t n = 0; n < count; n += LANES, points += per_sample)
+        for_runs<F, DENSE>(level, points, per_sample, block(n, count), table, [&](const Cell& cell, int s) {
             float g[F];
             std::memcpy(g, grad + (n + s) * F, sizeof g);
             for (int c = 0; c < CORNERS; c++) {
@@ -156,11 +153,10 @@ void scatter_level(const Level& level, const Point* points, int per_sample, int6
                 for (int f = 0; f < F; f++) entry[f] += cell.weight[c][s] * g[f];
             }
         });
-    }
 }
 
-// Samples that come in parts, each with its own number of points a sample: points in blocks of LANES samples, and the
-// incoming gradient level by level.
+// Samples with a gradient, which come in parts, each with its own number of points a sample: points in blocks of LANES
+// samples, and the incoming gradient level by level.
 template <int F>
 struct Gathered {
     struct Part {
@@ -175,18 +171,21 @@ struct Gathered {
     Gathered(const float* const* points, const float* const* grads, const int64_t* ends, const int64_t* per_sample,
              int count, int levels, int threads) {
         const int64_t stride = int64_t(levels) * F;
+        std::vector<int64_t> live;
         for (int i = 0; i < count; i++) {
-            const int64_t size = ends[i] - (i ? ends[i - 1] : 0);
+            rows_with_gradient(grads[i], ends[i] - (i ? ends[i - 1] : 0), stride, live);
+            const int64_t size = int64_t(live.size());
             const int own = int(per_sample[i]);
             Part part{size, own, std::unique_ptr<Point[]>(new Point[size_t((size + LANES - 1) / LANES * own)]),
                       std::unique_ptr<float[]>(new float[size_t(size * stride)])};
             for_ranges(threads, size, CHUNK, [&](int64_t begin, int64_t end) {
                 for (int64_t n = begin; n < end; n += LANES)
-                    load_points(points[i], own, n, block(n, end), part.points.get() + n / LANES * own);
+                    load_points(points[i], own, block(n, end), part.points.get() + n / LANES * own,
+                                [&](int s) { return live[size_t(n + s)]; });
                 for (int64_t n = begin; n < end; n++)
                     for (int l = 0; l < levels; l++)
-                        std::memcpy(part.by_level.get() + (l * size + n) * F, grads[i] + n * stride + l * F,
-                                    sizeof(float) * F);
+                        std::memcpy(part.by_level.get() + (l * size + n) * F,
+                                    grads[i] + live[size_t(n)] * stride + l * F, sizeof(float) * F);
             });
             parts.push_back(std::move(part));
         }

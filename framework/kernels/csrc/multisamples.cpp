@@ -1,4 +1,5 @@
-// Points in conical frustums, in the unit cube of a grid (Zip-NeRF). See ../multisamples.py for the reference.
+// Points in conical frustums, in the unit cube of a grid (Zip-NeRF): several in each, or one ball of its volume. See
+// ../multisamples.py for the references.
 #include "common.h"
 
 #include <algorithm>
@@ -68,6 +69,44 @@ inline void contract(Floats* x, Floats& shrunk) {
     shrunk = power * power;
 }
 
+// What rays and intervals say of LANES frustums.
+struct Frustums {
+    Floats origin[3], direction[3], start, end, radius;
+};
+
+inline Frustums load_frustums(const float* origins, const float* directions, const float* t_starts, const float* t_ends,
+                              const float* radii, int64_t first, int size) {
+    Frustums out;
+    load_rows(origins, first, size, out.origin);
+    load_rows(directions, first, size, out.direction);
+    out.start = load_some(t_starts, first, size), out.end = load_some(t_ends, first, size);
+    out.radius = load_some(radii, first, size);
+    return out;
+}
+
+// The map from the scene to the unit cube.
+struct Map {
+    const float *centre, *scale;
+    float deviation_scale;
+    bool contracted;
+
+    // Writes (x, y, z, deviation) of one point of each of `size` frustums, `stride` floats apart.
+    void write(Floats* x, Floats deviation, int size, float* out, int stride) const {
+        for (int axis = 0; axis < 3; axis++) x[axis] = (x[axis] - centre[axis]) * scale[axis];
+        deviation *= deviation_scale;
+        if (contracted) {
+            Floats shrunk;
+            contract(x, shrunk);
+            deviation *= shrunk;
+        }
+        alignas(64) float lanes[4][LANES];
+        for (int axis = 0; axis < 3; axis++) store(lanes[axis], x[axis]);
+        store(lanes[3], deviation);
+        for (int s = 0; s < size; s++)
+            for (int i = 0; i < 4; i++) out[s * stride + i] = lanes[i][s];
+    }
+};
+
 }  // namespace
 
 // 6 points (x, y, z, deviation) in each of `count` frustums. `cosines` and `sines` are those of the pattern's rotation,
@@ -78,43 +117,56 @@ EXPORT int multisamples(const float* origins, const float* directions, const flo
                         int64_t count, const float* centre, const float* scale, float deviation_scale, int contracted,
                         float* out, int threads) {
     return guarded([&] {
+        const Map map{centre, scale, deviation_scale, contracted != 0};
         for_each(threads, (count + LANES - 1) / LANES, 1024 / LANES, [&](int64_t b) {
             const int64_t n = b * LANES;
             const int size = int(std::min<int64_t>(LANES, count - n));
-            Floats o[3], d[3], first[3], second[3];
-            load_rows(origins, n, size, o);
-            load_rows(directions, n, size, d);
-            const Floats start = load_some(t_starts, n, size), end = load_some(t_ends, n, size);
-            const Floats radius = load_some(radii, n, size), mirror = load_some(mirrors, n, size);
+            const Frustums cones = load_frustums(origins, directions, t_starts, t_ends, radii, n, size);
+            const Floats *o = cones.origin, *d = cones.direction, mirror = load_some(mirrors, n, size);
             const Floats cosine = load_some(cosines, n, size), sine = load_some(sines, n, size);
+            Floats first[3], second[3];
             const Floats sign = d[2] < 0 ? splat(-1) : splat(1), a = -1.0f / (sign + d[2]), xy = d[0] * d[1] * a;
             first[0] = 1.0f + sign * d[0] * d[0] * a, first[1] = sign * xy, first[2] = -sign * d[0];
             second[0] = xy, second[1] = sign + d[1] * d[1] * a, second[2] = -d[1];
-            const Floats middle = 0.5f * start + 0.5f * end, half = 0.5f * end - 0.5f * start;
+            const Floats middle = 0.5f * cones.start + 0.5f * cones.end, half = 0.5f * cones.end - 0.5f * cones.start;
             const Floats share = middle > 0 ? half / middle : splat(0), squared = share * share;
             const Floats base = (1.0f + share) * (1.0f + share) + 2.0f, step = half / (squared + 3.0f);
             const Floats spread = SPREAD * root((squared - 1.0f) * (squared - 1.0f) + 4.0f);
             for (int j = 0; j < POINTS; j++) {
                 const float along = float(2 * j - (POINTS - 1)) / (POINTS - 1);
-                const Floats t = start + step * (base + along * spread), away = radius * t * ROOT_HALF;
+                const Floats t = cones.start + step * (base + along * spread), away = cones.radius * t * ROOT_HALF;
                 const Floats u = away * (COSINES[j] * cosine - SINES[j] * sine);
                 const Floats v = away * (SINES[j] * cosine + COSINES[j] * sine) * mirror;
-                Floats x[3], deviation = away * deviation_scale;
-                for (int axis = 0; axis < 3; axis++)
-                    x[axis] = (o[axis] + t * d[axis] + u * first[axis] + v * second[axis] - centre[axis]) * scale[axis];
-                if (contracted) {
-                    Floats shrunk;
-                    contract(x, shrunk);
-                    deviation *= shrunk;
-                }
-                alignas(64) float lanes[4][LANES];
-                for (int axis = 0; axis < 3; axis++) store(lanes[axis], x[axis]);
-                store(lanes[3], deviation);
-                for (int s = 0; s < size; s++) {
-                    float* to = out + ((n + s) * POINTS + j) * 4;
-                    for (int i = 0; i < 4; i++) to[i] = lanes[i][s];
-                }
+                Floats x[3];
+                for (int axis = 0; axis < 3; axis++) x[axis] = o[axis] + t * d[axis] + u * first[axis] + v * second[axis];
+                map.write(x, away, size, out + (n * POINTS + j) * 4, POINTS * 4);
             }
+        });
+    });
+}
+
+// (x, y, z, deviation) of the ball that stands for each of `count` frustums; the map is as in multisamples.
+EXPORT int frustum_balls(const float* origins, const float* directions, const float* t_starts, const float* t_ends,
+                         const float* radii, int64_t count, const float* centre, const float* scale,
+                         float deviation_scale, int contracted, float* out, int threads) {
+    return guarded([&] {
+        const Map map{centre, scale, deviation_scale, contracted != 0};
+        for_each(threads, (count + LANES - 1) / LANES, 1024 / LANES, [&](int64_t b) {
+            const int64_t n = b * LANES;
+            const int size = int(std::min<int64_t>(LANES, count - n));
+            const Frustums cones = load_frustums(origins, directions, t_starts, t_ends, radii, n, size);
+            const Floats middle = 0.5f * cones.start + 0.5f * cones.end, half = 0.5f * cones.end - 0.5f * cones.start;
+            const Floats share = middle > 0 ? half / middle : splat(0), squared = share * share;
+            const Floats total = 3.0f + squared, part = squared / total;
+            const Floats t = middle * (1.0f + 2.0f * part);
+            // Roots of the variances: half^2 and middle^2 would overflow.
+            const Floats along = half * root(1.0f / 3 - (4.0f / 15) * part * (12.0f - squared) / total);
+            const Floats across =
+                cones.radius * middle * root(0.25f + (5.0f / 12) * squared - (4.0f / 15) * squared * part);
+            const Floats deviation = cube_root(along) * cube_root(across) * cube_root(across);
+            Floats x[3];
+            for (int axis = 0; axis < 3; axis++) x[axis] = cones.origin[axis] + t * cones.direction[axis];
+            map.write(x, deviation, size, out + n * 4, 4);
         });
     });
 }

@@ -49,6 +49,7 @@ class ZipNeRFConfig(
     num_steps=256,
     num_levels=8,
     features_per_level=4,
+    thin_gradients=0.5,
 ):
     """Settings of zip-nerf; those not given depend on the scene."""
 

@@ -14,12 +14,15 @@ from framework.fields.appearance import affine_colors, exposed
 from framework.fields.multisampled import MultisampledField
 from framework.geometry.multisamples import Pattern
 from framework.geometry.points import Frustums, Points
+from framework.kernels import native
+from framework.kernels.kept import Waves
 from framework.kernels.multisampled_grid import multisampled_grid_reference
 from framework.kernels.multisamples import unit_multisamples_reference
 from framework.rendering.volume import VolumeRenderer
 from framework.tools.testing import check_method
 from framework.training.trainer import Trainer
 from methods.zip_nerf import METHOD, ZipNeRFConfig
+from tests.kernels.compiled import needs_kernels
 from tests.training.helpers import TINY, chosen, said_otherwise, tiny_run, tiny_trainer
 
 captured = partial(said_otherwise, "zip-nerf")
@@ -172,6 +175,31 @@ def test_patterns_are_turned_in_training_only(field: MultisampledField) -> None:
     turned = field.density(points)[0]
     assert not torch.equal(turned, fixed)
     assert torch.equal(turned, field.density(points)[0])
+
+
+@needs_kernels
+def test_what_a_march_has_evaluated_is_not_evaluated_again(field: MultisampledField) -> None:
+    """In training too, where patterns are turned."""
+    torch.manual_seed(0)
+    frustums, order = cones(60), torch.randperm(60)[:40]
+
+    def density(rows: Tensor) -> tuple[Tensor, Tensor]:
+        some = Frustums(*(x[rows] for x in vars(frustums).values()))
+        return field.density(Points(some.origins, frustums=some))
+
+    field.train()
+    waves = Waves()
+    for rows in torch.arange(60).split(30):
+        waves.evaluate(30, partial(density, rows))
+    native.spent = {}
+    try:
+        found = waves.choose(order, partial(density, order))
+        ran = set(native.spent)
+    finally:
+        native.spent = None
+    assert "multisamples" in ran
+    assert not {name for name in ran if name.startswith(("multisampled_grid", "mlp"))}
+    torch.testing.assert_close(found[0], density(order)[0])
 
 
 # -- exposures ----------------------------------------------------------------------------------------------------

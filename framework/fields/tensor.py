@@ -21,8 +21,10 @@ VM = (((0, 1), (2,)), ((0, 2), (1,)), ((1, 2), (0,)))
 """Three groups: a plane, and the line across it (equation 4)."""
 CP = (((0,), (1,), (2,)),)
 """One group: a line along each axis (equation 3)."""
-DENSITY_SHIFT, DENSITY_SCALE = -10.0, 25.0
-"""Density is DENSITY_SCALE * softplus(sum of components + DENSITY_SHIFT), near 0 at first (section 4.4 and code)."""
+DENSITY_SHIFT, DENSITY_SCALE = -5.0, 25.0
+"""Density is DENSITY_SCALE * softplus(sum of components + DENSITY_SHIFT), small at first (section 4.4). The authors'
+code has -10, from which thin things do not rise in a minute: their rays pass little that could become dense, and
+gradients are as small as the density."""
 
 
 class TensorField(Field):

@@ -107,9 +107,31 @@ inline void for_runs(const Level& level, const Point* points, int per_sample, in
     for (int s = 0; s < size; s++) visit(cells[(per_sample - 1) & 1], s);
 }
 
+// One point a sample: while a block is looked up, the next one's entries are on their way.
+template <int F, bool DENSE>
+void forward_level_of_points(const Level& level, const Point* points, const float* table, int64_t begin, int64_t end,
+                            float* out, int64_t stride) {
+    Cell cells[2];
+    const float* entries = table + level.offset * F;
+    const auto find = [&](const Point& point, Cell& cell) {
+        find_cell<DENSE>(level, point.xyz[0], point.xyz[1], point.xyz[2], cell);
+        const Floats share = share_of(level, point.deviation, 1);
+        for (int c = 0; c < CORNERS; c++) store(cell.weight[c], load(cell.weight[c]) * share);
+    };
+    find(*points, cells[0]);
+    for (int64_t n = begin, turn = 0; n < end; n += LANES, turn ^= 1) {
+        if (n + LANES < end) {
+            find(*++points, cells[turn ^ 1]);
+            grid::prefetch<F>(cells[turn ^ 1], entries);
+        }
+        blend<F>(cells[turn], entries, block(n, end), out + n * stride, stride);
+    }
+}
+
 template <int F, bool DENSE>
 void forward_level(const Level& level, const Point* points, int per_sample, const float* table, int64_t begin,
                    int64_t end, float* out, int64_t stride) {
+    if (per_sample == 1) return forward_level_of_points<F, DENSE>(level, points, table, begin, end, out, stride);
     const float* entries = table + level.offset * F;
     for (int64_t n = begin; n < end; n += LANES, points += per_sample) {
         const int size = block(n, end);

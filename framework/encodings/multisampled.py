@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from framework.base import device as devices
 from framework.encodings.hash_grid import HashGrid
 from framework.kernels.hash_grid_lookup import TableGradient
 from framework.kernels.multisampled_grid import LOOK_UP, multisampled_grid
@@ -71,7 +72,7 @@ class _Decayed(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
         (values,) = ctx.saved_tensors
-        if not grad.is_cpu:  # a recorded step would always take the same rows, and gains nothing from fewer
+        if devices.runs_ahead(grad.device):  # a recorded step would always take the same rows, and gains nothing from fewer
             return torch.add(grad, values, alpha=ctx.rate), None
         first, total = int(torch.randint(DECAYED, ())), grad.clone()
         total[first::DECAYED].add_(values[first::DECAYED], alpha=DECAYED * ctx.rate)

@@ -72,7 +72,7 @@ class _Decayed(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
         (values,) = ctx.saved_tensors
-        if devices.runs_ahead(grad.device):  # a recorded step would always take the same rows, and gains nothing from fewer
+        if devices.runs_ahead(grad.device):  # a recorded step would take the same rows each time, and gains nothing
             return torch.add(grad, values, alpha=ctx.rate), None
         first, total = int(torch.randint(DECAYED, ())), grad.clone()
         total[first::DECAYED].add_(values[first::DECAYED], alpha=DECAYED * ctx.rate)

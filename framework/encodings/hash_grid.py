@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-import torch
 from torch import Tensor, nn
 
 from framework.base.config import Range, TrainConfig
@@ -64,8 +63,6 @@ class HashGrid(nn.Module):
     """
 
     dims = 3
-    resolutions: Tensor
-    """(L,) cells along an axis, for each level."""
 
     def __init__(
         self,
@@ -85,7 +82,6 @@ class HashGrid(nn.Module):
         self.deferred = TableGradient(LOOK_UP, self.layout) if sparse else None
         self.opening = Opening(num_levels, min(FIRST_LEVELS, num_levels)) if opening else None
         self.num_features = num_levels * features_per_level
-        self.register_buffer("resolutions", torch.tensor(self.layout.resolutions), persistent=False)
 
     @classmethod
     def of(cls, config: HashGridConfig, opening: bool = False) -> HashGrid:

@@ -26,8 +26,8 @@ from framework.samplers.base import SkipsCells
 from framework.samplers.choice import SamplingConfig, batch_choice, contracted_box, make_sampler, sampler_choice
 from framework.scene.few_images import FewImagesConfig, decide_few_images
 
-BLIND_STEPS = 256
-"""Steps before the occupancy grid is updated: the field starts empty, and would mark every cell as empty."""
+BLIND_STEPS = 128
+"""Steps before the occupancy grid is updated: the field starts nearly empty, and would mark every cell as empty."""
 FIRST_SIDE, LAST_SIDE = 128, {"vm": 300, "cp": 500}
 """Vertices per axis of the first and the last grid, if cubes (section 5)."""
 VERTICES_PER_PIXEL = 2

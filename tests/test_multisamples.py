@@ -11,8 +11,8 @@ from framework.geometry.multisamples import (
     NUM_MULTISAMPLES,
     Pattern,
     fixed_pattern,
+    hashed_pattern,
     multisamples,
-    random_pattern,
 )
 from framework.geometry.points import Frustums, conical_frustums, frames, sample_points
 from framework.geometry.rays import Rays, Samples
@@ -118,16 +118,18 @@ def test_in_evaluation_each_second_pattern_is_the_mirror_image_turned_by_30_degr
         assert difference.abs().max().item() < 1e-9
 
 
-@pytest.mark.parametrize("starts", ["anywhere", "along a ray", "far"])
-def test_random_patterns_are_evenly_turned_and_half_of_them_mirrored(starts: str) -> None:
-    """Whatever the starts are: of rays that begin anywhere, of small steps from one place, and far away."""
+@pytest.mark.parametrize("starts", ["anywhere", "along a ray", "far", "all the same"])
+def test_hashed_patterns_are_evenly_turned_and_half_of_them_mirrored(starts: str) -> None:
+    """Whatever the starts are: of rays that begin anywhere, of small steps from one place, far away, and of rays of
+    which only the ends of the first intervals differ."""
     torch.manual_seed(0)
     t = {"anywhere": 2 + 4 * torch.rand(40_000), "along a ray": 2.1 + 1e-4 * torch.arange(40_000)}
-    t["far"] = 1e6 * t["anywhere"]
+    t["far"], t["all the same"] = 1e6 * t["anywhere"], torch.zeros(40_000)
     empty = torch.empty(40_000, 3)
-    cones = Frustums(empty, empty, t[starts], t[starts], t[starts])
-    turns, mirrors = random_pattern(cones)
-    assert all(torch.equal(again, first) for again, first in zip(random_pattern(cones), (turns, mirrors), strict=True))
+    ends = 0.1 * torch.rand(40_000) if starts == "all the same" else t[starts] + 0.1
+    cones = Frustums(empty, empty, t[starts], ends, ends)
+    turns, mirrors = hashed_pattern(cones)
+    assert all(torch.equal(again, first) for again, first in zip(hashed_pattern(cones), (turns, mirrors), strict=True))
     assert set(mirrors.tolist()) == {-1.0, 1.0}
     assert abs(mirrors.mean().item()) < 0.03
     assert bool(((turns >= 0) & (turns <= 2 * math.pi)).all())

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from framework.encodings.multisampled import MultisampledHashGrid
 from framework.fields.encoded import BoxField, DensityField, EncodedField
-from framework.geometry.multisamples import fixed_pattern, random_pattern
+from framework.geometry.multisamples import fixed_pattern, hashed_pattern
 from framework.geometry.points import Points
 from framework.kernels.multisamples import unit_multisamples
 
@@ -34,7 +34,7 @@ class MultisampledField(EncodedField):
 def encode_frustums(field: BoxField, points: Points) -> Tensor:
     """Return the features (N, E) of the frustums of points; points without one are taken to have no size.
 
-    The pattern of a frustum's points is turned at random in training mode, and fixed otherwise.
+    The pattern of a frustum's points is turned by a hash of its ends in training mode, and fixed otherwise.
 
     Args:
         field: a field on a `MultisampledHashGrid`.
@@ -45,5 +45,5 @@ def encode_frustums(field: BoxField, points: Points) -> Tensor:
     if cones is None:
         unit = field.unit(points.positions)
         return field.encoding(torch.cat([unit, torch.zeros_like(unit[:, :1])], dim=-1)[:, None])
-    pattern = random_pattern(cones) if field.training else fixed_pattern(cones)
+    pattern = hashed_pattern(cones) if field.training else fixed_pattern(cones)
     return field.encoding(unit_multisamples(cones, pattern, field.box, field.unbounded))

@@ -10,7 +10,7 @@ from torch import Tensor
 from framework.encodings.multisampled import MultisampledHashGrid
 from framework.fields.encoded import BoxField, DensityField, EncodedField
 from framework.geometry.points import Footprint, Points
-from framework.kernels.multisamples import frustum_balls
+from framework.kernels.multisamples import ball_deviations, frustum_balls, unit_balls
 
 
 class SizedGrid(BoxField):
@@ -36,10 +36,14 @@ class SizedGrid(BoxField):
         """Return positions and standard deviations (N, 4) in units of the encoding.
 
         Args:
-            points: N points; those without a frustum, as exports ask about, get half a cell of the finest level.
+            points: N points with frustums, or with Gaussians, as exports ask about; others get half a cell of the
+                finest level. The encoding has no axis of time.
         """
         if points.frustums is not None:
             return frustum_balls(points.frustums, self.box, self.unbounded)
+        if points.variances is not None:
+            deviations = ball_deviations(*points.variances.unbind(-1))
+            return unit_balls(points.positions, deviations, self.box, self.unbounded)
         assert isinstance(self.encoding, MultisampledHashGrid)
         unit = self.unit(points.positions)
         size = 0.5 / self.encoding.layout.resolutions[-1]

@@ -37,16 +37,17 @@ class Pattern(NamedTuple):
     """(N,) -1 where it is mirrored, 1 elsewhere."""
 
 
-def random_pattern(frustums: Frustums) -> Pattern:
-    """Return rotations that look random, each mirrored with a probability of one half; for training.
+def hashed_pattern(frustums: Frustums) -> Pattern:
+    """Return rotations that look random, half of them mirrored; for training.
 
-    They are a hash of the start of a frustum, which is random itself, so that those of the same frustum are the same
-    again: what a march has evaluated in waves need not be evaluated another time (`framework.kernels.kept`).
+    They are a hash of both ends of a frustum, which are random themselves, so that those of the same frustum are the
+    same again: what a march has evaluated in waves need not be evaluated another time (`framework.kernels.kept`).
 
     Args:
         frustums: N frustums.
     """
-    bits = frustums.t_starts.detach().float().view(torch.int32) * SCATTER  # wraps around; its upper bits are as random
+    start, end = (t.detach().float().contiguous().view(torch.int32) for t in (frustums.t_starts, frustums.t_ends))
+    bits = (start * SCATTER + end) * SCATTER  # products wrap around, as hashes do; the upper bits change most
     u = ((bits >> 8) & (2**24 - 1)).to(frustums.radii) * 2.0**-24
     mirrored = (u >= 0.5).to(u)
     return Pattern((2 * u - mirrored) * math.tau, 1 - 2 * mirrored)  # one number for both

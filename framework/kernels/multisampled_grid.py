@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from framework.kernels import native
+from framework.kernels.dispatch import FEW_OPERATIONS
 from framework.kernels.downweighting import level_weights
-from framework.kernels.hash_grid import HashGridLayout, corners
+from framework.kernels.hash_grid import HashGridLayout, corners, hash_grid
 from framework.kernels.hash_grid_lookup import LookUp, TableGradient
 
 
@@ -81,3 +82,15 @@ def multisampled_grid(
 
 
 MULTISAMPLED_GRID = LOOK_UP.operation(multisampled_grid_reference)
+
+
+def _has_one_point(points: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> bool:
+    return points.shape[1] == 1
+
+
+@MULTISAMPLED_GRID.implementation(FEW_OPERATIONS, types=None, order=torch.inf, fits=_has_one_point)
+def _one_point(points: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> Tensor:
+    """Compute `multisampled_grid` of one point in each frustum by the plain look-up, which has kernels on GPUs."""
+    positions, deviations = points[:, 0, :3].contiguous(), points[:, 0, 3].detach()
+    shares = level_weights(deviations, _resolutions(layout, points.dtype, points.device)).to(table.dtype)
+    return hash_grid(positions, table, layout) * shares.repeat_interleave(table.shape[1], dim=-1)

@@ -22,11 +22,20 @@ def unit_multisamples_reference(frustums: Frustums, pattern: Pattern, box: Tenso
 
     `frustums`, `pattern`, `box` and `contracted` are as in `unit_multisamples`.
     """
-    return _to_unit(*multisamples(frustums, pattern), box, contracted)
+    return unit_balls(*multisamples(frustums, pattern), box, contracted)
 
 
-def _to_unit(positions: Tensor, deviations: Tensor, box: Tensor, contracted: bool) -> Tensor:
-    """Map positions (..., 3) and deviations (...), scene units, to the unit cube; returns (..., 4)."""
+def unit_balls(positions: Tensor, deviations: Tensor, box: Tensor, contracted: bool) -> Tensor:
+    """Map isotropic Gaussians to the unit cube, in PyTorch.
+
+    Args:
+        positions: (..., 3) means, scene coordinates.
+        deviations: (...) standard deviations, scene units, through which no gradient goes.
+        box, contracted: as in `unit_multisamples`.
+
+    Returns:
+        (..., 4) positions and standard deviations.
+    """
     half = (box[1] - box[0]) / 2
     x = (positions - (box[0] + box[1]) / 2) / half
     deviations = deviations.detach() / half.prod() ** (1 / 3)
@@ -77,9 +86,16 @@ def frustum_balls_reference(frustums: Frustums, box: Tensor, contracted: bool) -
     """Compute `frustum_balls` of `frustums`, `box` and `contracted` in PyTorch, on any device, for any float type."""
     mean_t, along, across = conical_frustums(frustums.t_starts, frustums.t_ends, frustums.radii)
     positions = torch.addcmul(frustums.origins, frustums.directions, mean_t[:, None])
-    # The product of the variances would be too small for float32.
-    deviations = torch.exp((along.log() + 2 * across.log()) / 6)
-    return _to_unit(positions, deviations, box, contracted)
+    return unit_balls(positions, ball_deviations(along, across), box, contracted)
+
+
+def ball_deviations(along: Tensor, across: Tensor) -> Tensor:
+    """Return the standard deviation (N,) of balls of the volume of Gaussians.
+
+    Args:
+        along, across: (N,) variance along an axis and across it.
+    """
+    return torch.exp((along.log() + 2 * across.log()) / 6)  # the product would be too small for float32
 
 
 def frustum_balls(frustums: Frustums, box: Tensor, contracted: bool) -> Tensor:

@@ -76,6 +76,17 @@ def test_positions_alone_have_half_a_cell(unbounded: bool) -> None:
 
 
 @pytest.mark.parametrize("unbounded", [False, True])
+def test_sizes_in_a_grid_are_in_its_units(unbounded: bool) -> None:
+    """A ball of a tenth of the box's edge in its middle: a tenth of the grid, or a twentieth where all space fits."""
+    field = SizedField(BOX * 5, grid(), unbounded=unbounded)
+    ball = field.balls(Points(torch.zeros(1, 3)).sized(1.0))[0]
+    assert ball.tolist() == pytest.approx([0.5, 0.5, 0.5, 0.05 if unbounded else 0.1])
+    if unbounded:  # at distance 10 of the half edge: (2 - 1/10) / 10 across, 1 / 100 along
+        far = field.balls(Points(torch.tensor([[50.0, 0.0, 0.0]])).sized(1.0))[0]
+        assert far[3].item() == pytest.approx(0.05 * (0.19 * 0.19 * 0.01) ** (1 / 3), rel=1e-4)
+
+
+@pytest.mark.parametrize("unbounded", [False, True])
 @pytest.mark.parametrize("far", [1.0, 1e4])
 def test_values_and_gradients_are_finite_and_colours_reach_black_and_white(unbounded: bool, far: float) -> None:
     for field in fields(unbounded):

@@ -144,7 +144,7 @@ def adam(parameters: int) -> Arguments:
 RATES = 0.01, (0.9, 0.99), 1e-15
 CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     HASH_GRID: lambda: (torch.rand(50, 3), rand(GRID.num_entries, 2), GRID, None),
-    MULTISAMPLED_GRID: lambda: (rand(50, 6, 4), rand(GRID.num_entries, 2), GRID, None),
+    MULTISAMPLED_GRID: lambda: (rand(50, 1, 4), rand(GRID.num_entries, 2), GRID, None),
     UNIT_MULTISAMPLES: lambda: (frustums(), Pattern(6 * rand(50), torch.ones(50)), BOX, True),
     FRUSTUM_BALLS: lambda: (frustums(), BOX, True),
     PLANES: lambda: (torch.rand(50, 3), rand(LAYOUT.num_entries, 4), LAYOUT, None),

@@ -12,6 +12,7 @@ from framework.kernels.compositing import bounded_sum, segmented_sum
 from framework.kernels.dispatch import FEW_OPERATIONS, Operation
 from framework.kernels.hash_grid import HASH_GRID, HashGridLayout
 from framework.kernels.march import ReferenceMarch
+from framework.kernels.multisampled_grid import MULTISAMPLED_GRID
 from framework.kernels.plane_bands import PLANE_BANDS
 from framework.kernels.planes import PLANES, PlanesLayout
 from framework.kernels.rigid_motion import RIGID_MOTIONS
@@ -69,6 +70,18 @@ def test_a_hash_grid(held: int, monkeypatch: pytest.MonkeyPatch) -> None:
     forms = few(HASH_GRID), HASH_GRID.reference.run
     same(*(derived(lambda x, t, run=run: run(x, t, GRID, None), positions, table) for run in forms))
     assert few(HASH_GRID)(positions[:0], table, GRID, None).shape == (0, 8)
+
+
+def test_a_multisampled_grid_of_one_point() -> None:
+    """The plain look-up does not do for several points, which are left to the reference."""
+    torch.manual_seed(0)
+    points = torch.cat([torch.rand(60, 1, 4, dtype=torch.float64), torch.rand(60, 1, 4, dtype=torch.float64) / 100])
+    table = torch.randn(GRID.num_entries, 2, dtype=torch.float64)
+    forms = few(MULTISAMPLED_GRID), MULTISAMPLED_GRID.reference.run
+    same(*(derived(lambda x, t, run=run: run(x, t, GRID, None), points, table) for run in forms))
+    form = next(each for each in MULTISAMPLED_GRID.implementations if each.backend is FEW_OPERATIONS)
+    assert form.fits is not None
+    assert [form.fits(rows, table, GRID, None) for rows in (points, points.expand(-1, 6, -1))] == [True, False]
 
 
 def test_a_hash_grid_shows_nan() -> None:

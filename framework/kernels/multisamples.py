@@ -128,7 +128,7 @@ def _compiled_balls(frustums: Frustums, box: Tensor, contracted: bool) -> Tensor
 
 
 class _Inputs(NamedTuple):
-    """What both kernels read."""
+    """Tensors and numbers of frustums and of the map to the unit cube, which both kernels read."""
 
     rows: list[Tensor]
     columns: list[Tensor]

@@ -1,16 +1,17 @@
 """Builds the CPU kernels: plain shared libraries with a C interface, one for each instruction set.
 
 They know nothing of Python or torch, so one wheel a platform serves every Python and every torch version. Where no
-compiler is at hand the installation goes on without them. With NERFLOOM_VARIANTS=native only the one that this
-machine would choose is built, in a quarter of the time.
+compiler is at hand the installation goes on without them, and so it does without one whose flags a compiler does not
+know. With NERFLOOM_VARIANTS=native only the one that this machine would choose is built, in a fifth of the time.
 """
 
 from __future__ import annotations
 
+import ctypes
 import os
 import platform
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 from setuptools import Extension, setup
@@ -32,25 +33,31 @@ if platform.machine().lower() in ("x86_64", "amd64"):
         "avx512": [*AVX2, *AVX512],
         "avx512_bf16": [*AVX2, *AVX512, "-mavx512bf16"],
     }
+    if sys.platform == "linux":  # where a process can ask for tiles
+        VARIANTS["amx_bf16"] = [*VARIANTS["avx512_bf16"], "-mamx-tile", "-mamx-bf16"]
 
 
-def native_only(variants: dict[str, list[str]]) -> dict[str, list[str]]:
-    """Return the last of `variants` for whose flags -mNAME Linux lists this processor's NAME; all, if it lists none."""
+def fitting(variants: dict[str, list[str]]) -> dict[str, list[str]] | None:
+    """Return those of `variants` for whose flags -mNAME Linux lists this processor's NAME; None if it lists none."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
-        return variants
+        return None
     known = next((line.split(":", 1)[1].replace("_", "").split() for line in lines if line.startswith("flags")), [])
-    fitting = [
-        name
-        for name, flags in variants.items()
-        if all(flag[2:] in known for flag in flags if not flag.startswith("-mprefer"))
-    ]
-    return {name: variants[name] for name in fitting[-1:]} if known else variants
+    if "amxtile" in known and not gives_tiles():
+        known.remove("amxtile")
+    needed = {name: [f[2:].replace("-", "") for f in flags if "prefer" not in f] for name, flags in variants.items()}
+    return {name: variants[name] for name in variants if set(needed[name]) <= set(known)} if known else None
 
 
-if os.environ.get("NERFLOOM_VARIANTS") == "native":
-    VARIANTS = native_only(VARIANTS)
+def gives_tiles() -> bool:
+    """Return whether Linux gives this process the processor's tiles, as the library asks (csrc/tiles.cpp)."""
+    system_call, request, tile_data = 158, 0x1023, 18  # arch_prctl, ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA
+    return ctypes.CDLL(None).syscall(system_call, request, tile_data) == 0
+
+
+HERE = fitting(VARIANTS) if os.environ.get("NERFLOOM_VARIANTS") == "native" else None
+VARIANTS = HERE or VARIANTS
 # GCC for Windows aligns the stack to 16 bytes, and stores wider vectors there as if it were to more (GCC bug 54412).
 MINGW_FLAGS = ["-Wa,-muse-unaligned-vector-move"]
 FLAGS = ["-std=c++17", "-O3", "-g0", "-fno-math-errno", "-fno-trapping-math", "-fvisibility=hidden", "-pthread"]
@@ -61,7 +68,7 @@ NETWORK_FLAGS = ["-fno-wrapv"]
 
 
 class BuildKernels(build_ext):
-    """Compiles every variant, or none."""
+    """Compiles every variant that the compiler can; with NERFLOOM_VARIANTS=native the fastest of these."""
 
     def get_ext_filename(self, fullname: str) -> str:
         suffix = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
@@ -73,17 +80,16 @@ class BuildKernels(build_ext):
     def build_extensions(self) -> None:
         if self.compiler.compiler_type == "msvc":
             self.warn("MSVC cannot compile the CPU kernels, which use Clang's and GCC's vectors: torch alone is used")
+            self.extensions = []
             return
-        try:
-            with ThreadPoolExecutor(os.cpu_count()) as pool:
-                jobs = [(ext, source) for ext in self.extensions for source in ext.sources]
-                paths = list(pool.map(lambda job: self.compile_source(*job), jobs))
-            for ext in self.extensions:
-                self.link([path for (owner, _), path in zip(jobs, paths, strict=True) if owner is ext], ext)
-        except Exception as error:  # whatever the compiler's wrapper raises
-            self.warn(f"the CPU kernels could not be built ({error}): nerfloom will train much slower on a processor")
-            for extension in self.extensions:
-                Path(self.get_ext_fullpath(extension.name)).unlink(missing_ok=True)
+        variants, self.extensions = self.extensions, []
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            for group in [[each] for each in reversed(variants)] if HERE else [variants]:
+                jobs = [[pool.submit(self.compile_source, each, path) for path in each.sources] for each in group]
+                self.extensions += [each for each, job in zip(group, jobs, strict=True) if self.link(job, each)]
+                if self.extensions:
+                    return
+        self.warn("the CPU kernels could not be built: nerfloom will train much slower on a processor")
 
     def compile_source(self, ext: Extension, source: str) -> str:
         mingw = self.compiler.compiler_type == "mingw32"
@@ -99,23 +105,28 @@ class BuildKernels(build_ext):
         )
         return path
 
-    def link(self, objects: list[str], ext: Extension) -> None:
+    def link(self, compiled: list[Future[str]], ext: Extension) -> bool:
+        """Link a variant; if it cannot be built, say why, and return False."""
         # Without MinGW's own libraries, which no other Windows has.
         static = ["-static"] if self.compiler.compiler_type == "mingw32" else []
-        self.compiler.link_shared_object(
-            objects, self.get_ext_fullpath(ext.name), extra_postargs=[*ext.extra_link_args, *static], target_lang="c++"
-        )
-
-    def get_outputs(self) -> list[str]:
-        return [path for path in super().get_outputs() if Path(path).exists()]
+        path = self.get_ext_fullpath(ext.name)
+        try:
+            objects = [each.result() for each in compiled]
+            flags = [*ext.extra_link_args, *static]
+            self.compiler.link_shared_object(objects, path, extra_postargs=flags, target_lang="c++")
+        except Exception as error:  # whatever the compiler's wrapper raises
+            Path(path).unlink(missing_ok=True)
+            self.warn(f"the CPU kernels for {ext.name.rsplit('.', 1)[-1]} are left out: {error}")
+            return False
+        return True
 
     def copy_extensions_to_source(self) -> None:
-        built = [e for e in self.extensions if Path(self.build_lib, self.get_ext_filename(e.name)).exists()]
-        for extension in built:
-            Path(self.get_ext_filename(extension.name)).parent.mkdir(exist_ok=True)
-        self.extensions, everything = built, self.extensions
+        for extension in self.extensions:
+            path = Path(self.get_ext_filename(extension.name))
+            path.parent.mkdir(exist_ok=True)
+            for old in path.parent.glob(f"*{path.suffix}"):  # of other sources, whose functions have other arguments
+                old.unlink()
         super().copy_extensions_to_source()
-        self.extensions = everything
 
 
 class AnyPythonWheel(bdist_wheel):

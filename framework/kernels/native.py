@@ -4,9 +4,9 @@ Each kernel's Python file declares its C functions as `Function`, and passes ten
 them. A C function returns a status, which is raised as an exception here. The library has its own threads
 (`csrc/parallel.h`), as many as torch is set to use. ctypes releases Python's lock during a call.
 
-The environment variable `NERFLOOM_KERNELS` overrides the choice: a variant's name (baseline, avx2, avx512,
-avx512_bf16), "triton" for Triton's kernels only, or "reference" for PyTorch only. `NERFLOOM_KERNEL_FOLDER` is a folder
-of libraries to use instead of the installed one (`make sanitize`).
+The environment variable `NERFLOOM_KERNELS` overrides the choice: a variant's name (baseline, avx2, avx512, avx512_bf16,
+amx_bf16), "triton" for Triton's kernels only, or "reference" for PyTorch only. `NERFLOOM_KERNEL_FOLDER` is a folder of
+libraries to use instead of the installed one (`make sanitize`).
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from framework.base.extras import reinstall_command
 FOLDER = Path(os.environ.get("NERFLOOM_KERNEL_FOLDER") or Path(__file__).parent / "lib")
 _AVX512 = ("avx512f", "avx512bw", "avx512dq", "avx512vl", "fma")
 NEEDS: dict[str, tuple[str, ...]] = {
+    "amx_bf16": (*_AVX512, "avx512_bf16", "amx_tile", "amx_bf16"),
     "avx512_bf16": (*_AVX512, "avx512_bf16"),
     "avx512": _AVX512,
     "avx2": ("avx2", "fma"),
@@ -82,7 +83,7 @@ def _load() -> tuple[str, ctypes.CDLL | None]:
         path = FOLDER / f"{name}{SUFFIX}"
         if path.is_file():
             try:
-                return name, ctypes.CDLL(str(path))
+                return name, _opened(path)
             except OSError as error:
                 problem = str(error)
     if asked != "auto":
@@ -92,6 +93,21 @@ def _load() -> tuple[str, ctypes.CDLL | None]:
         f"install a C++ compiler ({_compiler_hint()}), then: {reinstall_command()}"
     )
     return "reference", None
+
+
+def _opened(path: Path) -> ctypes.CDLL:
+    """Return the library at `path`, with the leave of the system to use what it needs.
+
+    Raises:
+        OSError: if it does not load, or the system does not give leave.
+    """
+    library = ctypes.CDLL(str(path))
+    ask = getattr(library, "ask_for_tiles", None)
+    if ask is not None:
+        ask.restype = ctypes.c_char_p
+        if problem := ask():
+            raise OSError(problem.decode())
+    return library
 
 
 def _compiler_hint() -> str:

@@ -71,7 +71,7 @@ def _cpu() -> str:
     from framework.kernels.native import NEEDS
     from framework.training.machine import processor
 
-    relevant = {feature for needs in NEEDS.values() for feature in needs} | {"amx_bf16"}
+    relevant = {feature for needs in NEEDS.values() for feature in needs}
     sets = ", ".join(sorted(cpu_features() & relevant)) or "none of the instruction sets that kernels are built for"
     return f"{processor()}, {num_cores()} of {os.cpu_count()} cores; {sets}"
 

@@ -96,6 +96,7 @@ void outer_product(const float* x, int ldx, const float* dy, int ldy, int inner,
 
 struct Float {  // as mlp_calls.h wants a form
     typedef float Value;
+    struct Prepared {};
 
     struct Network {
         int layers;

@@ -1,7 +1,8 @@
 // The small networks of mlp.cpp with bfloat16 products and float32 sums, for processors that multiply bfloat16.
 //
 // Activations are rows of bfloat16, weights pairs of rows interleaved, as VDPBF16PS wants them: one instruction adds
-// two products to each of 16 sums.
+// two products to each of 16 sums. Tiles (AMX), which one processor family has, want the same: one instruction adds 32
+// products to each of 16 x 16 sums.
 #include "mlp_calls.h"
 
 #if defined(__AVX512BF16__)
@@ -32,6 +33,143 @@ inline __m512bh pair(const Half* from) {
     std::memcpy(&bits, from, 4);
     return (__m512bh)_mm512_set1_epi32(bits);
 }
+
+// Pairs of rows interleaved, as the sum over rows wants them: to[r / 2][column][r % 2].
+void interleave(const Half* from, int width, Half* to) {
+    alignas(64) static const uint16_t ORDER[2][32] = {
+        {0, 32, 1, 33, 2, 34, 3, 35, 4, 36, 5, 37, 6, 38, 7, 39, 8, 40, 9, 41, 10, 42, 11, 43, 12, 44, 13, 45, 14, 46,
+         15, 47},
+        {16, 48, 17, 49, 18, 50, 19, 51, 20, 52, 21, 53, 22, 54, 23, 55, 24, 56, 25, 57, 26, 58, 27, 59, 28, 60, 29,
+         61, 30, 62, 31, 63}};
+    const __m512i low = _mm512_load_si512(ORDER[0]), high = _mm512_load_si512(ORDER[1]);
+    for (int r = 0; r < BLOCK; r += 2)
+        for (int c = 0; c < width; c += 32) {
+            const __m512i a = _mm512_loadu_si512(from + r * width + c);
+            const __m512i b = _mm512_loadu_si512(from + (r + 1) * width + c);
+            Half* at = to + r * width + c * 2;
+            _mm512_storeu_si512(at, _mm512_permutex2var_epi16(a, low, b));
+            _mm512_storeu_si512(at + 32, _mm512_permutex2var_epi16(a, high, b));
+        }
+}
+
+#if defined(__AMX_BF16__)
+
+// How many inner products a layer's are rounded up to, which are of zeros.
+constexpr int DEPTH = 32;
+
+// What was written so far is in memory: GCC's instructions for tiles do not say all that they read.
+inline void written(const void* at = nullptr) { __asm__ volatile("" ::"r"(at) : "memory"); }
+
+// The processor's tiles, which a thread has to set up, and to leave so that others need not save them.
+struct Tiles {
+    Tiles() {
+        struct alignas(64) {
+            uint8_t palette = 1, start = 0, reserved[14] = {};
+            uint16_t bytes[16] = {64, 64, 64, 64, 64, 64, 64, 64};
+            uint8_t rows[16] = {16, 16, 16, 16, 16, 16, 16, 16};
+        } shapes;
+        written(&shapes);
+        _tile_loadconfig(&shapes);
+    }
+    ~Tiles() { _tile_release(); }
+    Tiles(const Tiles&) = delete;
+    Tiles& operator=(const Tiles&) = delete;
+};
+
+// y (BLOCK, width) float = x (BLOCK, inner) bf16 times w, whose rows are interleaved in pairs: w[k / 2][column][k % 2].
+// width is a multiple of 16, inner of DEPTH.
+void product(const Half* x, int ldx, const Half* w, int width, int inner, float* y, int ldy) {
+    written();
+    const int64_t of_x = ldx * 2, of_w = width * 4, of_y = ldy * 4;  // bytes of a row
+    int column = 0;
+    for (; column + 32 <= width; column += 32) {
+        _tile_zero(0);
+        _tile_zero(1);
+        _tile_zero(2);
+        _tile_zero(3);
+        for (int k = 0; k < inner; k += DEPTH) {
+            _tile_loadd(4, x + k, of_x);
+            _tile_loadd(6, w + k * width + column * 2, of_w);
+            _tile_loadd(7, w + k * width + column * 2 + 32, of_w);
+            _tile_dpbf16ps(0, 4, 6);
+            _tile_dpbf16ps(1, 4, 7);
+            _tile_loadd(5, x + 16 * ldx + k, of_x);
+            _tile_dpbf16ps(2, 5, 6);
+            _tile_dpbf16ps(3, 5, 7);
+        }
+        _tile_stored(0, y + column, of_y);
+        _tile_stored(1, y + column + 16, of_y);
+        _tile_stored(2, y + 16 * ldy + column, of_y);
+        _tile_stored(3, y + 16 * ldy + column + 16, of_y);
+    }
+    for (; column < width; column += 16) {
+        _tile_zero(0);
+        _tile_zero(2);
+        for (int k = 0; k < inner; k += DEPTH) {
+            _tile_loadd(4, x + k, of_x);
+            _tile_loadd(5, x + 16 * ldx + k, of_x);
+            _tile_loadd(6, w + k * width + column * 2, of_w);
+            _tile_dpbf16ps(0, 4, 6);
+            _tile_dpbf16ps(2, 5, 6);
+        }
+        _tile_stored(0, y + column, of_y);
+        _tile_stored(2, y + 16 * ldy + column, of_y);
+    }
+}
+
+// 16 x 16 values of 32 bits, rows `from_row` apart, to their transpose, rows `to_row` apart (in bytes).
+inline void transpose(const Half* from, int64_t from_row, Half* to, int64_t to_row) {
+    __m512i a[16], b[16];
+#pragma GCC unroll 16
+    for (int i = 0; i < 16; i++) a[i] = _mm512_loadu_si512((const char*)from + i * from_row);
+#pragma GCC unroll 8
+    for (int i = 0; i < 16; i += 2) {
+        b[i] = _mm512_unpacklo_epi32(a[i], a[i + 1]);
+        b[i + 1] = _mm512_unpackhi_epi32(a[i], a[i + 1]);
+    }
+#pragma GCC unroll 4
+    for (int i = 0; i < 16; i += 4) {
+        a[i] = _mm512_unpacklo_epi64(b[i], b[i + 2]);
+        a[i + 1] = _mm512_unpackhi_epi64(b[i], b[i + 2]);
+        a[i + 2] = _mm512_unpacklo_epi64(b[i + 1], b[i + 3]);
+        a[i + 3] = _mm512_unpackhi_epi64(b[i + 1], b[i + 3]);
+    }
+    // a[4 i + c] has of columns c, c + 4, c + 8, c + 12 (a quarter of the vector each) the rows 4 i to 4 i + 3.
+#pragma GCC unroll 4
+    for (int c = 0; c < 4; c++) {
+        const __m512i even = _mm512_shuffle_i32x4(a[c], a[4 + c], 0x88), odd = _mm512_shuffle_i32x4(a[c], a[4 + c], 0xdd);
+        const __m512i last = _mm512_shuffle_i32x4(a[8 + c], a[12 + c], 0x88);
+        const __m512i rest = _mm512_shuffle_i32x4(a[8 + c], a[12 + c], 0xdd);
+        _mm512_storeu_si512((char*)to + c * to_row, _mm512_shuffle_i32x4(even, last, 0x88));
+        _mm512_storeu_si512((char*)to + (c + 4) * to_row, _mm512_shuffle_i32x4(odd, rest, 0x88));
+        _mm512_storeu_si512((char*)to + (c + 8) * to_row, _mm512_shuffle_i32x4(even, last, 0xdd));
+        _mm512_storeu_si512((char*)to + (c + 12) * to_row, _mm512_shuffle_i32x4(odd, rest, 0xdd));
+    }
+}
+
+// dw (inner, width) += x^T dy over the block, both interleaved in pairs of rows.
+void outer_product(const Half* x, int ldx, const Half* dy, int ldy, int inner, float* dw, int width) {
+    alignas(64) Half turned[16 * BLOCK];
+    const int64_t of_dy = ldy * 4, of_dw = width * 4;
+    for (int k = 0; k < inner; k += 16) {
+        transpose(x + k * 2, ldx * 4, turned, 64);
+        written(turned);
+        _tile_loadd(4, turned, 64);
+        for (int column = 0; column < width; column += 16) {
+            float* at = dw + k * width + column;
+            _tile_loadd(0, at, of_dw);
+            _tile_loadd(6, dy + column * 2, of_dy);
+            _tile_dpbf16ps(0, 4, 6);
+            _tile_stored(0, at, of_dw);
+        }
+    }
+}
+
+#else
+
+constexpr int DEPTH = 2;
+
+struct Tiles {};
 
 // y (BLOCK, width) float = x (BLOCK, inner) bf16 times w, whose rows are interleaved in pairs: w[k / 2][column][k % 2].
 template <int ROWS, int VECTORS>
@@ -71,24 +209,6 @@ void product(const Half* x, int ldx, const Half* w, int width, int inner, float*
         product_columns<16, 1>(x, ldx, w + column * 2, width, inner, y + column, ldy);
 }
 
-// Pairs of rows interleaved, as the sum over rows wants them: to[r / 2][column][r % 2].
-void interleave(const Half* from, int width, Half* to) {
-    alignas(64) static const uint16_t ORDER[2][32] = {
-        {0, 32, 1, 33, 2, 34, 3, 35, 4, 36, 5, 37, 6, 38, 7, 39, 8, 40, 9, 41, 10, 42, 11, 43, 12, 44, 13, 45, 14, 46,
-         15, 47},
-        {16, 48, 17, 49, 18, 50, 19, 51, 20, 52, 21, 53, 22, 54, 23, 55, 24, 56, 25, 57, 26, 58, 27, 59, 28, 60, 29,
-         61, 30, 62, 31, 63}};
-    const __m512i low = _mm512_load_si512(ORDER[0]), high = _mm512_load_si512(ORDER[1]);
-    for (int r = 0; r < BLOCK; r += 2)
-        for (int c = 0; c < width; c += 32) {
-            const __m512i a = _mm512_loadu_si512(from + r * width + c);
-            const __m512i b = _mm512_loadu_si512(from + (r + 1) * width + c);
-            Half* at = to + r * width + c * 2;
-            _mm512_storeu_si512(at, _mm512_permutex2var_epi16(a, low, b));
-            _mm512_storeu_si512(at + 32, _mm512_permutex2var_epi16(a, high, b));
-        }
-}
-
 // dw (inner, width) += x^T dy over the block, both interleaved in pairs of rows.
 template <int INNER, int VECTORS>
 inline void outer_columns(const Half* x, int ldx, const Half* dy, int ldy, int inner, float* dw, int width) {
@@ -126,6 +246,8 @@ void outer_product(const Half* x, int ldx, const Half* dy, int ldy, int inner, f
         outer_columns<16, 1>(x, ldx, dy + column * 2, ldy, inner, dw + column, width);
 }
 
+#endif
+
 // The bias's gradient: sums over a block's rows of bf16 (rows wide).
 void add_halves(const Half* grad, int rows, int columns, float* sums) {
     for (int r = 0; r < BLOCK; r++)
@@ -158,6 +280,7 @@ void to_halves(const float* from, int columns, Half* to, int rows, bool relu, co
 
 struct Bfloat16 {  // as mlp_calls.h wants a form
     typedef Half Value;
+    typedef Tiles Prepared;
 
     struct Network {
         int layers;
@@ -189,7 +312,7 @@ struct Bfloat16 {  // as mlp_calls.h wants a form
                     }
             }
         }
-        int inner(int l) const { return (width[l] + 1) / 2 * 2; }
+        int inner(int l) const { return (width[l] + DEPTH - 1) / DEPTH * DEPTH; }
         const float* bias_of(int l) const { return bias[l].empty() ? nullptr : bias[l].data(); }
     };
 

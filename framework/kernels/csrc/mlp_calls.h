@@ -2,6 +2,7 @@
 //
 // A form has
 //   Value, the type of an activation;
+//   Prepared, which stands on the stack of a thread while it computes;
 //   Network(widths, layers, weights, biases): `width` of the input and of each layer, padded to `rows` for a row of
 //     activations and to `columns` for a row of sums;
 //   Block, the activations of BLOCK rows: layer[l] is the input of layer l, output(network) what the last has given,
@@ -21,6 +22,7 @@ template <typename Form, typename Each>
 void take_through(const typename Form::Network& net, const Inputs& input, int64_t begin, int64_t end, int activation,
                   float* out, float* density, const Each& each) {
     const int outputs = net.width[net.layers], columns = net.columns[net.layers];
+    [[maybe_unused]] const typename Form::Prepared prepared{};
     typename Form::Block block;
     for (int64_t first = begin; first < end; first += BLOCK) {
         const int size = int(std::min<int64_t>(end - first, BLOCK));
@@ -68,6 +70,7 @@ struct LayersOf final : Layers {
     void backward(const char* records, const int64_t* rows, int count, const float* grad, float* sums,
                   float* input_grad) const override {
         const int outputs = net.width[net.layers], columns = net.columns[net.layers], inputs = net.width[0];
+        [[maybe_unused]] const typename Form::Prepared prepared{};
         Block block;
         typename Form::Gradient gradient;
         float* start = Form::start(block, gradient);
@@ -119,6 +122,7 @@ void backward(const Inputs& input, int64_t count, const int64_t* widths, int lay
     WeightSums sums(count, layers, net.columns, threads);
     for_chunks(threads, sums.parts, [&](int64_t p, int) {
         sums.clear(p);
+        [[maybe_unused]] const typename Form::Prepared prepared{};
         typename Form::Block block;
         typename Form::Gradient gradient;
         for (int64_t next = sums.begin(p); next < sums.end(p);) {

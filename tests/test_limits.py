@@ -8,7 +8,7 @@ import torch
 from framework.geometry.bounds import contract
 from framework.geometry.limits import at_least, between
 from framework.kernels.math import safe_normalize
-from framework.samplers.proposal import to_disparity
+from framework.kernels.spacing import to_disparity
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])

@@ -12,7 +12,8 @@ from framework.data.dataset import Dataset
 from framework.data.sparse_depth import SparseDepth
 from framework.geometry.bounds import nested_boxes
 from framework.geometry.rays import Rays
-from framework.scene.shared_space import CELLS, LEVELS, REACH, STEPS, SharedSpace, share_cut_off, times_seen
+from framework.kernels.first_shared import CELLS, LEVELS, REACH, STEPS, first_shared_reference
+from framework.scene.shared_space import SharedSpace, share_cut_off, times_seen
 from framework.training.preparation import decided
 from tests.test_free_space import row
 from tests.training.test_graphs import small
@@ -95,11 +96,12 @@ def test_cells_are_counted_whose_points_are_all_seen() -> None:
     assert missed < 0.3 * shown  # those at the edges of the images
 
 
-def test_without_waiting_for_the_device_the_starts_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_starts_are_those_of_float64() -> None:
     found, rays = shared(row(0.0, 0.5), 2), fan(-0.5, -0.2, 0.0, 0.3, 0.8)
-    usual = found(rays).nears
-    monkeypatch.setattr("framework.base.device.runs_ahead", lambda device: True)
-    assert torch.equal(found(rays).nears, usual)
+    exact = Rays(*(each.double() for each in (rays.origins, rays.directions, rays.nears, rays.fars)))
+    expected = first_shared_reference(exact, found.box.double(), found.unshared)
+    torch.testing.assert_close(found(rays).nears.double(), expected, rtol=1e-5, atol=1e-6)
+    assert bool((expected > exact.nears).all())
 
 
 def test_training_leaves_out_what_one_image_shows_and_says_so(tmp_path: Path) -> None:

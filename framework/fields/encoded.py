@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
@@ -37,7 +40,7 @@ class BoxField(Field):
     def __init__(self, box: Tensor, encoding: HashGrid | FeaturePlanes, unbounded: bool = False) -> None:
         super().__init__()
         self.unbounded = unbounded
-        self.register_buffer("box", box.clone())
+        self.register_buffer("box", box.clone(memory_format=torch.contiguous_format))
         size = box[1] - box[0]
         self.register_buffer("scale", 1 / size, persistent=False)
         self.register_buffer("shift", -box[0] / size, persistent=False)
@@ -66,6 +69,26 @@ class BoxField(Field):
             unit = torch.cat([unit, times[:, None].to(unit)], dim=-1)
         return self.encoding(unit)
 
+    def _grid_density(self, density: Callable[..., Any], network: MLP) -> GridDensity | None:
+        """Return the density of `network` on the encoding; None unless `density` and what it calls are its own."""
+        grid, own = self.encoding, (density, BoxField.encode, BoxField.unit)
+        plain = (type(self).density, type(self).encode, type(self).unit) == own
+        plain = plain and not {"density", "encode", "unit"} & vars(self).keys()
+        hooked = any(m._forward_hooks or m._forward_pre_hooks for m in (network, grid))
+        if not plain or hooked or type(grid) is not HashGrid or type(network) is not MLP:
+            return None
+        if network.bias or network.activation != "none":
+            return None
+        if grid.opening is not None and not grid.opening.complete:
+            return None
+        if grid.deferred is not None:
+            grid.deferred.layout = grid.layout
+        weights = _weights(network)
+        if weights[0].shape[1] != grid.num_features:  # it reads further coordinates
+            return None
+        around = self.box if self.unbounded else None
+        return GridDensity(self.scale, self.shift, grid.table, grid.layout, grid.deferred, weights, around)
+
 
 class DensityField(BoxField):
     """A field of density without colour, for proposals: mip-NeRF 360 (Barron et al. 2022), section 3.
@@ -86,6 +109,10 @@ class DensityField(BoxField):
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
         features = self.encode(points.positions, points.times)
         return self.head.density(features)[0], features
+
+    def grid_density(self) -> GridDensity | None:
+        """Return the density as `proposal_weights` computes it; None if this field's is another."""
+        return self._grid_density(DensityField.density, self.head)
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         raise NotImplementedError("a density field has no colours")
@@ -140,20 +167,7 @@ class EncodedField(BoxField):
 
     def grid_density(self) -> GridDensity | None:
         """Return the density as `trace` computes it; None if this field's is another."""
-        grid, own = self.encoding, (EncodedField.density, BoxField.encode, BoxField.unit)
-        plain = (type(self).density, type(self).encode, type(self).unit) == own and not self.unbounded
-        plain = plain and not {"density", "encode", "unit"} & vars(self).keys()
-        hooked = any(m._forward_hooks or m._forward_pre_hooks for m in (self.density_head, grid))
-        if not plain or hooked or type(grid) is not HashGrid or type(self.density_head) is not MLP:
-            return None
-        if grid.opening is not None and not grid.opening.complete:
-            return None
-        if grid.deferred is not None:
-            grid.deferred.layout = grid.layout
-        weights = _weights(self.density_head)
-        if weights[0].shape[1] != grid.num_features:  # it reads further coordinates
-            return None
-        return GridDensity(self.scale, self.shift, grid.table, grid.layout, grid.deferred, weights)
+        return self._grid_density(EncodedField.density, self.density_head)
 
     def grid_color(self) -> GridColor | None:
         """Return the colour as `traced_error` computes it; None if this field's is another."""

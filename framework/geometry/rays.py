@@ -50,6 +50,10 @@ class Rays:
         """Return the rays on `device`."""
         return self._map(lambda values: values.to(device))
 
+    def detached(self) -> Rays:
+        """Return the rays without a gradient."""
+        return self._map(lambda values: values.detach())
+
     def _map(self, change: Callable[[Tensor], Tensor]) -> Rays:
         """Apply a function to every field that is not None."""
         tensors = {f.name: getattr(self, f.name) for f in fields(self)}

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from framework.kernels import kept, native
+from framework.kernels.contraction import contract_to_unit
 from framework.kernels.dispatch import CPP, Operation
 from framework.kernels.hash_grid import HASH_GRID, HashGridLayout, hash_grid
 from framework.kernels.hash_grid_lookup import TableGradient
@@ -27,10 +28,13 @@ WAVES = (4, 4, 4, 4, 8, 16, 32, 128)
 """Samples per ray in each wave of a trace; the last size repeats. They begin smaller than those of a march: within one
 call a wave costs next to nothing, and less is evaluated behind a surface."""
 
+PATH, DENSITY = "ppppppqpipffppiif", "ppppippipip"
+"""Kinds of the arguments of compiled traces that stand for a march, and of those that stand for a density."""
+
 
 @dataclass(frozen=True)
 class GridDensity:
-    """A density at positions: `density_mlp` of `hash_grid` at position * scale + shift."""
+    """A density: `density_mlp` of `hash_grid` at position * scale + shift, or at the contracted position."""
 
     scale: Tensor
     """(3,) factor of positions in scene units."""
@@ -44,10 +48,15 @@ class GridDensity:
     """Collects the gradient of the table, as in `hash_grid`."""
     weights: Sequence[Tensor]
     """(D_out, D_in) weights of each layer, without biases."""
+    box: Tensor | None = None
+    """(2, 3) corners of the box around which space is contracted by `contract_to_unit`; None if it is not."""
 
     def at(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Return the density (N,) and the outputs (N, D) of the network at `positions` (N, 3), scene units."""
-        unit = torch.addcmul(self.shift, positions, self.scale)
+        if self.box is None:
+            unit = torch.addcmul(self.shift, positions, self.scale)
+        else:
+            unit = contract_to_unit(positions, self.box)
         return density_mlp((hash_grid(unit, self.table, self.layout, self.deferred),), self.weights)
 
 
@@ -114,9 +123,19 @@ def is_compiled(marched: March, density: GridDensity) -> bool:
     """
     if not isinstance(marched, CompiledMarch) or marched.waves:
         return False
-    origins, table, weights = marched.origins, density.table, density.weights
-    grid = HASH_GRID.choose((origins, table), origins, table, density.layout, density.deferred)
-    network = DENSITY_NETWORK.choose((origins, *weights), (origins,), weights)
+    return has_compiled_parts(marched.origins, density)
+
+
+def has_compiled_parts(positions: Tensor, density: GridDensity) -> bool:
+    """Return whether hash grid and network run compiled, with the derivatives that are asked for.
+
+    Args:
+        positions: (N, 3), of which type and gradient count.
+        density: the density there.
+    """
+    table, weights = density.table, density.weights
+    grid = HASH_GRID.choose((positions, table), positions, table, density.layout, density.deferred)
+    network = DENSITY_NETWORK.choose((positions, *weights), (positions,), weights)
     return grid.backend is CPP and network.backend is CPP and all(t.is_contiguous() for t in (table, *weights))
 
 
@@ -147,13 +166,21 @@ def arguments(marched: March, density: GridDensity) -> tuple[Any, ...]:
         density: the density along the rays.
     """
     assert isinstance(marched, CompiledMarch)
-    layout, features = density.layout, density.table.shape[1]
     return (
         marched.origins.data_ptr(), marched.directions.data_ptr(), marched.enter.data_ptr(), marched.leave.data_ptr(),
         marched.first.data_ptr(), None if marched.slices is None else marched.slices.data_ptr(), len(marched.rays),
         native.integers(WAVES), len(WAVES), marched.box.data_ptr(), marched.step, marched.cone,
         marched.bits.data_ptr(), marched.blocks.data_ptr(), marched.resolution, marched.levels, marched.budget,
+        *density_arguments(density),
+    )  # fmt: skip
+
+
+def density_arguments(density: GridDensity) -> tuple[Any, ...]:
+    """Return the arguments of compiled calls that evaluate `density`, checked."""
+    layout, features, box = density.layout, density.table.shape[1], density.box
+    return (
         native.pointer(density.scale, "the scale", (3,)), native.pointer(density.shift, "the shift", (3,)),
+        None if box is None else native.pointer(box, "the box", (2, 3)),
         native.pointer(density.table, "the hash table", (layout.num_entries, features)), features, *layout.arrays,
         layout.num_levels, *network_arguments(density.weights),
     )  # fmt: skip
@@ -167,5 +194,5 @@ def network_arguments(weights: Sequence[Tensor]) -> tuple[Any, ...]:
     return native.integers(widths), len(weights), native.pointers(checked)
 
 
-_trace: Callable[..., int] = native.Function("trace_rays", "ppppppqpipffppiifpppippipipiii", "q")
+_trace: Callable[..., int] = native.Function("trace_rays", PATH + DENSITY + "iii", "q")
 _take = native.Function("trace_take", "qqppppppppi")

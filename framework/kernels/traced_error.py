@@ -28,7 +28,7 @@ from framework.kernels.hash_grid import hash_grid
 from framework.kernels.march import March
 from framework.kernels.mlp import NETWORK, mlp, multiplies_bf16
 from framework.kernels.spherical_harmonics import spherical_harmonics
-from framework.kernels.trace import GridDensity, arguments, is_compiled, network_arguments, trace
+from framework.kernels.trace import DENSITY, PATH, GridDensity, arguments, is_compiled, network_arguments, trace
 
 MAX_RAYS = 256
 """Maximum number of rays of a pixel in the compiled form."""
@@ -160,5 +160,5 @@ class _Known(torch.autograd.Function):
         return None, None, *(each if factor == 1 else each * factor for each in ctx.grads)
 
 
-_traced_error: Callable[..., int] = native.Function("traced_error", "ppppppqpipffppiifpppippipipipipipppqfqpppppi", "q")
+_traced_error: Callable[..., int] = native.Function("traced_error", PATH + DENSITY + "ipipipppqfqpppppi", "q")
 _take = native.Function("traced_error_take", "qppi")

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from framework.geometry.rays import Samples
 from framework.kernels.compositing import distortion, ray_sum
-from framework.samplers.proposal import to_disparity
+from framework.kernels.spacing import to_disparity
 
 WIDTH = 3.0
 """Standard deviations from a known distance within which a ray is to end."""

@@ -11,9 +11,8 @@ beyond, or follows Zip-NeRF's power ladder.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 
 import torch
@@ -23,14 +22,16 @@ from framework.base.device import StepValue
 from framework.base.optimised import Optimised
 from framework.base.step_kind import StepKind
 from framework.encodings.hash_grid import HashGrid
-from framework.fields.base import DensityFunction, Field
+from framework.fields.base import DensityFunction, Field, HasGridDensity
 from framework.fields.encoded import DensityField
 from framework.geometry.bounds import intersect_box
-from framework.geometry.limits import at_least
 from framework.geometry.points import Footprint, Points, sample_points
 from framework.geometry.rays import Histogram, Rays, Samples
 from framework.kernels.intervals import interval_weights, proposal_excess, resample
+from framework.kernels.proposals import proposal_weights
+from framework.kernels.spacing import spacing
 from framework.kernels.step_functions import blurred_excess
+from framework.kernels.trace import GridDensity
 from framework.samplers.base import Sampler
 
 ANNEALING_SLOPE = 10.0
@@ -41,8 +42,6 @@ ALWAYS_LEARN_UNTIL, LEARN_EVERY = 256, 4
 """Step until which the proposals learn in every step, and the interval of steps at which they learn afterwards."""
 FARTHEST = 1e10
 """Far end of the last interval of an endless ray, scene units."""
-LADDER_PREMULTIPLIER = 2.0
-"""Factor of distances, in units of the scene's scale, before the power ladder: Zip-NeRF."""
 
 
 class ProposalSampler(Sampler):
@@ -118,7 +117,7 @@ class ProposalSampler(Sampler):
         nears, fars = self._ends(rays)
         samples = propose(
             replace(rays, nears=nears, fars=fars),
-            [proposal.density for proposal in self.proposals],
+            [density_of(proposal) for proposal in self.proposals],
             self.counts,
             self.scale if self.unbounded else None,
             jitter=jitter,
@@ -162,7 +161,7 @@ class ProposalSampler(Sampler):
 
 def propose(
     rays: Rays,
-    densities: Sequence[DensityFunction],
+    densities: Sequence[DensityFunction | GridDensity],
     counts: Sequence[int],
     scale: float | None,
     *,
@@ -197,8 +196,11 @@ def propose(
     for (num_intervals, num_next), density, kind in zip(pairwise(counts), densities, kinds, strict=True):
         t = placed(edges)
         with torch.set_grad_enabled(learning):
-            sigma, _ = density(_points(rays, t, kind))
-            weights = interval_weights(sigma.view(count, num_intervals), t)
+            if isinstance(density, GridDensity):
+                weights = proposal_weights(rays, t, density)
+            else:
+                sigma, _ = density(_points(rays, t, kind))
+                weights = interval_weights(sigma.view(count, num_intervals), t)
         histograms.append(Histogram(edges, weights))
         shift = torch.rand(count, device=device) if jitter else torch.full((count,), 0.5, device=device)
         edges = resample(edges, weights.detach(), shift, num_next, power, PADDING / num_intervals)
@@ -211,76 +213,15 @@ def propose(
     )
 
 
-def spacing(
-    nears: Tensor, fars: Tensor, scale: float | None, ladder: float | None = None
-) -> Callable[[Tensor], Tensor]:
-    """Return the function from normalised distances (R, B) in [0, 1] to distances (R, B) along rays, scene units.
-
-    Args:
-        nears, fars: (R,) distances of the rays' ends, which correspond to 0 and 1.
-        scale: the distance up to which normalised distance is linear; beyond, it is linear in disparity. None if it is
-            linear throughout.
-        ladder: exponent of the power ladder of twice the distance in units of `scale`, in place of disparity: Zip-NeRF
-            has -1.5. It is linear near the camera as well, and bends gradually.
-    """
-    if scale is None:
-        return partial(torch.lerp, nears[:, None], fars[:, None])
-    if ladder is None:
-        near, far = (to_disparity(t / scale)[:, None] for t in (nears, fars))
-        return lambda edges: scale * from_disparity(torch.lerp(near, far, edges))
-    unit, power = scale / LADDER_PREMULTIPLIER, ladder
-    near, far = (power_ladder(t / unit, power)[:, None] for t in (nears, fars))
-    return lambda edges: unit * inverse_power_ladder(torch.lerp(near, far, edges), power)
+def density_of(proposal: Field) -> DensityFunction | GridDensity:
+    """Return the density of a proposal, as a small network on a hash grid if it is that."""
+    known = proposal.grid_density() if isinstance(proposal, HasGridDensity) else None
+    return proposal.density if known is None else known
 
 
 def half_edge(box: Tensor) -> float:
     """Return half the edge of the cube with the volume of `box` (2, 3): the `scale` of an unbounded scene."""
     return math.prod((box[1] - box[0]).tolist()) ** (1 / 3) / 2
-
-
-def to_disparity(t: Tensor) -> Tensor:
-    """Map distances `t` in [0, inf) to [0, 1): t / 2 up to t = 1, and 1 - 1 / (2 t) beyond."""
-    return torch.where(t < 1, t / 2, 1 - 1 / (2 * at_least(t, 1.0)))
-
-
-def from_disparity(s: Tensor) -> Tensor:
-    """Map `s` in [0, 1] to distances: the inverse of `to_disparity`, with a large, finite result at s = 1."""
-    tiny = torch.finfo(s.dtype).eps
-    return torch.where(s < 0.5, 2 * s, 1 / (2 - 2 * s).clamp(min=tiny))
-
-
-def power_ladder(x: Tensor, power: float) -> Tensor:
-    """Map distances `x` in [0, inf] by |p - 1| / p ((x / |p - 1| + 1)^p - 1), with a slope of 1 at 0: Zip-NeRF.
-
-    It is x for p = 1, log(1 + x) for p = 0, x / (1 + x / 2) for p = -1, and is bounded for p < 0.
-
-    Args:
-        x: distances, at least 0.
-        power: exponent p, at most 1.
-
-    Raises:
-        ValueError: if the exponent is above 1.
-    """
-    if power > 1:
-        raise ValueError(f"a power ladder's exponent is at most 1, not {power}")
-    if power in (0, 1):
-        return x if power else torch.log1p(x)
-    rest = 1 - power
-    return (rest / power) * torch.expm1(power * torch.log1p(x / rest))
-
-
-def inverse_power_ladder(y: Tensor, power: float) -> Tensor:
-    """Return the distances whose `power_ladder` is `y`, with a large, finite result where that is bounded.
-
-    Args:
-        y: values of the ladder.
-        power: exponent p, at most 1.
-    """
-    if power in (0, 1):
-        return y if power else torch.expm1(y)
-    rest = 1 - power
-    least = torch.finfo(y.dtype).eps - 1
-    return rest * torch.expm1(torch.log1p((y * (power / rest)).clamp(min=least)) / power)
 
 
 def interlevel_loss(samples: Samples, weights: Tensor, blurs: Sequence[float] = ()) -> Tensor:

@@ -12,19 +12,14 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from framework.base import device as devices
 from framework.cameras.cameras import Cameras
 from framework.geometry.bounds import nested_boxes
 from framework.geometry.rays import Rays
+from framework.kernels.first_shared import CELLS, LEVELS, first_shared
 from framework.kernels.native import torch_on_one_thread
 
-LEVELS, CELLS = 3, 32
-"""Nested boxes, each twice as large as the one before, and cells along an axis of each; beyond, nothing is left out."""
 BLOCK = 4
 """Cells along an edge of the cubes that are tested before their cells are."""
-STEPS, REACH, HALVINGS = 64, 4.0, 4
-"""Places along a ray that are looked up, the distance of the last from its near end in half edges of the box, and how
-often the step before the first that is shared is halved."""
 
 
 class SharedSpace(nn.Module):
@@ -40,7 +35,7 @@ class SharedSpace(nn.Module):
 
     def __init__(self, box: Tensor) -> None:
         super().__init__()
-        self.register_buffer("box", box.clone())
+        self.register_buffer("box", box.clone(memory_format=torch.contiguous_format))
         self.register_buffer("unshared", torch.zeros(LEVELS * CELLS**3 + 1, dtype=torch.bool, device=box.device))
 
     def leave_out(self, cameras: Cameras, nearest: Tensor, least: int) -> None:
@@ -62,36 +57,7 @@ class SharedSpace(nn.Module):
         Args:
             rays: R rays; R may be 0.
         """
-        if devices.runs_ahead(rays.nears.device):  # all rays, since to choose among them waits
-            return replace(rays, nears=self._starts(rays))
-        first = self._place(rays.origins.detach() + rays.directions.detach() * rays.nears[:, None])
-        late = self.unshared[first].nonzero().squeeze(-1)
-        if not len(late):
-            return rays
-        return replace(rays, nears=rays.nears.index_copy(0, late, self._starts(rays[late])))
-
-    def _starts(self, rays: Rays) -> Tensor:
-        """Return the distance (R,) of the first place along each ray that is not left out."""
-        half = (self.box[1] - self.box[0]).amax() / 2
-        ends = torch.minimum(rays.nears + REACH * half, rays.fars)
-        steps = torch.linspace(0, 1, STEPS, device=ends.device)
-        t = torch.lerp(rays.nears[:, None], ends[:, None], steps)
-        positions = torch.addcmul(rays.origins.detach()[:, None], rays.directions.detach()[:, None], t[..., None])
-        shared = ~self.unshared[self._place(positions.view(-1, 3))].view(t.shape)
-        first = shared.int().argmax(1, keepdim=True)  # index 0 if there is no other
-        before, start = t.gather(1, (first - 1).clamp(min=0)).squeeze(1), t.gather(1, first).squeeze(1)
-        for _ in range(HALVINGS):  # up to a whole step of what images do show is left out otherwise
-            middle = (before + start) / 2
-            found = ~self.unshared[self._place(rays.origins.detach() + rays.directions.detach() * middle[:, None])]
-            before, start = torch.where(found, before, middle), torch.where(found, middle, start)
-        return start
-
-    def _place(self, positions: Tensor) -> Tensor:
-        """Return the index (N,) in `unshared` of the smallest box's cell around each of `positions` (N, 3)."""
-        unit = (positions - self.box.mean(0)) / ((self.box[1] - self.box[0]) / 2)
-        level = unit.abs().amax(-1).clamp(min=1).log2().ceil().clamp(max=LEVELS)
-        x, y, z = ((unit * torch.exp2(-level)[:, None] + 1) * (CELLS / 2)).long().clamp(0, CELLS - 1).unbind(-1)
-        return (((level.long() * CELLS + x) * CELLS + y) * CELLS + z).clamp(max=LEVELS * CELLS**3)
+        return replace(rays, nears=first_shared(rays, self.box, self.unshared))
 
 
 @torch.no_grad()

@@ -19,6 +19,7 @@ from framework.kernels.adam import ALL_FINITE, DENSE_ADAM, SPARSE_ADAM
 from framework.kernels.compositing import COMPOSITE, DISTORTION
 from framework.kernels.contraction import CONTRACT
 from framework.kernels.dispatch import TRITON, Backend, Operation, derivatives
+from framework.kernels.first_shared import CELLS, FIRST_SHARED, LEVELS
 from framework.kernels.fixed_march import FILL, REACH, fill
 from framework.kernels.frequency import FREQUENCY_ENCODING
 from framework.kernels.hash_grid import HASH_GRID, HashGridLayout, hash_grid
@@ -30,9 +31,11 @@ from framework.kernels.multisamples import FRUSTUM_BALLS, UNIT_MULTISAMPLES
 from framework.kernels.occupancy import REFRESH_OCCUPANCY, Occupancy
 from framework.kernels.plane_bands import BAND_VARIATION, PLANE_BANDS
 from framework.kernels.planes import PLANES, PlanesGradient, PlanesLayout
+from framework.kernels.proposals import PROPOSAL_WEIGHTS
 from framework.kernels.rigid_motion import RIGID_MOTIONS
 from framework.kernels.rows import GATHER_ROWS
 from framework.kernels.silhouettes import HOLD_BALLS, OPAQUE_SUMS, PIXELS_NEAR_BALLS, Photograph, opaque_sums
+from framework.kernels.spacing import SPACED
 from framework.kernels.spherical_harmonics import SPHERICAL_HARMONICS
 from framework.kernels.splat_blend import BLEND
 from framework.kernels.splat_packed import PROJECT_PACKED, pack_gaussians
@@ -104,6 +107,10 @@ def grid_density() -> GridDensity:
     return GridDensity(1 / size, -BOX[0] / size, table, GRID, None, weights)
 
 
+def unshared() -> Tensor:
+    return torch.cat([torch.rand(LEVELS * CELLS**3) < 0.8, torch.tensor([False])])
+
+
 def grid_color() -> GridColor:
     return GridColor(2, [torch.randn(8, 9), torch.randn(3, 8)])
 
@@ -159,6 +166,9 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     DISTORTION: lambda: (rand(12), samples()),
     INTERVAL_WEIGHTS: lambda: (rand(6, 9), edges(6, 9)),
     RESAMPLE: lambda: (edges(6, 9), rand(6, 9), torch.rand(6), 5, 0.7, 0.01),
+    SPACED: lambda: (torch.rand(6, 9), torch.rand(6), 3 + rand(6), 0.9),
+    FIRST_SHARED: lambda: (rays(), BOX, unshared()),
+    PROPOSAL_WEIGHTS: lambda: (rays(), edges(100, 9), grid_density()),
     PROPOSAL_EXCESS: lambda: (edges(6, 9), rand(6, 9), edges(6, 4), rand(6, 4) / 10),
     BLURRED_EXCESS: lambda: (edges(6, 9), rand(6, 9), edges(6, 4), rand(6, 4) / 10, 0.03),
     SPARSE_ADAM: lambda: (*(t for (t,) in adam(1)), torch.zeros(20), *RATES),

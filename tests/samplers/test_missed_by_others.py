@@ -5,9 +5,9 @@ import torch
 
 from framework.data.scene import Scene
 from framework.geometry.points import Points
+from framework.kernels.spacing import spacing
 from framework.samplers.choice import SamplingConfig, make_sampler
 from framework.samplers.occupancy import DECAY, MOVING_DECAY, WARM_UP_STEPS, OccupancySampler
-from framework.samplers.proposal import spacing
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
 

@@ -10,8 +10,9 @@ from torch import Tensor
 from framework.fields.base import Field
 from framework.geometry.points import Points
 from framework.geometry.rays import Rays
+from framework.kernels.spacing import from_disparity, to_disparity
 from framework.rendering.volume import Rendered, VolumeRenderer
-from framework.samplers.proposal import FARTHEST, ProposalSampler, from_disparity, interlevel_loss, to_disparity
+from framework.samplers.proposal import FARTHEST, ProposalSampler, interlevel_loss
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
 

@@ -7,15 +7,9 @@ from torch import Tensor
 from framework.fields.base import Field
 from framework.geometry.points import Points
 from framework.geometry.rays import Histogram, Rays, Samples
+from framework.kernels.spacing import inverse_power_ladder, power_ladder, spacing
 from framework.kernels.step_functions import blurred_excess_reference
-from framework.samplers.proposal import (
-    ProposalSampler,
-    interlevel_loss,
-    inverse_power_ladder,
-    power_ladder,
-    propose,
-    spacing,
-)
+from framework.samplers.proposal import ProposalSampler, interlevel_loss, propose
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
 DISTANCES = torch.logspace(-6, 3, 100, dtype=torch.float64)

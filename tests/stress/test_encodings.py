@@ -21,9 +21,9 @@ from framework.kernels.intervals import interval_weights, resample
 from framework.kernels.math import cross_matrix, safe_normalize, truncated_exp
 from framework.kernels.mlp import mlp
 from framework.kernels.planes import PlanesLayout, planes, planes_reference
+from framework.kernels.spacing import from_disparity, to_disparity
 from framework.kernels.spherical_harmonics import spherical_harmonics
 from framework.samplers.inverse_cdf import inverse_cdf
-from framework.samplers.proposal import from_disparity, to_disparity
 from tests.kernels.compiled import relative_error
 from tests.stress.backends import COMPILED, FEW, backends
 

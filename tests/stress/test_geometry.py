@@ -23,7 +23,7 @@ from framework.geometry.rays import Rays
 from framework.kernels.contraction import contract_to_unit
 from framework.kernels.march import CompiledMarch, Occupancy
 from framework.kernels.math import safe_normalize
-from framework.samplers.proposal import from_disparity, to_disparity
+from framework.kernels.spacing import from_disparity, to_disparity
 from tests.stress.backends import COMPILED, FEW, backends
 
 CUBE = torch.tensor([[-1.0] * 3, [1.0] * 3])

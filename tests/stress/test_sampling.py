@@ -13,9 +13,10 @@ from framework.geometry.points import Points
 from framework.geometry.rays import Rays
 from framework.kernels.intervals import resample
 from framework.kernels.march import CompiledMarch, Occupancy, ReferenceMarch
+from framework.kernels.spacing import spacing
 from framework.rendering.volume import VolumeRenderer
 from framework.samplers.inverse_cdf import inverse_cdf
-from framework.samplers.proposal import FARTHEST, ProposalSampler, half_edge, interlevel_loss, spacing
+from framework.samplers.proposal import FARTHEST, ProposalSampler, half_edge, interlevel_loss
 from tests.kernels.test_march import walk
 from tests.stress.backends import COMPILED, FEW, backends
 

@@ -1,6 +1,7 @@
 // What proposal sampling does with the histograms of rays, and the contraction of space. See ../intervals.py and
 // ../contraction.py for the references and the equations.
-#include "common.h"
+#include "contraction.h"
+#include "interval_weights.h"
 
 #include <algorithm>
 #include <cmath>
@@ -11,15 +12,10 @@
 EXPORT int interval_weights(const float* sigma, const float* t, int64_t rays, int64_t bins, float* weights,
                             int threads) {
     return guarded([&] {
-        for_each(threads, rays, 64, [&](int64_t r) {
-            const float *s = sigma + r * bins, *edge = t + r * (bins + 1);
-            float depth = 0, in_front = 1;
-            for (int64_t i = 0; i < bins; i++) {
-                const float tau = optical_depth(s[i], edge[i + 1] - edge[i]);
-                weights[r * bins + i] = in_front * -std::expm1(-tau);
-                depth += tau;
-                in_front = std::exp(-depth);
-            }
+        for_ranges(threads, rays, 64, [&](int64_t begin, int64_t end) {
+            Weights of(bins);
+            for (int64_t r = begin; r < end; r++)
+                of.of_ray(sigma + r * bins, t + r * (bins + 1), weights + r * bins);
         });
     });
 }
@@ -111,31 +107,35 @@ EXPORT int proposal_excess(const float* edges, const float* weights, int64_t bin
 
 namespace {
 
-// A position from the centre in half edges, x = (position - centre) * scale, as place / unit; unit is 1, but far away,
-// where squares would overflow, a power of two that makes everything smaller.
-struct Contracted {
-    float place[3], unit, factor, norm;  // the contracted position is factor * place; norm = max(1, |x|) * unit
+float mix(float a, float b, float share) { return share < 0.5f ? a + share * (b - a) : b - (b - a) * (1 - share); }
 
-    Contracted(const float* position, const float* centre, const float* scale) {
-        constexpr float LARGEST = std::numeric_limits<float>::max();
-        float farthest = 0, squared = 0;
-        for (int c = 0; c < 3; c++) {
-            const float x = (position[c] - centre[c]) * scale[c];
-            place[c] = x > LARGEST ? LARGEST : x < -LARGEST ? -LARGEST : x;  // what is infinite has no direction
-            farthest = std::max(farthest, std::fabs(place[c]));
-        }
-        unit = farthest > 1e12f ? 0x1p-83f : 1.0f;  // from 1e12 to 3e38 becomes from 1e-13 to 4e13
-        for (int c = 0; c < 3; c++) {
-            place[c] *= unit;
-            squared += place[c] * place[c];
-        }
-        norm = std::sqrt(squared);
-        norm = norm < unit ? unit : norm;  // NaN stays
-        factor = (2 * norm - unit) / (norm * norm);
-    }
-};
+float to_disparity(float t) { return t < 1 ? t / 2 : 1 - 1 / (2 * t); }
+
+float from_disparity(float s) {
+    constexpr float LEAST = std::numeric_limits<float>::epsilon();
+    const float left = 2 - 2 * s;
+    return s < 0.5f ? 2 * s : 1 / (left < LEAST ? LEAST : left);
+}
 
 }  // namespace
+
+// Normalised distances (rays, count) between the near and the far end of each ray to distances: linear if scale is 0,
+// else in disparity beyond that distance. See ../spacing.py.
+EXPORT int spaced_distances(const float* edges, const float* nears, const float* fars, int64_t rays, int64_t count,
+                            float scale, float* out, int threads) {
+    return guarded([&] {
+        for_each(threads, rays, 256, [&](int64_t r) {
+            const float *s = edges + r * count, near = nears[r], far = fars[r];
+            float* t = out + r * count;
+            if (scale == 0) {
+                for (int64_t i = 0; i < count; i++) t[i] = mix(near, far, s[i]);
+                return;
+            }
+            const float first = to_disparity(near / scale), last = to_disparity(far / scale);
+            for (int64_t i = 0; i < count; i++) t[i] = scale * from_disparity(mix(first, last, s[i]));
+        });
+    });
+}
 
 // Positions (count, 3) to [0, 1]^3: those within half an edge of the centre as they are, all others contracted into the
 // ball of radius 2.
@@ -144,7 +144,7 @@ EXPORT int contract_positions(const float* positions, const float* centre, const
     return guarded([&] {
         for_each(threads, count, 4096, [&](int64_t n) {
             const Contracted x(positions + n * 3, centre, scale);
-            for (int c = 0; c < 3; c++) out[n * 3 + c] = 0.25f * x.place[c] * x.factor + 0.5f;
+            x.write(out + n * 3);
         });
     });
 }

@@ -33,20 +33,22 @@ Traced& traced() {
 
 }  // namespace
 
-// Samples of all waves, as march_wave and march_advance find them, with the density of a network on a hash grid at
-// positions * scale + shift. `total`: samples that light reached, which trace_take returns. The other parameters are as
+// Samples of all waves, as march_wave and march_advance find them, with the density of a network on a hash grid
+// (grid_density.h). `total`: samples that light reached, which trace_take returns. The other parameters are as
 // in march_wave, hash_grid_forward and mlp_forward. keep: whether trace_take will be asked for features.
 EXPORT int trace_rays(const float* origins, const float* directions, const float* enter, const float* leave,
                       const float* first, const int64_t* slices, int64_t rays, const int64_t* limits, int waves,
                       const float* box, float step, float cone, const uint8_t* bits, const uint8_t* blocks,
                       int resolution, int boxes, float budget, const float* scale, const float* shift,
-                      const float* table, int features, const int64_t* resolutions, const int64_t* offsets, int levels,
+                      const float* around, const float* table, int features, const int64_t* resolutions,
+                      const int64_t* offsets, int levels,
                       const int64_t* widths, int layers, const float* const* weights, int bf16, int keep, int threads,
                       int64_t* total) {
     return guarded([&] {
         const Path path{origins, directions, enter, leave,  first,      slices, limits, waves,
                         box,     step,       cone,  bits,   blocks,     resolution, boxes, budget};
-        const Density density(scale, shift, table, features, resolutions, offsets, levels, widths, layers, weights, bf16);
+        const Density density(scale, shift, around, table, features, resolutions, offsets, levels, widths, layers,
+                              weights, bf16);
         Traced& all = traced();
         all.total = -1;
         all.inputs = density.inputs, all.width = density.width, all.rays = rays, all.keep = keep != 0;

@@ -1,9 +1,8 @@
 // Tracing blocks of rays: marching, encoding and the density network. What trace.cpp and traced_error.cpp share.
 #pragma once
 
-#include "hash_grid.h"
+#include "grid_density.h"
 #include "march.h"
-#include "mlp.h"
 
 namespace tracing {
 
@@ -19,31 +18,6 @@ struct Path {  // rays, and the grid of occupied cells; see march_wave
     const uint8_t *bits, *blocks;
     int resolution, boxes;
     float budget;
-};
-
-struct Density {  // that of a network on a hash grid, at positions * scale + shift
-    const float *scale, *shift, *table;
-    const int64_t *resolutions, *offsets;
-    int levels;
-    int64_t inputs, width;  // of the network, and of its output
-    std::unique_ptr<mlp::Layers> net;
-    decltype(&grid::encode<2>) encode;
-
-    Density(const float* scale, const float* shift, const float* table, int features, const int64_t* resolutions,
-            const int64_t* offsets, int levels, const int64_t* widths, int layers, const float* const* weights,
-            bool bf16)
-        : scale(scale), shift(shift), table(table), resolutions(resolutions), offsets(offsets), levels(levels),
-          inputs(int64_t(levels) * features), width(widths[layers]),
-          net(bf16 ? mlp::layers_bf16_of(widths, layers, weights) : mlp::layers_of(widths, layers, weights)) {
-        if (widths[0] != inputs) throw std::invalid_argument("the network does not fit the grid");
-        switch (features) {
-            case 1: encode = grid::encode<1>; break;
-            case 2: encode = grid::encode<2>; break;
-            case 4: encode = grid::encode<4>; break;
-            case 8: encode = grid::encode<8>; break;
-            default: throw std::invalid_argument("hash grid: an entry has 1, 2, 4 or 8 features");
-        }
-    }
 };
 
 struct Samples {  // that a thread has evaluated
@@ -97,15 +71,11 @@ inline void trace_block(const Path& path, const Density& of, int64_t base, int64
         for (int64_t n = 0; n < count; n++) {
             const int64_t r = to.rays[size_t(from + n)];
             const float t = (to.starts[size_t(from + n)] + to.ends[size_t(from + n)]) / 2;
-            for (int a = 0; a < 3; a++)
-                unit[n * 3 + a] = (path.origins[r * 3 + a] + t * path.directions[r * 3 + a]) * of.scale[a] + of.shift[a];
+            of.place(path.origins + r * 3, path.directions + r * 3, t, unit + n * 3);
         }
         float* encoded = to.features.data() + (features ? from * of.inputs : 0);
-        for (int64_t n = 0; n < count; n += grid::CHUNK)
-            of.encode(unit, n, std::min(count, n + grid::CHUNK), of.table, of.resolutions, of.offsets, of.levels,
-                      encoded);
-        of.net->forward(encoded, count, mlp::NONE, to.outputs.data() + from * of.width, to.density.data() + from,
-                        records ? to.records.data() + size_t(from) * of.net->record() : nullptr);
+        of.evaluate(unit, count, encoded, to.outputs.data() + from * of.width, to.density.data() + from,
+                    records ? to.records.data() + size_t(from) * of.net->record() : nullptr);
         int on = 0;
         int64_t n = from;
         for (int i = 0; i < living; i++) {

@@ -264,8 +264,8 @@ EXPORT int traced_error(const float* origins, const float* directions, const flo
                         const float* first, const int64_t* slices, int64_t rays, const int64_t* limits, int waves,
                         const float* box, float step, float cone, const uint8_t* bits, const uint8_t* blocks,
                         int resolution, int boxes, float budget, const float* scale, const float* shift,
-                        const float* table, int features, const int64_t* resolutions, const int64_t* offsets,
-                        int levels, const int64_t* widths, int layers, const float* const* weights, int bf16,
+                        const float* around, const float* table, int features, const int64_t* resolutions,
+                        const int64_t* offsets, int levels, const int64_t* widths, int layers, const float* const* weights, int bf16,
                         const int64_t* color_widths, int color_layers, const float* const* color_weights, int bands,
                         const float* background, const float* target, const float* pixel_weights, int64_t per_pixel,
                         float floor, int64_t seed, float* rgb, float* error, float* const* weight_grads,
@@ -273,7 +273,8 @@ EXPORT int traced_error(const float* origins, const float* directions, const flo
     return guarded([&] {
         const Path path{origins, directions, enter, leave,  first,      slices, limits, waves,
                         box,     step,       cone,  bits,   blocks,     resolution, boxes, budget};
-        const Density density(scale, shift, table, features, resolutions, offsets, levels, widths, layers, weights, bf16);
+        const Density density(scale, shift, around, table, features, resolutions, offsets, levels, widths, layers,
+                              weights, bf16);
         const auto color = bf16 ? mlp::layers_bf16_of(color_widths, color_layers, color_weights)
                                 : mlp::layers_of(color_widths, color_layers, color_weights);
         const Networks nets{density, *color, color_widths[0], bands * bands};

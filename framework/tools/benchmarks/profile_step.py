@@ -12,12 +12,13 @@ from framework.kernels import native
 from framework.tools.benchmarks.workload import endless_trainer
 from framework.training.machine import machine
 
-MEASURED = 200
-"""Number of steps over which times are averaged."""
+MEASURED, FEWEST, LONGEST = 200, 8, 30.0
+"""Number of steps over which times are averaged; fewer, but not fewer than the second, where they take longer than the
+third, seconds."""
 
 
 def measure(data: Path, method: str, steps: int, max_seconds: float) -> dict[str, Any]:
-    """Train a method, measure `MEASURED` further steps, and print a line for each kernel.
+    """Train a method, measure `MEASURED` further steps at most, and print a line for each kernel.
 
     Args:
         data: folder of the data set.
@@ -33,11 +34,12 @@ def measure(data: Path, method: str, steps: int, max_seconds: float) -> dict[str
         for _ in range(steps):
             trainer.train_step()
         native.spent = {}
-        start = time.perf_counter()
-        for _ in range(MEASURED):
+        start, count = time.perf_counter(), 0
+        while count < FEWEST or (count < MEASURED and time.perf_counter() - start < LONGEST):
             trainer.train_step()
-        step = (time.perf_counter() - start) / MEASURED * 1e3
-    kernels = {name: seconds / MEASURED * 1e3 for name, seconds in native.spent.items()}
+            count += 1
+        step = (time.perf_counter() - start) / count * 1e3
+    kernels = {name: seconds / count * 1e3 for name, seconds in native.spent.items()}
     native.spent = None
     kernels["Python and torch"] = step - sum(kernels.values())
     parts = dict(sorted(kernels.items(), key=lambda item: -item[1]))
@@ -47,6 +49,7 @@ def measure(data: Path, method: str, steps: int, max_seconds: float) -> dict[str
     return {
         "machine": machine(),
         "kernels": native.variant(),
+        "steps": count,
         "ms per step": round(step, 2),
         "ms": {name: round(spent, 3) for name, spent in parts.items()},
     }

@@ -1,0 +1,80 @@
+"""The first place along a ray that enough images show, by the cells that they do not show (`scene/shared_space.py`)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from framework.geometry.rays import Rays
+from framework.kernels import native
+from framework.kernels.dispatch import CPP, Operation
+
+LEVELS, CELLS = 3, 32
+"""Nested boxes, each twice as large as the one before, and cells along an axis of each; beyond, all is shared."""
+STEPS, REACH, HALVINGS = 64, 4.0, 4
+"""Places along a ray that are looked up, the distance of the last from its near end in half edges of the box, and how
+often the step before the first that is shared is halved."""
+
+
+@torch.no_grad()
+def first_shared_reference(rays: Rays, box: Tensor, unshared: Tensor) -> Tensor:
+    """Compute `first_shared` of `rays`, `box` and `unshared` in PyTorch, on any device and for any float type."""
+    half = (box[1] - box[0]).amax() / 2
+    ends = torch.minimum(rays.nears + REACH * half, rays.fars)
+    steps = torch.linspace(0, 1, STEPS, device=ends.device, dtype=ends.dtype)
+    t = torch.lerp(rays.nears[:, None], ends[:, None], steps)
+
+    def shared(t: Tensor) -> Tensor:
+        positions = torch.addcmul(rays.origins[:, None], rays.directions[:, None], t[..., None])
+        return ~unshared[_cells(positions.view(-1, 3), box)].view(t.shape)
+
+    first = shared(t).int().argmax(1, keepdim=True)  # index 0 if there is no other
+    before, start = t.gather(1, (first - 1).clamp(min=0)), t.gather(1, first)
+    for _ in range(HALVINGS):  # up to a whole step of what images do show is left out otherwise
+        middle = (before + start) / 2
+        found = shared(middle)
+        before, start = torch.where(found, before, middle), torch.where(found, middle, start)
+    return start.squeeze(1)
+
+
+def _cells(positions: Tensor, box: Tensor) -> Tensor:
+    """Return the index (N,) of the smallest box's cell around each of `positions` (N, 3); the last one is beyond."""
+    unit = (positions - box.mean(0)) / ((box[1] - box[0]) / 2)
+    level = unit.abs().amax(-1).clamp(min=1).log2().ceil().clamp(max=LEVELS)
+    x, y, z = ((unit * torch.exp2(-level)[:, None] + 1) * (CELLS / 2)).long().clamp(0, CELLS - 1).unbind(-1)
+    return (((level.long() * CELLS + x) * CELLS + y) * CELLS + z).clamp(max=LEVELS * CELLS**3)
+
+
+def first_shared(rays: Rays, box: Tensor, unshared: Tensor) -> Tensor:
+    """Return the distance (R,) of the first place along each ray that is shared; its near end if none is.
+
+    Args:
+        rays: R rays, to which no gradient goes.
+        box: (2, 3) corners of the smallest box, scene units.
+        unshared: (`LEVELS` * `CELLS`^3 + 1,) bool, box by box; the last one stands for all of space beyond the boxes,
+            and is False.
+    """
+    rays = rays.detached()
+    return FIRST_SHARED((rays.origins, rays.directions, rays.nears, rays.fars, box), rays, box, unshared)
+
+
+FIRST_SHARED = Operation("first_shared", first_shared_reference)
+
+
+@FIRST_SHARED.implementation(CPP)
+def _compiled(rays: Rays, box: Tensor, unshared: Tensor) -> Tensor:
+    count, out = len(rays), torch.empty_like(rays.nears)
+    origins, directions, nears, fars = (
+        each.contiguous() for each in (rays.origins, rays.directions, rays.nears, rays.fars)
+    )
+    _first_shared(
+        native.pointer(origins, "origins", (count, 3)), native.pointer(directions, "directions", (count, 3)),
+        native.pointer(nears, "near ends", (count,)), native.pointer(fars, "far ends", (count,)), count,
+        native.pointer(box, "the box", (2, 3)),
+        native.pointer(unshared, "cells", (LEVELS * CELLS**3 + 1,), torch.bool), LEVELS, CELLS, STEPS, REACH, HALVINGS,
+        out.data_ptr(), native.threads(),
+    )  # fmt: skip
+    return out
+
+
+_first_shared = native.Function("first_shared", "ppppqppiiifipi")

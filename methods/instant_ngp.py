@@ -28,6 +28,12 @@ from framework.scene.few_images import FewImagesConfig, decide_few_images
 FITTED_SECONDS, FITTED_PIXELS = 150.0, 400
 """Seconds of training on two threads of a CPU, and pixels of the longer side of the images, from which `plan` counts.
 Its settings were found by trials on Lego, 400 x 400, after 15, 45, 150 and 300 s."""
+TABLE_SECONDS, STEPS_SECONDS, LARGE_STEP_SECONDS = 60.0, 110.0, 300.0
+"""Seconds at which tables have 2^17 entries, from which steps along rays shorten, and at which a training step has 2^16
+samples. On Lego, 2^17 entries were 0.30 and
+0.35 dB better than 2^16 after 45 s (docs/notes/learning.md)."""
+LEAST_SAMPLES, MOST_SAMPLES = 24 * 2**10, 2**16
+"""Samples of a step in the shortest time and the longest."""
 
 THIN = 0.5
 """Share of the mean gradient below which samples are thinned. On Lego, two seeds gave 28.34 and 28.52 dB after 800
@@ -95,10 +101,11 @@ class Plan:
 def plan(seconds: float, image_size: int, speed: float = 1.0) -> Plan:
     """Return the settings that suit a time and a size of images.
 
-    With twice the time each setting doubles, from a lower to an upper limit: 2^17 entries, 512 steps, 2^15 samples and
-    2 cells a pixel after 150 s on two threads, from 2^16, 512, 2^15 and 1 to 2^18, 1024, 2^16 and 2. Images larger than
-    400 pixels, up to twice as large, have more for tables to hold, and need as many times longer before they get 2
-    cells a pixel.
+    With twice the time tables double, to 2^17 entries after 60 s on two threads, from 2^16 to 2^18; so do the steps
+    along the diagonal and the cells of a pixel, to 704 and 2 after 150 s, from 512 and 1 to 1,024 and 2. The samples of
+    a step grow with the square root of time, to 2^16 after 300 s, from 24,576. Images larger than 400 pixels, up to
+    twice as large, have more for tables to hold, up to 2^19 entries after 600 s, and need as many times longer before
+    they get 2 cells a pixel.
 
     Args:
         seconds: maximum seconds of training; infinity without a maximum.
@@ -106,11 +113,13 @@ def plan(seconds: float, image_size: int, speed: float = 1.0) -> Plan:
         speed: speed of this machine, relative to two threads of a CPU.
     """
     time, size = seconds * speed / FITTED_SECONDS, min(max(image_size / FITTED_PIXELS, 1.0), 2.0)
-    longer = min(max(time, 1.0), 2.0)
+    longer = min(max(seconds * speed / STEPS_SECONDS, 1.0), 2.0)
+    share = (seconds * speed / LARGE_STEP_SECONDS) ** 0.5  # of the most samples
+    entries = max(min(seconds * speed / TABLE_SECONDS, 2.0), min(time, 2 * size), 0.5)  # in those of 2^17
     return Plan(
-        log2_table_size=17 + round(math.log2(min(max(time, 0.5), 2 * size))),
+        log2_table_size=17 + round(math.log2(entries)),
         num_steps=32 * round(16 * longer),
-        samples=1024 * round(32 * longer),
+        samples=1024 * round(min(max(share, LEAST_SAMPLES / MOST_SAMPLES), 1.0) * MOST_SAMPLES / 1024),
         detail=round(min(max(2 * time / size, 1.0), 2.0)),
     )
 

@@ -23,10 +23,9 @@ SPEEDS = [1 / (0.25 + 1.5 / threads) for threads in (1, 2, 3, 4, 8, 16)]
 @pytest.mark.parametrize(
     ("seconds", "size", "found"),
     [
-        (15, 400, Plan(16, 512, 2**15, 1)),
-        (45, 400, Plan(16, 512, 2**15, 1)),
-        (60, 400, Plan(16, 512, 2**15, 1)),
-        (150, 400, Plan(17, 512, 2**15, 2)),
+        (15, 400, Plan(16, 512, 24 * 2**10, 1)),
+        (45, 400, Plan(17, 512, 25 * 2**10, 1)),
+        (150, 400, Plan(18, 704, 45 * 2**10, 2)),
         (300, 400, Plan(18, 1024, 2**16, 2)),
         (math.inf, 400, Plan(18, 1024, 2**16, 2)),
         (300, 800, Plan(18, 1024, 2**16, 2)),
@@ -41,7 +40,7 @@ def test_settings_stay_within_what_was_tried_on_a_processor() -> None:
         found = plan(seconds, size, speed)
         assert 16 <= found.log2_table_size <= (18 if size <= 400 else 19)
         assert 512 <= found.num_steps <= 1024
-        assert 2**15 <= found.samples <= 2**16
+        assert 24 * 2**10 <= found.samples <= 2**16
         assert found.detail in (1, 2)
 
 

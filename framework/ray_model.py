@@ -34,7 +34,7 @@ from framework.rendering.losses import (
 )
 from framework.rendering.rendered import Picture, Rendered
 from framework.rendering.renderer import Renderer
-from framework.rendering.traced import error_of_traced
+from framework.rendering.traced import error_of_traced, traced_rays
 from framework.rendering.volume import VolumeRenderer
 from framework.samplers.base import Sampler, SkipsCells
 from framework.samplers.in_view import pixels_in_view
@@ -211,7 +211,7 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
                 part = part if places is None else places[part]
                 rays = view.camera.pixel_rays(pixels[part], self.scene.near, self.scene.far, times, offsets)
                 # Index 0 of the view's one camera must not be taken for the index of a training camera.
-                rendered = self.render(replace(rays, camera_indices=None), background).to_pixels(per_pixel)
+                rendered = self._shown(replace(rays, camera_indices=None), background).to_pixels(per_pixel)
                 rgb[part], depth[part], median[part] = rendered.rgb, rendered.depth, rendered.median_depth
                 accumulation[part] = rendered.accumulation
                 if rendered.normals is not None:
@@ -227,10 +227,21 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
             num_rays=count * per_pixel,
         )
 
+    def _shown(self, rays: Rays, background: Tensor) -> Rendered:
+        """Return rays of a view as `render` does, without weights and samples where one call knows the rest."""
+        known = None
+        if self._renders_plainly and self.shared_space is None:
+            known = traced_rays(rays, background, self.sampler, self.field, self.renderer)
+        return self.render(rays, background) if known is None else known
+
     def _seen(self, view: View) -> Tensor | None:
         """Return the pixels of a view that may show anything but the background; None if that is not known."""
-        own = getattr(self.render, "__func__", None) is RayModel.render and type(self.renderer) is VolumeRenderer
-        return pixels_in_view(self.sampler, view) if own else None
+        return pixels_in_view(self.sampler, view) if self._renders_plainly else None
+
+    @property
+    def _renders_plainly(self) -> bool:
+        """Whether `render` and the renderer are those from here."""
+        return getattr(self.render, "__func__", None) is RayModel.render and type(self.renderer) is VolumeRenderer
 
     def step_kind(self, step: int) -> StepKind:
         config = self.config

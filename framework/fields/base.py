@@ -15,7 +15,7 @@ from framework.geometry.points import Footprint, Points
 from framework.kernels.memory import require
 from framework.kernels.mlp import Activation, density_mlp, mlp
 from framework.kernels.trace import GridDensity
-from framework.kernels.traced_error import GridColor
+from framework.kernels.traced_colors import GridColor
 
 DensityFunction = Callable[[Points], tuple[Tensor, Tensor]]
 """Function from N points to density (N,), 1/length, and features (N, F); samplers are called with it."""

@@ -17,7 +17,7 @@ from framework.geometry.points import Points
 from framework.kernels.contraction import contract_to_unit
 from framework.kernels.spherical_harmonics import spherical_harmonics
 from framework.kernels.trace import GridDensity
-from framework.kernels.traced_error import GridColor
+from framework.kernels.traced_colors import GridColor
 
 NUM_FEATURES = 16
 """Number of features that the density network passes to the colour network; the first is the log-density."""

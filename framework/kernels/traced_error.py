@@ -14,34 +14,21 @@ light paths (Arvo and Kirk 1990, "Particle transport and image synthesis").
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from framework.geometry.rays import Samples
 from framework.kernels import kept, native
-from framework.kernels.compositing import composite
 from framework.kernels.dispatch import CPP, Operation
 from framework.kernels.hash_grid import hash_grid
 from framework.kernels.march import March
-from framework.kernels.mlp import NETWORK, mlp, multiplies_bf16
-from framework.kernels.spherical_harmonics import spherical_harmonics
-from framework.kernels.trace import DENSITY, PATH, GridDensity, arguments, is_compiled, network_arguments, trace
+from framework.kernels.mlp import multiplies_bf16
+from framework.kernels.trace import DENSITY, PATH, GridDensity, arguments, network_arguments
+from framework.kernels.traced_colors import GridColor, has_compiled_networks, traced_colors_reference
 
 MAX_RAYS = 256
 """Maximum number of rays of a pixel in the compiled form."""
-
-
-@dataclass(frozen=True)
-class GridColor:
-    """A colour: the sigmoid of `mlp` of the outputs of a `GridDensity` and of harmonics of the viewing direction."""
-
-    bands: int
-    """Bands of the harmonics; 0 for colours that do not depend on the direction."""
-    weights: Sequence[Tensor]
-    """(D_out, D_in) weights of each layer, without biases."""
 
 
 class TracedError(NamedTuple):
@@ -90,18 +77,11 @@ def traced_error_reference(
 
     `marched`, `density`, `color` and `pixels` are as in `traced_error`; `thin` is not used.
     """
-    traced, rays = trace(marched, density), marched.rays
-    inputs = [traced.features]
-    if color.bands:
-        inputs.append(spherical_harmonics(rays.directions.index_select(0, traced.owners), color.bands))
-    rgb = mlp(inputs, color.weights, "sigmoid")
-    samples = Samples(traced.t_starts, traced.t_ends, traced.offsets, owners=traced.owners, longest=traced.longest)
-    rgb = rgb if rgb.dtype == torch.float64 else rgb.float()
-    rendered = composite(samples, traced.sigma, rgb, pixels.background, rays.fars).color
-    rendered = rendered.view(len(pixels.target), -1, 3).mean(1)
+    shown = traced_colors_reference(marched, density, color, pixels.background)
+    rendered = shown.color.view(len(pixels.target), -1, 3).mean(1)
     squares = (rendered - pixels.target).square()
     error = squares if pixels.weights is None else squares * pixels.weights[:, None]
-    return TracedError(error.mean(), rendered.detach(), len(samples))
+    return TracedError(error.mean(), rendered.detach(), shown.num_samples)
 
 
 TRACED_ERROR = Operation("traced_error", traced_error_reference)
@@ -111,11 +91,9 @@ def _fits(marched: March, density: GridDensity, color: GridColor, pixels: PixelT
     """Return whether all single operations would run compiled, and gradients go to table and weights alone."""
     if not torch.is_grad_enabled() or any(tensor is not None and tensor.requires_grad for tensor in pixels):
         return False
-    if not 0 < len(marched.rays) <= MAX_RAYS * len(pixels.target) or not is_compiled(marched, density):
+    if not 0 < len(marched.rays) <= MAX_RAYS * len(pixels.target):
         return False
-    inputs = (marched.rays.origins,)
-    network = NETWORK.choose((*inputs, *color.weights), inputs, color.weights, "sigmoid")
-    return network.backend is CPP and all(weight.is_contiguous() for weight in color.weights)
+    return has_compiled_networks(marched, density, color)
 
 
 @TRACED_ERROR.implementation(CPP, fits=_fits)

@@ -1,12 +1,18 @@
-"""The error of traced rays, learnt in one compiled call where sampler, renderer and field are the plain ones."""
+"""Traced rays, rendered or learnt from in one compiled call where sampler, renderer and field are the plain ones."""
 
 from __future__ import annotations
 
+import torch
+from torch import Tensor
+
 from framework.fields.base import Field, HasGridColor
 from framework.geometry.rays import Rays
+from framework.kernels.trace import GridDensity
+from framework.kernels.traced_colors import GridColor, traced_colors
 from framework.kernels.traced_error import PixelTargets, TracedError, traced_error
+from framework.rendering.rendered import Rendered
 from framework.rendering.renderer import Renderer
-from framework.rendering.volume import VolumeRenderer
+from framework.rendering.volume import VolumeRenderer, mean_distance
 from framework.samplers.base import Sampler
 from framework.samplers.occupancy import OccupancySampler
 
@@ -27,16 +33,52 @@ def error_of_traced(
     Returns:
         None without rays, or where one of the parts computes something else.
     """
-    if type(sampler) is not OccupancySampler or sampler.endless or not (sampler.training and len(rays)):
+    if not sampler.training or not isinstance(sampler, OccupancySampler) or sampler.is_fixed(rays):
         return None
-    if sampler.is_fixed(rays):
+    parts = _plain(rays, sampler, field, renderer)
+    if parts is None or (isinstance(renderer, VolumeRenderer) and renderer.unit_length is not None):
+        return None
+    return traced_error(sampler.begin(rays, True, sampler.train_early_stop), *parts, pixels, thin)
+
+
+def traced_rays(rays: Rays, background: Tensor, sampler: Sampler, field: Field, renderer: Renderer) -> Rendered | None:
+    """Return rays as they are rendered outside of training, by `traced_colors`, without weights and samples.
+
+    Args:
+        rays: R rays.
+        background: (3,) colour in [0, 1].
+        sampler: chooses the positions along each ray.
+        field: density and colour.
+        renderer: turns samples into colours.
+
+    Returns:
+        None with gradients, without rays, or where one of the parts computes something else.
+    """
+    if sampler.training or torch.is_grad_enabled() or not isinstance(sampler, OccupancySampler):
+        return None
+    parts = _plain(rays, sampler, field, renderer)
+    if parts is None:
+        return None
+    behind = background.to(rays.origins).expand(len(rays), 3)
+    shown = traced_colors(sampler.begin(rays, False, sampler.early_stop), *parts, behind)
+    return Rendered(
+        rgb=shown.color,
+        depth=mean_distance(shown.moment, shown.opacity, rays.fars),
+        median_depth=shown.median,
+        accumulation=shown.opacity,
+        num_samples=shown.num_samples,
+        error_bound=sampler.early_stop,
+    )
+
+
+def _plain(
+    rays: Rays, sampler: OccupancySampler, field: Field, renderer: Renderer
+) -> tuple[GridDensity, GridColor] | None:
+    """Return the field's density and colour, if it has such, and sampler and renderer are the plain ones."""
+    if type(sampler) is not OccupancySampler or sampler.endless or not len(rays):
         return None
     changed = vars(sampler).keys() & {"sample"} | vars(renderer).keys() & {"render", "shade"}
-    if type(renderer) is not VolumeRenderer or renderer.unit_length is not None or changed:
-        return None
-    if not isinstance(field, HasGridColor):
+    if type(renderer) is not VolumeRenderer or changed or not isinstance(field, HasGridColor):
         return None
     density, color = field.grid_density(), field.grid_color()
-    if density is None or color is None:
-        return None
-    return traced_error(sampler.begin(rays, True, sampler.train_early_stop), density, color, pixels, thin)
+    return None if density is None or color is None else (density, color)

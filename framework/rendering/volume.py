@@ -152,12 +152,9 @@ def volume_render(
     sigma, rgb = _at_least_float32(sigma), _at_least_float32(rgb)
     over = composite_alpha if is_alpha else composite
     sums: Composited = over(samples, sigma, rgb, background.to(rgb.dtype), rays.fars)
-    visible = sums.opacity.detach() > 1e-6
-    mean = sums.moment / torch.where(visible, sums.opacity.detach(), torch.ones_like(sums.moment))
-    depth = torch.where(visible, torch.minimum(mean, rays.fars), rays.fars)
     return Rendered(
         rgb=sums.color,
-        depth=depth,
+        depth=mean_distance(sums.moment, sums.opacity.detach(), rays.fars),
         median_depth=sums.median,
         accumulation=sums.opacity,
         num_samples=samples.num_evaluated,
@@ -165,6 +162,19 @@ def volume_render(
         samples=samples,
         error_bound=samples.early_stop,
     )
+
+
+def mean_distance(moments: Tensor, opacity: Tensor, fars: Tensor) -> Tensor:
+    """Return the mean distance (R,) of what rays show; the far end of rays that show nothing.
+
+    Args:
+        moments: (R,) sums of weight times distance.
+        opacity: (R,) sums of the weights.
+        fars: (R,) far ends of the rays, scene units.
+    """
+    visible = opacity > 1e-6
+    mean = moments / torch.where(visible, opacity, torch.ones_like(moments))
+    return torch.where(visible, torch.minimum(mean, fars), fars)
 
 
 def _at_least_float32(values: Tensor) -> Tensor:

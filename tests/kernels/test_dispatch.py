@@ -53,7 +53,8 @@ from framework.kernels.splat_tiles import TILES, tile_lists
 from framework.kernels.ssim import PHOTOMETRIC, STRUCTURE
 from framework.kernels.step_functions import BLURRED_EXCESS
 from framework.kernels.trace import TRACE, GridDensity
-from framework.kernels.traced_error import TRACED_ERROR, GridColor, PixelTargets
+from framework.kernels.traced_colors import TRACED_COLORS, GridColor
+from framework.kernels.traced_error import TRACED_ERROR, PixelTargets
 from tests.kernels.compiled import needs_kernels
 
 GRID = HashGridLayout.build(3, 4, 20, 8)
@@ -180,6 +181,7 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     FILL: lambda: (rays(), Occupancy(torch.rand(16**3) < 0.1, BOX, 16), 0.05, 100, None, (2048, 2048)),
     REACH: lambda: (fill(*CASES[FILL]()).placed, rand(2048), 4.6, 100),
     TRACE: lambda: (marched(), grid_density()),
+    TRACED_COLORS: lambda: (marched(), grid_density(), grid_color(), rand(100, 3)),
     TRACED_ERROR: lambda: (marched(), grid_density(), grid_color(), PixelTargets(rand(100, 3), rand(25, 3), rand(25))),
     REFRESH_OCCUPANCY: lambda: (torch.rand(200) * 0.4, torch.zeros(200, dtype=torch.bool), 0.9, 0.05, 0.01),
     OPAQUE_SUMS: lambda: (torch.rand(7, 9) > 0.5,),

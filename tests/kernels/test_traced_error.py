@@ -14,9 +14,9 @@ from framework.kernels import dispatch
 from framework.kernels.march import March, march
 from framework.kernels.occupancy import Occupancy
 from framework.kernels.trace import GridDensity, trace
+from framework.kernels.traced_colors import GridColor
 from framework.kernels.traced_error import (
     TRACED_ERROR,
-    GridColor,
     PixelTargets,
     TracedError,
     traced_error,

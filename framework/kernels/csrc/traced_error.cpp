@@ -1,10 +1,13 @@
-// The squared error of what traced rays show, and its gradient, in one call. See ../traced_error.py for the reference.
+// What traced rays show, and the squared error of that with its gradient, each in one call. See ../traced_error.py and
+// ../traced_colors.py for the references.
 //
 // A block of rays goes all the way on one thread while it is in cache: through trace_block, the colour network,
 // compositing and the error, and back through both networks, whose activations were recorded on the way there. What
 // leaves the cache is the gradient of the encoding, for the hash table, and the sums of the weights' gradients.
 #include "harmonics.h"
 #include "trace.h"
+
+#include <atomic>
 
 using namespace tracing;
 
@@ -13,6 +16,11 @@ namespace {
 constexpr int64_t BLOCK_RAYS = 64;  // whose samples fit the second cache; with 256 a step takes 1.1 times as long
 constexpr int64_t PARTS = 64;     // at most, each with sums of its own
 constexpr size_t KEPT = 1 << 25;  // floats that a thread keeps between calls, for fresh memory costs faults
+
+struct Shown {  // by rays: colour over the background (R, 3), opacity, first moment of t, and median of t
+    const float *background, *fars;
+    float *rgb, *opacity, *moment, *median;
+};
 
 struct Pixels {  // of `per_pixel` consecutive rays each
     const float *background, *target, *weights;
@@ -66,9 +74,9 @@ inline uint64_t scrambled(uint64_t x) {
 struct Block {
     const Path& path;
     const Networks& nets;
-    const Pixels& pixels;
     Scratch& own;
     const int64_t base, rays;
+    const bool learns;  // whether there is a way back, for which activations are recorded
 
     int64_t first[RAYS + 1] = {}, count = 0;  // of each ray's samples; of all samples
     int64_t* order = nullptr;                 // which of the evaluated samples each is
@@ -78,15 +86,15 @@ struct Block {
     float *rgb, *by_rgb;  // and the gradient of what comes before the sigmoid
     float grads[RAYS * 3], opacity[RAYS];
 
-    Block(const Path& path, const Networks& nets, const Pixels& pixels, Scratch& own, int64_t base, int64_t rays)
-        : path(path), nets(nets), pixels(pixels), own(own), base(base), rays(rays) {}
+    Block(const Path& path, const Networks& nets, Scratch& own, int64_t base, int64_t rays, bool learns)
+        : path(path), nets(nets), own(own), base(base), rays(rays), learns(learns) {}
 
     void trace() {
         Samples& samples = own.samples;
         int32_t counts[RAYS] = {};
         int64_t at[RAYS];
         samples.clear();
-        trace_block(path, nets.density, base, base + rays, false, true, samples, counts);
+        trace_block(path, nets.density, base, base + rays, false, learns, samples, counts);
         for (int64_t r = 0; r < rays; r++) first[r + 1] = first[r] + counts[r], at[r] = first[r];
         count = first[rays];
         order = room(own.order, size_t(count));
@@ -110,13 +118,12 @@ struct Block {
             }
         }
         rgb = room(own.rgb, size_t(count) * 3), by_rgb = room(own.by_rgb, size_t(count) * 3);
-        char* records = room(own.records, size_t(count) * nets.color.record());
+        char* records = learns ? room(own.records, size_t(count) * nets.color.record()) : nullptr;
         nets.color.forward(inputs, count, mlp::SIGMOID, rgb, nullptr, records);
     }
 
-    // As in compositing.cpp, with the exponentials of a whole vector at once. Returns the squared error of the pixels.
-    double composite() {
-        float colors[RAYS * 3];
+    // As in compositing.cpp, with the exponentials of a whole vector at once.
+    void weigh() {
         for (int64_t r = 0; r < rays; r++) {
             float sum = 0;
             for (int64_t n = first[r]; n < first[r + 1]; n++) {
@@ -132,6 +139,29 @@ struct Block {
             store(weight + n, exponential(-before) * opacity_of(here));
             store(behind + n, exponential(-(before + here)));
         }
+    }
+
+    void show(const Shown& to) const {
+        for (int64_t r = 0; r < rays; r++) {
+            float sum[3] = {}, total = 0, mean = 0, half = to.fars[base + r];
+            bool found = false;
+            for (int64_t n = first[r]; n < first[r + 1]; n++) {
+                const size_t s = size_t(order[n]);
+                const float t = (own.samples.starts[s] + own.samples.ends[s]) / 2;
+                total += weight[n], mean += weight[n] * t;
+                for (int c = 0; c < 3; c++) sum[c] += weight[n] * rgb[n * 3 + c];
+                if (!found && behind[n] <= 0.5f) half = t < half ? t : half, found = true;
+            }
+            const float left = 1 - total < 0 ? 0 : 1 - total;
+            for (int c = 0; c < 3; c++)
+                to.rgb[(base + r) * 3 + c] = sum[c] + left * to.background[(base + r) * 3 + c];
+            to.opacity[base + r] = total, to.moment[base + r] = mean, to.median[base + r] = half;
+        }
+    }
+
+    // Returns the squared error of the pixels.
+    double composite(const Pixels& pixels) {
+        float colors[RAYS * 3];
         for (int64_t r = 0; r < rays; r++) {
             float sum[3] = {}, total = 0;
             for (int64_t n = first[r]; n < first[r + 1]; n++) {
@@ -143,13 +173,14 @@ struct Block {
             for (int c = 0; c < 3; c++) colors[r * 3 + c] = sum[c] + left * pixels.background[(base + r) * 3 + c];
         }
         double error = 0;
-        for (int64_t r = 0; r < rays; r += pixels.per_pixel) error += pixel_error(r, colors + r * 3, grads + r * 3);
+        for (int64_t r = 0; r < rays; r += pixels.per_pixel)
+            error += pixel_error(pixels, r, colors + r * 3, grads + r * 3);
         return error;
     }
 
     // That of the pixel of ray r and those behind it, times its weight and summed over channels. Writes its colour,
     // and the derivative of the mean over all pixels and channels to each ray's `grad`.
-    double pixel_error(int64_t r, const float* colors, float* grad) const {
+    double pixel_error(const Pixels& pixels, int64_t r, const float* colors, float* grad) const {
         const int64_t each = pixels.per_pixel, p = (base + r) / each;
         const float factor = pixels.weights ? pixels.weights[p] : 1;
         double error = 0;
@@ -166,7 +197,7 @@ struct Block {
     }
 
     // Back to density and colour of each sample.
-    void to_samples() {
+    void to_samples(const Pixels& pixels) {
         for (int64_t r = 0; r < rays; r++) {
             const float *g = grads + r * 3, *back = pixels.background + (base + r) * 3;
             float own_background = 0, after = 0;
@@ -253,6 +284,16 @@ Learnt& learnt() {
     return of_caller;
 }
 
+std::unique_ptr<mlp::Layers> color_network(const int64_t* widths, int layers, const float* const* weights, int bf16) {
+    return bf16 ? mlp::layers_bf16_of(widths, layers, weights) : mlp::layers_of(widths, layers, weights);
+}
+
+Networks networks(const Density& density, const mlp::Layers& color, const int64_t* widths, int layers, int bands) {
+    if (bands < 0 || bands > 4 || widths[0] != density.width + bands * bands || widths[layers] != 3)
+        throw std::invalid_argument("the colour network does not fit");
+    return {density, color, widths[0], bands * bands};
+}
+
 }  // namespace
 
 // The rays, their grid and the density are as in trace_rays. The colour is a network on the density network's outputs
@@ -275,11 +316,8 @@ EXPORT int traced_error(const float* origins, const float* directions, const flo
                         box,     step,       cone,  bits,   blocks,     resolution, boxes, budget};
         const Density density(scale, shift, around, table, features, resolutions, offsets, levels, widths, layers,
                               weights, bf16);
-        const auto color = bf16 ? mlp::layers_bf16_of(color_widths, color_layers, color_weights)
-                                : mlp::layers_of(color_widths, color_layers, color_weights);
-        const Networks nets{density, *color, color_widths[0], bands * bands};
-        if (bands < 0 || bands > 4 || nets.inputs != density.width + nets.harmonics || color_widths[color_layers] != 3)
-            throw std::invalid_argument("the colour network does not fit");
+        const auto color = color_network(color_widths, color_layers, color_weights, bf16);
+        const Networks nets = networks(density, *color, color_widths, color_layers, bands);
         if (per_pixel < 1 || per_pixel > RAYS || rays % per_pixel)
             throw std::invalid_argument("a pixel has 1 to 256 rays, all of them here");
         const Pixels pixels{background, target, pixel_weights, rays / per_pixel, per_pixel, rgb};
@@ -300,11 +338,12 @@ EXPORT int traced_error(const float* origins, const float* directions, const flo
             float* of_color = color_sums + size_t(p) * color->sums();
             std::fill_n(of_density, density.net->sums(), 0.0f), std::fill_n(of_color, color->sums(), 0.0f);
             for (int64_t b = p * each; b < std::min(count, (p + 1) * each); b++) {
-                Block block(path, nets, pixels, scratch, b * size, std::min(rays - b * size, size));
+                Block block(path, nets, scratch, b * size, std::min(rays - b * size, size), true);
                 block.trace();
                 block.shade();
-                part.error += block.composite();
-                block.to_samples();
+                block.weigh();
+                part.error += block.composite(pixels);
+                block.to_samples(pixels);
                 block.to_weights(block.thin(thinning), of_density, of_color);
                 part.samples += block.count;
             }
@@ -339,5 +378,40 @@ EXPORT int traced_error_take(int64_t total, float* unit, float* grad, int thread
         all.total = -1;
         for (Scratch& scratch : all.scratch)
             if (scratch.by_encoded.size() > KEPT) scratch = Scratch();
+    });
+}
+
+// What the rays show: the arguments up to `bands` are as in traced_error; background (R, 3), fars (R). Writes colour over
+// the background (R, 3), opacity, first moment of t, and median of t (R). `samples`: how many light reached.
+EXPORT int traced_colors(const float* origins, const float* directions, const float* enter, const float* leave,
+                         const float* first, const int64_t* slices, int64_t rays, const int64_t* limits, int waves,
+                         const float* box, float step, float cone, const uint8_t* bits, const uint8_t* blocks,
+                         int resolution, int boxes, float budget, const float* scale, const float* shift,
+                         const float* around, const float* table, int features, const int64_t* resolutions,
+                         const int64_t* offsets, int levels, const int64_t* widths, int layers,
+                         const float* const* weights, int bf16, const int64_t* color_widths, int color_layers,
+                         const float* const* color_weights, int bands, const float* background, const float* fars,
+                         float* rgb, float* opacity, float* moment, float* median, int threads, int64_t* samples) {
+    return guarded([&] {
+        const Path path{origins, directions, enter, leave,  first,      slices, limits, waves,
+                        box,     step,       cone,  bits,   blocks,     resolution, boxes, budget};
+        const Density density(scale, shift, around, table, features, resolutions, offsets, levels, widths, layers,
+                              weights, bf16);
+        const auto color = color_network(color_widths, color_layers, color_weights, bf16);
+        const Networks nets = networks(density, *color, color_widths, color_layers, bands);
+        const Shown shown{background, fars, rgb, opacity, moment, median};
+        std::vector<Scratch>& scratch = learnt().scratch;
+        if (scratch.size() < size_t(std::max(threads, 1))) scratch.resize(size_t(std::max(threads, 1)));
+        std::atomic<int64_t> reached{0};
+        for_chunks(threads, (rays + BLOCK_RAYS - 1) / BLOCK_RAYS, [&](int64_t b, int slot) {
+            const int64_t base = b * BLOCK_RAYS;
+            Block block(path, nets, scratch[size_t(slot)], base, std::min(rays - base, BLOCK_RAYS), false);
+            block.trace();
+            block.shade();
+            block.weigh();
+            block.show(shown);
+            reached += block.count;
+        });
+        *samples = reached;
     });
 }

@@ -214,7 +214,11 @@ def propose(
 
 
 def density_of(proposal: Field) -> DensityFunction | GridDensity:
-    """Return the density of a proposal, as a small network on a hash grid if it is that."""
+    """Return the density of a proposal, as a small network on a hash grid if it is that.
+
+    Args:
+        proposal: the field.
+    """
     known = proposal.grid_density() if isinstance(proposal, HasGridDensity) else None
     return proposal.density if known is None else known
 

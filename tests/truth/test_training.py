@@ -284,7 +284,7 @@ def test_each_group_has_the_rate_and_the_schedule_that_it_names(shared_tiny: Pat
     assert rates == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.parametrize(("seconds", "size"), [(20.0, 16), (60.0, 16), (120.0, 17), (300.0, 18), (None, 18)])
+@pytest.mark.parametrize(("seconds", "size"), [(20.0, 16), (60.0, 17), (120.0, 18), (300.0, 18), (None, 18)])
 def test_longer_runs_of_instant_ngp_get_larger_tables(
     seconds: float | None, size: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,12 +9,13 @@ from email import message_from_bytes
 from email.message import Message
 from pathlib import Path
 
+from framework.kernels.native import NEEDS
 from tests.release.problem import Problem
 from tests.release.sources import ROOT, version
 
 PACKAGES = ("nerfloom", "framework", "methods", "dataparsers")
 LARGEST_WHEEL = 6_000_000
-"""Bytes. The kernels of four instruction sets are most of it."""
+"""Bytes. The kernels of five instruction sets are most of it."""
 LARGEST_SDIST = 3_000_000
 """Bytes."""
 DATA = (".png", ".jpg", ".jpeg", ".gif", ".exr", ".mp4", ".npy", ".npz", ".ply", ".spz", ".ckpt", ".pt", ".zip")
@@ -45,12 +46,15 @@ def check_wheel(wheel: Path) -> str:
     libraries = [Path(name) for name in names if name.endswith(LIBRARIES)]
     if not libraries or any(path.parent.as_posix() != "framework/kernels/lib" for path in libraries):
         raise Problem(f"the wheel's libraries are {libraries}; those of the kernels are expected, and no others")
+    kinds = {path.stem for path in libraries}
+    if re.search(r"linux.*x86_64", wheel.name) and kinds != set(NEEDS):
+        raise Problem(f"the wheel lacks the kernels for {', '.join(sorted(set(NEEDS) - kinds))}: is the compiler old?")
     if not re.fullmatch(rf"nerfloom-{re.escape(version())}-py3-none-(?!any)\w+\.whl", wheel.name):
         raise Problem(f"{wheel.name} is not for any Python on one platform")
     check_declared(metadata)
     check_size(wheel, LARGEST_WHEEL)
-    kinds = ", ".join(sorted(path.stem for path in libraries))
-    return f"wheel: {len(names)} files, {wheel.stat().st_size / 1e6:.2f} MB, kernels {kinds}; no data, licence included"
+    built = ", ".join(sorted(kinds))
+    return f"wheel: {len(names)} files, {wheel.stat().st_size / 1e6:.2f} MB, kernels {built}; no data, licence included"
 
 
 def check_declared(metadata: Message) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import framework
+from framework.kernels.native import NEEDS
 from tests.release import archives, sources
 from tests.release.archives import PACKAGES, check_sdist, check_wheel, tracked
 from tests.release.install import BIN, Environment
@@ -30,7 +31,8 @@ def metadata(**changed: str) -> str:
 def write_wheel(folder: Path, left_out: str = "", more: str = "", **changed: str) -> Path:
     """A wheel as it should be, with empty files, but for what is changed."""
     path = folder / f"nerfloom-{framework.__version__}-py3-none-linux_x86_64.whl"
-    names = [*tracked(), f"{INFO}/licenses/LICENSE", f"{INFO}/RECORD", "framework/kernels/lib/baseline.so", more]
+    libraries = [f"framework/kernels/lib/{kind}.so" for kind in NEEDS]
+    names = [*tracked(), f"{INFO}/licenses/LICENSE", f"{INFO}/RECORD", *libraries, more]
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr(f"{INFO}/METADATA", metadata(**changed))
         for name in filter(None, names):
@@ -85,7 +87,7 @@ def test_sources_that_disagree(
 
 
 def test_a_wheel_as_it_should_be(tmp_path: Path) -> None:
-    assert "kernels baseline; no data, licence included" in check_wheel(write_wheel(tmp_path))
+    assert "kernels amx_bf16, avx2, avx512, avx512_bf16, baseline; no data, licence included" in check_wheel(write_wheel(tmp_path))
     assert "no tests, no data, no libraries" in check_sdist(write_sdist(tmp_path))
 
 
@@ -93,7 +95,7 @@ def test_a_wheel_as_it_should_be(tmp_path: Path) -> None:
     ("change", "said"),
     [
         ({"left_out": "framework/templates/method/README.md.template"}, "the wheel lacks framework/templates"),
-        ({"left_out": "framework/kernels/lib/baseline.so"}, "those of the kernels are expected"),
+        ({"left_out": "framework/kernels/lib/amx_bf16.so"}, "lacks the kernels for amx_bf16"),
         ({"left_out": f"{INFO}/licenses/LICENSE"}, "lacks the licence"),
         ({"more": "tests/test_light.py"}, "holds tests/test_light.py"),
         ({"more": "framework/lego.PNG"}, "holds framework/lego.PNG"),

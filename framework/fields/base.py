@@ -81,10 +81,10 @@ class HasGridDensity(Protocol):
 
 @runtime_checkable
 class HasGridColor(HasGridDensity, Protocol):
-    """A field of such a density whose colour may be a small network too, so that its error is learnt in one call."""
+    """A field of such a density whose colour may be a small network too, so that it is shown and learnt in one call."""
 
     def grid_color(self) -> GridColor | None:
-        """Return the colour as `framework.kernels.traced_error` computes it; None to evaluate `Field.color` instead."""
+        """Return the colour as `framework.kernels.traced_colors` computes it; None for `Field.color`."""
 
 
 @runtime_checkable

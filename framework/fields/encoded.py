@@ -170,14 +170,23 @@ class EncodedField(BoxField):
         return self._grid_density(EncodedField.density, self.density_head)
 
     def grid_color(self) -> GridColor | None:
-        """Return the colour as `traced_error` computes it; None if this field's is another."""
+        """Return the colour as `traced_colors` computes it; None if this field's is another."""
         head, opening = self.color_head, self.direction_opening
         plain = type(self).color is EncodedField.color and "color" not in vars(self) and self.appearance is None
         if not plain or type(head) is not MLP or head._forward_hooks or head._forward_pre_hooks:
             return None
         if opening is not None and not opening.complete:
             return None
-        return GridColor(self.direction_levels, _weights(head))
+        weights = _weights(head)
+        fits = (weights[0].shape[1], weights[-1].shape[0]) == (self.num_features + self.direction_levels**2, 3)
+        if (
+            head.bias
+            or head.activation != "sigmoid"
+            or not fits
+            or type(self)._harmonics is not EncodedField._harmonics
+        ):
+            return None
+        return GridColor(self.direction_levels, weights)
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         inputs = [features]

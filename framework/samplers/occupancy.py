@@ -140,8 +140,8 @@ class OccupancySampler(Sampler):
         self.register_buffer("carved", ~self.occupied)
         self.register_buffer("density_grid", torch.where(self.occupied, torch.inf, 0.0))
         self._packed: Occupancy | None = None
-        self._kept: tuple[tuple[int, int], Tensor] | None = None
-        self.register_load_state_dict_post_hook(lambda module, _: module.forget())
+        self._kept: tuple[int, Tensor | None] | None = None
+        self.register_load_state_dict_post_hook(lambda module, _: module.forget_all())
 
     @property
     def occupied_share(self) -> float:
@@ -155,13 +155,16 @@ class OccupancySampler(Sampler):
             self._packed = Occupancy(self.occupied, self.box, self.resolution, self.levels, self.slices)
         return self._packed
 
-    @property
-    def kept(self) -> Tensor:
-        """The indices (K,) int32 of the cells that are not carved, found again when `carved` has changed."""
-        state = self.carved.data_ptr(), self.carved._version
-        if self._kept is None or self._kept[0] != state:
-            self._kept = state, (~self.carved).nonzero().squeeze(-1).int()
-        return self._kept[1]
+    def kept(self) -> tuple[int, Tensor | None]:
+        """Return the number K of the cells that are not carved, and their indices (K,) int32; None if these are all."""
+        known = self._kept
+        if known is None or (known[1] is not None and known[1].device != self.carved.device):
+            count, found = len(self.carved), None
+            if bool(self.carved.any()):
+                found = (~self.carved).nonzero().squeeze(-1).int()
+                count = len(found)
+            known = self._kept = count, found
+        return known
 
     def occupied_when(self, time: float | None = None) -> Tensor:
         """Return the cells (L n^3,) that are occupied in the slice of `time`, or at any time if it is None."""
@@ -169,6 +172,11 @@ class OccupancySampler(Sampler):
         if time is None:
             return of_slices.any(0)
         return of_slices[min(max(int(time * self.slices), 0), self.slices - 1)]
+
+    def forget_all(self) -> None:
+        """Discard also which cells are not carved; to be called after `carved` has changed."""
+        self._kept = None
+        self.forget()
 
     def forget(self) -> None:
         """Discard `occupancy`, which is computed again on demand; to be called after `occupied` has changed."""
@@ -292,7 +300,7 @@ class OccupancySampler(Sampler):
         self.carved.view(self.slices, -1).copy_(~(hull.view(-1, len(own)) & own))
         self.density_grid.masked_fill_(self.carved, 0)
         self.occupied.masked_fill_(self.carved, False)
-        self.forget()
+        self.forget_all()
 
     @torch.no_grad()
     def update(self, step: int, density: DensityFunction) -> None:
@@ -345,10 +353,11 @@ class OccupancySampler(Sampler):
 
         Only one in eight of the empty cells is returned, because few of them become occupied again.
         """
-        kept = self.kept
-        count = math.ceil((PASSES if self.slices == 1 else PASSES_OF_SLICES) * len(kept) * 8 / WARM_UP_STEPS)
-        ranks = torch.arange(turn * count, (turn + 1) * count, device=kept.device)
-        cells = kept.index_select(0, ranks * SHUFFLE_STRIDE % max(len(kept), 1)).long()
+        num_kept, kept = self.kept()
+        count = math.ceil((PASSES if self.slices == 1 else PASSES_OF_SLICES) * num_kept * 8 / WARM_UP_STEPS)
+        ranks = torch.arange(turn * count, (turn + 1) * count, device=self.occupied.device)
+        cells = ranks * SHUFFLE_STRIDE % max(num_kept, 1)
+        cells = cells if kept is None else kept.index_select(0, cells).long()
         return cells[self.occupied.index_select(0, cells) | (torch.rand(count, device=cells.device) < 1 / 8)]
 
     def _drawn(self) -> Tensor:
@@ -358,10 +367,15 @@ class OccupancySampler(Sampler):
         is 30 times smaller with the neighbours than without (`ns-bench quadrature`). A cell that is drawn twice is
         evaluated twice, which does no harm.
         """
-        kept, device, share = self.kept, self.occupied.device, SHARE if self.slices == 1 else SHARE_OF_SLICES
+        device, share = self.occupied.device, SHARE if self.slices == 1 else SHARE_OF_SLICES
+        num_kept, kept = self.kept()
         third = max(len(self.occupied) // share, 1)
-        occupied = kept[self.occupied.index_select(0, kept)].long()
-        anywhere = kept[torch.randint(max(len(kept), 1), (math.ceil(len(kept) / share),), device=device)].long()
+        anywhere = torch.randint(max(num_kept, 1), (math.ceil(num_kept / share),), device=device)
+        anywhere = anywhere if kept is None else kept[anywhere].long()
+        if kept is None or 2 * num_kept > len(self.occupied):
+            occupied = self.occupied.nonzero().squeeze(-1)
+        else:
+            occupied = kept[self.occupied.index_select(0, kept)].long()
         if len(occupied) == 0:
             return anywhere
         drawn, centers = (occupied[torch.randint(len(occupied), (third,), device=device)] for _ in range(2))

@@ -341,7 +341,8 @@ WITHOUT_A_GRADIENT = {
     "trace_rays", "trace_take",  # whose values the operations are given that have the gradient (test_trace.py)
     "spaced_distances", "first_shared",  # of what has no gradient
     "proposal_weights",  # likewise (test_proposals.py)
-    "traced_error", "traced_error_take", "traced_colors",  # compared in test_traced_error.py
+    "traced_error", "traced_error_take",  # compared in test_traced_error.py
+    "traced_colors",  # for pictures alone, and refused where a gradient is asked for
     "sort_by_ray", "gather_rows", "resample_intervals",  # documented to have none
     "adam_sparse", "adam_dense", "all_finite", "hash_grid_adam", "multisampled_grid_adam",  # of the optimiser
     "opaque_sums", "hold_balls", "pixels_near_balls",  # whose results are counted or true and false

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from framework.encodings.hash_grid import HashGrid
+from framework.fields.base import MLP
 from framework.fields.encoded import EncodedField
 from framework.fields.inverted import InvertedField
 from framework.geometry.points import Points
@@ -173,6 +174,11 @@ def test_only_a_plain_field_says_what_its_density_is() -> None:
     assert around.box is not None
     assert EncodedField(BOX, HashGrid(6, 2, 4, 8, 8, opening=True), opening=True).grid_density() is None
     assert EncodedField(BOX, HashGrid(2, 2, 4, 8, 8), ambient=2).grid_density() is None
+    assert field.grid_color() is not None
+    for network in (MLP(32, 16, 3, activation="sigmoid"), MLP(32, 16, 3, bias=False), MLP(20, 3, bias=False)):
+        other = EncodedField(BOX, HashGrid(2, 2, 4, 8, 8))
+        other.color_head = network
+        assert other.grid_color() is None
     field.density = lambda points: (points.positions[:, 0], points.positions)
     assert field.grid_density() is None
     assert InvertedField(HashGrid(2, 2, 4, 8, 8)).grid_density() is None

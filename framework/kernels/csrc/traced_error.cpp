@@ -117,7 +117,8 @@ struct Block {
                 std::memcpy(to + width, harmonics, sizeof(float) * size_t(nets.harmonics));
             }
         }
-        rgb = room(own.rgb, size_t(count) * 3), by_rgb = room(own.by_rgb, size_t(count) * 3);
+        rgb = room(own.rgb, size_t(count) * 3);
+        if (learns) by_rgb = room(own.by_rgb, size_t(count) * 3);
         char* records = learns ? room(own.records, size_t(count) * nets.color.record()) : nullptr;
         nets.color.forward(inputs, count, mlp::SIGMOID, rgb, nullptr, records);
     }
@@ -306,7 +307,8 @@ EXPORT int traced_error(const float* origins, const float* directions, const flo
                         const float* box, float step, float cone, const uint8_t* bits, const uint8_t* blocks,
                         int resolution, int boxes, float budget, const float* scale, const float* shift,
                         const float* around, const float* table, int features, const int64_t* resolutions,
-                        const int64_t* offsets, int levels, const int64_t* widths, int layers, const float* const* weights, int bf16,
+                        const int64_t* offsets, int levels, const int64_t* widths, int layers,
+                        const float* const* weights, int bf16,
                         const int64_t* color_widths, int color_layers, const float* const* color_weights, int bands,
                         const float* background, const float* target, const float* pixel_weights, int64_t per_pixel,
                         float floor, int64_t seed, float* rgb, float* error, float* const* weight_grads,
@@ -413,5 +415,9 @@ EXPORT int traced_colors(const float* origins, const float* directions, const fl
             reached += block.count;
         });
         *samples = reached;
+        for (Scratch& each : scratch) {
+            const Samples& held = each.samples;
+            if (held.features.size() + held.outputs.size() + each.inputs.size() > KEPT) each = Scratch();
+        }
     });
 }

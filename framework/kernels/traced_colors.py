@@ -1,4 +1,4 @@
-"""What traced rays show, in one compiled call, where no gradient is asked for.
+"""Rendering of traced rays in one compiled call, where no gradient is asked for.
 
 The readable form traces rays, evaluates the colour network and composites. The compiled one takes a block of rays
 through all of that while it is in cache (`csrc/traced_error.cpp`), so that no sample is ever written to memory.
@@ -34,7 +34,7 @@ class GridColor:
 
 
 class TracedColors(NamedTuple):
-    """What R rays show."""
+    """Rendered values of R rays."""
 
     color: Tensor
     """(R, 3) colour over the background."""

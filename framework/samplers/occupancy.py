@@ -21,7 +21,7 @@ from framework.base.errors import ConfigError, shown
 from framework.base.step_kind import StepKind
 from framework.fields.base import DensityFunction, Field, HasAlpha, HasGridDensity
 from framework.geometry.bounds import nested_boxes
-from framework.geometry.points import Points, interval_points
+from framework.geometry.points import interval_points
 from framework.geometry.rays import Rays, Samples
 from framework.kernels.alpha import alpha_depth
 from framework.kernels.fixed_march import most_steps
@@ -32,6 +32,7 @@ from framework.kernels.occupancy import own_cells
 from framework.kernels.rows import gather_rows
 from framework.kernels.trace import trace
 from framework.samplers.base import Sampler
+from framework.samplers.cells import beside, densities_at, places
 from framework.samplers.fixed import Steps, attached, sample_into_slots
 from framework.samplers.room import Room
 
@@ -41,8 +42,6 @@ MAX_LEVELS = 16
 """Maximum number of nested boxes."""
 FARTHEST = 1e10
 """Far end of the last sample of an endless ray, scene units."""
-CHUNK = 2**15
-"""Number of cells that are evaluated at once."""
 WARM_UP_STEPS = 256
 """Number of training steps in which the cells are updated in the order of a fixed shuffle."""
 WARM_UP_DECAY, DECAY = 0.7, 0.8
@@ -159,11 +158,8 @@ class OccupancySampler(Sampler):
         """Return the number K of the cells that are not carved, and their indices (K,) int32; None if these are all."""
         known = self._kept
         if known is None or (known[1] is not None and known[1].device != self.carved.device):
-            count, found = len(self.carved), None
-            if bool(self.carved.any()):
-                found = (~self.carved).nonzero().squeeze(-1).int()
-                count = len(found)
-            known = self._kept = count, found
+            found = (~self.carved).nonzero().squeeze(-1).int()
+            known = self._kept = len(found), found if len(found) < len(self.carved) else None
         return known
 
     def occupied_when(self, time: float | None = None) -> Tensor:
@@ -318,14 +314,16 @@ class OccupancySampler(Sampler):
         warming_up = step < WARM_UP_STEPS
         if self.levels > 1:
             self._stride = next((longer for until, longer in COARSE_STEPS if step < until), 1.0)
+        if step == 0:
+            self.kept()  # for which a device is waited for, before the first step
         if step == 0 or step % (8 if warming_up else 16):
             return
         cells = self._shuffled(step // 8 - 1) if warming_up else self._drawn()
-        place = self._places(cells)
+        place = places(cells, self.resolution)
         unit = (place[:, 1:] + torch.rand(len(cells), 3, device=cells.device)) / self.resolution
         low, high = self.box if self.levels == 1 else nested_boxes(self.box, self.levels)[place[:, 0]].unbind(1)
         positions = torch.lerp(low, high, unit)
-        sigma = self._over_time(density, positions, place[:, 0]) if self.moving else _in_chunks(density, positions)
+        sigma = self._over_time(density, positions, place[:, 0]) if self.moving else densities_at(density, positions)
         before = self.density_grid.index_select(0, cells)
         before *= WARM_UP_DECAY if warming_up else MOVING_DECAY if self.moving and self.slices == 1 else DECAY
         evaluated = torch.isfinite(before)
@@ -379,23 +377,8 @@ class OccupancySampler(Sampler):
         if len(occupied) == 0:
             return anywhere
         drawn, centers = (occupied[torch.randint(len(occupied), (third,), device=device)] for _ in range(2))
-        neighbours = self._beside(centers)
+        neighbours = beside(centers, self.resolution, self.levels * self.slices, self.slices > 1)
         return torch.cat([anywhere, drawn, neighbours[~self.carved[neighbours]]])
-
-    def _places(self, cells: Tensor) -> Tensor:
-        """Return the box or slice, and the place along x, y and z, (N, 4) int32 of each of `cells` (N,)."""
-        n, narrow = self.resolution, cells.int()  # divided in half of the time
-        rows, columns = narrow // n, narrow // n**2
-        return torch.stack([columns // n, columns % n, rows % n, narrow % n], dim=-1)
-
-    def _beside(self, cells: Tensor) -> Tensor:
-        """Return a random neighbour, in the box and in time, of each of `cells`, or the cell itself."""
-        n, place = self.resolution, self._places(cells).long()
-        moved = place[:, 1:] if self.slices == 1 else place
-        moved += torch.randint(-1, 2, moved.shape, device=cells.device)
-        place[:, 0].clamp_(0, self.levels * self.slices - 1)
-        place[:, 1:].clamp_(0, n - 1)
-        return ((place[:, 0] * n + place[:, 1]) * n + place[:, 2]) * n + place[:, 3]
 
     def _over_time(self, density: DensityFunction, positions: Tensor, slices: Tensor) -> Tensor:
         """Return the maximum density (N,) over random times, one in each of a few equal parts of a position's slice."""
@@ -403,7 +386,7 @@ class OccupancySampler(Sampler):
         first = slices if self.slices > 1 else torch.zeros_like(slices)  # of several boxes there is one slice
         for part in range(parts):
             shares = (part + torch.rand(len(positions), device=positions.device)) / parts
-            densities.append(_in_chunks(density, positions, (first + shares) / self.slices))
+            densities.append(densities_at(density, positions, (first + shares) / self.slices))
         return torch.stack(densities).amax(0)
 
 
@@ -412,10 +395,3 @@ def _opened(samples: Samples, rays: Tensor) -> Samples:
     ends = samples.t_ends.clone()
     ends[samples.offsets[rays + 1] - 1] = FARTHEST
     return replace(samples, t_ends=ends, points=samples.t)
-
-
-def _in_chunks(density: DensityFunction, positions: Tensor, times: Tensor | None = None) -> Tensor:
-    """Return the density (N,) at positions (N, 3), in chunks: allocating large results costs more than the work."""
-    parts = positions.split(CHUNK)
-    part_times = [None] * len(parts) if times is None else times.split(CHUNK)
-    return torch.cat([density(Points(part, t))[0] for part, t in zip(parts, part_times, strict=True)])

@@ -1,0 +1,54 @@
+"""Cells of occupancy grids by their number: where they are, which are beside them, and density at places in them."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from framework.fields.base import DensityFunction
+from framework.geometry.points import Points
+
+CHUNK = 2**15
+"""Number of positions that are evaluated at once."""
+
+
+def places(cells: Tensor, resolution: int) -> Tensor:
+    """Return the box or slice, and the place along x, y and z, (N, 4) int32 of cells.
+
+    Args:
+        cells: (N,) numbers of cells, counted box by box or slice by slice, along z first.
+        resolution: cells along each axis.
+    """
+    n, narrow = resolution, cells.int()  # divided in half of the time
+    rows, columns = narrow // n, narrow // n**2
+    return torch.stack([columns // n, columns % n, rows % n, narrow % n], dim=-1)
+
+
+def beside(cells: Tensor, resolution: int, parts: int, in_time: bool) -> Tensor:
+    """Return a random neighbour (N,) int64 of each of some cells, or the cell itself.
+
+    Args:
+        cells: (N,) numbers of cells, as in `places`.
+        resolution: cells along each axis.
+        parts: number of boxes or slices.
+        in_time: whether neighbours are also in the slices before and after, rather than in the same box.
+    """
+    n, place = resolution, places(cells, resolution).long()
+    moved = place if in_time else place[:, 1:]
+    moved += torch.randint(-1, 2, moved.shape, device=cells.device)
+    place[:, 0].clamp_(0, parts - 1)
+    place[:, 1:].clamp_(0, n - 1)
+    return ((place[:, 0] * n + place[:, 1]) * n + place[:, 2]) * n + place[:, 3]
+
+
+def densities_at(density: DensityFunction, positions: Tensor, times: Tensor | None = None) -> Tensor:
+    """Return the density (N,) at positions, in chunks: allocating large results costs more than the work.
+
+    Args:
+        density: the density.
+        positions: (N, 3) scene coordinates.
+        times: (N,) in [0, 1]; None for a static scene.
+    """
+    parts = positions.split(CHUNK)
+    part_times = [None] * len(parts) if times is None else times.split(CHUNK)
+    return torch.cat([density(Points(part, t))[0] for part, t in zip(parts, part_times, strict=True)])

@@ -263,3 +263,38 @@ def test_a_cell_that_is_full_for_a_short_while_stays() -> None:
     centers = (torch.cartesian_prod(*[torch.arange(16)] * 3) + 0.5) / 8 - 1
     assert sampler.occupied[centers.norm(dim=-1) < 0.5].float().mean() > 0.95
     assert not bool(sampler.occupied[centers.norm(dim=-1) > 0.75].any())
+
+
+@pytest.mark.parametrize("carved", [0.0, 0.3, 0.95, 1.0])
+def test_updates_visit_all_cells_that_are_not_carved_and_no_others(carved: float) -> None:
+    torch.manual_seed(0)
+    sampler = OccupancySampler(BOX, 16, 100)
+    hull = torch.rand(16**3) >= carved
+    sampler.carve(hull)
+    asked: list[torch.Tensor] = []
+
+    def density(points: Points) -> tuple[torch.Tensor, torch.Tensor]:
+        asked.append(points.positions)
+        return torch.full((len(points),), 50.0), points.positions
+
+    for step in range(WARM_UP_STEPS + 640):
+        sampler.update(step, density)
+    cells = ((torch.cat(asked) + 1) * 8).long().clamp(0, 15)
+    visited = torch.bincount((cells[:, 0] * 16 + cells[:, 1]) * 16 + cells[:, 2], minlength=16**3) > 0
+    assert torch.equal(visited, hull)
+    assert torch.equal(sampler.occupied, hull)
+
+
+def test_what_is_carved_later_or_loaded_is_no_longer_visited() -> None:
+    torch.manual_seed(0)
+    sampler, other = OccupancySampler(BOX, 8, 50), OccupancySampler(BOX, 8, 50)
+    assert sampler.kept() == (512, None)
+    half = torch.arange(512) < 256
+    sampler.carve(half)
+    assert other.kept() == (512, None)
+    other.load_state_dict(sampler.state_dict())
+    for each in (sampler, other):
+        count, cells = each.kept()
+        assert count == 256
+        assert cells is not None
+        assert torch.equal(cells.long(), torch.arange(256))

@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import os
 import platform
+import runpy
 import sys
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -23,6 +24,7 @@ except ImportError:  # setuptools before 70.1
     from wheel.bdist_wheel import bdist_wheel
 
 SOURCES = sorted(str(path) for path in Path("framework/kernels/csrc").glob("*.cpp"))
+FINGERPRINT = runpy.run_path("framework/kernels/sources.py")["fingerprint"](Path("framework/kernels/csrc"))
 AVX2 = ["-mavx2", "-mfma"]
 AVX512 = ["-mavx512f", "-mavx512bw", "-mavx512dq", "-mavx512vl", "-mprefer-vector-width=512"]
 HEADERS = sorted(str(path) for path in Path("framework/kernels/csrc").glob("*.h"))
@@ -61,6 +63,7 @@ VARIANTS = HERE or VARIANTS
 # GCC for Windows aligns the stack to 16 bytes, and stores wider vectors there as if it were to more (GCC bug 54412).
 MINGW_FLAGS = ["-Wa,-muse-unaligned-vector-move"]
 FLAGS = ["-std=c++17", "-O3", "-g0", "-fno-math-errno", "-fno-trapping-math", "-fvisibility=hidden", "-pthread"]
+FLAGS.append(f"-DNERFLOOM_SOURCES={FINGERPRINT}")
 # Python's own flags, which setuptools puts before these, let signed integers wrap around (-fwrapv). Compilers then do
 # not know that a row's elements follow each other, and address each anew: small networks take 3 to 7 % longer, with the
 # same bits. No sum in these files leaves its type, which `make sanitize` watches.
@@ -124,7 +127,7 @@ class BuildKernels(build_ext):
         for extension in self.extensions:
             path = Path(self.get_ext_filename(extension.name))
             path.parent.mkdir(exist_ok=True)
-            for old in path.parent.glob(f"*{path.suffix}"):  # of other sources, whose functions have other arguments
+            for old in path.parent.glob(f"*{path.suffix}"):  # of other sources, or no longer the fastest
                 old.unlink()
         super().copy_extensions_to_source()
 

@@ -88,6 +88,8 @@ def test_compiled_rays_are_those_of_torch(count: int) -> None:
     assert len(one) == len(flat) * count
     for name, value in vars(two).items():
         torch.testing.assert_close(getattr(one, name), value)
+    every_other = cameras.pixel_rays(flat[::2], 0.1, 9.0, times)  # of indices that do not stand together
+    torch.testing.assert_close(every_other.directions, cameras.pixel_rays(flat, 0.1, 9.0, times).directions[::2])
     middle = two.directions / -(cameras.camera_to_worlds[two.camera_indices][:, :, 2] * two.directions).sum(-1)[:, None]
     centre = cameras.pixel_rays_reference(flat, 0.1, 9.0).directions
     found = torch.nn.functional.normalize(middle.view(len(flat), count, 3).mean(1), dim=-1)

@@ -319,6 +319,7 @@ def _compiled_rays(
     origins, directions, radii = torch.empty(count, 3), torch.empty(count, 3), torch.empty(count)
     indices = torch.empty(count, dtype=torch.int64)
     poses, widths, places = cameras.camera_to_worlds.contiguous(), cameras.widths.contiguous(), places.contiguous()
+    flat = flat.contiguous()
     numbers = {name: getattr(cameras, name).contiguous() for name in ("fx", "fy", "cx", "cy")}
     distortion = None if cameras.distortion is None else cameras.distortion.table
     _camera_rays(

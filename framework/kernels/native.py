@@ -29,7 +29,9 @@ from framework.base.console import say
 from framework.base.device import cpu_features
 from framework.base.errors import ConfigError
 from framework.base.extras import reinstall_command
+from framework.kernels.sources import fingerprint
 
+SOURCES = Path(__file__).parent / "csrc"
 FOLDER = Path(os.environ.get("NERFLOOM_KERNEL_FOLDER") or Path(__file__).parent / "lib")
 _AVX512 = ("avx512f", "avx512bw", "avx512dq", "avx512vl", "fma")
 NEEDS: dict[str, tuple[str, ...]] = {
@@ -90,7 +92,7 @@ def _load() -> tuple[str, ctypes.CDLL | None]:
         raise ConfigError(f"NERFLOOM_KERNELS asks for '{asked}', but {FOLDER / asked}{SUFFIX} does not load: {problem}")
     say(
         f"note: without its compiled kernels ({problem}) nerfloom trains more than ten times slower on this processor; "
-        f"install a C++ compiler ({_compiler_hint()}), then: {reinstall_command()}"
+        f"with a C++ compiler ({_compiler_hint()}), install it again: {reinstall_command()}"
     )
     return "reference", None
 
@@ -99,9 +101,15 @@ def _opened(path: Path) -> ctypes.CDLL:
     """Return the library at `path`, with the leave of the system to use what it needs.
 
     Raises:
-        OSError: if it does not load, or the system does not give leave.
+        OSError: if it does not load, was built from other sources than those beside it, whose functions may take other
+            arguments, or the system does not give leave.
     """
     library = ctypes.CDLL(str(path))
+    built_from = getattr(library, "built_from", None)
+    if built_from is not None:
+        built_from.restype = ctypes.c_int64
+    if built_from is None or built_from() != fingerprint(SOURCES):
+        raise OSError("they were built from other sources")
     ask = getattr(library, "ask_for_tiles", None)
     if ask is not None:
         ask.restype = ctypes.c_char_p

@@ -119,6 +119,22 @@ def test_a_nan_ray_does_not_show_what_is_hidden_on_others(kind) -> None:
     assert int(counts[torch.arange(100) != first].max()) == 1
 
 
+@pytest.mark.parametrize("kind", [CompiledMarch, ReferenceMarch])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_ray_that_is_nowhere_ends_at_once(kind, axis: int) -> None:
+    """Without a far end, a march along it would not end."""
+    if kind is CompiledMarch and not native.available():
+        pytest.skip("the compiled kernels are not installed")
+    rays = random_rays(20)
+    rays.fars[:] = math.inf
+    rays.origins[10, axis] = rays.directions[11, axis] = rays.origins[12, axis] = math.nan
+    rays.directions[12, axis] = 0  # and along a face
+    rays.origins[13, axis] = math.inf
+    _, _, owners, offsets = walk(kind(rays, occupancy(8, 1.0), 0.05, 0.0, None, 0.0))
+    assert len(owners) > 100
+    assert offsets.diff()[10:14].tolist() == [0, 0, 0, 0]
+
+
 @needs_kernels
 def test_threads_hand_out_the_same_samples() -> None:
     rays, grid, found = random_rays(500), occupancy(32, 0.05), []

@@ -1,6 +1,7 @@
 """Finding the compiled library, and what is checked before an address leaves Python."""
 
 import platform
+import shutil
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ import torch
 
 from framework.base.device import cpu_features
 from framework.kernels import native
+from framework.kernels.sources import fingerprint
 from tests.forked import Forks
 from tests.kernels.compiled import needs_kernels
 from tests.sanitize.build import extensions
@@ -96,6 +98,41 @@ def test_every_variant_that_fits_this_processor_gives_the_same_answer(variant: s
 
 
 @needs_kernels
+def test_libraries_of_other_sources_are_not_called(tmp_path: Path, forks: Forks) -> None:
+    """As after an update of a checkout: what a function takes may have changed, and it would read foreign memory."""
+    code = (
+        "from pathlib import Path\n"
+        "from framework.kernels import native\n"
+        f"native.SOURCES = Path({str(tmp_path)!r})\n"
+        "print(native.variant())"
+    )
+    shutil.copytree(native.SOURCES, tmp_path, dirs_exist_ok=True)
+    variant = native.variant()
+    assert forks.run(code, NERFLOOM_KERNELS=variant).stdout.split() == [variant]
+    (tmp_path / "march.h").write_bytes((tmp_path / "march.h").read_bytes() + b"\n")
+    chosen = forks.run(code, NERFLOOM_KERNELS="auto")
+    assert chosen.stdout.split()[-1] == "reference"
+    assert "without its compiled kernels (they were built from other sources)" in chosen.stdout + chosen.stderr
+    asked = forks.run(code, NERFLOOM_KERNELS=variant)
+    assert asked.returncode == 1
+    assert "does not load: they were built from other sources" in asked.stderr
+
+
+def test_every_file_counts_by_name_and_content(tmp_path: Path) -> None:
+    def number(**files: str) -> int:
+        folder = tmp_path / "-".join([*files, *files.values()])
+        folder.mkdir()
+        for name, text in files.items():
+            (folder / name.replace("_", ".")).write_text(text)
+        return fingerprint(folder)
+
+    numbers = [number(a_cpp="x", b_h="y"), number(a_cpp="xy", b_h=""), number(c_cpp="x", b_h="y"), number(b_h="y")]
+    assert len(set(numbers)) == 4
+    assert all(0 <= each < 2**63 for each in numbers)
+    assert numbers[0] == number(b_h="y", a_cpp="x", notes_txt="z")
+
+
+@needs_kernels
 def test_where_the_system_gives_no_tiles_the_next_variant_is_taken(forks: Forks) -> None:
     if not native.cpu_features().issuperset(native.NEEDS["amx_bf16"]):
         pytest.skip("this processor has no tiles")
@@ -104,7 +141,8 @@ def test_where_the_system_gives_no_tiles_the_next_variant_is_taken(forks: Forks)
         "from framework.kernels import native\n"
         "opened = ctypes.CDLL\n"
         "class Refused:\n"
-        "    def __init__(self, path): self.ask_for_tiles = lambda: b'no tiles today'\n"
+        "    def __init__(self, path):\n"
+        "        self.ask_for_tiles, self.built_from = lambda: b'no tiles today', opened(path).built_from\n"
         "native.ctypes.CDLL = lambda path: Refused(path) if 'amx' in path else opened(path)\n"
         "print(native.variant())"
     )

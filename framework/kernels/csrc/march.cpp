@@ -99,10 +99,11 @@ EXPORT int march_begin(const float* origins, const float* directions, const floa
             for (int a = 0; a < 3; a++) {
                 const float o = origins[r * 3 + a], d = directions[r * 3 + a];
                 if (d == 0) {
-                    if (o < box[a] || o > box[3 + a]) to = -1;
+                    if (!(o >= box[a] && o <= box[3 + a])) to = -1;
                     continue;
                 }
                 const float one = (box[a] - o) / d, two = (box[3 + a] - o) / d;
+                if (std::isnan(one) || std::isnan(two)) to = -1;  // nowhere, where a march would not end
                 from = std::max(from, std::min(one, two));
                 to = std::min(to, std::max(one, two));
             }

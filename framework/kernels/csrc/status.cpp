@@ -1,4 +1,4 @@
-// The words of the last failure of each thread. See status.h.
+// The words of the last failure of each thread (see status.h), and which sources this library was built from.
 #include "common.h"
 
 #include <string>
@@ -16,3 +16,6 @@ void bad_index(int64_t index, int64_t count, const char* what) {
 }
 
 EXPORT const char* last_error() { return words; }
+
+// The fingerprint of ../sources.py, so that a library that a checkout has outlived is not called with other arguments.
+EXPORT int64_t built_from() { return NERFLOOM_SOURCES; }

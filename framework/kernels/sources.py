@@ -1,4 +1,7 @@
-"""Which C++ sources a library of kernels was built from: setup.py writes it into each, and native.py compares."""
+"""The C++ sources that a library of kernels was built from, as a number.
+
+setup.py writes it into each library, and native.py compares it with that of the sources beside the library.
+"""
 
 from __future__ import annotations
 

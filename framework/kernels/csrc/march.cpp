@@ -96,17 +96,20 @@ EXPORT int march_begin(const float* origins, const float* directions, const floa
     return guarded([&] {
         for_each(threads, rays, 4096, [&](int64_t r) {
             float from = 0, to = std::numeric_limits<float>::infinity();
+            bool nowhere = false;
             for (int a = 0; a < 3; a++) {
                 const float o = origins[r * 3 + a], d = directions[r * 3 + a];
                 if (d == 0) {
-                    if (!(o >= box[a] && o <= box[3 + a])) to = -1;
+                    if (o < box[a] || o > box[3 + a]) to = -1;
+                    nowhere |= std::isnan(o);
                     continue;
                 }
                 const float one = (box[a] - o) / d, two = (box[3 + a] - o) / d;
-                if (std::isnan(one) || std::isnan(two)) to = -1;  // nowhere, where a march would not end
+                nowhere |= std::isnan(one) || std::isnan(two);
                 from = std::max(from, std::min(one, two));
                 to = std::min(to, std::max(one, two));
             }
+            if (nowhere && std::isinf(fars[r])) to = -1;  // a march along it would not end; else its colour shows it
             enter[r] = std::max(from, nears[r]);
             leave[r] = std::min(to, fars[r]);
             first[r] = enter[r] - (shift ? shift[r] * step : 0);

@@ -211,7 +211,7 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
                 part = part if places is None else places[part]
                 rays = view.camera.pixel_rays(pixels[part], self.scene.near, self.scene.far, times, offsets)
                 # Index 0 of the view's one camera must not be taken for the index of a training camera.
-                rendered = self._shown(replace(rays, camera_indices=None), background).to_pixels(per_pixel)
+                rendered = self.shown(replace(rays, camera_indices=None), background).to_pixels(per_pixel)
                 rgb[part], depth[part], median[part] = rendered.rgb, rendered.depth, rendered.median_depth
                 accumulation[part] = rendered.accumulation
                 if rendered.normals is not None:
@@ -227,8 +227,13 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
             num_rays=count * per_pixel,
         )
 
-    def _shown(self, rays: Rays, background: Tensor) -> Rendered:
-        """Return rays of a view as `render` does, without weights and samples where one call knows the rest."""
+    def shown(self, rays: Rays, background: Tensor) -> Rendered:
+        """Return rays of a view as `render` does, without weights and samples where one call knows the rest.
+
+        Args:
+            rays: R rays.
+            background: (3,) colour in [0, 1].
+        """
         known = None
         if self._renders_plainly and self.shared_space is None:
             known = traced_rays(rays, background, self.sampler, self.field, self.renderer)

@@ -131,10 +131,10 @@ def _probe(model: RayModel[Any], rays: Rays) -> tuple[float, int]:
     """Return the seconds to render the rays and the number of evaluated samples."""
     background = torch.zeros(3, device=model.device)
     with evaluating(model):
-        model.render(rays[:WARM_UP_RAYS], background)
+        model.shown(rays[:WARM_UP_RAYS], background)
         wait_for(model.device)
         start = time.perf_counter()
-        rendered = model.render(rays, background)
+        rendered = model.shown(rays, background)
         wait_for(model.device)
         seconds = time.perf_counter() - start
     return seconds, int(rendered.num_samples)

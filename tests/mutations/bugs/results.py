@@ -145,8 +145,8 @@ BUGS = (
         "held-out-as-first-camera",
         "evaluation",
         "framework/ray_model.py",
-        "self._shown(replace(rays, camera_indices=None), background)",
-        "self._shown(rays, background)",
+        "self.shown(replace(rays, camera_indices=None), background)",
+        "self.shown(rays, background)",
         "held-out photographs get the appearance and the pose of training photographs of the same number",
     ),
     Bug(

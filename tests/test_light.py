@@ -2,12 +2,13 @@
 
 import ast
 import re
-from importlib.metadata import PackageNotFoundError, distribution
+from importlib.metadata import PackageNotFoundError, distribution, version
 from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from packaging.version import Version
 
 ROOT = Path(__file__).parents[1]
 
@@ -79,6 +80,8 @@ def megabytes(name: str) -> float:
 
 
 def test_no_package_comes_unnoticed() -> None:
+    if Version(version("tensorboard")) < Version("2.20"):
+        pytest.skip("tensorboards before 2.20 need more packages: six, and before 2.16 google-auth")
     found = {name for name in closure(declared()) if not ONLY_SOMEWHERE.fullmatch(name)}
     assert found - TORCHS - set(OURS) == set(), "if it must be, list it above, and in README's count"
     assert set(OURS) - found == set(), "if it is no longer needed, take it out above, and of README's count"

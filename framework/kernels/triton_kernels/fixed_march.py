@@ -41,7 +41,7 @@ def _reach(sigma, starts, ends, offsets, counts, reached, budget, rays, BLOCK: t
     here = r < rays
     first, count = tl.load(offsets + r, mask=here, other=0), tl.load(counts + r, mask=here, other=0)
     depth, found = tl.zeros([BLOCK], tl.float32), tl.zeros([BLOCK], tl.int64)
-    going = (count > 0) & (budget > 0)
+    going = (count > 0) & (depth < budget)
     while tl.max(going.to(tl.int32), 0) > 0:
         n = first + found
         length = tl.load(ends + n, mask=going, other=0.0) - tl.load(starts + n, mask=going, other=0.0)

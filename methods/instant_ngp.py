@@ -34,6 +34,10 @@ samples. On Lego, 2^17 entries were 0.30 and
 0.35 dB better than 2^16 after 45 s (docs/notes/learning.md)."""
 LEAST_SAMPLES, MOST_SAMPLES = 24 * 2**10, 2**16
 """Samples of a step in the shortest time and the longest."""
+HASTE_SECONDS, NO_HASTE_SECONDS = 15.0, 45.0
+"""Seconds up to which a run is in all haste, and from which it is in none."""
+LATE_UNTIL_SECONDS = 150.0
+"""Seconds from which several rays a pixel are trained from 75 % of the time on; up to `NO_HASTE_SECONDS`, from 90 %."""
 
 THIN = 0.5
 """Share of the mean gradient below which samples are thinned. On Lego, two seeds gave 28.34 and 28.52 dB after 800
@@ -53,15 +57,15 @@ class InstantNGPConfig(
     max_num_iterations=20_000,
     num_rays_per_batch=8_192,
     rays_per_pixel=4,
-    train_rays_per_pixel_from=0.75,
-    learning_rate=1e-2,
+    train_rays_per_pixel_from=AUTO,
+    learning_rate=AUTO,
     lr_schedule="hold-exponential",
     lr_final=0.05,
     adam_beta2=0.95,
     adam_eps=1e-15,
     num_steps=AUTO,
     eval_num_rays_per_chunk=32_768,
-    thin_gradients=THIN,
+    thin_gradients=AUTO,
 ):
     """Settings of instant-ngp."""
 
@@ -96,6 +100,12 @@ class Plan:
     """Samples per training step."""
     detail: int
     """Cells of the finest level per pixel of the longer side of the images."""
+    learning_rate: float
+    """Initial learning rate of Adam."""
+    several_rays_from: float
+    """Fraction of the time after which several rays a pixel are trained."""
+    thin: float
+    """Share of the mean gradient below which samples are thinned."""
 
 
 def plan(seconds: float, image_size: int, speed: float = 1.0) -> Plan:
@@ -107,6 +117,9 @@ def plan(seconds: float, image_size: int, speed: float = 1.0) -> Plan:
     twice as large, have more for tables to hold, up to 2^19 entries after 600 s, and need as many times longer before
     they get 2 cells a pixel.
 
+    Less than 45 s are made more of by larger and coarser steps: after 15 s, twice the learning rate and twice the
+    thinning, and 384 steps along the diagonal.
+
     Args:
         seconds: maximum seconds of training; infinity without a maximum.
         image_size: longer side of the largest image, pixels.
@@ -115,13 +128,30 @@ def plan(seconds: float, image_size: int, speed: float = 1.0) -> Plan:
     time, size = seconds * speed / FITTED_SECONDS, min(max(image_size / FITTED_PIXELS, 1.0), 2.0)
     longer = min(max(seconds * speed / STEPS_SECONDS, 1.0), 2.0)
     share = (seconds * speed / LARGE_STEP_SECONDS) ** 0.5  # of the most samples
+    haste = share_of(seconds * speed, NO_HASTE_SECONDS, HASTE_SECONDS)
     entries = max(min(seconds * speed / TABLE_SECONDS, 2.0), min(time, 2 * size), 0.5)  # in those of 2^17
     return Plan(
         log2_table_size=17 + round(math.log2(entries)),
-        num_steps=32 * round(16 * longer),
+        num_steps=32 * round(16 * longer - 4 * haste),
         samples=1024 * round(min(max(share, LEAST_SAMPLES / MOST_SAMPLES), 1.0) * MOST_SAMPLES / 1024),
         detail=round(min(max(2 * time / size, 1.0), 2.0)),
+        learning_rate=round(0.01 * 2**haste, 4),
+        several_rays_from=round(0.9 - 0.15 * share_of(seconds * speed, NO_HASTE_SECONDS, LATE_UNTIL_SECONDS), 3),
+        thin=round(THIN * 2**haste, 3),
     )
+
+
+def share_of(seconds: float, first: float, last: float) -> float:
+    """Return how much of the way from one time to another a time is, in factors of time.
+
+    Args:
+        seconds: the time, seconds.
+        first, last: the times, seconds, at and before or after which the share is 0 and 1.
+
+    Returns:
+        The share, from 0 to 1.
+    """
+    return min(max(math.log(seconds / first) / math.log(last / first), 0.0), 1.0)
 
 
 def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, list[Decision]]:
@@ -143,6 +173,9 @@ def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, li
         Choice("log2_table_size", suited.log2_table_size, suits),
         Choice("num_steps", suited.num_steps, suits, "steps along the box's diagonal"),
         Choice("samples_per_batch", suited.samples, suits, "samples a step"),
+        Choice("learning_rate", suited.learning_rate, suits),
+        Choice("train_rays_per_pixel_from", suited.several_rays_from, suits, "share of the time with one ray a pixel"),
+        Choice("thin_gradients", suited.thin, suits, "gradients thinned, of the mean"),
     )
     config, _ = fill(config, Choice("detail", suited.detail, suits))  # reported with the resolution that follows
     finest = 2 ** (config.detail * scene.image_size - 1).bit_length()

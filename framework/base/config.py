@@ -151,7 +151,7 @@ class TrainConfig:
     """Start from the newest checkpoint in this folder."""
     load_checkpoint: Path | None = None
     """Start from this checkpoint."""
-    learning_rate: float = 5e-4
+    learning_rate: Auto[float] = 5e-4
     """Initial learning rate of Adam."""
     lr_schedule: Auto[Literal["constant", "exponential", "cosine", "hold-exponential"]] = "exponential"
     """Learning rate over the budget (steps or seconds, whichever is further spent); hold-: constant for half of it."""
@@ -175,9 +175,7 @@ class TrainConfig:
     """Seed, device and threads."""
 
     def __init_subclass__(cls, **defaults: Any) -> None:
-        """Change defaults of inherited settings without repeating their types.
-
-        As in `class MyConfig(RayConfig, learning_rate=1e-2)`.
+        """Change defaults of inherited settings, as in `class MyConfig(RayConfig, learning_rate=1e-2)`.
 
         Args:
             defaults: new defaults by name.
@@ -206,7 +204,8 @@ class TrainConfig:
             raise ConfigError(f"--adam-eps is {self.adam_eps}; it must be at least {SMALLEST_EPS}")
         if self.max_seconds is not None and not self.max_seconds > 0:
             raise ConfigError(f"--max-seconds is {self.max_seconds}; it must be more than 0")
-        if not self.learning_rate > 0 or not (self.lr_final is None or 0 < self.lr_final <= 1):
+        rates = [rate for rate in (self.learning_rate, self.lr_final) if rate is not None]
+        if not all(rate > 0 for rate in rates) or (self.lr_final or 0) > 1:
             raise ConfigError("--learning-rate must be more than 0, and --lr-final in (0, 1]")
 
 
@@ -229,7 +228,7 @@ class RayConfig(TrainConfig):
     """Rays per training step."""
     rays_per_pixel: RaysPerPixel = 1
     """Rays averaged for a pixel, which covers an area, not a point. More rays are more accurate and slower."""
-    train_rays_per_pixel_from: float = 1.0
+    train_rays_per_pixel_from: Auto[float] = 1.0
     """Share of the budget after which training averages as many rays per pixel; before, it uses one."""
     samples_per_batch: int | None = None
     """Samples per training step; the number of rays is adjusted to reach about this many."""

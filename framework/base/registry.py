@@ -152,7 +152,10 @@ def entry_of(kind: Kind, name: str) -> Entry:
         raise ConfigError(f"Nerfloom has no method '{name}': {ELSEWHERE[name]}")
     if kind == "dataparsers" and (answer := format_answer(name)) is not None:
         raise ConfigError(answer)
-    raise ConfigError(f"unknown {CALLED[kind]} '{name}'. {nearest(name, entries)}")
+    hint = nearest(name, entries)
+    if hint.startswith("Known"):
+        hint += f" One of your own has to be installed, or named in {VARIABLES[kind]}."
+    raise ConfigError(f"unknown {CALLED[kind]} '{name}'. {hint}")
 
 
 def _load(kind: Kind, name: str) -> Any:
@@ -166,6 +169,8 @@ def _load(kind: Kind, name: str) -> Any:
             loaded = getattr(loaded, part)
     except (Exception, SystemExit) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
+        if isinstance(error, ModuleNotFoundError) and error.name == entry.module and entry.package == VARIABLES[kind]:
+            reason += f"; PYTHONPATH has to name the folder of {entry.module}.py"
         if _looks_old(error):
             reason += f". It seems to be written for plugin interface 1, and this is {INTERFACE[kind]}: {CHANGED}"
         raise ConfigError(f"{title} cannot be loaded: {reason}") from error

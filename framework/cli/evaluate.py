@@ -23,7 +23,7 @@ class EvalFlags:
     render_output_path: Path | None = None
     """Folder for each view's render, true image, and comparison (image, render, error, depth, opacity)."""
     max_pictures: int | None = None
-    """Maximum number of views of which pictures are written to that folder, evenly spaced; all if not given."""
+    """Maximum number of views with pictures in that folder, evenly spaced, besides the worst; all if not given."""
     load_checkpoint: Path | None = None
     """Checkpoint to load; the newest if not given."""
     data: Path | None = None
@@ -87,6 +87,8 @@ def _command(arguments: list[str]) -> None:
             round_to_uint8=flags.round_to_uint8,
         )
     say(f"{flags.split}: {evaluation.line()}")
+    if evaluation.far_below is not None:
+        say(f"  {evaluation.far_below}")
     if bound is not None:
         worst, faster = measured_error(trained.model, dataset, bound)
         say(f"--max-error {bound:.2g}: colours off by at most {worst:.2g} (measured), {faster:.2f} x as fast as exact")

@@ -51,9 +51,9 @@ def _command(arguments: list[str]) -> None:
     write_package(name, folder)
     print(
         f"{folder} holds the method '{name}', all of it in {folder / 'src' / module_of(name)}.py. Next:\n"
-        f"  pip install -e {folder}\n"
+        f"  pip install -e '{folder}[test]'\n"
         f"  ns-train {name} --max-seconds 60\n"
-        f"  pytest {folder}"
+        f"  python -m pytest {folder}"
     )
 
 

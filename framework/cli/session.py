@@ -182,6 +182,8 @@ def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:
         max_pictures=PICTURES,
     )
     say(f"test: {evaluation.line()}")  # before files are written, which may fail on a full disk
+    if evaluation.far_below is not None:
+        say(f"  {evaluation.far_below}")
     if evaluation.pictures_note is None:
         say(f"pictures (photograph, render, error, depth, opacity): {run.folder / 'pictures'}")
     else:

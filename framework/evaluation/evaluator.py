@@ -30,6 +30,8 @@ from framework.rendering.rendered import Picture
 
 BEFORE = 0.9
 """Share of a sparse point's distance before which a view that sees the point should show nothing."""
+FAR_BELOW, MOST_NAMED = 3.0, 3
+"""Distance from the mean PSNR, dB, from which a view is named, and the maximum number of views that are."""
 LONGEST_STEM = 150
 """Maximum number of bytes of an image's name in the names of the files written for it."""
 
@@ -163,13 +165,23 @@ class Evaluation:
             "checkpoint (ns-eval --load-checkpoint)"
         )
 
+    @property
+    def far_below(self) -> str | None:
+        """The views whose PSNR is `FAR_BELOW` the mean or more, worst first, as text; None if there is none."""
+        mean = self.results["psnr"]
+        low = sorted((row for row in self.per_image if row["psnr"] <= mean - FAR_BELOW), key=lambda row: row["psnr"])
+        if not low:
+            return None
+        named = ", ".join(f"{row['name']} {row['psnr']:.2f} dB" for row in low[:MOST_NAMED])
+        return f"far below the mean: {named}" + (f", and {len(low) - MOST_NAMED} more" if len(low) > MOST_NAMED else "")
+
     def line(self) -> str:
         """Return the results as a line of text."""
         r = self.results
         ssim, lpips = ("absent" if r[name] is None else f"{r[name]:.4f}" for name in ("ssim", "lpips"))
         scales = "" if r["ms_ssim"] is None else f"  MS-SSIM {r['ms_ssim']:.4f}"
         before = "" if r["floaters"] is None else f"  floaters {r['floaters']:.1f} %"
-        rays = r["num_rays_per_sec"]  # 0 of a method that casts none
+        rays = r["num_rays_per_sec"]
         speed = f"{rays / 1e3:.1f}k rays/s  {1 / r['fps']:.2f} s/image" if rays else f"{r['fps']:.1f} images/s"
         sizes = ", ".join(f"{size}: {found['psnr']:.2f}" for size, found in r.get("by_size", {}).items())
         sizes = f" ({sizes})" if sizes else ""
@@ -199,7 +211,8 @@ def evaluate(
         dataset: views with images, on the model's device.
         max_images: maximum number of views, evenly spaced; all if None.
         pictures: folder for renders, true images, `view_panels` and normals (x, y, z as RGB); no files if None.
-        max_pictures: maximum number of views of which files are written, evenly spaced; all if None.
+        max_pictures: maximum number of views of which files are written, evenly spaced; all if None. If there are any,
+            files of the view with the lowest PSNR are written besides.
         round_to_uint8: whether colours are rounded to 8 bits before they are measured.
         title: text of the progress bar.
 
@@ -219,6 +232,7 @@ def evaluate(
     rows, seconds, rays = [], 0.0, 0
     pictures_note: str | None = None
     shown = {chosen[rank] for rank in spread(len(chosen), max_pictures)}
+    lowest, worst = math.inf, None  # what is written of the view with the lowest PSNR, where it is not shown anyway
     for index in track(chosen, title, total=len(chosen)):
         target = composite(dataset.image(index).float() / 255, background)
         with fitted_appearance(model, dataset, index, background) if half else nullcontext():
@@ -233,24 +247,31 @@ def evaluate(
         rows.append(row | {"floaters": floaters(picture, dataset, index)})
         seconds += spent
         rays += picture.num_rays
-        if pictures is not None and index in shown:
-            try:
-                _write_pictures(pictures, f"{index:04d}_{_short_stem(dataset.names[index])}", rgb, target, picture)
-            except OSError as error:  # metrics do not need the files
-                pictures, pictures_note = None, f"cannot write pictures to {pictures}: {error.strerror or error}"
-    results = {**_statistics(rows), **_by_size(rows), "num_rays_per_sec": rays / seconds, "fps": len(rows) / seconds}
+        drawn = (f"{index:04d}_{_short_stem(dataset.names[index])}", rgb, target, picture)
+        if row["psnr"] < lowest:
+            lowest, worst = row["psnr"], None if index in shown else drawn
+        if pictures is not None and index in shown and pictures_note is None:
+            pictures_note = _write_pictures(pictures, *drawn)
+    if pictures is not None and shown and worst is not None and pictures_note is None:
+        pictures_note = _write_pictures(pictures, *worst)
+    speed = rays / seconds if rays else None  # None of a method that casts none
+    results = {**_statistics(rows), **_by_size(rows), "num_rays_per_sec": speed, "fps": len(rows) / seconds}
     protocol: Literal["mean", "half"] | None = ("half" if half else "mean") if has_appearance else None
     return Evaluation(rows, {**results, "num_images": len(rows)}, lpips_note, protocol, pictures_note)
 
 
-def _write_pictures(folder: Path, stem: str, rgb: Tensor, target: Tensor, picture: Picture) -> None:
-    """Write a view's rendered image, true image, comparison and normals."""
-    write_image(folder / f"{stem}.png", rgb)
-    write_image(folder / f"{stem}_photograph.png", target)
+def _write_pictures(folder: Path, stem: str, rgb: Tensor, target: Tensor, picture: Picture) -> str | None:
+    """Write a view's rendered image, true image, comparison and normals; return why that failed, None if it did not."""
     panels = view_panels(rgb, target, picture.median_depth, picture.accumulation)
-    write_image(folder / f"{stem}_comparison.png", composed(panels))
+    files = {"": rgb, "_photograph": target, "_comparison": composed(panels)}
     if picture.normals is not None:
-        write_image(folder / f"{stem}_normals.png", (picture.normals + 1) / 2)
+        files["_normals"] = (picture.normals + 1) / 2
+    try:
+        for suffix, image in files.items():
+            write_image(folder / f"{stem}{suffix}.png", image)
+    except OSError as error:  # metrics do not need the files
+        return f"cannot write pictures to {folder}: {error.strerror or error}"
+    return None
 
 
 def _short_stem(name: str) -> str:

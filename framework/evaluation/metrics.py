@@ -121,7 +121,7 @@ def load_lpips() -> tuple[Callable[[Tensor, Tensor], float] | None, str]:
         The metric, a function of two images (H, W, 3) in [0, 1], or None; and the network's name, or why it is absent.
     """
     if (advice := install_command("lpips")) is not None:
-        return None, f"absent: {advice}"
+        return None, f"absent: {advice}; then AlexNet's weights, which no package has: {FETCH_ALEXNET}"
     weights = Path(torch.hub.get_dir()) / "checkpoints"
     if not list(weights.glob("alexnet-*.pth")):
         return None, f"absent: AlexNet's weights, which no package has, are not in {weights}: {FETCH_ALEXNET}"

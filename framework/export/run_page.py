@@ -58,7 +58,7 @@ class Closeness:
 
     def line(self) -> str:
         """Return a line for people."""
-        text = f"on {self.views} held-out views: PSNR {self.method:.2f} dB against the method's own pictures"
+        text = f"on {self.views} of the held-out views: PSNR {self.method:.2f} dB against the method's own pictures"
         if self.photographs is None:
             return text
         return f"{text}, {self.photographs:.2f} dB against the photographs (the method: {self.method_itself:.2f} dB)"

@@ -9,6 +9,7 @@ import torch
 from framework.base.device import peak_memory
 from framework.base.errors import ConfigError
 from framework.evaluation.evaluator import Evaluation
+from framework.ray_model import RayModel
 from framework.training.machine import kernels, machine
 from framework.training.outcome import Outcome
 from framework.training.run import Run, finite_or_null, write_json, write_report
@@ -69,7 +70,8 @@ def write_summary(trainer: Trainer, outcome: Outcome) -> None:
             "seconds": state.seconds,
             "rays": state.rays,
             "rays_per_second": state.rays / max(state.seconds, 1e-9),
-            "samples_per_ray": state.samples_per_ray,  # of the last steps, without proposals' own
+            # Of the last steps, without proposals' own; None of a method that casts no rays.
+            "samples_per_ray": state.samples_per_ray if isinstance(trainer.model, RayModel) else None,
             "skipped_steps": state.skipped,
             "peak_memory_bytes": peak_memory(trainer.device),
             "parameters": trainer.model.size(),

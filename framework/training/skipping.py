@@ -27,6 +27,8 @@ PROBE_RAYS, WARM_UP_RAYS = 1024, 64
 """Number of random training rays on which the savings are measured, and of those that are rendered before."""
 LEAST_TOLD = 0.005
 """Minimum skipped fraction that is printed."""
+LEAST_FASTER = 1.1
+"""Minimum speed of rendering, relative to that without skipping, that is printed; less is within a probe's noise."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ def skip_report(trainer: Trainer) -> list[Rung]:
     updated, there = trainer.optimizer.entries
     if there:
         share = updated / there
-        says = f"parameters that a step does not use: {1 - share:.0%} of each update of tables"
+        says = f"parameters that a step does not use: {1 - share:.0%} of each update"
         rungs.append(Rung("table entries in a step's update", 1 - share, None, "--sparse-updates False", says))
     return rungs
 
@@ -124,7 +126,8 @@ def _along_rays(place: str, before: int, after: int, faster: float) -> str:
     """Return a line about skipped samples of the probe's rays."""
     skipped = 1 - after / max(before, 1)
     a_ray = f"{after / PROBE_RAYS:.1f} a ray instead of {before / PROBE_RAYS:.1f}"
-    return f"{place}: {skipped:.0%} of samples, {a_ray}; renders {faster:.1f} x as fast"
+    speed = f"; renders {faster:.1f} x as fast" if faster >= LEAST_FASTER else ""
+    return f"{place}: {skipped:.0%} of samples, {a_ray}{speed}"
 
 
 def _probe(model: RayModel[Any], rays: Rays) -> tuple[float, int]:

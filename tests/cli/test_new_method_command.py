@@ -42,7 +42,7 @@ def test_it_writes_a_package_and_says_how_to_go_on(
     monkeypatch.setattr("sys.argv", ["ns-new-method", "my-3d-grid"])
     main()
     said = capsys.readouterr().out
-    for command in ("pip install -e my-3d-grid", "ns-train my-3d-grid ", "pytest my-3d-grid"):
+    for command in ("pip install -e 'my-3d-grid[test]'", "ns-train my-3d-grid ", "python -m pytest my-3d-grid"):
         assert command in said
     written = files(tmp_path / "my-3d-grid")
     assert set(written) == {"README.md", "pyproject.toml", "src/my_3d_grid.py", "tests/test_method.py"}

@@ -61,6 +61,8 @@ def test_seeds_are_put_together(tmp_path: Path) -> None:
     assert first.deviation("psnr") == pytest.approx(stdev(values["kplanes"]))
     assert first.seconds_to(28) is None  # one of the three had passed it when it was first judged
     assert first.seconds_to(30) == pytest.approx((60 + 45 + 22.5) / 3)
+    assert [first.seconds_before(level) for level in (20, 27, 28)] == [15.0, None, None]
+    assert third.seconds_before(20) is None
     assert (second.deviation("psnr"), second.failures) == (None, ("out of memory",))
     assert second.mean("lpips") is None
     assert third.mean("psnr") is None

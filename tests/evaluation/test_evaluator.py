@@ -15,7 +15,7 @@ from framework.cameras.view import View
 from framework.data.pixels import PixelBatch
 from framework.data.scene import Scene
 from framework.data.sources import PixelSource, Request
-from framework.evaluation.evaluator import evaluate, evaluation_background
+from framework.evaluation.evaluator import Evaluation, evaluate, evaluation_background
 from framework.fields.base import Field
 from framework.geometry.points import Points
 from framework.geometry.rays import Rays, Samples
@@ -164,14 +164,29 @@ def test_pictures_are_over_what_training_was_over(asked: Any, alpha: bool, expec
     assert evaluation_background(model).tolist() == [expected] * 3
 
 
-def test_pictures_are_of_views_evenly_spaced(shared_tiny: Path, tmp_path: Path) -> None:
+def test_pictures_are_of_views_evenly_spaced_and_of_the_worst(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run")
     images = trainer.train_set
-    evaluate(trainer.model, images, pictures=tmp_path / "all", max_pictures=2)
+    found = evaluate(trainer.model, images, pictures=tmp_path / "all", max_pictures=2)
     written = {int(path.name[:4]) for path in (tmp_path / "all").iterdir()}
-    assert written == {0, len(images) // 2}
+    worst = min(range(len(images)), key=lambda index: found.per_image[index]["psnr"])
+    assert written == {0, len(images) // 2, worst}
+    assert len(list((tmp_path / "all").iterdir())) == 3 * len(written)
     evaluate(trainer.model, images, max_images=2, pictures=tmp_path / "none", max_pictures=0)
     assert not (tmp_path / "none").exists()
+
+
+def test_views_far_below_the_mean_are_named() -> None:
+    psnrs = {"a.jpg": 31.0, "b.jpg": 13.5, "c.jpg": 30.0, "d.jpg": 21.25, "e.jpg": 35.0, "f.jpg": 33.0}
+    rows = [{"name": name, "psnr": psnr} for name, psnr in psnrs.items()]
+    mean = sum(psnrs.values()) / len(psnrs)  # 27.29
+    assert Evaluation(rows, {"psnr": mean}, "").far_below == "far below the mean: b.jpg 13.50 dB, d.jpg 21.25 dB"
+    assert Evaluation(rows[:1], {"psnr": 31.0}, "").far_below is None
+    many = [*rows, *({"name": f"{n}.jpg", "psnr": 10.0 + n} for n in range(3))]
+    assert Evaluation(many, {"psnr": mean}, "").far_below == (
+        "far below the mean: 0.jpg 10.00 dB, 1.jpg 11.00 dB, 2.jpg 12.00 dB, and 2 more"
+    )
+    assert Evaluation([{"name": "a.jpg", "psnr": math.nan}], {"psnr": math.nan}, "").far_below is None
 
 
 def test_a_picture_that_is_not_finite_has_metrics_that_are_not(shared_tiny: Path, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ ELSEWHERE = {
     r"make (release-check|test-versions)": "tests/release/__main__.py",
     r"python3 -m venv|\. \.venv|pip install .*-e (\.|'\.|\"\.)": "tests/release/install.py",
     r"pytest (-n|-s|tests)|TRITON|python -m tests": ".ci/run",
-    r"(pip install -e|pytest|ns-train|ns-compare --methods|ns-new-method) (my-method|dense-grid)": (
+    r"(pip install -e|python -m pytest|ns-train|ns-compare --methods|ns-new-method) '?(my-method|dense-grid)": (
         "tests/plugins/test_installed_plugin.py"
     ),
     r"export NERFLOOM_": "tests/test_registry.py",

@@ -202,6 +202,11 @@ class Row:
         reached = [value for value in values if value is not None]
         return fmean(reached) if reached and len(reached) == len(values) else None
 
+    def seconds_before(self, level: int) -> float | None:
+        """Return the seconds of the first evaluation, the latest of the runs, if all had more than `level` there."""
+        firsts = [min(run.seconds_to.items(), default=(-math.inf, 0.0)) for run in self.runs]
+        return max((s for _, s in firsts), default=None) if all(level < first for first, _ in firsts) else None
+
 
 def rows_of(labels: Sequence[str], runs: Sequence[Measured], failures: dict[str, list[str]]) -> list[Row]:
     """Return a row for each contender.

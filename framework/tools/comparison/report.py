@@ -245,10 +245,16 @@ def level_table(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """
     result = []
     for index, row in enumerate(rows):
-        times = [row.seconds_to(level) for level in levels(rows)]
-        cells = [Cell("–" if time is None else f"{time:.1f}") for time in times]
+        cells = [Cell(_when(row, level)) for level in levels(rows)]
         result.append({"label": row.label, "color": plots.color_of(index), "cells": cells})
     return result
+
+
+def _when(row: Row, level: int) -> str:
+    """Return when a contender reached a PSNR, for people."""
+    if (time := row.seconds_to(level)) is not None:
+        return f"{time:.1f}"
+    return "–" if (before := row.seconds_before(level)) is None else f"< {before:.1f}"
 
 
 def machines(runs: Sequence[Measured]) -> list[str]:
@@ -275,7 +281,7 @@ def markdown(content: dict[str, Any]) -> str:
         "",
     ]
     if content["levels"]:
-        lines += ["Seconds of training to PSNR on the validation views:", ""]
+        lines += ["Seconds of training to PSNR on the validation views (–: not reached; <: before the first look):", ""]
         lines += _markdown_table(["method", *(f"{level} dB" for level in content["levels"])], content["level_rows"])
         lines.append("")
     for label, reason in content["failures"]:

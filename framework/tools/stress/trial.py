@@ -137,7 +137,7 @@ def shortened(config: TrainConfig, budget: Budget, method: Method, scene: Scene)
     Args:
         config: the run's settings.
         budget: length of the run.
-        method: the method, which fills in the number of samples per step if left open.
+        method: the method, which fills in the number of samples per step and the learning rate if left open.
         scene: properties of the plain images.
     """
     config = replace(
@@ -151,9 +151,11 @@ def shortened(config: TrainConfig, budget: Budget, method: Method, scene: Scene)
     )
     if not isinstance(config, RayConfig):
         return config
-    samples = method.decided(config, scene)[0].samples_per_batch
+    decided = method.decided(config, scene)[0]
+    samples = decided.samples_per_batch
     return replace(
         config,
+        learning_rate=decided.learning_rate,
         num_rays_per_batch=min(config.num_rays_per_batch, MOST_RAYS),
         samples_per_batch=None if samples is None else min(samples, MOST_SAMPLES),
     )

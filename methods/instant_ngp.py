@@ -64,6 +64,7 @@ class InstantNGPConfig(
     adam_beta2=0.95,
     adam_eps=1e-15,
     num_steps=AUTO,
+    eval_step_scale=AUTO,
     eval_num_rays_per_chunk=32_768,
     thin_gradients=AUTO,
 ):
@@ -106,6 +107,8 @@ class Plan:
     """Fraction of the time after which several rays a pixel are trained."""
     thin: float
     """Share of the mean gradient below which samples are thinned."""
+    eval_step_scale: float
+    """Length of a step in rendering, relative to one in training."""
 
 
 def plan(seconds: float, image_size: int, speed: float = 1.0) -> Plan:
@@ -118,7 +121,7 @@ def plan(seconds: float, image_size: int, speed: float = 1.0) -> Plan:
     they get 2 cells a pixel.
 
     Less than 45 s are made more of by larger and coarser steps: after 15 s, twice the learning rate and twice the
-    thinning, and 384 steps along the diagonal.
+    thinning, and 384 steps along the diagonal, which rendering then halves.
 
     Args:
         seconds: maximum seconds of training; infinity without a maximum.
@@ -138,6 +141,7 @@ def plan(seconds: float, image_size: int, speed: float = 1.0) -> Plan:
         learning_rate=round(0.01 * 2**haste, 4),
         several_rays_from=round(0.9 - 0.15 * share_of(seconds * speed, NO_HASTE_SECONDS, LATE_UNTIL_SECONDS), 3),
         thin=round(THIN * 2**haste, 3),
+        eval_step_scale=round(1 - haste / 2, 3),
     )
 
 
@@ -175,6 +179,7 @@ def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, li
         Choice("samples_per_batch", suited.samples, suits, "samples a step"),
         Choice("learning_rate", suited.learning_rate, suits),
         Choice("train_rays_per_pixel_from", suited.several_rays_from, suits, "share of the time with one ray a pixel"),
+        Choice("eval_step_scale", suited.eval_step_scale, suits, "length of a step in rendering"),
         Choice("thin_gradients", suited.thin, suits, "gradients thinned, of the mean"),
     )
     config, _ = fill(config, Choice("detail", suited.detail, suits))  # reported with the resolution that follows

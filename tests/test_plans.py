@@ -17,7 +17,7 @@ from methods.instant_ngp import Plan, plan
 
 SECONDS = [10 * 360 ** (step / 60) for step in range(61)]  # 10 s to 1 h
 SIZES = (200, 400, 500, 800, 1600)
-GROW = ("log2_table_size", "num_steps", "samples", "detail")
+GROW = ("log2_table_size", "num_steps", "samples", "detail", "eval_step_scale")
 """Settings that grow with the time; the others fall."""
 SPEEDS = [1 / (0.25 + 1.5 / threads) for threads in (1, 2, 3, 4, 8, 16)]
 
@@ -25,12 +25,12 @@ SPEEDS = [1 / (0.25 + 1.5 / threads) for threads in (1, 2, 3, 4, 8, 16)]
 @pytest.mark.parametrize(
     ("seconds", "size", "found"),
     [
-        (15, 400, Plan(16, 384, 24 * 2**10, 1, 0.02, 0.9, 1.0)),
-        (45, 400, Plan(17, 512, 25 * 2**10, 1, 0.01, 0.9, 0.5)),
-        (150, 400, Plan(18, 704, 45 * 2**10, 2, 0.01, 0.75, 0.5)),
-        (300, 400, Plan(18, 1024, 2**16, 2, 0.01, 0.75, 0.5)),
-        (math.inf, 400, Plan(18, 1024, 2**16, 2, 0.01, 0.75, 0.5)),
-        (300, 800, Plan(18, 1024, 2**16, 2, 0.01, 0.75, 0.5)),
+        (15, 400, Plan(16, 384, 24 * 2**10, 1, 0.02, 0.9, 1.0, 0.5)),
+        (45, 400, Plan(17, 512, 25 * 2**10, 1, 0.01, 0.9, 0.5, 1.0)),
+        (150, 400, Plan(18, 704, 45 * 2**10, 2, 0.01, 0.75, 0.5, 1.0)),
+        (300, 400, Plan(18, 1024, 2**16, 2, 0.01, 0.75, 0.5, 1.0)),
+        (math.inf, 400, Plan(18, 1024, 2**16, 2, 0.01, 0.75, 0.5, 1.0)),
+        (300, 800, Plan(18, 1024, 2**16, 2, 0.01, 0.75, 0.5, 1.0)),
     ],
 )
 def test_where_trials_were_made_their_settings_are_taken(seconds: float, size: int, found: Plan) -> None:
@@ -47,6 +47,7 @@ def test_settings_stay_within_what_was_tried_on_a_processor() -> None:
         assert 0.01 <= found.learning_rate <= 0.02
         assert 0.75 <= found.several_rays_from <= 0.9
         assert 0.5 <= found.thin <= 1.0
+        assert 0.5 <= found.eval_step_scale <= 1.0
 
 
 @pytest.mark.parametrize("size", SIZES)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import time
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -234,20 +235,11 @@ def evaluate(
     shown = {chosen[rank] for rank in spread(len(chosen), max_pictures)}
     lowest, worst = math.inf, None  # what is written of the view with the lowest PSNR, where it is not shown anyway
     for index in track(chosen, title, total=len(chosen)):
-        target = composite(dataset.image(index).float() / 255, background)
-        with fitted_appearance(model, dataset, index, background) if half else nullcontext():
-            picture, spent = timed_view(model, dataset.view(index), background)
-        rgb = picture.rgb.clamp(0, 1)
-        if round_to_uint8:
-            rgb = (rgb * 255).round() / 255
-        pair, kept = _judged(rgb, target, dataset.kept_of(index), half)
-        row = _row(dataset, index, measure(*pair, kept), spent)
-        row["ms_ssim"] = None if min(target.shape[:2]) < SMALLEST_OF_SCALES else ms_ssim(*pair)
-        row["lpips"] = None if lpips is None else lpips(*pair)
-        rows.append(row | {"floaters": floaters(picture, dataset, index)})
-        seconds += spent
-        rays += picture.num_rays
-        drawn = (f"{index:04d}_{_short_stem(dataset.names[index])}", rgb, target, picture)
+        row, images = _judge(model, dataset, index, background, half, round_to_uint8, lpips)
+        rows.append(row)
+        seconds += row["seconds"]
+        rays += images[2].num_rays
+        drawn = (f"{index:04d}_{_short_stem(dataset.names[index])}", *images)
         if row["psnr"] < lowest:
             lowest, worst = row["psnr"], None if index in shown else drawn
         if pictures is not None and index in shown and pictures_note is None:
@@ -258,6 +250,29 @@ def evaluate(
     results = {**_statistics(rows), **_by_size(rows), "num_rays_per_sec": speed, "fps": len(rows) / seconds}
     protocol: Literal["mean", "half"] | None = ("half" if half else "mean") if has_appearance else None
     return Evaluation(rows, {**results, "num_images": len(rows)}, lpips_note, protocol, pictures_note)
+
+
+def _judge(
+    model: Model,
+    dataset: Dataset,
+    index: int,
+    background: Tensor,
+    half: bool,
+    round_to_uint8: bool,
+    lpips: Callable[[Tensor, Tensor], float] | None,
+) -> tuple[dict[str, Any], tuple[Tensor, Tensor, Picture]]:
+    """Return what is reported of a view, and its rendered image, true image and picture."""
+    target = composite(dataset.image(index).float() / 255, background)
+    with fitted_appearance(model, dataset, index, background) if half else nullcontext():
+        picture, spent = timed_view(model, dataset.view(index), background)
+    rgb = picture.rgb.clamp(0, 1)
+    if round_to_uint8:
+        rgb = (rgb * 255).round() / 255
+    pair, kept = _judged(rgb, target, dataset.kept_of(index), half)
+    row = _row(dataset, index, measure(*pair, kept), spent)
+    row["ms_ssim"] = None if min(target.shape[:2]) < SMALLEST_OF_SCALES else ms_ssim(*pair)
+    row["lpips"] = None if lpips is None else lpips(*pair)
+    return row | {"floaters": floaters(picture, dataset, index)}, (rgb, target, picture)
 
 
 def _write_pictures(folder: Path, stem: str, rgb: Tensor, target: Tensor, picture: Picture) -> str | None:

@@ -233,6 +233,9 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
         Args:
             rays: R rays.
             background: (3,) colour in [0, 1].
+
+        Returns:
+            What R rays show.
         """
         known = None
         if self._renders_plainly and self.shared_space is None:

@@ -13,7 +13,7 @@ from typing import ClassVar
 
 from framework import Decision, Method, Scene
 from framework.base.config import AUTO, Auto, Range
-from framework.base.decisions import Choice, fill
+from framework.base.decisions import Choice, fill, is_open
 from framework.base.device import relative_speed
 from framework.encodings.hash_grid import HashGrid, HashGridConfig
 from framework.fields.encoded import EncodedField
@@ -30,14 +30,12 @@ FITTED_SECONDS, FITTED_PIXELS = 150.0, 400
 Its settings were found by trials on Lego, 400 x 400, after 15, 45, 150 and 300 s."""
 TABLE_SECONDS, STEPS_SECONDS, LARGE_STEP_SECONDS = 60.0, 110.0, 300.0
 """Seconds at which tables have 2^17 entries, from which steps along rays shorten, and at which a training step has 2^16
-samples. On Lego, 2^17 entries were 0.30 and
-0.35 dB better than 2^16 after 45 s (docs/notes/learning.md)."""
+samples. On Lego, 2^17 entries were 0.30 and 0.35 dB better than 2^16 after 45 s (docs/notes/learning.md)."""
 LEAST_SAMPLES, MOST_SAMPLES = 24 * 2**10, 2**16
 """Samples of a step in the shortest time and the longest."""
-HASTE_SECONDS, NO_HASTE_SECONDS = 15.0, 45.0
-"""Seconds up to which a run is in all haste, and from which it is in none."""
-LATE_UNTIL_SECONDS = 150.0
-"""Seconds from which several rays a pixel are trained from 75 % of the time on; up to `NO_HASTE_SECONDS`, from 90 %."""
+HASTE_SECONDS, NO_HASTE_SECONDS, LATE_UNTIL_SECONDS = 15.0, 45.0, 150.0
+"""Seconds up to which a run is in all haste, from which it is in none, and from which 75 % of the time has one ray a
+pixel, where it is 90 % of shorter runs."""
 
 THIN = 0.5
 """Share of the mean gradient below which samples are thinned. On Lego, two seeds gave 28.34 and 28.52 dB after 800
@@ -115,13 +113,14 @@ def plan(seconds: float, image_size: int, speed: float = 1.0) -> Plan:
     """Return the settings that suit a time and a size of images.
 
     With twice the time tables double, to 2^17 entries after 60 s on two threads, from 2^16 to 2^18; so do the steps
-    along the diagonal and the cells of a pixel, to 704 and 2 after 150 s, from 512 and 1 to 1,024 and 2. The samples of
-    a step grow with the square root of time, to 2^16 after 300 s, from 24,576. Images larger than 400 pixels, up to
-    twice as large, have more for tables to hold, up to 2^19 entries after 600 s, and need as many times longer before
-    they get 2 cells a pixel.
+    along the diagonal and the cells of a pixel, to 704 and 2 after 150 s, from 512 and 1 after 45 s to 1,024 and 2.
+    The samples of a step grow with the square root of time, to 2^16 after 300 s, from 24,576. Images larger than
+    400 pixels, up to twice as large, have more for tables to hold, up to 2^19 entries after 600 s, and need as many
+    times longer before they get 2 cells a pixel.
 
-    Less than 45 s are made more of by larger and coarser steps: after 15 s, twice the learning rate and twice the
-    thinning, and 384 steps along the diagonal, which rendering then halves.
+    Less than 45 s are made more of by larger and coarser steps: up to 15 s, twice the learning rate, twice the
+    thinning, and 384 steps along the diagonal, whose length rendering halves. Several rays a pixel are trained from
+    90 % of up to 45 s on, and from 75 % of 150 s.
 
     Args:
         seconds: maximum seconds of training; infinity without a maximum.
@@ -131,7 +130,7 @@ def plan(seconds: float, image_size: int, speed: float = 1.0) -> Plan:
     time, size = seconds * speed / FITTED_SECONDS, min(max(image_size / FITTED_PIXELS, 1.0), 2.0)
     longer = min(max(seconds * speed / STEPS_SECONDS, 1.0), 2.0)
     share = (seconds * speed / LARGE_STEP_SECONDS) ** 0.5  # of the most samples
-    haste = share_of(seconds * speed, NO_HASTE_SECONDS, HASTE_SECONDS)
+    haste = way_between(seconds * speed, NO_HASTE_SECONDS, HASTE_SECONDS)
     entries = max(min(seconds * speed / TABLE_SECONDS, 2.0), min(time, 2 * size), 0.5)  # in those of 2^17
     return Plan(
         log2_table_size=17 + round(math.log2(entries)),
@@ -139,21 +138,21 @@ def plan(seconds: float, image_size: int, speed: float = 1.0) -> Plan:
         samples=1024 * round(min(max(share, LEAST_SAMPLES / MOST_SAMPLES), 1.0) * MOST_SAMPLES / 1024),
         detail=round(min(max(2 * time / size, 1.0), 2.0)),
         learning_rate=round(0.01 * 2**haste, 4),
-        several_rays_from=round(0.9 - 0.15 * share_of(seconds * speed, NO_HASTE_SECONDS, LATE_UNTIL_SECONDS), 3),
+        several_rays_from=round(0.9 - 0.15 * way_between(seconds * speed, NO_HASTE_SECONDS, LATE_UNTIL_SECONDS), 3),
         thin=round(THIN * 2**haste, 3),
         eval_step_scale=round(1 - haste / 2, 3),
     )
 
 
-def share_of(seconds: float, first: float, last: float) -> float:
-    """Return how much of the way from one time to another a time is, in factors of time.
+def way_between(seconds: float, first: float, last: float) -> float:
+    """Return how far a time is on the way between two others, measured on the logarithm of time.
 
     Args:
         seconds: the time, seconds.
-        first, last: the times, seconds, at and before or after which the share is 0 and 1.
+        first, last: the others, seconds; `last` may be the earlier one.
 
     Returns:
-        The share, from 0 to 1.
+        0 at `first` and before it, 1 at `last` and beyond.
     """
     return min(max(math.log(seconds / first) / math.log(last / first), 0.0), 1.0)
 
@@ -171,15 +170,19 @@ def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, li
     seconds = math.inf if config.max_seconds is None else config.max_seconds
     suited = plan(seconds, scene.image_size, relative_speed(config.machine))
     suits = "that suits the time" if seconds < math.inf else "there is time for it"
+    finer = suited.eval_step_scale if is_open(config.num_steps) else 1.0  # it makes up for longer steps in training
     config, made = decide_background(config, scene)
     config, sizes = fill(
         config,
         Choice("log2_table_size", suited.log2_table_size, suits),
         Choice("num_steps", suited.num_steps, suits, "steps along the box's diagonal"),
         Choice("samples_per_batch", suited.samples, suits, "samples a step"),
+    )
+    config, rates = fill(
+        config,
         Choice("learning_rate", suited.learning_rate, suits),
         Choice("train_rays_per_pixel_from", suited.several_rays_from, suits, "share of the time with one ray a pixel"),
-        Choice("eval_step_scale", suited.eval_step_scale, suits, "length of a step in rendering"),
+        Choice("eval_step_scale", finer, suits, "length of a step in rendering"),
         Choice("thin_gradients", suited.thin, suits, "gradients thinned, of the mean"),
     )
     config, _ = fill(config, Choice("detail", suited.detail, suits))  # reported with the resolution that follows
@@ -196,7 +199,8 @@ def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, li
         Choice("sparse_updates", pays, f"tables have 2^{config.log2_table_size} entries a level"),
     )
     config, few = decide_few_images(config, scene)
-    return config, made + sizes + more + few
+    hasty = suited.learning_rate > plan(math.inf, scene.image_size).learning_rate  # else they are as usual
+    return config, made + sizes + more + few + (rates if hasty else [])
 
 
 def make_field(config: InstantNGPConfig, scene: Scene) -> EncodedField:

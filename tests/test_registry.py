@@ -95,7 +95,7 @@ def test_a_broken_plugin_is_named_and_the_rest_goes_on(environment: Callable[...
         ("broken", "method 'broken' of NERFLOOM_METHODS cannot be loaded: RuntimeError: no such luck"),
         ("leaving", "cannot be loaded: SystemExit: 3"),
         ("unreadable", "cannot be loaded: SyntaxError"),
-        ("gone", "'no_such_module_at_all'; PYTHONPATH has to name the folder of no_such_module_at_all.py"),
+        ("gone", "'no_such_module_at_all'; PYTHONPATH has to name the folder that no_such_module_at_all is in"),
         ("wrong", "wrong_plugin:METHOD is no framework.Method"),
     ):
         with pytest.raises(ConfigError, match=re.escape(reason)):

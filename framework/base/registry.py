@@ -169,8 +169,9 @@ def _load(kind: Kind, name: str) -> Any:
             loaded = getattr(loaded, part)
     except (Exception, SystemExit) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
-        if isinstance(error, ModuleNotFoundError) and error.name == entry.module and entry.package == VARIABLES[kind]:
-            reason += f"; PYTHONPATH has to name the folder of {entry.module}.py"
+        top = entry.module.split(".")[0]
+        if isinstance(error, ModuleNotFoundError) and error.name == top and entry.package == VARIABLES[kind]:
+            reason += f"; PYTHONPATH has to name the folder that {top} is in"
         if _looks_old(error):
             reason += f". It seems to be written for plugin interface 1, and this is {INTERFACE[kind]}: {CHANGED}"
         raise ConfigError(f"{title} cannot be loaded: {reason}") from error

@@ -23,7 +23,7 @@ class EvalFlags:
     render_output_path: Path | None = None
     """Folder for each view's render, true image, and comparison (image, render, error, depth, opacity)."""
     max_pictures: int | None = None
-    """Maximum number of views with pictures in that folder, evenly spaced, besides the worst; all if not given."""
+    """Maximum number of views with pictures in that folder, evenly spaced, besides worst.png; all if not given."""
     load_checkpoint: Path | None = None
     """Checkpoint to load; the newest if not given."""
     data: Path | None = None

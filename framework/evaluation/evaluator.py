@@ -33,6 +33,8 @@ BEFORE = 0.9
 """Share of a sparse point's distance before which a view that sees the point should show nothing."""
 FAR_BELOW, MOST_NAMED = 3.0, 3
 """Distance from the mean PSNR, dB, from which a view is named, and the maximum number of views that are."""
+WORST = "worst"
+"""Name, without suffix, of the files of the view with the lowest PSNR; the next evaluation overwrites them."""
 LONGEST_STEM = 150
 """Maximum number of bytes of an image's name in the names of the files written for it."""
 
@@ -212,8 +214,8 @@ def evaluate(
         dataset: views with images, on the model's device.
         max_images: maximum number of views, evenly spaced; all if None.
         pictures: folder for renders, true images, `view_panels` and normals (x, y, z as RGB); no files if None.
-        max_pictures: maximum number of views of which files are written, evenly spaced; all if None. If there are any,
-            files of the view with the lowest PSNR are written besides.
+        max_pictures: maximum number of views of which files are written, evenly spaced; all if None. If that is some of
+            them, files of the view with the lowest PSNR are written besides, as worst.png and so on.
         round_to_uint8: whether colours are rounded to 8 bits before they are measured.
         title: text of the progress bar.
 
@@ -233,19 +235,20 @@ def evaluate(
     rows, seconds, rays = [], 0.0, 0
     pictures_note: str | None = None
     shown = {chosen[rank] for rank in spread(len(chosen), max_pictures)}
-    lowest, worst = math.inf, None  # what is written of the view with the lowest PSNR, where it is not shown anyway
+    marked = pictures is not None and 0 < len(shown) < len(chosen)
+    lowest, worst = math.inf, None
     for index in track(chosen, title, total=len(chosen)):
-        row, images = _judge(model, dataset, index, background, half, round_to_uint8, lpips)
+        row, (rgb, target, picture) = _judge(model, dataset, index, background, half, round_to_uint8, lpips)
         rows.append(row)
         seconds += row["seconds"]
-        rays += images[2].num_rays
-        drawn = (f"{index:04d}_{_short_stem(dataset.names[index])}", *images)
-        if row["psnr"] < lowest:
-            lowest, worst = row["psnr"], None if index in shown else drawn
+        rays += picture.num_rays
+        if marked and row["psnr"] < lowest:
+            lowest, worst = row["psnr"], (rgb, target, picture)
         if pictures is not None and index in shown and pictures_note is None:
-            pictures_note = _write_pictures(pictures, *drawn)
-    if pictures is not None and shown and worst is not None and pictures_note is None:
-        pictures_note = _write_pictures(pictures, *worst)
+            stem = f"{index:04d}_{_short_stem(dataset.names[index])}"
+            pictures_note = _write_pictures(pictures, stem, rgb, target, picture)
+    if pictures is not None and worst is not None and pictures_note is None:
+        pictures_note = _write_pictures(pictures, WORST, *worst)
     speed = rays / seconds if rays else None  # None of a method that casts none
     results = {**_statistics(rows), **_by_size(rows), "num_rays_per_sec": speed, "fps": len(rows) / seconds}
     protocol: Literal["mean", "half"] | None = ("half" if half else "mean") if has_appearance else None

@@ -28,7 +28,7 @@ PROBE_RAYS, WARM_UP_RAYS = 1024, 64
 LEAST_TOLD = 0.005
 """Minimum skipped fraction that is printed."""
 LEAST_FASTER = 1.1
-"""Minimum speed of rendering, relative to that without skipping, that is printed; less is within a probe's noise."""
+"""Minimum speed of rendering, relative to that without skipping, that is printed; less is not worth a number."""
 
 
 @dataclass(frozen=True)

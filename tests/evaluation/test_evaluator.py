@@ -167,11 +167,15 @@ def test_pictures_are_over_what_training_was_over(asked: Any, alpha: bool, expec
 def test_pictures_are_of_views_evenly_spaced_and_of_the_worst(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run")
     images = trainer.train_set
-    found = evaluate(trainer.model, images, pictures=tmp_path / "all", max_pictures=2)
-    written = {int(path.name[:4]) for path in (tmp_path / "all").iterdir()}
+    found = evaluate(trainer.model, images, pictures=tmp_path / "two", max_pictures=2)
+    evaluate(trainer.model, images, pictures=tmp_path / "all")
+    views = {path.name.split("_")[0].removesuffix(".png") for path in (tmp_path / "two").iterdir()}
+    assert views == {"0000", f"{len(images) // 2:04d}", "worst"}
     worst = min(range(len(images)), key=lambda index: found.per_image[index]["psnr"])
-    assert written == {0, len(images) // 2, worst}
-    assert len(list((tmp_path / "all").iterdir())) == 3 * len(written)
+    (expected,) = (tmp_path / "all").glob(f"{worst:04d}_*_photograph.png")
+    assert (tmp_path / "two" / "worst_photograph.png").read_bytes() == expected.read_bytes()
+    assert not list((tmp_path / "all").glob("worst*"))
+    assert found.results["num_rays_per_sec"] > 0
     evaluate(trainer.model, images, max_images=2, pictures=tmp_path / "none", max_pictures=0)
     assert not (tmp_path / "none").exists()
 

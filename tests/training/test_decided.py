@@ -28,7 +28,8 @@ def test_a_run_goes_on_with_what_was_decided_however_long_it_then_takes(shared_t
     assert "log2 table size: 16, as that suits the time" in said
     folder = tmp_path / shared_tiny.name / "instant-ngp" / "t"
     written = yaml.safe_load((folder / "config.yml").read_text())
-    decided = {"sampler": "occupancy", "log2_table_size": 16, "num_steps": 512, "sparse_updates": False}
+    decided = {"sampler": "occupancy", "log2_table_size": 16, "num_steps": 384, "sparse_updates": False}
+    decided["learning_rate"] = 0.02
     assert {name: written[name] for name in decided} == decided
     assert written["max_resolution"] == 32  # a finest cell or more for each of 20 pixels
     assert written["samples_per_batch"] == 1024  # as was asked for

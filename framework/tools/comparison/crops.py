@@ -11,6 +11,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 
+from framework.evaluation.evaluator import WORST
 from framework.evaluation.images import error_map
 
 VIEWS = 3
@@ -67,7 +68,7 @@ def views(folders: Sequence[tuple[str, Path]], count: int = VIEWS) -> list[View]
     names = [
         {file.name.removesuffix(IMAGE_SUFFIX) for file in folder.glob("*" + IMAGE_SUFFIX)} for _, folder in folders
     ]
-    shared = sorted(set.intersection(*names)) if names else []
+    shared = sorted(set.intersection(*names) - {WORST}) if names else []  # each contender's worst is another view
     count = min(count, len(shared))
     chosen = [shared[index * len(shared) // count] for index in range(count)]
     return [view for view in (_view(name, folders) for name in chosen) if view is not None]

@@ -281,7 +281,7 @@ def markdown(content: dict[str, Any]) -> str:
         "",
     ]
     if content["levels"]:
-        lines += ["Seconds of training to PSNR on the validation views (–: not reached; <: before the first look):", ""]
+        lines += ["Seconds of training to PSNR on the validation views (<: exceeded at the first evaluation):", ""]
         lines += _markdown_table(["method", *(f"{level} dB" for level in content["levels"])], content["level_rows"])
         lines.append("")
     for label, reason in content["failures"]:

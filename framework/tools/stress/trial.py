@@ -149,13 +149,13 @@ def shortened(config: TrainConfig, budget: Budget, method: Method, scene: Scene)
         seconds_per_save=float(NEVER),
         steps_per_save=NEVER,
     )
+    decided = method.decided(config, scene)[0]
+    config = replace(config, learning_rate=decided.learning_rate)
     if not isinstance(config, RayConfig):
         return config
-    decided = method.decided(config, scene)[0]
     samples = decided.samples_per_batch
     return replace(
         config,
-        learning_rate=decided.learning_rate,
         num_rays_per_batch=min(config.num_rays_per_batch, MOST_RAYS),
         samples_per_batch=None if samples is None else min(samples, MOST_SAMPLES),
     )

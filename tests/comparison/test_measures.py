@@ -8,6 +8,7 @@ from statistics import stdev
 import pytest
 
 from framework.tools.comparison.measures import measure, pareto, rows_of, whole_levels
+from framework.tools.comparison.report import level_table
 from framework.tools.comparison.runner import is_done
 from tests.comparison.runs import CONDITIONS, finish, plan
 
@@ -63,6 +64,9 @@ def test_seeds_are_put_together(tmp_path: Path) -> None:
     assert first.seconds_to(30) == pytest.approx((60 + 45 + 22.5) / 3)
     assert [first.seconds_before(level) for level in (20, 27, 28)] == [15.0, None, None]
     assert third.seconds_before(20) is None
+    table = level_table([first, second])  # from 25 dB on, which the second had at its first evaluation
+    assert [cell.text for cell in table[0]["cells"][:3]] == ["< 15.0", "< 15.0", "–"]
+    assert [cell.text for cell in table[1]["cells"][:3]] == ["15.0", "30.0", "45.0"]
     assert (second.deviation("psnr"), second.failures) == (None, ("out of memory",))
     assert second.mean("lpips") is None
     assert third.mean("psnr") is None

@@ -149,7 +149,10 @@ def test_a_field_shows_where_to_start(shared_tiny: Path, tmp_path: Path) -> None
         trainer = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path / f"{start}{len(bits)}", True, **settings)
         trainer.prepare()
         assert trainer.eval_set is not None
-        psnr[start] = evaluate(trainer.model, trainer.eval_set).results["psnr"]
+        found = evaluate(trainer.model, trainer.eval_set)
+        psnr[start] = found.results["psnr"]
+        assert found.results["num_rays_per_sec"] is None  # it casts none
+        assert "images/s" in found.line()
         bits.append(torch.cat([p.detach().flatten() for p in trainer.model.parameters()]))
     print(psnr)
     assert psnr["field"] > psnr["random"] + 3

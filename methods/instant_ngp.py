@@ -199,7 +199,7 @@ def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, li
         Choice("sparse_updates", pays, f"tables have 2^{config.log2_table_size} entries a level"),
     )
     config, few = decide_few_images(config, scene)
-    hasty = suited.learning_rate > plan(math.inf, scene.image_size).learning_rate  # else they are as usual
+    hasty = suited.several_rays_from > plan(math.inf, scene.image_size).several_rays_from  # else all are as usual
     return config, made + sizes + more + few + (rates if hasty else [])
 
 

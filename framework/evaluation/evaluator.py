@@ -170,7 +170,7 @@ class Evaluation:
 
     @property
     def far_below(self) -> str | None:
-        """The views whose PSNR is `FAR_BELOW` the mean or more, worst first, as text; None if there is none."""
+        """The views whose PSNR is `FAR_BELOW` or more below the mean, worst first, as text; None if there is none."""
         mean = self.results["psnr"]
         low = sorted((row for row in self.per_image if row["psnr"] <= mean - FAR_BELOW), key=lambda row: row["psnr"])
         if not low:

@@ -161,11 +161,16 @@ def _starts(flags: StartsFlags) -> None:
 
 
 def _profile(flags: ProfileFlags) -> None:
+    from framework.cli.train import run_of
     from framework.tools.benchmarks.profile_step import measure
+    from framework.tools.comparison.plan import split_words
 
-    path = flags.output_dir / f"profile-{flags.method}.json"
+    if not (words := split_words(flags.method, "--method")):
+        raise FlagError("--method is empty; give the name of a method, such as instant-ngp")
+    path = flags.output_dir / f"profile-{words[0]}.json"
     make_room(path)
-    write_results(path, measure(flags.data, flags.method, flags.steps, flags.max_seconds))
+    run = run_of(words[0], [*words[1:], "--data", str(flags.data)])
+    write_results(path, {"method": flags.method, **measure(run, flags.steps, flags.max_seconds)})
 
 
 def _operations(flags: OperationsFlags) -> None:

@@ -152,7 +152,7 @@ class ProfileFlags:
     data: Path
     """Folder of the data set."""
     method: str = "instant-ngp"
-    """Name of the method."""
+    """A method, with its flags if it has some: 'vanilla-nerf --sampler occupancy'."""
     steps: int = 900
     """Training steps before the measurement."""
     max_seconds: float = 45.0

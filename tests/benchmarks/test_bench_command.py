@@ -48,9 +48,12 @@ def test_bad_input_is_refused_in_a_line(shared_tiny: Path, tmp_path: Path, refus
 
 @pytest.mark.slow  # hundreds of steps of a whole instant-ngp
 def test_a_profile_adds_up(shared_tiny: Path, tmp_path: Path) -> None:
-    done = called("ns-bench", "profile-step", "--data", shared_tiny, "--steps", 2, "--output-dir", tmp_path)
+    method = "nerfacto --sampler proposal --num-rays-per-batch 128"
+    flags = ("--data", shared_tiny, "--method", method, "--steps", 2, "--output-dir", tmp_path)
+    done = called("ns-bench", "profile-step", *flags)
     assert done.returncode == 0, done.stderr
-    content = json.loads((tmp_path / "profile-instant-ngp.json").read_text())
+    content = json.loads((tmp_path / "profile-nerfacto.json").read_text())
+    assert (content["method"], content["rays per step"]) == (method, 128)
     assert sum(content["ms"].values()) == pytest.approx(content["ms per step"], abs=0.1)
     assert content["ms"]["Python and torch"] > 0
 

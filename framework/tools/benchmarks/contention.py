@@ -25,7 +25,7 @@ from framework.base.errors import FlagError, NerfloomError
 from framework.data.data_folder import find_data
 from framework.evaluation.evaluator import evaluation_background
 from framework.kernels import native
-from framework.tools.benchmarks.workload import endless_trainer
+from framework.tools.benchmarks.workload import default_run, endless_trainer
 from framework.training.datasets import load_split
 from framework.training.machine import machine
 from framework.training.trainer import Trainer
@@ -199,7 +199,7 @@ def child(work: str, data: Path, seconds: float) -> dict[str, float]:
         Steps or images per second, and the seconds of the first, the longest and the median one.
     """
     with tempfile.TemporaryDirectory() as folder:
-        trainer = endless_trainer("instant-ngp", data, SETTINGS_FOR, Path(folder))
+        trainer = endless_trainer(default_run("instant-ngp", data), SETTINGS_FOR, Path(folder))
         once = rendering(trainer) if work == "rendering" else lambda _: trainer.train_step()
         print("ready", native.variant(), flush=True)
         sys.stdin.readline()

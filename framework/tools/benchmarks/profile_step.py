@@ -11,18 +11,18 @@ from framework.base.console import say
 from framework.kernels import native
 from framework.tools.benchmarks.workload import endless_trainer
 from framework.training.machine import machine
+from framework.training.run import Run
 
 MEASURED, FEWEST, LONGEST = 200, 8, 30.0
 """Number of steps over which times are averaged; fewer, but not fewer than the second, where they take longer than the
 third, seconds."""
 
 
-def measure(data: Path, method: str, steps: int, max_seconds: float) -> dict[str, Any]:
+def measure(run: Run, steps: int, max_seconds: float) -> dict[str, Any]:
     """Train a method, measure `MEASURED` further steps at most, and print a line for each kernel.
 
     Args:
-        data: folder of the data set.
-        method: name of the method.
+        run: what to train.
         steps: training steps before the measurement, in which the occupancy grid finds empty space.
         max_seconds: time budget, seconds, for which the method chooses its settings.
 
@@ -30,26 +30,28 @@ def measure(data: Path, method: str, steps: int, max_seconds: float) -> dict[str
         Milliseconds per step, in total and by kernel, as plain data.
     """
     with tempfile.TemporaryDirectory() as folder:
-        trainer = endless_trainer(method, data, max_seconds, Path(folder))
+        trainer = endless_trainer(run, max_seconds, Path(folder))
         for _ in range(steps):
             trainer.train_step()
-        native.spent = {}
+        native.spent, rays = {}, trainer.state.rays
         start, count = time.perf_counter(), 0
         while count < FEWEST or (count < MEASURED and time.perf_counter() - start < LONGEST):
             trainer.train_step()
             count += 1
         step = (time.perf_counter() - start) / count * 1e3
+        rays = (trainer.state.rays - rays) // count
     kernels = {name: seconds / count * 1e3 for name, seconds in native.spent.items()}
     native.spent = None
     kernels["Python and torch"] = step - sum(kernels.values())
     parts = dict(sorted(kernels.items(), key=lambda item: -item[1]))
     for name, spent in parts.items():
         say(f"{name:28s} {spent:6.2f} ms  {spent / step:6.1%}")
-    say(f"{'a step':28s} {step:6.2f} ms  {native.variant()}")
+    say(f"{'a step':28s} {step:6.2f} ms  {rays:,} rays, {native.variant()}")
     return {
         "machine": machine(),
         "kernels": native.variant(),
         "steps": count,
+        "rays per step": rays,
         "ms per step": round(step, 2),
         "ms": {name: round(spent, 3) for name, spent in parts.items()},
     }

@@ -14,20 +14,22 @@ from torch import Tensor
 
 from framework import Decision, Field, Method, PixelBatch, Points, Rays, Rendered, Renderer, Sampler, Samples, Scene
 from framework.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
-from framework.base.decisions import Choice
+from framework.base.decisions import Choice, fill
 from framework.encodings.hash_grid import HashGrid, HashGridConfig
 from framework.fields.appearance import Appearance
 from framework.fields.encoded import NUM_FEATURES, EncodedField
 from framework.fields.normals import NormalHead, density_normals, normal_penalties
 from framework.kernels.compositing import ray_sum
-from framework.rendering.volume import VolumeRenderer, scaled_up_to
-from framework.samplers.choice import make_sampler
+from framework.rendering.volume import VolumeRenderer, scaled_up_to, volume_renderer
+from framework.samplers.choice import batch_choice, make_sampler
 from framework.scene.few_images import FewImagesConfig, decide_few_images
 from framework.scene.reasons import LIGHT_REASONS
-from methods._captures import CaptureConfig, CaptureModel, decide_capture
+from methods._captures import MARCHED_SAMPLES, CaptureConfig, CaptureModel, decide_capture
 
 APPEARANCE_SIZE = 16
 """Default length of appearance vectors where the appearance varies."""
+FEWEST_SAMPLES, FEWEST_UNTIL = 2**15, 150.0
+"""Samples of a training step with an occupancy grid over a box, and seconds on two threads up to which it has them."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,6 @@ class NerfactoConfig(
     adam_beta2=0.99,
     adam_eps=1e-15,
     eval_num_rays_per_chunk=4_096,
-    sampler="proposal",
 ):
     """Settings of nerfacto; those not given depend on the scene."""
 
@@ -65,32 +66,26 @@ class NerfactoConfig(
     """Features per hidden layer of the two networks."""
 
 
-class NerfactoRenderer(VolumeRenderer):
-    """Volume rendering with optional gradient scaling near cameras and optional predicted normals.
+class NormalRenderer(VolumeRenderer):
+    """Volume rendering with predicted normals, and in training with their penalties.
 
     Args:
+        normals: the network that predicts normals.
         unit_length: distance from the camera up to which gradients are scaled, scene units; None for no scaling.
-        normals: the network that predicts normals; None for no normals.
         thin: share of the mean gradient below which samples are thinned; 0 for none.
     """
 
-    def __init__(self, unit_length: float | None, normals: NormalHead | None, thin: float = 0.0) -> None:
+    def __init__(self, normals: NormalHead, unit_length: float | None, thin: float = 0.0) -> None:
         super().__init__(unit_length, thin)
         self.normals = normals
 
     def shade(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
         rendered = super().shade(rays, samples, field, background)
-        return rendered if self.normals is None else self._with_normals(self.normals, field, rays, samples, rendered)
-
-    def _with_normals(
-        self, head: NormalHead, field: Field, rays: Rays, samples: Samples, rendered: Rendered
-    ) -> Rendered:
-        """Return `rendered` with normals, and in training with their penalties."""
         assert isinstance(field, EncodedField)
         assert samples.features is not None
         assert rendered.weights is not None
         points, weights = Points(samples.positions(rays).detach(), samples.times(rays)), rendered.weights
-        predicted = head(samples.features.detach(), 2 * field.unit(points.positions) - 1)
+        predicted = self.normals(samples.features.detach(), 2 * field.unit(points.positions) - 1)
         facing = ray_sum(weights.detach()[:, None] * predicted, samples)
         if not self.training:
             return replace(rendered, normals=facing)
@@ -132,6 +127,9 @@ def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[D
     size = APPEARANCE_SIZE if varies else 0
     appearance = Choice("appearance_embedding_dim", size, LIGHT_REASONS[varies], "appearance features")
     config, made = decide_capture(config, scene, appearance)
+    if config.sampler == "occupancy":
+        config, samples = fill(config, batch_choice(config, FEWEST_SAMPLES, MARCHED_SAMPLES, FEWEST_UNTIL))
+        made += samples
     config, few = decide_few_images(config, scene)
     return config, made + few
 
@@ -171,8 +169,10 @@ def renderer(config: NerfactoConfig, scene: Scene) -> Renderer:
         config: the method's settings, none left open.
         scene: properties of the data.
     """
-    normals = NormalHead(NUM_FEATURES, config.hidden_width) if config.predict_normals else None
-    return NerfactoRenderer(scaled_up_to(config, scene), normals, config.thin_gradients)
+    if not config.predict_normals:
+        return volume_renderer(config, scene)
+    normals = NormalHead(NUM_FEATURES, config.hidden_width)
+    return NormalRenderer(normals, scaled_up_to(config, scene), config.thin_gradients)
 
 
 METHOD = Method(

@@ -45,7 +45,6 @@ class ZipNeRFConfig(
     adam_beta2=0.99,
     adam_eps=1e-15,
     eval_num_rays_per_chunk=4_096,
-    sampler="auto",
     num_steps=256,
     num_levels=8,
     features_per_level=4,

@@ -7,11 +7,15 @@ from pathlib import Path
 import pytest
 import torch
 
+from framework.base.config import MachineConfig
+from framework.base.registry import load_method
+from framework.data.scene import Scene
 from framework.evaluation.evaluator import evaluate
 from framework.fields.appearance import Appearance
 from framework.training.trainer import Trainer
 from tests.training.helpers import chosen, said_otherwise, tiny_run, tiny_trainer
 
+SCENE = Scene(torch.tensor([[-1.0] * 3, [1.0] * 3]), 1.0, 6.0, 4, True, False, 32)
 captured = partial(said_otherwise, "nerfacto")
 """A trainer on the tiny data set, of whose scene other things are said."""
 
@@ -25,6 +29,22 @@ def test_a_bounded_scene_with_exact_poses_needs_little(shared_tiny: Path, tmp_pa
     assert not model.field.unbounded
     assert model.poses is None
     assert model.field.appearance is None
+
+
+def test_what_ends_at_its_box_is_marched_and_all_else_is_proposed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lego after 45 s: 31.5 dB by an occupancy grid, 24.9 dB by proposals (docs/notes/captures.md)."""
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    method = load_method("nerfacto")
+
+    def decided(seconds: float | None, **facts: object) -> tuple[str, int | None]:
+        machine = MachineConfig(device_type="cpu")
+        asked = dataclasses.replace(method.config, max_seconds=seconds, machine=machine)
+        config, _ = method.decided(asked, dataclasses.replace(SCENE, **facts))
+        return config.sampler, config.samples_per_batch
+
+    assert decided(45.0) == decided(150.0) == ("occupancy", 2**15)
+    assert decided(300.0) == decided(None) == ("occupancy", 2**16)
+    assert decided(45.0, unbounded=True) == decided(None, unbounded=True) == ("proposal", None)
 
 
 def test_a_capture_gets_what_it_needs(shared_tiny: Path, tmp_path: Path) -> None:

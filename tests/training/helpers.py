@@ -118,6 +118,7 @@ TINY: dict[str, dict[str, Any]] = {
         "samples_per_batch": 4096,
     },
     "nerfacto": {
+        "sampler": "proposal",
         "num_levels": 4,
         "max_resolution": 64,
         "log2_table_size": 12,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import framework
 from framework.base.console import console, say
-from framework.base.errors import ConfigError, FlagError, NerfloomError, is_out_of_memory, nearest
+from framework.base.errors import ConfigError, FlagError, LostProcessError, NerfloomError, is_out_of_memory, nearest
 from framework.base.from_nerfstudio import KINDS
 from framework.base.registry import registered
 from framework.cli.flags import read_flags
@@ -146,6 +146,10 @@ def run_command(command: Callable[[list[str]], None]) -> None:
             raise
         console.quiet = False  # of several processes, each says why it ends
         say(f"error: {in_our_words(error)}")
+        if isinstance(error, LostProcessError):  # what waits for the lost process can abort Python's own end
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(1)
         sys.exit(2 if isinstance(error, FlagError) else 1)
     except (MemoryError, RuntimeError) as error:
         if debug or not is_out_of_memory(error):

@@ -11,6 +11,7 @@ from torch import Tensor
 from framework.base.config import RayConfig
 from framework.base.step_kind import StepKind
 from framework.cameras.cameras import subpixels
+from framework.cameras.refinement import PoseRefinement
 from framework.cameras.unseen import unseen_patches
 from framework.cameras.view import View
 from framework.data.pixels import PixelBatch, thinned
@@ -49,7 +50,7 @@ PATCH_IMAGE = 500
 """Longer side of an image, pixels, in which neighbouring rays of a patch are a pixel apart; in larger ones, as far in
 relation to the image."""
 
-PLAIN = "render", "color_error", "regularizers"
+PLAIN = "render", "color_error"
 """Methods that a model must have from here for its loss to be learnt in one call."""
 
 
@@ -74,6 +75,8 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
     def __init__(self, config: RayConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer) -> None:
         super().__init__(config, scene)
         self.field, self.sampler, self.renderer = field, sampler, renderer
+        self.poses: PoseRefinement | None = None
+        """Refinement of the training cameras' poses; None if they stay as they are."""
         starts = config.rays_shared_by and scene.unbounded and not scene.warped and not isinstance(sampler, SkipsCells)
         self.shared_space = SharedSpace(scene.box) if starts else None
 
@@ -84,6 +87,7 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
             rays: the rays; R may be 0.
             background: (R, 3) or (3,) colour in [0, 1] of the background.
         """
+        rays = rays if self.poses is None else self.poses(rays)
         rays = rays if self.shared_space is None else self.shared_space(rays)
         samples = self.sampler.sample(rays, self.field, self.training)
         return self.renderer.render(rays, samples, self.field, background)
@@ -130,6 +134,7 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
         few = isinstance(config, FewImagesConfig) and (config.occlusion_loss_mult or config.unseen_loss_mult)
         depths = batch.distances is not None and config.depth_loss_mult > 0
         others = type(self.sampler).losses is not Sampler.losses or isinstance(config, MotionConfig)
+        others = others or self._has_regularizers() or self.poses is not None
         if not own or few or depths or others or batch.clear is not None:
             return None
         pixels = PixelTargets(batch.background.repeat_interleave(batch.rays_per_pixel, 0), batch.rgb, batch.weights)
@@ -166,6 +171,20 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
             step: number of training steps done.
         """
         return {}
+
+    @property
+    def regularized(self) -> bool:
+        """Return whether `regularizers` may return terms.
+
+        Of a class that overrides `regularizers` and not this, it is taken to be so.
+        """
+        return False
+
+    def _has_regularizers(self) -> bool:
+        says, returns = (
+            next(base for base in type(self).__mro__ if name in vars(base)) for name in ("regularized", "regularizers")
+        )
+        return self.regularized or not issubclass(says, returns) or "regularizers" in vars(self)
 
     def _for_few_images(
         self, config: FewImagesConfig, rendered: Rendered, batch: PixelBatch, step: int
@@ -248,8 +267,9 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
 
     @property
     def _renders_plainly(self) -> bool:
-        """Whether `render` and the renderer are those from here."""
-        return getattr(self.render, "__func__", None) is RayModel.render and type(self.renderer) is VolumeRenderer
+        """Whether `render` and the renderer are those from here, and rays those of the view."""
+        own = getattr(self.render, "__func__", None) is RayModel.render
+        return own and self.poses is None and type(self.renderer) is VolumeRenderer
 
     def step_kind(self, step: int) -> StepKind:
         config = self.config

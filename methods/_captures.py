@@ -14,7 +14,6 @@ from framework import (
     Field,
     PixelBatch,
     RayModel,
-    Rays,
     Rendered,
     Renderer,
     Sampler,
@@ -130,7 +129,6 @@ class CaptureModel(RayModel[CaptureConfigT], Generic[CaptureConfigT]):
         self, config: CaptureConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer
     ) -> None:
         super().__init__(config, scene, field, sampler, renderer)
-        self.poses: PoseRefinement | None = None
         self._disparity_from = half_edge(scene.box) if config.contraction else None
         if config.camera_optimizer in ("SO3xR3", "SE3"):
             if scene.warped:
@@ -150,8 +148,9 @@ class CaptureModel(RayModel[CaptureConfigT], Generic[CaptureConfigT]):
         """
         return cameras if self.poses is None else self.poses.refined(cameras)
 
-    def render(self, rays: Rays, background: Tensor) -> Rendered:
-        return super().render(rays if self.poses is None else self.poses(rays), background)
+    @property
+    def regularized(self) -> bool:
+        return self.config.distortion_loss_mult > 0
 
     def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
         return distortion_term(rendered, self.config.distortion_loss_mult, self._disparity_from)

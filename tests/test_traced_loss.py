@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor
 
 from framework.data.pixels import PixelBatch
 from framework.kernels.native import available
@@ -16,6 +17,12 @@ from tests.training.helpers import tiny_trainer
 
 def losses(trainer: Trainer, steps: int = 4) -> list[float]:
     return [trainer.train_step().losses["rgb"] for _ in range(steps)]
+
+
+def traced(trainer: Trainer) -> TracedError | None:
+    """What the trainer's model learns of its next batch in one call; None if in several."""
+    trainer.prepare()
+    return trainer.model._traced(trainer.source.draw(trainer._request()))
 
 
 @pytest.mark.parametrize("rays_per_pixel", [1, 4])
@@ -73,3 +80,35 @@ def test_thinned_steps_learn_as_well(method: str, shared_tiny: Path, tmp_path: P
         assert sum(found[-5:]) < sum(found[:5]) / 2
         means.append(sum(found[-10:]))
     assert means[1] == pytest.approx(means[0], rel=0.3)
+
+
+@pytest.mark.parametrize(
+    ("settings", "together"),
+    [({}, True), ({"distortion_loss_mult": 0.01}, False), ({"predict_normals": True}, False)],
+    ids=str,
+)
+def test_nerfacto_in_a_box_learns_in_one_call_if_it_adds_nothing(
+    shared_tiny: Path, tmp_path: Path, settings: dict[str, object], together: bool
+) -> None:
+    trainer = tiny_trainer("nerfacto", shared_tiny, tmp_path, sampler="occupancy", samples_per_batch=4096, **settings)
+    found = traced(trainer)
+    assert (found is not None) == together
+
+
+def test_terms_of_a_class_of_ones_own_are_not_left_out(shared_tiny: Path, tmp_path: Path) -> None:
+    """Neither with the answer of the class that it derives from, nor if they are given to one model alone."""
+    trainer = tiny_trainer("nerfacto", shared_tiny, tmp_path, sampler="occupancy", samples_per_batch=4096)
+    model, kind = trainer.model, type(trainer.model)
+
+    def regularizers(*_: object) -> dict[str, Tensor]:
+        return {"own": next(model.field.parameters()).square().mean()}
+
+    assert traced(trainer) is not None
+    model.__class__ = type("Own", (kind,), {"regularizers": regularizers})
+    assert traced(trainer) is None
+    assert "own" in trainer.train_step().losses
+    model.__class__ = type("Silent", (kind,), {"regularizers": regularizers, "regularized": False})
+    assert traced(trainer) is not None
+    model.__class__ = kind
+    model.regularizers = regularizers
+    assert traced(trainer) is None

@@ -36,15 +36,15 @@ def test_what_ends_at_its_box_is_marched_and_all_else_is_proposed(monkeypatch: p
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     method = load_method("nerfacto")
 
-    def decided(seconds: float | None, **facts: object) -> tuple[str, int | None]:
+    def decided(seconds: float | None, **facts: object) -> tuple[str, int | None, float]:
         machine = MachineConfig(device_type="cpu")
         asked = dataclasses.replace(method.config, max_seconds=seconds, machine=machine)
         config, _ = method.decided(asked, dataclasses.replace(SCENE, **facts))
-        return config.sampler, config.samples_per_batch
+        return config.sampler, config.samples_per_batch, config.thin_gradients
 
-    assert decided(45.0) == decided(150.0) == ("occupancy", 2**15)
-    assert decided(300.0) == decided(None) == ("occupancy", 2**16)
-    assert decided(45.0, unbounded=True) == decided(None, unbounded=True) == ("proposal", None)
+    assert decided(45.0) == decided(150.0) == ("occupancy", 2**15, 0.5)
+    assert decided(300.0) == decided(None) == ("occupancy", 2**16, 0.5)
+    assert decided(45.0, unbounded=True) == decided(None, unbounded=True) == ("proposal", None, 0.0)
 
 
 def test_a_capture_gets_what_it_needs(shared_tiny: Path, tmp_path: Path) -> None:

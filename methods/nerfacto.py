@@ -134,14 +134,15 @@ def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[D
     size = APPEARANCE_SIZE if varies else 0
     appearance = Choice("appearance_embedding_dim", size, LIGHT_REASONS[varies], "appearance features")
     config, made = decide_capture(config, scene, appearance)
-    thin, why = 0.0, "with proposals, or in contracted space, all count"
     if config.sampler == "occupancy" and not config.contraction:
-        thin, why = THIN, "most samples that an occupancy grid chooses learn nothing"
         config, samples = fill(config, batch_choice(config, FEWEST_SAMPLES, MARCHED_SAMPLES, FEWEST_UNTIL))
-        made += samples
-    config, thinned = fill(config, Choice("thin_gradients", thin, why, "gradients thinned, of the mean"))
+        reason = "most samples that an occupancy grid chooses learn little"
+        config, thinned = fill(config, Choice("thin_gradients", THIN, reason, "gradients thinned, of the mean"))
+        made += samples + thinned
+    else:
+        config, _ = fill(config, Choice("thin_gradients", 0.0, "all samples of proposals count"))
     config, few = decide_few_images(config, scene)
-    return config, made + thinned + few
+    return config, made + few
 
 
 def make_field(config: NerfactoConfig, scene: Scene) -> EncodedField:

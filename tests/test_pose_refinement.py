@@ -7,7 +7,9 @@ import pytest
 import torch
 
 from framework.cameras.cameras import Cameras
+from framework.cameras.carried import carried_poses
 from framework.cameras.refinement import PoseRefinement
+from framework.geometry.alignment import align_cameras
 from framework.geometry.rays import Rays
 from framework.kernels.math import cross_matrix
 
@@ -116,6 +118,75 @@ def test_without_refinement_other_cameras_stay_though_all_are_in_one_place() -> 
     found = PoseRefinement(3, "SO3xR3", given)(rays)
     torch.testing.assert_close(found.origins, rays.origins)
     torch.testing.assert_close(found.directions, rays.directions)
+
+
+def test_held_out_cameras_follow_those_around_them_where_poses_drift_along_the_way() -> None:
+    """Errors that grow along a path, with noise of a single camera: what lies between cameras follows the path's."""
+    torch.manual_seed(0)
+    along = torch.linspace(0, 1, 41)
+    angles = 0.1 * along.square()  # about z, and a shift along x
+    turns = torch.linalg.matrix_exp(cross_matrix(torch.tensor([0.0, 0.0, 1.0])) * angles[:, None, None])
+    centers = torch.stack([torch.cos(3 * along), torch.sin(3 * along), along], dim=-1)
+    shifts = torch.stack([0.1 * along.square(), 0 * along, 0 * along], dim=-1)
+    given = torch.cat([torch.eye(3).expand(41, 3, 3), centers[:, :, None]], -1)
+    refined = torch.cat([turns, (centers + shifts)[:, :, None]], -1)
+    between = torch.arange(41) % 8 == 4
+    found, _ = carried_poses(given[between], given[~between], refined[~between])
+    apart = (found - refined[between]).flatten(1).norm(dim=1)
+    scale, rotation, translation = align_cameras(given[~between], refined[~between])
+    alike = torch.cat(
+        [
+            rotation.float().expand(int(between.sum()), 3, 3),
+            (scale * centers[between].double() @ rotation.T + translation).float()[:, :, None],
+        ],
+        -1,
+    )
+    assert float(apart.mean()) < 0.25 * float((alike - refined[between]).flatten(1).norm(dim=1).mean())
+
+
+def test_far_from_all_cameras_other_cameras_follow_the_similarity_alone() -> None:
+    torch.manual_seed(0)
+    given = torch.cat([torch.eye(3).expand(9, 3, 3), torch.randn(9, 3, 1)], -1)
+    turns = torch.linalg.matrix_exp(
+        cross_matrix(0.1 * torch.randn(3)) + 0.1 * torch.stack([cross_matrix(v) for v in torch.randn(9, 3)])
+    )
+    refined = torch.cat([turns, given[:, :, 3:] + 0.1 * torch.randn(9, 3, 1)], -1)
+    far = torch.cat([torch.eye(3), torch.tensor([[3e4], [2e4], [-1e4]])], -1)[None]
+    scale, rotation, translation = align_cameras(given, refined)
+    found, grown = carried_poses(far, given, refined)
+    assert grown == scale
+    torch.testing.assert_close(found[0, :, :3], rotation.float(), atol=1e-4, rtol=0)
+    expected = (scale * rotation @ far[0, :, 3].double() + translation).float()
+    torch.testing.assert_close(found[0, :, 3], expected, atol=0.02, rtol=0)
+
+
+def test_one_camera_and_many_at_one_place_carry_others_too() -> None:
+    for count in (1, 3):
+        given = torch.cat([torch.eye(3).expand(count, 3, 3), torch.ones(count, 3, 1)], -1)
+        refined = given.clone()
+        refined[:, 0, 3] += 0.5
+        for place in (torch.ones(3), torch.zeros(3)):
+            pose = torch.cat([torch.eye(3), place[:, None]], -1)[None]
+            found, _ = carried_poses(pose, given, refined)
+            expected = pose.clone()
+            expected[:, 0, 3] += 0.5
+            torch.testing.assert_close(found, expected)
+
+
+def test_rays_from_many_places_are_each_carried_as_alone() -> None:
+    torch.manual_seed(1)
+    given = torch.cat([torch.eye(3).expand(7, 3, 3), torch.randn(7, 3, 1)], -1)
+    poses = PoseRefinement(7, "SO3xR3", given)
+    torch.nn.init.normal_(poses.tangents, std=0.1)
+    rays = replace(some_rays(), camera_indices=None)
+    together = poses(rays)
+    for index in range(len(rays)):
+        one = slice(index, index + 1)
+        alone = poses(Rays(rays.origins[one], rays.directions[one], rays.nears[one], rays.fars[one]))
+        torch.testing.assert_close(together.origins[one], alone.origins)
+        torch.testing.assert_close(together.directions[one], alone.directions)
+        pose = torch.cat([torch.eye(3), rays.origins[index][:, None]], -1)
+        torch.testing.assert_close(poses.carried_pose(pose)[:, 3], alone.origins[0])
 
 
 @pytest.mark.parametrize("group", ["SO3xR3", "SE3"])

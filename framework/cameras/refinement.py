@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from framework.base.optimised import Optimised
 from framework.cameras.cameras import Cameras
-from framework.geometry.alignment import align_cameras
+from framework.cameras.carried import carried_poses
 from framework.geometry.rays import Rays
 from framework.kernels.rigid_motion import rigid_motions
 
@@ -25,8 +25,8 @@ class PoseRefinement(nn.Module):
         count: number of cameras.
         group: SO3xR3: the camera is rotated about its own centre, and the centre is translated. SE3: one screw motion
             about the scene's origin.
-        given: (count, 3, 4) the poses to be refined. All of them together may drift along with the scene; other cameras
-            then follow by the similarity transform from given to refined poses. If None, other cameras stay unchanged.
+        given: (count, 3, 4) the poses to be refined. Other cameras then follow those around them (`carried_poses`), as
+            all of them together may drift along with the scene. If None, other cameras stay unchanged.
     """
 
     given: Tensor | None
@@ -47,7 +47,7 @@ class PoseRefinement(nn.Module):
         return rigid_motions(self.tangents[chosen], self.group == "SE3")
 
     def forward(self, rays: Rays) -> Rays:
-        """Move the rays of training cameras by their refinements, and those of other cameras by the common drift."""
+        """Move the rays of training cameras by their refinements, and those of other cameras as those around them."""
         if rays.camera_indices is None:
             return self.carried(rays)
         # Not `motions[camera_indices]`: the order of summation of its gradient depends on the threads.
@@ -63,26 +63,28 @@ class PoseRefinement(nn.Module):
         """Transform `rays` from the given poses' frame to the refined poses'; lengths are scaled too."""
         if self.given is None:
             return rays
-        scale, rotation, translation = self._drift(self.given)
+        origins = rays.origins
+        if bool((origins == origins[:1]).all()):  # as of a view
+            origins = origins[:1]
+        axes = torch.eye(3).to(origins).expand(len(origins), 3, 3)
+        poses = torch.cat([axes, origins[:, :, None]], dim=-1)
+        moved, scale = carried_poses(poses, self.given, self._moved(self.given))
         return replace(
             rays,
-            origins=scale * (rotation * rays.origins[:, None]).sum(-1) + translation,
-            directions=(rotation * rays.directions[:, None]).sum(-1),
+            origins=moved[:, :, 3].expand_as(rays.origins),
+            directions=(moved[:, :, :3] * rays.directions[:, None]).sum(-1),
             nears=scale * rays.nears,
             fars=scale * rays.fars,
         )
 
     @torch.no_grad()
     def carried_pose(self, pose: Tensor) -> Tensor:
-        """Transform the pose of a camera that is no training camera by the common drift of those.
+        """Transform the pose of a camera that is no training camera, as those around it were moved.
 
         Args:
             pose: (3, 4) camera-to-scene pose.
         """
-        if self.given is None:
-            return pose
-        scale, rotation, translation = self._drift(self.given)
-        return torch.cat([rotation @ pose[:, :3], (scale * (rotation @ pose[:, 3]) + translation)[:, None]], dim=1)
+        return pose if self.given is None else carried_poses(pose[None], self.given, self._moved(self.given))[0][0]
 
     def pose(self, index: int, given: Tensor) -> Tensor:
         """Return the refined pose (3, 4) of a training camera, with a gradient.
@@ -92,11 +94,6 @@ class PoseRefinement(nn.Module):
             given: (3, 4) its pose as it is given.
         """
         return self._moved(given[None], slice(index, index + 1))[0]
-
-    def _drift(self, given: Tensor) -> tuple[float, Tensor, Tensor]:
-        """Return scale, rotation (3, 3) and translation (3,) of the common motion of all cameras."""
-        scale, rotation, translation = align_cameras(given.cpu(), self._moved(given).cpu())
-        return scale, rotation.to(given), translation.to(given)
 
     @torch.no_grad()
     def refined(self, cameras: Cameras) -> Cameras:

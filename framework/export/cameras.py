@@ -13,9 +13,9 @@ from torch import Tensor
 from framework.base.errors import ConfigError
 from framework.base.splits import Split
 from framework.cameras.cameras import LENSES, Cameras, join_cameras
+from framework.cameras.carried import carried_poses
 from framework.cameras.poses import Placement
 from framework.data.dataset import ParsedScene
-from framework.geometry.alignment import align_cameras
 from framework.model import Model, RefinesPoses
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
@@ -35,7 +35,7 @@ def refined_cameras(model: Model[Any], cameras: Cameras) -> Cameras:
 
 
 def carried_cameras(cameras: Cameras, given: Cameras, refined: Cameras) -> Cameras:
-    """Return cameras that were not refined, moved by the similarity that takes given poses to refined ones.
+    """Return cameras that were not refined, moved as the training cameras around them were.
 
     Args:
         cameras: M cameras of other images.
@@ -43,12 +43,8 @@ def carried_cameras(cameras: Cameras, given: Cameras, refined: Cameras) -> Camer
     """
     if torch.equal(given.camera_to_worlds, refined.camera_to_worlds):
         return cameras
-    before, after = (part.camera_to_worlds.cpu() for part in (given, refined))
-    scale, rotation, shift = align_cameras(before, after)
-    poses = cameras.camera_to_worlds
-    rotation, shift = rotation.to(poses), shift.to(poses)
-    centers = scale * poses[:, :, 3] @ rotation.T + shift
-    return replace(cameras, camera_to_worlds=torch.cat([rotation @ poses[:, :, :3], centers[..., None]], -1))
+    poses, _ = carried_poses(cameras.camera_to_worlds, given.camera_to_worlds, refined.camera_to_worlds)
+    return replace(cameras, camera_to_worlds=poses)
 
 
 def all_cameras(scenes: Mapping[str, ParsedScene], given: Cameras, refined: Cameras) -> dict[str, Cameras]:

@@ -374,7 +374,8 @@ def test_a_ray_of_a_capture_ends_in_matter_unless_photographs_tell_what_is_empty
     has_alpha: bool, opacity: float
 ) -> None:
     """However thin what there is: the sky of a photograph without alpha is no hole."""
-    config: Any = dataclasses.replace(load_method("nerfacto").config, num_proposal_samples=(8,), num_nerf_samples=8)
+    settings = {"sampler": "proposal", "num_proposal_samples": (8,), "num_nerf_samples": 8}
+    config: Any = dataclasses.replace(load_method("nerfacto").config, **settings)
     scene = dataclasses.replace(SCENE, unbounded=True, has_alpha=has_alpha, near=0.05, far=1000.0)
     count = 4
     rays = Rays(

@@ -200,7 +200,7 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         return affine_colors(rgb, self.appearance(which, 1)[0])
 
     def camera(self, camera: Cameras) -> SplatCamera:
-        """Return the camera of a view that is not trained on, moved by the common drift of the training cameras."""
+        """Return the camera of a view that is not trained on, moved as the training cameras around it were."""
         pose = None if self.poses is None else self.poses.carried_pose(camera.camera_to_worlds[0])
         return splat_camera(camera, self.near, self.config.antialiased, pose)
 

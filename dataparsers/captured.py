@@ -41,9 +41,9 @@ class Captured(DataParser):
     """Factor of camera positions, after automatic scaling."""
     scene_scale: float = 1.0
     """Half the side of the region of interest, a cube around the origin, scene units."""
-    orientation_method: Orientation = "up"
-    """Up direction: the cameras' mean up direction (up), the axis of least spread of their positions (pca), or
-    unchanged."""
+    orientation_method: Orientation = "auto"
+    """Up direction: the cameras' mean up direction (up), of photographs that lie on their side what is up then (auto),
+    the axis of least spread of the cameras' positions (pca), or unchanged."""
     center_method: Center = "poses"
     """Origin: the cameras' mean position (poses), the point that they look at (focus), or unchanged."""
     auto_scale_poses: bool = True
@@ -138,7 +138,9 @@ def captured_scene(flags: Captured, images: PosedImages, split: Split, division:
             f"{images.folder}: split '{split}' has none of the {len(names)} images; "
             "--eval-interval 0 uses all in every split"
         )
-    placement = place(images.poses, flags.orientation_method, flags.center_method, flags.auto_scale_poses)
+    # A device knows where gravity pulls, and its images are upright.
+    orientation = "up" if flags.orientation_method == "auto" and flags.poses == "device" else flags.orientation_method
+    placement = place(images.poses, orientation, flags.center_method, flags.auto_scale_poses)
     placement = replace(placement, scale=placement.scale * flags.scale_factor)
     cameras = _cameras(images, placement)
     points, sightings = _sparse_points(images, placement, cameras, chosen if split == "train" else None)

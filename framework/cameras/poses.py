@@ -10,9 +10,10 @@ from torch import Tensor
 
 from framework.base.splits import Split
 from framework.cameras.cameras import Cameras
+from framework.cameras.upright import sideways_up
 from framework.kernels.math import cross_matrix
 
-Orientation = Literal["up", "pca", "none"]
+Orientation = Literal["auto", "up", "pca", "none"]
 Center = Literal["poses", "focus", "none"]
 NEAR = 0.05
 """Near distance without sparse points, scene units."""
@@ -70,8 +71,9 @@ def place(
 
     Args:
         poses: (M, 3 or 4, 4) camera-to-world, OpenGL axes.
-        orientation: up: the cameras' mean up direction becomes +z. pca: the directions of largest spread of the camera
-            positions become x and y. none: unchanged.
+        orientation: up: the cameras' mean up direction becomes +z. auto: the same, but of photographs that lie on their
+            side what is up by `sideways_up`. pca: the directions of largest spread of the camera positions become x and
+            y. none: unchanged.
         center: poses: the cameras' mean position becomes the origin. focus: the point closest to all optical axes
             (least squares) does. none: unchanged.
         auto_scale: whether to scale the camera positions so that their largest absolute coordinate is 1.
@@ -84,8 +86,10 @@ def place(
     elif center == "none":
         middle = torch.zeros_like(middle)
     rotation = torch.eye(3, dtype=torch.float64)
-    if orientation == "up":
-        rotation = rotation_between(precise[:, :, 1].mean(0), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    if orientation in ("auto", "up"):
+        turned = sideways_up(precise) if orientation == "auto" else None
+        up = precise[:, :, 1].mean(0) if turned is None else turned
+        rotation = rotation_between(up, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
     elif orientation == "pca":
         rotation = _principal_axes(origins, precise[:, :, 1].mean(0))
     transform = torch.cat([rotation, -(rotation @ middle)[:, None]], dim=-1)

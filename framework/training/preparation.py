@@ -15,6 +15,7 @@ from framework.base.console import say
 from framework.base.decisions import Decision
 from framework.base.registry import load_method
 from framework.cameras.ndc import NdcCameras
+from framework.cameras.upright import sideways_up
 from framework.data.dataset import Dataset
 from framework.data.folds import angle_between, folds, thumbnail
 from framework.data.free_space import before_points
@@ -135,6 +136,11 @@ def profile_of(
         decisions.append(Decision("times", "ignored", f"{method} learns a still scene: moving objects are blurred"))
     if scene.appearance_varies and not isinstance(model, HasAppearance):
         decisions.append(Decision("light that differs", "ignored", f"{method} learns one light for all photographs"))
+    up = None if scene.poses != "photographs" or scene.num_scenes > 1 else sideways_up(dataset.cameras.camera_to_worlds)
+    if up is not None and float(up[2]) > 0.9:
+        decisions.append(
+            Decision("up", "their left or right", "the photographs lie on their side (else: --orientation-method up)")
+        )
     if scene.poses == "photographs" and not scene.moving and scene.num_scenes == 1:
         decisions += _warning_of_folds(dataset)
     if scene.poses == "device" and not isinstance(model, RefinesPoses):

@@ -15,7 +15,7 @@ usage: ns-render PATH RUN_FOLDER --output-path FILE_OR_FOLDER [flags]
 
 paths:
   interpolate     for captures: a smooth walk past the photographs' cameras, in the order of their names
-  orbit           for objects: a horizontal circle around them, as high and as far as the cameras on average
+  orbit           around what the photographs look at: a circle as high and as far as the cameras on average
   spiral          for cameras that all look the same way: a spiral in front of what they see
   time            for scenes that move: one camera, while time runs from 0 to 1
   camera-path     the cameras of a file: camera_path.json, as ns-viewer and nerfstudio's viewer write it
@@ -130,7 +130,9 @@ class SpiralFlags(PathFlags):
 
 @dataclass(frozen=True)
 class OrbitFlags(PathFlags):
-    """Render a horizontal circle around the scene, with the mean height and distance of the training cameras."""
+    """Render a horizontal circle around the scene, with the mean height and distance of the training cameras.
+
+    Around a capture it goes as far as the photographs do, there and back if they leave out a sixth or more."""
 
     output_path: Path = Path("orbit.gif")
     """File to write; its extension (.mp4, .gif, .webp, .png) is the format. Without one: a folder of images."""
@@ -138,6 +140,8 @@ class OrbitFlags(PathFlags):
     """Number of frames."""
     fps: float = 16.0
     """Frames per second."""
+    full_circle: bool = False
+    """Whether to go all around a capture also where its photographs do not. If not: a swing there and back."""
     time: float | None = None
     """Time of all frames of a scene that moves, 0 to 1. If not given, it runs from 0 to 1."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -30,6 +31,7 @@ from framework.data.image_files import reduce_image
 from framework.data.pixels import composite
 from framework.evaluation.evaluator import evaluation_background
 from framework.evaluation.paths import (
+    arc_of,
     focus_distance,
     interpolate,
     middle_pose,
@@ -126,7 +128,12 @@ def _circle(flags: OrbitFlags, trained: Trained, parsed: ParsedScene) -> tuple[C
     # The middle of the box is an object's; a capture's is what it looks at.
     middle = looked_at(parsed.cameras.camera_to_worlds) if scene.unbounded else None
     middle = scene.box.mean(0).cpu() if middle is None else middle.float()
-    cameras = orbit(parsed.cameras, middle, flags.num_frames)
+    # An object hides nothing of its surroundings; of a capture's, only what photographs look past is known.
+    arc = arc_of(parsed.cameras, middle) if scene.unbounded and not flags.full_circle else None
+    if arc is not None:
+        around = f"the photographs go around {math.degrees(arc.width):.0f} of 360 degrees"
+        say(f"{around}: the path swings there and back (--full-circle True goes all around)")
+    cameras = orbit(parsed.cameras, middle, flags.num_frames, arc)
     if flags.time is None:
         return cameras, torch.linspace(0, 1, flags.num_frames) if scene.moving else None
     if not scene.moving:

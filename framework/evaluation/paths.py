@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -19,6 +20,10 @@ JUMP = 5.0
 """Ratio of the step between two neighbours to the median step from which a walk is said to jump."""
 FEWEST = 3
 """Minimum number of cameras between two jumps; fewer are left out of an interpolated path."""
+GAP = 60.0
+"""Angle without a camera, degrees, from which cameras are said not to go all around something."""
+NEARLY_ABOVE = 0.2
+"""Horizontal distance from a centre, relative to the mean, up to which a camera stands above or below it."""
 STOPS = 24
 """Ratio of the number of cameras to the standard deviation, in cameras, of the weights of an interpolated path."""
 SAME_WAY = 0.7
@@ -42,8 +47,41 @@ def look_at(position: Tensor, target: Tensor, up: Tensor) -> Tensor:
     return torch.stack([right, torch.linalg.cross(back, right), back, position], dim=-1)
 
 
-def orbit(cameras: Cameras, center: Tensor, num_frames: int) -> Cameras:
-    """Return cameras on a horizontal circle, looking at its centre.
+@dataclass(frozen=True)
+class Arc:
+    """A part of a horizontal circle."""
+
+    middle: float
+    """Angle of its middle from +x towards +y, radians."""
+    width: float
+    """Its own angle, radians."""
+
+
+def arc_of(cameras: Cameras, center: Tensor) -> Arc | None:
+    """Return the arc around a centre on which cameras stand; None if they stand all around it.
+
+    They do if no two neighbours are more than `GAP` apart. Cameras almost above or below the centre do not count.
+
+    Args:
+        cameras: M cameras.
+        center: (3,) centre, scene units.
+    """
+    offsets = (cameras.camera_to_worlds[:, :2, 3] - center[:2]).double().cpu()
+    away = offsets.norm(dim=-1)
+    offsets = offsets[away > NEARLY_ABOVE * away.mean()]
+    if len(offsets) < FEWEST:
+        return None
+    angles = torch.atan2(offsets[:, 1], offsets[:, 0]).sort().values
+    gaps = torch.cat([angles[1:], angles[:1] + 2 * torch.pi]) - angles
+    largest = int(gaps.argmax())
+    if gaps[largest] <= math.radians(GAP):
+        return None
+    width = 2 * math.pi - float(gaps[largest])
+    return Arc(float(angles[(largest + 1) % len(angles)]) + width / 2, width)
+
+
+def orbit(cameras: Cameras, center: Tensor, num_frames: int, arc: Arc | None = None) -> Cameras:
+    """Return cameras on a horizontal circle, looking at its centre, that end where they begin.
 
     Height and radius are the means of the given cameras', and intrinsics those of the first.
 
@@ -51,10 +89,13 @@ def orbit(cameras: Cameras, center: Tensor, num_frames: int) -> Cameras:
         cameras: M cameras.
         center: (3,) centre, scene units.
         num_frames: number of cameras on the circle.
+        arc: part of the circle on which the cameras swing once there and back, slowly at its ends; None for all of it.
     """
     offsets = cameras.camera_to_worlds[:, :, 3] - center
     height, radius = offsets[:, 2].mean(), offsets[:, :2].norm(dim=-1).mean()
     angles = torch.arange(num_frames) * (2 * torch.pi / num_frames)
+    if arc is not None:
+        angles = arc.middle + arc.width / 2 * angles.sin()
     circle = torch.stack([radius * angles.cos(), radius * angles.sin(), height.expand(num_frames)], dim=-1)
     up = torch.tensor([0.0, 0.0, 1.0])
     poses = torch.stack([look_at(center + offset, center, up) for offset in circle])

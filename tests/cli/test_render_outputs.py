@@ -129,6 +129,21 @@ def test_colours_of_depth_have_one_range_for_the_whole_video(
     assert "depth: 1 (dark) to 9 (light), in units of the input" in given.stderr
 
 
+def test_an_orbit_goes_where_a_capture_was_taken_from(
+    capture_run: Path, ball_run: Path, shows_a_ball: float, tmp_path: Path
+) -> None:
+    """The cameras stand on 3.8 radians of a circle, but for the held-out ends of it."""
+    words = ("--num-frames", 4, "--output-path", tmp_path / "frames")
+    done = called("ns-render", "orbit", capture_run, *words)
+    assert done.returncode == 0, done.stderr
+    (around,) = (int(line.split()[4]) for line in done.stderr.splitlines() if "the path swings there and back" in line)
+    assert around == pytest.approx(math.degrees(3.8) * 6 / 8, abs=2)  # the first and the last of nine are held out
+    frames = [iio.imread(tmp_path / "frames" / f"{index:05d}.png") for index in range(4)]
+    assert np.array_equal(frames[0], frames[2])  # the middle, both ways
+    for run, flags in ((capture_run, ("--full-circle", "True")), (ball_run, ())):
+        assert "go around" not in called("ns-render", "orbit", run, *words, *flags).stderr
+
+
 def test_outputs_apart_and_in_folders(capture_run: Path, shows_a_ball: float, tmp_path: Path) -> None:
     words = ("--num-frames", 2, "--rendered-output-names", "rgb", "accumulation")
     for output in ("a.gif", "apart", "beside"):

@@ -13,6 +13,8 @@ from framework.cameras.cameras import Cameras, check_pose
 from framework.cameras.ndc import Ndc, NdcCameras
 from framework.cameras.poses import looked_at
 from framework.evaluation.paths import (
+    Arc,
+    arc_of,
     focus_distance,
     interpolate,
     look_at,
@@ -56,6 +58,59 @@ def test_orbit_keeps_height_and_distance_and_looks_at_the_centre() -> None:
     torch.testing.assert_close(torch.linalg.cross(ahead, centers), torch.zeros(8, 3), atol=1e-5, rtol=0)
     for pose in path.camera_to_worlds:
         check_pose(pose, "orbit")
+
+
+def standing(degrees: Tensor, radius: float = 2.0, center: tuple[float, float] = (0.3, -0.2)) -> Cameras:
+    """Return cameras at angles (M,) on a circle around a vertical axis, in any order."""
+    angles = torch.deg2rad(degrees.float())
+    poses = torch.eye(4)[:3].repeat(len(angles), 1, 1)
+    poses[:, 0, 3], poses[:, 1, 3] = center[0] + radius * angles.cos(), center[1] + radius * angles.sin()
+    poses[:, 2, 3] = 1.0
+    ones = torch.ones(len(angles))
+    return Cameras(poses, ones, ones, ones, ones, ones.long(), ones.long())
+
+
+CENTER = torch.tensor([0.3, -0.2, 0.0])
+
+
+@pytest.mark.parametrize("first", [-170, -45, 10, 130])
+@pytest.mark.parametrize("width", [40, 200, 290])
+def test_the_arc_on_which_cameras_stand(first: int, width: int) -> None:
+    degrees = first + torch.linspace(0, width, 30)
+    arc = arc_of(standing(degrees[torch.randperm(30, generator=torch.Generator().manual_seed(width))]), CENTER)
+    assert arc is not None
+    assert math.degrees(arc.width) == pytest.approx(width, abs=1e-3)
+    apart = math.degrees(arc.middle) - (first + width / 2)
+    assert math.remainder(apart, 360) == pytest.approx(0, abs=1e-3)
+
+
+def test_cameras_all_around_have_no_arc_and_few_have_none_either() -> None:
+    assert arc_of(standing(torch.arange(0, 360, 50)), CENTER) is None
+    assert arc_of(standing(torch.tensor([10, 20])), CENTER) is None
+    assert arc_of(standing(torch.arange(0, 300, 10)), CENTER) is not None
+
+
+def test_cameras_above_the_centre_do_not_close_a_gap() -> None:
+    around, above = standing(torch.arange(0, 181, 10)), standing(torch.arange(185, 360, 10), radius=0.1)
+    poses = torch.cat([around.camera_to_worlds, above.camera_to_worlds])
+    arc = arc_of(replace_poses(around, poses), CENTER)
+    assert arc is not None
+    assert math.degrees(arc.width) == pytest.approx(180, abs=1e-3)
+
+
+def test_an_orbit_swings_over_its_arc_and_ends_where_it_begins() -> None:
+    cameras = standing(torch.linspace(100, 260, 20))
+    path = orbit(cameras, CENTER, 48, arc_of(cameras, CENTER))
+    offsets = path.camera_to_worlds[:, :, 3] - CENTER
+    degrees = torch.rad2deg(torch.atan2(offsets[:, 1], offsets[:, 0])) % 360
+    assert float(degrees.min()) == pytest.approx(100, abs=0.01)
+    assert float(degrees.max()) == pytest.approx(260, abs=0.01)
+    turns = torch.cat([degrees, degrees[:1]]).diff()
+    assert float(turns.sum()) == pytest.approx(0, abs=1e-3)
+    assert float(turns.abs().max()) < 80 * 2 * math.pi / 48 + 0.1  # no jump, as a film of it runs on and on
+    torch.testing.assert_close(offsets[:, :2].norm(dim=-1), torch.full((48,), 2.0))
+    still = orbit(cameras, CENTER, 48, Arc(middle=0.5, width=0.0)).camera_to_worlds
+    assert torch.equal(still, still[:1].expand(48, 3, 4))
 
 
 def test_other_poses_keep_the_lens() -> None:

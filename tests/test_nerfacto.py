@@ -13,6 +13,7 @@ from framework.data.scene import Scene
 from framework.evaluation.evaluator import evaluate
 from framework.fields.appearance import Appearance
 from framework.training.trainer import Trainer
+from tests.conftest import EditJson
 from tests.training.helpers import chosen, said_otherwise, tiny_run, tiny_trainer
 
 SCENE = Scene(torch.tensor([[-1.0] * 3, [1.0] * 3]), 1.0, 6.0, 4, True, False, 32)
@@ -109,28 +110,67 @@ def test_held_out_photographs_are_shown_in_the_mean_appearance() -> None:
     assert appearance(None, 1).tolist() == [[1.0, 1.0]]
 
 
+def test_in_a_share_of_the_steps_an_image_has_the_mean_appearance() -> None:
+    torch.manual_seed(0)
+    appearance = Appearance(2, 400, mean_share=0.25)
+    with torch.no_grad():
+        appearance.vectors.copy_(torch.arange(800.0).view(400, 2))
+    indices, mean = torch.arange(400).repeat_interleave(3), appearance.vectors.detach().mean(0)
+    shown = appearance(indices, len(indices)).view(400, 3, 2)
+    has_mean = (shown == mean).all(-1)
+    assert torch.equal(has_mean, has_mean[:, :1].expand(-1, 3))  # all samples of an image alike
+    assert has_mean[:, 0].float().mean().item() == pytest.approx(0.25, abs=4 * (0.25 * 0.75 / 400) ** 0.5)
+    assert torch.equal(shown[~has_mean[:, 0], 0], appearance.vectors[~has_mean[:, 0]])
+    shown.sum().backward()
+    assert appearance.vectors.grad is not None
+    assert torch.equal(appearance.vectors.grad, torch.where(has_mean[:, :1], 0.0, 3.0).expand(-1, 2))
+    assert not torch.equal(appearance(indices, len(indices)).view(400, 3, 2), shown)  # others in the next step
+    assert torch.equal(appearance.eval()(indices, len(indices)), appearance.vectors[indices])
+
+
+def dimmed(folder: Path, out: Path, factors: torch.Tensor, **settings: object) -> Trainer:
+    """Return a trained nerfacto of the tiny data set, whose photographs are darker by factors (M,)."""
+    still = tiny_trainer("nerfacto", folder, out / "still").train_set
+    sizes, pixels = still.cameras.widths * still.cameras.heights, still.pixels.clone()
+    pixels[:, :3] = (still.pixels[:, :3] * factors.repeat_interleave(sizes)[:, None]).round().to(torch.uint8)
+    varied = dataclasses.replace(still, pixels=pixels, scene=dataclasses.replace(still.scene, appearance_varies=True))
+    (out / "run").mkdir()
+    trainer = Trainer(tiny_run("nerfacto", folder, out / "run", max_eval_images=0, **settings), varied, None)
+    trainer.train()
+    return trainer
+
+
 @pytest.mark.medium
 def test_half_of_a_held_out_photograph_tells_the_others_appearance(shared_tiny: Path, tmp_path: Path) -> None:
     """Trained on darker and lighter copies, a held-out dark photograph is found to be dark from its left half."""
-    still = tiny_trainer("nerfacto", shared_tiny, tmp_path / "still").train_set
-    factors = torch.linspace(0.1, 1.0, len(still))
-    sizes = still.cameras.widths * still.cameras.heights
-    dimmed = still.pixels.clone()
-    dimmed[:, :3] = (still.pixels[:, :3] * factors.repeat_interleave(sizes)[:, None]).round().to(torch.uint8)
-    varied = dataclasses.replace(still, pixels=dimmed, scene=dataclasses.replace(still.scene, appearance_varies=True))
-    (tmp_path / "run").mkdir()
-    run = tiny_run("nerfacto", shared_tiny, tmp_path / "run", max_eval_images=0, max_num_iterations=150)
-    trainer = Trainer(run, varied, None)
-    trainer.train()
+    factors = torch.linspace(0.1, 1.0, len(tiny_trainer("nerfacto", shared_tiny, tmp_path / "any").train_set))
+    trainer = dimmed(shared_tiny, tmp_path, factors, max_num_iterations=150)
     model = trainer.model
-    dark = dataclasses.replace(varied, pixels=dimmed)
     before = {name: value.clone() for name, value in model.state_dict().items()}
     found = {}
     for choice in ("mean", "half"):
         model.config = dataclasses.replace(model.config, eval_appearance=choice)
-        found[choice] = evaluate(model, dark, max_images=2).per_image[0]["psnr"]
+        found[choice] = evaluate(model, trainer.train_set, max_images=2).per_image[0]["psnr"]
     assert found["half"] > found["mean"] + 2
     assert all(torch.equal(before[name], value) for name, value in model.state_dict().items())
+
+
+@pytest.mark.medium
+def test_the_mean_appearance_is_what_photographs_have_in_common(
+    tiny: Path, edit_json: EditJson, tmp_path: Path
+) -> None:
+    """Each photograph is there twice, once as it is and once five times darker: what is between them is shown."""
+    edit_json(lambda content: content.update(frames=2 * content["frames"]))
+    factors, off = torch.tensor([1.0, 0.2]).repeat_interleave(10), {}
+    for share in (0.0, 0.25):
+        (tmp_path / str(share)).mkdir()
+        trainer = dimmed(tiny, tmp_path / str(share), factors, max_num_iterations=600, mean_appearance_share=share)
+        shown = trainer.model.render_view(trainer.train_set.view(0), torch.zeros(3))
+        expected = trainer.train_set.image(0)[..., :3] / 255 * 0.6
+        inside = shown.accumulation > 0.95
+        off[share] = (shown.rgb - expected)[inside].square().mean().sqrt().item()
+    print(f"off the mean photograph by {off[0.0]:.3f} without the mean vector in training, {off[0.25]:.3f} with it")
+    assert off[0.25] < 0.6 * off[0.0]
 
 
 @pytest.mark.medium

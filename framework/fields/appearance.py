@@ -18,15 +18,20 @@ AFFINE = 12
 class Appearance(nn.Module):
     """A learnt vector for each image, an input of the colour network: NeRF-W (Martin-Brualla et al. 2021), section 4.1.
 
+    In evaluation the mean vector is shown, which is no image's. A network that has never seen it may answer anything,
+    and does so the more, the further apart the vectors have moved. So in a share of the steps an image is shown with
+    the mean vector: then the network learns what all images have in common there.
+
     Args:
         size: number D of features of a vector.
         count: number of images.
         optimised: settings of the optimiser; those of the containing module if None.
+        mean_share: probability with which an image has the mean vector in a training step.
     """
 
-    def __init__(self, size: int, count: int, optimised: Optimised | None = None) -> None:
+    def __init__(self, size: int, count: int, optimised: Optimised | None = None, mean_share: float = 0.0) -> None:
         super().__init__()
-        self.optimised = optimised
+        self.size, self.optimised, self.mean_share = size, optimised, mean_share
         self.vectors = nn.Parameter(torch.zeros(count, size))
         self._shown: Tensor | None = None
 
@@ -43,8 +48,15 @@ class Appearance(nn.Module):
         """
         if camera_indices is not None:
             # Not `vectors[camera_indices]`, whose gradient depends on the order in which threads add it up.
-            return functional.embedding(camera_indices, self.vectors)
+            return functional.embedding(camera_indices, self._own_or_mean())
         return (self.vectors.detach().mean(0) if self._shown is None else self._shown).expand(count, -1)
+
+    def _own_or_mean(self) -> Tensor:
+        """Return the vector of each image in this step (M, D); the mean has no gradient."""
+        if not self.training or not self.mean_share:
+            return self.vectors
+        has_mean = torch.rand(len(self.vectors), 1, device=self.vectors.device) < self.mean_share
+        return torch.where(has_mean, self.vectors.detach().mean(0), self.vectors)
 
     @contextmanager
     def shown(self, vector: Tensor) -> Iterator[None]:

@@ -130,8 +130,7 @@ class EncodedField(BoxField):
         direction_levels: bands of the spherical harmonics of the viewing direction (4 in the paper); 0 for colours that
             do not depend on it.
         unbounded: whether the encoding covers all of space, contracted by `contract_to_unit`.
-        appearance: size of an image's appearance vector, and number of images (NeRF-W, Martin-Brualla et al. 2021,
-            section 4.1); None for no appearance vectors.
+        appearance: the images' appearance vectors, which the colour network reads; None for none.
         opening: whether the bands of the viewing direction open one after the other (`Opening`).
         ambient: number of coordinates beyond those of space (`Points.ambient`) that the density network reads.
     """
@@ -144,7 +143,7 @@ class EncodedField(BoxField):
         num_features: int = NUM_FEATURES,
         direction_levels: int = 4,
         unbounded: bool = False,
-        appearance: tuple[int, int] | None = None,
+        appearance: Appearance | None = None,
         opening: bool = False,
         ambient: int = 0,
     ) -> None:
@@ -153,10 +152,8 @@ class EncodedField(BoxField):
         self.density_head = MLP(encoding.num_features + ambient, width, num_features, bias=False)
         inputs = num_features + direction_levels**2
         self.direction_opening = Opening(direction_levels, 1) if opening and direction_levels else None
-        self.appearance = None
-        if appearance is not None:
-            self.appearance = Appearance(*appearance)
-            inputs += appearance[0]
+        self.appearance = appearance
+        inputs += 0 if appearance is None else appearance.size
         self.color_head = MLP(inputs, width, width, 3, bias=False, activation="sigmoid")
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:

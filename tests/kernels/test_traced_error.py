@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from framework.encodings.hash_grid import HashGrid
+from framework.fields.appearance import Appearance
 from framework.fields.encoded import EncodedField
 from framework.geometry.rays import Rays
 from framework.kernels import dispatch
@@ -253,7 +254,7 @@ def test_what_has_other_gradients_goes_operation_by_operation() -> None:
 def test_only_a_plain_field_says_what_its_colour_is() -> None:
     field = field_of(Case())
     assert field.grid_color() is not None
-    assert EncodedField(BOX, HashGrid(2, 2, 4, 8, 8), appearance=(4, 3)).grid_color() is None
+    assert EncodedField(BOX, HashGrid(2, 2, 4, 8, 8), appearance=Appearance(4, 3)).grid_color() is None
     assert EncodedField(BOX, HashGrid(6, 2, 4, 8, 8, opening=True), opening=True).grid_color() is None
     field.color = lambda features, directions, cameras: features[:, :3]
     assert field.grid_color() is None

@@ -109,7 +109,8 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         self.progress = 0.0
         self.appearance: Appearance | None = None
         if config.appearance:
-            self.appearance = Appearance(AFFINE, scene.num_cameras, Optimised("appearance", config.appearance_rate))
+            optimised, share = Optimised("appearance", config.appearance_rate), config.mean_appearance_share
+            self.appearance = Appearance(AFFINE, scene.num_cameras, optimised, share)
         self.poses: PoseRefinement | None = None
         if config.camera_optimizer in ("SO3xR3", "SE3"):
             self.poses = PoseRefinement(scene.num_cameras, config.camera_optimizer, scene.camera_to_worlds)

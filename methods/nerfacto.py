@@ -54,16 +54,12 @@ class NerfactoConfig(
 
     RANGES: ClassVar[dict[str, Range]] = {
         "appearance_embedding_dim": (0, 2**10),
-        "mean_appearance_share": (0, 1),
         "orientation_loss_mult": AT_LEAST_0,
         "hidden_width": (1, 2**14),
     }
     """Allowed range of each numeric setting."""
     appearance_embedding_dim: Auto[int] = AUTO
     """Length of each image's appearance vector. If not given: 16 if light or exposure differ between images, else 0."""
-    mean_appearance_share: float = 0.25
-    """Probability with which an image has the mean appearance vector in a step, with which held-out images are shown.
-    Without this, the vectors of a longer run tell the network nothing about their mean."""
     predict_normals: bool = False
     """Whether to predict normals, which are smoother than those of the density's gradient."""
     orientation_loss_mult: float = 0.1

@@ -110,7 +110,8 @@ class ZipNeRF(CaptureModel[ZipNeRFConfig]):
         self.appearance: Appearance | None = None
         if config.exposure:
             rate = config.exposure_learning_rate
-            self.appearance = Appearance(AFFINE, scene.num_cameras, Optimised("exposures", rate))
+            optimised, share = Optimised("exposures", rate), config.mean_appearance_share
+            self.appearance = Appearance(AFFINE, scene.num_cameras, optimised, share)
 
     def render(self, rays: Rays, background: Tensor) -> Rendered:
         rendered = super().render(rays, background)

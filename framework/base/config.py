@@ -269,9 +269,14 @@ class SourceViewsConfig(RayConfig):
 class AppearanceConfig(TrainConfig):
     """Settings of a method that learns an appearance for each image."""
 
+    RANGES: ClassVar[dict[str, Range]] = {"mean_appearance_share": (0, 1)}
+    """Allowed range of each numeric setting."""
     eval_appearance: Literal["mean", "half"] = "mean"
     """Appearance of held-out images: the mean of the training images', or optimised on the left half of each image,
     with the right half evaluated (NeRF-W's protocol)."""
+    mean_appearance_share: float = 0.25
+    """Probability with which an image has the mean appearance in a training step, so that it is learnt what to show
+    with it."""
 
 
 def _check_range(name: str, value: Any, least: float, most: float) -> None:

@@ -20,7 +20,7 @@ class Appearance(nn.Module):
 
     In evaluation the mean vector is shown, which is no image's. A network that has never seen it may answer anything,
     and does so the more, the further apart the vectors have moved. So in a share of the steps an image is shown with
-    the mean vector: then the network learns what all images have in common there.
+    the mean vector: then the network, or what else is shown so, learns what all images have in common there.
 
     Args:
         size: number D of features of a vector.

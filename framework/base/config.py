@@ -349,15 +349,10 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
             return tuple(_convert(item, kind, where) for item, kind in zip(value, inner, strict=True))
     if hint is Path and isinstance(value, str) and "\0" not in value:
         return Path(value)
-    if hint is float and isinstance(value, str):  # YAML 1.1 reads 1e-3 as a string
+    if hint is float and isinstance(value, (str, int, float)) and not isinstance(value, bool):
         try:
-            return float(value)
-        except ValueError:
-            pass
-    if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        try:
-            return float(value)
-        except OverflowError:
+            return float(value)  # also of a string, as which YAML 1.1 reads 1e-3
+        except (ValueError, OverflowError):
             pass
     if isinstance(hint, type) and (_is_count(value) if hint is int else isinstance(value, hint)):
         return value

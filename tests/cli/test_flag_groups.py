@@ -103,7 +103,7 @@ def test_flags_stand_with_what_they_belong_to() -> None:
     }
     for title, flags in belongs.items():
         assert set(flags) <= set(found[f"{title} options"])
-    assert found["appearance options"] == ["--eval-appearance"]
+    assert found["appearance options"] == ["--eval-appearance", "--mean-appearance-share"]
     assert "--eval-appearance" not in [flag for flags in plain.values() for flag in flags]
     assert "--num-coarse-samples" in plain["sampler options"]
 

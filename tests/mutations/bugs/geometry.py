@@ -79,8 +79,8 @@ BUGS = (
         "up-from-backs",
         "poses",
         "framework/cameras/poses.py",
-        "rotation = rotation_between(precise[:, :, 1].mean(0)",
-        "rotation = rotation_between(precise[:, :, 2].mean(0)",
+        "up = precise[:, :, 1].mean(0)",
+        "up = precise[:, :, 2].mean(0)",
         "scenes are turned by where cameras look and not by what is up: orbits go head over heels",
     ),
     Bug(

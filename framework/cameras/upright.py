@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 LEAST_TURN = 0.15
-"""Least second moment of the rows' axes in their plane beyond that across it: of an arc of 80 degrees or more."""
+"""Least second moment of the axes along columns in their plane, beyond that across it: of an arc of 80 degrees."""
 CLEARER = 2.0
-"""How many times clearer the plane of the rows' axes must be than that of the columns' axes."""
+"""How many times clearer the plane of the axes along columns must be than that of the axes along rows."""
 LEAST_WIDTH = 0.25
 """Least spread of the cameras' positions in their second direction, relative to that in their first."""
 LOOKING_DOWN = 0.1
@@ -20,7 +20,7 @@ def sideways_up(poses: Tensor) -> Tensor | None:
 
     Whoever walks around something turns about the vertical. The horizontal axis of the images then stays in one plane,
     however high or low the camera looks: the axis along rows (x) if they stand upright, the one along columns (y) if
-    they lie on their side. It counts as known only if that plane is several times clearer than that of the other axis,
+    they lie on their side. It counts as known only if that plane is twice as clear as that of the other axis,
     and if the cameras stand around something rather than in a line, along which to look up and down turns y alike.
 
     Of the two directions across the plane that one is up by which the cameras look down. If they look neither up nor

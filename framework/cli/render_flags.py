@@ -132,7 +132,8 @@ class SpiralFlags(PathFlags):
 class OrbitFlags(PathFlags):
     """Render a horizontal circle around the scene, with the mean height and distance of the training cameras.
 
-    Around a capture it goes as far as the photographs do, there and back if they leave out a sixth or more."""
+    Around a capture it goes as far as the photographs do, there and back if they leave out a sixth or more.
+    """
 
     output_path: Path = Path("orbit.gif")
     """File to write; its extension (.mp4, .gif, .webp, .png) is the format. Without one: a folder of images."""

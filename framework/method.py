@@ -23,7 +23,7 @@ DEPTH = 0.1
 SPARSE_DEPTH = 0.001
 """Default weight of the depth loss if there are points of a reconstruction."""
 SHARED_BY = 2
-"""Default number of images that show where rays start, where points can say whether this cuts anything off."""
+"""Default number of images that show where rays start, unless this would cut anything off."""
 
 
 def nothing_to_decide(config: Any, scene: Scene) -> tuple[Any, list[Decision]]:
@@ -90,7 +90,7 @@ class Method:
         config, made = self.decide(config, scene)
         if isinstance(config, RayConfig):
             config, more = fill(config, depth_choice(scene))
-            config, _ = fill(config, Choice("rays_shared_by", SHARED_BY if scene.num_sparse_depths else 0, ""))
+            config, _ = fill(config, Choice("rays_shared_by", SHARED_BY if scene.unbounded else 0, ""))
             made = made + more * bool(config.depth_loss_mult)  # nothing to learn from needs no words
         for name in left_open(config):
             raise ConfigError(f"--{name.replace('_', '-')} is None, and this method does not decide it; give a value")

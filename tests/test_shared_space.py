@@ -1,13 +1,16 @@
 """Where rays start: at the first place that several training images show."""
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
+from framework.base.registry import load_dataparser
 from framework.cameras.cameras import Cameras
+from framework.data.data_folder import find_data
 from framework.data.dataset import Dataset
 from framework.data.sparse_depth import SparseDepth
 from framework.geometry.bounds import nested_boxes
@@ -15,6 +18,7 @@ from framework.geometry.rays import Rays
 from framework.kernels.first_shared import CELLS, LEVELS, REACH, STEPS, first_shared_reference
 from framework.scene.shared_space import SharedSpace, share_cut_off, times_seen
 from framework.training.preparation import decided
+from framework.training.ray_starts import MOST_LATE, share_late
 from tests.test_free_space import row
 from tests.training.test_graphs import small
 
@@ -127,8 +131,94 @@ def with_points(dataset: Dataset, distance: float) -> Dataset:
     return dataclasses.replace(dataset, sparse_depth=known, scene=scene)
 
 
-def test_without_points_rays_start_at_their_near_ends(tmp_path: Path) -> None:
-    assert small(tmp_path).model.shared_space is None
+def around(distance: float, *degrees: float) -> Cameras:
+    """Cameras at a distance from the origin, in the plane y = 0, that look at it with 90 degrees from edge to edge."""
+    cameras = row(*[0.0] * len(degrees))
+    angles = torch.deg2rad(torch.tensor(degrees))
+    sine, cosine = angles.sin(), angles.cos()
+    turned = torch.zeros(len(degrees), 3, 4)
+    turned[:, 0, 0], turned[:, 0, 2], turned[:, 1, 1], turned[:, 2, 0], turned[:, 2, 2] = cosine, sine, 1, -sine, cosine
+    turned[:, :, 3] = distance * turned[:, :, 2]
+    return dataclasses.replace(cameras, camera_to_worlds=turned)
+
+
+def seen_by(dataset: Dataset, cameras: Cameras) -> Dataset:
+    """The data set without points, as if its images had been taken by the cameras."""
+    many = len(dataset.cameras)
+    return dataclasses.replace(dataset, sparse_depth=None, cameras=cameras[torch.arange(many) % len(cameras)])
+
+
+@pytest.mark.parametrize(
+    ("cameras", "reason"),
+    [
+        (around(1.0, *range(0, 360, 30)), None),
+        (around(0.2, -20, 0, 20), "% of the rays"),  # at 0.2, cells of 1/16 and their balls reach up to the target
+        (around(-1.0, *range(0, 360, 30)), "look apart"),
+    ],
+)
+def test_without_points_what_cameras_look_at_decides_whether_rays_start_late(
+    cameras: Cameras, reason: str | None, tmp_path: Path
+) -> None:
+    trainer = small(tmp_path)
+    dataset = seen_by(trainer.train_set, cameras)
+    config = dataclasses.replace(trainer.run.config, rays_shared_by=None)
+    _, settings, made = decided("nerfacto", config, dataset)
+    assert settings.rays_shared_by == (2 if reason is None else 0)
+    said = [decision.line() for decision in made if decision.option == "rays start"]
+    assert len(said) == (reason is not None)
+    assert all("at their near ends" in line and str(reason) in line for line in said)
+
+
+def test_without_points_a_moving_scene_starts_at_the_near_ends(tmp_path: Path) -> None:
+    trainer = small(tmp_path)
+    still = seen_by(trainer.train_set, around(1.0, *range(0, 360, 30)))
+    moving = dataclasses.replace(still, scene=dataclasses.replace(still.scene, moving=True))
+    config = dataclasses.replace(trainer.run.config, rays_shared_by=None)
+    assert decided("nerfacto", config, moving)[1].rays_shared_by == 0
+
+
+def test_the_share_of_rays_that_start_late_is_that_of_the_geometry() -> None:
+    """Two cameras at the distance 1 look at the origin from +-40 degrees.
+
+    The rays start late that are nowhere before 0.8 in both images, and more of them, as a cell counts as seen where
+    all of its ball is; fewer than those that are nowhere before 0.9 by a cell's diagonal within both.
+    """
+    cameras, space = around(1.0, -40, 40), SharedSpace(BOX / 4)
+    cameras = dataclasses.replace(cameras, fx=4 * cameras.fx, fy=4 * cameras.fy)
+    space.leave_out(cameras, torch.zeros(2), 2)
+    late = share_late(space, cameras, 0.01, 100.0)
+    rays = cameras.pixel_rays(torch.arange(int(cameras.offsets[-1])), 0.01, 100.0)
+
+    def nowhere(end: float, margin: float) -> float:
+        points = rays.origins + torch.linspace(0.01, end, 400)[:, None, None] * rays.directions
+        within = torch.ones(points.shape[:2], dtype=torch.bool)
+        for pose in cameras.camera_to_worlds:
+            x, y, z = ((points - pose[:, 3]) @ pose[:, :3]).unbind(-1)
+            within &= (-z / 4 - torch.maximum(x.abs(), y.abs())) / math.hypot(1, 1 / 4) > margin
+        return float((~within.any(0)).double().mean())
+
+    least, most = nowhere(0.8, 0.0), nowhere(0.9, CELL / 2 * math.sqrt(3))
+    print(f"{least:.3f} <= {late:.3f} <= {most:.3f}")
+    assert late is not None
+    assert 0 < least <= late <= most < 0.5
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize(
+    ("capture", "on"),
+    [("fern", False), ("colmap_desk", False), ("snowmiku", True), ("fox", True), ("statue_of_liberty", True)],
+)
+def test_in_real_captures_rays_start_late_where_the_cameras_go_around_something(
+    real_data: Path, capture: str, on: bool
+) -> None:
+    path, name = find_data(real_data / capture, None)
+    parsed = load_dataparser(name)().parse(path, "train")
+    space = SharedSpace(parsed.box)
+    space.leave_out(parsed.cameras, torch.full_like(parsed.cameras.fx, parsed.near), 2)
+    late = share_late(space, parsed.cameras, parsed.near, parsed.far)
+    assert late is not None
+    print(f"{capture}: {100 * late:.2f} % start late")
+    assert (late <= MOST_LATE) == on
 
 
 @pytest.mark.parametrize(("distance", "least"), [(50.0, 2), (0.06, 0)])

@@ -18,11 +18,9 @@ from framework.cameras.ndc import NdcCameras
 from framework.cameras.upright import sideways_up
 from framework.data.dataset import Dataset
 from framework.data.folds import angle_between, folds, thumbnail
-from framework.data.free_space import before_points
 from framework.data.pixel_set import PixelSet
 from framework.data.pixels import training_background
 from framework.geometry.bounds import nested_boxes
-from framework.method import SHARED_BY
 from framework.model import HasAppearance, LearnsMotion, Model, RefinesPoses, RendersFromImages, parts
 from framework.ray_model import RayModel
 from framework.samplers.base import SkipsCells
@@ -30,11 +28,8 @@ from framework.samplers.choice import SamplingConfig
 from framework.scene.motion import MotionConfig
 from framework.scene.profile import SceneProfile
 from framework.scene.seen_cells import seen_cells
-from framework.scene.shared_space import SharedSpace, share_cut_off
 from framework.scene.silhouettes import Silhouettes, moving_box, moving_hulls, pixels_near, visual_hull
-
-MOST_CUT_OFF, TESTED_POINTS = 0.002, 20_000
-"""Maximum share of points that rays may miss where they start late, and the number of points that are tested."""
+from framework.training.ray_starts import nearest_shown, starts_checked
 
 
 def decided(method: str, config: TrainConfig, dataset: Dataset) -> tuple[Dataset, TrainConfig, list[Decision]]:
@@ -52,7 +47,7 @@ def decided(method: str, config: TrainConfig, dataset: Dataset) -> tuple[Dataset
     """
     declared = load_method(method)
     settings, made = declared.decided(config, dataset.scene)
-    settings, made = _starts_checked(config, settings, made, dataset)
+    settings, made = starts_checked(config, settings, made, dataset)
     samples_in_box = isinstance(settings, SamplingConfig) and str(settings.sampler) == "occupancy"
     if not isinstance(settings, MotionConfig) or not settings.smallest_box or not samples_in_box:
         return dataset, settings, made
@@ -67,31 +62,6 @@ def decided(method: str, config: TrainConfig, dataset: Dataset) -> tuple[Dataset
     settings, made = declared.decided(config, dataset.scene)
     small = Decision("box", f"{100 * share:.0f}% of the data's", "alpha shows that nothing is ever outside")
     return dataset, settings, [small, *made]
-
-
-def _starts_checked(
-    config: TrainConfig, settings: TrainConfig, made: list[Decision], dataset: Dataset
-) -> tuple[TrainConfig, list[Decision]]:
-    """Let rays start at their near ends where they would else start behind points that they are known to show.
-
-    The cells that images show are coarse beside cameras that stand close together right before the scene: of LLFF's
-    fern they cut off 9 % of what rays meet, and 2 dB.
-    """
-    if not isinstance(config, RayConfig) or config.rays_shared_by is not None or not isinstance(settings, RayConfig):
-        return settings, made
-    known, scene = dataset.sparse_depth, dataset.scene
-    in_boxes = isinstance(settings, SamplingConfig) and str(settings.sampler) == "occupancy"
-    if known is None or not scene.unbounded or scene.warped or in_boxes or not settings.rays_shared_by:
-        return settings, made
-    space = SharedSpace(scene.box)
-    space.leave_out(dataset.cameras, _nearest(dataset), settings.rays_shared_by)
-    some = known[torch.linspace(0, len(known) - 1, min(len(known), TESTED_POINTS)).long().to(known.pixels.device)]
-    cut = share_cut_off(space, dataset.cameras.pixel_rays(some.pixels, scene.near, scene.far), some.distances)
-    if cut <= MOST_CUT_OFF:
-        return settings, made
-    reason = f"{100 * cut:.2g} % of the points that they show are before where {SHARED_BY} photographs look"
-    started = Decision("rays start", "at their near ends", f"{reason} (else: --rays-shared-by {SHARED_BY})")
-    return replace(settings, rays_shared_by=0), [*made, started]
 
 
 def _with_steps_as_long(config: TrainConfig, default: TrainConfig, decided: TrainConfig, shorter: float) -> TrainConfig:
@@ -195,7 +165,7 @@ def skip_empty(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: 
     if fresh:
         skip_unseen(config, model, dataset)
         if isinstance(config, RayConfig) and isinstance(model, RayModel) and model.shared_space is not None:
-            model.shared_space.leave_out(dataset.cameras, _nearest(dataset), config.rays_shared_by)
+            model.shared_space.leave_out(dataset.cameras, nearest_shown(dataset), config.rays_shared_by)
     return dataset
 
 
@@ -210,17 +180,11 @@ def skip_unseen(config: TrainConfig, model: Model[Any], dataset: Dataset) -> Non
     nested = [sampler for sampler in parts(model, SkipsCells) if sampler.levels > 1]
     if not nested or not isinstance(config, SamplingConfig) or not config.seen_cells:
         return
-    cameras, nearest = dataset.cameras, _nearest(dataset)
+    cameras, nearest = dataset.cameras, nearest_shown(dataset)
     for sampler in nested:
         boxes = nested_boxes(sampler.box, sampler.levels)
         seen = torch.cat([seen_cells(cameras, nearest, box, sampler.resolution) for box in boxes])
         sampler.carve(seen & ~sampler.carved)
-
-
-def _nearest(dataset: Dataset) -> Tensor:
-    """Return the distance (M,) from each camera before which its image shows nothing, as far as points tell."""
-    near = torch.full_like(dataset.cameras.fx, dataset.scene.near)
-    return near if dataset.sparse_depth is None else near.maximum(before_points(dataset.cameras, dataset.sparse_depth))
 
 
 def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: bool) -> Dataset:

@@ -241,8 +241,8 @@ class RayConfig(TrainConfig):
     """Weight of the penalty on matter right before cameras: nearer than most of the points that a camera sees, or than
     any other camera sees; 0 for none."""
     rays_shared_by: Auto[int] = AUTO
-    """Rays start at the first place that so many training images show; 0 for the near end. If not given: 2 if points of
-    a reconstruction say that this cuts nothing off, else 0. No effect in a box and in nested boxes (--seen-cells)."""
+    """Rays start at the first place that so many training images show; 0 for the near end. If not given: 2 if this cuts
+    nothing off, by a reconstruction's points or by what the cameras look at. No effect in boxes (--seen-cells)."""
     thin_gradients: Auto[float] = 0.0
     """Samples whose gradient is below this times the mean take part in a step at random, in proportion to it, and count
     as many times more, so that the mean over steps stays; 0 for all. It has an effect on the CPU alone."""

@@ -18,7 +18,7 @@ from framework.geometry.rays import Rays
 from framework.kernels.first_shared import CELLS, LEVELS, REACH, STEPS, first_shared_reference
 from framework.scene.shared_space import SharedSpace, share_cut_off, times_seen
 from framework.training.preparation import decided
-from framework.training.ray_starts import MOST_LATE, UNKNOWN, share_late
+from framework.training.ray_starts import MOST_LATE, share_late
 from tests.test_free_space import row
 from tests.training.test_graphs import small
 
@@ -169,20 +169,12 @@ def test_without_points_what_cameras_look_at_decides_whether_rays_start_late(
     assert all("at their near ends" in line and str(reason) in line for line in said)
 
 
-@pytest.mark.parametrize(
-    ("changed", "reason"),
-    [({"moving": True}, UNKNOWN), ({"num_scenes": 2}, UNKNOWN), ({"has_alpha": True}, "show themselves what is empty")],
-)
-def test_without_points_rays_of_other_scenes_start_at_their_near_ends(
-    changed: dict[str, Any], reason: str, tmp_path: Path
-) -> None:
+def test_without_points_a_moving_scene_starts_at_the_near_ends(tmp_path: Path) -> None:
     trainer = small(tmp_path)
     still = seen_by(trainer.train_set, around(1.0, *range(0, 360, 30)))
-    other = dataclasses.replace(still, scene=dataclasses.replace(still.scene, **changed))
+    moving = dataclasses.replace(still, scene=dataclasses.replace(still.scene, moving=True))
     config = dataclasses.replace(trainer.run.config, rays_shared_by=None)
-    _, settings, made = decided("nerfacto", config, other)
-    assert settings.rays_shared_by == 0
-    assert [decision for decision in made if decision.option == "rays start" and reason in decision.line()]
+    assert decided("nerfacto", config, moving)[1].rays_shared_by == 0
 
 
 def test_the_share_of_rays_that_start_late_is_that_of_the_geometry() -> None:

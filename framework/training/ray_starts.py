@@ -95,8 +95,6 @@ def share_late(space: SharedSpace, cameras: Cameras, near: float, far: float) ->
 def _why_not(dataset: Dataset, least: int) -> str | None:
     """Return why rays should not start where `least` images look; None if they should."""
     scene, cameras, known = dataset.scene, dataset.cameras, dataset.sparse_depth
-    if known is None and scene.has_alpha:
-        return "the photographs show themselves what is empty"
     if known is None and (scene.moving or scene.num_scenes > 1):
         return UNKNOWN
     space = SharedSpace(scene.box)

@@ -18,7 +18,7 @@ from framework.geometry.rays import Rays
 from framework.kernels.first_shared import CELLS, LEVELS, REACH, STEPS, first_shared_reference
 from framework.scene.shared_space import SharedSpace, share_cut_off, times_seen
 from framework.training.preparation import decided
-from framework.training.ray_starts import MOST_LATE, share_late
+from framework.training.ray_starts import MOST_LATE, UNKNOWN, share_late
 from tests.test_free_space import row
 from tests.training.test_graphs import small
 
@@ -169,12 +169,17 @@ def test_without_points_what_cameras_look_at_decides_whether_rays_start_late(
     assert all("at their near ends" in line and str(reason) in line for line in said)
 
 
-def test_without_points_a_moving_scene_starts_at_the_near_ends(tmp_path: Path) -> None:
+@pytest.mark.parametrize("changed", [{"moving": True}, {"num_scenes": 2}])
+def test_without_points_scenes_that_move_and_several_start_at_the_near_ends(
+    changed: dict[str, Any], tmp_path: Path
+) -> None:
     trainer = small(tmp_path)
     still = seen_by(trainer.train_set, around(1.0, *range(0, 360, 30)))
-    moving = dataclasses.replace(still, scene=dataclasses.replace(still.scene, moving=True))
+    other = dataclasses.replace(still, scene=dataclasses.replace(still.scene, **changed))
     config = dataclasses.replace(trainer.run.config, rays_shared_by=None)
-    assert decided("nerfacto", config, moving)[1].rays_shared_by == 0
+    _, settings, made = decided("nerfacto", config, other)
+    assert settings.rays_shared_by == 0
+    assert [decision for decision in made if decision.option == "rays start" and UNKNOWN in decision.line()]
 
 
 def test_the_share_of_rays_that_start_late_is_that_of_the_geometry() -> None:

@@ -89,7 +89,7 @@ def share_late(space: SharedSpace, cameras: Cameras, near: float, far: float) ->
         return None
     pixels = _spread(int(cameras.offsets[-1])).to(cameras.fx.device)
     rays = cameras.pixel_rays(pixels, near, far)
-    return share_cut_off(space, rays, LATEST * (rays.origins.double() - target.to(rays.origins.device)).norm(dim=-1))
+    return share_cut_off(space, rays, LATEST * (rays.origins - target.to(rays.origins)).norm(dim=-1))
 
 
 def _why_not(dataset: Dataset, least: int) -> str | None:
@@ -107,7 +107,9 @@ def _why_not(dataset: Dataset, least: int) -> str | None:
     late = share_late(space, cameras, scene.near, scene.far)
     if late is None:
         return f"the photographs look apart, and {UNKNOWN}"
-    reason = f"{least} photographs look at hardly anything before what all look at, on {100 * late:.2g} % of the rays"
+    reason = (
+        f"{100 * late:.2g} % of the rays reach what {least} photographs show only near what all look at, or behind it"
+    )
     return None if late <= MOST_LATE else reason
 
 

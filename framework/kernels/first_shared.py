@@ -11,9 +11,9 @@ from framework.kernels.dispatch import CPP, Operation
 
 LEVELS, CELLS = 3, 32
 """Nested boxes, each twice as large as the one before, and cells along an axis of each; beyond, all is shared."""
-STEPS, REACH, HALVINGS = 64, 4.0, 4
-"""Places along a ray that are looked up, the distance of the last from its near end in half edges of the box, and how
-often the step before the first that is shared is halved."""
+STEPS, REACH, PARTS = 64, 4.0, 16
+"""Places along a ray that are looked up, the distance of the last from its near end in half edges of the box, and parts
+of the step before the first that is shared, whose ends are looked up then."""
 
 
 @torch.no_grad()
@@ -29,12 +29,10 @@ def first_shared_reference(rays: Rays, box: Tensor, unshared: Tensor) -> Tensor:
         return ~unshared[_cells(positions.view(-1, 3), box)].view(t.shape)
 
     first = shared(t).int().argmax(1, keepdim=True)  # index 0 if there is no other
-    before, start = t.gather(1, (first - 1).clamp(min=0)), t.gather(1, first)
-    for _ in range(HALVINGS):  # up to a whole step of what images do show is left out otherwise
-        middle = (before + start) / 2
-        found = shared(middle)
-        before, start = torch.where(found, before, middle), torch.where(found, middle, start)
-    return start.squeeze(1)
+    # Up to a whole step of what images do show is left out otherwise.
+    parts = torch.linspace(1 / PARTS, 1, PARTS, device=ends.device, dtype=ends.dtype)
+    within = torch.lerp(t.gather(1, (first - 1).clamp(min=0)), t.gather(1, first), parts)
+    return within.gather(1, shared(within).int().argmax(1, keepdim=True)).squeeze(1)
 
 
 def _cells(positions: Tensor, box: Tensor) -> Tensor:
@@ -71,7 +69,7 @@ def _compiled(rays: Rays, box: Tensor, unshared: Tensor) -> Tensor:
         native.pointer(origins, "origins", (count, 3)), native.pointer(directions, "directions", (count, 3)),
         native.pointer(nears, "near ends", (count,)), native.pointer(fars, "far ends", (count,)), count,
         native.pointer(box, "the box", (2, 3)),
-        native.pointer(unshared, "cells", (LEVELS * CELLS**3 + 1,), torch.bool), LEVELS, CELLS, STEPS, REACH, HALVINGS,
+        native.pointer(unshared, "cells", (LEVELS * CELLS**3 + 1,), torch.bool), LEVELS, CELLS, STEPS, REACH, PARTS,
         out.data_ptr(), native.threads(),
     )  # fmt: skip
     return out

@@ -15,22 +15,22 @@ from tests.training.helpers import tiny_trainer
 
 BOUNDS = {
     "instant-ngp": (590, 0.3),
-    "nerfacto": (1080, 0),
+    "nerfacto": (970, 0),
     "kplanes": (1030, 0.3),
     "tensorf": (770, 0.3),
     "gaussian-splatting": (1170, 1),
     "vanilla-nerf": (555, 0),
     "dnerf": (740, 0),
     "mip-nerf": (735, 0),
-    "mip-nerf-360": (1380, 0),
-    "zip-nerf": (2530, 0),
-    "nerf-plus-plus": (1460, 0),
+    "mip-nerf-360": (1270, 0),
+    "zip-nerf": (2430, 0),
+    "nerf-plus-plus": (1360, 0),
 }
 """Operations and waits of a step: what was counted when this was written, and a tenth more operations, in which
 torch's releases may differ. Marched samples take a fixed number of slots, so that only updates of the occupancy grid,
 in every eighth or sixteenth step, ask how many cells they look at. Whether a step is finite is asked for Gaussians
 alone, whose number changes. The choice of transparent pixels of a scene that moves would have a wait. Where rays start
-takes some 200 of those of methods for captures."""
+takes some 100 of those of methods for captures."""
 
 
 @pytest.fixture

@@ -38,33 +38,34 @@ struct Space {  // nested boxes around `box` (2, 3), and which of their cells ar
     }
 };
 
+// As torch.lerp.
+float between(float a, float b, float share) {
+    return share < 0.5f ? a + share * (b - a) : b - (b - a) * (1 - share);
+}
+
 }  // namespace
 
 // `out` (rays): the distance of the first of `steps` places that is shared, between the near end of each ray and
-// `reach` half edges of the box behind it, or its far end; halfway to the place before it, `halvings` times, where that
-// is shared too. The near end where none is.
+// `reach` half edges of the box behind it, or its far end; of the step before it, in `parts`, the first end of a part
+// that is shared. The near end where none is.
 EXPORT int first_shared(const float* origins, const float* directions, const float* nears, const float* fars,
                         int64_t rays, const float* box, const uint8_t* unshared, int levels, int cells, int steps,
-                        float reach, int halvings, float* out, int threads) {
+                        float reach, int parts, float* out, int threads) {
     return guarded([&] {
         if (steps < 2 || cells < 1) throw std::invalid_argument("a ray is looked at in two places or more");
         const Space space(box, unshared, levels, cells);
         for_each(threads, rays, 64, [&](int64_t r) {
             const float *origin = origins + r * 3, *direction = directions + r * 3, near = nears[r];
             const float end = near + reach * space.largest, far = end < fars[r] ? end : fars[r];
-            const auto place = [&](int step) {
-                const float share = float(step) / float(steps - 1);
-                return share < 0.5f ? near + share * (far - near) : far - (far - near) * (1 - share);
-            };
+            const auto place = [&](int step) { return between(near, far, float(step) / float(steps - 1)); };
             int first = 0;
             while (first < steps && !space.shared(origin, direction, place(first))) first++;
             if (first == steps) first = 0;
-            float before = place(std::max(first - 1, 0)), start = place(first);
-            for (int i = 0; first > 0 && i < halvings; i++) {
-                const float middle = (before + start) / 2;
-                (space.shared(origin, direction, middle) ? start : before) = middle;
-            }
-            out[r] = start;
+            const float before = place(std::max(first - 1, 0)), after = place(first);
+            const auto within = [&](int part) { return between(before, after, float(part) / float(parts)); };
+            int part = first ? 1 : parts;
+            while (part < parts && !space.shared(origin, direction, within(part))) part++;
+            out[r] = within(part);
         });
     });
 }

@@ -148,11 +148,11 @@ BUGS = (
         "the density of a plugin's network with biases is computed without them",
     ),
     Bug(
-        "first-shared-not-halved",
+        "first-shared-whole-steps",
         "sampling",
         "framework/kernels/first_shared.py",
-        "LEVELS, CELLS, STEPS, REACH, HALVINGS,",
-        "LEVELS, CELLS, STEPS, REACH, 0,",
+        "LEVELS, CELLS, STEPS, REACH, PARTS,",
+        "LEVELS, CELLS, STEPS, REACH, 1,",
         "rays of captures start up to a step behind what images do show",
     ),
     Bug(

@@ -10,6 +10,7 @@ import torch
 from framework.base.config import MachineConfig
 from framework.base.registry import load_method
 from framework.data.scene import Scene
+from framework.evaluation.appearance import appearance_of, fit_appearance
 from framework.evaluation.evaluator import evaluate
 from framework.fields.appearance import Appearance
 from framework.training.trainer import Trainer
@@ -160,9 +161,12 @@ def test_half_of_a_held_out_photograph_tells_the_others_appearance(shared_tiny: 
 
 @pytest.mark.medium
 def test_the_mean_appearance_is_what_photographs_have_in_common(
-    tiny: Path, edit_json: EditJson, tmp_path: Path
+    tiny: Path, edit_json: EditJson, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each photograph is there twice, once as it is and once five times darker: what is between them is shown."""
+    """Each photograph is there twice, once as it is and once five times darker: what is between them is shown.
+
+    And the fit of an appearance starts from that of a photograph in the same light.
+    """
     edit_json(lambda content: content.update(frames=2 * content["frames"]))
     factors, off = torch.tensor([1.0, 0.2]).repeat_interleave(10), {}
     for share in (0.0, 0.25):
@@ -174,6 +178,15 @@ def test_the_mean_appearance_is_what_photographs_have_in_common(
         off[share] = (shown.rgb - expected)[inside].square().mean().sqrt().item()
     print(f"off the mean photograph by {off[0.0]:.3f} without the mean vector in training, {off[0.25]:.3f} with it")
     assert off[0.25] < 0.6 * off[0.0]
+    monkeypatch.setattr("framework.evaluation.appearance.STEPS", 0)
+    model, dataset = trainer.model, trainer.train_set
+    appearance = appearance_of(model)
+    assert appearance is not None
+    for index in range(len(factors)):
+        start = fit_appearance(model, dataset, dataset.cameras.image_pixels(index).view(-1), torch.zeros(3))
+        assert start is not None
+        (same,) = (appearance.vectors - start).abs().amax(-1).eq(0).nonzero().squeeze(-1).tolist()
+        assert factors[same] == factors[index]
 
 
 @pytest.mark.medium

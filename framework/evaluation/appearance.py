@@ -23,6 +23,8 @@ from framework.rendering.losses import mean_squared_error
 
 STEPS, PIXELS, RATE = 60, 1024, 0.05
 """Steps of Adam, pixels per step, and learning rate, with which an appearance vector is fitted."""
+CANDIDATES = 32
+"""Maximum number of training images' vectors among which the first vector is looked for."""
 
 
 def appearance_of(model: Model[Any]) -> Appearance | None:
@@ -80,7 +82,8 @@ def fit_appearance(
         dataset: the images.
         pixels: (P,) indices of the pixels, counted through all images; P may be 0.
         background: (3,) colour behind transparent pixels.
-        start: (D,) initial vector; the mean of the training images' vectors if None.
+        start: (D,) initial vector; if None, for a model that casts rays, that of the training images' vectors and their
+            mean which shows the pixels best, and for others the mean.
 
     Returns:
         (D,) vector; None if the model has no appearance vectors.
@@ -88,7 +91,9 @@ def fit_appearance(
     appearance = appearance_of(model)
     if appearance is None:
         return None
-    vector = (appearance.vectors.mean(0) if start is None else start).detach().clone().requires_grad_()
+    if start is None:
+        start = _closest(model, appearance, dataset, pixels, background)
+    vector = start.detach().clone().requires_grad_()
     if len(pixels):
         with appearance.shown(vector):
             if isinstance(model, RayModel):
@@ -96,6 +101,32 @@ def fit_appearance(
             else:
                 _fit_view(model, dataset, pixels, vector, background)
     return vector.detach()
+
+
+@torch.no_grad()
+def _closest(model: Model[Any], appearance: Appearance, dataset: Dataset, pixels: Tensor, background: Tensor) -> Tensor:
+    """Return the vector (D,) with which some of the pixels are shown best: the mean, or one of the training images'.
+
+    What the mean shows is learnt besides (`Appearance`), so that vectors near it say little of the light of others, and
+    a descent from there may end where it is no better.
+    """
+    mean = appearance.vectors.mean(0)
+    if not len(pixels) or not isinstance(model, RayModel):
+        return mean
+    candidates = torch.cat([mean[None], _spread(appearance.vectors, CANDIDATES)])
+    some = _spread(pixels, PIXELS)
+    batch = gather_batch(dataset, some, background.repeat(len(some), 1))
+    rays, errors = replace(batch.rays, camera_indices=None), []
+    with evaluating(model), torch.autocast(model.device.type, torch.bfloat16, enabled=False):
+        for vector in candidates:
+            with appearance.shown(vector):
+                errors.append(mean_squared_error(model.render(rays, batch.background).rgb, batch.rgb))
+    return candidates[torch.stack(errors).argmin()]
+
+
+def _spread(rows: Tensor, most: int) -> Tensor:
+    """Return at most that many of N rows, equally far apart."""
+    return rows[torch.linspace(0, len(rows) - 1, min(len(rows), most), device=rows.device).long()]
 
 
 def _left_pixels(dataset: Dataset, index: int) -> Tensor:

@@ -50,7 +50,7 @@ def test_colours_are_transformed_where_light_differs(given: bool | None, varies:
 def test_a_transform_is_learnt_by_the_image_it_is_of() -> None:
     one = camera()
     model = model_of(ball(), Cameras(**{**vars(one), "camera_to_worlds": one.camera_to_worlds.expand(3, 3, 4)}),
-                     appearance=True)  # fmt: skip
+                     appearance=True, mean_appearance_share=0.0)  # fmt: skip
     batch = ViewBatch(1, View(one), torch.rand(33, 33, 3), torch.zeros(3))
     model.loss(batch, 0).total.backward()
     assert model.appearance is not None

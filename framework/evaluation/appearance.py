@@ -126,7 +126,8 @@ def _closest(model: Model[Any], appearance: Appearance, dataset: Dataset, pixels
 
 def _spread(rows: Tensor, most: int) -> Tensor:
     """Return at most that many of N rows, equally far apart."""
-    return rows[torch.linspace(0, len(rows) - 1, min(len(rows), most), device=rows.device).long()]
+    places = torch.linspace(0, len(rows) - 1, min(len(rows), most), dtype=torch.float64)  # beyond 2^24 not exact else
+    return rows[places.long().to(rows.device)]
 
 
 def _left_pixels(dataset: Dataset, index: int) -> Tensor:

@@ -25,6 +25,7 @@ from dataparsers.reading import file_name, number, numbers, read_json, read_pose
 from framework import DataError, ParsedScene
 from framework.base.console import say
 from framework.base.errors import nearest
+from framework.base.evenly_spaced import evenly_spaced
 from framework.data.dataset import Split
 from framework.data.ply import read_points
 from framework.data.tracks import Tracks
@@ -282,7 +283,7 @@ def _fraction(names: list[str], split: Split, fraction: float) -> Tensor:
     """Select evenly spaced images, first and last included, to train on; the others are held out."""
     count = len(names)
     training = torch.zeros(count, dtype=torch.bool)
-    training[torch.linspace(0, count - 1, math.ceil(count * fraction), dtype=torch.float64).long()] = True
+    training[evenly_spaced(count, math.ceil(count * fraction))] = True
     return _sorted(names)[training if split == "train" else ~training]
 
 

@@ -8,6 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from framework.base.evenly_spaced import evenly_spaced
 from framework.base.splits import Split
 from framework.cameras.cameras import Cameras
 from framework.cameras.upright import sideways_up
@@ -171,7 +172,7 @@ def estimate_near(cameras: Cameras, points: Tensor | None) -> float:
     """
     if points is None or not len(points):
         return NEAR
-    points = points[torch.linspace(0, len(points) - 1, min(len(points), MOST_POINTS)).long()]
+    points = points[evenly_spaced(len(points), MOST_POINTS).to(points.device)]
     visible_distances = []
     for index in range(len(cameras)):
         columns, rows, ahead = cameras.project(points, index)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from framework.base.evenly_spaced import evenly_spaced
 from framework.cameras.cameras import Cameras
 from framework.data.sparse_depth import SparseDepth
 
@@ -74,7 +75,7 @@ def distances_alone(cameras: Cameras, near: float, far: float) -> Tensor:
         return torch.zeros(1, device=device)
     steps = torch.linspace(near, far, STEPS, device=device)
     across = (torch.arange(RAYS, device=device) + 0.5) / RAYS
-    asked = torch.linspace(0, len(cameras) - 1, min(len(cameras), MOST_CAMERAS), device=device).long()
+    asked = evenly_spaced(len(cameras), MOST_CAMERAS).to(device)
     found = torch.zeros(len(cameras), device=device)
     for index in range(len(cameras)):
         columns = (across * cameras.widths[index] - 0.5).repeat(RAYS)

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from framework.base.evenly_spaced import evenly_spaced
 from framework.data.dataset import Dataset
 from framework.data.pixels import gather_batch
 from framework.fields.appearance import Appearance
@@ -113,8 +114,8 @@ def _closest(model: Model[Any], appearance: Appearance, dataset: Dataset, pixels
     mean = appearance.vectors.mean(0)
     if not len(pixels) or not isinstance(model, RayModel):
         return mean
-    candidates = torch.cat([mean[None], _spread(appearance.vectors, CANDIDATES)])
-    some = _spread(pixels, PIXELS)
+    candidates = torch.cat([mean[None], _some(appearance.vectors, CANDIDATES)])
+    some = _some(pixels, PIXELS)
     batch = gather_batch(dataset, some, background.repeat(len(some), 1))
     rays, errors = replace(batch.rays, camera_indices=None), []
     with evaluating(model), torch.autocast(model.device.type, torch.bfloat16, enabled=False):
@@ -124,10 +125,8 @@ def _closest(model: Model[Any], appearance: Appearance, dataset: Dataset, pixels
     return candidates[torch.stack(errors).argmin()]
 
 
-def _spread(rows: Tensor, most: int) -> Tensor:
-    """Return at most that many of N rows, equally far apart."""
-    places = torch.linspace(0, len(rows) - 1, min(len(rows), most), dtype=torch.float64)  # beyond 2^24 not exact else
-    return rows[places.long().to(rows.device)]
+def _some(rows: Tensor, most: int) -> Tensor:
+    return rows[evenly_spaced(len(rows), most).to(rows.device)]
 
 
 def _left_pixels(dataset: Dataset, index: int) -> Tensor:

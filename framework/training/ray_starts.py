@@ -9,6 +9,7 @@ from torch import Tensor
 
 from framework.base.config import RayConfig, TrainConfig
 from framework.base.decisions import Decision
+from framework.base.evenly_spaced import evenly_spaced
 from framework.cameras.cameras import Cameras
 from framework.cameras.poses import looked_at
 from framework.data.dataset import Dataset
@@ -87,7 +88,7 @@ def share_late(space: SharedSpace, cameras: Cameras, near: float, far: float) ->
     target = looked_at(cameras.camera_to_worlds)
     if target is None:
         return None
-    pixels = _spread(int(cameras.offsets[-1])).to(cameras.fx.device)
+    pixels = evenly_spaced(int(cameras.offsets[-1]), TESTED_RAYS).to(cameras.fx.device)
     rays = cameras.pixel_rays(pixels, near, far)
     return share_cut_off(space, rays, LATEST * (rays.origins - target.to(rays.origins)).norm(dim=-1))
 
@@ -100,7 +101,7 @@ def _why_not(dataset: Dataset, least: int) -> str | None:
     space = SharedSpace(scene.box)
     space.leave_out(cameras, nearest_shown(dataset), least)
     if known is not None:
-        some = known[_spread(len(known)).to(known.pixels.device)]
+        some = known[evenly_spaced(len(known), TESTED_RAYS).to(known.pixels.device)]
         cut = share_cut_off(space, cameras.pixel_rays(some.pixels, scene.near, scene.far), some.distances)
         reason = f"{100 * cut:.2g} % of the points that they show are before where {least} photographs look"
         return None if cut <= MOST_CUT_OFF else reason
@@ -111,8 +112,3 @@ def _why_not(dataset: Dataset, least: int) -> str | None:
         f"{100 * late:.2g} % of the rays reach what {least} photographs show only near what all look at, or behind it"
     )
     return None if late <= MOST_LATE else reason
-
-
-def _spread(count: int) -> Tensor:
-    """Return at most `TESTED_RAYS` of the numbers below `count`, equally far apart, (K,) int64."""
-    return torch.linspace(0, count - 1, min(count, TESTED_RAYS), dtype=torch.float64).long()

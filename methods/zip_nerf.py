@@ -2,9 +2,10 @@
 
 Barron et al., "Zip-NeRF: Anti-Aliased Grid-Based Neural Radiance Fields", ICCV 2023. Sizes are for a processor: tables
 of 2^18 entries and grids of up to 2048 cells an axis, where the paper has 2^21 and 8192. The networks are nerfacto's.
-Other than in the paper, a scene that ends at its box is sampled by an occupancy grid, the loss of colours is the mean
-squared error, the networks are not told of levels' weights, gradients are scaled down near cameras (Philip and
-Deschaintre 2023), and an image's exposure is an affine transform of its colours.
+Other than in the paper, a scene that ends at its box is sampled by an occupancy grid, proposals are looked up at one
+point of each interval and the grid does not decay if not asked for, the loss of colours is the mean squared error, the
+networks are not told of levels' weights, gradients are scaled down near cameras (Philip and Deschaintre 2023), and an
+image's exposure is an affine transform of its colours.
 """
 
 from __future__ import annotations
@@ -18,9 +19,10 @@ from framework import ConfigError, Decision, Field, Method, Rays, Rendered, Rend
 from framework.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
 from framework.base.decisions import Choice
 from framework.base.optimised import Optimised
-from framework.encodings.hash_grid import HashGridConfig
+from framework.encodings.hash_grid import HashGrid, HashGridConfig
 from framework.encodings.multisampled import MultisampledHashGrid
 from framework.fields.appearance import AFFINE, Appearance, exposed
+from framework.fields.encoded import DensityField
 from framework.fields.multisampled import MultisampledDensity, MultisampledField
 from framework.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
 from framework.samplers.choice import decide_samples, make_sampler
@@ -38,7 +40,7 @@ class ZipNeRFConfig(
     CaptureConfig,
     AppearanceConfig,
     max_num_iterations=25_000,
-    num_rays_per_batch=1_024,
+    num_rays_per_batch=2_048,
     learning_rate=1e-2,
     lr_schedule="hold-exponential",
     lr_final=0.02,
@@ -67,18 +69,21 @@ class ZipNeRFConfig(
     """Exponent of the power ladder by which distances are spaced where space is contracted."""
     interlevel_blurs: tuple[float, ...] = (0.03, 0.003)
     """Radius of the box that blurs the samples' histogram in the loss of each proposal, in normalised distance."""
-    hash_decay_mult: float = 0.1
-    """Weight of the mean square of each level's features. For objects the paper has 10, which suits its 25,000 steps of
-    65,536 rays, and keeps a run of minutes from learning anything but haze."""
+    hash_decay_mult: float = 0.0
+    """Weight of the mean square of each level's features. The paper has 0.1, and 10 for objects, which suits its 25,000
+    steps of 65,536 rays and its loss, whose gradient is larger; in a run of minutes 0.1 costs 0.5 to 1.4 dB."""
     exposure: Auto[bool] = AUTO
     """Whether each image has an affine transform of colours. If not given: if light or exposure differ between them."""
     exposure_learning_rate: float = 1e-3
     """Initial learning rate of these transforms."""
-    num_proposal_levels: int = 6
-    """Number of levels of each proposal's hash grid, which has one feature per vertex."""
-    proposal_resolutions: tuple[int, ...] = (512, 2_048)
+    multisampled_proposals: bool = False
+    """Whether the proposals, too, are looked up at several points of each interval, as in the paper, not at one. The
+    paper's grids for that are of up to 512 and 2048 cells an axis."""
+    num_proposal_levels: int = 5
+    """Number of levels of each proposal's hash grid, which has two features per vertex."""
+    proposal_resolutions: tuple[int, ...] = (128, 256)
     """Cells per axis at the finest level of each proposal's hash grid."""
-    proposal_log2_table_size: int = 17
+    proposal_log2_table_size: int = 16
     """Maximum number of table entries per level of the proposals' hash grids, log2."""
     hidden_width: int = 64
     """Features per hidden layer of the two networks."""
@@ -138,13 +143,15 @@ def make_field(config: ZipNeRFConfig, scene: Scene) -> MultisampledField:
 
 
 def sampler(config: ZipNeRFConfig, scene: Scene) -> Sampler:
-    """Return multisampled proposals with the anti-aliased loss for `scene`, or the sampler that `config` names."""
+    """Return proposals with the anti-aliased loss for `scene`, or the sampler that `config` names."""
     scene = replace(scene, unbounded=config.contraction)
     if config.sampler != "proposal":
         return make_sampler(config, scene)
 
-    def proposal(finest: int) -> MultisampledDensity:
-        sizes = config.num_proposal_levels, 1, config.base_resolution, finest, config.proposal_log2_table_size
+    def proposal(finest: int) -> DensityField:
+        sizes = config.num_proposal_levels, 2, config.base_resolution, finest, config.proposal_log2_table_size
+        if not config.multisampled_proposals:
+            return DensityField(scene.box, HashGrid(*sizes), unbounded=scene.unbounded)
         grid = MultisampledHashGrid(*sizes, config.sparse_updates, config.hash_decay_mult)
         return MultisampledDensity(scene.box, grid, unbounded=scene.unbounded)
 

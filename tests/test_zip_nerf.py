@@ -39,8 +39,17 @@ def test_an_object_before_no_background_needs_little(shared_tiny: Path, tmp_path
     assert (model.poses, model.appearance) == (None, None)
     assert not model.field.unbounded
     assert not model.sampler.unbounded
-    assert model.field.encoding.decay == model.config.hash_decay_mult == 0.1
+    assert model.field.encoding.decay == model.config.hash_decay_mult == 0
+
+
+def test_proposals_are_looked_up_at_points_if_not_asked_for_the_papers(shared_tiny: Path, tmp_path: Path) -> None:
+    plain = captured(shared_tiny, tmp_path / "plain", {}).model.sampler
+    assert [proposal.footprint for proposal in plain.proposals] == ["none", "none"]
+    asked = {"multisampled_proposals": True, "hash_decay_mult": 0.1}
+    model = captured(shared_tiny, tmp_path / "asked", {}, **asked).model
+    assert [proposal.footprint for proposal in model.sampler.proposals] == ["frustum", "frustum"]
     assert [proposal.encoding.decay for proposal in model.sampler.proposals] == [0.1, 0.1]
+    assert model.field.encoding.decay == 0.1
 
 
 def test_an_object_is_marched_through_and_a_capture_has_proposals(shared_tiny: Path, tmp_path: Path) -> None:
@@ -88,9 +97,10 @@ def test_what_is_asked_for_is_done_and_not_called_a_decision(shared_tiny: Path, 
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("unbounded", [True, False])
-def test_it_learns(unbounded: bool, shared_tiny: Path, tmp_path: Path) -> None:
-    trainer = captured(shared_tiny, tmp_path, {"unbounded": unbounded}, max_num_iterations=60)
+@pytest.mark.parametrize(("unbounded", "multisampled"), [(True, False), (False, False), (True, True)])
+def test_it_learns(unbounded: bool, multisampled: bool, shared_tiny: Path, tmp_path: Path) -> None:
+    asked = {"multisampled_proposals": multisampled, "max_num_iterations": 60}
+    trainer = captured(shared_tiny, tmp_path, {"unbounded": unbounded}, **asked)
     first = trainer.train_step().losses["rgb"]
     trainer.train()
     assert trainer.state.skipped == 0

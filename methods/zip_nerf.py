@@ -77,10 +77,10 @@ class ZipNeRFConfig(
     exposure_learning_rate: float = 1e-3
     """Initial learning rate of these transforms."""
     multisampled_proposals: bool = False
-    """Whether the proposals, too, are looked up at several points of each interval, as in the paper, not at one. The
-    paper's grids for that are of up to 512 and 2048 cells an axis."""
+    """Whether the proposals, too, are looked up at several points of each interval, in grids of one feature per vertex,
+    as in the paper, not at one point and two features. The paper's grids are of up to 512 and 2048 cells an axis."""
     num_proposal_levels: int = 5
-    """Number of levels of each proposal's hash grid, which has two features per vertex."""
+    """Number of levels of each proposal's hash grid."""
     proposal_resolutions: tuple[int, ...] = (128, 256)
     """Cells per axis at the finest level of each proposal's hash grid."""
     proposal_log2_table_size: int = 16
@@ -149,7 +149,8 @@ def sampler(config: ZipNeRFConfig, scene: Scene) -> Sampler:
         return make_sampler(config, scene)
 
     def proposal(finest: int) -> DensityField:
-        sizes = config.num_proposal_levels, 2, config.base_resolution, finest, config.proposal_log2_table_size
+        features = 1 if config.multisampled_proposals else 2
+        sizes = config.num_proposal_levels, features, config.base_resolution, finest, config.proposal_log2_table_size
         if not config.multisampled_proposals:
             return DensityField(scene.box, HashGrid(*sizes), unbounded=scene.unbounded)
         grid = MultisampledHashGrid(*sizes, config.sparse_updates, config.hash_decay_mult)

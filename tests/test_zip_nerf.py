@@ -45,9 +45,11 @@ def test_an_object_before_no_background_needs_little(shared_tiny: Path, tmp_path
 def test_proposals_are_looked_up_at_points_if_not_asked_for_the_papers(shared_tiny: Path, tmp_path: Path) -> None:
     plain = captured(shared_tiny, tmp_path / "plain", {}).model.sampler
     assert [proposal.footprint for proposal in plain.proposals] == ["none", "none"]
+    assert [proposal.encoding.table.shape[1] for proposal in plain.proposals] == [2, 2]
     asked = {"multisampled_proposals": True, "hash_decay_mult": 0.1}
     model = captured(shared_tiny, tmp_path / "asked", {}, **asked).model
     assert [proposal.footprint for proposal in model.sampler.proposals] == ["frustum", "frustum"]
+    assert [proposal.encoding.table.shape[1] for proposal in model.sampler.proposals] == [1, 1]
     assert [proposal.encoding.decay for proposal in model.sampler.proposals] == [0.1, 0.1]
     assert model.field.encoding.decay == 0.1
 

@@ -88,6 +88,8 @@ def test_the_encoding_is_decided_by_the_device() -> None:
     assert mip_nerf_360.decide(config, BOUNDED)[0].distortion_loss_mult == 0
     on_gpu = dataclasses.replace(config, machine=MachineConfig(device_type="cuda"))
     assert mip_nerf_360.decide(on_gpu, UNBOUNDED)[0].encoding == "integrated"
+    hurried = dataclasses.replace(on_gpu, max_seconds=600.0)
+    assert mip_nerf_360.decide(hurried, UNBOUNDED)[0].encoding == "hash-grid"
     asked = dataclasses.replace(config, encoding="integrated", distortion_loss_mult=0.5, max_seconds=60.0)
     papers = dataclasses.replace(asked, num_proposal_samples=(64, 64), num_nerf_samples=32)
     assert mip_nerf_360.decide(asked, UNBOUNDED) == (papers, [])

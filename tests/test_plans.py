@@ -86,7 +86,7 @@ def test_speed_grows_with_threads_but_less_than_they_do(monkeypatch: pytest.Monk
     assert 0.55 <= speeds[0] <= 0.58  # as measured
     for threads, (less, more) in enumerate(itertools.pairwise(speeds), 1):
         assert less < more < less * (threads + 1) / threads
-    assert relative_speed(MachineConfig(device_type="cuda")) == 1
+    assert relative_speed(MachineConfig(device_type="cuda")) == 10
     monkeypatch.setattr("framework.base.device.processes", lambda: dataclasses.replace(Processes(), count=2))
     assert relative_speed(MachineConfig(device_type="cpu")) == 1
 

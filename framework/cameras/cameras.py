@@ -15,8 +15,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from framework.base.device import runs_ahead
 from framework.base.errors import DataError
-from framework.geometry.lenses import DISTORTED, Distortion, LensRays, project, unproject
+from framework.geometry.lenses import DISTORTED, Distortion, LensRays, iterations_needed, project, unproject
 from framework.geometry.lenses import LENSES as LENSES
 from framework.geometry.rays import Rays
 from framework.kernels import native
@@ -29,6 +30,8 @@ LARGEST_SIDE = 10**9
 """Maximum width or height of an image that a file may state, pixels; file formats have room for 2^64."""
 CENTER = torch.zeros(1, 2)
 """The pixel's centre as the only sample position, in columns and rows from the centre."""
+TESTED_POSITIONS = 9
+"""Positions along each side of an image, edges included, by which it is found how many iterations a lens needs."""
 COMPILED = ("pinhole", *DISTORTED)
 """Models whose rays are compiled, in the order of the kernel's enumeration."""
 
@@ -175,7 +178,16 @@ class Cameras:
         if self.model not in DISTORTED:
             return None
         lens = self.fx.new_zeros(len(self), len(LENSES[self.model])) if self.lens is None else self.lens
-        return Distortion.of(self.model, lens)
+        found = Distortion.of(self.model, lens)
+        return replace(found, iterations=self._iterations(found)) if runs_ahead(lens.device) else found
+
+    def _iterations(self, lenses: Distortion) -> int:
+        """Return how many iterations `undistort` needs anywhere in the images, so that no step waits for the answer."""
+        shares = torch.linspace(0, 1, TESTED_POSITIONS, device=self.fx.device)
+        x = (self.widths[:, None] * shares - self.cx[:, None]) / self.fx[:, None]
+        y = (self.heights[:, None] * shares - self.cy[:, None]) / self.fy[:, None]
+        u, v = (part.to(lenses.reach).flatten() for part in torch.broadcast_tensors(x[:, :, None], y[:, None]))
+        return iterations_needed(u, v, lenses[torch.arange(len(u), device=u.device) // TESTED_POSITIONS**2])
 
     @cached_property
     def offsets(self) -> Tensor:

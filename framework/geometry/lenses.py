@@ -18,7 +18,7 @@ find a wrong root. Beyond the reach, polynomials fitted to a lens are meaningles
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -72,6 +72,8 @@ class Distortion:
     """(M,) radius of the disk on which the distortion is one to one."""
     bounds: Tensor
     """(M, 2) radii of distorted positions: all within the first have a ray, and none beyond the second has."""
+    iterations: int | None = None
+    """Newton iterations that `undistort` takes; if None, it asks after each whether another is needed."""
 
     @classmethod
     def of(cls, model: str, lens: Tensor) -> Distortion:
@@ -93,7 +95,7 @@ class Distortion:
         return cls(coefficients, reach, torch.stack([edge - tangential, edge + tangential], dim=-1))
 
     def __getitem__(self, index: Tensor) -> Distortion:
-        return Distortion(self.coefficients[index], self.reach[index], self.bounds[index])
+        return Distortion(self.coefficients[index], self.reach[index], self.bounds[index], self.iterations)
 
     @cached_property
     def table(self) -> Tensor:
@@ -184,14 +186,14 @@ def undistort(u: Tensor, v: Tensor, lenses: Distortion) -> tuple[Tensor, Tensor,
     step_x, step_y = u * start, v * start
     possible = distance <= lenses.bounds[:, 1]
     tolerance = (1e-9 if u.dtype == torch.float64 else 1e-6) ** 2 * (1 + distance.square())
-    for _ in range(ITERATIONS):
+    for _ in range(lenses.iterations or ITERATIONS):
         at_x, at_y = x + step_x, y + step_y
         bent_u, bent_v, (uu, uv, vv) = distort(at_x, at_y, lenses.coefficients)
         off_u, off_v = bent_u - u, bent_v - v
         error = off_u * off_u + off_v * off_v
         better = error < best
         x, y, best = torch.where(better, at_x, x), torch.where(better, at_y, y), torch.where(better, error, best)
-        if bool(((best <= tolerance) | ~possible).all()):
+        if lenses.iterations is None and bool(((best <= tolerance) | ~possible).all()):
             break
         area = (uu * vv - uv * uv).clamp(min=1e-12)
         step_x = torch.where(better, (uv * off_v - vv * off_u) / area, step_x / 2)
@@ -202,6 +204,20 @@ def undistort(u: Tensor, v: Tensor, lenses: Distortion) -> tuple[Tensor, Tensor,
     valid = possible & (best <= tolerance)
     edge = reach / distance.clamp(min=1e-30)
     return torch.where(valid, x, u * edge), torch.where(valid, y, v * edge), valid
+
+
+def iterations_needed(u: Tensor, v: Tensor, lenses: Distortion) -> int:
+    """Return after how many iterations `undistort` has found all positions that it ever finds, and one more.
+
+    Args:
+        u, v: (R,) distorted coordinates.
+        lenses: the R lenses, one for each point.
+    """
+    found = undistort(u, v, lenses)[2]
+    for count in range(1, ITERATIONS):
+        if bool((undistort(u, v, replace(lenses, iterations=count))[2] | ~found).all()):
+            return count + 1
+    return ITERATIONS
 
 
 def unproject(model: str, x: Tensor, y: Tensor, lenses: Distortion | None) -> LensRays:

@@ -69,7 +69,10 @@ class Points:
         if self.axes is None or self.variances is None:
             raise ValueError("these points have no Gaussians: sample_points() computes them for footprint 'gaussian'")
         deviations = self.variances.clamp(min=torch.finfo(self.variances.dtype).tiny).sqrt()  # has a gradient at 0
-        return frames(self.axes) * deviations[:, None, [0, 1, 1]]
+        along_and_across = torch.cat(
+            [deviations, deviations[:, 1:]], dim=-1
+        )  # a list of indices would come from the CPU
+        return frames(self.axes) * along_and_across[:, None]
 
     def sized(self, deviation: float) -> Points:
         """Return points with Gaussians; points without get balls, as fields are also asked at mere positions.
@@ -82,7 +85,9 @@ class Points:
         axes = torch.zeros_like(self.positions)
         axes[:, 2] = 1
         variances = self.positions.new_full((len(self), 2), deviation**2)
-        return replace(self, axes=axes, variances=variances, covariances=variances[:, [1, 1, 0]])
+        return replace(
+            self, axes=axes, variances=variances, covariances=torch.cat([variances[:, 1:], variances.flip(-1)], -1)
+        )
 
 
 class Intervals(Protocol):

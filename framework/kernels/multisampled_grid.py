@@ -84,13 +84,10 @@ def multisampled_grid(
 MULTISAMPLED_GRID = LOOK_UP.operation(multisampled_grid_reference)
 
 
-def _has_one_point(points: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> bool:
-    return points.shape[1] == 1
-
-
-@MULTISAMPLED_GRID.implementation(FEW_OPERATIONS, types=None, order=torch.inf, fits=_has_one_point)
-def _one_point(points: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> Tensor:
-    """Compute `multisampled_grid` of one point in each frustum by the plain look-up, which has kernels on GPUs."""
-    positions, deviations = points[:, 0, :3].contiguous(), points[:, 0, 3].detach()
+@MULTISAMPLED_GRID.implementation(FEW_OPERATIONS, types=None, order=torch.inf)
+def _by_points(points: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> Tensor:
+    """Compute `multisampled_grid` by the plain look-up of all points, which has kernels on GPUs."""
+    positions, deviations = points[..., :3].flatten(0, 1).contiguous(), points[..., 3].detach().flatten()
     shares = level_weights(deviations, _resolutions(layout, points.dtype, points.device)).to(table.dtype)
-    return hash_grid(positions, table, layout) * shares.repeat_interleave(table.shape[1], dim=-1)
+    features = hash_grid(positions, table, layout) * shares.repeat_interleave(table.shape[1], dim=-1)
+    return features if points.shape[1] == 1 else features.view(*points.shape[:2], features.shape[-1]).mean(1)

@@ -57,7 +57,7 @@ class _Counts(Sequence[Tensor]):
 
 @dataclass(frozen=True)
 class Silhouettes:
-    """The pixels of M images that are not fully transparent."""
+    """The pixels of M images that are not fully transparent; the boxes that they are compared with are on the CPU."""
 
     dataset: Dataset
     """Images with alpha, and pinhole cameras."""
@@ -66,10 +66,12 @@ class Silhouettes:
 
     @classmethod
     def of(cls, dataset: Dataset) -> Silhouettes:
-        """Sum up each image of `dataset`, so that the count in any rectangle of pixels takes four look-ups.
+        """Sum up each image of `dataset`, on the CPU, so that the count in any rectangle of pixels takes four look-ups.
 
-        If the images exceed the memory, so do the sums; they are then computed each time they are requested.
+        If the images exceed the memory, so do the sums; they are then computed each time they are requested. A hull is
+        found in thousands of small parts, each by the answers to those before, which takes a GPU far longer.
         """
+        dataset = dataset.to("cpu")
         counts = _Counts(dataset)
         return cls(dataset, tuple(counts) if dataset.resident else counts)
 

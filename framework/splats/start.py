@@ -194,7 +194,7 @@ def first_points(kind: Literal["points", "silhouettes", "random"], dataset: Data
     if kind == "silhouettes":
         if not scene.has_alpha or dataset.cameras.model != "pinhole":
             raise ConfigError("--start silhouettes needs pinhole images with alpha; leave out --start")
-        hull = visual_hull(Silhouettes.of(dataset), box, HULL_CELLS)
+        hull = visual_hull(Silhouettes.of(dataset), scene.box, HULL_CELLS).to(box.device)
         if bool(hull.any()):
             return hull_points(hull, box, HULL_CELLS, count)
         say("warning: the images' alpha leaves no part of the box; Gaussians start anywhere in it")

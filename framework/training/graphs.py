@@ -15,8 +15,10 @@ still have held on to has changed. Whatever fails, training goes on without reco
 from __future__ import annotations
 
 import gc
+import warnings
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 import torch
@@ -44,6 +46,8 @@ TESTED = 0, 64
 and more, learning rates have changed, and other tensors may have moved."""
 MOST_KINDS = 4
 """Number of kinds of steps whose recordings are kept, with the memory that each holds: those that were taken last."""
+WAITED = "called a synchronizing CUDA operation"
+"""What torch warns of where Python waits for a GPU, if it is asked to."""
 FLAG = "--machine.cuda-graphs"
 
 
@@ -52,6 +56,9 @@ class Recorder(Protocol):
 
     def run(self, function: Callable[[], T]) -> T:
         """Call `function` as it is recorded later, and return its result."""
+
+    def watched(self, function: Callable[[], T]) -> tuple[T, str | None]:
+        """Call `function` likewise, and return its result, and where it waited for the device; None if nowhere."""
 
     def record(self, function: Callable[[], T]) -> tuple[T, Callable[[], None]]:
         """Record `function` without running what it starts.
@@ -78,6 +85,23 @@ class CudaRecorder:
             result = function()
         torch.cuda.current_stream().wait_stream(self.stream)
         return result
+
+    def watched(self, function: Callable[[], T]) -> tuple[T, str | None]:
+        """Call `function` on the stream, and return its result, and where it waited for the GPU; None if nowhere.
+
+        A recording of what waits fails, and leaves torch's allocator and generator in a state from which nothing goes
+        on; so this is found out before.
+        """
+        before = torch.cuda.get_sync_debug_mode()
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always")
+            torch.cuda.set_sync_debug_mode("warn")
+            try:
+                result = self.run(function)
+            finally:
+                torch.cuda.set_sync_debug_mode(before)
+        places = [f"{Path(each.filename).name}:{each.lineno}" for each in warned if WAITED in str(each.message)]
+        return result, places[0] if places else None
 
     def record(self, function: Callable[[], T]) -> tuple[T, Callable[[], None]]:
         """Record `function` as a graph, and return its result, with the graph's memory, and what replays it.
@@ -176,10 +200,14 @@ class StepGraphs(Generic[T]):
             self._kinds.pop(next(iter(self._kinds)))
         if kept.recorded is None:
             seed()
-            result = self._recorder.run(step)
             kept.taken += 1
-            if kept.taken >= WARM_UP:
+            if kept.taken < WARM_UP:
+                return self._recorder.run(step)
+            result, waited = self._recorder.watched(step)
+            if waited is None:
                 self._record(kept, step)
+            else:
+                self._give_up(f"a step waits for the GPU ({waited})")
             return result
         result, repeat = kept.recorded
         if kept.passed < len(TESTED) and kept.repeated >= TESTED[kept.passed]:

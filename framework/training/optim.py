@@ -49,7 +49,8 @@ class Adam:
         """Moments and counts of each parameter."""
         self.deferred = deferred
         self._rates: list[StepValue] = []
-        self._entries, self._entries_on_device = [0, 0], torch.zeros(2, dtype=torch.int64)
+        device = next((parameter.device for parameter in self.parameters), None)
+        self._entries, self._entries_on_device = [0, 0], torch.zeros(2, dtype=torch.int64, device=device)
         for group in self.param_groups:
             for parameter in group["params"]:
                 self._begin(parameter, group["sparse"])
@@ -213,7 +214,6 @@ class Adam:
 
     def _count(self, updated: int | Tensor, there: int) -> None:
         if isinstance(updated, Tensor):  # added up in place, so that a repeated step counts too
-            self._entries_on_device = self._entries_on_device.to(updated.device)
             self._entries_on_device[0].add_(updated)
             self._entries_on_device[1].add_(there)
         else:

@@ -218,17 +218,19 @@ def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset
     near = [
         pixels_near(silhouettes, kept, box, s.resolution)
         for s in samplers
-        for kept, box in zip((~s.carved).view(s.levels, -1), nested_boxes(s.box, s.levels), strict=True)
+        for kept, box in zip((~s.carved).view(s.levels, -1).cpu(), nested_boxes(s.box.cpu(), s.levels), strict=True)
     ]
     return dataset.drawing(PixelSet.shared(near, 1))
 
 
 def _hull(silhouettes: Silhouettes, sampler: SkipsCells, times: Tensor | None) -> Tensor:
     """Return the cells of `sampler` that `silhouettes`, taken at `times` if it moves, do not show to be empty."""
-    boxes, n = nested_boxes(sampler.box, sampler.levels), sampler.resolution
+    boxes, n = nested_boxes(sampler.box.cpu(), sampler.levels), sampler.resolution
     if times is None:
-        return torch.cat([visual_hull(silhouettes, box, n) for box in boxes])
-    return torch.cat([moving_hulls(silhouettes, box, n, times, sampler.slices) for box in boxes])
+        hulls = [visual_hull(silhouettes, box, n) for box in boxes]
+    else:
+        hulls = [moving_hulls(silhouettes, box, n, times, sampler.slices) for box in boxes]
+    return torch.cat(hulls).to(sampler.box.device)
 
 
 def _no_silhouettes(dataset: Dataset) -> str | None:

@@ -98,7 +98,7 @@ def _why_not(dataset: Dataset, least: int) -> str | None:
     scene, cameras, known = dataset.scene, dataset.cameras, dataset.sparse_depth
     if known is None and (scene.moving or scene.num_scenes > 1):
         return UNKNOWN
-    space = SharedSpace(scene.box)
+    space = SharedSpace(scene.box).to(dataset.device)
     space.leave_out(cameras, nearest_shown(dataset), least)
     if known is not None:
         some = known[evenly_spaced(len(known), TESTED_RAYS).to(known.pixels.device)]

@@ -61,7 +61,9 @@ def shows_a_ball(monkeypatch: pytest.MonkeyPatch, capture_run: Path) -> float:
 
     def render_view(model: Any, view: View, background: Tensor) -> Picture:
         rays = view.camera.pixel_rays(view.pixels().flatten(), 0.0, 1.0)
-        found = distances(rays.origins.double().numpy(), rays.directions.double().numpy(), center, RADIUS * scale)
+        found = distances(
+            *(part.double().cpu().numpy() for part in (rays.origins, rays.directions)), center, RADIUS * scale
+        )
         depth = torch.from_numpy(found).float().view(view.height, view.width)
         hit = ~depth.isnan()
         depth = torch.where(hit, depth, 1000.0)

@@ -85,6 +85,9 @@ class FakeRecorder:
     def run(self, function: Callable[[], T]) -> T:
         return function()
 
+    def watched(self, function: Callable[[], T]) -> tuple[T, str | None]:
+        return function(), None
+
     @torch.no_grad()
     def _play(self, tape: Tape) -> None:
         self.repeated += 1

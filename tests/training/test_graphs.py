@@ -3,6 +3,8 @@
 import dataclasses
 import functools
 import gc
+import inspect
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -479,6 +481,7 @@ def test_a_recording_that_breaks_the_gpu_ends_the_run_in_a_line(
     monkeypatch.setattr(torch.cuda, "graph", lambda graph, stream: nullcontext())
     monkeypatch.setattr(torch.cuda, "synchronize", lambda device: None)
     monkeypatch.setattr(CudaRecorder, "run", lambda self, function: function())
+    monkeypatch.setattr(CudaRecorder, "watched", lambda self, function: (function(), None))
     steps = StepGraphs[None](CudaRecorder(torch.device("cuda", 0)), list)
     taken: list[int] = []
 
@@ -492,3 +495,30 @@ def test_a_recording_that_breaks_the_gpu_ends_the_run_in_a_line(
         for _ in range(WARM_UP):
             steps.run(StepKind(), lambda: None, step)
     assert [line.split("because ")[1] for line in said] == ["recording one failed (invalidated by a wait)"] * usable
+
+
+def test_a_step_that_waits_for_the_gpu_is_not_recorded(monkeypatch: pytest.MonkeyPatch, said: list[str]) -> None:
+    """A recording of it would break what comes after; torch's warning of it tells the line of the program."""
+    modes = ["default"]
+
+    def set_mode(mode: str) -> None:
+        warnings.warn("Synchronization debug mode is a prototype feature", stacklevel=2)
+        modes.append(mode)
+
+    monkeypatch.setattr(torch.cuda, "Stream", lambda device: None)
+    monkeypatch.setattr(torch.cuda, "get_sync_debug_mode", lambda: "default")
+    monkeypatch.setattr(torch.cuda, "set_sync_debug_mode", set_mode)
+    monkeypatch.setattr(CudaRecorder, "run", lambda self, function: function())
+    monkeypatch.setattr(CudaRecorder, "record", lambda self, function: pytest.fail("it was recorded"))
+    steps = StepGraphs[int](CudaRecorder(torch.device("cuda", 0)), list)
+
+    def step() -> int:
+        if modes[-1] == "warn":
+            warnings.warn("called a synchronizing CUDA operation (Triggered internally)", stacklevel=1)
+        return 7
+
+    assert [steps.run(StepKind(), lambda: None, step) for _ in range(WARM_UP)] == [7] * WARM_UP
+    assert modes == ["default", "warn", "default"]
+    line = inspect.getsourcelines(step)[1] + 2
+    assert [each.split("because ")[1] for each in said] == [f"a step waits for the GPU (test_graphs.py:{line})"]
+    assert not steps.take(StepKind())

@@ -49,11 +49,15 @@ def free_port() -> int:
 
 
 def numbered() -> list[dict[str, str]]:
-    """Variables of two processes, as torchrun numbers them, which itself takes seconds to begin."""
+    """Variables of two processes, as torchrun numbers them, which itself takes seconds to begin.
+
+    They have no GPU, of which there may be one, and none of whose runs has the same bits twice.
+    """
     port = free_port()
     return [
         {
             "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port),
+            "CUDA_VISIBLE_DEVICES": "",
             "WORLD_SIZE": str(COUNT), "LOCAL_WORLD_SIZE": str(COUNT), "RANK": str(rank), "LOCAL_RANK": str(rank),
         }
         for rank in range(COUNT)

@@ -175,7 +175,7 @@ class Frame:
     @classmethod
     def saved(cls, checkpoint: dict[str, Any]) -> Frame:
         """Return the frame of the model in `checkpoint`."""
-        scene, placement = checkpoint["scene"], Placement(checkpoint["transform"], checkpoint["scale"])
+        scene, placement = checkpoint["scene"], Placement(checkpoint["transform"].cpu(), checkpoint["scale"])
         return cls(placement, scene["box"], scene["near"], scene["far"], scene["unbounded"])
 
     def placed(self, cameras: Cameras) -> Cameras:

@@ -18,12 +18,12 @@ def test_random_images(shape: tuple[int, ...]) -> None:
 
 
 def test_extremes() -> None:
-    """The same image, black beside white, and values far outside [0, 1]."""
+    """The same image, black beside white, and values far outside [0, 1], whose similarity is next to 0."""
     torch.manual_seed(0)
     image = torch.rand(12, 11, 2)
     assert compare(ssim, {"image": image, "target": image})[0] == 1
     compare(ssim, {"image": torch.zeros(11, 11, 1), "target": torch.ones(11, 11, 1)}, "image", tolerance=1e-3)
-    compare(ssim, {"image": 100 * image, "target": -image}, "image", tolerance=1e-4)
+    compare(ssim, {"image": 100 * image, "target": -image}, "image", tolerance=1e-3)
 
 
 def test_a_target_with_a_gradient_is_the_references() -> None:

@@ -1,0 +1,73 @@
+"""Every method trains and renders on another device than the CPU, and learns there what it learns on the CPU."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from framework.data.dataset import Dataset
+from framework.evaluation.evaluator import evaluation_background, measure_view
+from framework.training.trainer import Trainer
+from tests.elsewhere import ELSEWHERE, There, elsewhere
+from tests.training.test_graphs import VARIANTS, small
+
+STRIDE = 16
+"""Every so many-th row and column of a picture is compared."""
+
+
+def bent(dataset: Dataset) -> Dataset:
+    """The data set as if its lenses bent straight lines."""
+    lens = torch.tensor([0.05, -0.02, 1e-3, -1e-3, 0, 0, 0, 0, 0]).expand(len(dataset.cameras), 9)
+    return dataclasses.replace(dataset, cameras=dataclasses.replace(dataset.cameras, model="opencv", lens=lens))
+
+
+CASES: dict[str, dict[str, Any]] = {
+    **VARIANTS,
+    "marched": {"method": "instant-ngp"},
+    "planes": {"method": "kplanes"},
+    "marched voxels": {"method": "tensorf"},
+    "moving": {"method": "dnerf", "canonical": "hash-grid"},
+    "Gaussians": {"method": "gaussian-splatting"},
+    "nested boxes": {"sampler": "occupancy"},
+    "few images": {"unseen_loss_mult": 0.1, "open_levels_until": 0.5, "occlusion_loss_mult": 0.01},
+}
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("case", CASES)
+def test_every_method_trains_and_renders_elsewhere(case: str, tmp_path: Path) -> None:
+    here = small(tmp_path, **CASES[case])
+    with elsewhere():
+        there = Trainer(here.run, here.train_set.to(ELSEWHERE), None)
+        for _ in range(2):
+            losses = there.train_step().losses
+        assert isinstance(next(there.model.parameters()), There)
+        picture = measure_view(there.model, there.train_set, 0, evaluation_background(there.model), STRIDE)
+    for _ in range(2):
+        expected = here.train_step().losses
+    assert losses.keys() == expected.keys()
+    assert losses["rgb"] == pytest.approx(expected["rgb"], rel=5e-3)  # gradients are thinned at random
+    same = measure_view(here.model, here.train_set, 0, evaluation_background(here.model), STRIDE)
+    assert picture.psnr == pytest.approx(same.psnr, abs=0.05)
+
+
+def test_tensors_of_two_devices_are_refused() -> None:
+    """The tests above can fail."""
+    with elsewhere(), pytest.raises(RuntimeError, match="two devices"):
+        torch.ones(3, device=ELSEWHERE) + torch.ones(3)
+
+
+def test_steps_of_captures_with_bent_lenses_do_not_wait(tmp_path: Path) -> None:
+    """A recording of them would fail: how often a lens's inverse is improved is found out before."""
+    here = small(tmp_path, draw_by_error=False)
+    with elsewhere() as mode:
+        trainer = Trainer(here.run, bent(here.train_set).to(ELSEWHERE), None)
+        for _ in range(2):
+            trainer.train_step()
+        mode.waits.clear()
+        trainer.train_step()
+        assert not mode.waits
+        float(torch.ones((), device=ELSEWHERE))
+        assert mode.waits.total() == 1

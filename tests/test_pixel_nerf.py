@@ -20,6 +20,7 @@ from framework.data.sources import Request, make_source
 from framework.evaluation.evaluator import evaluate, views_to_judge
 from framework.evaluation.metrics import psnr
 from framework.model import RendersFromImages
+from framework.tools.stress.faults import spoiled_pose
 from framework.tools.testing.scenes import ball_in_a_box
 from framework.training.run import Run, create_folder
 from framework.training.trained import build_model, load_trained
@@ -130,6 +131,13 @@ def test_data_of_one_scene_is_rendered_from_the_training_images() -> None:
     model.nearest_views(view)
     assert 2 not in indices_of(seen.images[0], ball)
     assert images_of(ball, None).tolist() == list(range(len(ball)))
+
+
+def test_nothing_is_rendered_from_an_image_whose_pose_is_not_finite() -> None:
+    ball = spoiled_pose(ball_in_a_box(), math.nan)
+    assert images_of(ball, None).tolist() == list(range(1, len(ball)))
+    model = built(ball, dataclasses.replace(SMALL, num_source_views=64))
+    assert all(features.isfinite().all() for features in model.nearest_views(ball.view(2)).features)
 
 
 def test_what_cannot_be_rendered_says_why(many: dict[str, Dataset]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from framework.data.dataset import Dataset
@@ -16,9 +15,10 @@ def images_of(dataset: Dataset, scene: int | None) -> Tensor:
         scene: number of the scene; None for the first.
 
     Returns:
-        The source images of the scene, or all of its images where none is declared; none for an unknown scene.
+        The source images of the scene, or all of its images where none is declared; none for an unknown scene. Images
+        whose pose is not finite are left out, since they would spoil all that is rendered from them.
     """
-    found = torch.ones(len(dataset), dtype=torch.bool)
+    found = dataset.cameras.camera_to_worlds.isfinite().flatten(1).all(-1).cpu()
     if dataset.scene_indices is not None:
         found &= dataset.scene_indices == (dataset.scene_indices[0] if scene is None else scene)
     if dataset.source_images is not None:

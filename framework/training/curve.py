@@ -15,6 +15,7 @@ from dataclasses import asdict, astuple, dataclass
 from statistics import fmean
 from typing import Any, TypeAlias
 
+from framework.base.device import runs_ahead
 from framework.data.dataset import Dataset
 from framework.evaluation.evaluator import Measured, evaluation_background, measure_view, spread, views_to_judge
 from framework.model import Model
@@ -157,6 +158,8 @@ class FewImages:
         stride, cost = self._plan(points, report)
         if not is_due(points, report.seconds, cost, last=last):
             return None
+        if not points and runs_ahead(model.device):
+            self._measure(model, stride)  # compiles what rendering needs, which is not the cost of the next ones
         start = time.perf_counter()
         found = self._measure(model, stride)
         cost = time.perf_counter() - start

@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -57,11 +58,11 @@ def test_every_run_has_a_curve_at_its_price(
         return Measured(20.0, 0.5)
 
     monkeypatch.setattr(few, "_measure", measure)
-    points, now, step = list[Point](), 1.0, 1
+    points, now, step, model = list[Point](), 1.0, 1, SimpleNamespace(device=torch.device("cpu"))
     while now < seconds:
         now, step = now + max(0.03, seconds / 1000), step + 1
         report = StepReport(step, now, min(now / seconds, 1.0), {}, 20.0, learnt, None)
-        found = few.look_if_due(None, [point.entry() for point in points], report, last=now >= seconds)  # type: ignore[arg-type]
+        found = few.look_if_due(model, [point.entry() for point in points], report, last=now >= seconds)  # type: ignore[arg-type]
         points += [] if found is None else [found]
     spent = sum(point.evaluation_seconds or 0.0 for point in points)
     print(f"{len(points)} points, stride {points[-1].pixel_stride}, {spent / now:.1%} of {seconds:g} s")
@@ -104,6 +105,29 @@ def test_a_look_is_what_its_pixels_say(shared_tiny: Path, tmp_path: Path) -> Non
     for name in ("rgb", "depth", "accumulation"):  # bfloat16 products differ by the number of rays
         torch.testing.assert_close(getattr(part, name), every(getattr(full, name), 3), atol=2e-2, rtol=0)
     assert part.rgb.shape == (7, 7, 3)
+
+
+def test_what_the_first_look_compiles_on_a_gpu_is_not_the_cost_of_the_next(
+    shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", evaluated=True)
+    dataset, costs, clock = trainer.eval_set, [1.0, 10.0], [0.0]
+    assert dataset is not None
+
+    def measure(self: FewImages, model: Any, stride: int) -> Measured:
+        clock[0] += costs.pop()
+        return Measured(20.0, None)
+
+    monkeypatch.setattr("framework.training.curve.time", SimpleNamespace(perf_counter=lambda: clock[0]))
+
+    monkeypatch.setattr(FewImages, "_measure", measure)
+    monkeypatch.setattr("framework.training.curve.runs_ahead", lambda device: True)
+    found = FewImages(dataset, None, 1).look_if_due(
+        trainer.model, (), StepReport(10, 1e9, 1.0, {}, 20.0, 1e9, None), last=False
+    )
+    assert found is not None
+    assert found.evaluation_seconds == 1.0
+    assert not costs
 
 
 def test_every_so_many_th_pixel_estimates_psnr_without_bias() -> None:

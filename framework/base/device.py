@@ -62,9 +62,9 @@ def relative_speed(machine: MachineConfig) -> float:
     """Return how fast kernels train here, relative to two threads of a CPU, by the device and the number of threads.
 
     One thread was measured to be 0.55 to 0.58 as fast as two, as if a quarter of a step on two threads were not shared
-    out (Amdahl 1967); 4 and 8 were 1.7 and 2.3 times as fast as two. A data-centre GPU took the samples of a step of
-    instant-ngp ten times as fast and more; what slower ones do was not measured. Several processes have 1, since all
-    must decide the same.
+    out (Amdahl 1967); 4 and 8 were 1.7 and 2.3 times as fast as two. A GPU counts as ten times: one of a data
+    centre took the samples of instant-ngp six times as fast while three other runs shared it. Several processes have 1,
+    since all must decide the same.
 
     Args:
         machine: the device type; threads are those that torch is set to.

@@ -69,10 +69,8 @@ class Points:
         if self.axes is None or self.variances is None:
             raise ValueError("these points have no Gaussians: sample_points() computes them for footprint 'gaussian'")
         deviations = self.variances.clamp(min=torch.finfo(self.variances.dtype).tiny).sqrt()  # has a gradient at 0
-        along_and_across = torch.cat(
-            [deviations, deviations[:, 1:]], dim=-1
-        )  # a list of indices would come from the CPU
-        return frames(self.axes) * along_and_across[:, None]
+        # Indexing by a list would bring it from the CPU.
+        return frames(self.axes) * torch.cat([deviations, deviations[:, 1:]], dim=-1)[:, None]
 
     def sized(self, deviation: float) -> Points:
         """Return points with Gaussians; points without get balls, as fields are also asked at mere positions.
@@ -85,9 +83,8 @@ class Points:
         axes = torch.zeros_like(self.positions)
         axes[:, 2] = 1
         variances = self.positions.new_full((len(self), 2), deviation**2)
-        return replace(
-            self, axes=axes, variances=variances, covariances=torch.cat([variances[:, 1:], variances.flip(-1)], -1)
-        )
+        covariances = self.positions.new_full((len(self), 3), deviation**2)
+        return replace(self, axes=axes, variances=variances, covariances=covariances)
 
 
 class Intervals(Protocol):

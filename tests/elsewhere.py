@@ -17,7 +17,8 @@ from torch.utils._pytree import tree_flatten, tree_map, tree_unflatten
 
 from framework.tools.benchmarks.operations import _place
 
-ELSEWHERE = torch.device("meta")
+ELSEWHERE = torch.device("meta", 1)
+"""Not "meta" itself: what is kept for a device would reach tests on that, whose tensors have no values."""
 BRING = {"aten::copy_", "aten::_to_copy"}
 """Operations that take tensors of both devices."""
 INDEX = {"aten::index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_"}

@@ -10,7 +10,7 @@ import torch
 from framework.data.dataset import Dataset
 from framework.evaluation.evaluator import evaluation_background, measure_view
 from framework.training.trainer import Trainer
-from tests.elsewhere import ELSEWHERE, There, elsewhere
+from tests.other_device import OTHER, There, other_device
 from tests.training.test_graphs import VARIANTS, small
 
 STRIDE = 16
@@ -37,10 +37,10 @@ CASES: dict[str, dict[str, Any]] = {
 
 @pytest.mark.medium
 @pytest.mark.parametrize("case", CASES)
-def test_every_method_trains_and_renders_elsewhere(case: str, tmp_path: Path) -> None:
+def test_every_method_trains_and_renders_there(case: str, tmp_path: Path) -> None:
     here = small(tmp_path, **CASES[case])
-    with elsewhere():
-        there = Trainer(here.run, here.train_set.to(ELSEWHERE), None)
+    with other_device():
+        there = Trainer(here.run, here.train_set.to(OTHER), None)
         for _ in range(2):
             losses = there.train_step().losses
         assert isinstance(next(there.model.parameters()), There)
@@ -55,19 +55,19 @@ def test_every_method_trains_and_renders_elsewhere(case: str, tmp_path: Path) ->
 
 def test_tensors_of_two_devices_are_refused() -> None:
     """The tests above can fail."""
-    with elsewhere(), pytest.raises(RuntimeError, match="two devices"):
-        torch.ones(3, device=ELSEWHERE) + torch.ones(3)
+    with other_device(), pytest.raises(RuntimeError, match="two devices"):
+        torch.ones(3, device=OTHER) + torch.ones(3)
 
 
 def test_steps_of_captures_with_bent_lenses_do_not_wait(tmp_path: Path) -> None:
     """A recording of them would fail: how often a lens's inverse is improved is found out before."""
     here = small(tmp_path, draw_by_error=False)
-    with elsewhere() as mode:
-        trainer = Trainer(here.run, bent(here.train_set).to(ELSEWHERE), None)
+    with other_device() as mode:
+        trainer = Trainer(here.run, bent(here.train_set).to(OTHER), None)
         for _ in range(2):
             trainer.train_step()
         mode.waits.clear()
         trainer.train_step()
         assert not mode.waits
-        float(torch.ones((), device=ELSEWHERE))
+        float(torch.ones((), device=OTHER))
         assert mode.waits.total() == 1

@@ -15,16 +15,14 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map, tree_unflatten
 
-from framework.tools.benchmarks.operations import _place
+from framework.tools.benchmarks.operations import _place, _waits
 
-ELSEWHERE = torch.device("meta", 1)
+OTHER = torch.device("meta", 1)
 """Not "meta" itself: what is kept for a device would reach tests on that, whose tensors have no values."""
 BRING = {"aten::copy_", "aten::_to_copy"}
 """Operations that take tensors of both devices."""
 INDEX = {"aten::index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_"}
 """Operations whose indices may be on the CPU."""
-WAITS = {"aten::_local_scalar_dense", "aten::nonzero", "aten::masked_select", "aten::_unique2", "aten::unique_dim"}
-"""Operations whose result has a size or a value that Python asks for."""
 
 
 class There(Tensor):
@@ -41,7 +39,7 @@ class There(Tensor):
             strides=values.stride(),
             storage_offset=values.storage_offset(),
             dtype=values.dtype,
-            device=ELSEWHERE,
+            device=OTHER,
         )
         found.values = values
         return found
@@ -85,7 +83,7 @@ def computed(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         if here:
             raise RuntimeError(f"{func}: tensors are on two devices, as {tuple(here[0].shape)} is on the CPU")
     if device is not None:
-        to_there = torch.device(device).type == ELSEWHERE.type
+        to_there = torch.device(device).type == OTHER.type
     else:
         to_there = isinstance(args[0], There) if name == "aten::copy_" else bool(there)
     wrapped = {id(each.values): each for each in there}
@@ -106,7 +104,7 @@ def computed(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     return tree_map(wrap, out)
 
 
-class Elsewhere(TorchDispatchMode):
+class OtherDevice(TorchDispatchMode):
     """Computes what is on the other device, and counts by place what Python waits for."""
 
     def __init__(self) -> None:
@@ -121,16 +119,14 @@ class Elsewhere(TorchDispatchMode):
 
 
 def _asks(func: Any, args: Any, kwargs: dict[str, Any]) -> bool:
-    name = func.name().split(".")[0]
-    if name == "aten::_to_copy":
-        return kwargs.get("device") is not None and torch.device(kwargs["device"]).type != ELSEWHERE.type
-    if name in INDEX:
-        return any(isinstance(each, Tensor) and each.dtype in (torch.bool, torch.uint8) for each in args[1])
-    return name in WAITS
+    """Return whether Python waits for the result of an operation on the other device."""
+    if func.name().startswith("aten::_to_copy"):
+        return kwargs.get("device") is not None and torch.device(kwargs["device"]).type != OTHER.type
+    return _waits(func, args, kwargs)
 
 
 @contextmanager
-def elsewhere() -> Iterator[Elsewhere]:
+def other_device() -> Iterator[OtherDevice]:
     """The other device, within the block."""
     make, make_like = torch.tensor, torch.as_tensor
 
@@ -150,6 +146,6 @@ def elsewhere() -> Iterator[Elsewhere]:
         patch.object(torch, "as_tensor", as_tensor),
         patch.object(Tensor, "new_tensor", new_tensor),
         patch.object(torch, "autocast", lambda *words, **settings: nullcontext()),  # which "meta" does not have
-        Elsewhere() as mode,
+        OtherDevice() as mode,
     ):
         yield mode

@@ -32,6 +32,9 @@ DISTORTION = 2e-3
 """Default weight of the distortion loss in unbounded scenes."""
 PAPER_SAMPLES = 64, 64
 """Intervals a ray of each proposal in mip-NeRF 360 and in Zip-NeRF."""
+POSE_WARMUP = 512
+"""Steps in which the learning rate of poses rises. Before there is a scene their gradients are noise, by which Adam
+would move each camera by about the rate times the square root of the number of steps: half a degree in 100 steps."""
 MARCHED_SAMPLES = 2**16
 """Samples a training step with an occupancy grid: as many as 2,048 rays have with proposals."""
 
@@ -138,7 +141,9 @@ class CaptureModel(RayModel[CaptureConfigT], Generic[CaptureConfigT]):
                     "--camera-optimizer needs --sampler proposal: marched samples carry no gradient to rays"
                 )
             self.poses = PoseRefinement(scene.num_cameras, config.camera_optimizer, scene.camera_to_worlds)
-            self.poses.optimised = Optimised("poses", config.camera_learning_rate, schedule="exponential")
+            self.poses.optimised = Optimised(
+                "poses", config.camera_learning_rate, schedule="exponential", warmup_steps=POSE_WARMUP
+            )
 
     def refined_cameras(self, cameras: Cameras) -> Cameras:
         """Return the training cameras with refined poses.

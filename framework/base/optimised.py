@@ -32,6 +32,8 @@ class Optimised:
     """Epsilon of Adam."""
     schedule: Schedule | None = None
     """Schedule of the learning rate over the training budget."""
+    warmup_steps: int | None = None
+    """Number of steps in which the learning rate rises linearly from 0."""
     sparse: bool | None = None
     """True if the parameters are tables (E, F), of which a step updates only the entries that it has used."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -253,21 +252,27 @@ def _plain(group: ParameterGroup, config: TrainConfig) -> dict[str, Any]:
     settings = group.settings
     rate = config.learning_rate if settings.learning_rate is None else settings.learning_rate
     plain: dict[str, Any] = {"params": list(group.parameters), "name": settings.name, "lr": rate, "initial_lr": rate}
-    named = {"betas": settings.betas, "eps": settings.eps, "schedule": settings.schedule, "sparse": settings.sparse}
+    names = "betas", "eps", "schedule", "warmup_steps", "sparse"
+    named = {name: getattr(settings, name) for name in names}
     return plain | {name: value for name, value in named.items() if value is not None}
 
 
-def learning_rate_factor(config: TrainConfig, step: int, progress: float) -> float:
+def learning_rate_factor(
+    config: TrainConfig, step: int, progress: float, schedule: str | None = None, warmup_steps: int | None = None
+) -> float:
     """Return the learning rate as a fraction of the initial one.
 
     Args:
         config: the run's settings: schedule, final fraction and warm-up steps.
         step: number of training steps done.
         progress: fraction of the budget spent, clamped to [0, 1].
+        schedule: a group's own schedule; the run's if None.
+        warmup_steps: a group's own number of warm-up steps; the run's if None.
     """
     progress = min(max(progress, 0.0), 1.0)
-    warm_up = min(1.0, (step + 1) / config.lr_warmup_steps) if config.lr_warmup_steps else 1.0
-    return warm_up * _decay(config.lr_schedule, config.lr_final, progress)
+    steps = config.lr_warmup_steps if warmup_steps is None else warmup_steps
+    warm_up = min(1.0, (step + 1) / steps) if steps else 1.0
+    return warm_up * _decay(schedule or config.lr_schedule, config.lr_final, progress)
 
 
 def _decay(schedule: str, final: float, progress: float) -> float:
@@ -281,7 +286,7 @@ def _decay(schedule: str, final: float, progress: float) -> float:
 
 
 def set_learning_rate(optimizer: Adam, config: TrainConfig, step: int, progress: float) -> None:
-    """Set each group's learning rate for a step, by the run's schedule or the group's own.
+    """Set each group's learning rate for a step, by the run's schedule and warm-up or the group's own.
 
     Args:
         optimizer: the optimiser, whose groups have their initial learning rate as `initial_lr`.
@@ -289,11 +294,9 @@ def set_learning_rate(optimizer: Adam, config: TrainConfig, step: int, progress:
         step: number of training steps done.
         progress: fraction of the budget spent, 0 to 1.
     """
-    usual = learning_rate_factor(config, step, progress)
     for group in optimizer.param_groups:
-        own = group.get("schedule")
-        factor = usual if own is None else learning_rate_factor(replace(config, lr_schedule=own), step, progress)
-        group["lr"] = group["initial_lr"] * factor
+        own = group.get("schedule"), group.get("warmup_steps")
+        group["lr"] = group["initial_lr"] * learning_rate_factor(config, step, progress, *own)
     optimizer.bring_rates()
 
 

@@ -35,6 +35,13 @@ def test_warm_up_is_linear() -> None:
     assert [learning_rate_factor(config, step, 0.0) for step in (0, 1, 3, 9)] == [0.25, 0.5, 1.0, 1.0]
 
 
+def test_a_groups_own_schedule_and_warm_up_replace_those_of_the_run() -> None:
+    config = TrainConfig(lr_schedule="constant", lr_final=0.01, lr_warmup_steps=4)
+    assert learning_rate_factor(config, 1, 0.5, "exponential") == pytest.approx(0.5 * 0.1)
+    assert learning_rate_factor(config, 1, 0.5, warmup_steps=8) == 0.25
+    assert learning_rate_factor(config, 1, 0.5, "exponential", 0) == pytest.approx(0.1)
+
+
 def two_groups(seed: int) -> tuple[list[torch.nn.Parameter], list[dict[str, Any]]]:
     torch.manual_seed(seed)
     parameters = [torch.nn.Parameter(torch.randn(shape)) for shape in ((5, 3), (4,), (2, 2))]

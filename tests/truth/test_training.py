@@ -272,7 +272,7 @@ def test_adams_moments_decay_as_the_settings_say(shared_tiny: Path, tmp_path: Pa
 
 
 def test_each_group_has_the_rate_and_the_schedule_that_it_names(shared_tiny: Path, tmp_path: Path) -> None:
-    """Poses decay from the first step on, while the rest is held for half of the budget."""
+    """Poses decay from the first step on, while the rest is held for half of the budget, and rise for 512 steps."""
     trainer = captured(
         shared_tiny, tmp_path, {"unbounded": True, "poses": "device"}, learning_rate=3e-3, camera_learning_rate=7e-4,
         lr_schedule="hold-exponential", lr_final=0.04, max_num_iterations=1000,
@@ -280,7 +280,7 @@ def test_each_group_has_the_rate_and_the_schedule_that_it_names(shared_tiny: Pat
     trainer.state.step = 250
     trainer.train_step()
     rates = {group["name"]: group["lr"] for group in trainer.optimizer.param_groups}
-    expected = {"networks": 3e-3, "tables": 3e-3, "proposals": 1e-2, "poses": 7e-4 * 0.04**0.25}
+    expected = {"networks": 3e-3, "tables": 3e-3, "proposals": 1e-2, "poses": 251 / 512 * 7e-4 * 0.04**0.25}
     assert rates == pytest.approx(expected, rel=1e-4)
 
 

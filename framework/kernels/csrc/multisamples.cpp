@@ -69,9 +69,9 @@ inline void contract(Floats* x, Floats& shrunk) {
     shrunk = power * power;
 }
 
-// What rays and intervals say of LANES frustums.
+// What rays and intervals say of LANES frustums: middle and half length along the ray, and their ratio and its square.
 struct Frustums {
-    Floats origin[3], direction[3], start, end, radius;
+    Floats origin[3], direction[3], start, radius, middle, half, share, squared;
 };
 
 inline Frustums load_frustums(const float* origins, const float* directions, const float* t_starts, const float* t_ends,
@@ -79,8 +79,10 @@ inline Frustums load_frustums(const float* origins, const float* directions, con
     Frustums out;
     load_rows(origins, first, size, out.origin);
     load_rows(directions, first, size, out.direction);
-    out.start = load_some(t_starts, first, size), out.end = load_some(t_ends, first, size);
-    out.radius = load_some(radii, first, size);
+    out.start = load_some(t_starts, first, size), out.radius = load_some(radii, first, size);
+    const Floats end = load_some(t_ends, first, size);
+    out.middle = 0.5f * out.start + 0.5f * end, out.half = 0.5f * end - 0.5f * out.start;
+    out.share = out.middle > 0 ? out.half / out.middle : splat(0), out.squared = out.share * out.share;
     return out;
 }
 
@@ -128,9 +130,8 @@ EXPORT int multisamples(const float* origins, const float* directions, const flo
             const Floats sign = d[2] < 0 ? splat(-1) : splat(1), a = -1.0f / (sign + d[2]), xy = d[0] * d[1] * a;
             first[0] = 1.0f + sign * d[0] * d[0] * a, first[1] = sign * xy, first[2] = -sign * d[0];
             second[0] = xy, second[1] = sign + d[1] * d[1] * a, second[2] = -d[1];
-            const Floats middle = 0.5f * cones.start + 0.5f * cones.end, half = 0.5f * cones.end - 0.5f * cones.start;
-            const Floats share = middle > 0 ? half / middle : splat(0), squared = share * share;
-            const Floats base = (1.0f + share) * (1.0f + share) + 2.0f, step = half / (squared + 3.0f);
+            const Floats share = cones.share, squared = cones.squared;
+            const Floats base = (1.0f + share) * (1.0f + share) + 2.0f, step = cones.half / (squared + 3.0f);
             const Floats spread = SPREAD * root((squared - 1.0f) * (squared - 1.0f) + 4.0f);
             for (int j = 0; j < POINTS; j++) {
                 const float along = float(2 * j - (POINTS - 1)) / (POINTS - 1);
@@ -155,12 +156,11 @@ EXPORT int frustum_balls(const float* origins, const float* directions, const fl
             const int64_t n = b * LANES;
             const int size = int(std::min<int64_t>(LANES, count - n));
             const Frustums cones = load_frustums(origins, directions, t_starts, t_ends, radii, n, size);
-            const Floats middle = 0.5f * cones.start + 0.5f * cones.end, half = 0.5f * cones.end - 0.5f * cones.start;
-            const Floats share = middle > 0 ? half / middle : splat(0), squared = share * share;
+            const Floats middle = cones.middle, squared = cones.squared;
             const Floats total = 3.0f + squared, part = squared / total;
             const Floats t = middle * (1.0f + 2.0f * part);
             // Roots of the variances: half^2 and middle^2 would overflow.
-            const Floats along = half * root(1.0f / 3 - (4.0f / 15) * part * (12.0f - squared) / total);
+            const Floats along = cones.half * root(1.0f / 3 - (4.0f / 15) * part * (12.0f - squared) / total);
             const Floats across =
                 cones.radius * middle * root(0.25f + (5.0f / 12) * squared - (4.0f / 15) * squared * part);
             const Floats deviation = cube_root(along) * cube_root(across) * cube_root(across);

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Generic, Literal, TypeVar
 
 from torch import Tensor
@@ -77,7 +77,10 @@ def decide_capture(
         The settings, and a record of each that was filled in.
     """
     contracted = scene.unbounded if config.contraction is None else config.contraction
-    config, made = fill(config, sampler_choice(config, contracted))
+    sampler = sampler_choice(config, contracted)
+    if config.camera_optimizer in ("SO3xR3", "SE3") and not contracted:
+        sampler = replace(sampler, value="proposal", reason=f"poses are refined, and {MARCHED_REASON}")
+    config, made = fill(config, sampler)
     around = "there may be something outside the box" if contracted else "the scene ends at its box"
     reason = f"contraction is {'on' if contracted else 'off'}"
     refined = "SO3xR3" if scene.poses == "device" and not scene.warped else "off"

@@ -76,6 +76,15 @@ def test_what_is_asked_for_is_done_and_not_called_a_decision(shared_tiny: Path, 
     assert not trainer.model.field.unbounded
 
 
+def test_poses_that_are_to_be_refined_get_proposals_in_a_box_too(shared_tiny: Path, tmp_path: Path) -> None:
+    """Marched samples have no gradient to rays."""
+    trainer = captured(shared_tiny, tmp_path, {}, sampler="auto", camera_optimizer="SE3")
+    assert chosen(trainer)["sampler"] == "proposal"
+    for _ in range(4):
+        trainer.train_step()
+    assert bool((trainer.model.poses.tangents != 0).any())
+
+
 @pytest.mark.medium
 @pytest.mark.parametrize("unbounded", [True, False])
 def test_it_learns(unbounded: bool, shared_tiny: Path, tmp_path: Path) -> None:

@@ -11,7 +11,9 @@ import torch
 from PIL import Image
 
 from framework.base.errors import ConfigError, DataError, NerfloomError
+from framework.base.registry import load_dataparser
 from framework.cameras.cameras import Cameras
+from framework.data.dataset import load_dataset
 from framework.tools.benchmarks import ablation, cache, contention, pose_refinement, poses
 from framework.tools.benchmarks.children import output_of
 from tests.dataparsers.sparse_models import Capture, make_capture, write_colmap
@@ -83,6 +85,15 @@ def test_cameras_are_disturbed_by_the_angle_and_the_share_asked_for() -> None:
     )
     moves = (after[:, :, 3] - before[:, :, 3]).norm(dim=-1) / before[:, :, 3].norm(dim=-1)
     torch.testing.assert_close(moves, torch.full((20,), 0.05))
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("method", ["nerfacto", "zip-nerf"])
+def test_poses_of_an_object_in_a_box_are_refined(method: str, shared_tiny: Path) -> None:
+    data = load_dataset(load_dataparser("blender")().parse(shared_tiny, "train"), "train")
+    trainer = pose_refinement.trained(method, data, 0.5, "SO3xR3")
+    assert trainer.model.poses is not None
+    assert bool((trainer.model.poses.tangents != 0).any())
 
 
 def test_cameras_are_carried_into_the_frame_of_other_poses() -> None:

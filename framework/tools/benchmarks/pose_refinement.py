@@ -27,6 +27,7 @@ from framework.data.dataset import Dataset, load_dataset
 from framework.evaluation.evaluator import evaluate
 from framework.geometry.alignment import align_cameras, pose_errors
 from framework.kernels.math import cross_matrix
+from framework.samplers.choice import SamplingConfig
 from framework.training.machine import machine
 from framework.training.run import Run, create_folder
 from framework.training.trainer import Trainer
@@ -89,7 +90,7 @@ def disturb(cameras: Cameras, degrees: float, share: float) -> Cameras:
 
 
 def refinable(method: str) -> Any:
-    """Return the settings of a method that refines poses.
+    """Return the settings of a method that refines poses, with proposals if it casts rays: a march would not see them.
 
     Args:
         method: name of the method.
@@ -100,7 +101,7 @@ def refinable(method: str) -> Any:
     config = load_method(method).config
     if not hasattr(config, "camera_optimizer"):
         raise ConfigError(f"--method {method}: it does not refine poses, for it has no --camera-optimizer")
-    return config
+    return replace(config, sampler="proposal") if isinstance(config, SamplingConfig) else config
 
 
 def trained(method: str, data: Dataset, seconds: float, camera_optimizer: str) -> Trainer:

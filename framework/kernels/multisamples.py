@@ -5,7 +5,7 @@ Letters: N frustums, J points in each.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -69,17 +69,9 @@ def unit_multisamples(frustums: Frustums, pattern: Pattern, box: Tensor, contrac
 UNIT_MULTISAMPLES = Operation("unit_multisamples", unit_multisamples_reference)
 
 
-# Without a gradient, which only learnt poses need: then it is torch's.
-@UNIT_MULTISAMPLES.implementation(CPP, differentiable=0)
+@UNIT_MULTISAMPLES.implementation(CPP, differentiable=2)
 def _compiled(frustums: Frustums, pattern: Pattern, box: Tensor, contracted: bool) -> Tensor:
-    count, inputs = len(frustums), _Inputs.of(frustums, box, contracted)
-    out = frustums.t_starts.new_empty(count, NUM_MULTISAMPLES, 4)
-    turned = [x.contiguous() for x in (pattern.turns.cos(), pattern.turns.sin(), pattern.mirrors)]
-    _multisamples(
-        *inputs.frustums(), *(native.pointer(x, "the pattern", (count,)) for x in turned), count,
-        *inputs.map(STD_SCALE), out.data_ptr(), native.threads(),
-    )  # fmt: skip
-    return out
+    return _Multisamples.apply(frustums.origins, frustums.directions, frustums, pattern, _Map.of(box, contracted))
 
 
 def frustum_balls_reference(frustums: Frustums, box: Tensor, contracted: bool) -> Tensor:
@@ -119,44 +111,95 @@ def frustum_balls(frustums: Frustums, box: Tensor, contracted: bool) -> Tensor:
 FRUSTUM_BALLS = Operation("frustum_balls", frustum_balls_reference)
 
 
-@FRUSTUM_BALLS.implementation(CPP, differentiable=0)
+@FRUSTUM_BALLS.implementation(CPP, differentiable=2)
 def _compiled_balls(frustums: Frustums, box: Tensor, contracted: bool) -> Tensor:
-    count, inputs = len(frustums), _Inputs.of(frustums, box, contracted)
-    out = frustums.t_starts.new_empty(count, 4)
-    _balls(*inputs.frustums(), count, *inputs.map(1.0), out.data_ptr(), native.threads())
-    return out
+    return _Balls.apply(frustums.origins, frustums.directions, frustums, _Map.of(box, contracted))
 
 
-class _Inputs(NamedTuple):
-    """Tensors and numbers of frustums and of the map to the unit cube, which both kernels read."""
+class _Map(NamedTuple):
+    """The map from the scene to the unit cube."""
 
-    rows: list[Tensor]
-    columns: list[Tensor]
     centre: Tensor
     scale: Tensor
     deviation: float
     contracted: bool
 
     @classmethod
-    def of(cls, frustums: Frustums, box: Tensor, contracted: bool) -> _Inputs:
+    def of(cls, box: Tensor, contracted: bool) -> _Map:
         half = (box[1] - box[0]) / 2
         # What is contracted is in half edges from the centre, everything else in edges from the corner.
         centre, scale = ((box[0] + box[1]) / 2, 1 / half) if contracted else (box[0].clone(), 0.5 / half)
-        deviation = 1 / (half.prod() ** (1 / 3)).item() / (4 if contracted else 2)
-        rows = [x.contiguous() for x in (frustums.origins, frustums.directions)]
-        columns = [x.contiguous() for x in (frustums.t_starts, frustums.t_ends, frustums.radii)]
-        return cls(rows, columns, centre, scale, deviation, contracted)
+        return cls(centre, scale, 1 / (half.prod() ** (1 / 3)).item() / (4 if contracted else 2), contracted)
 
-    def frustums(self) -> list[int]:
-        count = len(self.columns[0])
-        rows = [native.pointer(x, "rays", (count, 3)) for x in self.rows]
-        return rows + [native.pointer(x, "frustums", (count,)) for x in self.columns]
+    def addresses(self) -> tuple[int, int]:
+        return native.pointer(self.centre, "the centre", (3,)), native.pointer(self.scale, "the scale", (3,))
 
-    def map(self, deviation: float) -> tuple[int, int, float, int]:
-        """Return the map to the unit cube, where a deviation is `deviation` times what it is without the map."""
-        centre, scale = native.pointer(self.centre, "the centre", (3,)), native.pointer(self.scale, "the scale", (3,))
-        return centre, scale, deviation * self.deviation, int(self.contracted)
+
+def _contiguous(origins: Tensor, directions: Tensor, frustums: Frustums) -> list[Tensor]:
+    """Return the tensors that describe N frustums, of which the first two may be learnt."""
+    return [x.contiguous() for x in (origins, directions, frustums.t_starts, frustums.t_ends, frustums.radii)]
+
+
+def _addresses(count: int, origins: Tensor, directions: Tensor, *columns: Tensor) -> list[int]:
+    """Return the addresses of what describes N = `count` frustums: (N, 3) rays, and numbers (N,)."""
+    rows = [native.pointer(x, "rays", (count, 3)) for x in (origins, directions)]
+    return rows + [native.pointer(x, "frustums", (count,)) for x in columns]
+
+
+class _Multisamples(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, origins: Tensor, directions: Tensor, frustums: Frustums, pattern: Pattern, to_cube: _Map
+    ) -> Tensor:
+        count = len(frustums)
+        turned = [x.contiguous() for x in (pattern.turns.cos(), pattern.turns.sin(), pattern.mirrors)]
+        tensors = (*_contiguous(origins, directions, frustums), *turned)
+        out = origins.new_empty(count, NUM_MULTISAMPLES, 4)
+        _multisamples(
+            *_addresses(count, *tensors), count, *to_cube.addresses(), STD_SCALE * to_cube.deviation,
+            int(to_cube.contracted), out.data_ptr(), native.threads(),
+        )  # fmt: skip
+        ctx.save_for_backward(*tensors)
+        ctx.to_cube = to_cube
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        return *_by_rays(ctx, _multisamples_backward, grad), None, None, None
+
+
+class _Balls(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, origins: Tensor, directions: Tensor, frustums: Frustums, to_cube: _Map) -> Tensor:
+        count, tensors = len(frustums), _contiguous(origins, directions, frustums)
+        out = origins.new_empty(count, 4)
+        _balls(
+            *_addresses(count, *tensors), count, *to_cube.addresses(), to_cube.deviation, int(to_cube.contracted),
+            out.data_ptr(), native.threads(),
+        )  # fmt: skip
+        ctx.save_for_backward(*tensors)
+        ctx.to_cube = to_cube
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        return *_by_rays(ctx, _balls_backward, grad), None, None
+
+
+def _by_rays(ctx: Any, backward: native.Function, grad: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the gradients (N, 3) by origins and directions, from that by points (N, ..., 4)."""
+    tensors, to_cube, grad = ctx.saved_tensors, ctx.to_cube, grad.contiguous()
+    by_origins, by_directions = (torch.empty_like(x) for x in tensors[:2])
+    backward(
+        *_addresses(len(grad), *tensors), len(grad), *to_cube.addresses(), int(to_cube.contracted),
+        grad.data_ptr(), by_origins.data_ptr(), by_directions.data_ptr(), native.threads(),
+    )  # fmt: skip
+    return by_origins, by_directions
 
 
 _multisamples = native.Function("multisamples", "ppppppppqppfipi")
+_multisamples_backward = native.Function("multisamples_backward", "ppppppppqppipppi")
 _balls = native.Function("frustum_balls", "pppppqppfipi")
+_balls_backward = native.Function("frustum_balls_backward", "pppppqppipppi")

@@ -199,7 +199,7 @@ OPERATIONS = {
             "starts": rand(20), "lengths": rand(20), "radii": rand(20), "turns": rand(20),
             "box": torch.tensor([[-1.0] * 3, [1.0, 2.0, 1.5]]),
         },
-        ("multisamples",),
+        ("multisamples", "multisamples_backward"),
     ),
     "frustum balls": Operation(
         lambda origins, directions, starts, lengths, box: frustum_balls(
@@ -213,7 +213,7 @@ OPERATIONS = {
             "starts": torch.rand(20), "lengths": 0.1 + torch.rand(20),
             "box": torch.tensor([[-1.0] * 3, [1.0, 2.0, 1.5]]),
         },
-        ("frustum_balls",),
+        ("frustum_balls", "frustum_balls_backward"),
     ),
     "planes": Operation(
         lambda positions, table: planes(positions, table, PLANES),

@@ -1,5 +1,7 @@
 """The hash grid at multisamples: compiled against reference, and both against look-ups of single points."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -58,9 +60,9 @@ def test_one_point_without_size_is_a_plain_look_up() -> None:
 @pytest.mark.parametrize(("each", "spread"), [(6, 1e-4), (6, 0.02), (6, 1.0), (1, 0.1), (3, 0.01)])
 def test_compiled_values_and_gradients_are_the_references(each: int, spread: float, features: int) -> None:
     """With points that share their cells at all levels, at some, and at none."""
-    x, found = points(203, each, spread), []
+    x, found = points(603, each, spread), []
     table = torch.randn(LAYOUT.num_entries, features, generator=torch.Generator().manual_seed(1))
-    direction = torch.randn(203, 4 * features, generator=torch.Generator().manual_seed(2))
+    direction = torch.randn(603, 4 * features, generator=torch.Generator().manual_seed(2))
     direction[::3] = 0
     for form in (multisampled_grid, multisampled_grid_reference):
         p, t = x.clone().requires_grad_(), table.clone().requires_grad_()
@@ -224,11 +226,41 @@ def test_a_ball_has_the_mean_and_the_volume_of_points_in_its_frustum(contracted:
     assert found[3].item() == pytest.approx(deviation.item(), rel=0.01)
 
 
+def gradients_of_rays(form: str, cones: Frustums, box: Tensor, contracted: bool) -> tuple[Tensor, Tensor]:
+    """The gradients by origins and directions of a random direction in what stands for the frustums, in one form."""
+    origins, directions = (x.clone().requires_grad_() for x in (cones.origins, cones.directions))
+    learnt = replace(cones, origins=origins, directions=directions)
+    if "ball" in form:
+        out = (frustum_balls if form == "ball" else frustum_balls_reference)(learnt, box, contracted)
+    else:
+        out = (unit_multisamples if form == "points" else unit_multisamples_reference)(
+            learnt, fixed_pattern(replace(cones, ranks=torch.arange(len(cones)))), box, contracted
+        )
+    weights = torch.randn(out.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    found = torch.autograd.grad((out * weights).sum(), (origins, directions))
+    return found[0], found[1]
+
+
+@needs_kernels
+@pytest.mark.parametrize("contracted", [True, False])
 @pytest.mark.parametrize("form", ["points", "ball"])
-def test_learnt_rays_have_the_references_gradient(form: str) -> None:
+def test_compiled_gradients_of_learnt_rays_are_the_references(form: str, contracted: bool) -> None:
+    """Near the camera and 10,000 times as far away as the box, and in all directions."""
+    cones = frustums(203)
+    found = gradients_of_rays(form, cones, BOX, contracted)
+    double = Frustums(*(x.double() for x in vars(cones).values() if x is not None))
+    truth = gradients_of_rays(f"{form} reference", double, BOX.double(), contracted)
+    for name, ours, exact in zip(("origins", "directions"), found, truth, strict=True):
+        size = exact.abs().amax(1, keepdim=True)
+        assert size.min().item() > 0, name
+        assert ((ours - exact).abs() / size).max().item() < 2e-4, name
+
+
+@pytest.mark.parametrize("form", ["points", "ball"])
+def test_learnt_rays_move_what_stands_for_their_frustums(form: str) -> None:
     cones = frustums(10)
     origins = cones.origins.clone().requires_grad_()
-    learnt = Frustums(origins, cones.directions, cones.t_starts, cones.t_ends, cones.radii)
+    learnt = replace(cones, origins=origins)
     if form == "ball":
         x, each = frustum_balls(learnt, BOX, False), 1
     else:

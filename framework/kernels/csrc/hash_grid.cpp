@@ -89,22 +89,50 @@ struct Gathered {
     }
 };
 
+// Adds the gradient of one level by positions to `out`; `grad`: the incoming one of the level, rows `stride` wide.
+template <int F, bool DENSE>
+void add_position_gradient(const Level& level, const Floats (*xyz)[3], int64_t count, const float* table,
+                           const float* grad, int64_t stride, Floats (*out)[3]) {
+    Cell cells[2];  // this block's and the next one's, whose entries are on their way meanwhile
+    alignas(64) float value[CORNERS][LANES] = {};
+    const float* entries = table + level.offset * F;
+    find_cell<DENSE>(level, (*xyz)[0], (*xyz)[1], (*xyz)[2], cells[0]);
+    for (int64_t n = 0, turn = 0; n < count; n += LANES, turn ^= 1) {
+        if (n + LANES < count) {
+            xyz++;
+            find_cell<DENSE>(level, (*xyz)[0], (*xyz)[1], (*xyz)[2], cells[turn ^ 1]);
+            grid::prefetch<F>(cells[turn ^ 1], entries);
+        }
+        for (int s = 0; s < block(n, count); s++)
+            weigh_corners<F>(cells[turn], s, entries, grad + (n + s) * stride, value);
+        add_slopes(cells[turn], value, *out++);
+    }
+}
+
 template <int F>
 void backward_positions(const float* positions, int64_t count, const float* table, const float* grad,
                         const int64_t* resolutions, const int64_t* offsets, int levels, float* out, int threads) {
-    const int64_t stride = int64_t(levels) * F, blocks = (count + LANES - 1) / LANES;
-    for_each(threads, blocks, 256 / LANES, [&](int64_t b) {
-        const int64_t n = b * LANES;
-        const int size = block(n, count);
-        Floats xyz[3], sum[3] = {splat(0), splat(0), splat(0)};
-        load_positions(positions, n, size, xyz);
+    const int64_t stride = int64_t(levels) * F;
+    std::vector<int64_t> live;
+    rows_with_gradient(grad, count, stride, live);
+    if (int64_t(live.size()) < count) std::memset(out, 0, sizeof(float) * size_t(count) * 3);
+    for_ranges(threads, int64_t(live.size()), CHUNK, [&](int64_t begin, int64_t end) {
+        const int64_t size = end - begin, *rows = live.data() + begin;
+        const std::unique_ptr<float[]> incoming(new float[size_t(size * stride)]);
+        float places[CHUNK * 3];
+        Floats xyz[CHUNK / LANES][3], sum[CHUNK / LANES][3] = {};
+        for (int64_t n = 0; n < size; n++) {
+            std::memcpy(places + n * 3, positions + rows[n] * 3, sizeof(float) * 3);
+            std::memcpy(incoming.get() + n * stride, grad + rows[n] * stride, sizeof(float) * size_t(stride));
+        }
+        for (int64_t n = 0; n < size; n += LANES) load_positions(places, n, block(n, size), xyz[n / LANES]);
         for (int l = 0; l < levels; l++) {
             const Level level = level_of(resolutions, offsets, l);
             const auto run = level.dense ? add_position_gradient<F, true> : add_position_gradient<F, false>;
-            run(level, table, xyz, size, grad + n * stride + l * F, stride, sum);
+            run(level, xyz, size, table, incoming.get() + l * F, stride, sum);
         }
-        for (int s = 0; s < size; s++)
-            for (int axis = 0; axis < 3; axis++) out[(n + s) * 3 + axis] = sum[axis][s];
+        for (int64_t n = 0; n < size; n++)
+            for (int axis = 0; axis < 3; axis++) out[rows[n] * 3 + axis] = sum[n / LANES][axis][n % LANES];
     });
 }
 

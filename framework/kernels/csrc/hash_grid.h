@@ -138,16 +138,19 @@ void encode(const float* positions, int64_t begin, int64_t end, const float* tab
     }
 }
 
-template <int F, bool DENSE>
-inline void add_position_gradient(const Level& level, const float* table, const Floats* xyz, int size,
-                                  const float* grad, int64_t stride, Floats* out) {
-    Cell cell;
-    find_cell<DENSE>(level, xyz[0], xyz[1], xyz[2], cell);
-    alignas(64) float value[CORNERS][LANES] = {};  // of the incoming gradient times each corner's entry
-    for (int c = 0; c < CORNERS; c++)
-        for (int s = 0; s < size; s++)
-            for (int f = 0; f < F; f++)
-                value[c][s] += table[(level.offset + cell.entry[c][s]) * F + f] * grad[s * stride + f];
+// What the entries at the corners of a lane's cell are worth: each times the incoming gradient `grad`, to value[c][s].
+template <int F>
+inline void weigh_corners(const Cell& cell, int s, const float* entries, const float* grad, float (*value)[LANES]) {
+    for (int c = 0; c < CORNERS; c++) {
+        const float* entry = entries + int64_t(cell.entry[c][s]) * F;
+        float sum = 0;
+        for (int f = 0; f < F; f++) sum += entry[f] * grad[f];
+        value[c][s] = sum;
+    }
+}
+
+// Adds the gradient by the position to `out`, by what the corners are worth.
+inline void add_slopes(const Cell& cell, const float (*value)[LANES], Floats* out) {
     const Floats* t = cell.fraction;
     for (int axis = 0; axis < 3; axis++) {
         const int one = 4 >> axis, p = axis == 0 ? 1 : 0, q = axis == 2 ? 1 : 2;  // p, q: the other two axes

@@ -70,30 +70,45 @@ inline Words entries_of(const Cell& cell, int corner) {
     return out;
 }
 
-template <int F>
-inline void prefetch(const Cell& cell, int s, const float* entries) {
-    for (int c = 0; c < CORNERS; c++) __builtin_prefetch(entries + int64_t(cell.entry[c][s]) * F);
+// Which lanes have other corners than before.
+inline Ints have_moved(const Cell& here, const Cell& before) {
+    Ints moved = {};
+    for (int c = 0; c < CORNERS; c++) moved |= entries_of(here, c) != entries_of(before, c);
+    return moved;
 }
+
+// Of the lanes whose bits are set.
+template <int F>
+inline void prefetch(const Cell& cell, uint32_t lanes, const float* entries) {
+    for (; lanes; lanes &= lanes - 1)
+        for (int c = 0; c < CORNERS; c++)
+            __builtin_prefetch(entries + int64_t(cell.entry[c][__builtin_ctz(lanes)]) * F);
+}
+
+// Whether a level, of F features, is too large to stay in a near cache.
+template <int F>
+inline bool is_far(const Level& level) {
+    return (size_t(level.mask) + 1) * F > NEAR;
+}
+
+inline uint32_t first_lanes(int size) { return uint32_t((uint64_t(1) << size) - 1); }
 
 // Calls visit(cell, s) for each run of consecutive points of sample s that have the same corners, whose weights in
 // `cell` are those of the run.
 template <int F, bool DENSE, typename Visit>
 inline void for_runs(const Level& level, const Point* points, int per_sample, int size, const float* entries,
                      const Visit& visit) {
-    const bool far = (size_t(level.mask) + 1) * F > NEAR;
-    const uint32_t all = uint32_t((uint64_t(1) << size) - 1);
+    const bool far = is_far<F>(level);
+    const uint32_t all = first_lanes(size);
     Cell cells[2];
     for (int j = 0; j < per_sample; j++) {
         Cell &before = cells[~j & 1], &here = cells[j & 1];
         const Floats* xyz = points[j].xyz;
         find_cell<DENSE>(level, xyz[0], xyz[1], xyz[2], here);
         const Floats share = share_of(level, points[j].deviation, per_sample);
-        Ints moved = {};
-        if (j)
-            for (int c = 0; c < CORNERS; c++) moved |= entries_of(here, c) != entries_of(before, c);
+        const Ints moved = j ? have_moved(here, before) : Ints{};
         const uint32_t fresh = j ? bits_of(moved) & all : all;
-        if (far)
-            for (uint32_t left = fresh; left; left &= left - 1) prefetch<F>(here, __builtin_ctz(left), entries);
+        if (far) prefetch<F>(here, fresh, entries);
         if (j == 0) {
             for (int c = 0; c < CORNERS; c++) store(here.weight[c], load(here.weight[c]) * share);
             continue;
@@ -177,11 +192,12 @@ void scatter_level(const Level& level, const Point* points, int per_sample, int6
         });
 }
 
-// Samples with a gradient, which come in parts, each with its own number of points a sample: points in blocks of LANES
-// samples, and the incoming gradient level by level.
+// Samples with a gradient, which come in parts, each with its own number of points a sample: which rows they are, points
+// in blocks of LANES samples, and the incoming gradient level by level.
 template <int F>
 struct Gathered {
     struct Part {
+        std::vector<int64_t> rows;
         int64_t count;
         int per_sample;
         std::unique_ptr<Point[]> points;
@@ -193,21 +209,22 @@ struct Gathered {
     Gathered(const float* const* points, const float* const* grads, const int64_t* ends, const int64_t* per_sample,
              int count, int levels, int threads) {
         const int64_t stride = int64_t(levels) * F;
-        std::vector<int64_t> live;
         for (int i = 0; i < count; i++) {
+            std::vector<int64_t> live;
             rows_with_gradient(grads[i], ends[i] - (i ? ends[i - 1] : 0), stride, live);
             const int64_t size = int64_t(live.size());
             const int own = int(per_sample[i]);
-            Part part{size, own, std::unique_ptr<Point[]>(new Point[size_t((size + LANES - 1) / LANES * own)]),
+            Part part{std::move(live), size, own,
+                      std::unique_ptr<Point[]>(new Point[size_t((size + LANES - 1) / LANES * own)]),
                       std::unique_ptr<float[]>(new float[size_t(size * stride)])};
             for_ranges(threads, size, CHUNK, [&](int64_t begin, int64_t end) {
                 for (int64_t n = begin; n < end; n += LANES)
                     load_points(points[i], own, block(n, end), part.points.get() + n / LANES * own,
-                                [&](int s) { return live[size_t(n + s)]; });
+                                [&](int s) { return part.rows[size_t(n + s)]; });
                 for (int64_t n = begin; n < end; n++)
                     for (int l = 0; l < levels; l++)
                         std::memcpy(part.by_level.get() + (l * size + n) * F,
-                                    grads[i] + live[size_t(n)] * stride + l * F, sizeof(float) * F);
+                                    grads[i] + part.rows[size_t(n)] * stride + l * F, sizeof(float) * F);
             });
             parts.push_back(std::move(part));
         }
@@ -220,32 +237,65 @@ struct Gathered {
     }
 };
 
+// Adds the gradient of one level by the points of `count` samples to `out`, which has three sums for each block of
+// points; `grad`: that of the level, (count, F). The points of a run look up once what its corners are worth.
+template <int F, bool DENSE>
+void add_point_gradient(const Level& level, const Point* points, int per_sample, int64_t count, const float* table,
+                        const float* grad, Floats (*out)[3]) {
+    const float* entries = table + level.offset * F;
+    const bool far = is_far<F>(level);
+    alignas(64) float value[CORNERS][LANES] = {};
+    Cell cells[2];  // this point's and the next one's, whose entries are on their way meanwhile
+    uint32_t fresh[2];
+    for (int64_t n = 0; n < count; n += LANES, points += per_sample) {
+        const uint32_t all = first_lanes(block(n, count));
+        const auto find = [&](int j) {
+            Cell& here = cells[j & 1];
+            find_cell<DENSE>(level, points[j].xyz[0], points[j].xyz[1], points[j].xyz[2], here);
+            fresh[j & 1] = j ? bits_of(have_moved(here, cells[~j & 1])) & all : all;
+            if (far) prefetch<F>(here, fresh[j & 1], entries);
+        };
+        find(0);
+        for (int j = 0; j < per_sample; j++) {
+            const Cell& here = cells[j & 1];
+            if (j + 1 < per_sample) find(j + 1);
+            for (uint32_t left = fresh[j & 1]; left; left &= left - 1) {
+                const int s = __builtin_ctz(left);
+                weigh_corners<F>(here, s, entries, grad + (n + s) * F, value);
+            }
+            Floats own[3] = {splat(0), splat(0), splat(0)};
+            add_slopes(here, value, own);
+            const Floats share = share_of(level, points[j].deviation, per_sample);
+            for (int axis = 0; axis < 3; axis++) (*out)[axis] += share * own[axis];
+            out++;
+        }
+    }
+}
+
 template <int F>
 void backward_points(const float* points, int64_t count, int per_sample, const float* table, const float* grad,
                      const int64_t* resolutions, const int64_t* offsets, int levels, float* out, int threads) {
-    const int64_t stride = int64_t(levels) * F, blocks = (count + LANES - 1) / LANES;
-    for_each(threads, blocks, 256 / LANES, [&](int64_t b) {
-        const int64_t n = b * LANES;
-        const int size = block(n, count);
-        const std::unique_ptr<Point[]> loaded(new Point[size_t(per_sample)]);
-        load_points(points, per_sample, n, size, loaded.get());
-        for (int j = 0; j < per_sample; j++) {
-            const Point& point = loaded[size_t(j)];
-            Floats sum[3] = {splat(0), splat(0), splat(0)};
-            for (int l = 0; l < levels; l++) {
-                const Level level = level_of(resolutions, offsets, l);
-                const auto run = level.dense ? add_position_gradient<F, true> : add_position_gradient<F, false>;
-                Floats own[3] = {splat(0), splat(0), splat(0)};
-                run(level, table, point.xyz, size, grad + n * stride + l * F, stride, own);
-                const Floats share = share_of(level, point.deviation, per_sample);
-                for (int axis = 0; axis < 3; axis++) sum[axis] += share * own[axis];
-            }
-            for (int s = 0; s < size; s++) {
-                float* to = out + ((n + s) * per_sample + j) * 4;
-                for (int axis = 0; axis < 3; axis++) to[axis] = sum[axis][s];
+    const int64_t each = per_sample;
+    const Gathered<F> gathered(&points, &grad, &count, &each, 1, levels, threads);
+    const auto& live = gathered.parts[0];
+    const int64_t row = each * 4;
+    if (live.count < count) std::memset(out, 0, sizeof(float) * size_t(count * row));
+    for_ranges(threads, live.count, CHUNK, [&](int64_t begin, int64_t end) {
+        const int64_t size = end - begin, first = begin / LANES * each;
+        const std::unique_ptr<Floats[][3]> sums(new Floats[size_t((size + LANES - 1) / LANES * each)][3]());
+        for (int l = 0; l < levels; l++) {
+            const Level level = level_of(resolutions, offsets, l);
+            const auto run = level.dense ? add_point_gradient<F, true> : add_point_gradient<F, false>;
+            const float* incoming = live.by_level.get() + (l * live.count + begin) * F;
+            run(level, live.points.get() + first, per_sample, size, table, incoming, sums.get());
+        }
+        for (int64_t n = 0; n < size; n++)
+            for (int j = 0; j < per_sample; j++) {
+                const Floats* sum = sums[size_t(n / LANES * each + j)];
+                float* to = out + live.rows[size_t(begin + n)] * row + j * 4;
+                for (int axis = 0; axis < 3; axis++) to[axis] = sum[axis][n % LANES];
                 to[3] = 0;
             }
-        }
     });
 }
 

@@ -26,12 +26,13 @@ PAIRS = tuple(combinations_with_replacement(range(3), 2))
 TRIPLES = tuple((PAIRS.index((a, b)), c) for a, b, c in combinations_with_replacement(range(3), 3))
 """Pair and axis of the products x x x, x x y, ..., z z z."""
 _harmonics = native.Function("spherical_harmonics", "pqipi")
+_backward = native.Function("spherical_harmonics_backward", "pqippi")
 
 
 def spherical_harmonics(directions: Tensor, levels: int = 4) -> Tensor:
     """Return the first real spherical harmonics Y_l^m of directions, ordered by l = 0, 1, ... and m = -l ... l.
 
-    The compiled form has no derivatives.
+    The compiled form has first derivatives only.
 
     Args:
         directions: (N, 3) unit vectors.
@@ -83,17 +84,34 @@ def _polynomials(x: Any, y: Any, z: Any, levels: int) -> list[Any]:
 SPHERICAL_HARMONICS = Operation("spherical_harmonics", spherical_harmonics_reference)
 
 
-@SPHERICAL_HARMONICS.implementation(CPP, order=0)
+@SPHERICAL_HARMONICS.implementation(CPP)
 def _compiled(directions: Tensor, levels: int = 4) -> Tensor:
-    rows = directions.contiguous()
+    return _Harmonics.apply(directions.contiguous(), levels)
 
-    def compute() -> Tensor:
-        out = rows.new_empty(len(rows), levels**2)
-        address = native.pointer(rows, "directions", (len(rows), 3))
-        _harmonics(address, len(rows), levels, out.data_ptr(), native.threads())
-        return out
 
-    return kept.result(("spherical_harmonics", levels), (rows,), (), compute)
+class _Harmonics(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, directions: Tensor, levels: int) -> Tensor:
+        count = len(directions)
+
+        def compute() -> Tensor:
+            out = directions.new_empty(count, levels**2)
+            address = native.pointer(directions, "directions", (count, 3))
+            _harmonics(address, count, levels, out.data_ptr(), native.threads())
+            return out
+
+        ctx.save_for_backward(directions)
+        ctx.levels = levels
+        return kept.result(("spherical_harmonics", levels), (directions,), (), compute)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        (directions,), grad = ctx.saved_tensors, grad.contiguous()
+        count, out = len(directions), torch.empty_like(directions)
+        address = native.pointer(grad, "the gradient", (count, ctx.levels**2))
+        _backward(directions.data_ptr(), count, ctx.levels, address, out.data_ptr(), native.threads())
+        return out, None
 
 
 SPHERICAL_HARMONICS.implementation(TRITON, order=0)(later("encodings", "spherical_harmonics"))

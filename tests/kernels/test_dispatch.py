@@ -300,7 +300,9 @@ def test_what_is_taken() -> None:
 @pytest.mark.parametrize(
     ("operation", "followed", "expected"),
     [
-        (SPHERICAL_HARMONICS, 0, "reference"),
+        (SPHERICAL_HARMONICS, 0, "c++"),
+        (UNIT_MULTISAMPLES, 1, "c++"),
+        (UNIT_MULTISAMPLES, 2, "reference"),
         (CONTRACT, 0, "c++"),
         (CONTRACT, 1, "reference"),
         (DENSITY_NETWORK, 0, "c++"),

@@ -273,7 +273,10 @@ OPERATIONS = {
         ("frequency_encoding", "frequency_encoding_backward"),
     ),
     "spherical harmonics": Operation(
-        spherical_harmonics, spherical_harmonics_reference, lambda: {"directions": rand(9, 3)}, ("spherical_harmonics",)
+        spherical_harmonics,
+        spherical_harmonics_reference,
+        lambda: {"directions": rand(9, 3)},
+        ("spherical_harmonics", "spherical_harmonics_backward"),
     ),
     "interval weights": Operation(
         interval_weights,

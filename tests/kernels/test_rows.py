@@ -33,7 +33,14 @@ def test_the_gradient_of_taken_rows() -> None:
 @needs_kernels
 @pytest.mark.parametrize("levels", [1, 2, 3, 4])
 def test_compiled_spherical_harmonics(levels: int) -> None:
-    directions = torch.nn.functional.normalize(torch.randn(1000, 3), dim=-1)
-    truth = spherical_harmonics_reference(directions.double(), levels)
-    assert relative_error(spherical_harmonics(directions, levels), truth) < 1e-6
+    directions = torch.nn.functional.normalize(torch.randn(5000, 3), dim=-1)
+    weights = torch.randn(5000, levels**2, dtype=torch.float64)
+    found = []
+    for form, given in ((spherical_harmonics, directions), (spherical_harmonics_reference, directions.double())):
+        leaf = given.clone().requires_grad_()
+        out = form(leaf, levels)
+        by_directions = torch.autograd.grad((out * weights).sum(), leaf) if levels > 1 else ()
+        found.append((out, *by_directions))
+    for value, truth in zip(*found, strict=True):
+        assert relative_error(value, truth) < 1e-6
     assert spherical_harmonics(directions[:0], levels).shape == (0, levels**2)

@@ -39,6 +39,12 @@ void sines_and_cosines(const float* angles, int count, float* sines, float* cosi
     }
 }
 
+// How many harmonics `levels` bands have.
+inline int harmonics_of_levels(int levels) {
+    if (levels < 1 || levels > 4) throw std::invalid_argument("spherical harmonics have 1 to 4 levels");
+    return levels * levels;
+}
+
 }  // namespace
 
 // Rows [x, sin(x), cos(x), sin(2 x), ...] of x (N, dims); x itself only where `include_input`.
@@ -91,10 +97,23 @@ EXPORT int frequency_encoding_backward(const float* rows, const float* grad, int
 // Real spherical harmonics of directions (N, 3), `levels` bands.
 EXPORT int spherical_harmonics(const float* directions, int64_t count, int levels, float* out, int threads) {
     return guarded([&] {
-        if (levels < 1 || levels > 4) throw std::invalid_argument("spherical harmonics have 1 to 4 levels");
-        const int width = levels * levels;
+        const int width = harmonics_of_levels(levels);
         for_each(threads, count, 2048, [&](int64_t n) {
-            harmonics_of(directions + n * 3, width, out + n * width);
+            const float* d = directions + n * 3;
+            out[n * width] = FIRST_HARMONIC;
+            harmonics(d[0], d[1], d[2], width - 1, out + n * width + 1);
+        });
+    });
+}
+
+// The gradient (N, 3) by directions, from `grad` (N, levels^2) by their harmonics.
+EXPORT int spherical_harmonics_backward(const float* directions, int64_t count, int levels, const float* grad,
+                                        float* out, int threads) {
+    return guarded([&] {
+        const int width = harmonics_of_levels(levels);
+        for_each(threads, count, 2048, [&](int64_t n) {
+            const float* d = directions + n * 3;
+            harmonics_gradient(d[0], d[1], d[2], width - 1, grad + n * width + 1, out + n * 3);
         });
     });
 }

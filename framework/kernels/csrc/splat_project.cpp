@@ -36,28 +36,6 @@ inline void put(float* table, int64_t from, int64_t count, int width, int c, Flo
     for (int i = 0; i < LANES && from + i < count; i++) table[(from + i) * width + c] = out[i];
 }
 
-// Of the sum of g[k] times each harmonic, the gradient.
-inline void harmonics_gradient(Floats x, Floats y, Floats z, int basis, const Floats* g, Floats* out) {
-    Floats gx{}, gy{}, gz{};
-    if (basis >= 3) gy -= 0.4886025119029199f * g[0], gz += 0.4886025119029199f * g[1], gx -= 0.4886025119029199f * g[2];
-    if (basis >= 8) {
-        gx += 1.0925484305920792f * (y * g[3] - z * g[6] + x * g[7]);
-        gy += 1.0925484305920792f * (x * g[3] - z * g[4] - y * g[7]);
-        gz += -1.0925484305920792f * (y * g[4] + x * g[6]) + 6 * 0.31539156525252005f * z * g[5];
-    }
-    if (basis >= 15) {
-        gx += -0.5900435899266435f * 6 * x * y * g[8] + 2.890611442640554f * y * z * g[9] -
-              0.4570457994644658f * (5 * z * z - 1) * g[12] + 2 * 1.445305721320277f * x * z * g[13] -
-              0.5900435899266435f * 3 * (x * x - y * y) * g[14];
-        gy += -0.5900435899266435f * 3 * (x * x - y * y) * g[8] + 2.890611442640554f * x * z * g[9] -
-              0.4570457994644658f * (5 * z * z - 1) * g[10] - 2 * 1.445305721320277f * y * z * g[13] +
-              0.5900435899266435f * 6 * x * y * g[14];
-        gz += 2.890611442640554f * x * y * g[9] - 0.4570457994644658f * 10 * z * (y * g[10] + x * g[12]) +
-              0.3731763325901154f * (15 * z * z - 3) * g[11] + 1.445305721320277f * (x * x - y * y) * g[13];
-    }
-    out[0] = gx, out[1] = gy, out[2] = gz;
-}
-
 }  // namespace
 
 // A record of each Gaussian, (count, RECORD). One that is not visible has a CUT of 0, and zeros elsewhere. Returns how
@@ -129,7 +107,7 @@ EXPORT int splat_project_backward(const float* means, const float* log_scales, c
                 for (int i = 0; i < 3; i++) {
                     const Floats shade = column(records, from, count, RECORD, RED + i);
                     const Floats own = shade > 0 ? d[RED + i] : splat(0);  // cut off below 0
-                    give(of_colors, 3, i, DC * own);
+                    give(of_colors, 3, i, FIRST_HARMONIC * own);
                     for (int k = 0; k < basis; k++) {
                         of_basis[k] += own * column(harmonic, from, count, 3 * stride, i * stride + k);
                         give(of_harmonic, 3 * stride, i * stride + k, own * basis_values[k]);

@@ -2,6 +2,7 @@
 // equations. A source says what their parameters are: mean(from, i) and so on return one of LANES Gaussians in a row.
 #pragma once
 
+#include "harmonics.h"
 #include "lens.h"
 #include "splat.h"
 
@@ -9,7 +10,6 @@
 
 namespace {
 
-constexpr float DC = 0.28209479177387814f;
 constexpr int MAX_BASIS = 15;
 
 struct Camera {
@@ -37,27 +37,6 @@ struct Camera {
         if (lens == FISHEYE) low_x = low_y = -INFINITY, high_x = high_y = INFINITY;
     }
 };
-
-// The real spherical harmonics of degrees 1 to 3 (Sloan 2008).
-inline void harmonics(Floats x, Floats y, Floats z, int basis, Floats* b) {
-    if (basis >= 3) b[0] = -0.4886025119029199f * y, b[1] = 0.4886025119029199f * z, b[2] = -0.4886025119029199f * x;
-    if (basis >= 8) {
-        b[3] = 1.0925484305920792f * x * y;
-        b[4] = -1.0925484305920792f * y * z;
-        b[5] = 0.31539156525252005f * (3 * z * z - 1);
-        b[6] = -1.0925484305920792f * x * z;
-        b[7] = 0.5462742152960396f * (x * x - y * y);
-    }
-    if (basis >= 15) {
-        b[8] = -0.5900435899266435f * y * (3 * x * x - y * y);
-        b[9] = 2.890611442640554f * x * y * z;
-        b[10] = -0.4570457994644658f * y * (5 * z * z - 1);
-        b[11] = 0.3731763325901154f * z * (5 * z * z - 3);
-        b[12] = -0.4570457994644658f * x * (5 * z * z - 1);
-        b[13] = 1.445305721320277f * z * (x * x - y * y);
-        b[14] = -0.5900435899266435f * x * (x * x - 3 * y * y);
-    }
-}
 
 inline Floats logistic(Floats x) { return 1.0f / (1.0f + exponential(-x)); }
 
@@ -215,7 +194,7 @@ struct Projected {
 
 template <typename Source>
 inline Floats color_of(const Source& in, int64_t from, int channel, int basis, const Floats* values) {
-    Floats color = 0.5f + DC * in.color(from, channel);
+    Floats color = 0.5f + FIRST_HARMONIC * in.color(from, channel);
     for (int k = 0; k < basis; k++) color += values[k] * in.harmonic(from, channel, k);
     return color;
 }

@@ -108,13 +108,14 @@ struct Block {
     void shade() {
         const int64_t width = nets.density.width;
         float* inputs = room(own.inputs, size_t(count * nets.inputs));
-        float harmonics[16];
+        float basis[16] = {FIRST_HARMONIC};
         for (int64_t r = 0; r < rays; r++) {
-            harmonics_of(path.directions + (base + r) * 3, nets.harmonics, harmonics);
+            const float* d = path.directions + (base + r) * 3;
+            harmonics(d[0], d[1], d[2], nets.harmonics - 1, basis + 1);
             for (int64_t n = first[r]; n < first[r + 1]; n++) {
                 float* to = inputs + n * nets.inputs;
                 std::memcpy(to, &own.samples.outputs[size_t(order[n] * width)], sizeof(float) * size_t(width));
-                std::memcpy(to + width, harmonics, sizeof(float) * size_t(nets.harmonics));
+                std::memcpy(to + width, basis, sizeof(float) * size_t(nets.harmonics));
             }
         }
         rgb = room(own.rgb, size_t(count) * 3);

@@ -10,9 +10,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from dataparsers.placing import placement_of
 from framework import Cameras, DataError, DataParser, ParsedScene
 from framework.cameras.cameras import LENSES
-from framework.cameras.poses import Center, Orientation, Placement, estimate_near, held_out, place
+from framework.cameras.poses import Center, Orientation, Placement, estimate_near, held_out
 from framework.data.dataset import Split, existing_files, image_size
 from framework.data.scene import PoseSource
 from framework.data.tracks import Sightings, Tracks
@@ -47,7 +48,8 @@ class Captured(DataParser):
     center_method: Center = "poses"
     """Origin: the cameras' mean position (poses), the point that they look at (focus), or unchanged."""
     auto_scale_poses: bool = True
-    """Scale camera positions to fit the cube from -1 to 1."""
+    """Scale camera positions to fit the cube from -1 to 1. If long lenses show less than half a scene unit of what most
+    cameras look at, it is enlarged until they show one."""
     eval_interval: int = 8
     """Interval of held-out images, by sorted name, which are both val and test split; 0 holds out none."""
     near: float | None = None
@@ -138,10 +140,7 @@ def captured_scene(flags: Captured, images: PosedImages, split: Split, division:
             f"{images.folder}: split '{split}' has none of the {len(names)} images; "
             "--eval-interval 0 uses all in every split"
         )
-    # A device knows where gravity pulls, and its images are upright.
-    orientation = "up" if flags.orientation_method == "auto" and flags.poses == "device" else flags.orientation_method
-    placement = place(images.poses, orientation, flags.center_method, flags.auto_scale_poses)
-    placement = replace(placement, scale=placement.scale * flags.scale_factor)
+    placement = placement_of(flags, images, split)
     cameras = _cameras(images, placement)
     points, sightings = _sparse_points(images, placement, cameras, chosen if split == "train" else None)
     near = min(estimate_near(cameras, points), flags.far / 2) if flags.near is None else flags.near

@@ -20,6 +20,10 @@ NEAR = 0.05
 """Near distance without sparse points, scene units."""
 NEAR_SHARE = 0.5
 """Near distance as a fraction of the distance to the nearest sparse points."""
+SMALL_VIEW = 0.5
+"""Scene units that images show where their cameras look below which a scene is enlarged (`enlargement`)."""
+MOST_LOOK = 0.9
+"""Share of the cameras that must have the place where they look in the picture for a scene to be enlarged."""
 MOST_POINTS = 2000
 """Maximum number of sparse points that are used."""
 
@@ -147,6 +151,32 @@ def looked_at(poses: Tensor) -> Tensor | None:
     point = nearest_point(origins, ahead)
     is_ahead = ((point - origins) * ahead).sum(-1) > 0
     return point if bool(point.isfinite().all()) and float(is_ahead.double().mean()) >= 0.5 else None
+
+
+def enlargement(poses: Tensor, spreads: Tensor) -> float:
+    """Return a factor for scenes that cameras see from afar through long lenses, so that they do not fill their box.
+
+    The rules of `place` fit a box to the cameras. What these look at may be a small part of it: a statue that strangers
+    photographed from afar is a tenth of the box high, and a cell of a hash grid as wide as five pixels. If the images
+    show less than `SMALL_VIEW` where their cameras look, in the median, the factor makes that 1. Other scenes stay as
+    they are.
+
+    Args:
+        poses: (M, 3, 4) camera-to-world, OpenGL axes, scene coordinates.
+        spreads: (M,) length that the longer side of each image shows, for each unit of distance.
+
+    Returns:
+        The factor; 1 if not `MOST_LOOK` of the cameras look at one place, or if they see enough of it.
+    """
+    point = looked_at(poses)
+    if point is None:
+        return 1.0
+    away = point - poses[:, :, 3].double()
+    depths = -(away * poses[:, :, 2].double()).sum(-1)
+    shown = depths * spreads
+    inside = (depths > 0) & ((away.norm(dim=-1).square() - depths.square()).clamp(min=0).sqrt() < shown / 2)
+    median = float(shown.median())
+    return 1 / median if 0 < median < SMALL_VIEW and float(inside.double().mean()) >= MOST_LOOK else 1.0
 
 
 def _principal_axes(points: Tensor, up: Tensor) -> Tensor:

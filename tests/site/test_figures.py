@@ -47,6 +47,34 @@ def test_figures_are_those_of_their_files() -> None:
         assert row[1:3] == [psnr_of(found), f"{fmean(run['ssim'] for run in found):.3f}"], row
 
 
+CAPTURED_BY = ("nerfacto-without-points", "nerfacto", "nerfacto-free-space", "zip-nerf", "mip-nerf-360")
+"""Names in the files of the columns of both tables of captures, after the first column."""
+WITH_POINTS = ("can", "cup", "desk")
+"""Captures of which points are known, so that `nerfacto` learns from them."""
+
+
+def test_the_tables_of_captures_are_those_of_their_files() -> None:
+    """The first has PSNR and SSIM, the second steps, seconds an image and, where points are known, floaters."""
+    tables = [row for row in rows(DOCS / "figures.md") if len(row) == 6 and re.match(r"`\w+`", row[0])]
+    checked = 0
+    for number, (first, *cells) in enumerate(tables):
+        capture = first.split("`")[1]
+        for name, cell in zip(CAPTURED_BY, cells, strict=True):
+            file = DOCS / "results" / f"{capture}-{name}-600s.json"
+            expected = file.exists() and (name != "nerfacto" or capture in WITH_POINTS)
+            assert bool(cell) == expected, (first, name)
+            if not cell:
+                continue
+            content = json.loads(file.read_text())
+            found, floaters = content["results"], content["results"].get("floaters")
+            quality = f"{psnr_of([found])}, {found['ssim']:.3f}"
+            share = "" if floaters is None else f", {floaters:.2f} %"
+            work = f"{content['run']['steps']:,}, {1 / found['fps']:.1f} s{share}"
+            assert cell.replace("*", "") == (quality if number < len(tables) // 2 else work), (first, name)
+            checked += 1
+    assert checked >= 40
+
+
 def test_several_seeds_are_a_mean_with_its_spread() -> None:
     assert psnr_of([{"psnr": 31.0}, {"psnr": 32.0}, {"psnr": 33.0}]) == "32.00 ± 1.00 dB"
     assert psnr_of([{"psnr": 31.0}]) == "31.00 dB"

@@ -24,12 +24,15 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+import torch
 import yaml
 
 from framework.base.config import TrainConfig, from_plain, read_yaml, to_plain
 from framework.base.console import say
 from framework.base.errors import ConfigError, DataError
 from framework.base.registry import load_dataparser, load_method
+from framework.cameras.camera_path import read_transforms
+from framework.cameras.poses import Placement
 from framework.data.data_folder import find_data
 from framework.data.dataset import DataParser, Dataset, ParsedScene, Split
 from framework.data.training_images import chosen_images
@@ -37,6 +40,10 @@ from framework.training.checkpoint import write_atomically
 
 CONFIG = "config.yml"
 """Name of the settings in a run's folder."""
+TRANSFORMS = "dataparser_transforms.json"
+"""Name of the placement in a run's folder."""
+PLACED_ALIKE = 1e-3
+"""Distance between two placements of a camera, relative to the furthest from the origin, that does not count."""
 
 
 @dataclass(frozen=True)
@@ -63,16 +70,39 @@ class Run:
         """Read a `split` of the run's data; of the training images, those that the settings choose.
 
         Raises:
-            DataError: if the data is missing or cannot be read.
+            DataError: if the data is missing or cannot be read, or is not placed as when the run was trained.
             ConfigError: if the settings choose training images that the data does not have.
         """
         data = self.config.data
         if data is not None and not os.path.exists(data):
             raise DataError(f"{data}, the run's data, is not there; say where it is now: --data DIR")
         parsed = self.parser.parse(data, split)
+        self._check_placement(parsed)
         if split != "train":
             return parsed
         return chosen_images(parsed, self.config.max_train_images, self.config.train_image_indices)
+
+    def _check_placement(self, parsed: ParsedScene) -> None:
+        """Refuse data whose placement is not the one that a trained run has recorded: every picture would be off."""
+        file = self.folder / TRANSFORMS
+        if not file.is_file():
+            return
+        try:
+            then = read_transforms(file)
+        except DataError as error:
+            say(f"warning: {error}; going on without a check of how the data is placed")
+            return
+        transform = torch.eye(4)[:3] if parsed.transform is None else parsed.transform
+        now = Placement(transform.double(), parsed.scale)
+        origins = parsed.cameras.camera_to_worlds[:, :, 3].double()
+        moved = (then.points(now.original_points(origins)) - origins).norm(dim=-1).max()
+        share = max(float(moved / origins.norm(dim=-1).max().clamp(min=1e-9)), abs(then.scale / now.scale - 1))
+        if not share < PLACED_ALIKE:
+            raise DataError(
+                f"{self.config.data}: cameras are placed otherwise than when {self.folder} was trained, by up to "
+                f"{100 * share:.2g} % of their distance from the origin: images were added or removed since, or the "
+                "format's settings changed; restore them, or train anew"
+            )
 
 
 def run_folder(method: str, config: TrainConfig) -> Path:
@@ -209,4 +239,4 @@ def write_transforms(run: Run, dataset: Dataset) -> None:
         dataset: its data set, with the transform from the input's frame to the scene's.
     """
     content = {"transform": dataset.transform.tolist(), "scale": dataset.scale}
-    write_report(run.folder / "dataparser_transforms.json", content)
+    write_report(run.folder / TRANSFORMS, content)

@@ -136,9 +136,9 @@ BUGS = (
     Bug(
         "scale-factor-before-transform",
         "poses",
-        "dataparsers/captured.py",
-        "placement = replace(placement, scale=placement.scale * flags.scale_factor)",
-        "placement = replace(placement, scale=placement.scale / flags.scale_factor)",
+        "dataparsers/placing.py",
+        "return replace(placement, scale=placement.scale * flags.scale_factor)",
+        "return replace(placement, scale=placement.scale / flags.scale_factor)",
         "--scale-factor 2 halves the scene",
     ),
     Bug(

@@ -61,6 +61,8 @@ def test_the_tables_of_captures_are_those_of_their_files() -> None:
         capture = first.split("`")[1]
         for name, cell in zip(CAPTURED_BY, cells, strict=True):
             file = DOCS / "results" / f"{capture}-{name}-600s.json"
+            if (capture, name) == ("fox", "nerfacto-without-points") and not file.exists():
+                file = DOCS / "results" / "fox-nerfacto-600s.json"
             expected = file.exists() and (name != "nerfacto" or capture in WITH_POINTS)
             assert bool(cell) == expected, (first, name)
             if not cell:

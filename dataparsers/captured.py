@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dataparsers.placing import placement_of
+from dataparsers.placing import Applied, placement_of
 from framework import Cameras, DataError, DataParser, ParsedScene
 from framework.cameras.cameras import LENSES
 from framework.cameras.poses import Center, Orientation, Placement, estimate_near, held_out
@@ -50,6 +50,8 @@ class Captured(DataParser):
     auto_scale_poses: bool = True
     """Scale camera positions to fit the cube from -1 to 1. If long lenses show less than half a scene unit of what most
     cameras look at, it is enlarged until they show one."""
+    placement: Path | None = None
+    """dataparser_transforms.json of a run, ours or nerfstudio's, whose placement is taken instead of all of these."""
     eval_interval: int = 8
     """Interval of held-out images, by sorted name, which are both val and test split; 0 holds out none."""
     near: float | None = None
@@ -116,7 +118,13 @@ Division = Callable[[list[str]], Tensor]
 """Function from the names of all existing images to the indices (S,) of those of a split."""
 
 
-def captured_scene(flags: Captured, images: PosedImages, split: Split, division: Division | None = None) -> ParsedScene:
+def captured_scene(
+    flags: Captured,
+    images: PosedImages,
+    split: Split,
+    division: Division | None = None,
+    applied: Applied | None = None,
+) -> ParsedScene:
     """Return the images of one split, placed together with those of the others.
 
     Missing image files are reported once and left out before anything else is decided.
@@ -126,6 +134,7 @@ def captured_scene(flags: Captured, images: PosedImages, split: Split, division:
         images: images of all splits.
         split: the split to return.
         division: selects the split's images; by default, every `eval_interval`-th is held out.
+        applied: what the poses were moved by before, if the caller undoes it by `from_original`.
 
     Raises:
         DataError: if a flag or a camera is invalid, a camera does not fit its image, or a mask is missing.
@@ -140,7 +149,7 @@ def captured_scene(flags: Captured, images: PosedImages, split: Split, division:
             f"{images.folder}: split '{split}' has none of the {len(names)} images; "
             "--eval-interval 0 uses all in every split"
         )
-    placement = placement_of(flags, images, split)
+    placement = placement_of(flags, images, split, applied)
     cameras = _cameras(images, placement)
     points, sightings = _sparse_points(images, placement, cameras, chosen if split == "train" else None)
     near = min(estimate_near(cameras, points), flags.far / 2) if flags.near is None else flags.near
@@ -163,21 +172,6 @@ def captured_scene(flags: Captured, images: PosedImages, split: Split, division:
         poses=flags.poses,
         depth_paths=images.depths,
     )
-
-
-def from_original(scene: ParsedScene, applied: Tensor, scale: float = 1.0) -> ParsedScene:
-    """Return the scene with `transform` and `scale` relative to an earlier frame.
-
-    Args:
-        scene: a scene with `transform` and `scale` relative to the later frame.
-        applied: (4, 4) rigid transform from the earlier frame to the later one, applied before `scale`.
-        scale: units of the later frame per unit of the earlier: x becomes `scale * (applied @ x)`.
-    """
-    transform = torch.eye(4)[:3] if scene.transform is None else scene.transform
-    # s (R (a A x) + t) = s a (R A x + t / a)
-    moved = transform[:, :3].double() @ applied[:3].double()
-    moved[:, 3] += transform[:, 3] / scale
-    return replace(scene, transform=moved.float(), scale=scene.scale * scale)
 
 
 def image_sizes(paths: Sequence[Path]) -> Tensor:

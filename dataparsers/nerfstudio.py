@@ -17,10 +17,10 @@ from dataparsers.captured import (
     PosedImages,
     captured_scene,
     checked_box,
-    from_original,
     image_sizes,
 )
 from dataparsers.colmap_beside import names_in_model, tracks_beside
+from dataparsers.placing import from_original
 from dataparsers.reading import file_name, number, numbers, read_json, read_pose, read_times, rigid, shown, side
 from framework import DataError, ParsedScene
 from framework.base.console import say
@@ -80,7 +80,7 @@ class Nerfstudio(Captured):
         content = read_json(file)
         images = _posed_images(file, content)
         lists = {} if self.eval_mode == "all" else _lists(file, content, images.names)
-        scene = captured_scene(self, images, split, self._division(split, lists))
+        scene = captured_scene(self, images, split, self._division(split, lists), _applied(content, file))
         scene = replace(scene, depth_unit=self.depth_unit_scale_factor)
         return _from_original(_with_cube(scene, content, file, self.scene_scale), content, file)
 

@@ -5,7 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import torch
+from torch import Tensor
+
+from framework import ParsedScene
 from framework.base.console import say
+from framework.cameras.camera_path import read_transforms
 from framework.cameras.poses import Placement, enlargement, place
 from framework.data.dataset import Split
 
@@ -13,14 +18,26 @@ if TYPE_CHECKING:
     from dataparsers.captured import Captured, PosedImages
 
 
-def placement_of(flags: Captured, images: PosedImages, split: Split) -> Placement:
+Applied = tuple[Tensor, float]
+"""Rigid transform (4, 4) from an earlier frame to that of a format's poses, and units of the later per unit of the
+earlier: x becomes `scale * (transform @ x)`."""
+
+
+def placement_of(flags: Captured, images: PosedImages, split: Split, applied: Applied | None) -> Placement:
     """Return the placement of the scene that all images show, and say if it is enlarged.
 
     Args:
         flags: the format's flags.
         images: images of all splits.
         split: the split that is read; training says what is unusual.
+        applied: what the poses were moved by before, which a placement that the flags name does not know.
+
+    Raises:
+        DataError: if the placement that the flags name cannot be read.
     """
+    if flags.placement is not None:
+        given = read_transforms(flags.placement)
+        return given.after(*applied) if applied else Placement(given.transform.float(), given.scale)
     # A device knows where gravity pulls, and its images are upright.
     orientation = "up" if flags.orientation_method == "auto" and flags.poses == "device" else flags.orientation_method
     placement = place(images.poses, orientation, flags.center_method, flags.auto_scale_poses)
@@ -34,3 +51,18 @@ def placement_of(flags: Captured, images: PosedImages, split: Split) -> Placemen
             )
         placement = replace(placement, scale=placement.scale * factor)
     return replace(placement, scale=placement.scale * flags.scale_factor)
+
+
+def from_original(scene: ParsedScene, applied: Tensor, scale: float = 1.0) -> ParsedScene:
+    """Return the scene with `transform` and `scale` relative to an earlier frame.
+
+    Args:
+        scene: a scene with `transform` and `scale` relative to the later frame.
+        applied: (4, 4) rigid transform from the earlier frame to the later one, applied before `scale`.
+        scale: units of the later frame per unit of the earlier: x becomes `scale * (applied @ x)`.
+    """
+    transform = torch.eye(4)[:3] if scene.transform is None else scene.transform
+    # s (R (a A x) + t) = s a (R A x + t / a)
+    moved = transform[:, :3].double() @ applied[:3].double()
+    moved[:, 3] += transform[:, 3] / scale
+    return replace(scene, transform=moved.float(), scale=scene.scale * scale)

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import torch
 
-from dataparsers.captured import SUFFIXES, Captured, PosedImages, captured_scene, from_original, has_transforms
+from dataparsers.captured import SUFFIXES, Captured, PosedImages, captured_scene, has_transforms
+from dataparsers.placing import from_original
 from dataparsers.reading import number, read_json, rigid, side
 from framework import DataError, ParsedScene
 from framework.data.dataset import Split
@@ -40,7 +41,7 @@ class Polycam(Captured):
         if not pairs:
             raise DataError(f"{path} has no keyframes/cameras with keyframes/images; export Polycam's raw data")
         images = _posed_images(path / "keyframes", *pairs[0])
-        scene = captured_scene(self, images, split)
+        scene = captured_scene(self, images, split, applied=(Z_UP, 1.0))
         return replace(from_original(scene, Z_UP), depth_unit=self.depth_unit_scale_factor)
 
 

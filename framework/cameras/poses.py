@@ -63,6 +63,17 @@ class Placement:
         rotation = self.transform[:, :3].T
         return rotation, 1 / self.scale, -rotation @ self.transform[:, 3]
 
+    def after(self, applied: Tensor, scale: float) -> Placement:
+        """Return the placement of a later frame by which the scene is where it is by this one.
+
+        Args:
+            applied: (4, 4) rigid transform from the input's frame to the later one, applied before `scale`.
+            scale: units of the later frame per unit of the input.
+        """
+        rotation = self.transform[:, :3].double() @ applied[:3, :3].double().T
+        shift = scale * (self.transform[:, 3].double() - rotation @ applied[:3, 3].double())
+        return Placement(torch.cat([rotation, shift[:, None]], dim=-1).float(), self.scale / scale)
+
     def original_poses(self, poses: Tensor) -> Tensor:
         """Transform `poses` (M, 3, 4) from the scene's frame to the input's: the inverse of `Placement.poses`."""
         rotations = self.transform[:, :3].T @ poses[:, :, :3]

@@ -77,7 +77,11 @@ class ParsedScene:
 
 
 class DataParser(ABC):
-    """A data format. Subclasses are frozen dataclasses whose fields are the format's flags."""
+    """A data format. Subclasses are frozen dataclasses whose fields are the format's flags.
+
+    One that places cameras by all of them should have the flag `placement: Path | None`, dataparser_transforms.json of
+    a run whose placement it takes: a trained run gives its own if its images are not those of then.
+    """
 
     interface: ClassVar[int] = 1
     """Version of the plugin interface for which the format was written (`registry.INTERFACE`)."""

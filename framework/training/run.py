@@ -76,33 +76,46 @@ class Run:
         data = self.config.data
         if data is not None and not os.path.exists(data):
             raise DataError(f"{data}, the run's data, is not there; say where it is now: --data DIR")
-        parsed = self.parser.parse(data, split)
-        self._check_placement(parsed)
+        parsed = self._placed_as_trained(self.parser.parse(data, split), split)
         if split != "train":
             return parsed
         return chosen_images(parsed, self.config.max_train_images, self.config.train_image_indices)
 
-    def _check_placement(self, parsed: ParsedScene) -> None:
-        """Refuse data whose placement is not the one that a trained run has recorded: every picture would be off."""
+    def _placed_as_trained(self, parsed: ParsedScene, split: Split) -> ParsedScene:
+        """Return the data placed as the trained run has recorded it: elsewhere, every picture would be off."""
         file = self.folder / TRANSFORMS
         if not file.is_file():
-            return
+            return parsed
         try:
             then = read_transforms(file)
         except DataError as error:
             say(f"warning: {error}; going on without a check of how the data is placed")
-            return
-        transform = torch.eye(4)[:3] if parsed.transform is None else parsed.transform
-        now = Placement(transform.double(), parsed.scale)
-        origins = parsed.cameras.camera_to_worlds[:, :, 3].double()
-        moved = (then.points(now.original_points(origins)) - origins).norm(dim=-1).max()
-        share = max(float(moved / origins.norm(dim=-1).max().clamp(min=1e-9)), abs(then.scale / now.scale - 1))
-        if not share < PLACED_ALIKE:
+            return parsed
+        moved = _moved(parsed, then)
+        if moved >= PLACED_ALIKE and any(field.name == "placement" for field in dataclasses.fields(self.parser)):  # type: ignore[arg-type]
+            say(
+                f"{self.config.data}: images or settings are others than when {self.folder} was trained; cameras are "
+                "placed as they were then, but other images may be held out"
+            )
+            parser = dataclasses.replace(self.parser, placement=file)  # type: ignore[type-var]
+            parsed = parser.parse(self.config.data, split)
+            moved = _moved(parsed, then)
+        if not moved < PLACED_ALIKE:
             raise DataError(
                 f"{self.config.data}: cameras are placed otherwise than when {self.folder} was trained, by up to "
-                f"{100 * share:.2g} % of their distance from the origin: images were added or removed since, or the "
+                f"{100 * moved:.2g} % of their distance from the origin: images were added or removed since, or the "
                 "format's settings changed; restore them, or train anew"
             )
+        return parsed
+
+
+def _moved(parsed: ParsedScene, then: Placement) -> float:
+    """Return how far cameras have moved since another placement, relative to the furthest from the origin."""
+    transform = torch.eye(4)[:3] if parsed.transform is None else parsed.transform
+    now = Placement(transform.double(), parsed.scale)
+    origins = parsed.cameras.camera_to_worlds[:, :, 3].double()
+    moved = (then.points(now.original_points(origins)) - origins).norm(dim=-1).max()
+    return max(float(moved / origins.norm(dim=-1).max().clamp(min=1e-9)), abs(then.scale / now.scale - 1))
 
 
 def run_folder(method: str, config: TrainConfig) -> Path:

@@ -1,27 +1,30 @@
-"""A trained run meets its data where it was placed in training, or says that it is not there."""
+"""A trained run meets its data where they were placed in training, or says that they are not there."""
 
 import dataclasses
 import json
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
+from torch import Tensor
 
 from dataparsers.nerfstudio import Nerfstudio
+from framework import DataParser, ParsedScene
 from framework.base.errors import DataError
 from framework.base.registry import load_method
-from framework.data.dataset import load_dataset
+from framework.data.dataset import Split, load_dataset
 from framework.training.run import TRANSFORMS, Run, write_transforms
 from tests.dataparsers.captures import write_capture
 
+TURNED = [[0.0, 1.0, 0.0, 3.0], [0.0, 0.0, 1.0, -2.0], [1.0, 0.0, 0.0, 5.0]]
 
-@pytest.fixture
-def trained(tmp_path: Path) -> Run:
-    """A run, as training leaves it, of a capture that is scaled and turned."""
-    data = write_capture(tmp_path / "capture", count=12)
-    config = dataclasses.replace(load_method("nerfacto").config, data=data)
-    folder = tmp_path / "run"
-    folder.mkdir()
-    run = Run("nerfacto", config, "nerfstudio", Nerfstudio(), folder)
+
+def trained_on(folder: Path, parser: DataParser, **changes: Any) -> Run:
+    """A run, as training leaves it, of a capture that is scaled and turned; `changes` go into its transforms.json."""
+    data = write_capture(folder / "capture", count=12, **changes)
+    run = Run("nerfacto", dataclasses.replace(load_method("nerfacto").config, data=data), "nerfstudio", parser, folder)
     write_transforms(run, load_dataset(run.parse("train"), "train"))
     return run
 
@@ -31,30 +34,86 @@ def without_a_photograph(run: Run) -> None:
     (run.config.data / "images" / "003.png").unlink()
 
 
-def test_the_same_data_are_read_as_before(trained: Run) -> None:
-    for split in ("train", "val"):
-        assert len(trained.parse(split).image_paths) == {"train": 10, "val": 2}[split]  # type: ignore[arg-type]
+def poses_of(run: Run) -> dict[str, Tensor]:
+    """The pose of every image, by name."""
+    parsed = [run.parse(split) for split in ("train", "val")]  # type: ignore[arg-type]
+    return {
+        path.name: pose
+        for scene in parsed
+        for path, pose in zip(scene.image_paths, scene.cameras.camera_to_worlds, strict=True)
+    }
 
 
-def test_data_that_are_placed_otherwise_are_refused(trained: Run) -> None:
-    """Every picture would be off: without a photograph, the mean position of the others is another."""
-    without_a_photograph(trained)
-    for split in ("train", "val"):
-        with pytest.raises(DataError, match=r"placed otherwise than when .*run was trained, by up to [\d.]+ %"):
-            trained.parse(split)  # type: ignore[arg-type]
-    new = dataclasses.replace(trained, folder=trained.folder.with_name("new"))
-    assert len(new.parse("train").image_paths) == 9
+def test_the_same_data_are_read_as_before(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = trained_on(tmp_path, Nerfstudio())
+    fresh = dataclasses.replace(run, folder=tmp_path / "new")
+    capsys.readouterr()
+    before, after = poses_of(fresh), poses_of(run)
+    assert len(after) == 12
+    assert all(torch.equal(after[name], pose) for name, pose in before.items())
+    assert capsys.readouterr().err == ""
 
 
-def test_another_scale_is_refused(trained: Run) -> None:
-    larger = dataclasses.replace(trained, parser=Nerfstudio(scale_factor=1.1))
-    with pytest.raises(DataError, match=r"by up to 9\.1 % of their distance"):
-        larger.parse("train")
+@pytest.mark.parametrize("changes", [{}, {"applied_transform": TURNED, "applied_scale": 2.5}], ids=["plain", "applied"])
+def test_without_a_photograph_the_others_stay_where_they_were(
+    changes: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By the mean of those that are left, every one would be elsewhere."""
+    run = trained_on(tmp_path, Nerfstudio(), **changes)
+    then = poses_of(run)
+    without_a_photograph(run)
+    capsys.readouterr()
+    now, anew = poses_of(run), poses_of(dataclasses.replace(run, folder=tmp_path / "new"))
+    said = " ".join(capsys.readouterr().err.split())
+    assert len(now) == len(anew) == 11
+    for name, pose in now.items():
+        torch.testing.assert_close(pose, then[name], rtol=1e-5, atol=1e-5)
+    assert min((pose - then[name]).abs().max().item() for name, pose in anew.items()) > 0.01
+    assert f"others than when {tmp_path} was trained; cameras are placed as they were then" in said
+    recorded, found = json.loads((tmp_path / TRANSFORMS).read_text()), run.parse("train")
+    assert found.transform is not None
+    torch.testing.assert_close(found.transform, torch.tensor(recorded["transform"]), rtol=1e-5, atol=1e-5)
+    assert found.scale == pytest.approx(recorded["scale"])
 
 
-def test_a_damaged_placement_is_reported(trained: Run, capsys: pytest.CaptureFixture[str]) -> None:
-    (trained.folder / TRANSFORMS).write_text(json.dumps({"scale": -1}))
-    assert len(trained.parse("train").image_paths) == 10
+def test_a_placement_that_is_asked_for_is_that_of_the_run(tmp_path: Path) -> None:
+    """Whatever else is asked for, and for another part of the photographs."""
+    run = trained_on(tmp_path, Nerfstudio())
+    then = poses_of(run)
+    without_a_photograph(run)
+    asked = Nerfstudio(placement=tmp_path / TRANSFORMS, scale_factor=3.0, orientation_method="pca")
+    now = poses_of(dataclasses.replace(run, parser=asked, folder=tmp_path / "new"))
+    for name, pose in now.items():
+        torch.testing.assert_close(pose, then[name], rtol=1e-5, atol=1e-5)
+    missing = Nerfstudio(placement=tmp_path / "nowhere.json")
+    with pytest.raises(DataError, match=r"nowhere\.json"):
+        dataclasses.replace(run, parser=missing, folder=tmp_path / "new").parse("train")
+
+
+@dataclass(frozen=True)
+class Plugin(DataParser):
+    """A format that knows nothing of placements."""
+
+    @classmethod
+    def recognizes(cls, path: Path) -> bool:
+        return False
+
+    def parse(self, path: Path | None, split: Split) -> ParsedScene:
+        return Nerfstudio().parse(path, split)
+
+
+def test_where_a_format_cannot_place_them_as_then_data_are_refused(tmp_path: Path) -> None:
+    run = trained_on(tmp_path, Plugin())
+    assert len(poses_of(run)) == 12
+    without_a_photograph(run)
+    with pytest.raises(DataError, match=r"placed otherwise than when .* was trained, by up to [\d.]+ % of"):
+        run.parse("val")
+
+
+def test_a_damaged_placement_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = trained_on(tmp_path, Nerfstudio())
+    (tmp_path / TRANSFORMS).write_text(json.dumps({"scale": -1}))
+    assert len(run.parse("train").image_paths) == 10
     said = capsys.readouterr().err
     assert said.count("going on without a check of how the data is placed") == 1
     assert TRANSFORMS in said

@@ -120,7 +120,7 @@ BUGS = (
     Bug(
         "original-frame-of-applied",
         "poses",
-        "dataparsers/captured.py",
+        "dataparsers/placing.py",
         "moved[:, 3] += transform[:, 3] / scale",
         "moved[:, 3] += transform[:, 3] * scale",
         "exports of data with applied_scale lie beside their place",

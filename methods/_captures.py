@@ -40,26 +40,62 @@ MARCHED_SAMPLES = 2**16
 
 
 @dataclass(frozen=True)
-class CaptureConfig(SamplingConfig, num_proposal_samples=AUTO, num_nerf_samples=AUTO):
-    """Settings of a method for captures."""
+class RefinedConfig(SamplingConfig, num_proposal_samples=AUTO, num_nerf_samples=AUTO):
+    """Settings of a method that may refine the poses of its training cameras."""
 
-    RANGES: ClassVar[dict[str, Range]] = {"distortion_loss_mult": AT_LEAST_0, "camera_learning_rate": AT_LEAST_0}
+    RANGES: ClassVar[dict[str, Range]] = {"camera_learning_rate": AT_LEAST_0}
     """Allowed range of each numeric setting."""
-    contraction: Auto[bool] = AUTO
-    """Whether space outside the box is contracted. If not given: in unbounded scenes."""
-    distortion_loss_mult: Auto[float] = AUTO
-    """Weight of the distortion loss. If not given: 0.002 in unbounded scenes, else 0."""
     camera_optimizer: Literal["auto", "off", "SO3xR3", "SE3"] = "auto"
     """Refinement of the training cameras' poses; auto: SO3xR3 if a device tracked them and proposals choose the
     samples, else off."""
     camera_learning_rate: float = 1e-3
     """Initial learning rate of the poses."""
+
+
+@dataclass(frozen=True)
+class CaptureConfig(RefinedConfig):
+    """Settings of a method for captures."""
+
+    RANGES: ClassVar[dict[str, Range]] = {"distortion_loss_mult": AT_LEAST_0}
+    """Allowed range of each numeric setting."""
+    contraction: Auto[bool] = AUTO
+    """Whether space outside the box is contracted. If not given: in unbounded scenes."""
+    distortion_loss_mult: Auto[float] = AUTO
+    """Weight of the distortion loss. If not given: 0.002 in unbounded scenes, else 0."""
     gradient_scaling: Auto[bool] = AUTO
     """Whether gradients near cameras are scaled down, by squared distance up to half of the box's edge, against
     floaters. If not given: in unbounded scenes."""
 
 
+RefinedConfigT = TypeVar("RefinedConfigT", bound=RefinedConfig)
 CaptureConfigT = TypeVar("CaptureConfigT", bound=CaptureConfig)
+
+
+def refined_sampler_choice(config: RefinedConfig, contracted: bool) -> Choice:
+    """Return what samples rays: by `sampler_choice`, but proposals if poses are asked to be refined.
+
+    Args:
+        config: the method's settings.
+        contracted: whether the field sees space outside of the box.
+    """
+    choice = sampler_choice(config, contracted)
+    if config.camera_optimizer in ("SO3xR3", "SE3") and not contracted:
+        return replace(choice, value="proposal", reason=f"poses are refined, and {MARCHED_REASON}")
+    return choice
+
+
+def refinement_choice(config: RefinedConfig, scene: Scene) -> Choice:
+    """Return whether poses are refined.
+
+    Args:
+        config: the method's settings; the sampler is chosen.
+        scene: properties of the data.
+    """
+    refined = "SO3xR3" if scene.poses == "device" and not scene.warped else "off"
+    reason = POSE_REASONS[scene.poses]
+    if config.sampler != "proposal" and refined != "off":
+        refined, reason = "off", MARCHED_REASON
+    return Choice("camera_optimizer", refined, reason, "pose refinement")
 
 
 def decide_capture(
@@ -77,23 +113,16 @@ def decide_capture(
         The settings, and a record of each that was filled in.
     """
     contracted = scene.unbounded if config.contraction is None else config.contraction
-    sampler = sampler_choice(config, contracted)
-    if config.camera_optimizer in ("SO3xR3", "SE3") and not contracted:
-        sampler = replace(sampler, value="proposal", reason=f"poses are refined, and {MARCHED_REASON}")
-    config, made = fill(config, sampler)
+    config, made = fill(config, refined_sampler_choice(config, contracted))
     around = "there may be something outside the box" if contracted else "the scene ends at its box"
     reason = f"contraction is {'on' if contracted else 'off'}"
-    refined = "SO3xR3" if scene.poses == "device" and not scene.warped else "off"
-    why = POSE_REASONS[scene.poses]
-    if config.sampler != "proposal" and refined != "off":
-        refined, why = "off", MARCHED_REASON
     config, more = fill(
         config,
         Choice("contraction", contracted, around),
         Choice("distortion_loss_mult", DISTORTION if contracted else 0.0, reason, "distortion loss"),
         Choice("gradient_scaling", contracted, reason, "gradient scaling near cameras"),
         *own,
-        Choice("camera_optimizer", refined, why, "pose refinement"),
+        refinement_choice(config, scene),
     )
     config, samples = decide_samples(config, MARCHED_SAMPLES) if config.contraction else (config, [])
     config, counts = fill(config, *samples_choices(config, proposals))
@@ -117,8 +146,8 @@ def distortion_term(rendered: Rendered, weight: float, scale: float | None = Non
     return {} if scale is None else {"distortion": weight * normalised_distortion(weights, samples, scale)}
 
 
-class CaptureModel(RayModel[CaptureConfigT], Generic[CaptureConfigT]):
-    """A model whose training poses can be refined, with the distortion loss.
+class RefinedModel(RayModel[RefinedConfigT], Generic[RefinedConfigT]):
+    """A model whose training poses can be refined.
 
     Args:
         config: the method's settings, none left open.
@@ -132,10 +161,9 @@ class CaptureModel(RayModel[CaptureConfigT], Generic[CaptureConfigT]):
     """
 
     def __init__(
-        self, config: CaptureConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer
+        self, config: RefinedConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer
     ) -> None:
         super().__init__(config, scene, field, sampler, renderer)
-        self._disparity_from = half_edge(scene.box) if config.contraction else None
         if config.camera_optimizer in ("SO3xR3", "SE3"):
             if scene.warped:
                 raise ConfigError("--camera-optimizer: poses cannot be refined in normalised device coordinates")
@@ -155,6 +183,24 @@ class CaptureModel(RayModel[CaptureConfigT], Generic[CaptureConfigT]):
             cameras: M training cameras with the poses of the data.
         """
         return cameras if self.poses is None else self.poses.refined(cameras)
+
+
+class CaptureModel(RefinedModel[CaptureConfigT], Generic[CaptureConfigT]):
+    """A model whose training poses can be refined, with the distortion loss.
+
+    Args:
+        config: the method's settings, none left open.
+        scene: properties of the data.
+        field: density and colour.
+        sampler: chooses the samples along rays.
+        renderer: turns samples into colours and depths.
+    """
+
+    def __init__(
+        self, config: CaptureConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer
+    ) -> None:
+        super().__init__(config, scene, field, sampler, renderer)
+        self._disparity_from = half_edge(scene.box) if config.contraction else None
 
     @property
     def regularized(self) -> bool:

@@ -13,7 +13,7 @@ from typing import ClassVar, Literal
 
 from torch import Tensor
 
-from framework import Decision, Field, Method, PixelBatch, RayModel, Rendered, Sampler, Scene
+from framework import Decision, Field, Method, PixelBatch, Rendered, Sampler, Scene
 from framework.base.config import AT_LEAST_0, AUTO, Auto, Range
 from framework.base.decisions import Choice, fill
 from framework.base.device import device_kind
@@ -26,15 +26,21 @@ from framework.kernels.frequency import MAX_FREQUENCIES
 from framework.rendering.losses import charbonnier
 from framework.samplers.choice import (
     COARSEST_PROPOSAL,
-    SamplingConfig,
     contracted_box,
     decide_samples,
     make_sampler,
-    sampler_choice,
     samples_choices,
 )
 from framework.samplers.proposal import LEARN_EVERY, half_edge
-from methods._captures import MARCHED_SAMPLES, PAPER_SAMPLES, distortion_term
+from methods._captures import (
+    MARCHED_SAMPLES,
+    PAPER_SAMPLES,
+    RefinedConfig,
+    RefinedModel,
+    distortion_term,
+    refined_sampler_choice,
+    refinement_choice,
+)
 from methods._grids import GridsConfig, grid_optimiser
 
 DISTORTION = 0.01
@@ -49,7 +55,7 @@ PROPOSAL_LEVELS, PROPOSAL_BASE, PROPOSAL_TABLE = 5, 16, 16
 @dataclass(frozen=True)
 class MipNeRF360Config(
     GridsConfig,
-    SamplingConfig,
+    RefinedConfig,
     max_num_iterations=250_000,
     num_rays_per_batch=2_048,
     learning_rate=2e-3,
@@ -58,8 +64,6 @@ class MipNeRF360Config(
     adam_eps=1e-6,
     eval_num_rays_per_chunk=4_096,
     sampler="proposal",
-    num_proposal_samples=AUTO,
-    num_nerf_samples=AUTO,
     max_resolution=4_096,
 ):
     """Settings of mip-nerf-360; the defaults are the paper's, with an eighth of its rays and a quarter of its warm-up.
@@ -95,7 +99,7 @@ class MipNeRF360Config(
     """Number of frequencies in the encoding of directions (integrated)."""
 
 
-class MipNeRF360(RayModel[MipNeRF360Config]):
+class MipNeRF360(RefinedModel[MipNeRF360Config]):
     """A model with a smooth absolute error of colours and the distortion of rays, where scenes have no bounds.
 
     In a box the error is the mean of squares: absolute errors are least in empty space if most of a picture is
@@ -129,17 +133,18 @@ def decide(config: MipNeRF360Config, scene: Scene) -> tuple[MipNeRF360Config, li
     elif config.max_seconds is not None and config.max_seconds < NETWORKS_FROM:
         encoding, reason = "hash-grid", "the paper's networks take hours on a GPU (else: --encoding integrated)"
     around = "there may be something outside the box" if scene.unbounded else "the scene ends at its box"
-    config, made = fill(
+    config, made = fill(config, refined_sampler_choice(config, scene.unbounded))
+    config, more = fill(
         config,
-        sampler_choice(config, scene.unbounded),
         Choice("encoding", encoding, reason),
         Choice("distortion_loss_mult", DISTORTION if scene.unbounded else 0.0, around, "distortion loss"),
+        refinement_choice(config, scene),
     )
     config, samples = decide_samples(config, MARCHED_SAMPLES)
     grids = config.encoding == "hash-grid"
     timed = config if grids else replace(config, max_seconds=None)
     config, counts = fill(config, *samples_choices(timed, PAPER_SAMPLES))
-    return config, made + samples + counts * (grids and config.sampler == "proposal")
+    return config, made + more + samples + counts * (grids and config.sampler == "proposal")
 
 
 def make_field(config: MipNeRF360Config, scene: Scene) -> Field:

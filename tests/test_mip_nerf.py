@@ -61,6 +61,9 @@ def test_mip_nerf_is_one_network_of_the_papers_shape() -> None:
 
 def test_mip_nerf_360_has_the_papers_networks_and_one_proposal() -> None:
     config = dataclasses.replace(mip_nerf_360.METHOD.config, encoding="integrated")
+    assert found.camera_optimizer == "off"
+    tracked = dataclasses.replace(UNBOUNDED, poses="device")
+    assert mip_nerf_360.decide(config, tracked)[0].camera_optimizer == "SO3xR3"
     model = mip_nerf_360.METHOD.build(config, UNBOUNDED)
     assert isinstance(model, RayModel)
     assert isinstance(model.sampler, ProposalSampler)
@@ -90,7 +93,9 @@ def test_the_encoding_is_decided_by_the_device() -> None:
     assert mip_nerf_360.decide(on_gpu, UNBOUNDED)[0].encoding == "integrated"
     hurried = dataclasses.replace(on_gpu, max_seconds=600.0)
     assert mip_nerf_360.decide(hurried, UNBOUNDED)[0].encoding == "hash-grid"
-    asked = dataclasses.replace(config, encoding="integrated", distortion_loss_mult=0.5, max_seconds=60.0)
+    asked = dataclasses.replace(
+        config, encoding="integrated", distortion_loss_mult=0.5, max_seconds=60.0, camera_optimizer="off"
+    )
     papers = dataclasses.replace(asked, num_proposal_samples=(64, 64), num_nerf_samples=32)
     assert mip_nerf_360.decide(asked, UNBOUNDED) == (papers, [])
     model = mip_nerf_360.METHOD.build(config, UNBOUNDED)

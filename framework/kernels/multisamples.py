@@ -71,7 +71,11 @@ UNIT_MULTISAMPLES = Operation("unit_multisamples", unit_multisamples_reference)
 
 @UNIT_MULTISAMPLES.implementation(CPP, differentiable=2)
 def _compiled(frustums: Frustums, pattern: Pattern, box: Tensor, contracted: bool) -> Tensor:
-    return _Multisamples.apply(frustums.origins, frustums.directions, frustums, pattern, _Map.of(box, contracted))
+    turned = pattern.turns.cos(), pattern.turns.sin(), pattern.mirrors
+    kernels, row = (_multisamples, _multisamples_backward), (NUM_MULTISAMPLES, 4)
+    columns = (*_columns(frustums), *turned)
+    to_cube = _Map.of(box, contracted, STD_SCALE)
+    return _InCube.apply(frustums.origins, frustums.directions, columns, row, to_cube, kernels)
 
 
 def frustum_balls_reference(frustums: Frustums, box: Tensor, contracted: bool) -> Tensor:
@@ -113,11 +117,16 @@ FRUSTUM_BALLS = Operation("frustum_balls", frustum_balls_reference)
 
 @FRUSTUM_BALLS.implementation(CPP, differentiable=2)
 def _compiled_balls(frustums: Frustums, box: Tensor, contracted: bool) -> Tensor:
-    return _Balls.apply(frustums.origins, frustums.directions, frustums, _Map.of(box, contracted))
+    kernels, to_cube = (_balls, _balls_backward), _Map.of(box, contracted, 1.0)
+    return _InCube.apply(frustums.origins, frustums.directions, _columns(frustums), (4,), to_cube, kernels)
+
+
+def _columns(frustums: Frustums) -> tuple[Tensor, ...]:
+    return frustums.t_starts, frustums.t_ends, frustums.radii
 
 
 class _Map(NamedTuple):
-    """The map from the scene to the unit cube."""
+    """The map from the scene to the unit cube, and the factor of deviations."""
 
     centre: Tensor
     scale: Tensor
@@ -125,19 +134,15 @@ class _Map(NamedTuple):
     contracted: bool
 
     @classmethod
-    def of(cls, box: Tensor, contracted: bool) -> _Map:
+    def of(cls, box: Tensor, contracted: bool, deviation: float) -> _Map:
         half = (box[1] - box[0]) / 2
         # What is contracted is in half edges from the centre, everything else in edges from the corner.
         centre, scale = ((box[0] + box[1]) / 2, 1 / half) if contracted else (box[0].clone(), 0.5 / half)
-        return cls(centre, scale, 1 / (half.prod() ** (1 / 3)).item() / (4 if contracted else 2), contracted)
+        smaller = (half.prod() ** (1 / 3)).item() * (4 if contracted else 2)
+        return cls(centre, scale, deviation / smaller, contracted)
 
     def addresses(self) -> tuple[int, int]:
         return native.pointer(self.centre, "the centre", (3,)), native.pointer(self.scale, "the scale", (3,))
-
-
-def _contiguous(origins: Tensor, directions: Tensor, frustums: Frustums) -> list[Tensor]:
-    """Return the tensors that describe N frustums, of which the first two may be learnt."""
-    return [x.contiguous() for x in (origins, directions, frustums.t_starts, frustums.t_ends, frustums.radii)]
 
 
 def _addresses(count: int, origins: Tensor, directions: Tensor, *columns: Tensor) -> list[int]:
@@ -146,57 +151,39 @@ def _addresses(count: int, origins: Tensor, directions: Tensor, *columns: Tensor
     return rows + [native.pointer(x, "frustums", (count,)) for x in columns]
 
 
-class _Multisamples(torch.autograd.Function):
+class _InCube(torch.autograd.Function):
+    """What stands for N frustums in the unit cube, with the gradient by origins and directions of their rays."""
+
     @staticmethod
     def forward(
-        ctx: Any, origins: Tensor, directions: Tensor, frustums: Frustums, pattern: Pattern, to_cube: _Map
+        ctx: Any,
+        origins: Tensor,
+        directions: Tensor,
+        columns: tuple[Tensor, ...],
+        row: tuple[int, ...],
+        to_cube: _Map,
+        kernels: tuple[native.Function, native.Function],
     ) -> Tensor:
-        count = len(frustums)
-        turned = [x.contiguous() for x in (pattern.turns.cos(), pattern.turns.sin(), pattern.mirrors)]
-        tensors = (*_contiguous(origins, directions, frustums), *turned)
-        out = origins.new_empty(count, NUM_MULTISAMPLES, 4)
-        _multisamples(
-            *_addresses(count, *tensors), count, *to_cube.addresses(), STD_SCALE * to_cube.deviation,
-            int(to_cube.contracted), out.data_ptr(), native.threads(),
-        )  # fmt: skip
-        ctx.save_for_backward(*tensors)
-        ctx.to_cube = to_cube
-        return out
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        return *_by_rays(ctx, _multisamples_backward, grad), None, None, None
-
-
-class _Balls(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, origins: Tensor, directions: Tensor, frustums: Frustums, to_cube: _Map) -> Tensor:
-        count, tensors = len(frustums), _contiguous(origins, directions, frustums)
-        out = origins.new_empty(count, 4)
-        _balls(
+        count, tensors = len(origins), [x.contiguous() for x in (origins, directions, *columns)]
+        out = origins.new_empty(count, *row)
+        kernels[0](
             *_addresses(count, *tensors), count, *to_cube.addresses(), to_cube.deviation, int(to_cube.contracted),
             out.data_ptr(), native.threads(),
         )  # fmt: skip
         ctx.save_for_backward(*tensors)
-        ctx.to_cube = to_cube
+        ctx.to_cube, ctx.kernels = to_cube, kernels
         return out
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        return *_by_rays(ctx, _balls_backward, grad), None, None
-
-
-def _by_rays(ctx: Any, backward: native.Function, grad: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the gradients (N, 3) by origins and directions, from that by points (N, ..., 4)."""
-    tensors, to_cube, grad = ctx.saved_tensors, ctx.to_cube, grad.contiguous()
-    by_origins, by_directions = (torch.empty_like(x) for x in tensors[:2])
-    backward(
-        *_addresses(len(grad), *tensors), len(grad), *to_cube.addresses(), int(to_cube.contracted),
-        grad.data_ptr(), by_origins.data_ptr(), by_directions.data_ptr(), native.threads(),
-    )  # fmt: skip
-    return by_origins, by_directions
+        tensors, to_cube, grad = ctx.saved_tensors, ctx.to_cube, grad.contiguous()
+        by_origins, by_directions = (torch.empty_like(x) for x in tensors[:2])
+        ctx.kernels[1](
+            *_addresses(len(grad), *tensors), len(grad), *to_cube.addresses(), int(to_cube.contracted),
+            grad.data_ptr(), by_origins.data_ptr(), by_directions.data_ptr(), native.threads(),
+        )  # fmt: skip
+        return by_origins, by_directions, None, None, None, None
 
 
 _multisamples = native.Function("multisamples", "ppppppppqppfipi")

@@ -36,7 +36,7 @@ class StepReport:
     psnr: float
     """PSNR of the batches, dB, smoothed; on other devices than the CPU that of the last step that was read."""
     rays_per_second: float
-    """Rays of the batch per second of this step."""
+    """Rays per second of the last steps of which errors were read: on the CPU of this step."""
     held_out_psnr: float | None
     """PSNR of the last evaluation of a few held-out images, dB; None before the first."""
 

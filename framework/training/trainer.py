@@ -86,6 +86,7 @@ class Trainer:
         self.steps_per_read = 1 if self.device.type == "cpu" else STEPS_PER_LOG
         """Steps after which the errors of batches are read from the device, which is waited for."""
         self._unread: list[Tensor] = []
+        self._unread_rays, self._unread_seconds, self._rays_per_second = 0, 0.0, 0.0
         mode = self.config.machine.cuda_graphs
         self.graphs = make_graphs(mode, self.device, self._learnt, lambda taken: taken[1].loss.total)
         self.held_out = HeldOut(self.run, self.model, eval_set)
@@ -269,13 +270,14 @@ class Trainer:
             self._read_errors(done)
         seconds = time.perf_counter() - start
         self._account(num_rays, math.nan if isinstance(per_ray, Tensor) else per_ray, seconds)
+        self._count_rays(num_rays * processes().count, seconds)
         return StepReport(
             step=state.step,
             seconds=state.seconds,
             progress=self.progress,
             terms={name: value.detach() for name, value in result.loss.terms.items()},
             psnr=self._train_psnr(),
-            rays_per_second=num_rays * processes().count / seconds,
+            rays_per_second=self._rays_per_second,
             held_out_psnr=state.looks[-1][2] if state.looks else None,
         )
 
@@ -340,6 +342,15 @@ class Trainer:
         state.seconds += seconds
         state.rays += num_rays * processes().count
         state.learn_samples_per_ray(samples_per_ray)
+
+    def _count_rays(self, num_rays: int, seconds: float) -> None:
+        """Measure the rate from one read to the next: a step that does not wait for the device seems to be short."""
+        self._unread_rays += num_rays
+        self._unread_seconds += seconds
+        if not self._unread or self._rays_per_second == 0:
+            self._rays_per_second = self._unread_rays / self._unread_seconds
+        if not self._unread:
+            self._unread_rays, self._unread_seconds = 0, 0.0
 
     def _read_errors(self, done: int) -> None:
         """Read of the last of `done` steps what was left on the device: errors, and whether they were finite."""

@@ -183,7 +183,7 @@ def variation_by_torch(table: Tensor, layout: PlanesLayout) -> tuple[Tensor, Ten
 def test_regularisers_of_planes_in_space_and_time(backend: str, moving_planes: KPlanes) -> None:
     """Value and gradient, wherever that waits, against float64: planes of 6 x 6, 12 x 12, 6 x 5 and 12 x 5.
 
-    A step looks at one plane of time; its mean over all of them is what is compared.
+    A step looks at one plane of time, and the mean over all of them is what is compared; on a GPU it looks at all.
     """
     planes = moving_planes.field.encoding
     assert planes.layout.resolutions == ((6, 6, 6, 5), (12, 12, 12, 5))
@@ -193,8 +193,10 @@ def test_regularisers_of_planes_in_space_and_time(backend: str, moving_planes: K
     truth = variation_by_torch(exact, planes.layout)
     turns = [moving_planes._regularisers(torch.zeros(()), turn) for turn in range(6)]
     found = [torch.stack(values).mean() for values in zip(*turns, strict=True)]
-    for value, expected in zip(found, truth, strict=True):
+    at_once = moving_planes._regularisers(torch.zeros(()), None)
+    for value, all_planes, expected in zip(found, at_once, truth, strict=True):
         assert value.item() == pytest.approx(expected.item(), rel=1e-5)
+        assert all_planes.item() == pytest.approx(expected.item(), rel=1e-5)
     sum(found).backward()
     sum(truth).backward()
     slope = torch.zeros_like(planes.table) if planes.table.grad is None else planes.table.grad.clone()

@@ -7,6 +7,7 @@ import os
 import signal
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -18,6 +19,7 @@ from framework import Loss, Model, PixelBatch, RayModel, Rays, Rendered
 from framework.base import registry
 from framework.base.errors import CheckpointError, ConfigError, DivergenceError
 from framework.evaluation.evaluator import evaluate, evaluation_background
+from framework.training import trainer as trainer_file
 from framework.training.checkpoint import list_checkpoints, load_checkpoint
 from framework.training.datasets import first_split, load_split
 from framework.training.run import create_folder
@@ -402,3 +404,17 @@ def test_a_checkpoint_of_another_method_is_refused(shared_tiny: Path, tmp_path: 
     other = tiny_trainer("vanilla-nerf", shared_tiny, tmp_path / "b")
     with pytest.raises(CheckpointError, match="does not fit"):
         other.restore(load_checkpoint(saved))
+
+
+def test_rays_per_second_are_those_since_errors_were_read(
+    shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a device that runs ahead, only a step that reads from it takes the time of those before it."""
+    trainer = tiny_trainer("vanilla-nerf", shared_tiny, tmp_path, num_rays_per_batch=30)
+    trainer.steps_per_read = 4
+    trainer.prepare()
+    moments = iter([0.0, 3.0, 3.0, 3.1, 3.1, 3.2, 3.2, 6.0, 6.0, 6.1, 6.1, 6.2, 6.2, 6.3, 6.3, 12.0])
+    monkeypatch.setattr(trainer_file, "time", SimpleNamespace(perf_counter=lambda: next(moments)))
+    rates = [trainer.train_step().rays_per_second for _ in range(8)]
+    first, then = 30 / 3.0, 4 * 30 / 6.0
+    assert rates == pytest.approx([first, first, first, then, then, then, then, then])

@@ -135,15 +135,16 @@ def measure(methods: Sequence[str], before: int, steps: int) -> dict[str, Any]:
     return {"machine": machine(), "steps before": before, "steps": steps, "image size": SIZE, "rows": rows}
 
 
-def trainer_of(method: str, folder: Path) -> Trainer:
+def trainer_of(method: str, folder: Path, scene: Callable[[int], Dataset] | None = None) -> Trainer:
     """Return a trainer of a method on images of a ball, with settings for larger images, but small tables and batches.
 
     Args:
         method: name of the method.
         folder: folder of the run's files.
+        scene: returns images of this width; if not given, those that suit the method.
     """
     declared = load_method(method)
-    dataset = SCENES.get(method, ball_in_a_box)(SIZE)
+    dataset = (scene or SCENES.get(method, ball_in_a_box))(SIZE)
     dataset = dataclasses.replace(
         dataset, scene=dataclasses.replace(dataset.scene, image_size=IMAGE_SIZE, image_pixels=IMAGE_SIZE**2)
     )

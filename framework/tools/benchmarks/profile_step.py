@@ -1,4 +1,4 @@
-"""Time of a training step: of each compiled kernel, and of Python and torch."""
+"""Time of a training step: of each compiled kernel of the CPU, and of Python and torch."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from framework.base.console import say
+from framework.base.device import wait_for
 from framework.kernels import native
 from framework.tools.benchmarks.workload import endless_trainer
-from framework.training.machine import machine
+from framework.training.machine import kernels, machine
 from framework.training.run import Run
 
 MEASURED, FEWEST, LONGEST = 200, 8, 30.0
@@ -19,7 +20,7 @@ third, seconds."""
 
 
 def measure(run: Run, steps: int, max_seconds: float) -> dict[str, Any]:
-    """Train a method, measure `MEASURED` further steps at most, and print a line for each kernel.
+    """Train a method, measure `MEASURED` further steps at most, and print a line for each kernel of the CPU.
 
     Args:
         run: what to train.
@@ -33,23 +34,25 @@ def measure(run: Run, steps: int, max_seconds: float) -> dict[str, Any]:
         trainer = endless_trainer(run, max_seconds, Path(folder))
         for _ in range(steps):
             trainer.train_step()
+        wait_for(trainer.device)
         native.spent, rays = {}, trainer.state.rays
         start, count = time.perf_counter(), 0
         while count < FEWEST or (count < MEASURED and time.perf_counter() - start < LONGEST):
             trainer.train_step()
             count += 1
+        wait_for(trainer.device)
         step = (time.perf_counter() - start) / count * 1e3
         rays = (trainer.state.rays - rays) // count
-    kernels = {name: seconds / count * 1e3 for name, seconds in native.spent.items()}
-    native.spent = None
-    kernels["Python and torch"] = step - sum(kernels.values())
-    parts = dict(sorted(kernels.items(), key=lambda item: -item[1]))
+    spent_in = {name: seconds / count * 1e3 for name, seconds in native.spent.items()}
+    native.spent, used = None, kernels(trainer.device)
+    spent_in["Python and torch"] = step - sum(spent_in.values())
+    parts = dict(sorted(spent_in.items(), key=lambda item: -item[1]))
     for name, spent in parts.items():
         say(f"{name:28s} {spent:6.2f} ms  {spent / step:6.1%}")
-    say(f"{'a step':28s} {step:6.2f} ms  {rays:,} rays, {native.variant()}")
+    say(f"{'a step':28s} {step:6.2f} ms  {rays:,} rays, {used}")
     return {
-        "machine": machine(),
-        "kernels": native.variant(),
+        "machine": machine(trainer.device),
+        "kernels": used,
         "steps": count,
         "rays per step": rays,
         "ms per step": round(step, 2),

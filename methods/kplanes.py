@@ -123,7 +123,7 @@ class KPlanes(RayModel[KPlanesConfig], LearnsMotion):
 
     def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
         zero = rendered.rgb.new_zeros(())
-        # A GPU reads all planes of time sooner than steps can be chosen for it; so they also repeat each other.
+        # On a GPU all planes of time cost little more than one, and steps that look at all of them can be recorded.
         turn = int(torch.randint(2**31, ())) if self.scene.moving and not runs_ahead(zero.device) else None
         variation, roughness, activity = self._regularisers(zero, turn)
         losses = {"space_tv": self.config.space_tv * variation}

@@ -413,8 +413,8 @@ def test_rays_per_second_are_those_since_errors_were_read(
     trainer = tiny_trainer("vanilla-nerf", shared_tiny, tmp_path, num_rays_per_batch=30)
     trainer.steps_per_read = 4
     trainer.prepare()
-    moments = iter([0.0, 3.0, 3.0, 3.1, 3.1, 3.2, 3.2, 6.0, 6.0, 6.1, 6.1, 6.2, 6.2, 6.3, 6.3, 12.0])
+    moments = iter([0.0, 3.0, 3.0, 3.1, 3.1, 3.2, 3.2, 6.0, 6.0, 6.1, 6.1, 6.2, 6.2, 6.3, 6.3, 9.0])
     monkeypatch.setattr(trainer_file, "time", SimpleNamespace(perf_counter=lambda: next(moments)))
     rates = [trainer.train_step().rays_per_second for _ in range(8)]
-    first, then = 30 / 3.0, 4 * 30 / 6.0
-    assert rates == pytest.approx([first, first, first, then, then, then, then, then])
+    first, then, last = 30 / 3.0, 4 * 30 / 6.0, 4 * 30 / 3.0
+    assert rates == pytest.approx([first, first, first, then, then, then, then, last])

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from framework import Decision, LearnsMotion, Method, PixelBatch, Points, RayModel, Rendered, Scene
+from framework.base import device as devices
 from framework.base.config import AT_LEAST_0, AUTO, Auto, Range
 from framework.base.decisions import Choice, fill
-from framework.base.device import device_kind, runs_ahead
 from framework.encodings.planes import FeaturePlanes
 from framework.fields.base import MLP
 from framework.fields.encoded import BoxField, EncodedField
@@ -124,7 +124,7 @@ class KPlanes(RayModel[KPlanesConfig], LearnsMotion):
     def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
         zero = rendered.rgb.new_zeros(())
         # On a GPU all planes of time cost little more than one, and steps that look at all of them can be recorded.
-        turn = int(torch.randint(2**31, ())) if self.scene.moving and not runs_ahead(zero.device) else None
+        turn = int(torch.randint(2**31, ())) if self.scene.moving and not devices.runs_ahead(zero.device) else None
         variation, roughness, activity = self._regularisers(zero, turn)
         losses = {"space_tv": self.config.space_tv * variation}
         if self.scene.moving:
@@ -179,7 +179,7 @@ def decide(config: KPlanesConfig, scene: Scene) -> tuple[KPlanesConfig, list[Dec
     config, few = decide_few_images(config, scene)
     samples = batch_choice(config, FEWEST_SAMPLES, MOST_SAMPLES, FEWEST_UNTIL)
     if scene.moving:
-        count = MOVING_SAMPLES if device_kind(config.machine) == "cpu" else MOVING_SAMPLES_OF_A_GPU
+        count = MOVING_SAMPLES if devices.device_kind(config.machine) == "cpu" else MOVING_SAMPLES_OF_A_GPU
         samples = Choice("samples_per_batch", count, "the scene moves", "samples a step")
     steps = Choice("num_steps", MOVING_NUM_STEPS if scene.moving else NUM_STEPS, "the scene moves")
     shorter = Choice(

@@ -152,7 +152,7 @@ def _addresses(count: int, origins: Tensor, directions: Tensor, *columns: Tensor
 
 
 class _InCube(torch.autograd.Function):
-    """What stands for N frustums in the unit cube, with the gradient by origins and directions of their rays."""
+    """Points and balls that stand for N frustums in the unit cube, with the gradient by the rays of the frustums."""
 
     @staticmethod
     def forward(

@@ -308,9 +308,9 @@ def _sparse_points(
         cameras: M cameras in the scene's frame.
         known: the images that may be learned from; all if None.
     """
-    precise, points, sightings = _in_float64(placement), None, None
+    points, sightings = None, None
     if images.tracks is not None:
-        tracks = images.tracks.at(precise.points(images.tracks.points).float())
+        tracks = images.tracks.at(placement.points(images.tracks.points).float())
         if known is not None:
             others = torch.ones(len(cameras), dtype=torch.bool)
             others[known] = False
@@ -319,14 +319,9 @@ def _sparse_points(
         if len(confirmed):
             points, sightings = confirmed, tracks.sightings(cameras.camera_to_worlds[:, :, 3])
     if images.points is not None:
-        points = precise.points(images.points.double()).float()
+        points = placement.points(images.points).float()
         points = points[points.isfinite().all(-1)]
     return points, sightings
-
-
-def _in_float64(placement: Placement) -> Placement:
-    """Return the placement in float64: positions in a mapped scene may be millions of units from their origin."""
-    return replace(placement, transform=placement.transform.double())
 
 
 def _cameras(images: PosedImages, placement: Placement) -> Cameras:
@@ -338,7 +333,7 @@ def _cameras(images: PosedImages, placement: Placement) -> Cameras:
     if images.model == "orthographic":
         intrinsics[:, :2] /= placement.scale
     _check_range(images, intrinsics)
-    poses = _in_float64(placement).poses(images.poses.double()).float()
+    poses = placement.poses(images.poses).float()
     if not bool(poses.isfinite().all()):
         raise DataError(f"{images.folder}: positions of cameras are too large; use --auto-scale-poses True")
     fx, fy, cx, cy = intrinsics.float().unbind(-1)

@@ -16,7 +16,6 @@ from framework import DataError, ParsedScene
 from framework.base.arrays import read_array
 from framework.cameras.cameras import check_pose
 from framework.cameras.ndc import NdcCameras, find_ndc, ndc_box
-from framework.cameras.poses import Placement
 from framework.data.dataset import Split, one_line
 
 POSES = "poses_bounds.npy"
@@ -64,7 +63,7 @@ class Llff(Captured):
             masks=find_masks(path / self.masks_path, names),
         )
         scene = captured_scene(self, images, split)
-        placed = Placement(_transform(scene).double(), scene.scale).poses(poses)
+        placed = scene.placement.poses(poses)
         corners, bounds = corner_directions(placed, intrinsics, sizes), bounds * scene.scale
         if self.ndc:
             return _in_ndc(scene, placed, corners, NEAR_SHARE * bounds[:, 0])
@@ -169,10 +168,6 @@ def _in_ndc(scene: ParsedScene, poses: Tensor, corners: Tensor, nears: Tensor) -
     cameras = NdcCameras(**{f.name: getattr(scene.cameras, f.name) for f in fields(scene.cameras)}, ndc=ndc)
     # No ray is longer than the box's diagonal.
     return replace(scene, cameras=cameras, box=box, near=0.0, far=float((box[1] - box[0]).norm()), unbounded=False)
-
-
-def _transform(scene: ParsedScene) -> Tensor:
-    return torch.eye(4)[:3] if scene.transform is None else scene.transform
 
 
 def _image_names(root: Path) -> list[str]:

@@ -304,10 +304,9 @@ def _with_cube(scene: ParsedScene, content: dict[str, Any], file: Path, scene_sc
     unit = number(content.get("scale", NGP_SCALE), "scale", str(file), positive=True)
     edge = number(content["aabb_scale"], "aabb_scale", str(file), positive=True) / unit
     offset = numbers(content.get("offset", NGP_OFFSET), 3, "offset", str(file))
-    center = (0.5 - torch.tensor(offset)) / unit
-    center = scene.scale * (scene.transform[:, :3] @ center + scene.transform[:, 3])
+    center = scene.placement.points((0.5 - torch.tensor([offset], dtype=torch.float64)) / unit)[0]
     half = 0.5 * edge * scene.scale * scene_scale
-    box = torch.stack([center - half, center + half])
+    box = torch.stack([center - half, center + half]).float()
     return replace(scene, box=checked_box(box, f"{file}: 'aabb_scale', 'scale' and 'offset'"))
 
 

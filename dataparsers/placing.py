@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import torch
 from torch import Tensor
 
 from framework import ParsedScene
@@ -37,14 +36,13 @@ def placement_of(flags: Captured, images: PosedImages, split: Split, applied: Ap
     """
     if flags.placement is not None:
         given = read_transforms(flags.placement)
-        return given.after(*applied) if applied else Placement(given.transform.float(), given.scale)
+        return given.after(*applied) if applied else given
     # A device knows where gravity pulls, and its images are upright.
     orientation = "up" if flags.orientation_method == "auto" and flags.poses == "device" else flags.orientation_method
     placement = place(images.poses, orientation, flags.center_method, flags.auto_scale_poses)
     if flags.auto_scale_poses and images.model != "orthographic":
         spreads = (images.sizes / images.intrinsics[:, :2]).amax(-1)
-        precise = replace(placement, transform=placement.transform.double())
-        factor = enlargement(precise.poses(images.poses.double()), spreads)
+        factor = enlargement(placement.poses(images.poses), spreads)
         if factor > 1 and split == "train":
             say(
                 f"cameras look at something small from afar: the scene is enlarged by {factor:.1f} (--auto-scale-poses)"
@@ -61,8 +59,5 @@ def from_original(scene: ParsedScene, applied: Tensor, scale: float = 1.0) -> Pa
         applied: (4, 4) rigid transform from the earlier frame to the later one, applied before `scale`.
         scale: units of the later frame per unit of the earlier: x becomes `scale * (applied @ x)`.
     """
-    transform = torch.eye(4)[:3] if scene.transform is None else scene.transform
-    # s (R (a A x) + t) = s a (R A x + t / a)
-    moved = transform[:, :3].double() @ applied[:3].double()
-    moved[:, 3] += transform[:, 3] / scale
-    return replace(scene, transform=moved.float(), scale=scene.scale * scale)
+    placement = scene.placement.before(applied, scale)
+    return replace(scene, transform=placement.transform, scale=placement.scale)

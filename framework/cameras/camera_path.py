@@ -108,10 +108,10 @@ class CameraPath:
         """Return the path in a scene with another `placement` of the same input; unchanged if its own is unknown."""
         if self.placement is None:
             return self
-        before, after = (replace(one, transform=one.transform.double()) for one in (self.placement, placement))
+        before = self.placement
 
         def moved(poses: Tensor) -> Tensor:
-            return after.poses(before.original_poses(poses))
+            return placement.poses(before.original_poses(poses))
 
         keyframes = tuple(replace(one, pose=moved(one.pose[None])[0]) for one in self.keyframes)
         return replace(self, poses=moved(self.poses), keyframes=keyframes, placement=placement)

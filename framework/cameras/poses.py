@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -30,29 +30,44 @@ MOST_POINTS = 2000
 
 @dataclass(frozen=True)
 class Placement:
-    """A similarity transform from the input's frame to the scene's: `scale * (transform @ x)`."""
+    """A similarity transform from the input's frame to the scene's: `scale * (transform @ x)`.
+
+    It is computed in float64, as the input may be millions of units from its origin; scene coordinates fit float32.
+    """
 
     transform: Tensor
-    """(3, 4) rigid transform, applied before `scale`."""
+    """(3, 4) float64 rigid transform on the CPU, applied before `scale`. Its rotation may be rounded to float32, as
+    nerfstudio's is: the inverse is that of the matrix as it is, not its transpose."""
     scale: float
     """Scene units per unit of the input."""
 
+    @classmethod
+    def of(cls, transform: Any, scale: float) -> Placement:
+        """Construct a placement from a transform as scenes, files and checkpoints hold it.
+
+        Args:
+            transform: (3, 4) tensor of any type and device, or rows of numbers; None for the identity.
+            scale: scene units per unit of the input.
+        """
+        identity = torch.eye(4, dtype=torch.float64)[:3]
+        return cls(identity if transform is None else torch.as_tensor(transform, device="cpu").double(), float(scale))
+
     def points(self, points: Tensor) -> Tensor:
-        """Transform `points` (K, 3) from the input's frame to the scene's."""
-        return self.scale * (points @ self.transform[:, :3].T + self.transform[:, 3])
+        """Transform `points` (K, 3) from the input's frame to the scene's, float64."""
+        return self.scale * (points.double() @ self.transform[:, :3].T + self.transform[:, 3])
 
     def poses(self, poses: Tensor) -> Tensor:
-        """Transform camera-to-world `poses` (M, 3 or 4, 4) from the input's frame to (M, 3, 4) in the scene's."""
-        rotations = self.transform[:, :3] @ poses[:, :3, :3]
+        """Transform camera-to-world `poses` (M, 3 or 4, 4) to (M, 3, 4) float64 in the scene's frame."""
+        rotations = self.transform[:, :3] @ poses[:, :3, :3].double()
         return torch.cat([rotations, self.points(poses[:, :3, 3])[..., None]], dim=-1)
 
     def original_points(self, points: Tensor) -> Tensor:
-        """Transform `points` (K, 3) from the scene's frame to the input's: the inverse of `Placement.points`."""
-        return (points / self.scale - self.transform[:, 3]) @ self.transform[:, :3]
+        """Transform `points` (K, 3) from the scene's frame to the input's, float64: the inverse of `points`."""
+        return (points.double() / self.scale - self.transform[:, 3]) @ self._turned_back.T
 
     def original_directions(self, directions: Tensor) -> Tensor:
-        """Rotate unit `directions` (K, 3) from the scene's frame to the input's."""
-        return directions @ self.transform[:, :3]
+        """Rotate unit `directions` (K, 3) from the scene's frame to the input's, float64."""
+        return directions.double() @ self.transform[:, :3]
 
     def similarity(self) -> tuple[Tensor, float, Tensor]:
         """Return rotation (3, 3), scale and shift (3,) of `points`: x -> scale * rotation @ x + shift."""
@@ -60,8 +75,13 @@ class Placement:
 
     def original_similarity(self) -> tuple[Tensor, float, Tensor]:
         """Return rotation (3, 3), scale and shift (3,) of `original_points`: x -> scale * rotation @ x + shift."""
-        rotation = self.transform[:, :3].T
-        return rotation, 1 / self.scale, -rotation @ self.transform[:, 3]
+        return self._turned_back, 1 / self.scale, -self._turned_back @ self.transform[:, 3]
+
+    def about(self, origin: Tensor) -> Placement:
+        """Return the placement of coordinates of the input that are counted from another `origin` (3,) of its frame."""
+        rotation = self.transform[:, :3]
+        shift = self.transform[:, 3] + rotation @ origin.double()
+        return Placement(torch.cat([rotation, shift[:, None]], dim=-1), self.scale)
 
     def after(self, applied: Tensor, scale: float) -> Placement:
         """Return the placement of a later frame by which the scene is where it is by this one.
@@ -70,14 +90,30 @@ class Placement:
             applied: (4, 4) rigid transform from the input's frame to the later one, applied before `scale`.
             scale: units of the later frame per unit of the input.
         """
-        rotation = self.transform[:, :3].double() @ applied[:3, :3].double().T
-        shift = scale * (self.transform[:, 3].double() - rotation @ applied[:3, 3].double())
-        return Placement(torch.cat([rotation, shift[:, None]], dim=-1).float(), self.scale / scale)
+        rotation = self.transform[:, :3] @ applied[:3, :3].double().T
+        shift = scale * (self.transform[:, 3] - rotation @ applied[:3, 3].double())
+        return Placement(torch.cat([rotation, shift[:, None]], dim=-1), self.scale / scale)
+
+    def before(self, applied: Tensor, scale: float) -> Placement:
+        """Return the placement of an earlier frame by which the scene is where it is by this one.
+
+        Args:
+            applied: (4, 4) rigid transform from the earlier frame to the input's, applied before `scale`.
+            scale: units of the input per unit of the earlier frame.
+        """
+        # s (R (a A x) + t) = s a (R A x + t / a)
+        moved = self.transform[:, :3] @ applied[:3].double()
+        moved[:, 3] += self.transform[:, 3] / scale
+        return Placement(moved, self.scale * scale)
 
     def original_poses(self, poses: Tensor) -> Tensor:
-        """Transform `poses` (M, 3, 4) from the scene's frame to the input's: the inverse of `Placement.poses`."""
-        rotations = self.transform[:, :3].T @ poses[:, :, :3]
+        """Transform `poses` (M, 3, 4) from the scene's frame to the input's, float64: the inverse of `poses`."""
+        rotations = self._turned_back @ poses[:, :, :3].double()
         return torch.cat([rotations, self.original_points(poses[:, :, 3])[..., None]], dim=-1)
+
+    @property
+    def _turned_back(self) -> Tensor:
+        return torch.linalg.inv(self.transform[:, :3])
 
 
 def place(
@@ -111,7 +147,7 @@ def place(
     transform = torch.cat([rotation, -(rotation @ middle)[:, None]], dim=-1)
     furthest = float(((origins - middle) @ rotation.T).abs().max())
     scale = 1 / furthest if auto_scale and furthest > 0 else 1.0
-    return Placement(transform.float(), scale)
+    return Placement(transform, scale)
 
 
 def rotation_between(start: Tensor, end: Tensor) -> Tensor:

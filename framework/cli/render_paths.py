@@ -16,7 +16,7 @@ from framework.base.console import say
 from framework.base.errors import ConfigError, FlagError
 from framework.cameras.camera_path import read_camera_path, read_transforms
 from framework.cameras.cameras import Cameras
-from framework.cameras.poses import Placement, looked_at
+from framework.cameras.poses import looked_at
 from framework.cli.render_flags import (
     CameraPathFlags,
     DatasetFlags,
@@ -76,7 +76,7 @@ def camera_path_views(flags: CameraPathFlags, trained: Trained) -> Views:
     path = read_camera_path(flags.camera_path_filename)
     if flags.dataparser_transforms is not None:
         path = replace(path, placement=read_transforms(flags.dataparser_transforms))
-    path = path.placed(Placement(trained.content["transform"].double().cpu(), float(trained.content["scale"])))
+    path = path.placed(trained.placement)
     if path.has_crop:
         say(f"{flags.camera_path_filename}: its crop box is not applied")
     times = None

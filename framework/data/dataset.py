@@ -18,6 +18,7 @@ from framework.base.errors import DataError
 from framework.base.splits import Split as Split
 from framework.cameras.cameras import Cameras
 from framework.cameras.ndc import NdcCameras
+from framework.cameras.poses import Placement
 from framework.cameras.view import View
 from framework.data.coverage import pixels_with_rays
 from framework.data.decoding import Decoded, ImageFiles, decode
@@ -54,7 +55,7 @@ class Dataset:
     scene: Scene
     """Description of the scene for methods."""
     transform: Tensor
-    """(3, 4) from the input's frame to the scene's."""
+    """(3, 4) float64 on the CPU, from the input's frame to the scene's."""
     scale: float
     """Scene units per unit of the input."""
     drawn: PixelSet | None = None
@@ -83,6 +84,11 @@ class Dataset:
 
     def __len__(self) -> int:
         return len(self.cameras)
+
+    @property
+    def placement(self) -> Placement:
+        """Placement of the input in the scene."""
+        return Placement.of(self.transform, self.scale)
 
     @cached_property
     def image_weights(self) -> Tensor | None:
@@ -295,7 +301,7 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         times=parsed.times,
         names=names,
         scene=scene,
-        transform=torch.eye(4)[:3] if parsed.transform is None else parsed.transform,
+        transform=parsed.placement.transform,
         scale=parsed.scale,
         drawn=kept if kept is None or decoded.mapped is not None else kept.listed(),
         kept=kept,

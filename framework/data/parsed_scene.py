@@ -11,6 +11,7 @@ from torch import Tensor
 
 from framework.base.splits import Split
 from framework.cameras.cameras import Cameras
+from framework.cameras.poses import Placement
 from framework.data.scene import PoseSource
 from framework.data.tracks import Sightings
 
@@ -32,7 +33,8 @@ class ParsedScene:
     times: Tensor | None = None
     """(M,) time of each image in [0, 1]; None for a static scene."""
     transform: Tensor | None = None
-    """(3, 4) rigid transform from the input's frame to the scene's, applied before `scale`; None for the identity."""
+    """(3, 4) float64 rigid transform from the input's frame to the scene's, applied before `scale`; None for the
+    identity."""
     scale: float = 1.0
     """Scene units per unit of the input."""
     downscale_factor: int = 1
@@ -59,6 +61,11 @@ class ParsedScene:
     """(M,) int64 number of the scene that each image shows; None if all show the same."""
     source_images: Tensor | None = None
     """(M,) bool, images that a method may render the others from, and is not judged by; None if there are none."""
+
+    @property
+    def placement(self) -> Placement:
+        """Placement of the input in the scene."""
+        return Placement.of(self.transform, self.scale)
 
     def __getitem__(self, index: Tensor) -> ParsedScene:
         """Return the images selected by an index tensor."""

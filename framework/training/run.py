@@ -24,7 +24,6 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import torch
 import yaml
 
 from framework.base.config import TrainConfig, from_plain, read_yaml, to_plain
@@ -111,9 +110,7 @@ class Run:
 
 def _moved(parsed: ParsedScene, then: Placement) -> float:
     """Return how far cameras have moved since another placement, relative to the furthest from the origin."""
-    transform = torch.eye(4)[:3] if parsed.transform is None else parsed.transform
-    now = Placement(transform.double(), parsed.scale)
-    origins = parsed.cameras.camera_to_worlds[:, :, 3].double()
+    now, origins = parsed.placement, parsed.cameras.camera_to_worlds[:, :, 3].double()
     moved = (then.points(now.original_points(origins)) - origins).norm(dim=-1).max()
     return max(float(moved / origins.norm(dim=-1).max().clamp(min=1e-9)), abs(then.scale / now.scale - 1))
 

@@ -12,7 +12,6 @@ from framework.base.config import MachineConfig, RaysPerPixel, TrainConfig
 from framework.base.device import choose_device
 from framework.base.errors import ConfigError
 from framework.base.registry import load_dataparser, load_method
-from framework.cameras.poses import Placement
 from framework.data.data_folder import find_data
 from framework.data.dataset import DataParser, ParsedScene, load_dataset
 from framework.data.pixel_cache import PixelMemory
@@ -91,10 +90,9 @@ def _load_splats(file: Path, data: Path | None, data_format: DataFormat | None, 
     model = build_model(METHOD, config, scene)
     if not isinstance(model, TakesGaussians):
         raise ConfigError(f"the installed method {METHOD} cannot take the Gaussians of a file")
-    transform = torch.eye(4)[:3] if parsed.transform is None else parsed.transform
-    placement = Placement(transform.double(), parsed.scale)
+    placement = parsed.placement
     model.set_gaussians(transformed(gaussians, *placement.similarity()))
-    content = {"method": METHOD, "transform": transform, "scale": parsed.scale}
+    content = {"method": METHOD, "transform": placement.transform, "scale": placement.scale}
     return Trained(run, model.to(device).eval(), file, content)
 
 

@@ -14,6 +14,7 @@ from framework.base.config import AppearanceConfig, RayConfig, RaysPerPixel, Tra
 from framework.base.device import choose_device
 from framework.base.errors import CheckpointError, ConfigError, NerfloomError, is_out_of_memory
 from framework.base.registry import load_method
+from framework.cameras.poses import Placement
 from framework.data.data_folder import find_data
 from framework.data.scene import Scene
 from framework.model import Model, RendersFromImages
@@ -34,6 +35,11 @@ class Trained:
     """File from which the parameters were read."""
     content: dict[str, Any]
     """Content of the checkpoint, with transform, scale and state."""
+
+    @property
+    def placement(self) -> Placement:
+        """Placement of the input in the run's scene."""
+        return Placement.of(self.content["transform"], self.content["scale"])
 
 
 def load_trained(

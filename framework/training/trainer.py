@@ -118,7 +118,7 @@ class Trainer:
             "method": self.run.method,
             "config": to_plain(self.config),
             "scene": vars(self.model.scene.to("cpu")),
-            "transform": self.train_set.transform,
+            "transform": self.train_set.transform.tolist(),  # float64, which not every device has
             "scale": self.train_set.scale,
             "model": self.model.state_dict(),
             "optimizer": self.optimizer.state_dict(),

@@ -40,11 +40,9 @@ def of_trained(trained: Trained) -> Subject:
     Args:
         trained: the run.
     """
-    content = trained.content
-    placement = Placement(content["transform"].double().cpu(), float(content["scale"]))
-    state = content.get("state")
+    state = trained.content.get("state")
     step = state.get("step", 0) if isinstance(state, dict) else 0
-    return Subject(trained.run, trained.model, placement, step if isinstance(step, int) else 0)
+    return Subject(trained.run, trained.model, trained.placement, step if isinstance(step, int) else 0)
 
 
 def of_trainer(trainer: Trainer) -> Subject:
@@ -53,8 +51,7 @@ def of_trainer(trainer: Trainer) -> Subject:
     Args:
         trainer: the run's trainer.
     """
-    placement = Placement(trainer.train_set.transform.double().cpu(), trainer.train_set.scale)
-    return Subject(trainer.run, trainer.model, placement, trainer.state.step)
+    return Subject(trainer.run, trainer.model, trainer.train_set.placement, trainer.state.step)
 
 
 def newer_checkpoint(folder: Path, seen: Path | None) -> Path | None:

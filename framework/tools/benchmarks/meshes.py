@@ -23,7 +23,6 @@ from torch import Tensor
 from framework.base.child import python_command
 from framework.base.console import say
 from framework.base.errors import NerfloomError
-from framework.cameras.poses import Placement
 from framework.data.ply import read_points
 from framework.export.mesh import Mesh
 from framework.kernels import native
@@ -95,16 +94,15 @@ class Truth:
     def __init__(self, run: Path) -> None:
         loaded = read_run(run)
         parsed = loaded.parse("train")
-        transform = torch.eye(4)[:3] if parsed.transform is None else parsed.transform
-        placement = Placement(transform.double(), parsed.scale)
-        poses = placement.original_poses(parsed.cameras.camera_to_worlds.double())
+        placement = parsed.placement
+        poses = placement.original_poses(parsed.cameras.camera_to_worlds)
         self.eyes = poses[:: max(len(poses) // EYES, 1), :, 3]
         self.size = float((poses[:, :, 3] - poses[:, :, 3].mean(0)).norm(dim=-1).mean())
         self.distance = loaded.parser.signed_distance if isinstance(loaded.parser, KnowsItsSurface) else None
         self.sparse: Tensor | None = None
         if parsed.points is not None:
             inside = ((parsed.points >= parsed.box[0]) & (parsed.points <= parsed.box[1])).all(-1)
-            self.sparse = placement.original_points(parsed.points[inside].double())
+            self.sparse = placement.original_points(parsed.points[inside])
         if self.distance is not None:
             torch.manual_seed(0)
             self.points, normals = surface_sample(self.distance, parsed.box, SURFACE_POINTS)

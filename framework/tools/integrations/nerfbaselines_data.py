@@ -175,13 +175,12 @@ class Frame:
     @classmethod
     def saved(cls, checkpoint: dict[str, Any]) -> Frame:
         """Return the frame of the model in `checkpoint`."""
-        scene, placement = checkpoint["scene"], Placement(checkpoint["transform"].cpu(), checkpoint["scale"])
+        scene, placement = checkpoint["scene"], Placement.of(checkpoint["transform"], checkpoint["scale"])
         return cls(placement, scene["box"], scene["near"], scene["far"], scene["unbounded"])
 
     def placed(self, cameras: Cameras) -> Cameras:
         """Transform `cameras` from the data set's own frame to the scene's."""
-        poses = _in_float64(self.placement).poses(cameras.camera_to_worlds.double())
-        return replace(cameras, camera_to_worlds=poses.float())
+        return replace(cameras, camera_to_worlds=self.placement.poses(cameras.camera_to_worlds).float())
 
 
 def _object_frame(images: ArrayImages, half_size: float | None) -> Frame:
@@ -194,7 +193,7 @@ def _object_frame(images: ArrayImages, half_size: float | None) -> Frame:
     if not half > 0:
         raise DataError("the size of the object cannot be determined; set frame.half_size, in the data set's units")
     box = torch.stack([centre - half, centre + half]).float()
-    return Frame(Placement(torch.eye(4)[:3], 1.0), box, near, far, unbounded=False)
+    return Frame(Placement.of(None, 1.0), box, near, far, unbounded=False)
 
 
 def _unbounded_frame(images: ArrayImages) -> Frame:
@@ -203,18 +202,13 @@ def _unbounded_frame(images: ArrayImages) -> Frame:
     cube = torch.tensor([[-1.0], [1.0]]).repeat(1, 3)
     frame = Frame(placement, cube, NEAR, FAR, unbounded=True)
     if images.points is not None:
-        points = _in_float64(placement).points(images.points).float()
+        points = placement.points(images.points).float()
         near = estimate_near(frame.placed(images.cameras), points)
     elif images.bounds is not None:
         near = BOUND_SHARE * images.bounds[0] * placement.scale
     else:
         near = NEAR
     return replace(frame, near=min(near, FAR / 2))
-
-
-def _in_float64(placement: Placement) -> Placement:
-    """Return the placement in float64: positions in a mapped scene may be millions of units from their origin."""
-    return replace(placement, transform=placement.transform.double())
 
 
 def dataset_of(images: ArrayImages, frame: Frame, masks: Masks) -> Dataset:

@@ -101,7 +101,7 @@ def moved(views: Views, scale: float = 1.0, shift: float = 0.0, placed: bool = F
         poses = torch.cat([dataset.cameras.camera_to_worlds for dataset in (views.train, views.test)]).double()
         poses[:, :, 3] = factor * poses[:, :, 3] + offset
         placement = place(poses, orientation="none")
-        factor, offset = placement.scale * factor, placement.scale * (offset + placement.transform[:, 3].double())
+        factor, offset = placement.scale * factor, placement.scale * (offset + placement.transform[:, 3])
     return views.each(partial(_mapped, factor=factor, offset=offset))
 
 
@@ -110,7 +110,7 @@ def _mapped(dataset: Dataset, factor: float, offset: Tensor) -> Dataset:
     poses, scene = dataset.cameras.camera_to_worlds.to(torch.float64, copy=True), dataset.scene
     poses[:, :, 3] = factor * poses[:, :, 3] + offset
     cameras = replace(dataset.cameras, camera_to_worlds=poses.float())
-    transform = dataset.transform.to(torch.float64, copy=True)
+    transform = dataset.transform.clone()
     transform[:, 3] += offset / (factor * dataset.scale)  # it is applied before the scale
     return replace(
         dataset,
@@ -122,6 +122,6 @@ def _mapped(dataset: Dataset, factor: float, offset: Tensor) -> Dataset:
             far=factor * scene.far,
             camera_to_worlds=cameras.camera_to_worlds,
         ),
-        transform=transform.float(),
+        transform=transform,
         scale=factor * dataset.scale,
     )

@@ -89,6 +89,6 @@ def _dataset(colors: Tensor, size: int, times: Tensor | None = None, unbounded: 
         times=times,
         names=tuple(f"{index}.png" for index in range(COUNT)),
         scene=scene,
-        transform=torch.eye(4)[:3],
+        transform=torch.eye(4, dtype=torch.float64)[:3],
         scale=1.0,
     )

@@ -107,14 +107,7 @@ def _command(arguments: list[str]) -> None:
     trained = load_trained(flags.load_config, flags.load_checkpoint, flags.device_type, flags.data)
     if trained.model.scene.warped:
         raise ConfigError("this run is in normalised device coordinates (--ndc), which have no scale to export")
-    run(flags, trained, _placement(trained), path)
-
-
-def _placement(trained: Trained) -> Placement:
-    """Return the placement of the input in the run's scene."""
-    from framework.cameras.poses import Placement
-
-    return Placement(trained.content["transform"].double().cpu(), float(trained.content["scale"]))
+    run(flags, trained, trained.placement, path)
 
 
 def _points(flags: PointFlags, trained: Trained, placement: Placement, path: Path) -> None:
@@ -149,8 +142,8 @@ def _points(flags: PointFlags, trained: Trained, placement: Placement, path: Pat
     normals = found.normals
     if normals is None and flags.estimate_normals:
         normals = plane_normals(found.positions, -found.directions)
-    positions = placement.original_points(found.positions.double()).float()
-    normals = None if normals is None else placement.original_directions(normals.double()).float()
+    positions = placement.original_points(found.positions)
+    normals = None if normals is None else placement.original_directions(normals).float()
     write_points(path, positions, found.colors, normals)
     say(f"{len(positions):,} points: {path}")
 
@@ -220,6 +213,8 @@ def _splats(flags: SplatFlags, trained: Trained, placement: Placement, path: Pat
     if flags.max_megabytes is not None and not flags.max_megabytes > 0:
         raise FlagError(f"--max-megabytes must be positive, not {flags.max_megabytes}")
     from framework.base.console import say
+    from framework.data.offsets import write_offset
+    from framework.geometry.local_origin import local_origin
     from framework.splats.files import write_gaussians
     from framework.splats.gaussians import HasGaussians
     from framework.splats.transform import transformed
@@ -234,8 +229,13 @@ def _splats(flags: SplatFlags, trained: Trained, placement: Placement, path: Pat
         say(f"{len(found) - len(good):,} of {len(found):,} Gaussians are not finite and are left out")
     if not len(good):
         raise ConfigError("this run has no Gaussians left; train it again")
-    for cost in write_gaussians(path, transformed(good, *placement.original_similarity()), flags.max_megabytes):
+    # Programs read float32 from these files.
+    origin = local_origin(placement.original_points(good.means), good.typical_size / placement.scale)
+    about = placement if origin is None else placement.about(origin)
+    for cost in write_gaussians(path, transformed(good, *about.original_similarity()), flags.max_megabytes):
         say(cost)
+    if sentence := write_offset(path, origin):
+        say(sentence)
     say(f"{path.stat().st_size / 1e6:.2f} MB: {path}")
 
 

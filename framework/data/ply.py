@@ -1,4 +1,4 @@
-"""Vertices in PLY files (Turk 1994), ascii or binary: points, and whatever other numbers they have."""
+"""Vertices in PLY files (Turk 1994), ascii or binary: points, and other numbers of theirs; triangles are written."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ import torch
 from torch import Tensor
 
 from framework.base.atomic import write_atomically
+from framework.base.console import say
 from framework.base.errors import DataError
+from framework.geometry.local_origin import local_origin, rounding
 
 TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
@@ -21,6 +23,8 @@ TYPES = {
     "float32": "f4", "float64": "f8",
 }  # fmt: skip
 """PLY's names of types, old and new, to numpy's."""
+NAMES = {"uint8": "uchar", "float32": "float", "float64": "double"}
+"""numpy's types that are written, to PLY's names of them."""
 ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 """PLY's formats, to numpy's prefixes of byte order."""
 LONGEST_HEADER = 1000
@@ -168,50 +172,78 @@ def _ascii_columns(stream: BinaryIO, file: Path, header: PlyHeader, names: Seque
 
 
 def write_points(file: Path, positions: Tensor, colors: Tensor, normals: Tensor | None = None) -> None:
-    """Write points to a binary PLY file.
+    """Write points to a binary PLY file: positions as float, or as double where float would be too coarse.
 
     Args:
         file: path of the PLY file.
-        positions: (K, 3).
+        positions: (K, 3) positions, as `coordinate_columns` takes them.
         colors: (K, 3) in [0, 1].
         normals: (K, 3) unit vectors, or None.
 
     Raises:
         OSError: if the file cannot be written.
     """
-    columns: list[tuple[str, np.ndarray]] = []
-    for names, values in (("xyz", positions), (("nx", "ny", "nz"), normals)):
-        if values is not None:
-            columns += zip(names, values.float().numpy().T, strict=True)
+    columns = coordinate_columns(file, positions)
+    if normals is not None:
+        columns += zip(("nx", "ny", "nz"), normals.float().numpy().T, strict=True)
     stored = (colors.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
     columns += zip(("red", "green", "blue"), stored.T, strict=True)
     write_columns(file, columns)
 
 
-def write_columns(file: Path, columns: Sequence[tuple[str, np.ndarray]]) -> None:
+def coordinate_columns(file: Path, positions: Tensor) -> list[tuple[str, np.ndarray]]:
+    """Return the columns x, y and z of positions: float32, or float64 where float32 is too coarse, which is said.
+
+    Args:
+        file: path of the PLY file, for the message.
+        positions: (K, 3) float64.
+    """
+    if local_origin(positions) is None:
+        return list(zip("xyz", positions.float().numpy().T, strict=True))
+    say(f"{file.name}: {in_full(positions)}")
+    return list(zip("xyz", positions.double().numpy().T, strict=True))
+
+
+def in_full(positions: Tensor) -> str:
+    """Return a sentence on positions (K, 3) that are written in float64, since float32 is too coarse for them."""
+    return (
+        f"so far from the origin, float32 would round coordinates by up to {rounding(positions):.2g}; they are "
+        "written in double precision, for programs that read it"
+    )
+
+
+def write_columns(file: Path, columns: Sequence[tuple[str, np.ndarray]], faces: Tensor | None = None) -> None:
     """Write vertices to a binary PLY file, little endian, as a whole or not at all.
 
     Args:
         file: path of the PLY file.
-        columns: names and values (K,) of the properties, uint8 or floating point, which is written as float32.
+        columns: names and values (K,) of the properties, uint8, float32 or float64.
+        faces: (F, 3) int64 vertices of triangles; None if there are none.
 
     Raises:
         OSError: if the file cannot be written.
     """
-    kinds = [(name, "uchar" if values.dtype == np.uint8 else "float") for name, values in columns]
-    table = np.empty(len(columns[0][1]), [(name, {"uchar": "u1", "float": "<f4"}[kind]) for name, kind in kinds])
+    kinds = [(name, NAMES[values.dtype.name]) for name, values in columns]
+    table = np.empty(len(columns[0][1]), [(name, "<" + TYPES[kind]) for name, kind in kinds])
     for name, values in columns:
         table[name] = values
-    write_atomically(file, lambda stream: stream.writelines([header_text(len(table), kinds), table.data]))
+    triangles = np.empty(0 if faces is None else len(faces), [("count", "u1"), ("index", "<i4", 3)])
+    if faces is not None:
+        triangles["count"], triangles["index"] = 3, faces.numpy()
+    header = header_text(len(table), kinds, None if faces is None else len(faces))
+    write_atomically(file, lambda stream: stream.writelines([header, table.data, triangles.data]))
 
 
-def header_text(count: int, kinds: Sequence[tuple[str, str]]) -> bytes:
+def header_text(count: int, kinds: Sequence[tuple[str, str]], faces: int | None = None) -> bytes:
     """Return the header of a binary file, little endian.
 
     Args:
         count: number of vertices.
         kinds: names of their properties, and PLY's names of their types.
+        faces: number of triangles behind them; None for no such element.
     """
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     lines += [f"property {kind} {name}" for name, kind in kinds]
+    if faces is not None:
+        lines += [f"element face {faces}", "property list uchar int vertex_indices"]
     return ("\n".join([*lines, "end_header"]) + "\n").encode()

@@ -77,12 +77,9 @@ def input_poses(cameras: Cameras, placement: Placement) -> Tensor:
 
     Args:
         cameras: M cameras in the scene's frame.
-        placement: the transform from the input's frame to the scene's; it was rounded to float32, so that its rotation
-            is made orthonormal first.
+        placement: the transform from the input's frame to the scene's.
     """
-    rotation = orthonormal(placement.transform[:, :3].double().cpu())
-    transform = torch.cat([rotation, placement.transform[:, 3:].double().cpu()], -1)
-    poses = Placement(transform, placement.scale).original_poses(cameras.camera_to_worlds.double().cpu())
+    poses = placement.original_poses(cameras.camera_to_worlds.cpu())
     return torch.cat([orthonormal(poses[:, :, :3]), poses[:, :, 3:]], -1)
 
 
@@ -145,7 +142,7 @@ def posed_files(scenes: Mapping[str, ParsedScene], cameras: Mapping[str, Cameras
         splits=splits,
         masks=tuple(None if (masks := scenes[split].mask_paths) is None else masks[index] for split, index in chosen),
         times=torch.cat([_times(scenes[split])[parts[split]] for split in scenes]) if moving else None,
-        points=None if points is None else placement.original_points(points.double()),
+        points=None if points is None else placement.original_points(points),
         pixels_per_unit=placement.scale,
     )
 

@@ -101,5 +101,5 @@ def lattice_of(
     x, y, z = (max(math.ceil(float(edge) / spacing - 1e-6), 1) for edge in last - first)
     if low is None or placement is None:
         return Lattice(first, spacing * axes, (x, y, z))
-    rotation = placement.transform[:, :3].double()
+    rotation = placement.transform[:, :3]
     return Lattice(placement.points(first[None])[0], placement.scale * spacing * rotation.T, (x, y, z))

@@ -1,19 +1,28 @@
-"""Mesh files: PLY, OBJ and GLB, written by trimesh."""
+"""Mesh files: PLY, and OBJ and GLB, which trimesh writes."""
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
 import numpy as np
+from torch import Tensor
 
+from framework.base.console import say
+from framework.data.offsets import write_offset
+from framework.data.ply import coordinate_columns, in_full, write_columns
 from framework.export.mesh import Mesh
 from framework.export.texture import Texture
+from framework.geometry.local_origin import local_origin
 from framework.training.checkpoint import write_atomically
 
 MeshFormat = Literal["ply", "obj", "glb"]
 """Suffix of a file that meshes are written to."""
+DECIMALS = 8
+"""Least number of decimals of a coordinate in an OBJ file."""
 
 
 def write_mesh(file: Path, mesh: Mesh) -> None:
@@ -22,6 +31,9 @@ def write_mesh(file: Path, mesh: Mesh) -> None:
     Coordinates are written as they are: a GLB file too has the axes of the mesh, although viewers take its y for up. A
     texture is inside a GLB file, and beside an OBJ file as NAME.mtl and NAME.png.
 
+    Far from the origin, where float32 is too coarse, PLY and OBJ files have double precision. A GLB file holds float32
+    alone, and is written about a local origin with its offset beside it (`data.offsets`). A line says so.
+
     Args:
         file: path of the file, with a suffix of `MeshFormat`.
         mesh: a mesh on the CPU. With a texture it has no vertex colours in the file, and PLY files have no texture.
@@ -29,30 +41,59 @@ def write_mesh(file: Path, mesh: Mesh) -> None:
     Raises:
         OSError: if the file cannot be written.
     """
-    if mesh.texture is not None and file.suffix != ".ply":
-        _write_textured(file, mesh, mesh.texture)
-    else:
+    if file.suffix == ".ply":
+        _write_ply(file, mesh)
+        return
+    origin = local_origin(mesh.vertices)
+    if origin is not None and file.suffix == ".glb":
+        mesh = replace(mesh, vertices=mesh.vertices - origin)
+    if mesh.texture is None:
         _write_colored(file, mesh)
+    else:
+        _write_textured(file, mesh, mesh.texture)
+    if file.suffix == ".glb" and (sentence := write_offset(file, origin)):
+        say(sentence)
+    elif origin is not None:
+        say(f"{file.name}: {in_full(mesh.vertices)}")
+
+
+def _write_ply(file: Path, mesh: Mesh) -> None:
+    columns = coordinate_columns(file, mesh.vertices)
+    if mesh.normals is not None:
+        columns += zip(("nx", "ny", "nz"), mesh.normals.float().numpy().T, strict=True)
+    if (colors := _bytes(mesh)) is not None:
+        columns += zip(("red", "green", "blue", "alpha"), colors.T, strict=True)
+    write_columns(file, columns, mesh.faces)
+
+
+def _bytes(mesh: Mesh) -> np.ndarray | None:
+    """Return the colours (V, 4) uint8 of the vertices; None if they have none."""
+    if mesh.colors is None:
+        return None
+    stored = (mesh.colors.clamp(0, 1) * 255).round().numpy().astype(np.uint8)
+    return np.concatenate([stored, np.full((len(stored), 1), 255, np.uint8)], axis=1)
+
+
+def decimals(vertices: Tensor) -> int:
+    """Return the number of decimals with which `vertices` (V, 3) are written as text: 1e-7 of their extent or finer."""
+    extent = float((vertices.amax(0) - vertices.amin(0)).max()) if len(vertices) else 0.0
+    return DECIMALS if not extent > 0 else max(DECIMALS, math.ceil(7 - math.log10(extent)))
 
 
 def _write_colored(file: Path, mesh: Mesh) -> None:
     import trimesh
 
-    colors = None
-    if mesh.colors is not None:
-        stored = (mesh.colors.clamp(0, 1) * 255).round().numpy().astype(np.uint8)
-        colors = np.concatenate([stored, np.full((len(stored), 1), 255, np.uint8)], axis=1)
     made = trimesh.Trimesh(
         vertices=mesh.vertices.numpy(),
         faces=mesh.faces.numpy(),
         vertex_normals=None if mesh.normals is None else mesh.normals.numpy(),
-        vertex_colors=colors,
+        vertex_colors=_bytes(mesh),
         process=False,
         validate=False,
     )
     flags: dict[str, Any] = {"include_normals": mesh.normals is not None}
-    if file.suffix == ".ply":
-        flags = {"vertex_normal": mesh.normals is not None}
+    if file.suffix == ".obj":
+        flags["digits"] = decimals(mesh.vertices)
     write_atomically(file, lambda stream: made.export(stream, file_type=file.suffix[1:], **flags))
 
 
@@ -78,7 +119,12 @@ def _write_textured(file: Path, mesh: Mesh, texture: Texture) -> None:
         write_atomically(file, lambda stream: made.export(stream, file_type="glb", include_normals=normals))
         return
     text, beside = trimesh.exchange.obj.export_obj(
-        made, include_normals=normals, return_texture=True, write_texture=False, mtl_name=f"{file.stem}.mtl"
+        made,
+        include_normals=normals,
+        return_texture=True,
+        write_texture=False,
+        mtl_name=f"{file.stem}.mtl",
+        digits=decimals(mesh.vertices),
     )
     for name, content in (*beside.items(), (file.name, text.encode())):
         write_atomically(file.parent / name, partial(_put, content))

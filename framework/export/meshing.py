@@ -135,7 +135,7 @@ def in_input(mesh: Mesh, placement: Placement) -> Mesh:
         mesh: a mesh in scene coordinates.
         placement: the input's in the scene.
     """
-    normals = None if mesh.normals is None else placement.original_directions(mesh.normals.double()).float()
+    normals = None if mesh.normals is None else placement.original_directions(mesh.normals).float()
     return replace(mesh, vertices=placement.original_points(mesh.vertices), normals=normals)
 
 

@@ -91,13 +91,8 @@ def write_cells(file: Path, grid: SkipsCells, placement: Placement, boxes: bool)
         OSError: if the file cannot be written.
     """
     if not boxes:
-        centers = cell_centers(grid, placement).float()
-        temporary = file.with_name(f".{file.name}.tmp")
-        try:
-            write_points(temporary, centers, torch.full_like(centers, GREY))
-            temporary.replace(file)
-        finally:
-            temporary.unlink(missing_ok=True)
+        centers = cell_centers(grid, placement)
+        write_points(file, centers, torch.full_like(centers, GREY))
         return
     mesh, matrix = boxes_mesh(grid), box_frame(grid, placement)
     vertices = mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3]

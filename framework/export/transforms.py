@@ -38,8 +38,7 @@ def write_transforms(file: Path, posed: PosedFiles, relative: bool) -> None:
     content = transforms(posed, file.parent, relative)
     file.parent.mkdir(parents=True, exist_ok=True)
     if posed.points is not None:
-        points = posed.points.float()
-        write_points(file.with_name(POINTS), points, torch.full_like(points, 0.5))
+        write_points(file.with_name(POINTS), posed.points, torch.full_like(posed.points, 0.5))
     write_json(file, content)
 
 

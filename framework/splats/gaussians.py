@@ -22,7 +22,7 @@ class Gaussians:
     """N Gaussians of 3D Gaussian Splatting (Kerbl et al. 2023), before their activations."""
 
     means: Tensor
-    """(N, 3) centres, scene coordinates."""
+    """(N, 3) centres, scene coordinates; float64 if a file holds them so."""
     log_scales: Tensor
     """(N, 3) logarithm of the standard deviation along each axis."""
     rotations: Tensor
@@ -43,6 +43,11 @@ class Gaussians:
     def degree(self) -> int:
         """Highest degree of the harmonics, 0 to 3."""
         return {count: degree for degree, count in DEGREES.items()}[self.harmonics.shape[2]]
+
+    @property
+    def typical_size(self) -> float:
+        """Median of the standard deviations; 0 without Gaussians."""
+        return float(self.log_scales.exp().median()) if len(self) else 0.0
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
         """Return what a function makes of every tensor.

@@ -80,6 +80,7 @@ def read_ply(file: Path) -> Gaussians:
 
     Gaussians with parameters that are not finite, or without a rotation, are left out, which is said on the terminal.
     An infinite opacity, as other programs write it for an opaque Gaussian, becomes `SURE`. Degree 4 is left out.
+    Centres that the file holds in double precision, as of a survey, stay in it.
 
     Args:
         file: path of the PLY file.
@@ -110,15 +111,17 @@ def read_ply(file: Path) -> Gaussians:
     named = ["x", "y", "z", *_DC, *kept, "opacity", *_SCALES, *_ROTATIONS]
     columns = dict(zip(named, read_columns(file, header, named), strict=True))
 
-    def together(names: Sequence[str]) -> Tensor:
-        values = np.empty((header.count, len(names)), np.float32)
+    precise = dict(header.columns)["x"] == "f8"
+
+    def together(names: Sequence[str], kind: type = np.float32) -> Tensor:
+        values = np.empty((header.count, len(names)), kind)
         with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold is left out below
             for index, name in enumerate(names):
                 values[:, index] = columns[name]
         return torch.from_numpy(values)
 
     gaussians = Gaussians(
-        means=together("xyz"),
+        means=together("xyz", np.float64 if precise else np.float32),
         log_scales=together(_SCALES),
         rotations=together(_ROTATIONS),
         logits=_finite_logits(together(["opacity"])[:, 0]),

@@ -40,7 +40,7 @@ def transformed(gaussians: Gaussians, rotation: Tensor, scale: float, shift: Ten
     means = scale * (gaussians.means.double() @ rotation.T) + shift
     rotations = quaternion_product(quaternion(rotation), gaussians.rotations.double())
     return Gaussians(
-        means=means.to(gaussians.means),
+        means=means.to(gaussians.log_scales),
         log_scales=gaussians.log_scales + math.log(scale),
         rotations=rotations.to(gaussians.rotations),
         logits=gaussians.logits,

@@ -9,15 +9,18 @@ from typing import Any, Literal
 import torch
 
 from framework.base.config import MachineConfig, RaysPerPixel, TrainConfig
+from framework.base.console import say
 from framework.base.device import choose_device
-from framework.base.errors import ConfigError
+from framework.base.errors import ConfigError, DataError
 from framework.base.registry import load_dataparser, load_method
 from framework.data.data_folder import find_data
 from framework.data.dataset import DataParser, ParsedScene, load_dataset
+from framework.data.offsets import offset_file, read_offset
 from framework.data.pixel_cache import PixelMemory
 from framework.data.scene import Scene
+from framework.geometry.local_origin import local_origin, rounding
 from framework.splats.files import SUFFIXES, read_gaussians
-from framework.splats.gaussians import TakesGaussians
+from framework.splats.gaussians import Gaussians, TakesGaussians
 from framework.splats.transform import transformed
 from framework.training.run import Run
 from framework.training.trained import Trained, build_model, load_trained
@@ -91,9 +94,38 @@ def _load_splats(file: Path, data: Path | None, data_format: DataFormat | None, 
     if not isinstance(model, TakesGaussians):
         raise ConfigError(f"the installed method {METHOD} cannot take the Gaussians of a file")
     placement = parsed.placement
-    model.set_gaussians(transformed(gaussians, *placement.similarity()))
+    placed = transformed(gaussians, *placement.about(read_offset(file)).similarity())
+    _check_place(file, gaussians, placed, parsed)
+    model.set_gaussians(placed)
     content = {"method": METHOD, "transform": placement.transform, "scale": placement.scale}
     return Trained(run, model.to(device).eval(), file, content)
+
+
+def _check_place(file: Path, given: Gaussians, placed: Gaussians, parsed: ParsedScene) -> None:
+    """Refuse Gaussians that no camera can see, and say if the file has rounded their centres.
+
+    Args:
+        file: path of the file.
+        given: the Gaussians in the frame of the file.
+        placed: the Gaussians in the frame of the scene.
+        parsed: the training images.
+
+    Raises:
+        DataError: if they are beyond the end of the scene.
+    """
+    middle = placed.means.double().median(0).values
+    away = float((parsed.cameras.camera_to_worlds[:, :, 3].double() - middle).norm(dim=-1).min())
+    beside = offset_file(file).name
+    if not away < parsed.far:
+        raise DataError(
+            f"{file}: its Gaussians are {away:,.0f} scene units from the nearest camera, and the scene ends at "
+            f"{parsed.far:g}, so it is in another frame than the data; a file about a local origin needs {beside}"
+        )
+    if given.means.dtype == torch.float32 and local_origin(given.means, given.typical_size) is not None:
+        say(
+            f"{file}: so far from the origin, float32 has rounded its centres by up to {rounding(given.means):.2g}; "
+            f"write it about a local origin, with the offset in {beside}"
+        )
 
 
 def _scene(parsed: ParsedScene, config: TrainConfig) -> Scene:

@@ -45,13 +45,20 @@ def write_images(folder: Path, names: list[str], width: int = WIDTH, height: int
         iio.imwrite(folder / name, np.full((height, width, 3), 20 * index % 256, dtype=np.uint8))
 
 
-def write_capture(folder: Path, count: int = 9, **changes: Any) -> Path:
-    """A nerfstudio folder; `changes` go into transforms.json."""
+def moved(given: np.ndarray, unit: float, shift: np.ndarray) -> np.ndarray:
+    """The poses (M, 4, 4) in another unit and at another place: position x becomes unit * x + shift."""
+    found = given.copy()
+    found[:, :3, 3] = unit * found[:, :3, 3] + shift
+    return found
+
+
+def write_capture(folder: Path, count: int = 9, given: np.ndarray | None = None, **changes: Any) -> Path:
+    """A nerfstudio folder, with other poses than those of `poses` if they are given; `changes` go into its file."""
     names = [f"{index:03d}.png" for index in range(count)]
     write_images(folder / "images", names)
     frames = [
         {"file_path": f"images/{name}", "transform_matrix": pose.tolist()}
-        for name, pose in zip(names, poses(count), strict=True)
+        for name, pose in zip(names, poses(count) if given is None else given, strict=True)
     ]
     content = {"camera_model": "PINHOLE", "w": WIDTH, "h": HEIGHT, "fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY}
     (folder / "transforms.json").write_text(json.dumps({**content, "frames": frames, **changes}))

@@ -18,7 +18,6 @@ from dataparsers.nerfstudio import Nerfstudio
 from dataparsers.reading import read_json, read_pose
 from framework.base.errors import ConfigError
 from framework.cameras.cameras import Cameras
-from framework.cameras.poses import Placement
 from framework.data.dataset import DataParser, ParsedScene
 from framework.export.cameras import PosedFiles, all_cameras, orthonormal, posed_files
 from framework.export.colmap_text import images_folder, quaternion, write_model
@@ -32,9 +31,8 @@ def exported(parser: DataParser, data: Path) -> tuple[PosedFiles, dict[str, Pars
     """What a run on some data exports, as far as it depends on the data."""
     scenes = {split: parser.parse(data, split) for split in SPLITS}
     first = scenes["train"]
-    transform = torch.eye(4)[:3] if first.transform is None else first.transform
     cameras = all_cameras(scenes, first.cameras, first.cameras)
-    return posed_files(scenes, cameras, Placement(transform.double(), first.scale)), scenes
+    return posed_files(scenes, cameras, first.placement), scenes
 
 
 def given_poses(file: Path) -> dict[str, Tensor]:

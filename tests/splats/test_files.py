@@ -519,8 +519,7 @@ class Splats:
 
 
 def pretend(monkeypatch: pytest.MonkeyPatch, model: object, placement: Placement, method: str) -> None:
-    content = {"transform": placement.transform, "scale": placement.scale}
-    trained = SimpleNamespace(model=model, content=content, run=SimpleNamespace(method=method))
+    trained = SimpleNamespace(model=model, placement=placement, run=SimpleNamespace(method=method))
     monkeypatch.setattr("framework.training.trained.load_trained", lambda *_: trained)
 
 

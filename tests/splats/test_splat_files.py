@@ -42,9 +42,9 @@ def psnr(file: Path) -> float:
 @pytest.mark.medium
 @pytest.mark.parametrize("kind", ["ply", "spz"])
 def test_a_file_has_the_psnr_of_its_run(kind: str, capture: Path, capture_run: Path, tmp_path: Path) -> None:
-    placement = load_run_or_splats(capture_run).content
-    assert placement["scale"] < 0.5
-    assert not torch.allclose(placement["transform"].cpu(), torch.eye(4)[:3], atol=0.1)
+    placement = load_run_or_splats(capture_run).placement
+    assert placement.scale < 0.5
+    assert not torch.allclose(placement.transform.float(), torch.eye(4)[:3], atol=0.1)
     called("ns-export", "gaussian-splat", capture_run, "--output-dir", tmp_path, "--format", kind)
     file = tmp_path / f"splat.{kind}"
     for words in ((capture_run,), (file, "--data", capture)):

@@ -45,7 +45,7 @@ def untrained(tmp_path: Path) -> Trainer:
 def test_a_checkpoint_tells_where_its_scene_lies_in_the_captures_frame(untrained: Trainer) -> None:
     """By its transform and scale, with which every export begins, cameras stand where photographs were taken."""
     content = load_checkpoint(untrained.save())
-    transform, scale = content["transform"].double().numpy(), content["scale"]
+    transform, scale = np.array(content["transform"]), content["scale"]
     places = untrained.train_set.cameras.camera_to_worlds[:, :, 3].double().numpy()
     found = (places / scale - transform[:, 3]) @ transform[:, :3]
     truth = np.stack([pose_of(NAMES.index(name))[:3, 3] for name in untrained.train_set.names])

@@ -14,6 +14,8 @@ from torch import Tensor
 from framework.base.errors import ConfigError, DataError
 from framework.cameras.poses import Placement
 from framework.cli.export import main
+from framework.data.offsets import offset_file, read_offset
+from framework.data.ply import read_columns, read_header, write_columns
 from framework.kernels.spherical_harmonics import spherical_harmonics_reference
 from framework.splats.budget import colour_error, fitted_ply, fitted_spz, visibility
 from framework.splats.files import read_gaussians, write_gaussians
@@ -518,9 +520,20 @@ class Splats:
         return self.found
 
 
+UTM = torch.tensor([512345.678, 5403210.987, 432.1], dtype=torch.float64)
+"""A place on Earth in metres."""
+
+
 def pretend(monkeypatch: pytest.MonkeyPatch, model: object, placement: Placement, method: str) -> None:
     trained = SimpleNamespace(model=model, placement=placement, run=SimpleNamespace(method=method))
     monkeypatch.setattr("framework.training.trained.load_trained", lambda *_: trained)
+
+
+def exported(monkeypatch: pytest.MonkeyPatch, folder: Path, suffix: str, *flags: str) -> None:
+    """Let ns-export write splat.ply or splat.spz to a folder."""
+    words = ("ns-export", "gaussian-splat", str(folder / "run"), "--output-dir", str(folder), "--format", suffix)
+    monkeypatch.setattr("sys.argv", [*words, *flags])
+    main()
 
 
 @pytest.mark.parametrize("suffix", ["ply", "spz"])
@@ -531,17 +544,7 @@ def test_ns_export(
     gaussians = some(40)
     gaussians.means[3] = math.nan
     pretend(monkeypatch, Splats(gaussians), placement, "gaussian-splatting")
-    arguments = [
-        "ns-export",
-        "gaussian-splat",
-        str(tmp_path / "run"),
-        "--output-dir",
-        str(tmp_path),
-        "--format",
-        suffix,
-    ]
-    monkeypatch.setattr("sys.argv", arguments)
-    main()
+    exported(monkeypatch, tmp_path, suffix)
     said = capsys.readouterr().err
     assert "1 of 40 Gaussians are not finite" in said
     assert f"splat.{suffix}" in said
@@ -557,15 +560,68 @@ def test_ns_export(
             original = placement.original_directions(direction[None])[0]
             torch.testing.assert_close(seen(read, original), seen(kept, direction), atol=1e-5, rtol=0)
     size = (tmp_path / f"splat.{suffix}").stat().st_size
-    monkeypatch.setattr("sys.argv", [*arguments, "--max-megabytes", f"{size / 2e6:.6f}"])
-    main()
+    exported(monkeypatch, tmp_path, suffix, "--max-megabytes", f"{size / 2e6:.6f}")
     assert (tmp_path / f"splat.{suffix}").stat().st_size <= size / 2 + 1
     assert " MB hold harmonics up to degree" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("unit", [1e-4, 1.0, 1e5, 5e6])
+@pytest.mark.parametrize("suffix", ["ply", "spz"])
+def test_ns_export_near_the_origin_writes_what_it_always_wrote(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, unit: float
+) -> None:
+    """In any unit that the format can hold: the Gaussians in the frame of the input, and no file beside."""
+    if suffix == "spz" and unit > 1e5:
+        return  # SPZ holds positions up to 8,388,607
+    placement = Placement(torch.cat([turn(), unit * torch.tensor([[1.0], [2.0], [3.0]]).double()], -1), 0.25 / unit)
+    pretend(monkeypatch, Splats(some(40)), placement, "gaussian-splatting")
+    exported(monkeypatch, tmp_path, suffix)
+    write_gaussians(tmp_path / f"plain.{suffix}", transformed(some(40), *placement.original_similarity()))
+    assert (tmp_path / f"splat.{suffix}").read_bytes() == (tmp_path / f"plain.{suffix}").read_bytes()
+    assert not offset_file(tmp_path / f"splat.{suffix}").exists()
+
+
+@pytest.mark.parametrize("unit", [1.0, 100.0])
+@pytest.mark.parametrize("suffix", ["ply", "spz"])
+def test_ns_export_far_from_the_origin_writes_about_a_local_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], suffix: str, unit: float
+) -> None:
+    """And the file beside leads back to the input's frame and to the scene's."""
+    gaussians = some(500)
+    placement = Placement(torch.cat([turn(), -(turn() @ UTM)[:, None]], -1), 0.25 / unit)
+    pretend(monkeypatch, Splats(gaussians), placement, "gaussian-splatting")
+    exported(monkeypatch, tmp_path, suffix)
+    file = tmp_path / f"splat.{suffix}"
+    assert f"which splat.{suffix}.offset.json says too" in " ".join(capsys.readouterr().err.split())
+    read = read_gaussians(file)
+    truth = (gaussians.means.double() / placement.scale) @ turn() + UTM
+    step = 1e-5 * unit + (0.5 * 2.0 ** -fractional_bits(read) if suffix == "spz" else 0.0)
+    torch.testing.assert_close(read.means.double() + read_offset(file), truth, atol=step, rtol=0)
+    back = transformed(read, *placement.about(read_offset(file)).similarity())
+    torch.testing.assert_close(back.means, gaussians.means, atol=placement.scale * step + 1e-5, rtol=0)
+    # The same folder, and a run near the origin.
+    pretend(monkeypatch, Splats(gaussians), Placement.of(None, 1.0), "gaussian-splatting")
+    exported(monkeypatch, tmp_path, suffix)
+    assert not offset_file(file).exists()
+
+
+def test_centres_in_double_precision_stay_in_it_until_they_are_placed(tmp_path: Path) -> None:
+    """Files of other programs, which hold the coordinates of a survey as double."""
+    gaussians, names = some(40), property_names(15)
+    write_ply(tmp_path / "a.ply", gaussians)
+    values = read_columns(tmp_path / "a.ply", read_header(tmp_path / "a.ply"), names)
+    far = gaussians.means.double() + UTM
+    write_columns(tmp_path / "b.ply", list(zip(names, [*far.numpy().T, *values[3:]], strict=True)))
+    read = read_gaussians(tmp_path / "b.ply")
+    assert torch.equal(read.means, far)
+    placed = transformed(read, torch.eye(3), 1.0, -UTM)
+    assert placed.means.dtype == torch.float32
+    torch.testing.assert_close(placed.means, gaussians.means, atol=1e-6, rtol=0)
+
+
 def test_what_cannot_be_exported_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: Refused) -> None:
     given = ("gaussian-splat", tmp_path / "run", "--output-dir", tmp_path)
-    placement = Placement(torch.eye(3, 4), 1.0)
+    placement = Placement.of(None, 1.0)
     pretend(monkeypatch, SimpleNamespace(scene=Splats.scene), placement, "instant-ngp")
     message = "ns-export gaussian-splat: instant-ngp has no Gaussians; ns-train gaussian-splatting makes them"
     assert message in refused(main, *given)

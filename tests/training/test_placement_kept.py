@@ -72,7 +72,8 @@ def test_without_a_photograph_the_others_stay_where_they_were(
     assert f"others than when {tmp_path} was trained; cameras are placed as they were then" in said
     recorded, found = json.loads((tmp_path / TRANSFORMS).read_text()), run.parse("train")
     assert found.transform is not None
-    torch.testing.assert_close(found.transform, torch.tensor(recorded["transform"], dtype=torch.float64), rtol=1e-5, atol=1e-5)
+    then = torch.tensor(recorded["transform"], dtype=torch.float64)
+    torch.testing.assert_close(found.transform, then, rtol=1e-5, atol=1e-5)
     assert found.scale == pytest.approx(recorded["scale"])
 
 

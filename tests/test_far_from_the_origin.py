@@ -100,6 +100,14 @@ def test_placements_that_were_rounded_to_float32_are_still_read(tmp_path: Path) 
     torch.testing.assert_close(found[:, :, 3], truth[:, :3, 3], rtol=0, atol=1e-6)
 
 
+def test_a_placement_is_what_a_checkpoint_holds() -> None:
+    rows = [[1.0, 0.0, 0.0, -UTM[0]], [0.0, 1.0, 0.0, -UTM[1]], [0.0, 0.0, 1.0, -UTM[2]]]
+    for held in (rows, torch.tensor(rows, dtype=torch.float64)):
+        assert Placement.of(held, 2.0).transform.tolist() == rows
+    assert torch.equal(Placement.of(torch.tensor(rows), 2.0).transform, torch.tensor(rows).double())
+    assert Placement.of(None, 2.0).points(torch.ones(1, 3)).tolist() == [[2.0, 2.0, 2.0]]
+
+
 def test_points_and_the_cube_of_a_file_are_where_its_cameras_are(tmp_path: Path) -> None:
     """`offset` and `scale` map the file's positions to a unit cube; UTM coordinates make the offset large."""
     points = torch.from_numpy(UTM) + torch.tensor([[0.5, 0.25, -0.125], [0.0, 0.0, 0.0], [-1.0, 0.5, 0.25]])

@@ -49,8 +49,10 @@ class Placement:
             transform: (3, 4) tensor of any type and device, or rows of numbers; None for the identity.
             scale: scene units per unit of the input.
         """
-        identity = torch.eye(4, dtype=torch.float64)[:3]
-        return cls(identity if transform is None else torch.as_tensor(transform, device="cpu").double(), float(scale))
+        if transform is None:
+            return cls(torch.eye(4, dtype=torch.float64)[:3], float(scale))
+        held = transform.cpu() if isinstance(transform, Tensor) else transform  # not every device has float64
+        return cls(torch.as_tensor(held, dtype=torch.float64), float(scale))
 
     def points(self, points: Tensor) -> Tensor:
         """Transform `points` (K, 3) from the input's frame to the scene's, float64."""

@@ -12,6 +12,7 @@ from framework.base.console import say
 from framework.cameras.camera_path import read_transforms
 from framework.cameras.poses import Placement, enlargement, place
 from framework.data.dataset import Split
+from framework.geometry.local_origin import local_origin, rounding
 
 if TYPE_CHECKING:
     from dataparsers.captured import Captured, PosedImages
@@ -23,7 +24,7 @@ earlier: x becomes `scale * (transform @ x)`."""
 
 
 def placement_of(flags: Captured, images: PosedImages, split: Split, applied: Applied | None) -> Placement:
-    """Return the placement of the scene that all images show, and say if it is enlarged.
+    """Return the placement of the scene that all images show, and say if it is enlarged or far from its origin.
 
     Args:
         flags: the format's flags.
@@ -34,6 +35,17 @@ def placement_of(flags: Captured, images: PosedImages, split: Split, applied: Ap
     Raises:
         DataError: if the placement that the flags name cannot be read.
     """
+    placement = _placement(flags, images, split, applied)
+    positions = placement.points(images.poses[:, :3, 3])
+    if split == "train" and local_origin(positions, flags.scene_scale) is not None:
+        say(
+            f"cameras are so far from the scene's origin that float32 rounds positions by up to "
+            f"{rounding(positions):.2g} scene units: --center-method poses moves the origin between them"
+        )
+    return placement
+
+
+def _placement(flags: Captured, images: PosedImages, split: Split, applied: Applied | None) -> Placement:
     if flags.placement is not None:
         given = read_transforms(flags.placement)
         return given.after(*applied) if applied else given

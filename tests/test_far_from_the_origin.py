@@ -86,6 +86,18 @@ def test_a_run_accepts_its_own_data(
     torch.testing.assert_close(given.parse(run.config.data, "val").cameras.camera_to_worlds, before, rtol=0, atol=1e-6)
 
 
+def test_a_scene_that_is_left_where_it_is_is_said_to_be_far(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    left = Nerfstudio(center_method="none", auto_scale_poses=False, orientation_method="none")
+    for name, shift, far in (("here", 0 * UTM, False), ("there", UTM, True)):
+        data = write_capture(tmp_path / name, given=moved(poses(), 1.0, shift))
+        capsys.readouterr()
+        left.parse(data, "train")
+        said = " ".join(capsys.readouterr().err.split())
+        assert ("float32 rounds positions by up to 0.32 scene units: --center-method poses" in said) == far
+        left.parse(data, "val")
+        assert capsys.readouterr().err == ""
+
+
 def test_placements_that_were_rounded_to_float32_are_still_read(tmp_path: Path) -> None:
     """Those of earlier runs, and nerfstudio's: cameras are where they say, and exports lead back to the input."""
     run = run_on(tmp_path, 1.0, UTM)

@@ -3,15 +3,18 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from framework.cli import evaluate as eval_command
+from framework.data.offsets import offset_file
 from framework.splats.files import read_gaussians, write_gaussians
+from framework.splats.transform import transformed
 from framework.training.splat_files import load_run_or_splats
 from tests.cli.helpers import called
 from tests.conftest import Refused
-from tests.dataparsers.captures import write_capture
+from tests.dataparsers.captures import moved, poses, write_capture
 
 FLAGS = "--num-gaussians 200 --start-gaussians 200 --start random --vis none --max-eval-images 0 --timestamp t"
 
@@ -59,6 +62,36 @@ def test_a_file_has_the_psnr_of_its_run(kind: str, capture: Path, capture_run: P
         assert abs(psnr(tmp_path / "else.eval.json") - expected) > 0.5
 
 
+@pytest.mark.medium
+def test_a_survey_is_trained_exported_and_read_back(
+    tmp_path: Path, refused: Refused, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Five million metres from the origin: cameras to the millimetre, and the pictures of the run."""
+    survey = moved(poses(), 1.0, np.array([512345.678, 5403210.987, 432.1]))
+    data = write_capture(tmp_path / "survey", given=survey)
+    run = trained(data, tmp_path / "out")
+    assert called("ns-eval", run).returncode == 0
+    expected = psnr(run / "eval.json")
+    for kind, tolerance in (("ply", 0.01), ("spz", 0.3)):
+        called("ns-export", "gaussian-splat", run, "--output-dir", tmp_path, "--format", kind)
+        done = called("ns-eval", tmp_path / f"splat.{kind}", "--data", data)
+        assert done.returncode == 0, done.stderr
+        assert psnr(tmp_path / "splat.eval.json") == pytest.approx(expected, abs=tolerance)
+    called("ns-export", "cameras", run, "--output-dir", tmp_path)
+    for row in json.loads((tmp_path / "transforms_train.json").read_text()):
+        np.testing.assert_allclose(row["transform"], survey[int(row["file_path"][:3]), :3], rtol=0, atol=1e-3)
+    offset_file(tmp_path / "splat.ply").unlink()
+    said = refused(eval_command.main, tmp_path / "splat.ply", "--data", data)
+    assert "in another frame than the data; a file about a local origin needs splat.ply.offset.json" in said
+    # Another program's file, in the frame of the survey and in float32.
+    read = load_run_or_splats(tmp_path / "splat.spz", data=data)
+    inside = transformed(read.model.gaussians(), *read.placement.original_similarity())  # type: ignore[attr-defined]
+    write_gaussians(tmp_path / "rounded.ply", inside)
+    capsys.readouterr()
+    load_run_or_splats(tmp_path / "rounded.ply", data=data)
+    assert "float32 has rounded its centres by up to 0.3" in " ".join(capsys.readouterr().err.split())
+
+
 def test_the_format_and_its_flags_may_be_named(shared_tiny: Path, tmp_path: Path) -> None:
     run = trained(shared_tiny, tmp_path / "out", "blender", "--downscale-factor", 2)
     called("ns-export", "gaussian-splat", run, "--output-dir", tmp_path)
@@ -79,7 +112,6 @@ def test_paths_through_a_file(capture: Path, capture_run: Path, tmp_path: Path) 
     file = ("orbit", tmp_path / "splat.ply", "--data", capture, *words, "--output-path", tmp_path / "file")
     said = [called("ns-render", *given).stderr for given in (run, file)]
     import imageio.v3 as iio
-    import numpy as np
 
     for name in ("00000.png", "00001.png"):
         one, other = (iio.imread(tmp_path / folder / name).astype(float) for folder in ("run", "file"))

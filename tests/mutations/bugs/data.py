@@ -120,9 +120,9 @@ BUGS = (
     Bug(
         "original-frame-of-applied",
         "poses",
-        "dataparsers/placing.py",
-        "moved[:, 3] += transform[:, 3] / scale",
-        "moved[:, 3] += transform[:, 3] * scale",
+        "framework/cameras/poses.py",
+        "moved[:, 3] += self.transform[:, 3] / scale",
+        "moved[:, 3] += self.transform[:, 3] * scale",
         "exports of data with applied_scale lie beside their place",
     ),
     Bug(
@@ -145,7 +145,7 @@ BUGS = (
         "sparse-points-not-placed",
         "poses",
         "dataparsers/captured.py",
-        "images.tracks.at(precise.points(images.tracks.points).float())",
+        "images.tracks.at(placement.points(images.tracks.points).float())",
         "images.tracks.at(images.tracks.points.float())",
         "near is found from points in another frame than the cameras, so rays start too far away or too near",
     ),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import IO, TypeVar
@@ -35,7 +35,7 @@ def frame_count(path: Path) -> int:
         raise DataError(f"--data {path}: there is no such file")
     if (advice := install_command("video")) is not None:
         raise DataError(f"reading a video needs ffmpeg: {advice}")
-    import imageio_ffmpeg
+    import imageio_ffmpeg  # type: ignore[import-untyped]
 
     try:
         count, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
@@ -92,7 +92,7 @@ def chosen_frames(path: Path, numbers: np.ndarray) -> Iterator[np.ndarray]:
                 return
 
 
-def _pictures(path: Path, arguments: list[str]) -> Iterator[np.ndarray]:
+def _pictures(path: Path, arguments: list[str]) -> Generator[np.ndarray, None, None]:
     """Yield the pictures (H, W, C) uint8 that ffmpeg writes as a stream of PGM or PPM files."""
     import imageio_ffmpeg
 
@@ -114,7 +114,7 @@ def _pictures(path: Path, arguments: list[str]) -> Iterator[np.ndarray]:
 
 
 def _next_picture(stream: IO[bytes]) -> np.ndarray | None:
-    """Read a binary PGM or PPM file as ffmpeg writes it: kind, size and maximum in lines of their own; None at the end."""
+    """Read a PGM or PPM file as ffmpeg writes it, with three lines of text before its pixels; None at the end."""
     kind, size, _ = (stream.readline() for _ in range(3))
     if len(size.split()) != 2:
         return None

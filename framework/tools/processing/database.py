@@ -46,17 +46,17 @@ def camera_of(database: Path, names: list[str]) -> int | None:
     return next((int(cameras[name]) for name in names if name in cameras), None)
 
 
-def pairs(database: Path) -> dict[tuple[str, str], tuple[int, int]]:
-    """Return the number of matches that fit a geometry, and COLMAP's number of its kind, of each pair of names.
-
-    Names of a pair are in the order of their numbers in the database.
-    """
+def pairs(database: Path) -> set[tuple[str, str]]:
+    """Return the pairs of names that were matched, each in both orders."""
     names = dict(_read(database, "SELECT image_id, name FROM images"))
-    query = "SELECT pair_id, rows, config FROM two_view_geometries"
-    return {
-        (names[number // PAIR_BASE], names[number % PAIR_BASE]): (int(count), int(kind))
-        for number, count, kind in _read(database, query)
-    }
+    numbers = [number for (number,) in _read(database, "SELECT pair_id FROM two_view_geometries")]
+    found = {(names[number // PAIR_BASE], names[number % PAIR_BASE]) for number in numbers}
+    return found | {pair[::-1] for pair in found}
+
+
+def connected(database: Path) -> int:
+    """Return the number of pairs with matches that fit a geometry."""
+    return rows(database, "two_view_geometries", "SUM(rows > 0)")
 
 
 def matches(database: Path, most: int) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -36,6 +36,11 @@ class Job:
         return self.work / "images" if self.flags.undistort else self.flags.output_dir / "images"
 
     @property
+    def stretched(self) -> Path:
+        """Folder of images whose brightness is stretched; it is there if some use a small part of their range."""
+        return self.work / "stretched"
+
+    @property
     def database(self) -> Path:
         """COLMAP's database."""
         return self.work / "database.db"

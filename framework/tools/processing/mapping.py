@@ -89,13 +89,16 @@ def _with_more_pairs(job: Job, names: list[str], sizes: list[int]) -> list[int]:
     """Match images that stayed unregistered with more, and reconstruct again; return the sizes of what is kept."""
     first, again = job.work / "sparse", job.work / "again"
     placed = job.run(colmap.read_model, (first / "0",), "Reading the model").images if sizes else {}
-    features, known = database.features(job.database), database.pairs(job.database)
+    features = database.features(job.database)
     left = [name for name in names if name not in placed and features.get(name, 0) >= FEWEST_FEATURES]
     pairs = pairs_of(left, names, job)
-    if all(pair in known or pair[::-1] in known for pair in pairs):
+    known, connected = database.pairs(job.database), database.connected(job.database)
+    if known.issuperset(pairs):
         return sizes
     few = f"{left[0]}{', ...' if len(left) > 1 else ''}"
     match(job, pairs, len(names), f"{len(left)} images stay unregistered ({few}) and are matched with more")
+    if database.connected(job.database) == connected:
+        return sizes
     found = _map(job, again, len(names))
     if not found or (sizes and found[0] <= sizes[0]):
         return sizes
@@ -107,9 +110,10 @@ def _with_more_pairs(job: Job, names: list[str], sizes: list[int]) -> list[int]:
 def _reason(job: Job) -> str:
     """Return why images could not be registered, as far as their features and matches say."""
     found = database.features(job.database).values()
-    middle = statistics.median(found) if found else 0
+    middle = statistics.median(found) if found else 0.0
+    dark = ", and some are dark or foggy (see above): take them in more light" if job.stretched.is_dir() else ""
     if middle < FEW_FEATURES:
-        return f"they have few features ({middle:.0f} in the middle one), as dark, blurred or blank images do"
-    if not any(count for count, _ in database.pairs(job.database).values()):
-        return "no two of them show the same thing"
-    return "none are connected well enough"
+        return f"they have few features, {middle:.0f} on average, as blurred, dark or blank images do{dark}"
+    if not database.connected(job.database):
+        return f"no two of them show the same thing{dark}"
+    return f"none are connected well enough{dark}"

@@ -84,14 +84,14 @@ def match(job: Job, pairs: list[tuple[str, str]], count: int, rule: str) -> None
         rule: what the pairs are, for people.
     """
     known = database.pairs(job.database)
-    missing = [pair for pair in pairs if pair not in known and pair[::-1] not in known]
+    missing = [pair for pair in pairs if pair not in known]
     kept = f", {len(pairs) - len(missing)} of them kept from before" if len(missing) < len(pairs) else ""
     say(f"matching: {len(pairs):,} of {count * (count - 1) // 2:,} pairs{kept}: {rule}")
+    before = job.seconds.get("matching", 0.0)
     with job.timed("matching"):
         if missing:
             everything = len(missing) == count * (count - 1) // 2
             arguments = (job.database, missing, job.database.with_name("pairs.txt"), everything, job.flags)
             job.run(colmap.match_pairs, arguments, "Matching", len(missing), unit="pairs")
-    found = database.pairs(job.database)
-    connected = sum(rows > 0 for rows, _ in found.values())
-    say(f"matching: {connected:,} of {len(found):,} pairs are connected, in {job.seconds['matching']:.1f} s")
+    done, connected = database.rows(job.database, "two_view_geometries"), database.connected(job.database)
+    say(f"matching: {connected:,} of {done:,} pairs are connected, in {job.seconds['matching'] - before:.1f} s")

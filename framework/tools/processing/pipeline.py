@@ -35,10 +35,10 @@ def process(job: Job, folder: Path, sources: list[Path], masks: Path | None) -> 
     flags, output, work = job.flags, job.flags.output_dir, job.work
     with job.timed("preparing"):
         prepared, unreadable = prepare_and_report(folder, sources, job.images)
+        clear = contrast.for_features(folder, prepared, job.images, job.stretched)
         if len(prepared) < FEWEST:
-            raise DataError(f"{folder} has {len(prepared)} readable images; at least {FEWEST} are needed")
+            raise DataError(f"--data {flags.data}: {len(prepared)} images can be used; at least {FEWEST} are needed")
         mask_of = write_masks(masks, prepared, output / "masks") if masks is not None else {}
-        clear = contrast.for_features(folder, prepared, job.images, work / "stretched")
     names = [image.name for image in prepared]
     features.extract(job, prepared, clear, output / "masks" if mask_of else None)
     rule = matching.choose_matching(flags.matching_method, len(names), flags.exhaustive_limit, job.ordered)
@@ -73,7 +73,7 @@ def process(job: Job, folder: Path, sources: list[Path], masks: Path | None) -> 
         points=len(points),
         reprojection_error=round(model.error, 4),
         matching=rule,
-        pairs=len(database.pairs(job.database)),
+        pairs=database.rows(job.database, "two_view_geometries"),
         turned=turned,
         seconds=job.seconds,
     )

@@ -19,7 +19,9 @@ from framework.tools.processing.estimate import about
 Report = Callable[[int], None]
 """Function that the child calls with the number of units done; with 0 when it begins, after imports."""
 FEW = 4
-"""Number of units after which the time of all is estimated."""
+"""Number of units that must be done before the time of all is estimated."""
+SOON = 1.0
+"""Seconds that must have passed before the time of all is estimated."""
 SHORT = 10.0
 """Seconds up to which no estimate is said."""
 
@@ -100,17 +102,22 @@ def _numbers(
 
 
 def _estimated(numbers: Iterator[int | None], title: str, total: int, unit: str) -> Iterator[int | None]:
-    """Pass on the numbers of units done, and say once, after the first few, how long all will take."""
-    begin: float | None = None
+    """Pass on the numbers of units done, and say once how long all will take.
+
+    That is measured from the first units on, which take longer, as COLMAP's threads and caches begin with them.
+    """
+    first: tuple[float, int] | None = None
     said = False
     for done in numbers:
         yield done
-        if begin is None:
-            begin = None if done is None else time.monotonic()
-        elif done is not None and done >= min(FEW, total) and not said:
-            seconds, said = (time.monotonic() - begin) / done * total, True
-            if seconds > SHORT:
-                say(f"{title}: {about(seconds)} for {total:,} {unit}")
+        if done and first is None:
+            first = time.monotonic(), done
+        elif done and first is not None and not said:
+            seconds, count = time.monotonic() - first[0], done - first[1]
+            if count >= FEW and seconds > SOON:
+                said = True
+                if seconds / count * total > SHORT:
+                    say(f"{title}: {about(seconds / count * total)} for {total:,} {unit}")
 
 
 def _units(numbers: Iterator[int | None], total: int) -> Iterator[int]:

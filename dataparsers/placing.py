@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from dataparsers.parallax import SMALL, camera_spread, warning
 from framework import ParsedScene
 from framework.base.console import say
 from framework.cameras.camera_path import read_transforms
@@ -51,8 +52,12 @@ def _placement(flags: Captured, images: PosedImages, split: Split, applied: Appl
         return given.after(*applied) if applied else given
     # A device knows where gravity pulls, and its images are upright.
     orientation = "up" if flags.orientation_method == "auto" and flags.poses == "device" else flags.orientation_method
-    placement = place(images.poses, orientation, flags.center_method, flags.auto_scale_poses)
-    if flags.auto_scale_poses and images.model != "orthographic":
+    spread = camera_spread(images.poses, images.points if images.tracks is None else images.tracks.points)
+    if spread is not None and spread < SMALL and split == "train" and images.model != "orthographic":
+        say(warning(spread))
+    scaled = flags.auto_scale_poses and spread != 0  # the distances of cameras in one position are rounding
+    placement = place(images.poses, orientation, flags.center_method, scaled)
+    if scaled and images.model != "orthographic":
         spreads = (images.sizes / images.intrinsics[:, :2]).amax(-1)
         factor = enlargement(placement.poses(images.poses), spreads)
         if factor > 1 and split == "train":

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import get_type_hints
@@ -22,6 +21,7 @@ usage: ns-process-data KIND --data IN --output-dir OUT [flags]
 kinds:
   images          a folder of images; COLMAP estimates their poses
   video           a video; COLMAP estimates the poses of its sharpest frames
+                  (each of the two takes what the other does, and says so)
   polycam         Polycam's raw export, with the phone's poses
   record3d        Record3D's export with EXR and RGBD, with the phone's poses
 
@@ -49,7 +49,7 @@ class VideoFlags(ColmapFlags):
     """Estimate the poses of the sharpest frames of a video."""
 
     num_frames_target: int = 300
-    """Number of frames to take, the sharpest of each of as many equal intervals."""
+    """Number of frames to take, the sharpest of each of as many intervals of equal duration."""
 
     def check(self) -> None:
         super().check()
@@ -112,13 +112,33 @@ def _command(arguments: list[str]) -> None:
     if (chosen := chosen_kind(arguments, KINDS, USAGE, "unknown kind")) is None:
         return
     name, kind, rest = chosen
-    flags = read_flags(kind, f"ns-process-data {name}", _spelt_out(rest, kind))
+    words = _spelt_out(rest, kind)
+    if (other := _what_it_is(name, words)) is not None:
+        name, words = other
+        kind = KINDS[name]
+    flags = read_flags(kind, f"ns-process-data {name}", words)
     flags.check()
     try:
         _process(flags)
     except KeyboardInterrupt as stop:
-        note = f"interrupted; {flags.output_dir} is unfinished, --overwrite begins again"
+        kept = "features and matches are kept: --resume goes on, " if isinstance(flags, ColmapFlags) else ""
+        note = f"interrupted; {flags.output_dir} is unfinished, {kept}--overwrite begins again"
         raise Stopped(signal_of(stop), note) from None
+
+
+def _what_it_is(name: str, words: list[str]) -> tuple[str, list[str]] | None:
+    """Return the other kind and its arguments if --data is a video where images are named, or the other way round.
+
+    A folder without images but with one video stands for the video.
+    """
+    words = [part for word in words for part in (word.split("=", 1) if word.startswith("--data=") else [word])]
+    given = [index for index, word in enumerate(words[:-1]) if word == "--data"]
+    if name not in ("images", "video") or not given:
+        return None
+    from framework.tools.processing.listing import kind_of
+
+    kind, data = kind_of(name, Path(words[given[-1] + 1]))
+    return None if kind == name else (kind, [*words[: given[-1] + 1], str(data), *words[given[-1] + 2 :]])
 
 
 def _spelt_out(arguments: list[str], kind: type[OutputFlags]) -> list[str]:
@@ -148,27 +168,30 @@ def _process(flags: OutputFlags) -> None:
 
 def _find_poses(flags: ColmapFlags) -> None:
     from framework.tools.processing import colmap
-    from framework.tools.processing.images import find_images
-    from framework.tools.processing.output import claim
+    from framework.tools.processing.ffmpeg import frame_count
+    from framework.tools.processing.job import Job
+    from framework.tools.processing.listing import find_images
+    from framework.tools.processing.output import FINISHED, begin, ready
     from framework.tools.processing.pipeline import process
-    from framework.tools.processing.video import open_video, write_frames
+    from framework.tools.processing.sequence import is_sequence
+    from framework.tools.processing.unfinished import frames_of
 
     colmap.require()
-    seconds: dict[str, float] = {}
-    masks = flags.masks_dir if isinstance(flags, ImagesFlags) else None
+    if flags.resume and (flags.output_dir / FINISHED).exists():
+        say(f"nothing to resume: it is finished. {ready(flags.output_dir)}")
+        return
     if isinstance(flags, VideoFlags):
-        open_video(flags.data)  # before anything is removed, check that the video can be read
-        claim(flags.output_dir, flags.data, flags.overwrite)
-        start = time.perf_counter()
-        folder = flags.output_dir / "colmap" / "unfinished" / "frames"
-        sources = write_frames(flags.data, folder, flags.num_frames_target)
-        seconds["reading the video"] = time.perf_counter() - start
-        say(f"video: {len(sources)} frames taken, in {seconds['reading the video']:.1f} s")
-    else:
-        folder = flags.data
-        sources = find_images(folder, [flags.output_dir, *([] if masks is None else [masks])])
-        claim(flags.output_dir, flags.data, flags.overwrite)
-    process(folder, sources, flags, masks, isinstance(flags, VideoFlags), seconds)
+        frame_count(flags.data)  # before anything is removed, check that the video can be read
+        begin(flags, [Path(flags.data.name)])
+        job = Job(flags, ordered=True)
+        with job.timed("reading the video"):
+            folder, sources = frames_of(flags.output_dir, flags.data, flags.num_frames_target)
+        process(job, folder, sources, None)
+        return
+    masks = flags.masks_dir if isinstance(flags, ImagesFlags) else None
+    sources = find_images(flags.data, [flags.output_dir, *([] if masks is None else [masks])])
+    begin(flags, sources)
+    process(Job(flags, ordered=is_sequence(sources)), flags.data, sources, masks)
 
 
 def _convert(flags: OutputFlags) -> None:

@@ -36,7 +36,8 @@ from framework.splats.files import SUFFIXES, read_gaussians, write_gaussians
 from framework.splats.gaussians import Gaussians
 from framework.tools.downloads import unpack as downloads
 from framework.tools.processing import polycam, record3d
-from framework.tools.processing.images import find_images, prepare_all
+from framework.tools.processing.images import prepare_all
+from framework.tools.processing.listing import find_images
 from framework.training.checkpoint import FOLDER, load_newest
 from framework.training.datasets import load_split
 from framework.training.run import Run, create_folder, read_run

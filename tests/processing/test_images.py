@@ -7,7 +7,8 @@ import pytest
 from PIL import Image
 
 from framework.base.errors import DataError
-from framework.tools.processing.images import find_images, output_names, prepare, prepare_all
+from framework.tools.processing.images import output_names, prepare, prepare_all
+from framework.tools.processing.listing import find_images
 
 
 def write(path: Path, size: tuple[int, int] = (6, 4), mode: str = "RGB", orientation: int | None = None) -> np.ndarray:

@@ -11,7 +11,8 @@ import pytest
 from framework.data.folds import folds, thumbnail
 from framework.data.image_files import read_image
 from framework.tools.processing.colmap import Model
-from framework.tools.processing.unfolding import MOST_IMAGES, folded_pairs, unfold
+from framework.tools.processing.database import PAIR_BASE
+from framework.tools.processing.unfolding import folded_pairs, unfold
 from tests.test_folds import walk
 
 COUNT = 60
@@ -34,7 +35,7 @@ def database_of(path: Path, names: list[str]) -> Path:
         opened.executemany("INSERT INTO images VALUES (?, ?)", [(9 + i, name) for i, name in enumerate(names)])
         for table in ("matches", "two_view_geometries"):
             opened.execute(f"CREATE TABLE {table} (pair_id INTEGER PRIMARY KEY, rows INTEGER)")
-            pairs = [((9 + i) * MOST_IMAGES + 9 + j, 50) for i in range(COUNT) for j in range(i + 1, COUNT)]
+            pairs = [((9 + i) * PAIR_BASE + 9 + j, 50) for i in range(COUNT) for j in range(i + 1, COUNT)]
             opened.executemany(f"INSERT INTO {table} VALUES (?, ?)", pairs)
     return path
 
@@ -43,7 +44,7 @@ def matched(database: Path, table: str = "two_view_geometries") -> set[tuple[int
     """Indices of the images of each pair that has a match."""
     with closing(sqlite3.connect(database)) as opened:
         numbers = [pair for (pair,) in opened.execute(f"SELECT pair_id FROM {table}")]
-    return {(number // MOST_IMAGES - 9, number % MOST_IMAGES - 9) for number in numbers}
+    return {(number // PAIR_BASE - 9, number % PAIR_BASE - 9) for number in numbers}
 
 
 def test_matches_of_neighbours_and_then_of_the_same_side_are_kept(tmp_path: Path) -> None:

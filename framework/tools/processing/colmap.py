@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,9 +12,16 @@ from typing import Any
 import numpy as np
 
 from framework.base.errors import DataError
+from framework.tools.processing.pair_matching import write_matches
 from framework.tools.processing.settings import ColmapFlags
 from framework.tools.processing.worker import Report
 
+FIRST_PAIRS = 8
+"""Number of pairs that are matched first, by which the time of all is estimated; no part has fewer."""
+SECONDS_OF_A_PART = 5.0
+"""Seconds after which matches are added to the database: what is lost if matching is stopped."""
+MOST_PAIRS = 1000
+"""Maximum number of pairs of a part."""
 MANY = 10
 """Minimum number of images of a camera whose principal point is refined."""
 
@@ -45,33 +53,41 @@ def require() -> None:
 
 
 def extract(
-    report: Report, database: Path, images: Path, groups: list[list[str]], masks: Path | None, flags: ColmapFlags
+    report: Report,
+    database: Path,
+    images: Path,
+    groups: list[tuple[list[str], int | None]],
+    masks: Path | None,
+    flags: ColmapFlags,
 ) -> None:
-    """Extract features.
+    """Extract features. COLMAP adds each image to the database when its features are found.
 
     Args:
-        report: called with the number of images done; unused, as COLMAP does not report progress.
-        database: COLMAP's database, to be created.
+        report: called at the beginning only, as COLMAP does not report progress.
+        database: COLMAP's database, which may be missing.
         images: folder of the images.
-        groups: names of the images that share a camera, for each camera.
+        groups: names of the images that share a camera, and its number if it is in the database, for each camera.
         masks: folder of masks, or None.
         flags: the user's flags.
     """
     import pycolmap
 
+    report(0)
     sift = _extraction_options(pycolmap)
     _set(sift, "max_image_size", flags.max_image_size)
     _set(sift, "max_num_features", flags.max_num_features)
     _set(sift, "num_threads", flags.num_threads)
-    reader = pycolmap.ImageReaderOptions()
-    _set(reader, "camera_model", flags.camera_model)
-    if masks is not None:
-        reader.mask_path = str(masks)
     usage = pycolmap.extract_features.__doc__ or ""
     names = "image_names" if "image_names:" in usage else "image_list"  # before 3.12
     options = "extraction_options" if "extraction_options:" in usage else "sift_options"  # before 3.13
     more = {"camera_model": flags.camera_model} if "camera_model:" in usage else {}  # before 4
-    for group in groups:
+    for group, camera in groups:
+        reader = pycolmap.ImageReaderOptions()
+        _set(reader, "camera_model", flags.camera_model)
+        if masks is not None:
+            reader.mask_path = str(masks)
+        if camera is not None:
+            reader.existing_camera_id = camera
         pycolmap.extract_features(
             str(database),
             str(images),
@@ -86,7 +102,7 @@ def extract(
 def match_pairs(
     report: Report, database: Path, pairs: list[tuple[str, str]], list_path: Path, everything: bool, flags: ColmapFlags
 ) -> None:
-    """Match the features of pairs of images.
+    """Match the features of pairs of images, a few at a time: COLMAP adds each part to the database when it is done.
 
     Args:
         report: called with the number of pairs done.
@@ -98,7 +114,7 @@ def match_pairs(
     """
     import pycolmap
 
-    list_path.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")
+    report(0)
     usage = pycolmap.match_exhaustive.__doc__ or ""
     if "pairing_options:" in usage:
         name, options = "matching_options", pycolmap.FeatureMatchingOptions()
@@ -106,17 +122,23 @@ def match_pairs(
         name, options = "sift_options", pycolmap.SiftMatchingOptions()
     _set(options, "num_threads", flags.num_threads)
     settings = {name: options, "device": _device(pycolmap, flags)}
-    if everything:
+    if everything and not hasattr(pycolmap, "match_image_pairs"):  # before 4
         pycolmap.match_exhaustive(str(database), **settings)
-    elif hasattr(pycolmap, "match_image_pairs"):
-        pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = str(list_path)
-        pycolmap.match_image_pairs(str(database), pairing_options=pairing, **settings)
-    else:
-        from framework.tools.processing.pair_matching import write_matches
-
-        write_matches(report, database, pairs)
-        pycolmap.verify_matches(str(database), str(list_path))
+        return
+    done, size = 0, FIRST_PAIRS
+    while done < len(pairs):
+        part, start = pairs[done : done + size], time.perf_counter()
+        list_path.write_text("".join(f"{first} {second}\n" for first, second in part), encoding="utf-8")
+        if hasattr(pycolmap, "match_image_pairs"):
+            pairing = pycolmap.ImportedPairingOptions()
+            pairing.match_list_path = str(list_path)
+            pycolmap.match_image_pairs(str(database), pairing_options=pairing, **settings)
+        else:
+            write_matches(database, part)
+            pycolmap.verify_matches(str(database), str(list_path))
+        done += len(part)
+        report(done)
+        size = round(min(max(SECONDS_OF_A_PART / (time.perf_counter() - start) * len(part), FIRST_PAIRS), MOST_PAIRS))
 
 
 def reconstruct(report: Report, database: Path, images: Path, output: Path, flags: ColmapFlags) -> list[int]:

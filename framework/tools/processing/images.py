@@ -11,17 +11,16 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
-import numpy as np
 from PIL import Image
 
 from framework.base.console import say, track
 from framework.base.errors import DataError
-from framework.data.data_folder import IMAGE_SUFFIXES
 from framework.data.image_files import Content, unreadable
+from framework.tools.processing.brightness import eight_bits, tones
 
 _JPEG = (".jpg", ".jpeg")
 _ORIENTATION = 0x0112
-_OPERATIONS = {
+OPERATIONS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
     4: Image.Transpose.FLIP_TOP_BOTTOM,
@@ -51,39 +50,8 @@ class PreparedImage:
     """Maker, model and focal lengths (mm) from EXIF, which are equal for images of one camera."""
     orientation: int
     """EXIF orientation that was undone; 1 for none."""
-
-
-def find_images(folder: Path, leave_out: Iterable[Path] = ()) -> list[Path]:
-    """Return the image files in a folder and its subfolders, relative to it, in natural order: 'img2' before 'img10'.
-
-    Hidden files are ignored.
-
-    Args:
-        folder: the folder.
-        leave_out: folders inside it to ignore.
-
-    Raises:
-        DataError: if the folder does not exist or has no image.
-    """
-    if not folder.is_dir():
-        raise DataError(f"--data {folder}: there is no such folder")
-    ignored = [path.resolve() for path in leave_out if not folder.resolve().is_relative_to(path.resolve())]
-    paths = []
-    for path in folder.rglob("*"):
-        relative = path.relative_to(folder)
-        if path.suffix.lower() not in IMAGE_SUFFIXES or any(part.startswith(".") for part in relative.parts):
-            continue
-        if path.is_file() and not any(path.resolve().is_relative_to(entry) for entry in ignored):
-            paths.append(relative)
-    if not paths:
-        raise DataError(f"--data {folder} has no image (looked for {', '.join(IMAGE_SUFFIXES)})")
-    return sorted(paths, key=natural_order)
-
-
-def natural_order(path: Path) -> list[tuple[int, int, str]]:
-    """Return a sorting key of `path` by which numbers in names are compared as numbers."""
-    parts = re.split(r"(\d+)", path.as_posix().lower())
-    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts if part]
+    tones: tuple[float, float]
+    """Ends of the range of brightness in the source, from 0 to 1 (`brightness.tones`)."""
 
 
 def output_names(sources: Iterable[Path]) -> list[str]:
@@ -158,8 +126,8 @@ def prepare(folder: Path, source: Path, images: Path, name: str, upright: bool =
             image.load()  # a truncated file fails here
             exif = image.getexif()
             orientation = exif.get(_ORIENTATION, 1)
-            operation = _OPERATIONS.get(orientation) if upright else None
-            device = _device(exif)
+            operation = OPERATIONS.get(orientation) if upright else None
+            device, ends = _device(exif), tones(image)
             if orientation == 1 and not crop and _is_uniform(image, path, target.suffix):
                 shutil.copyfile(path, target)
                 size = image.size
@@ -178,24 +146,7 @@ def prepare(folder: Path, source: Path, images: Path, name: str, upright: bool =
         raise unreadable(path, error) from error
     except Exception as error:  # Pillow raises SyntaxError, struct.error, DecompressionBombError and more
         raise unreadable(path, error) from error
-    return PreparedImage(name, source.as_posix(), *size, device, orientation if operation is not None else 1)
-
-
-def eight_bits(image: Image.Image) -> Image.Image:
-    """Convert an `image` of any mode to RGB, or to RGBA if a pixel is transparent.
-
-    Raises:
-        DataError: for floating-point images, whose white level is unknown.
-    """
-    if image.mode == "F":
-        raise DataError("floating-point pixels; convert it to an 8-bit PNG")
-    if image.mode.startswith("I"):  # grey with 16 bits
-        deep = np.asarray(image).astype(np.float64)
-        return Image.fromarray((deep / 257).round().clip(0, 255).astype(np.uint8)).convert("RGB")
-    if image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info:
-        rgba = image.convert("RGBA")
-        return rgba if (np.asarray(rgba)[..., 3] < 255).any() else rgba.convert("RGB")
-    return image.convert("RGB")
+    return PreparedImage(name, source.as_posix(), *size, device, orientation if operation is not None else 1, ends)
 
 
 def save(image: Image.Image, path: Path, options: dict[str, Any] | None = None) -> None:
@@ -241,8 +192,8 @@ def write_masks(folder: Path, prepared: list[PreparedImage], masks: Path, crop: 
             raise unreadable(path, error, "the mask") from error
         size = (entry.width + 2 * crop, entry.height + 2 * crop)
         is_upright = entry.orientation >= 5 and mask.size == size and size[0] != size[1]
-        if entry.orientation in _OPERATIONS and not is_upright:
-            mask = mask.transpose(_OPERATIONS[entry.orientation])
+        if entry.orientation in OPERATIONS and not is_upright:
+            mask = mask.transpose(OPERATIONS[entry.orientation])
         if mask.size != size:
             raise DataError(f"the mask {path} differs in size from its image {entry.source}")
         mask = _cropped(mask, crop)

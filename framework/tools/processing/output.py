@@ -9,6 +9,8 @@ from pathlib import Path
 
 from framework.base.errors import DataError
 from framework.data.data_folder import processed_folder
+from framework.tools.processing.settings import ColmapFlags
+from framework.tools.processing.unfinished import STARTED, go_on, mark, unfinished
 
 FINISHED = "transforms.json"
 """File that is written last; a folder with it is complete."""
@@ -50,6 +52,10 @@ def claim(output: Path, data: Path, overwrite: bool) -> None:
     if output.exists() and not output.is_dir():
         raise DataError(f"--output-dir {output} is a file; choose a folder")
     present = sorted(output.iterdir()) if output.is_dir() else []
+    if is_unfinished(output) and not overwrite:
+        raise DataError(
+            f"--output-dir {output} holds a run that was stopped; --resume goes on, --overwrite begins again"
+        )
     if present and not overwrite:
         content = "a processed data set" if (output / FINISHED).exists() else f"'{present[0].name}' but no {FINISHED}"
         raise DataError(f"--output-dir {output} holds {content}; choose a new folder, or use --overwrite")
@@ -63,6 +69,28 @@ def claim(output: Path, data: Path, overwrite: bool) -> None:
         else:
             path.unlink()
     output.mkdir(parents=True, exist_ok=True)
+
+
+def begin(flags: ColmapFlags, sources: list[Path]) -> None:
+    """Claim the output folder and mark what the run starts with; with `flags.resume`, go on with what was stopped.
+
+    Args:
+        flags: the user's flags.
+        sources: the files that are read, as `unfinished.mark` takes them.
+
+    Raises:
+        DataError: as `claim` and `unfinished.go_on`.
+    """
+    if flags.resume and is_unfinished(flags.output_dir):
+        go_on(flags, sources)
+        return
+    claim(flags.output_dir, flags.data, flags.overwrite)
+    mark(flags, sources)
+
+
+def is_unfinished(output: Path) -> bool:
+    """Return whether the folder `output` holds a run of COLMAP that was stopped."""
+    return not (output / FINISHED).exists() and (unfinished(output) / STARTED).is_file()
 
 
 def ready(output: Path) -> str:

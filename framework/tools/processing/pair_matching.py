@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Callable
 from contextlib import closing
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
+from framework.tools.processing.database import PAIR_BASE
 from framework.tools.processing.retrieval import read_descriptors
 
 MAX_RATIO = 0.8
 """Maximum ratio of the nearest feature's angle to the second nearest's (Lowe 2004)."""
 MAX_ANGLE = 0.7
 """Maximum angle between matching features, radians."""
-_PAIR_BASE = 2147483647
-"""COLMAP's number of the pair of images i < j is this times i, plus j."""
 
 
 def match(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -38,11 +36,10 @@ def match(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.stack([mutual, forward[mutual]], axis=1).astype(np.uint32)
 
 
-def write_matches(report: Callable[[int], None], database: Path, pairs: list[tuple[str, str]]) -> None:
+def write_matches(database: Path, pairs: list[tuple[str, str]]) -> None:
     """Match pairs of images and write the matches to COLMAP's database, for verification by COLMAP.
 
     Args:
-        report: called with the number of pairs done.
         database: COLMAP's database with features.
         pairs: pairs of names.
     """
@@ -53,14 +50,13 @@ def write_matches(report: Callable[[int], None], database: Path, pairs: list[tup
 
     with closing(sqlite3.connect(database)) as connection:
         identities = dict(connection.execute("SELECT name, image_id FROM images"))
-        for index, (first, second) in enumerate(pairs):
+        for first, second in pairs:
             if identities[first] > identities[second]:
                 first, second = second, first
             matches = match(features(first), features(second))
-            number = identities[first] * _PAIR_BASE + identities[second]
+            number = identities[first] * PAIR_BASE + identities[second]
             row = (number, *matches.shape, matches.tobytes())
             connection.execute("INSERT OR REPLACE INTO matches(pair_id, rows, cols, data) VALUES(?, ?, ?, ?)", row)
-            report(index + 1)
         connection.commit()
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from framework.base.console import say
 from framework.base.errors import DataError
-from framework.tools.processing.images import find_images
+from framework.tools.processing.listing import find_images
 from framework.tools.processing.phone import UNUSABLE, evenly_spaced, read_json, undistorted_lens, write_folder
 from framework.tools.processing.transforms import Lens
 

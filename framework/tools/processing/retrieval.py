@@ -33,16 +33,17 @@ def sequential_pairs(count: int, overlap: int) -> list[Pair]:
     return sorted((i, i + offset) for offset in offsets for i in range(count - offset))
 
 
-def similar_pairs(descriptors: np.ndarray, neighbors: int) -> list[Pair]:
+def similar_pairs(descriptors: np.ndarray, neighbors: int, apart: int = 0) -> list[Pair]:
     """Return the pairs (i, j), i < j, of each image with the most similar ones, each pair once.
 
     Args:
         descriptors: (N, D) unit vectors (`global_descriptors`); an image without features is 0, and in no pair.
         neighbors: number of similar images.
+        apart: images with at most this difference of their indices are left out, as they are matched anyway.
     """
     count = len(descriptors)
     similarity = descriptors @ descriptors.T
-    np.fill_diagonal(similarity, -np.inf)
+    similarity[np.abs(np.subtract.outer(np.arange(count), np.arange(count))) <= apart] = -np.inf
     empty = ~descriptors.any(axis=1)
     similarity[:, empty] = -np.inf
     limit = min(neighbors, count - 1)

@@ -46,9 +46,10 @@ class ColmapFlags(OutputFlags):
     camera_sharing: Literal["auto", "single", "per-image"] = "auto"
     """Which images share a camera. auto: those in a folder with equal size, device and focal length."""
     matching_method: Matching = "auto"
-    """Which images are matched. auto: all pairs up to --exhaustive-limit, then retrieval; for videos, neighbours."""
+    """Which images are matched. auto: neighbours and loops of a video or of numbered photographs, and more where that
+    leaves some out; of others all pairs up to --exhaustive-limit, then retrieval."""
     exhaustive_limit: int = 150
-    """Maximum number of images of which auto matches all pairs."""
+    """Maximum number of images of which auto matches all pairs, or those left out with all."""
     num_neighbors: int = 30
     """Similar images with which retrieval matches each image."""
     sequential_overlap: int = 10
@@ -66,11 +67,15 @@ class ColmapFlags(OutputFlags):
     """Device for extraction and matching of features; cuda needs a pycolmap built with it."""
     num_threads: int = -1
     """CPU threads; -1 for all."""
+    resume: bool = False
+    """Go on with a run that was stopped: features and matches in --output-dir are kept."""
     verbose: bool = False
     """Show COLMAP's output, which otherwise goes to OUTPUT_DIR/colmap/log.txt."""
 
     def check(self) -> None:
         super().check()
+        if self.resume and self.overwrite:
+            raise FlagError("--resume goes on with what --overwrite removes; leave one of them out")
         minimums = {
             "exhaustive_limit": 0, "num_neighbors": 1, "sequential_overlap": 1,
             "max_image_size": 64, "max_num_features": 64,

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from framework.tools.processing.parallax import NO_PARALLAX, WITHOUT
+
 ENOUGH = 0.8
 """Share of registered images below which advice is given."""
 
@@ -27,6 +29,10 @@ class Summary:
     """Mean reprojection error, pixels."""
     matching: str
     """Rule by which pairs were selected."""
+    pairs: int
+    """Number of pairs of images that were matched."""
+    turned: float
+    """Share of pairs of images between which the camera only turned (`parallax.share_that_turned`)."""
     seconds: dict[str, float]
     """Seconds by stage."""
 
@@ -47,6 +53,8 @@ def lines(summary: Summary) -> list[str]:
     if summary.other_models:
         sizes = ", ".join(map(str, summary.other_models))
         messages.append(f"left out: {len(summary.other_models)} other models that are not connected, of {sizes} images")
+    if summary.turned >= WITHOUT:
+        messages.append(f"warning: {NO_PARALLAX}")
     if share < ENOUGH:
         messages.append(f"few images were registered. {advice(summary.matching)}")
     return messages

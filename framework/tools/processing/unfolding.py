@@ -20,6 +20,7 @@ from framework.base.console import say
 from framework.data.folds import angle_between, folds, in_order, thumbnail
 from framework.data.image_files import read_image
 from framework.tools.processing.colmap import Model
+from framework.tools.processing.database import PAIR_BASE
 
 NEXT = 3
 """Number of next photographs that are neighbours of one."""
@@ -27,8 +28,6 @@ SAME_WAY = 50.0
 """Maximum angle between cameras that look the same way, degrees: less than any fold that is noticed."""
 ENOUGH = 0.9
 """Minimum number of photographs placed without the fold, as a share of those placed with it."""
-MOST_IMAGES = 2**31 - 1
-"""COLMAP's number of a pair of images i < j is i * MOST_IMAGES + j."""
 
 Reconstruct = Callable[[Path, Path], "tuple[Model | None, list[int]]"]
 """Function of a database and a folder for models that reconstructs, and returns the largest model, None without, and
@@ -135,7 +134,7 @@ def _copy_with(database: Path, target: Path, pairs: Iterable[tuple[str, str]]) -
     with closing(sqlite3.connect(target)) as opened, opened:
         numbers = dict(opened.execute("SELECT name, image_id FROM images"))
         kept = [
-            (min(i, j) * MOST_IMAGES + max(i, j),)
+            (min(i, j) * PAIR_BASE + max(i, j),)
             for i, j in ((numbers[first], numbers[second]) for first, second in pairs)
         ]
         opened.execute("CREATE TEMP TABLE kept (pair_id INTEGER PRIMARY KEY)")

@@ -12,11 +12,18 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from framework.base.console import track
+from framework.base.console import say, track
 from framework.base.errors import DataError, NerfloomError
+from framework.tools.processing.estimate import about
 
 Report = Callable[[int], None]
-"""Function that the child calls with the number of units done."""
+"""Function that the child calls with the number of units done; with 0 when it begins, after imports."""
+FEW = 4
+"""Number of units that must be done before the time of all is estimated."""
+SOON = 1.0
+"""Seconds that must have passed before the time of all is estimated."""
+SHORT = 10.0
+"""Seconds up to which no estimate is said."""
 
 
 def run_in_child(
@@ -26,6 +33,7 @@ def run_in_child(
     total: int,
     log: Path | None,
     count: Callable[[], int] | None = None,
+    unit: str | None = None,
 ) -> Any:
     """Run `work(report, *arguments)` in a child process, with a progress bar.
 
@@ -36,6 +44,7 @@ def run_in_child(
         total: units of the progress bar.
         log: file to which the child's output is appended; None leaves it on the terminal.
         count: returns the number of units done, for work that cannot report it.
+        unit: name of the units, which take equally long: a line says how long all will take, once a few are done.
 
     Returns:
         The result of `work`.
@@ -50,7 +59,8 @@ def run_in_child(
     sender.close()
     outcome: list[Any] = []
     try:
-        for _ in track(_units(receiver, process.is_alive, count, total, outcome), title, total=total):
+        numbers = _numbers(receiver, process.is_alive, count, outcome)
+        for _ in track(_units(_estimated(numbers, title, total, unit) if unit else numbers, total), title, total=total):
             pass
         process.join()
     finally:
@@ -66,15 +76,14 @@ def run_in_child(
     return result
 
 
-def _units(
-    receiver: Connection,
-    alive: Callable[[], bool],
-    count: Callable[[], int] | None,
-    total: int,
-    outcome: list[Any],
-) -> Iterator[int]:
-    """Yield once for each unit done, until the process ends; its last message is appended to `outcome`."""
-    yielded, done = 0, 0
+def _numbers(
+    receiver: Connection, alive: Callable[[], bool], count: Callable[[], int] | None, outcome: list[Any]
+) -> Iterator[int | None]:
+    """Yield the number of units done several times a second, until the process ends; None until it begins.
+
+    The process's last message is appended to `outcome`.
+    """
+    done: int | None = None
     while True:
         try:
             if receiver.poll(0.3):
@@ -82,14 +91,40 @@ def _units(
                 if kind != "at":
                     outcome.append((kind, value))
                     return
-                done = max(done, value)
+                done = max(done or 0, value)
             elif not alive():
                 return
         except EOFError:
             return
-        if count is not None:
+        if count is not None and done is not None:
             done = max(done, count())
-        for _ in range(yielded, min(done, total)):
+        yield done
+
+
+def _estimated(numbers: Iterator[int | None], title: str, total: int, unit: str) -> Iterator[int | None]:
+    """Pass on the numbers of units done, and say once how long all will take.
+
+    That is measured from the first units on, which take longer, as COLMAP's threads and caches begin with them.
+    """
+    first: tuple[float, int] | None = None
+    said = False
+    for done in numbers:
+        yield done
+        if done and first is None:
+            first = time.monotonic(), done
+        elif done and first is not None and not said:
+            seconds, count = time.monotonic() - first[0], done - first[1]
+            if count >= FEW and seconds > SOON:
+                said = True
+                if seconds / count * total > SHORT:
+                    say(f"{title}: {about(seconds / count * total)} for {total:,} {unit}")
+
+
+def _units(numbers: Iterator[int | None], total: int) -> Iterator[int]:
+    """Yield once for each unit done."""
+    yielded = 0
+    for done in numbers:
+        for _ in range(yielded, min(done or 0, total)):
             yield yielded
             yielded += 1
 

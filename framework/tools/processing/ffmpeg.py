@@ -1,0 +1,145 @@
+"""Frames of a video as they are stored, with their times, by ffmpeg: none is added, left out or moved in time."""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import IO, TypeVar
+
+import numpy as np
+
+from framework.base.console import say, track
+from framework.base.errors import DataError
+from framework.base.extras import install_command
+
+SIDE = 1000
+"""Maximum side of the grey pictures that frames are judged by, pixels."""
+_GREY = f"scale=min({SIDE}\\,iw):min({SIDE}\\,ih):force_original_aspect_ratio=decrease:flags=area,format=gray"
+
+R = TypeVar("R")
+
+
+def frame_count(path: Path) -> int:
+    """Return the number of frames that a video's container lists.
+
+    Args:
+        path: the video file.
+
+    Raises:
+        DataError: if the file or ffmpeg is missing, or the file is not a readable video.
+    """
+    if not path.is_file():
+        raise DataError(f"--data {path}: there is no such file")
+    if (advice := install_command("video")) is not None:
+        raise DataError(f"reading a video needs ffmpeg: {advice}")
+    import imageio_ffmpeg  # type: ignore[import-untyped]
+
+    try:
+        count, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
+    except Exception as error:  # any type, from ffmpeg or its wrapper
+        raise DataError(f"--data {path} is not a readable video; play it to see whether it is whole") from error
+    return max(int(count), 1)
+
+
+def survey(path: Path, look: Callable[[np.ndarray], R]) -> tuple[np.ndarray, list[R]]:
+    """Apply a function to a small grey picture of each frame.
+
+    A video that cannot be decoded to its end is used up to there, and a line says so.
+
+    Args:
+        path: the video file.
+        look: function of a picture (H, W) uint8, upright, with at most `SIDE` pixels a side.
+
+    Returns:
+        The times of the frames, seconds, in order, and the results.
+
+    Raises:
+        DataError: if no frame can be decoded.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        listed = Path(folder) / "times"
+        graph = f"[0:v:0]{_GREY},split[seen][timed]"
+        kept = [*_passthrough(), "-map", "[seen]", "-c:v", "pgm", "-f", "image2pipe", "pipe:1"]
+        timed = [*_passthrough(), "-map", "[timed]", "-f", "framecrc", str(listed)]
+        arguments = ["-i", str(path), "-filter_complex", graph, *kept, *timed]
+        frames = track(_pictures(path, arguments), "Looking at the video", total=frame_count(path))
+        results = [look(frame[..., 0]) for frame in frames]
+        times = _times(listed)[: len(results)] if results else np.zeros(0)
+    if len(times) == 0:
+        raise DataError(f"--data {path} has no frame that can be decoded")
+    return np.maximum.accumulate(times), results[: len(times)]
+
+
+def chosen_frames(path: Path, numbers: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield some frames of a video as (H, W, 3) uint8, upright.
+
+    Args:
+        path: the video file.
+        numbers: (K,) their numbers, rising; the first frame is 0.
+    """
+    arguments = ["-i", str(path), "-map", "0:v:0", *_passthrough(), "-c:v", "ppm", "-pix_fmt", "rgb24"]
+    wanted = iter(track(numbers.tolist(), "Reading the frames", total=len(numbers)))
+    number = next(wanted, None)
+    with closing(_pictures(path, [*arguments, "-f", "image2pipe", "pipe:1"])) as frames:
+        for index, frame in enumerate(frames):
+            if index == number:
+                yield frame
+                number = next(wanted, None)
+            if number is None:
+                return
+
+
+def _pictures(path: Path, arguments: list[str]) -> Generator[np.ndarray, None, None]:
+    """Yield the pictures (H, W, C) uint8 that ffmpeg writes as a stream of PGM or PPM files."""
+    import imageio_ffmpeg
+
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-loglevel", "error", *arguments]
+    with tempfile.TemporaryFile() as errors:
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, stdin=subprocess.DEVNULL)
+        assert process.stdout is not None
+        try:
+            while (picture := _next_picture(process.stdout)) is not None:
+                yield picture
+            if process.wait() != 0:
+                errors.seek(0)
+                last = errors.read().decode(errors="replace").strip().splitlines()[-1:] or ["ffmpeg failed"]
+                say(f"{path} cannot be decoded to its end; the frames before are used: {last[0].strip()}")
+        finally:
+            process.kill()
+            process.wait()
+            process.stdout.close()
+
+
+def _next_picture(stream: IO[bytes]) -> np.ndarray | None:
+    """Read a PGM or PPM file as ffmpeg writes it, with three lines of text before its pixels; None at the end."""
+    kind, size, _ = (stream.readline() for _ in range(3))
+    if len(size.split()) != 2:
+        return None
+    width, height = map(int, size.split())
+    shape = (height, width, 3 if kind.strip() == b"P6" else 1)
+    content = stream.read(int(np.prod(shape)))
+    return np.frombuffer(content, np.uint8).reshape(shape) if len(content) == np.prod(shape) else None
+
+
+def _times(listed: Path) -> np.ndarray:
+    """Read the times (N,) of frames, seconds, from the file of ffmpeg's format framecrc."""
+    second, times = 1.0, []
+    for line in listed.read_text(errors="replace").splitlines():
+        if line.startswith("#tb 0:"):
+            numerator, denominator = line.partition(":")[2].split("/")
+            second = int(numerator) / int(denominator)
+        elif line and not line.startswith("#"):
+            times.append(int(line.split(",")[2]) * second)
+    return np.array(times)
+
+
+def _passthrough() -> list[str]:
+    """Return the option by which ffmpeg keeps each frame once, at its time; versions before 5.1 call it -vsync."""
+    import imageio_ffmpeg
+
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-h", "long"]
+    known = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL, check=False).stdout
+    return ["-fps_mode" if b"fps_mode" in known else "-vsync", "passthrough"]

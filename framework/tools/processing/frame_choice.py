@@ -1,0 +1,94 @@
+"""Choice of frames of a video: different ones, spread evenly over time, and the sharpest nearby."""
+
+from __future__ import annotations
+
+import numpy as np
+
+BLOCK = 16
+"""Side of the squares whose mean brightness tells frames apart, pixels."""
+SAME = 0.003
+"""Maximum difference of frames that are repeats, as a share of their contrast. Of videos encoded by x264 and MPEG-4, a
+frame that was repeated differed by up to 0.0025, and one moved by half a pixel by 0.004 or more."""
+
+
+def sharpness(picture: np.ndarray) -> float:
+    """Return the variance of the Laplacian of a picture.
+
+    Pech-Pacheco et al. 2000, "Diatom autofocusing in brightfield microscopy".
+
+    Args:
+        picture: (H, W) uint8.
+    """
+    if min(picture.shape) < 3:
+        return 0.0
+    grey = picture.astype(np.float32)
+    inner = grey[1:-1, 1:-1]
+    laplacian = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4 * inner
+    return float(laplacian.var())
+
+
+def blocks(picture: np.ndarray) -> np.ndarray:
+    """Return the mean of each square of `BLOCK` pixels a side of a picture (H, W), as (h, w) float32."""
+    height, width = (max(side // BLOCK, 1) for side in picture.shape)
+    rows, columns = (min(side, BLOCK) for side in picture.shape)
+    squares = picture[: height * rows, : width * columns].reshape(height, rows, width, columns)
+    return squares.mean((1, 3), dtype=np.float32)
+
+
+def different(frames: list[np.ndarray]) -> np.ndarray:
+    """Return the numbers of the frames that show something else than the last one that does, rising.
+
+    A frame is a repeat if its blocks differ by at most `SAME` of the contrast, on average: encoders and players repeat
+    frames to keep a rate, and a camera that stands still repeats what it sees.
+
+    Args:
+        frames: `blocks` of each frame.
+    """
+    kept: list[int] = []
+    for number, frame in enumerate(frames):
+        last = frames[kept[-1]] if kept else None
+        if last is None or np.abs(frame - last).mean() > SAME * last.std():
+            kept.append(number)
+    return np.array(kept, np.int64)
+
+
+def intervals(times: np.ndarray, count: int) -> np.ndarray:
+    """Divide frames into intervals of equal duration, none of which is empty.
+
+    A pause without frames that is longer than an interval counts as one interval, so that there are always as many as
+    asked for: the interval's length L solves sum(min(d, L)) = count L, with the durations d of frames.
+
+    Args:
+        times: (N,) seconds, rising.
+        count: number of intervals.
+
+    Returns:
+        (N,) the interval of each frame, from 0 on; each frame has its own if there are no more than `count`.
+    """
+    if len(times) <= count:
+        return np.arange(len(times))
+    gaps = np.diff(times)
+    durations = np.append(gaps, gaps.mean())
+    if durations.sum() <= 0:  # no times at all
+        durations = np.ones(len(times))
+    low, high = 0.0, float(durations.sum()) / count
+    for _ in range(100):
+        middle = (low + high) / 2
+        low, high = (middle, high) if np.minimum(durations, middle).sum() > count * middle else (low, middle)
+    starts = np.concatenate([[0.0], np.cumsum(np.minimum(durations, high))[:-1]])
+    return np.minimum(np.floor(starts / high + 1e-9).astype(np.int64), count - 1)
+
+
+def sharpest(sharpnesses: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """Return the index of the sharpest frame of each group; of equally sharp ones, the first.
+
+    Args:
+        sharpnesses: (N,) sharpness of each frame.
+        groups: (N,) group of each frame.
+
+    Returns:
+        (G,) indices, rising by group.
+    """
+    order = np.lexsort((np.arange(len(groups)), -sharpnesses, groups))
+    first = np.append(True, np.diff(groups[order]) > 0)[: len(order)]
+    return order[first]

@@ -1,0 +1,56 @@
+"""Cameras that turned on the spot: without parallax, nothing tells how far anything is."""
+
+from __future__ import annotations
+
+import numpy as np
+
+WITHOUT = 0.8
+"""Share of pairs that a rotation explains above which a capture has no parallax. Of two panoramas a rotation explained
+99 % and 100 % of the pairs, of two captures by somebody who walked 5 % and 8 %."""
+EXPLAINED = 0.003
+"""Maximum median distance of matches that a rotation explains, as a share of the image's longer side."""
+MOVED = 0.02
+"""Minimum median distance that matches move for a pair to tell anything, as a share of the longer side."""
+FOCALS = np.geomspace(0.3, 5.0, 25)
+"""Focal lengths that are tried, in units of the image's longer side."""
+PAIRS = 100
+"""Maximum number of pairs that are examined."""
+NO_PARALLAX = (
+    "the photographs have no parallax, as from a camera that turned on the spot (a panorama). Nothing tells how far "
+    "anything is, and poses mean nothing: take photographs from different positions, with a step to the side each"
+)
+"""What is wrong with such a capture, and what to do."""
+
+
+def share_that_turned(pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:
+    """Return the share of pairs whose matches are explained by a rotation of the camera alone, at one focal length.
+
+    The focal length is that which explains most. Pairs that hardly moved are left out.
+
+    Args:
+        pairs: matches of each pair, as positions (M, 2) in units of the image's longer side from its middle.
+
+    Returns:
+        From 0 to 1; 0 if no pair tells anything.
+    """
+    telling = [(one, two) for one, two in pairs if np.median(np.linalg.norm(one - two, axis=1)) > MOVED]
+    if not telling:
+        return 0.0
+    shares = [np.mean([left_by_rotation(*pair, focal) <= EXPLAINED for pair in telling]) for focal in FOCALS]
+    return float(max(shares))
+
+
+def left_by_rotation(first: np.ndarray, second: np.ndarray, focal: float) -> float:
+    """Return the median distance of matches after the rotation that aligns their rays best (Wahba's problem, by SVD).
+
+    Args:
+        first: (M, 2) positions in one image, in units of the longer side from its middle.
+        second: (M, 2) positions in the other.
+        focal: focal length in the same units.
+    """
+    one, two = (np.concatenate([points, np.full((len(points), 1), focal)], axis=1) for points in (first, second))
+    rays = [points / np.linalg.norm(points, axis=1, keepdims=True) for points in (one, two)]
+    u, _, vt = np.linalg.svd(rays[1].T @ rays[0])
+    turned = rays[0] @ (u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt).T
+    ahead = np.maximum(turned[:, 2:], 1e-9)
+    return float(np.median(np.linalg.norm(turned[:, :2] / ahead * focal - second, axis=1)))

@@ -1,0 +1,42 @@
+"""Photographs whose names say that they were taken one after the other."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import PurePath
+
+NEXT = 10
+"""Maximum difference between the numbers of neighbours: a few photographs may have been deleted."""
+MOST = 0.8
+"""Minimum share of neighbours whose numbers follow each other."""
+_NUMBER = re.compile(r"\d+")
+_TIME = re.compile(r"(19|20)\d{6}[_-]?\d{6}")
+"""Date and time, as phones name photographs."""
+
+
+def is_sequence(names: Sequence[PurePath]) -> bool:
+    """Return whether neighbours in a list of file names are numbered, or named by the time, one after the other.
+
+    Args:
+        names: the names in natural order.
+    """
+    follows = [_follows(first, second) for first, second in pairwise(names)]
+    return bool(follows) and sum(follows) >= MOST * len(follows)
+
+
+def _follows(first: PurePath, second: PurePath) -> bool:
+    if _TIME.search(first.stem) and _TIME.search(second.stem):
+        return True
+    one, two = _numbered(first), _numbered(second)
+    return one is not None and two is not None and one[0] == two[0] and 0 < two[1] - one[1] <= NEXT
+
+
+def _numbered(path: PurePath) -> tuple[str, int] | None:
+    """Return the path with its last number, unless that has over nine digits, taken out, and the number."""
+    found = list(_NUMBER.finditer(path.stem))
+    if not found or len(found[-1][0]) > 9:
+        return None
+    start, end = found[-1].span()
+    return f"{path.parent.as_posix()}/{path.stem[:start]}#{path.stem[end:]}", int(found[-1][0])

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from framework.base.config import from_plain, to_plain
+from framework.base.given import limited_as_given
 from framework.base.registry import load_dataparser, load_method, registered, summary
 from framework.base.splits import Split
 from framework.cameras.cameras import Cameras
@@ -126,6 +127,7 @@ def train(method: str, data: str | Path | None = None, format: str | None = None
 
     folder, name = find_data(None if data is None else Path(data), format)
     config = from_plain(load_method(method).config, {**to_plain(settings), "data": _text(folder)}, "train()")
+    config = limited_as_given(config, settings)
     run = Run(method, config, name, load_dataparser(name)(), run_folder(method, config))
     start(run)
     return load(run.folder, device=config.machine.device_type)

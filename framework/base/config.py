@@ -119,8 +119,8 @@ class TrainConfig:
     """First part of the run folder's path; the data folder's name if not given."""
     timestamp: str | None = None
     """Last part of the run folder's path; date and time if not given."""
-    max_num_iterations: int = 30_000
-    """Stop after this many steps."""
+    max_num_iterations: int | None = 30_000
+    """Stop after this many steps; there is no such limit if --max-seconds is given and this is not."""
     max_seconds: float | None = None
     """Stop after this many seconds of training; evaluation and saving are not counted."""
     target_psnr: float | None = None

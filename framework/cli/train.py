@@ -116,6 +116,7 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
 
     Flags are parsed with those of the data format, so that --data and the format's name must be found before.
     """
+    from framework.base.given import limited_as_given
     from framework.base.registry import load_dataparser
     from framework.data.data_folder import find_data
     from framework.training.run import run_folder
@@ -142,7 +143,7 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
     run = dataclasses.replace(run, dataparser=named, parser=parser)
     description = f"{summary(registered('methods')[run.method])}\n\nData format: {named}"
     parsed = _parsed(run, flags, {"method": run.config, "format": parser}, description=description)
-    config = dataclasses.replace(parsed.method, data=data)
+    config = limited_as_given(dataclasses.replace(parsed.method, data=data), _names(flags))
     folder = run_folder(run.method, config) if fresh else run.folder
     return dataclasses.replace(run, config=config, parser=parsed.format, folder=folder)
 
@@ -206,6 +207,11 @@ def _check_for_nerfstudio(flags: list[str], method: str, settings: list[Any]) ->
     for flag in flags:
         if flag.startswith("--") and (answer := flag_answer(flag, method, names)) is not None:
             raise FlagError(answer)
+
+
+def _names(flags: list[str]) -> set[str]:
+    """Return the names of the settings that flags give."""
+    return {flag[2:].partition("=")[0].replace("-", "_") for flag in flags if flag.startswith("--")}
 
 
 def _flag_names(settings: Any, prefix: str = "--") -> Iterator[str]:

@@ -12,11 +12,13 @@ from framework.training.state import State
 def spent(config: TrainConfig, state: State) -> float:
     """Return the fraction of the budget that is spent, 0 to 1: of steps or seconds, whichever is larger.
 
+    Without a limit it is 0.
+
     Args:
         config: settings, with the budget.
         state: state of the run.
     """
-    done = state.step / config.max_num_iterations
+    done = 0.0 if config.max_num_iterations is None else state.step / config.max_num_iterations
     if config.max_seconds is not None:
         done = max(done, state.seconds / config.max_seconds)
     return min(done, 1.0)
@@ -32,7 +34,7 @@ def reason_to_stop(config: TrainConfig, state: State, stopped: Sequence[int]) ->
     """
     if stopped:
         return "stopped by " + signal.Signals(stopped[0]).name
-    if state.step >= config.max_num_iterations:
+    if config.max_num_iterations is not None and state.step >= config.max_num_iterations:
         return f"{config.max_num_iterations} steps done"
     if config.max_seconds is not None and state.seconds >= config.max_seconds:
         return f"{config.max_seconds:g} s of training spent"

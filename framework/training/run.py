@@ -30,6 +30,7 @@ import yaml
 from framework.base.config import TrainConfig, from_plain, read_yaml, to_plain
 from framework.base.console import say
 from framework.base.errors import ConfigError, DataError
+from framework.base.given import limited_as_given
 from framework.base.registry import load_dataparser, load_method
 from framework.cameras.camera_path import read_transforms
 from framework.cameras.poses import Placement
@@ -191,7 +192,7 @@ def read_run(path: Path) -> Run:
     if not isinstance(method, str):
         raise ConfigError(f"{path} does not say which method, as in 'method: instant-ngp'")
     data_flags = values.pop("dataparser", None) or {}
-    config = from_plain(load_method(method).config, values, str(path))
+    config = limited_as_given(from_plain(load_method(method).config, values, str(path)), values)
     if not isinstance(data_flags, dict):
         raise ConfigError(f"{path}: 'dataparser' must hold keys and values, such as 'name: blender'")
     data_flags = dict(data_flags)

@@ -41,7 +41,7 @@ def test_a_resumed_run_does_not_show_what_an_earlier_process_has_measured(shared
     report = first.train_step()
     first.state.looks = ((report.seconds, report.step, 5.52),)
     report = first.train_step()
-    assert report.held_out is not None and report.held_out[0] == 5.52
+    assert (report.held_out or (0.0,))[0] == 5.52
     second = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "b", evaluated=True, max_num_iterations=4)
     second.restore(load_checkpoint(first.save()))
     assert second.train_step().held_out is None

@@ -45,6 +45,7 @@ def test_what_was_there_before_tells_nothing_of_the_speed() -> None:
     clock.now += 40
     meter.advance(10)
     assert meter.seconds_left == 40
+    assert Meter("Evaluating", 5, 1, 33.0, clock=clock).line == "Evaluating: 20 %, 1 of 5, 2 min left"
 
 
 def test_an_unknown_total_and_an_empty_one_have_a_line() -> None:

@@ -34,16 +34,17 @@ def say(message: str) -> None:
     console.print(printable(message), markup=False, soft_wrap=True)
 
 
-def track(items: Iterable[T], title: str, total: int) -> Iterator[T]:
+def track(items: Iterable[T], title: str, total: int, *, done: int = 0, spent: float | None = None) -> Iterator[T]:
     """Iterate over `items`, and show how far that is and how long it will take.
 
     Args:
         items: any iterable.
         title: text in front of the bar or in the line.
-        total: number of items.
+        total: number of items, with those that are done.
+        done: number of items that are done already.
+        spent: seconds that those took; None if that is unknown.
     """
-    meter = Meter(title, total)
-    with _shown(meter, title, total) as advance:
+    with _shown(Meter(title, total, done, spent), title, total, done) as advance:
         for item in items:
             yield item
             advance(1)

@@ -31,7 +31,8 @@ class Meter:
     Args:
         title: what is done, for people.
         total: number of units; None if it is unknown.
-        done: number of units that are done already, which tell nothing of the time.
+        done: number of units that are done already.
+        spent: seconds that those took; if None, they tell nothing of the time that the others take.
         clock: function that returns seconds.
         number: function that writes a number of units.
     """
@@ -41,12 +42,14 @@ class Meter:
         title: str,
         total: int | None,
         done: int = 0,
+        spent: float | None = None,
         clock: Callable[[], float] = time.monotonic,
         number: Callable[[int], str] = "{:,}".format,
     ) -> None:
         self._title, self._total, self._clock, self._number = title, total, clock, number
-        self._first = self._done = done
-        self._start = self._last = clock()
+        self._done, self._first = done, done if spent is None else 0
+        self._last = clock()
+        self._start = self._last - (spent or 0.0)
 
     def advance(self, count: int = 1) -> None:
         """Count further units as done."""

@@ -8,6 +8,10 @@ from collections.abc import Sequence
 from framework.base.config import TrainConfig
 from framework.training.state import State
 
+EVALUATION_SHARE, EVALUATION_SECONDS = 0.5, 10.0
+"""Maximum time of an evaluation that nobody has asked for, as a fraction of that of training; and what it may always
+take, seconds."""
+
 
 def spent(config: TrainConfig, state: State) -> float:
     """Return the fraction of the budget that is spent, 0 to 1: of steps or seconds, whichever is larger.
@@ -42,3 +46,13 @@ def reason_to_stop(config: TrainConfig, state: State, stopped: Sequence[int]) ->
     if target is not None and curve and curve[-1][2] >= target:
         return f"{target:g} dB reached"
     return None
+
+
+def evaluation_seconds(config: TrainConfig, state: State) -> float | None:
+    """Return how long an evaluation may take, seconds; None if all images are asked for.
+
+    Args:
+        config: settings of the run.
+        state: its state.
+    """
+    return None if config.eval == "all" else max(EVALUATION_SHARE * state.seconds, EVALUATION_SECONDS)

@@ -9,7 +9,7 @@ from framework.base.config import TrainConfig
 from framework.base.errors import FlagError
 from framework.base.given import limited_as_given
 from framework.cli.train import run_of
-from framework.training.budget import reason_to_stop, spent
+from framework.training.budget import evaluation_seconds, reason_to_stop, spent
 from framework.training.run import Run, create_folder, read_run
 from framework.training.state import State
 
@@ -75,7 +75,7 @@ def test_no_limit_at_all_is_refused() -> None:
 
 
 def test_flags_recipes_and_runs_say_what_is_given(tiny: Path, tmp_path: Path) -> None:
-    """A method's number of steps is a default; what stands in a file or a flag is not, also with the default's value."""
+    """A method's number of steps is a default; what stands in a file or a flag is not, even if it is the same."""
 
     def limits(run: Run) -> tuple[int | None, float | None]:
         return run.config.max_num_iterations, run.config.max_seconds
@@ -92,3 +92,9 @@ def test_flags_recipes_and_runs_say_what_is_given(tiny: Path, tmp_path: Path) ->
     run = run_of("instant-ngp", [*data, "--max-seconds", "60", "--output-dir", str(tmp_path)])
     create_folder(run)
     assert limits(read_run(run.folder)) == (None, 60.0)
+
+
+def test_an_evaluation_takes_half_of_the_training_at_most_unless_all_images_are_asked_for() -> None:
+    assert evaluation_seconds(TrainConfig(), State(seconds=60.0)) == 30
+    assert evaluation_seconds(TrainConfig(), State(seconds=1.0)) == 10
+    assert evaluation_seconds(TrainConfig(eval="all"), State(seconds=60.0)) is None

@@ -16,7 +16,8 @@ from framework.data.dataset import Dataset
 from framework.evaluation.evaluator import evaluate, evaluation_background
 from framework.rendering.rendered import Picture
 from framework.training.datasets import load_split
-from framework.training.run import Run, config_file, run_folder
+from framework.training.run import Run, run_folder
+from framework.training.run_path import config_file
 from framework.training.trained import Trained, load_trained
 
 if TYPE_CHECKING:
@@ -98,7 +99,7 @@ def load(run: str | Path, data: str | Path | None = None, device: Device = "auto
     """Load a trained run.
 
     Args:
-        run: folder of the run, or its config.yml.
+        run: folder of the run, its config.yml, or a folder above it, of which the newest run is taken.
         data: new location of the data, if it has been moved.
         device: device of the model.
 

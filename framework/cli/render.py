@@ -23,6 +23,8 @@ from framework.cli.render_flags import (
     TimeFlags,
     check_flags,
 )
+from framework.evaluation.video_suffixes import check_suffix
+from framework.training.run_path import trained_run
 
 if TYPE_CHECKING:
     import numpy as np
@@ -54,9 +56,9 @@ def _command(arguments: list[str]) -> None:
 
 def _render(name: str, flags: Flags, named: DataFormat | None) -> None:
     check_flags(flags)
-    from framework.evaluation.videos import check_suffix
-
     check_suffix(flags.output_path)
+    run = flags.run
+    found = trained_run(run.load_config, run.load_checkpoint, run.data)
     output = flags.output_path
     is_folder = not output.suffix
     if isinstance(flags, DatasetFlags) and is_folder:
@@ -73,11 +75,8 @@ def _render(name: str, flags: Flags, named: DataFormat | None) -> None:
     from framework.training.splat_files import load_run_or_splats
 
     bound = None if flags.outputs.max_error is None else parse_error(flags.outputs.max_error)
-    run = flags.run
     rays = flags.outputs.rays_per_pixel
-    trained = load_run_or_splats(
-        run.load_config, run.load_checkpoint, run.device_type, run.data, rays, data_format=named
-    )
+    trained = load_run_or_splats(found, run.load_checkpoint, run.device_type, run.data, rays, data_format=named)
     model, names = trained.model, flags.outputs.rendered_output_names
     views, background = _views(flags, trained), evaluation_background(trained.model)
     facts = _facts(name, flags, trained, views)

@@ -14,6 +14,8 @@ from framework.base.from_nerfstudio import flag_answer, vis_answer
 from framework.base.registry import entry_of, registered, summary
 from framework.cli.common import run_command
 from framework.cli.flags import read_flags
+from framework.cli.train_paths import check_paths
+from framework.training.run_path import config_file
 
 if TYPE_CHECKING:
     from framework.training.run import Run
@@ -41,18 +43,25 @@ def _command(arguments: list[str]) -> None:
     resumed, flags = _take(arguments, "--resume")
     recipe, flags = _take(flags, "--load-config")
     if resumed is not None:
+        found = config_file(Path(resumed))
+        check_paths(flags, found, found.parent)
         from framework.cli.session import resume
 
-        resume(_parse_flags(_read_run(Path(resumed) / "config.yml"), flags))
+        resume(_parse_flags(_read_run(found), flags))
         return
     if recipe is not None:
-        run = _read_run(Path(recipe))
+        found = config_file(Path(recipe))
+        check_paths(flags, found)
+        run = _read_run(found)
         if flags and flags[0] in registered("methods"):  # nerfstudio's order: METHOD ... --load-config FILE
             if flags[0] != run.method:
                 raise ConfigError(f"{recipe} is for {run.method}, not for {flags[0]}")
             flags = flags[1:]
     else:
-        run, flags = _default_run(flags[0]), flags[1:]
+        method, flags = flags[0], flags[1:]
+        _check_method(method)
+        check_paths(flags)
+        run = _default_run(method)
     from framework.cli.session import start
 
     start(_parse_flags(run, flags, fresh=True))
@@ -83,13 +92,17 @@ def _overview() -> str:
     return "\n".join(lines)
 
 
-def _default_run(method: str) -> Run:
-    """Return a run of a method with its default settings, without data."""
+def _check_method(method: str) -> None:
+    """Raise ConfigError if `method` is no method: before slow imports."""
     if os.path.exists(method) and method not in registered("methods"):
         raise ConfigError(f"the method comes first, as in: ns-train nerfacto --data {shlex.quote(method)}")
     if method.startswith("-"):
         raise ConfigError(f"the method comes first, before {method}; ns-train --help lists them")
-    entry_of("methods", method)  # report an unknown name before slow imports
+    entry_of("methods", method)
+
+
+def _default_run(method: str) -> Run:
+    """Return a run of a method with its default settings, without data."""
     from framework.base.registry import load_dataparser, load_method
     from framework.training.run import Run
 
@@ -102,6 +115,7 @@ def run_of(method: str, flags: list[str]) -> Run:
     Raises:
         ConfigError: if the method or a flag is unknown or invalid.
     """
+    _check_method(method)
     return _parse_flags(_default_run(method), flags, fresh=True)
 
 

@@ -9,8 +9,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from framework.base.console import say
 from framework.base.errors import ConfigError, FlagError
-from framework.base.from_nerfstudio import flag_answer, vis_answer
+from framework.base.from_nerfstudio import flag_answer, taken, vis_answer
 from framework.base.registry import entry_of, registered, summary
 from framework.cli.common import run_command
 from framework.cli.flags import read_flags
@@ -135,6 +136,9 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
     from framework.data.data_folder import find_data
     from framework.training.run import run_folder
 
+    flags, notes = taken(flags, set(_flag_names(run.config)))
+    for note in notes:
+        say(note)
     if (answer := vis_answer(_take(flags, "--vis")[0] or "")) is not None:
         raise FlagError(answer)
     if _are_pairs(flags):

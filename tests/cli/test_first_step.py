@@ -72,7 +72,7 @@ print(*sys.modules)
 """
 """A program that runs a command, and prints its exit status and what it has imported."""
 PATHS = {
-    "no data": ("ns-train", ["instant-ngp", "--data", "{0}/capturs"], "there is no such folder. Did you mean 'capture'?"),
+    "no data": ("ns-train", ["instant-ngp", "--data", "{0}/capturs"], "Did you mean 'capture'?"),
     "no output": ("ns-train", ["nerfacto", "--data", "{0}/capture", "--output-dir", "{0}/file/x"], "cannot write"),
     "no start": ("ns-train", ["nerfacto", "--data", "{0}/capture", "--load-checkpoint", "{0}/a.ckpt"], "is not there"),
     "no recipe": ("ns-train", ["--load-config", "{0}/recipe.yml"], "there is no run"),

@@ -15,8 +15,6 @@ from framework.base.from_nerfstudio import flag_answer, taken, vis_answer
 from framework.base.registry import entry_of, registered, summary
 from framework.cli.common import run_command
 from framework.cli.flags import read_flags
-from framework.cli.train_paths import check_paths
-from framework.training.run_path import config_file
 
 if TYPE_CHECKING:
     from framework.training.run import Run
@@ -41,6 +39,9 @@ def _command(arguments: list[str]) -> None:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_overview())
         return
+    from framework.cli.train_paths import check_paths  # here, so that the help above comes at once
+    from framework.training.run_path import config_file
+
     resumed, flags = _take(arguments, "--resume")
     recipe, flags = _take(flags, "--load-config")
     if resumed is not None:

@@ -119,7 +119,7 @@ class TrainConfig:
     timestamp: str | None = None
     """Last part of the run folder's path; date and time if not given."""
     max_num_iterations: int | None = 30_000
-    """Stop after this many steps; there is no such limit if --max-seconds is given and this is not."""
+    """Stop after this many steps; no limit with --max-seconds alone."""
     max_seconds: float | None = None
     """Stop after this many seconds of training; evaluation and saving are not counted."""
     target_psnr: float | None = None

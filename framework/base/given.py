@@ -1,4 +1,4 @@
-"""What follows from which settings a user gives, whatever their values are."""
+"""Settings that follow from the names of those that a user gives."""
 
 from __future__ import annotations
 

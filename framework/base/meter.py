@@ -1,4 +1,4 @@
-"""How far an operation is: how many of its units are done, and how long the others will take."""
+"""A meter of operations: units that are done, and the time that the others will take."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a run is: its folder, the newest run below another folder, and what a command needs of it, without torch."""
+"""Paths of runs and of what commands need of them, found without torch."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def config_file(path: Path) -> Path:
         ConfigError: if `path` is missing, or a folder without a run.
     """
     if not os.path.lexists(path):
-        raise ConfigError(f"there is no run {path}{_nearest_to(path)}")
+        raise ConfigError(f"cannot read {path}: {os.strerror(errno.ENOENT)}{_nearest_to(path)}")
     if not os.path.isdir(path):
         return path
     if (path / CONFIG).is_file():
@@ -75,6 +75,9 @@ def trained_run(path: Path, checkpoint: Path | None = None, data: Path | None = 
 
 def check_data(data: Path) -> None:
     """Refuse a folder of data, or a part of one, that is not there.
+
+    Args:
+        data: path of the folder or of its part.
 
     Raises:
         DataError: with the nearest name beside it.

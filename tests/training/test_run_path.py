@@ -39,7 +39,7 @@ def test_the_newest_run_with_a_checkpoint_below_any_folder(tmp_path: Path, capsy
 
 def test_what_is_missing_is_named_with_the_nearest_that_is_there(tmp_path: Path) -> None:
     make_run(tmp_path / "cup" / "nerfacto" / "2026-01-02_030405", 0, True)
-    with pytest.raises(ConfigError, match=r"there is no run .*Did you mean '2026-01-02_030405'\? \(in .*nerfacto\)"):
+    with pytest.raises(ConfigError, match=r"cannot read .*Did you mean '2026-01-02_030405'\? \(in .*nerfacto\)"):
         config_file(tmp_path / "cup" / "nerfacto" / "2026-01-02_030406")
     with pytest.raises(ConfigError, match=r"Did you mean 'nerfacto'\? \(in .*cup\)"):
         config_file(tmp_path / "cup" / "nerfato" / "2026-01-02_030405")

@@ -18,7 +18,7 @@ def time_text(seconds: float) -> str:
 
 
 def left_text(seconds: float | None) -> str:
-    """Return how long something will take, such as ``3 min left``; a dash for None."""
+    """Return how long something will take, such as ``3 min left``, for `seconds`; a dash for None."""
     return f"{UNKNOWN if seconds is None else time_text(seconds)} left"
 
 
@@ -52,7 +52,7 @@ class Meter:
         self._start = self._last - (spent or 0.0)
 
     def advance(self, count: int = 1) -> None:
-        """Count further units as done."""
+        """Count further units, `count` of them, as done."""
         self._done += count
         self._last = self._clock()
 

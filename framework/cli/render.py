@@ -199,12 +199,12 @@ def _write(flags: Flags, frames: Frames, output: Path, views: Views, facts: dict
 
 def _colored_range(flags: Flags, frames: Frames, name: str) -> tuple[float, float]:
     """Return the distances at the ends of the colours of depth, and say them."""
-    from framework.base.console import say
+    from framework.base.console import say, track
     from framework.evaluation.outputs import distance_range
 
     near, far = flags.outputs.depth_near_plane, flags.outputs.depth_far_plane
     if near is None or far is None:
-        found = distance_range(frames, name)
+        found = distance_range(track(frames, "Measuring distances", total=frames.count), name)
         near, far = found[0] if near is None else near, found[1] if far is None else far
     say(f"{name}: {near:.4g} (dark) to {far:.4g} (light), in units of the input")
     return near, far
@@ -220,7 +220,7 @@ def _write_depths(flags: Flags, frames: Frames, folder: Path, stems: Sequence[st
     packed = flags.files.depth_format == "png16"
     farthest = flags.outputs.depth_far_plane
     if packed and farthest is None:
-        farthest = largest_distance(frames, name)
+        farthest = largest_distance(track(frames, "Measuring distances", total=frames.count), name)
     unit = (farthest or 1.0) / MOST if packed else 1.0
     distances: Iterator[np.ndarray] = map(partial(opaque_distance, name=name), frames)
     suffix = ".png" if packed else ".npy"

@@ -18,7 +18,11 @@ def time_text(seconds: float) -> str:
 
 
 def left_text(seconds: float | None) -> str:
-    """Return how long something will take, such as ``3 min left``, for `seconds`; a dash for None."""
+    """Return how long something will take, such as ``3 min left``.
+
+    Args:
+        seconds: the duration; None, which is written as a dash, if it is unknown.
+    """
     return f"{UNKNOWN if seconds is None else time_text(seconds)} left"
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from framework.base.config import from_plain, to_plain
+from framework.base.given import limited_as_given
 from framework.base.registry import load_dataparser, load_method, registered, summary
 from framework.base.splits import Split
 from framework.cameras.cameras import Cameras
@@ -15,7 +16,8 @@ from framework.data.dataset import Dataset
 from framework.evaluation.evaluator import evaluate, evaluation_background
 from framework.rendering.rendered import Picture
 from framework.training.datasets import load_split
-from framework.training.run import Run, config_file, run_folder
+from framework.training.run import Run, run_folder
+from framework.training.run_path import config_file
 from framework.training.trained import Trained, load_trained
 
 if TYPE_CHECKING:
@@ -97,7 +99,7 @@ def load(run: str | Path, data: str | Path | None = None, device: Device = "auto
     """Load a trained run.
 
     Args:
-        run: folder of the run, or its config.yml.
+        run: folder of the run, its config.yml, or a folder above it, of which the newest run is taken.
         data: new location of the data, if it has been moved.
         device: device of the model.
 
@@ -126,6 +128,7 @@ def train(method: str, data: str | Path | None = None, format: str | None = None
 
     folder, name = find_data(None if data is None else Path(data), format)
     config = from_plain(load_method(method).config, {**to_plain(settings), "data": _text(folder)}, "train()")
+    config = limited_as_given(config, settings)
     run = Run(method, config, name, load_dataparser(name)(), run_folder(method, config))
     start(run)
     return load(run.folder, device=config.machine.device_type)

@@ -42,7 +42,18 @@ COMMANDS = {
 
 def train(words: list[str], folder: Path) -> None:
     """Train, and judge four held-out images, in a process of its own."""
-    hidden = ["--vis", "none", "--max-eval-images", "4", "--output-dir", str(folder), "--timestamp", "run"]
+    hidden = [
+        "--vis",
+        "none",
+        "--eval",
+        "all",
+        "--max-eval-images",
+        "4",
+        "--output-dir",
+        str(folder),
+        "--timestamp",
+        "run",
+    ]
     at = words.index("procedural") if "procedural" in words else len(words)
     command = [sys.executable, "-m", "framework.cli.train", *words[:at], *hidden, *words[at:]]
     subprocess.run(command, cwd=folder, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True)

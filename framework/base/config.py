@@ -101,8 +101,7 @@ class TrainConfig:
         "lr_warmup_steps": AT_LEAST_0,
         "viewer_share": (0.001, 1),
     }
-    """Allowed range of each numeric setting. A method's config adds its own, and may override these. None, where it
-    is allowed, is in every range; of a tuple, each number must be in the range."""
+    """Allowed ranges; a method's config adds and overrides some. None is in every range, a tuple if each number is."""
     data: Path | None = None
     """Folder of the data set; the embedded scene if not given."""
     max_train_images: int | None = None
@@ -119,8 +118,8 @@ class TrainConfig:
     """First part of the run folder's path; the data folder's name if not given."""
     timestamp: str | None = None
     """Last part of the run folder's path; date and time if not given."""
-    max_num_iterations: int = 30_000
-    """Stop after this many steps."""
+    max_num_iterations: int | None = 30_000
+    """Stop after this many steps; no limit with --max-seconds alone."""
     max_seconds: float | None = None
     """Stop after this many seconds of training; evaluation and saving are not counted."""
     target_psnr: float | None = None
@@ -139,6 +138,8 @@ class TrainConfig:
     """Seconds of training between evaluations of all images; 15 if --target-psnr is given and this is not."""
     max_eval_images: int | None = None
     """Maximum number of evaluated images, evenly spaced; all if not given, none if 0."""
+    eval: Literal["in-time", "all"] = "in-time"
+    """Evaluated images. in-time: as many, evenly spaced, as take half of the time of training at most; all: all."""
     vis: Literal["tensorboard", "viewer", "viewer+tensorboard", "none"] = "tensorboard"
     """Where training curves and rendered images are shown: in TensorBoard's files, in a browser, or in both."""
     viewer_share: float = 0.1

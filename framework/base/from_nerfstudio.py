@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 import shlex
 from collections.abc import Collection
@@ -36,8 +37,34 @@ SETTINGS = {
     "warmup-steps": "--lr-warmup-steps",
     "max-steps": "--max-num-iterations",
     "load-step": "--load-checkpoint",
+    "sh-degree": "--degree",
+    "max-gs-num": "--num-gaussians",
+    "ssim-lambda": "--ssim-weight",
 }
 """Last part of a nerfstudio flag -> the equivalent flag here. Flags of the same name need no entry."""
+TAKEN = (
+    "appearance-embed-dim", "background-color", "base-res", "camera-optimizer.mode", "distortion-loss-mult",
+    "downscale-factor", "eval-interval", "eval-mode", "eval-num-rays-per-chunk", "features-per-level",
+    "log2-hashmap-size", "max-gs-num", "max-num-iterations", "max-res", "num-coarse-samples", "num-importance-samples",
+    "num-levels", "num-nerf-samples-per-ray", "num-proposal-samples-per-ray", "orientation-loss-mult",
+    "predict-normals", "sh-degree", "ssim-lambda", "train-num-rays-per-batch", "train-split-fraction",
+    "use-gradient-scaling",
+)  # fmt: skip
+"""Last parts of the nerfstudio flags that mean the same here and have the same values, so that they are taken."""
+SPELLINGS = {
+    "iterations": "--max-num-iterations",
+    "iters": "--max-num-iterations",
+    "max-iterations": "--max-num-iterations",
+    "max-iters": "--max-num-iterations",
+    "max-steps": "--max-num-iterations",
+    "n-steps": "--max-num-iterations",
+    "num-iterations": "--max-num-iterations",
+    "lr": "--learning-rate",
+    "seed": "--machine.seed",
+    "sh-degree": "--degree",
+    "source-path": "--data",
+}
+"""Flag without prefix, as it is spelt in other programs -> the flag here that means the same, and is taken."""
 CAMERA_SETTINGS = {"lr": "--camera-learning-rate"}
 """As `SETTINGS`, for flags of the camera optimiser."""
 SECTIONS = {
@@ -121,6 +148,43 @@ def vis_answer(value: str) -> str | None:
     return f"--vis {value} is nerfstudio's; {SECTIONS['logging']}" if foreign else None
 
 
+def taken(words: list[str], known: Collection[str]) -> tuple[list[str], list[str]]:
+    """Return the words of a command line with flags and formats of nerfstudio as they are called here, and what to say.
+
+    Only what means the same is taken. All other words are returned as they are.
+
+    Args:
+        words: flags and their values.
+        known: flags of the method, with their dashes.
+
+    Returns:
+        The words, and a line for each that was replaced.
+    """
+    ours, notes = [], []
+    for index, word in enumerate(words):
+        flag, equals, value = word.partition("=") if word.startswith("--") else (word, "", "")
+        name = _ours(flag, known)
+        if flag in FORMATS and not (index and words[index - 1].startswith("--") and "=" not in words[index - 1]):
+            name = FORMATS[flag]
+        if name is not None:
+            notes.append(f"{flag} is taken as {name}, which means the same")
+        ours.append((name or flag) + equals + value)
+    return ours, notes
+
+
+def _ours(flag: str, known: Collection[str]) -> str | None:
+    """Return the flag that means the same as a flag of nerfstudio or of other programs; None for any other word."""
+    name = flag.removeprefix("--").replace("_", "-")
+    if not flag.startswith("--") or f"--{name}" in known:
+        return None
+    prefix, dot, _ = name.partition(".")
+    ours = SPELLINGS.get(name)
+    if dot and prefix in ("pipeline", "trainer") and any(name.endswith(f".{end}") for end in TAKEN):
+        ours = _equivalent(name)
+    of_data = ("--downscale-factor", "--eval-interval", "--eval-mode", "--train-split-fraction")
+    return ours if ours in known or ours in of_data else None
+
+
 def flag_answer(flag: str, method: str, known: Collection[str]) -> str | None:
     """Return the answer to a flag of nerfstudio that does not exist here; None for any other flag.
 
@@ -135,6 +199,8 @@ def flag_answer(flag: str, method: str, known: Collection[str]) -> str | None:
         return None
     ours = _equivalent(name)
     answer = f"here it is {ours}" if ours in known else SECTIONS.get(beginning, "{method} has no such flag")
+    near = difflib.get_close_matches(ours, known, n=1) if ours not in known else []
+    answer += f"; the nearest is {near[0]}" if near else ""
     return f"--{name} is nerfstudio's; {answer.format(method=method)}"
 
 

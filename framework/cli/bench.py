@@ -35,6 +35,7 @@ from framework.cli.bench_results import write_results
 from framework.cli.bench_tables import TablesFlags, measure_tables
 from framework.cli.common import chosen_kind, make_room, run_command
 from framework.cli.flags import read_flags
+from framework.training.run_path import check_data, trained_run
 
 USAGE = """\
 usage: ns-bench WHAT [flags]
@@ -72,7 +73,10 @@ def _command(arguments: list[str]) -> None:
     if (chosen := chosen_kind(arguments, KINDS, USAGE, "there is no benchmark")) is None:
         return
     name, (flags, run), rest = chosen
-    run(read_flags(flags, f"ns-bench {name}", rest))
+    settings = read_flags(flags, f"ns-bench {name}", rest)
+    if getattr(settings, "data", None) is not None:
+        check_data(settings.data)
+    run(settings)
 
 
 def _kernels(flags: KernelFlags) -> None:
@@ -216,7 +220,8 @@ def _meshes(flags: MeshFlags) -> None:
     from framework.tools.benchmarks.meshes import measure
 
     make_room(flags.output)
-    write_results(flags.output, measure(flags.load_config, flags.seconds, flags.exports, flags.resolutions))
+    run = None if flags.load_config is None else trained_run(flags.load_config).parent
+    write_results(flags.output, measure(run, flags.seconds, flags.exports, flags.resolutions))
 
 
 def _viewer(flags: ViewerBenchFlags) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from framework.base.errors import ConfigError, FlagError
 from framework.cli.common import run_command
 from framework.cli.flags import read_flags
+from framework.training.run_path import check_data, check_writable
 
 if TYPE_CHECKING:
     from framework.tools.comparison.measures import Row
@@ -88,6 +89,9 @@ def plan_of(flags: CompareFlags) -> Plan:
     Raises:
         ConfigError: if a flag's value is invalid, or flags contradict each other.
     """
+    if flags.data is not None:
+        check_data(flags.data)
+    check_writable(flags.output_dir or Path("outputs"), "the comparison's folder")
     from framework.data.data_folder import find_data
     from framework.tools.comparison.plan import Conditions, Contender, Plan, split_words, views_for
 

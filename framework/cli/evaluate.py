@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from framework.base.config import RaysPerPixel
 from framework.base.errors import ConfigError, FlagError
-from framework.cli.common import run_command, with_format, with_run
+from framework.cli.common import make_room, run_command, with_format, with_run
 from framework.cli.flags import read_flags
+from framework.training.run_path import check_writable, trained_run
 
 
 @dataclass(frozen=True)
@@ -17,7 +18,8 @@ class EvalFlags:
     """Compute PSNR, SSIM and LPIPS of a trained run on held-out views."""
 
     load_config: Path
-    """RUN_FOLDER, its config.yml, or a file of Gaussians (.ply, .spz); the flag's name may be left out."""
+    """RUN_FOLDER, its config.yml, a folder above (its newest run), or a file of Gaussians (.ply, .spz); the flag's name
+    may be left out."""
     output_path: Path | None = None
     """JSON file to write. If not given: eval.json beside config.yml, or NAME.eval.json beside a file of Gaussians."""
     render_output_path: Path | None = None
@@ -57,6 +59,11 @@ def _command(arguments: list[str]) -> None:
         raise FlagError(f"--max-images is {flags.max_images}; it must be at least 1")
     if flags.max_pictures is not None and flags.max_pictures < 0:
         raise FlagError(f"--max-pictures is {flags.max_pictures}; it must be at least 0")
+    flags = replace(flags, load_config=trained_run(flags.load_config, flags.load_checkpoint, flags.data))
+    output = flags.output_path or _beside(flags.load_config)
+    make_room(output)
+    if flags.render_output_path is not None:
+        check_writable(flags.render_output_path, "pictures to")
     from contextlib import nullcontext
 
     from framework.base.console import say
@@ -64,7 +71,7 @@ def _command(arguments: list[str]) -> None:
     from framework.evaluation.evaluator import evaluate
     from framework.training.datasets import load_split
     from framework.training.report import write_evaluation
-    from framework.training.splat_files import is_splat_file, load_run_or_splats
+    from framework.training.splat_files import load_run_or_splats
 
     trained = load_run_or_splats(
         flags.load_config,
@@ -95,14 +102,15 @@ def _command(arguments: list[str]) -> None:
     if flags.eval_appearance == "half" and evaluation.eval_appearance is None:
         say("--eval-appearance half: this run has no appearance vectors; whole images were evaluated")
     say(f"LPIPS {evaluation.lpips_note}")
-    run = flags.load_config
-    output = flags.output_path or (
-        run.with_suffix(".eval.json") if is_splat_file(run) else trained.run.folder / "eval.json"
-    )
     write_evaluation(output, trained.run, trained.checkpoint, evaluation, trained.model.device)
     say(f"written to {output}")
     if (wrong := evaluation.pictures_note or evaluation.warning) is not None:
         raise ConfigError(wrong)
+
+
+def _beside(run: Path) -> Path:
+    """Return the file of the results of a run, by its settings, or of a file of Gaussians."""
+    return run.parent / "eval.json" if run.suffix == ".yml" else run.with_suffix(".eval.json")
 
 
 if __name__ == "__main__":

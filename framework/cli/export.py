@@ -12,6 +12,7 @@ from framework.cli.common import chosen_kind, make_room, run_command, with_run
 from framework.cli.export_flags import ExportFlags
 from framework.cli.export_mesh import MarchingCubesFlags, TsdfFlags, marching_cubes, tsdf
 from framework.cli.flags import read_flags
+from framework.training.run_path import trained_run
 
 if TYPE_CHECKING:
     from framework.cameras.poses import Placement
@@ -100,11 +101,12 @@ def _command(arguments: list[str]) -> None:
         return
     name, (kind, file, run), rest = chosen
     flags = read_flags(kind, f"ns-export {name}", with_run(rest), takes="RUN_FOLDER")
-    from framework.training.trained import load_trained
-
+    found = trained_run(flags.load_config, flags.load_checkpoint, flags.data)
     path = flags.output_dir / file.format_map(vars(flags))
     make_room(path)
-    trained = load_trained(flags.load_config, flags.load_checkpoint, flags.device_type, flags.data)
+    from framework.training.trained import load_trained
+
+    trained = load_trained(found, flags.load_checkpoint, flags.device_type, flags.data)
     if trained.model.scene.warped:
         raise ConfigError("this run is in normalised device coordinates (--ndc), which have no scale to export")
     run(flags, trained, trained.placement, path)

@@ -12,7 +12,7 @@ class ExportFlags:
     """Flags of every export."""
 
     load_config: Path
-    """RUN_FOLDER, or its config.yml; the flag's name may be left out."""
+    """RUN_FOLDER, its config.yml, or a folder above (its newest run); the flag's name may be left out."""
     output_dir: Path
     """Folder to write to."""
     load_checkpoint: Path | None = None

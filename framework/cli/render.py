@@ -23,6 +23,8 @@ from framework.cli.render_flags import (
     TimeFlags,
     check_flags,
 )
+from framework.evaluation.video_suffixes import check_suffix
+from framework.training.run_path import trained_run
 
 if TYPE_CHECKING:
     import numpy as np
@@ -54,9 +56,9 @@ def _command(arguments: list[str]) -> None:
 
 def _render(name: str, flags: Flags, named: DataFormat | None) -> None:
     check_flags(flags)
-    from framework.evaluation.videos import check_suffix
-
     check_suffix(flags.output_path)
+    run = flags.run
+    found = trained_run(run.load_config, run.load_checkpoint, run.data)
     output = flags.output_path
     is_folder = not output.suffix
     if isinstance(flags, DatasetFlags) and is_folder:
@@ -73,11 +75,8 @@ def _render(name: str, flags: Flags, named: DataFormat | None) -> None:
     from framework.training.splat_files import load_run_or_splats
 
     bound = None if flags.outputs.max_error is None else parse_error(flags.outputs.max_error)
-    run = flags.run
     rays = flags.outputs.rays_per_pixel
-    trained = load_run_or_splats(
-        run.load_config, run.load_checkpoint, run.device_type, run.data, rays, data_format=named
-    )
+    trained = load_run_or_splats(found, run.load_checkpoint, run.device_type, run.data, rays, data_format=named)
     model, names = trained.model, flags.outputs.rendered_output_names
     views, background = _views(flags, trained), evaluation_background(trained.model)
     facts = _facts(name, flags, trained, views)
@@ -200,12 +199,12 @@ def _write(flags: Flags, frames: Frames, output: Path, views: Views, facts: dict
 
 def _colored_range(flags: Flags, frames: Frames, name: str) -> tuple[float, float]:
     """Return the distances at the ends of the colours of depth, and say them."""
-    from framework.base.console import say
+    from framework.base.console import say, track
     from framework.evaluation.outputs import distance_range
 
     near, far = flags.outputs.depth_near_plane, flags.outputs.depth_far_plane
     if near is None or far is None:
-        found = distance_range(frames, name)
+        found = distance_range(track(frames, "Measuring distances", total=frames.count), name)
         near, far = found[0] if near is None else near, found[1] if far is None else far
     say(f"{name}: {near:.4g} (dark) to {far:.4g} (light), in units of the input")
     return near, far
@@ -221,7 +220,7 @@ def _write_depths(flags: Flags, frames: Frames, folder: Path, stems: Sequence[st
     packed = flags.files.depth_format == "png16"
     farthest = flags.outputs.depth_far_plane
     if packed and farthest is None:
-        farthest = largest_distance(frames, name)
+        farthest = largest_distance(track(frames, "Measuring distances", total=frames.count), name)
     unit = (farthest or 1.0) / MOST if packed else 1.0
     distances: Iterator[np.ndarray] = map(partial(opaque_distance, name=name), frames)
     suffix = ".png" if packed else ".npy"

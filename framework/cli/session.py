@@ -21,6 +21,7 @@ from framework.data.residence import on_device
 from framework.evaluation.evaluator import evaluate
 from framework.model import StartsFromImages
 from framework.splats.gaussians import HasGaussians
+from framework.training.budget import evaluation_seconds
 from framework.training.checkpoint import FOLDER, list_checkpoints, load_newest
 from framework.training.curve import FEW
 from framework.training.datasets import first_split, load_split
@@ -174,10 +175,12 @@ def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:
     test_set = first_split(run, ("test", "val"))
     if test_set is None or run.config.max_eval_images == 0:
         return
+    say(f"evaluating held-out images, first those with pictures, which are in {run.folder / 'pictures'}")
     evaluation = evaluate(
         trainer.model,
         test_set.to(trainer.device, with_pixels=False),
         max_images=run.config.max_eval_images,
+        seconds=evaluation_seconds(run.config, trainer.state),
         pictures=run.folder / "pictures",
         max_pictures=PICTURES,
     )

@@ -12,6 +12,7 @@ from framework.base.errors import ConfigError, FlagError, NerfloomError
 from framework.base.registry import registered
 from framework.cli.common import make_room, run_command
 from framework.cli.flags import read_flags
+from framework.training.run_path import check_data
 
 if TYPE_CHECKING:
     from framework.tools.stress.conditions import Condition
@@ -93,6 +94,8 @@ def stress(methods: Sequence[str], flags: StressFlags) -> list[Result]:
         ConfigError: if a flag is invalid.
         DataError: if the data is missing or cannot be read.
     """
+    if flags.data is not None:
+        check_data(flags.data)
     from framework.base.console import say
     from framework.base.device import choose_device
     from framework.tools.stress.report import Result, markdown, settings_of

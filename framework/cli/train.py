@@ -9,8 +9,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from framework.base.console import say
 from framework.base.errors import ConfigError, FlagError
-from framework.base.from_nerfstudio import flag_answer, vis_answer
+from framework.base.from_nerfstudio import flag_answer, taken, vis_answer
 from framework.base.registry import entry_of, registered, summary
 from framework.cli.common import run_command
 from framework.cli.flags import read_flags
@@ -38,21 +39,31 @@ def _command(arguments: list[str]) -> None:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_overview())
         return
+    from framework.cli.train_paths import check_paths  # here, so that the help above comes at once
+    from framework.training.run_path import config_file
+
     resumed, flags = _take(arguments, "--resume")
     recipe, flags = _take(flags, "--load-config")
     if resumed is not None:
+        found = config_file(Path(resumed))
+        check_paths(flags, found, found.parent)
         from framework.cli.session import resume
 
-        resume(_parse_flags(_read_run(Path(resumed) / "config.yml"), flags))
+        resume(_parse_flags(_read_run(found), flags))
         return
     if recipe is not None:
-        run = _read_run(Path(recipe))
+        found = config_file(Path(recipe))
+        check_paths(flags, found)
+        run = _read_run(found)
         if flags and flags[0] in registered("methods"):  # nerfstudio's order: METHOD ... --load-config FILE
             if flags[0] != run.method:
                 raise ConfigError(f"{recipe} is for {run.method}, not for {flags[0]}")
             flags = flags[1:]
     else:
-        run, flags = _default_run(flags[0]), flags[1:]
+        method, flags = flags[0], flags[1:]
+        _check_method(method)
+        check_paths(flags)
+        run = _default_run(method)
     from framework.cli.session import start
 
     start(_parse_flags(run, flags, fresh=True))
@@ -83,13 +94,17 @@ def _overview() -> str:
     return "\n".join(lines)
 
 
-def _default_run(method: str) -> Run:
-    """Return a run of a method with its default settings, without data."""
+def _check_method(method: str) -> None:
+    """Raise ConfigError if `method` is no method: before slow imports."""
     if os.path.exists(method) and method not in registered("methods"):
         raise ConfigError(f"the method comes first, as in: ns-train nerfacto --data {shlex.quote(method)}")
     if method.startswith("-"):
         raise ConfigError(f"the method comes first, before {method}; ns-train --help lists them")
-    entry_of("methods", method)  # report an unknown name before slow imports
+    entry_of("methods", method)
+
+
+def _default_run(method: str) -> Run:
+    """Return a run of a method with its default settings, without data."""
     from framework.base.registry import load_dataparser, load_method
     from framework.training.run import Run
 
@@ -102,6 +117,7 @@ def run_of(method: str, flags: list[str]) -> Run:
     Raises:
         ConfigError: if the method or a flag is unknown or invalid.
     """
+    _check_method(method)
     return _parse_flags(_default_run(method), flags, fresh=True)
 
 
@@ -116,10 +132,14 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
 
     Flags are parsed with those of the data format, so that --data and the format's name must be found before.
     """
+    from framework.base.given import limited_as_given
     from framework.base.registry import load_dataparser
     from framework.data.data_folder import find_data
     from framework.training.run import run_folder
 
+    flags, notes = taken(flags, set(_flag_names(run.config)))
+    for note in notes:
+        say(note)
     if (answer := vis_answer(_take(flags, "--vis")[0] or "")) is not None:
         raise FlagError(answer)
     if _are_pairs(flags):
@@ -142,7 +162,7 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
     run = dataclasses.replace(run, dataparser=named, parser=parser)
     description = f"{summary(registered('methods')[run.method])}\n\nData format: {named}"
     parsed = _parsed(run, flags, {"method": run.config, "format": parser}, description=description)
-    config = dataclasses.replace(parsed.method, data=data)
+    config = limited_as_given(dataclasses.replace(parsed.method, data=data), _names(flags))
     folder = run_folder(run.method, config) if fresh else run.folder
     return dataclasses.replace(run, config=config, parser=parsed.format, folder=folder)
 
@@ -206,6 +226,11 @@ def _check_for_nerfstudio(flags: list[str], method: str, settings: list[Any]) ->
     for flag in flags:
         if flag.startswith("--") and (answer := flag_answer(flag, method, names)) is not None:
             raise FlagError(answer)
+
+
+def _names(flags: list[str]) -> set[str]:
+    """Return the names of the settings that flags give."""
+    return {flag[2:].partition("=")[0].replace("-", "_") for flag in flags if flag.startswith("--")}
 
 
 def _flag_names(settings: Any, prefix: str = "--") -> Iterator[str]:

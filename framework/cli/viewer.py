@@ -11,6 +11,7 @@ from framework.base.errors import ConfigError
 from framework.base.extras import install_command
 from framework.cli.common import run_command, with_format, with_run
 from framework.cli.flags import read_flags
+from framework.training.run_path import trained_run
 
 
 @dataclass(frozen=True)
@@ -18,7 +19,8 @@ class ViewerFlags:
     """Look at a trained run in a browser. It shows newer checkpoints as they are written; Ctrl-C ends it."""
 
     load_config: Path
-    """RUN_FOLDER, its config.yml, or a file of Gaussians (.ply, .spz); the flag's name may be left out."""
+    """RUN_FOLDER, its config.yml, a folder above (its newest run), or a file of Gaussians (.ply, .spz); the flag's name
+    may be left out."""
     load_checkpoint: Path | None = None
     """Checkpoint to load; if not given, the newest, and each that is written later."""
     data: Path | None = None
@@ -41,13 +43,12 @@ def _command(arguments: list[str]) -> None:
     flags = read_flags(ViewerFlags, "ns-viewer", words, takes="RUN_FOLDER")
     if (command := install_command("viewer")) is not None:
         raise ConfigError(f"the viewer needs viser: {command}")
+    found = trained_run(flags.load_config, flags.load_checkpoint, flags.data)
     from framework.training.splat_files import is_splat_file, load_run_or_splats
     from framework.viewer.trained_viewer import view_trained
 
-    trained = load_run_or_splats(
-        flags.load_config, flags.load_checkpoint, flags.device_type, flags.data, data_format=named
-    )
-    follow = flags.load_checkpoint is None and not is_splat_file(flags.load_config)
+    trained = load_run_or_splats(found, flags.load_checkpoint, flags.device_type, flags.data, data_format=named)
+    follow = flags.load_checkpoint is None and not is_splat_file(found)
     view_trained(trained, flags.websocket_host, flags.websocket_port, follow)
 
 

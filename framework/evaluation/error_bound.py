@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from framework.base.console import track
 from framework.base.errors import ConfigError, FlagError
 from framework.data.dataset import Dataset
 from framework.evaluation.evaluator import evaluation_background, spread, timed_view
@@ -68,7 +69,8 @@ def measured_error(model: Model[Any], dataset: Dataset, bound: float) -> tuple[f
         The maximum difference of a colour channel to rendering without early stop, and the ratio of the two times.
     """
     background, worst, times = evaluation_background(model), 0.0, [0.0, 0.0]
-    for index in spread(len(dataset), MEASURED_VIEWS):
+    chosen = spread(len(dataset), MEASURED_VIEWS)
+    for index in track(chosen, "Measuring the error", total=len(chosen)):
         views = []
         for number, stop in enumerate((0.0, bound)):
             with limited_error(model, stop):

@@ -3,40 +3,39 @@
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from statistics import fmean, stdev
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import torch
 from torch import Tensor
 
 from framework.base.config import AppearanceConfig
-from framework.base.console import track
-from framework.base.device import wait_for
+from framework.base.console import say, track
+from framework.base.device import runs_ahead, wait_for
 from framework.base.errors import DataError
+from framework.base.meter import time_text
 from framework.cameras.view import View, every
 from framework.data.dataset import Dataset
 from framework.data.pixels import composite
 from framework.evaluation.appearance import appearance_of, fitted_appearance, right_half
-from framework.evaluation.images import write_image
 from framework.evaluation.metrics import SMALLEST_OF_SCALES, load_lpips, ms_ssim, psnr, quick_ssim
-from framework.evaluation.panels import composed, view_panels
+from framework.evaluation.view_files import Judged, ViewFiles
 from framework.model import Model, RendersFromImages
 from framework.rendering.rendered import Picture
+
+T = TypeVar("T")
 
 BEFORE = 0.9
 """Share of a sparse point's distance before which a view that sees the point should show nothing."""
 FAR_BELOW, MOST_NAMED = 3.0, 3
 """Distance from the mean PSNR, dB, from which a view is named, and the maximum number of views that are."""
-WORST = "worst"
-"""Name, without suffix, of the files of the view with the lowest PSNR; the next evaluation overwrites them."""
-LONGEST_STEM = 150
-"""Maximum number of bytes of an image's name in the names of the files written for it."""
 
 
 def evaluation_background(model: Model) -> Tensor:
@@ -189,7 +188,8 @@ class Evaluation:
         sizes = ", ".join(f"{size}: {found['psnr']:.2f}" for size, found in r.get("by_size", {}).items())
         sizes = f" ({sizes})" if sizes else ""
         quality = f"PSNR {r['psnr']:.2f} dB{sizes}  SSIM {ssim}{scales}  LPIPS {lpips}{before}"
-        return f"{quality}  {speed}  ({r['num_images']} images)"
+        count, of = r["num_images"], r["num_images_in_split"]
+        return f"{quality}  {speed}  ({count if count == of else f'{count} of {of}'} images)"
 
 
 def evaluate(
@@ -197,6 +197,7 @@ def evaluate(
     dataset: Dataset,
     *,
     max_images: int | None = None,
+    seconds: float | None = None,
     pictures: Path | None = None,
     max_pictures: int | None = None,
     round_to_uint8: bool = False,
@@ -213,9 +214,11 @@ def evaluate(
         model: the trained model.
         dataset: views with images, on the model's device.
         max_images: maximum number of views, evenly spaced; all if None.
+        seconds: time that the views may take by the time of the first, which is always evaluated; no limit if None.
         pictures: folder for renders, true images, `view_panels` and normals (x, y, z as RGB); no files if None.
         max_pictures: maximum number of views of which files are written, evenly spaced; all if None. If that is some of
-            them, files of the view with the lowest PSNR are written besides, as worst.png and so on.
+            them, files of the view with the lowest PSNR are written besides, as worst.png and so on. Views with files
+            are evaluated before the others.
         round_to_uint8: whether colours are rounded to 8 bits before they are measured.
         title: text of the progress bar.
 
@@ -225,46 +228,62 @@ def evaluate(
     has_appearance = appearance_of(model) is not None
     half = has_appearance and isinstance(model.config, AppearanceConfig) and model.config.eval_appearance == "half"
     views = views_to_judge(dataset, half)
-    chosen = [views[rank] for rank in spread(len(views), max_images)]
-    if not chosen:
+    asked = [views[rank] for rank in spread(len(views), max_images)]
+    if not asked:
         raise DataError(f"there is no image to evaluate: masks leave nothing of the {len(dataset)} that there are")
     if isinstance(model, RendersFromImages) and dataset.source_images is not None:
         model.show_images(dataset)
     lpips, lpips_note = load_lpips()
     background = evaluation_background(model)
-    rows, seconds, rays = [], 0.0, 0
-    pictures_note: str | None = None
+    judge = partial(_judge, model, dataset, background, half, round_to_uint8, lpips)
+    if seconds is not None and runs_ahead(model.device):
+        judge(asked[0])  # compiles what rendering needs, which the other views do not wait for
+    first, cost = _timed(partial(judge, asked[0]), f"{title}: the first image")
+    chosen = _in_time(asked, cost, seconds)
     shown = {chosen[rank] for rank in spread(len(chosen), max_pictures)}
-    marked = pictures is not None and 0 < len(shown) < len(chosen)
-    lowest, worst = math.inf, None
-    for index in track(chosen, title, total=len(chosen)):
-        row, (rgb, target, picture) = _judge(model, dataset, index, background, half, round_to_uint8, lpips)
-        rows.append(row)
-        seconds += row["seconds"]
-        rays += picture.num_rays
-        if marked and row["psnr"] < lowest:
-            lowest, worst = row["psnr"], (rgb, target, picture)
-        if pictures is not None and index in shown and pictures_note is None:
-            stem = f"{index:04d}_{_short_stem(dataset.names[index])}"
-            pictures_note = _write_pictures(pictures, stem, rgb, target, picture)
-    if pictures is not None and worst is not None and pictures_note is None:
-        pictures_note = _write_pictures(pictures, WORST, *worst)
-    speed = rays / seconds if rays else None  # None of a method that casts none
-    results = {**_statistics(rows), **_by_size(rows), "num_rays_per_sec": speed, "fps": len(rows) / seconds}
+    files = ViewFiles(pictures, dataset.names, shown, with_worst=0 < len(shown) < len(chosen))
+    order = sorted(chosen, key=lambda index: index not in shown)
+    others = ((index, judge(index)) for index in track(order[1:], title, len(order), done=1, spent=cost))
+    found, rays = {}, 0
+    for index, (row, judged) in chain([(order[0], first)], others):
+        found[index] = row
+        rays += judged.picture.num_rays
+        files.take(index, row["psnr"], judged)
+    files.write_worst()
+    rows = [found[index] for index in chosen]
+    spent = sum(row["seconds"] for row in rows)
+    speed = {"num_rays_per_sec": rays / spent if rays else None, "fps": len(rows) / spent}  # None: no rays are cast
+    counts = {"num_images": len(rows), "num_images_in_split": len(views)}
     protocol: Literal["mean", "half"] | None = ("half" if half else "mean") if has_appearance else None
-    return Evaluation(rows, {**results, "num_images": len(rows)}, lpips_note, protocol, pictures_note)
+    results = {**_statistics(rows), **_by_size(rows), **speed, **counts}
+    return Evaluation(rows, results, lpips_note, protocol, files.note)
+
+
+def _timed(work: Callable[[], T], title: str) -> tuple[T, float]:
+    """Return the result of some work, whose title is shown, and the seconds that it took."""
+    start = time.perf_counter()
+    (result,) = track((work() for _ in range(1)), title, total=1)
+    return result, time.perf_counter() - start
+
+
+def _in_time(views: list[int], cost: float, seconds: float | None) -> list[int]:
+    """Return as many of some views, evenly spaced, as take some time if each takes `cost` seconds; all if None."""
+    chosen = views if seconds is None else [views[rank] for rank in spread(len(views), max(int(seconds / cost), 1))]
+    if len(chosen) < len(views):
+        say(f"evaluating {len(chosen)} of {len(views)} images, {time_text(cost)} each (all: --eval all, or ns-eval)")
+    return chosen
 
 
 def _judge(
     model: Model,
     dataset: Dataset,
-    index: int,
     background: Tensor,
     half: bool,
     round_to_uint8: bool,
     lpips: Callable[[Tensor, Tensor], float] | None,
-) -> tuple[dict[str, Any], tuple[Tensor, Tensor, Picture]]:
-    """Return what is reported of a view, and its rendered image, true image and picture."""
+    index: int,
+) -> tuple[dict[str, Any], Judged]:
+    """Return what is reported of a view, and its images."""
     target = composite(dataset.image(index).float() / 255, background)
     with fitted_appearance(model, dataset, index, background) if half else nullcontext():
         picture, spent = timed_view(model, dataset.view(index), background)
@@ -275,26 +294,7 @@ def _judge(
     row = _row(dataset, index, measure(*pair, kept), spent)
     row["ms_ssim"] = None if min(target.shape[:2]) < SMALLEST_OF_SCALES else ms_ssim(*pair)
     row["lpips"] = None if lpips is None else lpips(*pair)
-    return row | {"floaters": floaters(picture, dataset, index)}, (rgb, target, picture)
-
-
-def _write_pictures(folder: Path, stem: str, rgb: Tensor, target: Tensor, picture: Picture) -> str | None:
-    """Write a view's rendered image, true image, comparison and normals; return why that failed, None if it did not."""
-    panels = view_panels(rgb, target, picture.median_depth, picture.accumulation)
-    files = {"": rgb, "_photograph": target, "_comparison": composed(panels)}
-    if picture.normals is not None:
-        files["_normals"] = (picture.normals + 1) / 2
-    try:
-        for suffix, image in files.items():
-            write_image(folder / f"{stem}{suffix}.png", image)
-    except OSError as error:  # metrics do not need the files
-        return f"cannot write pictures to {folder}: {error.strerror or error}"
-    return None
-
-
-def _short_stem(name: str) -> str:
-    """Return an image's name without its extension, cut to LONGEST_STEM bytes."""
-    return os.fsencode(Path(name).stem)[:LONGEST_STEM].decode("utf-8", "ignore")
+    return row | {"floaters": floaters(picture, dataset, index)}, Judged(rgb, target, picture)
 
 
 def _judged(

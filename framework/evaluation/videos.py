@@ -11,37 +11,16 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from framework.base.errors import ConfigError, FlagError
-from framework.base.extras import install_command
+from framework.base.errors import ConfigError
 from framework.evaluation.frames import write_file
+from framework.evaluation.video_suffixes import VIDEO
 
-VIDEO, ANIMATIONS = ".mp4", (".gif", ".webp", ".png")
-"""Suffixes of files of several pictures."""
 QUALITY = 18
 """Constant rate factor of H.264; 18 is said to be visually lossless."""
 JPEG_QUALITY = 95
 """Quality of JPEG images, 1 to 95."""
 MOST = 65_535
 """Largest value of a 16-bit PNG."""
-
-
-def check_suffix(path: Path) -> None:
-    """Refuse, before anything is rendered, a file that cannot be written.
-
-    Args:
-        path: file; a path without suffix is a folder.
-
-    Raises:
-        ConfigError: for an unknown suffix, or for MP4 if ffmpeg is not installed.
-    """
-    suffix = path.suffix.lower()
-    if suffix not in ("", VIDEO, *ANIMATIONS):
-        known = ", ".join((VIDEO, *ANIMATIONS))
-        raise FlagError(f"--output-path {path}: the extension must be {known}, or none for a folder of images")
-    if suffix == VIDEO and (advice := install_command("video")) is not None:
-        raise ConfigError(
-            f"--output-path {path}: MP4 needs ffmpeg, the extra [video]: {advice}; or name a .gif, a .webp or a folder"
-        )
 
 
 def write_video(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:

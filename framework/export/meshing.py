@@ -26,6 +26,8 @@ from framework.ray_model import RayModel
 
 ColorFunction = Callable[[Tensor, Tensor], Tensor]
 """Function from vertices and normals (V, 3) in scene coordinates to colours (V, 3), NaN for a vertex without."""
+COLOURED = 2**16
+"""Number of vertices that are coloured at once."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +160,9 @@ def _finished(
     if cleaning.target_num_faces is not None:
         mesh = simplified(mesh, cleaning.target_num_faces)
     normals = vertex_normals(mesh)
-    of_vertices = spread_colors(colors(mesh.vertices, normals), mesh.faces)
+    pieces = list(zip(mesh.vertices.split(COLOURED), normals.split(COLOURED), strict=True))
+    seen = [colors(*piece) for piece in track(pieces, "Colouring the vertices", total=len(pieces))]
+    of_vertices = spread_colors(torch.cat(seen), mesh.faces)
     texture = painted(mesh.vertices, normals, of_vertices, mesh.faces, colors, texturing) if texturing else None
     return replace(mesh, normals=normals, colors=of_vertices, texture=texture)
 

@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from framework.base.console import track
+
 NEIGHBORS = 20
 """Number of nearest neighbours."""
 CHUNK = 2**16
@@ -69,6 +71,6 @@ def _nearest(points: Tensor, count: int) -> Iterator[tuple[np.ndarray, np.ndarra
     values = points.double().numpy()
     tree = cKDTree(values)
     most = min(count + 1, len(values))
-    for start in range(0, len(values), CHUNK):
+    for start in track(starts := range(0, len(values), CHUNK), "Looking for neighbours", total=len(starts)):
         distances, indices = tree.query(values[start : start + CHUNK], k=most, workers=-1)
         yield distances.reshape(-1, most), indices.reshape(-1, most)

@@ -103,7 +103,7 @@ def decide_splatting(config: SplattingConfigT, scene: Scene) -> tuple[SplattingC
         The settings, and a record of each that was filled in.
     """
     speed = min(PIXELS_PER_SECOND / (scene.image_pixels or scene.image_size**2), MOST_STEPS_PER_SECOND)
-    seconds = min(config.max_seconds or math.inf, config.max_num_iterations / speed)
+    seconds = min(config.max_seconds or math.inf, (config.max_num_iterations or math.inf) / speed)
     count, factor = number_for(seconds, MOST_GAUSSIANS), rate_factor(speed * seconds, MOST_RATE)
     why = "that suits the time"
     config, made = fill(config, Choice("num_gaussians", count, why, "Gaussians", f"up to {count:,}"))

@@ -8,15 +8,21 @@ from collections.abc import Sequence
 from framework.base.config import TrainConfig
 from framework.training.state import State
 
+EVALUATION_SHARE, EVALUATION_SECONDS = 0.5, 10.0
+"""Maximum time of an evaluation that nobody has asked for, as a fraction of that of training; and what it may always
+take, seconds."""
+
 
 def spent(config: TrainConfig, state: State) -> float:
     """Return the fraction of the budget that is spent, 0 to 1: of steps or seconds, whichever is larger.
+
+    Without a limit it is 0.
 
     Args:
         config: settings, with the budget.
         state: state of the run.
     """
-    done = state.step / config.max_num_iterations
+    done = 0.0 if config.max_num_iterations is None else state.step / config.max_num_iterations
     if config.max_seconds is not None:
         done = max(done, state.seconds / config.max_seconds)
     return min(done, 1.0)
@@ -32,7 +38,7 @@ def reason_to_stop(config: TrainConfig, state: State, stopped: Sequence[int]) ->
     """
     if stopped:
         return "stopped by " + signal.Signals(stopped[0]).name
-    if state.step >= config.max_num_iterations:
+    if config.max_num_iterations is not None and state.step >= config.max_num_iterations:
         return f"{config.max_num_iterations} steps done"
     if config.max_seconds is not None and state.seconds >= config.max_seconds:
         return f"{config.max_seconds:g} s of training spent"
@@ -40,3 +46,13 @@ def reason_to_stop(config: TrainConfig, state: State, stopped: Sequence[int]) ->
     if target is not None and curve and curve[-1][2] >= target:
         return f"{target:g} dB reached"
     return None
+
+
+def evaluation_seconds(config: TrainConfig, state: State) -> float | None:
+    """Return how long an evaluation may take, seconds; None if all images are asked for.
+
+    Args:
+        config: settings of the run.
+        state: its state.
+    """
+    return None if config.eval == "all" else max(EVALUATION_SHARE * state.seconds, EVALUATION_SECONDS)

@@ -22,8 +22,9 @@ from framework.base.archives import uncompressed_size
 from framework.base.atomic import write_atomically as write_atomically
 from framework.base.console import say
 from framework.base.errors import CheckpointError
+from framework.training.run_path import CHECKPOINTS
 
-FOLDER = "nerfstudio_models"
+FOLDER = CHECKPOINTS
 """Name of the checkpoints' folder in a run's folder."""
 UNSEALED, SEALED = 1, 2
 """Values of a checkpoint's `format`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from functools import cached_property
@@ -13,6 +14,7 @@ from framework.data.pixels import composite
 from framework.evaluation.evaluator import evaluate, evaluation_background, timed_view
 from framework.evaluation.panels import composed, view_panels
 from framework.model import Model
+from framework.training.budget import evaluation_seconds
 from framework.training.curve import FewImages, Point, in_order, rows
 from framework.training.progress import StepReport, TensorBoard
 from framework.training.run import Run, write_report
@@ -60,7 +62,7 @@ class HeldOut:
         config, step = self.run.config, state.step
         if self._given is None or config.max_eval_images == 0:
             return
-        affordable = self._picture_seconds <= PICTURE_SHARE * state.seconds
+        affordable = self._picture_seconds + self._seconds_per_image(state) <= PICTURE_SHARE * state.seconds
         shown = step % config.steps_per_eval_image == 0 and "tensorboard" in config.vis and affordable
         if shown and self.dataset is not None:
             self._show((step // config.steps_per_eval_image - 1) % len(self.dataset), self.dataset, step, board)
@@ -70,13 +72,22 @@ class HeldOut:
         due = every is not None and state.seconds - self._last >= every
         if (due or step % config.steps_per_eval_all_images == 0) and self.dataset is not None:
             self._last, start = state.seconds, time.perf_counter()
-            evaluation = evaluate(self.model, self.dataset, max_images=config.max_eval_images, title="Evaluating")
+            limit = evaluation_seconds(config, state) if every is None else None
+            evaluation = evaluate(self.model, self.dataset, max_images=config.max_eval_images, seconds=limit)
             psnr, ssim, images = (evaluation.results[name] for name in ("psnr", "ssim", "num_images"))
+            full = images == min(evaluation.results["num_images_in_split"], config.max_eval_images or math.inf)
             cost = time.perf_counter() - start
-            state.curve += (Point(state.seconds, step, psnr, ssim, images, evaluation_seconds=cost).entry(),)
+            state.curve += (Point(state.seconds, step, psnr, ssim, images, 1, cost, full).entry(),)
             board.scalars({"eval/psnr": psnr} | ({} if ssim is None else {"eval/ssim": ssim}), step)
             say(f"{state.seconds:5.0f} s  step {step:,}  {evaluation.line()}")
             self.write_curve(state)
+
+    def _seconds_per_image(self, state: State) -> float:
+        """Return how long a whole image takes by the last evaluation of a few; infinity before the first."""
+        if not state.looks:
+            return math.inf
+        last = Point(*state.looks[-1])
+        return (last.evaluation_seconds or 0.0) / (last.images or 1) * last.pixel_stride**2
 
     def _show(self, index: int, dataset: Dataset, step: int, board: TensorBoard) -> None:
         """Show image `index` beside what the model renders of it."""

@@ -10,13 +10,12 @@ from types import TracebackType
 from typing import Any
 
 import torch
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn
 from torch import Tensor
 
-from framework.base.console import console, say
+from framework.base.console import SECONDS_BETWEEN_LINES, console, say
+from framework.base.meter import UNKNOWN, left_text, time_text
 
-SECONDS_BETWEEN_LINES = 15.0
-"""Seconds between lines of progress where there is no terminal."""
 SECONDS_BETWEEN_STATES = 0.1
 """Seconds between changes of the progress bar, which shows losses: reading them means to wait for a GPU."""
 
@@ -37,8 +36,9 @@ class StepReport:
     """PSNR of the batches, dB, smoothed; on other devices than the CPU that of the last step that was read."""
     rays_per_second: float
     """Rays per second of the last steps of which errors were read: on the CPU of this step."""
-    held_out_psnr: float | None
-    """PSNR of the last evaluation of a few held-out images, dB; None before the first."""
+    held_out: tuple[float, float] | None
+    """PSNR of the newest evaluation of held-out images, dB, and the seconds of training since; None before the first
+    that this process has made."""
 
     @cached_property
     def losses(self) -> dict[str, float]:
@@ -48,25 +48,46 @@ class StepReport:
 
     def line(self) -> str:
         """Return the report as a line of text."""
-        held_out = "" if self.held_out_psnr is None else f", {self.held_out_psnr:.2f} dB on held-out images"
         return (
-            f"step {self.step:,}  loss {sum(self.losses.values()):.5f}  PSNR {self.psnr:.2f} dB{held_out}  "
+            f"step {self.step:,}  loss {sum(self.losses.values()):.5f}  PSNR {self.psnr:.2f} dB  {self.held_out_text}  "
             f"{self.rays_per_second / 1e3:.1f}k rays/s"
         )
 
+    @property
+    def held_out_text(self) -> str:
+        """The PSNR of held-out images and its age, as text; a dash before the first evaluation."""
+        if self.held_out is None:
+            return f"held out {UNKNOWN}"
+        psnr, age = self.held_out
+        return f"held out {psnr:.2f} dB ({time_text(age)} ago)"
+
+
+def share_and_time(first: StepReport, last: StepReport) -> str:
+    """Return the share of the budget that is spent, and the time of training that is left, as text.
+
+    The time is that of the speed between two reports of this process: an earlier one may have been on another machine.
+
+    Args:
+        first: report of the first training step of this process.
+        last: report of the last training step.
+    """
+    spent = last.progress - first.progress
+    left = (last.seconds - first.seconds) / spent * (1 - last.progress) if spent > 0 else None
+    return f"{100 * last.progress:.0f} %, {left_text(left)}"
+
 
 class ProgressBar:
-    """A progress bar on a terminal; elsewhere, a line every 15 seconds.
+    """A progress bar on a terminal; elsewhere, a line every ten seconds.
 
     Args:
         title: text before the bar.
     """
 
     def __init__(self, title: str) -> None:
-        columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), TimeRemainingColumn())
-        state = TextColumn("{task.fields[state]}")
-        self._bar = Progress(*columns, state, console=console, transient=True, disable=not console.is_terminal)
+        columns = (TextColumn("{task.description}"), BarColumn(bar_width=16), TextColumn("{task.fields[state]}"))
+        self._bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
         self._task = self._bar.add_task(title, total=1.0, state="")
+        self._first: StepReport | None = None
         self._last_line = time.monotonic()
         self._last_state = 0.0
 
@@ -81,13 +102,15 @@ class ProgressBar:
 
     def show(self, report: StepReport) -> None:
         """Show the `report` of the last training step, unless another was shown a moment ago."""
+        self._first = self._first or report
         now = time.monotonic()
         if console.is_terminal and now - self._last_state > SECONDS_BETWEEN_STATES:
             self._last_state = now
-            self._bar.update(self._task, completed=report.progress, state=report.line())
+            state = f"{share_and_time(self._first, report)}  {report.line()}"
+            self._bar.update(self._task, completed=report.progress, state=state)
         if not console.is_terminal and now - self._last_line > SECONDS_BETWEEN_LINES:
             self._last_line = now
-            say(f"{report.seconds:5.0f} s  {report.line()}")
+            say(f"{report.seconds:5.0f} s  {share_and_time(self._first, report)}  {report.line()}")
 
 
 class TensorBoard:

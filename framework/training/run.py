@@ -29,6 +29,7 @@ import yaml
 from framework.base.config import TrainConfig, from_plain, read_yaml, to_plain
 from framework.base.console import say
 from framework.base.errors import ConfigError, DataError
+from framework.base.given import limited_as_given
 from framework.base.registry import load_dataparser, load_method
 from framework.cameras.camera_path import read_transforms
 from framework.cameras.poses import Placement
@@ -36,9 +37,8 @@ from framework.data.data_folder import find_data
 from framework.data.dataset import DataParser, Dataset, ParsedScene, Split
 from framework.data.training_images import chosen_images
 from framework.training.checkpoint import write_atomically
+from framework.training.run_path import CONFIG, config_file
 
-CONFIG = "config.yml"
-"""Name of the settings in a run's folder."""
 TRANSFORMS = "dataparser_transforms.json"
 """Name of the placement in a run's folder."""
 PLACED_ALIKE = 1e-3
@@ -154,30 +154,13 @@ def create_folder(run: Run) -> None:
         raise ConfigError(f"cannot write the run's folder {run.folder}: {error.strerror or error}") from error
 
 
-def config_file(path: Path) -> Path:
-    """Return the path of a run's config.yml.
-
-    Args:
-        path: the file itself, or the run's folder.
-
-    Raises:
-        ConfigError: if `path` is a folder without one.
-    """
-    if not os.path.isdir(path) or (path / CONFIG).is_file():
-        return path / CONFIG if os.path.isdir(path) else path
-    levels = ("*", "*/*", "*/*/*")  # outputs/{experiment}/{method}/{timestamp}
-    runs = sorted((file for level in levels for file in path.glob(f"{level}/{CONFIG}")), key=os.path.getmtime)
-    newest = f"; the newest run in it is {runs[-1].parent}" if runs else ""
-    raise ConfigError(f"{path} is not a run's folder, for it has no {CONFIG}{newest}")
-
-
 def read_run(path: Path) -> Run:
     """Read a run, or a recipe for one, from a YAML file.
 
     Its keys are `method`, optionally `dataparser` (with `name` and the format's flags), and the method's settings.
 
     Args:
-        path: the file, or a run's folder, of which config.yml is read.
+        path: the file, or what `config_file` finds one in.
 
     Raises:
         ConfigError: if a method, format or key is unknown, or a value has the wrong type.
@@ -188,7 +171,7 @@ def read_run(path: Path) -> Run:
     if not isinstance(method, str):
         raise ConfigError(f"{path} does not say which method, as in 'method: instant-ngp'")
     data_flags = values.pop("dataparser", None) or {}
-    config = from_plain(load_method(method).config, values, str(path))
+    config = limited_as_given(from_plain(load_method(method).config, values, str(path)), values)
     if not isinstance(data_flags, dict):
         raise ConfigError(f"{path}: 'dataparser' must hold keys and values, such as 'name: blender'")
     data_flags = dict(data_flags)

@@ -34,6 +34,20 @@ class State:
     looks: tuple[Entry, ...] = ()
     """Evaluations of a few held-out images."""
 
+    def newest_held_out(self, first_step: int) -> tuple[float, float] | None:
+        """Return the PSNR of the newest evaluation of held-out images, dB, and the seconds of training since.
+
+        Args:
+            first_step: step up to which evaluations do not count, as an earlier process made them.
+
+        Returns:
+            PSNR and seconds; None if there is no such evaluation.
+        """
+        newest = max((*self.curve[-1:], *self.looks[-1:]), key=lambda entry: entry[1], default=None)
+        if newest is None or newest[1] <= first_step:
+            return None
+        return newest[2], self.seconds - newest[0]
+
     def learn_samples_per_ray(self, found: float) -> None:
         """Take the samples per ray that a step has `found` into their mean; NaN if they are not known, or not yet."""
         if not math.isnan(found):

@@ -278,7 +278,7 @@ class Trainer:
             terms={name: value.detach() for name, value in result.loss.terms.items()},
             psnr=self._train_psnr(),
             rays_per_second=self._rays_per_second,
-            held_out_psnr=state.looks[-1][2] if state.looks else None,
+            held_out=state.newest_held_out(self.first_step),
         )
 
     def _drawn_and_taken(self) -> tuple[Any, StepResult]:

@@ -103,11 +103,10 @@ class Status:
         if now - self._told < SECONDS_PER_REPORT:
             return
         self._told = now
-        held_out = "" if report.held_out_psnr is None else f"  \nheld-out images {report.held_out_psnr:.2f} dB"
         loss = sum(report.losses.values())
         self._text.content = (
             f"**{self._trainer.run.method}** · step {report.step:,} · {report.seconds:.0f} s  \n"
-            f"loss {loss:.5f} · PSNR of batches {report.psnr:.2f} dB{held_out}"
+            f"loss {loss:.5f} · PSNR of batches {report.psnr:.2f} dB  \n{report.held_out_text}"
         )
         state = self._trainer.state
         points = in_order(state.curve, state.looks)

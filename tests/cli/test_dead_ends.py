@@ -57,8 +57,12 @@ def test_a_runs_folder_stands_for_its_config(trained: Path, tmp_path: Path, refu
         assert f"kernels: {content['kernels']}" in called("ns-train", "--resume", trained).stderr
     assert called("ns-export", "cameras", trained, "--output-dir", tmp_path).returncode == 0
     assert read_run(trained).folder == trained
-    said = refused(evaluate.main, trained.parents[1])
-    assert f"has no config.yml; the newest run in it is {trained}" in said
+    (trained / "eval.json").unlink()
+    for above in (trained.parent, trained.parents[1], trained.parents[2]):
+        done = called("ns-eval", above)
+        assert f"runs in {above}: {trained}" in done.stderr
+        assert (trained / "eval.json").exists()
+        (trained / "eval.json").unlink()
 
 
 @pytest.mark.medium

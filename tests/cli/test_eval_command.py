@@ -155,7 +155,7 @@ def test_what_is_missing_is_named(finished: Path, tmp_path: Path, refused: Refus
         (["--load-config", config, "--max-images", 0], "--max-images is 0"),
         (
             ["--load-config", config, "--data", tmp_path / "gone"],
-            f"{tmp_path / 'gone'}, the run's data, is not there",
+            f"--data {tmp_path / 'gone'}: there is no such folder",
         ),
         (["--load-config", config, "--load-checkpoint", tmp_path / "no.ckpt"], "there is no checkpoint"),
         (["--load-config", config, "--load-checkpoint", tmp_path / "file"], f"{tmp_path / 'file'} is damaged"),

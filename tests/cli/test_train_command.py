@@ -196,7 +196,7 @@ def test_help_loads_nothing_heavy() -> None:
 
 
 def test_resuming_nothing(tmp_path: Path, refused: Refused) -> None:
-    assert f"cannot read {tmp_path / 'gone' / 'config.yml'}" in refused(main, "--resume", tmp_path / "gone")
+    assert f"cannot read {tmp_path / 'gone'}: No such file" in refused(main, "--resume", tmp_path / "gone")
 
 
 @pytest.mark.medium

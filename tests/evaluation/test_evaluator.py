@@ -15,6 +15,7 @@ from framework.cameras.view import View
 from framework.data.pixels import PixelBatch
 from framework.data.scene import Scene
 from framework.data.sources import PixelSource, Request
+from framework.evaluation import evaluator
 from framework.evaluation.evaluator import Evaluation, evaluate, evaluation_background
 from framework.fields.base import Field
 from framework.geometry.points import Points
@@ -178,6 +179,45 @@ def test_pictures_are_of_views_evenly_spaced_and_of_the_worst(shared_tiny: Path,
     assert found.results["num_rays_per_sec"] > 0
     evaluate(trainer.model, images, max_images=2, pictures=tmp_path / "none", max_pictures=0)
     assert not (tmp_path / "none").exists()
+
+
+def test_as_many_images_as_fit_the_time_evenly_spaced_and_it_is_said(
+    shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By the time of the first image: 3 s each, of 10 s."""
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run")
+    images, timed = trainer.train_set, evaluator._timed
+    monkeypatch.setattr(evaluator, "_timed", lambda work, title: (timed(work, title)[0], 3.0))
+    whole = evaluate(trainer.model, images)
+    assert "evaluating" not in capsys.readouterr().err
+    found = evaluate(trainer.model, images, seconds=10.0, pictures=tmp_path / "two", max_pictures=2)
+    assert f"evaluating 3 of {len(images)} images, 3 s each" in capsys.readouterr().err
+    third = [index * len(images) // 3 for index in range(3)]
+    without_time = [{name: value for name, value in row.items() if name != "seconds"} for row in whole.per_image]
+    assert [without_time[index] for index in third] == [
+        {name: value for name, value in row.items() if name != "seconds"} for row in found.per_image
+    ]
+    assert (found.results["num_images"], found.results["num_images_in_split"]) == (3, len(images))
+    assert found.line().endswith(f"(3 of {len(images)} images)")
+    assert whole.line().endswith(f"({len(images)} images)")
+    assert {path.name[:4] for path in (tmp_path / "two").iterdir()} == {f"{third[0]:04d}", f"{third[1]:04d}", "wors"}
+    assert len(evaluate(trainer.model, images, seconds=0.1).per_image) == 1
+    assert len(evaluate(trainer.model, images, seconds=1e9, max_images=4).per_image) == 4
+
+
+def test_views_with_pictures_come_first(shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run")
+    names, judge, seen = trainer.train_set.names, evaluator._judge, []
+
+    def recorded(*arguments: Any) -> Any:
+        seen.append(arguments[-1])
+        return judge(*arguments)
+
+    monkeypatch.setattr(evaluator, "_judge", recorded)
+    found = evaluate(trainer.model, trainer.train_set, pictures=tmp_path / "two", max_pictures=2)
+    assert seen[:2] == [0, len(names) // 2]
+    assert sorted(seen) == list(range(len(names)))
+    assert tuple(row["name"] for row in found.per_image) == tuple(names)
 
 
 def test_views_far_below_the_mean_are_named() -> None:

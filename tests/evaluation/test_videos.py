@@ -14,8 +14,8 @@ from PIL import Image
 from framework.base import extras
 from framework.base.errors import ConfigError
 from framework.evaluation import videos
+from framework.evaluation.video_suffixes import check_suffix
 from framework.evaluation.videos import (
-    check_suffix,
     write_distances,
     write_images,
     write_strip,

@@ -127,7 +127,7 @@ def test_a_session_ends_with_its_figures(
     assert json.loads((tmp_path / "run" / "eval.json").read_text())["results"]["num_images"] == 3
 
 
-def test_an_evaluation_that_cannot_be_written_fails_at_the_end(
+def test_an_evaluation_that_cannot_be_written_is_refused_before_it_begins(
     shared_tiny: Path, tmp_path: Path, refused: Refused
 ) -> None:
     tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=2, max_eval_images=0).train()
@@ -136,9 +136,9 @@ def test_an_evaluation_that_cannot_be_written_fails_at_the_end(
     pictures = tmp_path / "file" / "pictures"
     said = refused(eval_command.main, *config, "--render-output-path", pictures)
     assert said.startswith(f"error: cannot write pictures to {pictures}: ")
-    assert (tmp_path / "run" / "eval.json").is_file()
     said = refused(eval_command.main, *config, "--output-path", tmp_path / "file" / "eval.json")
     assert said.startswith(f"error: cannot write {tmp_path / 'file' / 'eval.json'}: ")
+    assert not (tmp_path / "run" / "eval.json").exists()
 
 
 def test_photographs_with_long_names_have_pictures(tiny: Path, tmp_path: Path) -> None:

@@ -68,6 +68,7 @@ def measure(run: Path | None, seconds: float, kinds: Sequence[str], resolutions:
     with tempfile.TemporaryDirectory() as folder:
         if run is None:
             command = python_command("framework.cli.train", "instant-ngp", "--max-seconds", seconds, "--vis", "none")
+            command += ["--eval", "all"]
             output_of([*command, "--output-dir", folder])
             run = next(Path(folder).rglob("config.yml")).parent
         truth = Truth(run)

@@ -71,7 +71,7 @@ def trained(
         command = [sys.executable, *launch, *command[1:]]
     with tempfile.TemporaryDirectory() as folder:
         command += ["--machine.seed", str(seed), "--samples-per-batch", str(samples), "--vis", "none"]
-        command += ["--max-eval-images", str(VIEWS)]
+        command += ["--eval", "all", "--max-eval-images", str(VIEWS)]
         output_of([*command, "--output-dir", folder])
         run = next(Path(folder).rglob("config.yml")).parent
         points = json.loads((run / "learning_curve.json").read_text())

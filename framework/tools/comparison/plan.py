@@ -179,7 +179,7 @@ class Job:
         start = python_command("framework.cli.train")
         if (self.folder / "config.yml").exists():
             return [*start, "--resume", str(self.folder)]
-        c, flags = conditions, ["--vis", "none", "--max-eval-images", str(conditions.curve_images)]
+        c, flags = conditions, ["--vis", "none", "--eval", "all", "--max-eval-images", str(conditions.curve_images)]
         for name in ("data", "max_seconds", "max_num_iterations", "target_psnr"):
             if getattr(c, name) is not None:
                 flags += ["--" + name.replace("_", "-"), str(getattr(c, name))]

@@ -71,8 +71,8 @@ BUGS = (
         "stops-a-step-early",
         "schedule",
         "framework/training/budget.py",
-        "if state.step >= config.max_num_iterations:",
-        "if state.step + 1 >= config.max_num_iterations:",
+        "and state.step >= config.max_num_iterations:",
+        "and state.step + 1 >= config.max_num_iterations:",
         "a run has a step less than was asked for",
     ),
     Bug(

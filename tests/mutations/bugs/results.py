@@ -182,6 +182,22 @@ BUGS = (
         "--max-images judges the first views alone",
     ),
     Bug(
+        "evaluation-without-end",
+        "evaluation",
+        "framework/cli/session.py",
+        "seconds=evaluation_seconds(run.config, trainer.state)",
+        "seconds=None",
+        "a run of 30 s renders held-out images for minutes",
+    ),
+    Bug(
+        "few-called-all",
+        "evaluation",
+        "framework/evaluation/evaluator.py",
+        '"num_images_in_split": len(views)}',
+        '"num_images_in_split": len(rows)}',
+        "an evaluation of some images is said to be of all",
+    ),
+    Bug(
         "rounding-down",
         "evaluation",
         "framework/evaluation/evaluator.py",
@@ -193,8 +209,8 @@ BUGS = (
         "mean-of-photographs-and-speed",
         "evaluation",
         "framework/evaluation/evaluator.py",
-        '"fps": len(rows) / seconds}',
-        '"fps": rays / seconds}',
+        '"fps": len(rows) / spent}',
+        '"fps": rays / spent}',
         "seconds an image are wrong in every report",
     ),
     Bug(

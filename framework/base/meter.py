@@ -1,0 +1,88 @@
+"""A meter of operations: units that are done, and the time that the others will take."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+UNKNOWN = "–"
+"""Text in place of what is not known yet."""
+
+
+def time_text(seconds: float) -> str:
+    """Return a duration of `seconds` for people, such as ``45 s``, ``3 min`` or ``2 h 05 min``."""
+    if seconds < 99.5:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def left_text(seconds: float | None) -> str:
+    """Return how long something will take, such as ``3 min left``.
+
+    Args:
+        seconds: the duration; None, which is written as a dash, if it is unknown.
+    """
+    return f"{UNKNOWN if seconds is None else time_text(seconds)} left"
+
+
+class Meter:
+    """Units of an operation that are done, and the time that the others will take.
+
+    All units are taken to last as long as those that are done did on average. This holds for units of minutes too, for
+    which a speed over the last seconds would be unknown.
+
+    Args:
+        title: what is done, for people.
+        total: number of units; None if it is unknown.
+        done: number of units that are done already.
+        spent: seconds that those took; if None, they tell nothing of the time that the others take.
+        clock: function that returns seconds.
+        number: function that writes a number of units.
+    """
+
+    def __init__(
+        self,
+        title: str,
+        total: int | None,
+        done: int = 0,
+        spent: float | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        number: Callable[[int], str] = "{:,}".format,
+    ) -> None:
+        self._title, self._total, self._clock, self._number = title, total, clock, number
+        self._done, self._first = done, done if spent is None else 0
+        self._last = clock()
+        self._start = self._last - (spent or 0.0)
+
+    def advance(self, count: int = 1) -> None:
+        """Count further units, `count` of them, as done."""
+        self._done += count
+        self._last = self._clock()
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Seconds that the other units will take; None before the first is done, or if their number is unknown."""
+        counted = self._done - self._first
+        if not counted or self._total is None:
+            return None
+        others = (self._last - self._start) / counted * max(self._total - self._done, 0)
+        return max(others - (self._clock() - self._last), 0.0)
+
+    @property
+    def left(self) -> str:
+        """The time that the other units will take, as text."""
+        return left_text(self.seconds_left)
+
+    @property
+    def state(self) -> str:
+        """The units that are done, their share and the time left, as text."""
+        if self._total is None:
+            return self._number(self._done)
+        share = 100 * self._done / max(self._total, 1)
+        return f"{share:.0f} %, {self._number(self._done)} of {self._number(self._total)}, {self.left}"
+
+    @property
+    def line(self) -> str:
+        """The operation and its state, as text."""
+        return f"{self._title}: {self.state}"

@@ -1,0 +1,30 @@
+"""Suffixes of videos and animations, without numpy, so that a wrong one is refused at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from framework.base.errors import ConfigError, FlagError
+from framework.base.extras import install_command
+
+VIDEO, ANIMATIONS = ".mp4", (".gif", ".webp", ".png")
+"""Suffixes of files of several pictures."""
+
+
+def check_suffix(path: Path) -> None:
+    """Refuse, before anything is rendered, a file that cannot be written.
+
+    Args:
+        path: file; a path without suffix is a folder.
+
+    Raises:
+        ConfigError: for an unknown suffix, or for MP4 if ffmpeg is not installed.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in ("", VIDEO, *ANIMATIONS):
+        known = ", ".join((VIDEO, *ANIMATIONS))
+        raise FlagError(f"--output-path {path}: the extension must be {known}, or none for a folder of images")
+    if suffix == VIDEO and (advice := install_command("video")) is not None:
+        raise ConfigError(
+            f"--output-path {path}: MP4 needs ffmpeg, the extra [video]: {advice}; or name a .gif, a .webp or a folder"
+        )

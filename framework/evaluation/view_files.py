@@ -1,0 +1,87 @@
+"""Image files of some evaluated views, and of the one with the lowest PSNR."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from torch import Tensor
+
+from framework.evaluation.images import write_image
+from framework.evaluation.panels import composed, view_panels
+from framework.rendering.rendered import Picture
+
+WORST = "worst"
+"""Name, without suffix, of the files of the view with the lowest PSNR; the next evaluation overwrites them."""
+LONGEST_STEM = 150
+"""Maximum number of bytes of an image's name in the names of the files written for it."""
+
+
+class Judged(NamedTuple):
+    """Images of an evaluated view."""
+
+    rgb: Tensor
+    """(H, W, 3) rendered colours, as they are measured."""
+    target: Tensor
+    """(H, W, 3) colours of the true image."""
+    picture: Picture
+    """What was rendered."""
+
+
+class ViewFiles:
+    """Writer of the files of some evaluated views.
+
+    Args:
+        folder: folder of the files; None to write none.
+        names: names of all images.
+        views: indices of the views with files of their own.
+        with_worst: whether the files of the view with the lowest PSNR are written besides.
+    """
+
+    def __init__(self, folder: Path | None, names: Sequence[str], views: Collection[int], with_worst: bool) -> None:
+        self._folder, self._names, self._views, self._with_worst = folder, names, views, with_worst
+        self._lowest = math.inf
+        self._worst: Judged | None = None
+        self.note: str | None = None
+        """Reason why files could not be written; None if there is none."""
+
+    def take(self, index: int, psnr: float, judged: Judged) -> None:
+        """Write the files of a view, or remember it if it is the worst so far.
+
+        Args:
+            index: index of the view.
+            psnr: its PSNR, dB.
+            judged: its images.
+        """
+        if self._with_worst and psnr < self._lowest:
+            self._lowest, self._worst = psnr, judged
+        if index in self._views:
+            self._write(f"{index:04d}_{_short_stem(self._names[index])}", judged)
+
+    def write_worst(self) -> None:
+        """Write the files of the view with the lowest PSNR."""
+        if self._worst is not None:
+            self._write(WORST, self._worst)
+
+    def _write(self, stem: str, judged: Judged) -> None:
+        """Write a view's rendered image, true image, comparison and normals, unless a file before could not be."""
+        if self._folder is None or self.note is not None:
+            return
+        rgb, target, picture = judged
+        panels = view_panels(rgb, target, picture.median_depth, picture.accumulation)
+        files = {"": rgb, "_photograph": target, "_comparison": composed(panels)}
+        if picture.normals is not None:
+            files["_normals"] = (picture.normals + 1) / 2
+        try:
+            for suffix, image in files.items():
+                write_image(self._folder / f"{stem}{suffix}.png", image)
+        except OSError as error:  # metrics do not need the files
+            self.note = f"cannot write pictures to {self._folder}: {error.strerror or error}"
+
+
+def _short_stem(name: str) -> str:
+    """Return an image's name without its extension, cut to LONGEST_STEM bytes."""
+    return os.fsencode(Path(name).stem)[:LONGEST_STEM].decode("utf-8", "ignore")

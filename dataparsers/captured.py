@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from dataparsers.placing import Applied, placement_of
+from dataparsers.sparse_points import sparse_points
 from framework import Cameras, DataError, DataParser, ParsedScene
 from framework.cameras.cameras import LENSES
 from framework.cameras.poses import Center, Orientation, Placement, estimate_near, held_out
 from framework.data.dataset import Split, existing_files, image_size
 from framework.data.scene import PoseSource
-from framework.data.tracks import Sightings, Tracks
+from framework.data.tracks import Tracks
 
 LARGEST_SIDE = 1600
 """Longer side of an image, pixels, above which images are reduced by default."""
@@ -151,8 +152,8 @@ def captured_scene(
         )
     placement = placement_of(flags, images, split, applied)
     cameras = _cameras(images, placement)
-    points, sightings = _sparse_points(images, placement, cameras, chosen if split == "train" else None)
-    near = min(estimate_near(cameras, points), flags.far / 2) if flags.near is None else flags.near
+    sparse = sparse_points(images, placement, cameras, chosen if split == "train" else None)
+    near = min(estimate_near(cameras, sparse.sound), flags.far / 2) if flags.near is None else flags.near
     images = images[chosen]
     _check_masks(images.masks)
     return ParsedScene(
@@ -166,8 +167,8 @@ def captured_scene(
         scale=placement.scale,
         downscale_factor=reduction,
         mask_paths=images.masks,
-        points=points,
-        sightings=None if sightings is None else sightings.of_images(chosen),
+        points=sparse.points,
+        sightings=None if sparse.sightings is None else sparse.sightings.of_images(chosen),
         unbounded=True,
         poses=flags.poses,
         depth_paths=images.depths,
@@ -291,37 +292,6 @@ def checked_box(box: Tensor, source: str) -> Tensor:
     if not bool((box.abs() < EXTREME).all()) or not bool((box[0] < box[1]).all()):
         raise DataError(f"{source} give a box that is empty or too large")
     return box
-
-
-def _sparse_points(
-    images: PosedImages, placement: Placement, cameras: Cameras, known: Tensor | None
-) -> tuple[Tensor | None, Sightings | None]:
-    """Return the sparse points (K, 3) in the scene's frame, and how images see them; None if there are none.
-
-    Points beyond the range of float32 are left out. So are those of tracks that fewer than two of the `known` images
-    see: only held-out images know of them. (The others' positions were found by all images together, as all poses
-    were.)
-
-    Args:
-        images: M images.
-        placement: placement of the scene.
-        cameras: M cameras in the scene's frame.
-        known: the images that may be learned from; all if None.
-    """
-    precise, points, sightings = _in_float64(placement), None, None
-    if images.tracks is not None:
-        tracks = images.tracks.at(precise.points(images.tracks.points).float())
-        if known is not None:
-            others = torch.ones(len(cameras), dtype=torch.bool)
-            others[known] = False
-            tracks = tracks.without(others)
-        confirmed = tracks.points[tracks.confirmed()]
-        if len(confirmed):
-            points, sightings = confirmed, tracks.sightings(cameras.camera_to_worlds[:, :, 3])
-    if images.points is not None:
-        points = precise.points(images.points.double()).float()
-        points = points[points.isfinite().all(-1)]
-    return points, sightings
 
 
 def _in_float64(placement: Placement) -> Placement:

@@ -13,7 +13,7 @@ from dataparsers.colmap_model import SparseModel, choose_model, find_models, rea
 from dataparsers.masks import find_masks
 from framework import DataError, ParsedScene
 from framework.data.dataset import Split
-from framework.data.tracks import Tracks
+from framework.data.tracks import Tracks, doubts_about
 
 
 @dataclass(frozen=True)
@@ -78,4 +78,5 @@ def tracks_of(sparse: SparseModel, intrinsics: Tensor) -> Tracks | None:
     if not len(sparse.points):
         return None
     images, seen = sparse.sightings.unbind(-1)
-    return Tracks(sparse.points, images, seen, sparse.errors[seen] / intrinsics[images, :2].mean(-1))
+    angles = sparse.errors[seen] / intrinsics[images, :2].mean(-1)
+    return Tracks(sparse.points, images, seen, angles, doubts_about(sparse.lengths, sparse.errors))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import torch
@@ -71,7 +72,9 @@ def tracks_beside(
     number[theirs[alike]] = ours[alike]
     kept = number[tracks.images] >= 0
     points = scale * (tracks.points @ applied[:3, :3].T.double() + applied[:3, 3].double())
-    return Tracks(points, number[tracks.images[kept]], tracks.seen[kept], tracks.angles[kept])
+    return replace(
+        tracks, points=points, images=number[tracks.images[kept]], seen=tracks.seen[kept], angles=tracks.angles[kept]
+    )
 
 
 def names_in_model(file_path: str, source_path: object) -> list[str]:

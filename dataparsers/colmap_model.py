@@ -25,10 +25,6 @@ LOCATIONS = ("sparse", "colmap/sparse")
 """Folders searched for reconstructions: each itself, and its subfolders."""
 FILES = ("cameras", "images", "points3D")
 """Files of a reconstruction, without suffix."""
-SHORTEST_TRACK = 3
-"""Minimum number of images that observe a sparse point; two can agree on a wrong one."""
-LARGEST_ERROR = 2.0
-"""Maximum mean reprojection error of a sparse point, pixels."""
 LEAST_ERROR = 0.5
 """Least error that is believed, pixels; also that of a point whose error was not computed."""
 
@@ -58,9 +54,11 @@ class SparseModel:
     cameras: tuple[SparseCamera, ...]
     """The camera of each image."""
     points: Tensor
-    """(K, 3) float64 sparse points confirmed by several images."""
+    """(K, 3) float64 sparse points, all that are finite."""
     errors: Tensor
-    """(K,) float64 mean reprojection error of each point, pixels."""
+    """(K,) float64 mean reprojection error of each point, pixels, at least `LEAST_ERROR`."""
+    lengths: Tensor
+    """(K,) int64 length of each point's track, sightings in images without a pose included."""
     sightings: Tensor
     """(O, 2) int64 image, and point that it sees."""
 
@@ -135,7 +133,7 @@ def read_model(folder: Path) -> SparseModel:
         names = tuple(image.name for image in images)
         poses = [_camera_to_world(image) for image in images]
         cameras = tuple(_camera(model.cameras[image.camera_id]) for image in images)
-        points, errors, sightings = _points(model, [image.image_id for image in images])
+        points, errors, lengths, sightings = _points(model, [image.image_id for image in images])
     except Exception as error:  # pycolmap raises IndexError, ValueError, RuntimeError, UnicodeDecodeError and more
         raise DataError(
             f"{folder} cannot be read: its files are damaged or inconsistent ({one_line(error)})"
@@ -144,7 +142,9 @@ def read_model(folder: Path) -> SparseModel:
         raise DataError(f"{folder} has no image with a pose; COLMAP could not register any")
     for name, pose in zip(names, poses, strict=True):
         _check(name, pose, folder)
-    return SparseModel(names, torch.stack(poses), cameras, points, errors, sightings)
+    if left_out := len(model.points3D) - len(points):
+        say(f"{folder}: {left_out:,} of {len(model.points3D):,} sparse points are not finite and left out")
+    return SparseModel(names, torch.stack(poses), cameras, points, errors, lengths, sightings)
 
 
 def _camera_to_world(image: Any) -> Tensor:
@@ -163,8 +163,8 @@ def _camera(camera: Any) -> SparseCamera:
     return SparseCamera(camera.model.name, tuple(float(p) for p in camera.params), camera.width, camera.height)
 
 
-def _points(model: Any, numbers: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the sparse points that enough images confirm, their errors, and which images see them.
+def _points(model: Any, numbers: Sequence[int]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the finite sparse points, their errors, the lengths of their tracks, and which images see them.
 
     Args:
         model: the reconstruction.
@@ -173,19 +173,20 @@ def _points(model: Any, numbers: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]
     rows = {number: row for row, number in enumerate(numbers)}
     positions: list[np.ndarray] = []
     errors: list[float] = []
+    lengths: list[int] = []
     sightings: list[tuple[int, int]] = []
     for point in model.points3D.values():
-        # The error is -1 if it was not computed.
-        if point.track.length() < SHORTEST_TRACK or point.error > LARGEST_ERROR or not np.isfinite(point.xyz).all():
+        if not np.isfinite(point.xyz).all():
             continue
         # A track may meet an image twice.
         images = {rows[number] for number in (sighting.image_id for sighting in point.track.elements) if number in rows}
         sightings += [(image, len(positions)) for image in sorted(images)]
         positions.append(point.xyz)
-        errors.append(max(float(point.error), LEAST_ERROR))
+        errors.append(max(float(point.error), LEAST_ERROR))  # the error is -1 if it was not computed
+        lengths.append(point.track.length())
     points = torch.from_numpy(np.stack(positions)) if positions else torch.zeros(0, 3, dtype=torch.float64)
     seen = torch.tensor(sightings, dtype=torch.int64).view(-1, 2)
-    return points, torch.tensor(errors, dtype=torch.float64), seen
+    return points, torch.tensor(errors, dtype=torch.float64), torch.tensor(lengths, dtype=torch.int64), seen
 
 
 def _check(name: str, pose: Tensor, folder: Path) -> None:

@@ -16,15 +16,12 @@ from framework import Cameras, DataError, DataParser, ParsedScene
 from framework.cameras.cameras import LENSES
 from framework.cameras.poses import Center, Orientation, Placement, estimate_near, held_out
 from framework.data.dataset import Split, existing_files, image_size
+from framework.data.names_on_disk import LIKELIEST, REDUCED, nearest_on_disk
 from framework.data.scene import PoseSource
 from framework.data.tracks import Tracks
 
 LARGEST_SIDE = 1600
 """Longer side of an image, pixels, above which images are reduced by default."""
-REDUCED = (1, 2, 4, 8)
-"""Integer factors by which images may have been reduced in advance; those of `images` by 2 are in `images_2`."""
-SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp")
-"""Suffixes that a reduced image may have instead of the original's."""
 EXTREME = 1e9
 """Limit of focal lengths, principal points (pixels) and boxes (scene units) beyond which float32 may overflow; focal
 lengths must also be larger than its inverse."""
@@ -194,6 +191,22 @@ def image_sizes(paths: Sequence[Path]) -> Tensor:
     return torch.tensor(sizes)
 
 
+def sizes_of(stated: Sequence[Sequence[int | None]], paths: Sequence[Path]) -> Tensor:
+    """Return width and height (M, 2) int64 that intrinsics refer to: those stated, or the image's if one is missing.
+
+    Args:
+        stated: M widths and heights; None for what is missing.
+        paths: M image files.
+
+    Raises:
+        DataError: if sizes are missing and no image is readable.
+    """
+    if not any(None in size for size in stated):
+        return torch.tensor(stated)
+    actual = image_sizes(paths).tolist()
+    return torch.tensor([found if None in size else size for size, found in zip(stated, actual, strict=True)])
+
+
 def has_transforms(path: Path) -> bool:
     """Return whether the folder `path` has transforms*.json, which take precedence over files of other formats."""
     return any((path / f"transforms{part}.json").is_file() for part in ("", "_train"))
@@ -258,7 +271,7 @@ def _reduced(path: Path, root: Path | None, step: int) -> Path:
         return path / "none"
     folder = root.with_name(f"{root.name}_{step}")
     file = folder / path.relative_to(root)
-    alternatives = [file.with_suffix(ending) for ending in SUFFIXES if folder.is_dir()]
+    alternatives = [file.with_suffix(ending) for ending in LIKELIEST if folder.is_dir()]
     return next((alternative for alternative in (file, *alternatives) if alternative.is_file()), file)
 
 
@@ -275,7 +288,8 @@ def _check_masks(masks: tuple[Path | None, ...] | None) -> None:
     missing = [path for path in masks or () if path is not None and not path.is_file()]
     if missing:
         raise DataError(
-            f"the mask {missing[0]} does not exist (missing in all: {len(missing)}); restore it, or remove its name"
+            f"the mask {missing[0]} does not exist (missing in all: {len(missing)}; {nearest_on_disk(missing[0])}); "
+            "restore it, or remove its name"
         )
 
 

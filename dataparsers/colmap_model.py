@@ -14,15 +14,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dataparsers.colmap_files import check_binary, count_images
+from dataparsers.colmap_files import check_binary, image_names, text_names
 from dataparsers.reading import file_name
 from framework import DataError
 from framework.base.console import say
 from framework.cameras.cameras import check_pose
 from framework.data.dataset import one_line
+from framework.data.names_on_disk import match_names
 
-LOCATIONS = ("sparse", "colmap/sparse")
-"""Folders searched for reconstructions: each itself, and its subfolders."""
+LOCATIONS = ("sparse", "colmap/sparse", ".")
+"""Folders searched for reconstructions, below which they may lie too; the data folder itself comes last."""
+DEEPEST = 4
+"""Maximum number of levels below these folders, as in sparse/0/models/1."""
 FILES = ("cameras", "images", "points3D")
 """Files of a reconstruction, without suffix."""
 LEAST_ERROR = 0.5
@@ -63,31 +66,43 @@ class SparseModel:
     """(O, 2) int64 image, and point that it sees."""
 
 
-def find_models(path: Path, locations: tuple[str, ...] = LOCATIONS) -> list[Path]:
-    """Return the reconstructions in the first location that has any, sorted by name. Never raises.
+def find_models(path: Path, locations: Sequence[str] = LOCATIONS) -> list[Path]:
+    """Return the reconstructions in some folders and below them, those of the first folder first. Never raises.
 
     Args:
         path: the data folder.
-        locations: subfolders to search.
+        locations: subfolders to search; the data folder itself, ".", is not searched below.
     """
+    models: list[Path] = []
     for location in locations:
-        try:
-            folders = [path / location, *sorted(path.joinpath(location).iterdir())]
-            kinds = ("bin", "txt")
-            models = [folder for folder in folders if any((folder / f"images.{kind}").is_file() for kind in kinds)]
-        except OSError:
-            continue
-        if models:
-            return models
-    return []
+        levels = 0 if location == "." else DEEPEST
+        models += [folder for folder in _folders(path / location, levels) if _is_model(folder)]
+    return list(dict.fromkeys(models))
 
 
-def choose_model(path: Path, location: str | None, flag: str = "--colmap-path") -> Path:
-    """Return the folder of the reconstruction to read; of several, report and use the one with the most images.
+def _folders(folder: Path, levels: int) -> list[Path]:
+    """Return a folder and those below it, down to a number of levels, sorted by name."""
+    try:
+        inside = sorted(entry for entry in folder.iterdir() if entry.is_dir()) if levels else []
+    except OSError:
+        return [folder]
+    return [folder, *(deeper for entry in inside for deeper in _folders(entry, levels - 1))]
+
+
+def _is_model(folder: Path) -> bool:
+    try:
+        return any((folder / f"images.{kind}").is_file() for kind in ("bin", "txt"))
+    except OSError:
+        return False
+
+
+def choose_model(path: Path, location: str | None, images: str = "images", flag: str = "--colmap-path") -> Path:
+    """Return the reconstruction of most of the images that are there; of several, say which others there are.
 
     Args:
         path: the data folder.
         location: subfolder to search; None for the default ones.
+        images: folder of the images in `path`.
         flag: the flag that sets `location`, for messages.
 
     Raises:
@@ -100,13 +115,17 @@ def choose_model(path: Path, location: str | None, flag: str = "--colmap-path") 
             f"{path} has no COLMAP reconstruction: no images.bin or images.txt in {', '.join(locations)} or a folder "
             f"below; run COLMAP, or set its folder with {flag}"
         )
-    counts = [count_images(model) for model in models]
-    best = counts.index(max(counts))
-    if len(models) > 1:
-        say(
-            f"{len(models)} COLMAP reconstructions: {models[best]} has the most images "
-            f"({counts[best]}) and is used ({flag} chooses another)"
-        )
+    if len(models) == 1:
+        return models[0]
+    names = [image_names(model) for model in models]
+    there = [len(match_names(path, [f"{images}/{name}" for name in some]).files) for some in names]
+    best = max(range(len(models)), key=lambda index: (there[index], len(names[index]), -index))
+    shown = [model.relative_to(path).as_posix() for model in models]
+    others = ", ".join(f"{shown[index]} has {there[index]}" for index in range(len(models)) if index != best)
+    say(
+        f"{len(models)} COLMAP reconstructions in {path}: {shown[best]} is used, since it has {there[best]} of the images "
+        f"that are there; {others} ({flag} chooses another)"
+    )
     return models[best]
 
 
@@ -120,7 +139,8 @@ def read_model(folder: Path) -> SparseModel:
         DataError: if a file is missing, damaged or contradicts another, no image has a pose, or pycolmap is not
             installed.
     """
-    if not any(all((folder / f"{name}.{kind}").is_file() for name in FILES) for kind in ("bin", "txt")):
+    complete = {kind: all((folder / f"{name}.{kind}").is_file() for name in FILES) for kind in ("bin", "txt")}
+    if not any(complete.values()):
         raise DataError(f"{folder} is not a complete COLMAP model: it needs {', '.join(FILES)}, all .bin or all .txt")
     check_binary(folder)
     try:
@@ -129,11 +149,16 @@ def read_model(folder: Path) -> SparseModel:
         raise DataError(f"reading {folder} needs pycolmap, which is not installed: pip install pycolmap") from error
     try:
         model = pycolmap.Reconstruction(str(folder))
-        images = sorted((model.images[number] for number in model.reg_image_ids()), key=lambda image: image.name)
-        names = tuple(image.name for image in images)
+        # Of text, pycolmap takes a name to end at its first space.
+        known = {} if complete["bin"] else text_names(folder / "images.txt")
+        named = {number: known.get(number) or model.images[number].name for number in model.reg_image_ids()}
+        images = [model.images[number] for number in sorted(named, key=lambda number: (named[number], number))]
+        names = tuple(named[image.image_id] for image in images)
         poses = [_camera_to_world(image) for image in images]
         cameras = tuple(_camera(model.cameras[image.camera_id]) for image in images)
         points, errors, lengths, sightings = _points(model, [image.image_id for image in images])
+    except DataError:
+        raise
     except Exception as error:  # pycolmap raises IndexError, ValueError, RuntimeError, UnicodeDecodeError and more
         raise DataError(
             f"{folder} cannot be read: its files are damaged or inconsistent ({one_line(error)})"

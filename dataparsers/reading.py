@@ -132,6 +132,11 @@ def side(value: Any, name: str, where: str) -> int:
     return round(length)
 
 
+def side_or_none(value: Any, name: str, where: str) -> int | None:
+    """Return `side`, or None for an entry that is missing."""
+    return None if value is None else side(value, name, where)
+
+
 def numbers(value: Any, count: int, name: str, where: str) -> list[float]:
     """Return a list of `count` finite numbers.
 

@@ -13,6 +13,7 @@ from dataparsers.captured import Captured, PosedImages, captured_scene, has_tran
 from dataparsers.reading import numbers, read_json, side
 from framework import DataError, ParsedScene
 from framework.data.dataset import Split, existing_files
+from framework.data.names_on_disk import on_disk
 from framework.data.scene import PoseSource
 from framework.kernels.math import cross_matrix
 
@@ -46,12 +47,12 @@ class Record3D(Captured):
         file = folder / METADATA
         content = read_json(file)
         poses = _poses(content, file)
-        paths = [_image(folder / "rgb", index) for index in range(len(poses))]
+        paths = on_disk(folder, [f"rgb/{index}" for index in range(len(poses))], quiet=split != "train")
         keep = _evenly_spaced(existing_files(paths, split), self.max_images)
         width, height = (side(content.get(key), key, str(file)) for key in "wh")
         images = PosedImages(
             folder=folder,
-            paths=tuple(paths),
+            paths=paths,
             names=tuple(f"{index:09d}" for index in range(len(paths))),  # padded, so that names sort as numbers
             poses=poses,
             intrinsics=_intrinsics(content, file).expand(len(paths), 4),
@@ -63,12 +64,6 @@ class Record3D(Captured):
 def _folder(path: Path) -> Path:
     """Return the folder of the export: the folder that the user named, or one in it."""
     return path / EXPORT if (path / EXPORT).is_dir() else path
-
-
-def _image(folder: Path, index: int) -> Path:
-    """Return the image of a pose, whose file name is the pose's index."""
-    png = folder / f"{index}.png"
-    return png if png.is_file() else folder / f"{index}.jpg"
 
 
 def _evenly_spaced(indices: Tensor, limit: int) -> Tensor:

@@ -14,10 +14,13 @@ from torch import Tensor
 from framework.base.arrays import read_array
 from framework.base.errors import DataError
 from framework.cameras.cameras import Cameras
+from framework.data.data_folder import IMAGE_SUFFIXES
 from framework.data.image_files import Content, unreadable
 
 T = TypeVar("T")
 
+DEPTH_SUFFIXES = (*IMAGE_SUFFIXES, ".npy", ".exr")
+"""Suffixes of depth images, in lower case."""
 MOST_PIXELS = 64
 """Maximum number of pixels of a depth image per pixel of its image; most have less than one."""
 

@@ -288,7 +288,7 @@ def _check_masks(masks: tuple[Path | None, ...] | None) -> None:
     missing = [path for path in masks or () if path is not None and not path.is_file()]
     if missing:
         raise DataError(
-            f"the mask {missing[0]} does not exist (missing in all: {len(missing)}; {nearest_on_disk(missing[0])}); "
+            f"the mask {missing[0]} does not exist (missing in all: {len(missing)}): {nearest_on_disk(missing[0])}; "
             "restore it, or remove its name"
         )
 

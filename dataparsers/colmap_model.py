@@ -16,6 +16,7 @@ from torch import Tensor
 
 from dataparsers.colmap_files import check_binary, image_names, text_names
 from dataparsers.reading import file_name
+from dataparsers.rotations import rotations, unit_quaternions
 from framework import DataError
 from framework.base.console import say
 from framework.cameras.cameras import check_pose
@@ -123,8 +124,8 @@ def choose_model(path: Path, location: str | None, images: str = "images", flag:
     shown = [model.relative_to(path).as_posix() for model in models]
     others = ", ".join(f"{shown[index]} has {there[index]}" for index in range(len(models)) if index != best)
     say(
-        f"{len(models)} COLMAP reconstructions in {path}: {shown[best]} is used, since it has {there[best]} of the images "
-        f"that are there; {others} ({flag} chooses another)"
+        f"{len(models)} COLMAP reconstructions in {path}: {shown[best]} has {there[best]} of the images that are "
+        f"there, and is used; {others} ({flag} chooses another)"
     )
     return models[best]
 
@@ -154,7 +155,7 @@ def read_model(folder: Path) -> SparseModel:
         named = {number: known.get(number) or model.images[number].name for number in model.reg_image_ids()}
         images = [model.images[number] for number in sorted(named, key=lambda number: (named[number], number))]
         names = tuple(named[image.image_id] for image in images)
-        poses = [_camera_to_world(image) for image in images]
+        poses = _camera_to_worlds(images, names, folder)
         cameras = tuple(_camera(model.cameras[image.camera_id]) for image in images)
         points, errors, lengths, sightings = _points(model, [image.image_id for image in images])
     except DataError:
@@ -169,18 +170,21 @@ def read_model(folder: Path) -> SparseModel:
         _check(name, pose, folder)
     if left_out := len(model.points3D) - len(points):
         say(f"{folder}: {left_out:,} of {len(model.points3D):,} sparse points are not finite and left out")
-    return SparseModel(names, torch.stack(poses), cameras, points, errors, lengths, sightings)
+    return SparseModel(names, poses, cameras, points, errors, lengths, sightings)
 
 
-def _camera_to_world(image: Any) -> Tensor:
-    """Return the camera-to-world matrix (4, 4) float64, OpenGL axes; COLMAP stores the inverse with OpenCV's axes."""
-    pose = image.cam_from_world
-    pose = pose() if callable(pose) else pose  # a property before pycolmap 3.12, a method since
-    world_to_camera = torch.from_numpy(pose.matrix()).double()
-    rotation = world_to_camera[:, :3].T
-    result = torch.eye(4, dtype=torch.float64)
-    result[:3, :3] = rotation * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
-    result[:3, 3] = -(rotation @ world_to_camera[:, 3])
+def _camera_to_worlds(images: Sequence[Any], names: Sequence[str], folder: Path) -> Tensor:
+    """Return camera-to-world matrices (M, 4, 4) float64, OpenGL axes; COLMAP stores the inverse with OpenCV's axes."""
+    stored = [image.cam_from_world for image in images]
+    stored = [pose() if callable(pose) else pose for pose in stored]  # a property before pycolmap 3.12, a method since
+    quaternions = torch.tensor(np.array([pose.rotation.quat for pose in stored]), dtype=torch.float64).view(-1, 4)
+    translations = torch.tensor(np.array([pose.translation for pose in stored]), dtype=torch.float64).view(-1, 3)
+    # A quaternion of length 0 would pass for no rotation at all.
+    unit = unit_quaternions(quaternions, [f"{folder}: image {name!r}" for name in names])
+    rotation = rotations(unit).transpose(1, 2)
+    result = torch.eye(4, dtype=torch.float64).repeat(len(images), 1, 1)
+    result[:, :3, :3] = rotation * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+    result[:, :3, 3] = -(rotation @ translations[..., None])[..., 0]
     return result
 
 

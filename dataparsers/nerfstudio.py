@@ -50,6 +50,8 @@ CAMERA_MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     "ORTHOPHOTO": ("orthographic", ()),
 }
 """`camera_model` -> projection, and the file's name of each coefficient of `LENSES`; '' if it has none."""
+MILLIMETRE = 0.001
+"""Units of the input per unit of a stored depth by default, as in nerfstudio."""
 NGP_SCALE = 0.33
 NGP_OFFSET = [0.5, 0.5, 0.5]
 """instant-ngp maps a position x of the file to `scale * x + offset` in its unit cube; these are its defaults."""
@@ -65,7 +67,7 @@ class Nerfstudio(Captured):
     train_filenames, val_filenames and test_filenames take precedence over all rules but the last."""
     train_split_fraction: float = 0.9
     """Fraction of images to train on, evenly spaced, with --eval-mode fraction."""
-    depth_unit_scale_factor: float = 0.001
+    depth_unit_scale_factor: float = MILLIMETRE
     """Units of the input per unit of a stored depth: 0.001 for an input in metres and depths in millimetres."""
 
     @classmethod
@@ -82,6 +84,8 @@ class Nerfstudio(Captured):
         file = path if path.suffix == ".json" else path / TRANSFORMS
         content = read_json(file)
         images = _posed_images(file, content, split)
+        if split == "train" and self.depth_unit_scale_factor == MILLIMETRE and _has_exr(images.depths):
+            say("depths in EXR files are taken for millimetres; --depth-unit-scale-factor 1 takes them as they are")
         lists = {} if self.eval_mode == "all" else _lists(file, content, images.names)
         scene = captured_scene(self, images, split, self._division(split, lists), _applied(content, file))
         scene = replace(scene, depth_unit=self.depth_unit_scale_factor)
@@ -136,6 +140,10 @@ def _posed_images(file: Path, content: dict[str, Any], split: Split) -> PosedIma
     )
 
 
+def _has_exr(depths: tuple[Path | None, ...] | None) -> bool:
+    return any(path is not None and path.suffix.lower() == ".exr" for path in depths or ())
+
+
 def _value(frame: dict[str, Any], content: dict[str, Any], key: str) -> Any:
     """Return a frame's own value, else the file's value for all frames; None if both are missing."""
     own = frame.get(key)
@@ -160,7 +168,7 @@ def _companions(
     if all(name is None for name in named):
         return None
     written = [file_name(name, key, label) for name, label in zip(named, labels, strict=True) if name is not None]
-    files = iter(on_disk(folder, written, f"files of '{key}'", endings, quiet=split != "train"))
+    files = iter(on_disk(folder, written, f"files of '{key}'", endings, split != "train", shared=2))
     return tuple(None if name is None else next(files) for name in named)
 
 

@@ -65,7 +65,7 @@ def _posed_images(folder: Path, cameras: str, images: str, split: Split) -> Pose
         focal = [number(content.get(key), key, str(file), positive=True) for key in ("fx", "fy")]
         intrinsics.append(focal + [number(content.get(key), key, str(file)) for key in ("cx", "cy")])
         stated.append([side_or_none(content.get(key), key, str(file)) for key in ("width", "height")])
-    depths = on_disk(folder, [f"depth/{stem}" for stem in stems], "depth images", DEPTH_SUFFIXES, quiet=True)
+    depths = on_disk(folder, [f"depth/{stem}" for stem in stems], "depth images", DEPTH_SUFFIXES, quiet=True, shared=2)
     known = tuple(file if file.is_file() else None for file in depths)
     return PosedImages(
         folder=folder,

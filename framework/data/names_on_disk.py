@@ -15,7 +15,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from pathlib import Path
+from pathlib import Path, PurePath
 from urllib.parse import unquote
 
 from framework.base.console import say
@@ -27,6 +27,8 @@ REDUCED = (1, 2, 4, 8)
 """Integer factors by which images may have been reduced in advance; those of `images` by 2 are in `images_2`."""
 MOST_FILES = 200_000
 """Maximum number of files below a folder among which names are looked for."""
+COMPANIONS = ("mask", "depth", "normal", "semantic", "segment", "label", "confidence", "thumb")
+"""Beginnings of the names of folders with files that have the names of images, in lower case."""
 MOST_FOLDERS = 100
 """Maximum number of folders that are looked into to find one image."""
 MOST_NAMED = 3
@@ -49,6 +51,7 @@ def on_disk(
     what: str = "images",
     endings: Sequence[str] = IMAGE_SUFFIXES,
     quiet: bool = False,
+    shared: int = 1,
 ) -> tuple[Path, ...]:
     """Return the files that names mean, and say where they are written differently on the disk.
 
@@ -58,18 +61,24 @@ def on_disk(
         what: what the files are, as a plural, in messages.
         endings: endings of such files, in lower case.
         quiet: whether nothing is said.
+        shared: number of parts at the end of a path, the file's name and folders, that a file in another folder has in
+            common with a name at least. What only accompanies images has their names, and needs its own folder: 2.
 
     Returns:
         M paths; those of names that were not found are as the names are written. A file may exist in a folder of
         reduced images alone: the path is then that at full size.
     """
-    found = match_names(folder, names, endings)
+    found = match_names(folder, names, endings, shared)
     for note in () if quiet else found.notes:
         say(f"{folder}: {what}: {note}")
-    return tuple(folder / found.files.get(name, name) for name in names)
+    return tuple(
+        folder / found.files.get(name, name if PurePath(name).suffix else name + LIKELIEST[0]) for name in names
+    )
 
 
-def match_names(folder: Path, names: Sequence[str], endings: Sequence[str] = IMAGE_SUFFIXES) -> Matches:
+def match_names(
+    folder: Path, names: Sequence[str], endings: Sequence[str] = IMAGE_SUFFIXES, shared: int = 1
+) -> Matches:
     """Return the files that names mean. Arguments are as in `on_disk`."""
     files = {name: written for name in names if (written := _as_written(folder, name)) is not None}
     missing = sorted(set(names) - set(files))
@@ -84,7 +93,7 @@ def match_names(folder: Path, names: Sequence[str], endings: Sequence[str] = IMA
         missing = [name for name in missing if name not in pairs]
     if missing and not files:
         for key in (spelled, without_ending):
-            if files := _moved(missing, below, key):
+            if files := _moved(missing, below, key, shared):
                 notes.append(_note(files, len(names), "in another folder"))
                 break
     return Matches(files, tuple(notes))
@@ -192,11 +201,12 @@ def _paired(names: Iterable[str], files: Iterable[str], key: Callable[[str], str
     return {ours[0]: theirs[0] for ours, theirs in groups.values() if len(ours) == len(theirs) == 1}
 
 
-def _moved(names: Sequence[str], files: Sequence[str], key: Callable[[str], str]) -> dict[str, str]:
+def _moved(names: Sequence[str], files: Sequence[str], key: Callable[[str], str], least: int) -> dict[str, str]:
     """Return name -> file where more than half of the names are found with one beginning exchanged for another.
 
     The beginnings are those that leave the longest common end of path for the most names. Of several, the folder
-    called images is preferred; if that does not decide, nothing is found.
+    called images is preferred; if that does not decide, nothing is found. Ends of fewer than `least` parts do not
+    count, nor do folders of what accompanies images, such as masks.
     """
     keys = Counter(map(key, files))
     by_key = {known: file for file in files if keys[known := key(file)] == 1}
@@ -208,8 +218,12 @@ def _moved(names: Sequence[str], files: Sequence[str], key: Callable[[str], str]
         parts = key(name).split("/")
         shared = [(_common_end(parts, there), there) for there in ends[parts[-1]]]
         longest = max((length for length, _ in shared), default=0)
+        if longest < least:
+            continue
         votes.update(
-            ("/".join(parts[:-length]), "/".join(there[:-length])) for length, there in shared if length == longest
+            ("/".join(parts[:-length]), "/".join(there[:-length]))
+            for length, there in shared
+            if length == longest and not any(part.startswith(COMPANIONS) for part in there[:-length])
         )
     most = max(votes.values(), default=0)
     best = sorted((-there.split("/").count("images"), cut, there) for (cut, there), n in votes.items() if n == most)

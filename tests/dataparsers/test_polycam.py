@@ -84,7 +84,7 @@ BAD = {
     "scaled pose": (lambda c: c.update(t_00=2.0), "the pose is not rigid"),
     "zero focal length": (lambda c: c.update(fx=0), "'fx' is 0; it must be a number above zero"),
     "no centre": (lambda c: c.pop("cx"), "'cx' is None"),
-    "no height": (lambda c: c.pop("height"), "'height' is None; it must be a number above zero"),
+    "negative height": (lambda c: c.update(height=-3), "'height' is -3; it must be a number above zero"),
     "endless height": (lambda c: c.update(height=1e300), "'height' is 1e.300; it must be from 1"),
 }
 

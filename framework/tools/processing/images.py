@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import re
 import shutil
+from collections import Counter
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from PIL import Image
 
 from framework.base.console import say, track
 from framework.base.errors import DataError
-from framework.data.data_folder import IMAGE_SUFFIXES
+from framework.data.data_folder import IMAGE_SUFFIXES, UNREAD_SUFFIXES
 from framework.data.image_files import Content, unreadable
 
 _JPEG = (".jpg", ".jpeg")
@@ -68,13 +69,19 @@ def find_images(folder: Path, leave_out: Iterable[Path] = ()) -> list[Path]:
     if not folder.is_dir():
         raise DataError(f"--data {folder}: there is no such folder")
     ignored = [path.resolve() for path in leave_out if not folder.resolve().is_relative_to(path.resolve())]
-    paths = []
+    paths, unread = [], Counter[str]()
     for path in folder.rglob("*"):
-        relative = path.relative_to(folder)
-        if path.suffix.lower() not in IMAGE_SUFFIXES or any(part.startswith(".") for part in relative.parts):
+        relative, suffix = path.relative_to(folder), path.suffix.lower()
+        if suffix not in (*IMAGE_SUFFIXES, *UNREAD_SUFFIXES) or any(part.startswith(".") for part in relative.parts):
+            continue
+        if suffix in UNREAD_SUFFIXES:
+            unread[suffix] += 1
             continue
         if path.is_file() and not any(path.resolve().is_relative_to(entry) for entry in ignored):
             paths.append(relative)
+    if unread:
+        kinds = ", ".join(f"{count} {suffix}" for suffix, count in sorted(unread.items()))
+        say(f"{folder}: images of kinds that are not read are left out: {kinds}; convert them to JPEG or PNG")
     if not paths:
         raise DataError(f"--data {folder} has no image (looked for {', '.join(IMAGE_SUFFIXES)})")
     return sorted(paths, key=natural_order)

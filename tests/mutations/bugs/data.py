@@ -104,7 +104,7 @@ BUGS = (
     Bug(
         "record3d-quaternion-order",
         "poses",
-        "dataparsers/record3d.py",
+        "dataparsers/rotations.py",
         "vector, scalar = quaternions[:, :3], quaternions[:, 3]",
         "vector, scalar = quaternions[:, 1:], quaternions[:, 0]",
         "Record3D's rotations are taken for w, x, y, z",

@@ -149,9 +149,9 @@ def read_model(folder: Path) -> SparseModel:
     except ImportError as error:
         raise DataError(f"reading {folder} needs pycolmap, which is not installed: pip install pycolmap") from error
     try:
-        model = pycolmap.Reconstruction(str(folder))
         # Of text, pycolmap takes a name to end at its first space.
         known = {} if complete["bin"] else text_names(folder / "images.txt")
+        model = pycolmap.Reconstruction(str(folder))
         named = {number: known.get(number) or model.images[number].name for number in model.reg_image_ids()}
         images = [model.images[number] for number in sorted(named, key=lambda number: (named[number], number))]
         names = tuple(named[image.image_id] for image in images)

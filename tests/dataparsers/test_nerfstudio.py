@@ -303,7 +303,10 @@ def test_masks_depths_and_times(capture: Path) -> None:
     assert scene.times.tolist() == [0, 1]
     (capture / "masks" / "001.png").unlink()
     assert Nerfstudio().parse(capture, "val").mask_paths is not None
-    with pytest.raises(DataError, match=r"mask .*masks/001\.png does not exist \(missing in all: 1\): .*masks has no 001\.png, but 000\.png"):
+    with pytest.raises(
+        DataError,
+        match=r"mask .*masks/001\.png does not exist \(missing in all: 1\): .*masks has no 001\.png, but 000\.png",
+    ):
         Nerfstudio().parse(capture, "train")
 
 

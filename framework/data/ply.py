@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from framework.base.atomic import write_atomically
+from framework.base.console import say
 from framework.base.errors import DataError
 
 TYPES = {
@@ -49,7 +50,7 @@ class PlyHeader:
 
 
 def read_points(file: Path) -> Tensor:
-    """Read the positions of the vertices (K, 3), float64; those that are not finite are left out.
+    """Read the positions of the vertices (K, 3), float64; those that are not finite are left out, and counted.
 
     Args:
         file: path of the PLY file.
@@ -59,7 +60,10 @@ def read_points(file: Path) -> Tensor:
     """
     columns = read_columns(file, read_header(file), "xyz")
     points = torch.from_numpy(np.stack([column.astype(np.float64) for column in columns], axis=-1))
-    return points[points.isfinite().all(-1)]
+    finite = points.isfinite().all(-1)
+    if not bool(finite.all()):
+        say(f"{file}: {int((~finite).sum()):,} of {len(points):,} points are not finite and left out")
+    return points[finite]
 
 
 def read_header(file: Path) -> PlyHeader:

@@ -71,6 +71,12 @@ def test_depth_goes_with_its_image(capture: Path) -> None:
     assert scene.depth_unit == 0.001
 
 
+def test_sizes_that_are_not_stated_are_those_of_the_images(capture: Path) -> None:
+    edit(capture, lambda content: content.pop("width"))
+    scene = Polycam(eval_interval=0).parse(capture, "train")
+    assert worst_miss(scene, poses()) < 2e-6
+
+
 def test_missing_images_do_not_shift_poses(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (capture / "keyframes" / "images" / f"{STAMPS[3]}.jpg").unlink()
     scene = Polycam(eval_interval=0).parse(capture, "train")

@@ -12,7 +12,7 @@ from framework.data.names_on_disk import REDUCED, files_below, spelled, without_
 def find_masks(root: Path, names: Sequence[str]) -> tuple[Path | None, ...] | None:
     """Return the masks of M images, or None if no image has one.
 
-    A mask has the name of its image, as it is compared (`spelled`), with an ending appended to it (COLMAP) or exchanged.
+    A mask has the name of its image (`spelled`), with an ending appended to it (COLMAP) or exchanged.
 
     Args:
         root: folder of masks at full size; reduced ones are in folders beside it, such as masks_2.

@@ -137,7 +137,13 @@ def side(value: Any, name: str, where: str) -> int:
 
 
 def side_or_none(value: Any, name: str, where: str) -> int | None:
-    """Return `side`, or None for an entry that is missing."""
+    """Return `side` of an entry, or None if it is missing.
+
+    `value`, `name` and `where` are as in `number`.
+
+    Raises:
+        DataError: as `side`.
+    """
     return None if value is None else side(value, name, where)
 
 

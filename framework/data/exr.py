@@ -32,7 +32,7 @@ LONGEST_TEXT = 256
 
 @dataclass(frozen=True)
 class ExrHeader:
-    """What the header of a file says."""
+    """Header of a file."""
 
     channels: tuple[tuple[str, np.dtype], ...]
     """Name and type of each channel, in the order in which a row has them."""

@@ -37,7 +37,7 @@ MOST_NAMED = 3
 
 @dataclass(frozen=True)
 class Matches:
-    """Files that names mean."""
+    """Files that are meant by names."""
 
     files: dict[str, str]
     """Name as it is written -> path in the folder, with slashes; names that were not found are missing."""
@@ -79,7 +79,14 @@ def on_disk(
 def match_names(
     folder: Path, names: Sequence[str], endings: Sequence[str] = IMAGE_SUFFIXES, shared: int = 1
 ) -> Matches:
-    """Return the files that names mean. Arguments are as in `on_disk`."""
+    """Return the files that names mean, and in how many names differ from the disk, but say nothing.
+
+    Args:
+        folder: the folder that the names are relative to.
+        names: M names, as a data set has them.
+        endings: endings of such files, in lower case.
+        shared: as in `on_disk`.
+    """
     files = {name: written for name in names if (written := _as_written(folder, name)) is not None}
     missing = sorted(set(names) - set(files))
     notes: list[str] = []
@@ -100,7 +107,7 @@ def match_names(
 
 
 def spelled(name: str) -> str:
-    """Return a name as it is compared: with slashes, without percent-encoding, composed (NFC), in lower case."""
+    """Return `name` as it is compared: with slashes, without percent-encoding, composed (NFC), in lower case."""
     return _decoded(name).casefold()
 
 
@@ -127,12 +134,12 @@ def files_below(folder: Path, endings: Sequence[str] = IMAGE_SUFFIXES) -> list[s
 
 
 def has_images(folder: Path) -> bool:
-    """Return whether there is an image in or below a folder, as far as a quick look shows. Never raises."""
+    """Return whether there is an image in or below `folder`, as far as a quick look shows. Never raises."""
     return any(_is_image(name) for _, _, names in islice(os.walk(folder), MOST_FOLDERS) for name in names)
 
 
 def nearest_on_disk(path: Path) -> str:
-    """Return a sentence that names what is there and resembles a path that is not, to end an error message."""
+    """Return words for an error message about a `path` that does not exist: what resembles it and does."""
     parent = path.parent
     while not parent.is_dir() and parent != parent.parent:
         path, parent = parent, parent.parent
@@ -175,7 +182,7 @@ def _decoded(name: str) -> str:
 
 
 def without_ending(name: str) -> str:
-    """Return a name as `spelled` does, without the ending of an image."""
+    """Return `name` as `spelled` does, without the ending of an image."""
     path = spelled(name)
     stem, dot, ending = path.rpartition(".")
     return stem if dot + ending in IMAGE_SUFFIXES else path

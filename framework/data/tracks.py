@@ -97,8 +97,9 @@ class Tracks:
         return self._counts() >= FEWEST
 
     def known_without(self, images: Tensor) -> Tensor:
-        """Return whether a point's position is known without some images, (K,) bool: they do not see it, or at least
-        `FEWEST` others do.
+        """Return whether a point's position is known without some images, (K,) bool.
+
+        It is if these do not see it, or if at least `FEWEST` others do.
 
         Args:
             images: (M,) bool, the images.
@@ -111,8 +112,9 @@ class Tracks:
         return torch.bincount(self.seen, minlength=len(self.points))
 
     def known_distances(self, centers: Tensor) -> Tensor:
-        """Return whether a sighting's distance is known well enough to learn from, (O,) bool: at least `FEWEST` images
-        see the point, nobody doubts it, and the distance's deviation is small.
+        """Return whether a sighting's distance is known well enough to learn from, (O,) bool.
+
+        It is if at least `FEWEST` images see the point, it is not doubted, and the distance's deviation is small.
 
         Args:
             centers: (M, 3) positions of the cameras.

@@ -144,7 +144,7 @@ BUGS = (
     Bug(
         "sparse-points-not-placed",
         "poses",
-        "dataparsers/captured.py",
+        "dataparsers/sparse_points.py",
         "images.tracks.at(precise.points(images.tracks.points).float())",
         "images.tracks.at(images.tracks.points.float())",
         "near is found from points in another frame than the cameras, so rays start too far away or too near",

@@ -18,7 +18,7 @@ from framework.base.errors import DataError
 MAGIC = b"\x76\x2f\x31\x01"
 TILED_OR_SEVERAL = 0x200 | 0x800 | 0x1000
 """Flags of files of tiles, of deep pixels or of several parts."""
-TYPES = {0: np.dtype("<u4"), 1: np.dtype("<f2"), 2: np.dtype("<f4")}
+TYPES: dict[int, np.dtype] = {0: np.dtype("<u4"), 1: np.dtype("<f2"), 2: np.dtype("<f4")}
 """Number of a channel's type -> numpy's type."""
 ROWS = {0: 1, 1: 1, 2: 1, 3: 16}
 """Number of a compression that is read -> rows of a block: none, RLE, ZIPS and ZIP."""

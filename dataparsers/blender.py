@@ -14,6 +14,7 @@ from torch import Tensor
 from dataparsers.reading import file_name, read_json, read_pose, read_times, shown
 from framework import Cameras, DataError, DataParser, ParsedScene
 from framework.data.dataset import Split, existing_files, image_size
+from framework.data.names_on_disk import on_disk
 
 TRANSFORMS = "transforms_train.json"
 """File by which the format is recognised."""
@@ -60,12 +61,13 @@ class Blender(DataParser):
         if not isinstance(frames, list) or not frames:
             raise DataError(f"{file} lists no frames")
         labels = [f"{file}: frame {index}" for index in range(len(frames))]
-        paths = [_image_path(path, frame, label) for frame, label in zip(frames, labels, strict=True)]
+        names = [_image_name(frame, label) for frame, label in zip(frames, labels, strict=True)]
+        paths = on_disk(path, names, quiet=split != "train")
         poses = torch.stack([read_pose(frame, label) for frame, label in zip(frames, labels, strict=True)])
         keep = existing_files(paths, split)
         width, height = image_size([paths[index] for index in keep.tolist()])
         scene = ParsedScene(
-            image_paths=tuple(paths),
+            image_paths=paths,
             cameras=self._cameras(poses, _focal_length(content, width, file), width, height),
             box=torch.tensor([[-1.0], [1.0]]).expand(2, 3) * self.half_size * self.scale_factor,
             near=self.near * self.scale_factor,
@@ -101,10 +103,9 @@ def has_times(file: Path) -> bool:
         return False
 
 
-def _image_path(folder: Path, frame: Any, labels: str) -> Path:
-    """Return the path of a frame's image; Blender writes paths without a suffix."""
-    path = folder / file_name(frame.get("file_path") if isinstance(frame, dict) else None, "file_path", labels)
-    return path if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".webp") else path.with_name(path.name + ".png")
+def _image_name(frame: Any, label: str) -> str:
+    """Return the name of a frame's image; Blender writes names without a suffix."""
+    return file_name(frame.get("file_path") if isinstance(frame, dict) else None, "file_path", label)
 
 
 def _focal_length(content: dict[str, Any], width: int, file: Path) -> float:

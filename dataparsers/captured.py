@@ -11,19 +11,17 @@ import torch
 from torch import Tensor
 
 from dataparsers.placing import Applied, placement_of
+from dataparsers.sparse_points import sparse_points
 from framework import Cameras, DataError, DataParser, ParsedScene
 from framework.cameras.cameras import LENSES
 from framework.cameras.poses import Center, Orientation, Placement, estimate_near, held_out
 from framework.data.dataset import Split, existing_files, image_size
+from framework.data.names_on_disk import LIKELIEST, REDUCED, nearest_on_disk
 from framework.data.scene import PoseSource
-from framework.data.tracks import Sightings, Tracks
+from framework.data.tracks import Tracks
 
 LARGEST_SIDE = 1600
 """Longer side of an image, pixels, above which images are reduced by default."""
-REDUCED = (1, 2, 4, 8)
-"""Integer factors by which images may have been reduced in advance; those of `images` by 2 are in `images_2`."""
-SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp")
-"""Suffixes that a reduced image may have instead of the original's."""
 EXTREME = 1e9
 """Limit of focal lengths, principal points (pixels) and boxes (scene units) beyond which float32 may overflow; focal
 lengths must also be larger than its inverse."""
@@ -151,8 +149,8 @@ def captured_scene(
         )
     placement = placement_of(flags, images, split, applied)
     cameras = _cameras(images, placement)
-    points, sightings = _sparse_points(images, placement, cameras, chosen if split == "train" else None)
-    near = min(estimate_near(cameras, points), flags.far / 2) if flags.near is None else flags.near
+    sparse = sparse_points(images, placement, cameras, chosen if split == "train" else None)
+    near = min(estimate_near(cameras, sparse.sound), flags.far / 2) if flags.near is None else flags.near
     images = images[chosen]
     _check_masks(images.masks)
     return ParsedScene(
@@ -166,8 +164,8 @@ def captured_scene(
         scale=placement.scale,
         downscale_factor=reduction,
         mask_paths=images.masks,
-        points=points,
-        sightings=None if sightings is None else sightings.of_images(chosen),
+        points=sparse.points,
+        sightings=None if sparse.sightings is None else sparse.sightings.of_images(chosen),
         unbounded=True,
         poses=flags.poses,
         depth_paths=images.depths,
@@ -191,6 +189,22 @@ def image_sizes(paths: Sequence[Path]) -> Tensor:
         except DataError:  # reported and skipped when it is decoded
             sizes.append(default)
     return torch.tensor(sizes)
+
+
+def sizes_of(stated: Sequence[Sequence[int | None]], paths: Sequence[Path]) -> Tensor:
+    """Return width and height (M, 2) int64 that intrinsics refer to: those stated, or the image's if one is missing.
+
+    Args:
+        stated: M widths and heights; None for what is missing.
+        paths: M image files.
+
+    Raises:
+        DataError: if sizes are missing and no image is readable.
+    """
+    if not any(None in size for size in stated):
+        return torch.tensor(stated)
+    actual = image_sizes(paths).tolist()
+    return torch.tensor([found if None in size else size for size, found in zip(stated, actual, strict=True)])
 
 
 def has_transforms(path: Path) -> bool:
@@ -257,7 +271,7 @@ def _reduced(path: Path, root: Path | None, step: int) -> Path:
         return path / "none"
     folder = root.with_name(f"{root.name}_{step}")
     file = folder / path.relative_to(root)
-    alternatives = [file.with_suffix(ending) for ending in SUFFIXES if folder.is_dir()]
+    alternatives = [file.with_suffix(ending) for ending in LIKELIEST if folder.is_dir()]
     return next((alternative for alternative in (file, *alternatives) if alternative.is_file()), file)
 
 
@@ -274,7 +288,8 @@ def _check_masks(masks: tuple[Path | None, ...] | None) -> None:
     missing = [path for path in masks or () if path is not None and not path.is_file()]
     if missing:
         raise DataError(
-            f"the mask {missing[0]} does not exist (missing in all: {len(missing)}); restore it, or remove its name"
+            f"the mask {missing[0]} does not exist (missing in all: {len(missing)}): {nearest_on_disk(missing[0])}; "
+            "restore it, or remove its name"
         )
 
 
@@ -293,35 +308,6 @@ def checked_box(box: Tensor, source: str) -> Tensor:
     return box
 
 
-def _sparse_points(
-    images: PosedImages, placement: Placement, cameras: Cameras, known: Tensor | None
-) -> tuple[Tensor | None, Sightings | None]:
-    """Return the sparse points (K, 3) in the scene's frame, and how images see them; None if there are none.
-
-    Points beyond the range of float32 are left out. So are those of tracks that fewer than two of the `known` images
-    see: only held-out images know of them. (The others' positions were found by all images together, as all poses
-    were.)
-
-    Args:
-        images: M images.
-        placement: placement of the scene.
-        cameras: M cameras in the scene's frame.
-        known: the images that may be learned from; all if None.
-    """
-    points, sightings = None, None
-    if images.tracks is not None:
-        tracks = images.tracks.at(placement.points(images.tracks.points).float())
-        if known is not None:
-            others = torch.ones(len(cameras), dtype=torch.bool)
-            others[known] = False
-            tracks = tracks.without(others)
-        confirmed = tracks.points[tracks.confirmed()]
-        if len(confirmed):
-            points, sightings = confirmed, tracks.sightings(cameras.camera_to_worlds[:, :, 3])
-    if images.points is not None:
-        points = placement.points(images.points).float()
-        points = points[points.isfinite().all(-1)]
-    return points, sightings
 
 
 def _cameras(images: PosedImages, placement: Placement) -> Cameras:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from torch import Tensor
 
@@ -13,7 +13,8 @@ from dataparsers.colmap_model import SparseModel, choose_model, find_models, rea
 from dataparsers.masks import find_masks
 from framework import DataError, ParsedScene
 from framework.data.dataset import Split
-from framework.data.tracks import Tracks
+from framework.data.names_on_disk import has_images, on_disk
+from framework.data.tracks import Tracks, doubts_about
 
 
 @dataclass(frozen=True)
@@ -31,16 +32,18 @@ class Colmap(Captured):
     @classmethod
     def recognizes(cls, path: Path) -> bool:
         # Collections of the phototourism format have their reconstruction in dense/sparse, which is not searched here.
-        return bool(find_models(path)) and not has_transforms(path)
+        models = find_models(path)
+        # A model alone, such as sparse/0 itself, is no data folder: its images lie elsewhere.
+        return bool(models) and (models != [path / "."] or has_images(path)) and not has_transforms(path)
 
     def parse(self, path: Path | None, split: Split) -> ParsedScene:
         if path is None:
             raise DataError("the colmap format needs a folder: --data DIR")
-        model = choose_model(path, self.colmap_path)
-        return captured_scene(self, read_images(path, model, self.images_path, self.masks_path), split)
+        model = choose_model(path, self.colmap_path, self.images_path)
+        return captured_scene(self, read_images(path, model, self.images_path, self.masks_path, split), split)
 
 
-def read_images(path: Path, model: Path, images: str, masks: str) -> PosedImages:
+def read_images(path: Path, model: Path, images: str, masks: str, split: Split) -> PosedImages:
     """Read all registered images of a reconstruction, sorted by name.
 
     Args:
@@ -48,22 +51,25 @@ def read_images(path: Path, model: Path, images: str, masks: str) -> PosedImages
         model: folder of the reconstruction.
         images: folder of the images in `path`.
         masks: folder of the masks in `path`.
+        split: the split that is read; training says what is named differently on the disk.
 
     Raises:
         DataError: as `read_model`, or for an unsupported camera model.
     """
     sparse = read_model(model)
     optics = lenses_of(sparse.cameras, sparse.names, str(model))
+    paths = on_disk(path, [f"{images}/{name}" for name in sparse.names], quiet=split != "train")
+    inside = [file.relative_to(path / images) if file.is_relative_to(path / images) else file.name for file in paths]
     return PosedImages(
         folder=path,
-        paths=tuple(path / images / name for name in sparse.names),
+        paths=paths,
         names=sparse.names,
         poses=sparse.poses,
         intrinsics=optics.intrinsics,
         sizes=optics.sizes,
         model=optics.model,
         lens=optics.lens,
-        masks=find_masks(path / masks, sparse.names),
+        masks=find_masks(path / masks, [PurePath(name).as_posix() for name in inside]),
         tracks=tracks_of(sparse, optics.intrinsics),
     )
 
@@ -78,4 +84,5 @@ def tracks_of(sparse: SparseModel, intrinsics: Tensor) -> Tracks | None:
     if not len(sparse.points):
         return None
     images, seen = sparse.sightings.unbind(-1)
-    return Tracks(sparse.points, images, seen, sparse.errors[seen] / intrinsics[images, :2].mean(-1))
+    angles = sparse.errors[seen] / intrinsics[images, :2].mean(-1)
+    return Tracks(sparse.points, images, seen, angles, doubts_about(sparse.lengths, sparse.errors))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path, PurePosixPath
+from dataclasses import replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -13,6 +14,7 @@ from dataparsers.colmap_lens import lenses_of
 from dataparsers.colmap_model import choose_model, find_models, read_model
 from framework import DataError
 from framework.base.console import say
+from framework.data.names_on_disk import spelled
 from framework.data.tracks import Tracks
 
 LARGEST_ANGLE = 0.2
@@ -53,7 +55,7 @@ def tracks_beside(
         return None
     if tracks is None:
         return None
-    places = {name: place for place, name in enumerate(model.names)}
+    places = {spelled(name): place for place, name in enumerate(model.names)}
     pairs = [
         (image, next(places[name] for name in known if name in places))
         for image, known in enumerate(names)
@@ -71,19 +73,21 @@ def tracks_beside(
     number[theirs[alike]] = ours[alike]
     kept = number[tracks.images] >= 0
     points = scale * (tracks.points @ applied[:3, :3].T.double() + applied[:3, 3].double())
-    return Tracks(points, number[tracks.images[kept]], tracks.seen[kept], tracks.angles[kept])
+    return replace(
+        tracks, points=points, images=number[tracks.images[kept]], seen=tracks.seen[kept], angles=tracks.angles[kept]
+    )
 
 
 def names_in_model(file_path: str, source_path: object) -> list[str]:
-    """Return the paths under which a model may have a frame's image, the likeliest first.
+    """Return the paths under which a model may have a frame's image, as they are compared, the likeliest first.
 
     Args:
         file_path: the frame's image, as in 'images/a/1.jpg', where a model has 'a/1.jpg'.
         source_path: the file that the image was made from; anything but text is left out.
     """
-    parts = PurePosixPath(file_path).parts
+    parts = spelled(file_path).split("/")
     endings = ["/".join(parts[start:]) for start in range(len(parts))]
-    return [*endings, source_path] if isinstance(source_path, str) else endings
+    return [*endings, spelled(source_path)] if isinstance(source_path, str) else endings
 
 
 def _moved(poses: Tensor, applied: Tensor, scale: float) -> Tensor:

@@ -19,6 +19,8 @@ PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 1
 """Number of a camera model -> number of its parameters."""
 POSE = 7 * 8
 """Size of a rotation (4) and a translation (3), bytes."""
+NAME = 4 + POSE + 4
+"""Place of the name in an image's record, after its number, pose and camera, bytes."""
 
 Walk = Callable[[mmap.mmap, int], int]
 """Function from the start of a record to its end; raises `struct.error` if the file ends before or the record is
@@ -39,17 +41,57 @@ def check_binary(folder: Path) -> None:
             _check_file(folder / f"{name}.bin", walk, records)
 
 
-def count_images(folder: Path) -> int:
-    """Return the number of images that the model in `folder` states, binary or text; 0 if unreadable. Never raises."""
+def image_names(folder: Path) -> list[str]:
+    """Return the names of the images that the model in `folder` has, as far as they can be read. Never raises."""
+    names: list[str] = []
     try:
-        if (folder / "images.bin").is_file():
-            with (folder / "images.bin").open("rb") as file:
-                return struct.unpack("<Q", file.read(8))[0]
-        with (folder / "images.txt").open(encoding="utf-8", errors="replace") as file:
-            # Two lines per image, the second of which is empty if there are no keypoints.
-            return sum(not line.startswith("#") for line in file) // 2
-    except (OSError, struct.error):
-        return 0
+        if not (folder / "images.bin").is_file():
+            return list(text_names(folder / "images.txt").values())
+        with (folder / "images.bin").open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            (count,) = struct.unpack_from("<Q", data, 0)
+            offset = 8
+            while len(names) < count:
+                start = offset + NAME
+                names.append(data[start : data.find(b"\0", start, start + LONGEST_NAME)].decode("utf-8", "replace"))
+                offset = _image(data, offset)
+    except (OSError, ValueError, struct.error, OverflowError):  # DataError is a ValueError
+        pass
+    return names
+
+
+def text_names(file: Path) -> dict[int, str]:
+    """Return the name of each image of a text model by its number, with the spaces that pycolmap cuts it off at.
+
+    Args:
+        file: images.txt, with two lines for each image: number, pose, camera and name; and the keypoints.
+
+    Raises:
+        OSError: if the file cannot be read.
+        DataError: if an image's second line, which may be empty, is missing.
+    """
+    names: dict[int, str] = {}
+    with file.open(encoding="utf-8", errors="surrogateescape", newline="\n") as lines:
+        for line in lines:
+            words = line.strip().split(maxsplit=9)
+            if not words or words[0].startswith("#"):
+                continue
+            if len(words) == 10 and words[0].isdecimal():
+                names[int(words[0])] = words[9]
+            points = next(lines, "").split(maxsplit=9)
+            if len(points) == 10 and points[0].isdecimal() and not _is_number(points[9].split()[-1]):
+                raise DataError(
+                    f"{file}: the line after image {words[-1]!r} is another image; each image has two lines, and the "
+                    "second has its keypoints, or is empty"
+                )
+    return names
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _check_file(file: Path, walk: Walk, records: str) -> None:
@@ -85,7 +127,7 @@ def _camera(data: mmap.mmap, offset: int) -> int:
 
 def _image(data: mmap.mmap, offset: int) -> int:
     """Return the end of an image: number u32, pose, camera u32, zero-terminated name, u64 keypoints of 24 bytes."""
-    start = offset + 4 + POSE + 4
+    start = offset + NAME
     end = data.find(b"\0", start, start + LONGEST_NAME)
     if end < 0:
         raise struct.error

@@ -14,21 +14,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dataparsers.colmap_files import check_binary, count_images
+from dataparsers.colmap_files import check_binary, image_names, text_names
 from dataparsers.reading import file_name
+from dataparsers.rotations import rotations, unit_quaternions
 from framework import DataError
 from framework.base.console import say
 from framework.cameras.cameras import check_pose
 from framework.data.dataset import one_line
+from framework.data.names_on_disk import match_names
 
-LOCATIONS = ("sparse", "colmap/sparse")
-"""Folders searched for reconstructions: each itself, and its subfolders."""
+LOCATIONS = ("sparse", "colmap/sparse", ".")
+"""Folders searched for reconstructions, below which they may lie too; the data folder itself comes last."""
+DEEPEST = 4
+"""Maximum number of levels below these folders, as in sparse/0/models/1."""
 FILES = ("cameras", "images", "points3D")
 """Files of a reconstruction, without suffix."""
-SHORTEST_TRACK = 3
-"""Minimum number of images that observe a sparse point; two can agree on a wrong one."""
-LARGEST_ERROR = 2.0
-"""Maximum mean reprojection error of a sparse point, pixels."""
 LEAST_ERROR = 0.5
 """Least error that is believed, pixels; also that of a point whose error was not computed."""
 
@@ -58,38 +58,52 @@ class SparseModel:
     cameras: tuple[SparseCamera, ...]
     """The camera of each image."""
     points: Tensor
-    """(K, 3) float64 sparse points confirmed by several images."""
+    """(K, 3) float64 sparse points, all that are finite."""
     errors: Tensor
-    """(K,) float64 mean reprojection error of each point, pixels."""
+    """(K,) float64 mean reprojection error of each point, pixels, at least `LEAST_ERROR`."""
+    lengths: Tensor
+    """(K,) int64 length of each point's track, sightings in images without a pose included."""
     sightings: Tensor
     """(O, 2) int64 image, and point that it sees."""
 
 
-def find_models(path: Path, locations: tuple[str, ...] = LOCATIONS) -> list[Path]:
-    """Return the reconstructions in the first location that has any, sorted by name. Never raises.
+def find_models(path: Path, locations: Sequence[str] = LOCATIONS) -> list[Path]:
+    """Return the reconstructions in some folders and below them, those of the first folder first. Never raises.
 
     Args:
         path: the data folder.
-        locations: subfolders to search.
+        locations: subfolders to search; the data folder itself, ".", is not searched below.
     """
+    models: list[Path] = []
     for location in locations:
-        try:
-            folders = [path / location, *sorted(path.joinpath(location).iterdir())]
-            kinds = ("bin", "txt")
-            models = [folder for folder in folders if any((folder / f"images.{kind}").is_file() for kind in kinds)]
-        except OSError:
-            continue
-        if models:
-            return models
-    return []
+        levels = 0 if location == "." else DEEPEST
+        models += [folder for folder in _folders(path / location, levels) if _is_model(folder)]
+    return list(dict.fromkeys(models))
 
 
-def choose_model(path: Path, location: str | None, flag: str = "--colmap-path") -> Path:
-    """Return the folder of the reconstruction to read; of several, report and use the one with the most images.
+def _folders(folder: Path, levels: int) -> list[Path]:
+    """Return a folder and those below it, down to a number of levels, sorted by name."""
+    try:
+        inside = sorted(entry for entry in folder.iterdir() if entry.is_dir()) if levels else []
+    except OSError:
+        return [folder]
+    return [folder, *(deeper for entry in inside for deeper in _folders(entry, levels - 1))]
+
+
+def _is_model(folder: Path) -> bool:
+    try:
+        return any((folder / f"images.{kind}").is_file() for kind in ("bin", "txt"))
+    except OSError:
+        return False
+
+
+def choose_model(path: Path, location: str | None, images: str = "images", flag: str = "--colmap-path") -> Path:
+    """Return the reconstruction of most of the images that are there; of several, say which others there are.
 
     Args:
         path: the data folder.
         location: subfolder to search; None for the default ones.
+        images: folder of the images in `path`.
         flag: the flag that sets `location`, for messages.
 
     Raises:
@@ -102,13 +116,17 @@ def choose_model(path: Path, location: str | None, flag: str = "--colmap-path") 
             f"{path} has no COLMAP reconstruction: no images.bin or images.txt in {', '.join(locations)} or a folder "
             f"below; run COLMAP, or set its folder with {flag}"
         )
-    counts = [count_images(model) for model in models]
-    best = counts.index(max(counts))
-    if len(models) > 1:
-        say(
-            f"{len(models)} COLMAP reconstructions: {models[best]} has the most images "
-            f"({counts[best]}) and is used ({flag} chooses another)"
-        )
+    if len(models) == 1:
+        return models[0]
+    names = [image_names(model) for model in models]
+    there = [len(match_names(path, [f"{images}/{name}" for name in some]).files) for some in names]
+    best = max(range(len(models)), key=lambda index: (there[index], len(names[index]), -index))
+    shown = [model.relative_to(path).as_posix() for model in models]
+    others = ", ".join(f"{shown[index]} has {there[index]}" for index in range(len(models)) if index != best)
+    say(
+        f"{len(models)} COLMAP reconstructions in {path}: {shown[best]} has {there[best]} of the images that are "
+        f"there, and is used; {others} ({flag} chooses another)"
+    )
     return models[best]
 
 
@@ -122,7 +140,8 @@ def read_model(folder: Path) -> SparseModel:
         DataError: if a file is missing, damaged or contradicts another, no image has a pose, or pycolmap is not
             installed.
     """
-    if not any(all((folder / f"{name}.{kind}").is_file() for name in FILES) for kind in ("bin", "txt")):
+    complete = {kind: all((folder / f"{name}.{kind}").is_file() for name in FILES) for kind in ("bin", "txt")}
+    if not any(complete.values()):
         raise DataError(f"{folder} is not a complete COLMAP model: it needs {', '.join(FILES)}, all .bin or all .txt")
     check_binary(folder)
     try:
@@ -130,12 +149,17 @@ def read_model(folder: Path) -> SparseModel:
     except ImportError as error:
         raise DataError(f"reading {folder} needs pycolmap, which is not installed: pip install pycolmap") from error
     try:
+        # Of text, pycolmap takes a name to end at its first space.
+        known = {} if complete["bin"] else text_names(folder / "images.txt")
         model = pycolmap.Reconstruction(str(folder))
-        images = sorted((model.images[number] for number in model.reg_image_ids()), key=lambda image: image.name)
-        names = tuple(image.name for image in images)
-        poses = [_camera_to_world(image) for image in images]
+        named = {number: known.get(number) or model.images[number].name for number in model.reg_image_ids()}
+        images = [model.images[number] for number in sorted(named, key=lambda number: (named[number], number))]
+        names = tuple(named[image.image_id] for image in images)
+        poses = _camera_to_worlds(images, names, folder)
         cameras = tuple(_camera(model.cameras[image.camera_id]) for image in images)
-        points, errors, sightings = _points(model, [image.image_id for image in images])
+        points, errors, lengths, sightings = _points(model, [image.image_id for image in images])
+    except DataError:
+        raise
     except Exception as error:  # pycolmap raises IndexError, ValueError, RuntimeError, UnicodeDecodeError and more
         raise DataError(
             f"{folder} cannot be read: its files are damaged or inconsistent ({one_line(error)})"
@@ -144,18 +168,23 @@ def read_model(folder: Path) -> SparseModel:
         raise DataError(f"{folder} has no image with a pose; COLMAP could not register any")
     for name, pose in zip(names, poses, strict=True):
         _check(name, pose, folder)
-    return SparseModel(names, torch.stack(poses), cameras, points, errors, sightings)
+    if left_out := len(model.points3D) - len(points):
+        say(f"{folder}: {left_out:,} of {len(model.points3D):,} sparse points are not finite and left out")
+    return SparseModel(names, poses, cameras, points, errors, lengths, sightings)
 
 
-def _camera_to_world(image: Any) -> Tensor:
-    """Return the camera-to-world matrix (4, 4) float64, OpenGL axes; COLMAP stores the inverse with OpenCV's axes."""
-    pose = image.cam_from_world
-    pose = pose() if callable(pose) else pose  # a property before pycolmap 3.12, a method since
-    world_to_camera = torch.from_numpy(pose.matrix()).double()
-    rotation = world_to_camera[:, :3].T
-    result = torch.eye(4, dtype=torch.float64)
-    result[:3, :3] = rotation * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
-    result[:3, 3] = -(rotation @ world_to_camera[:, 3])
+def _camera_to_worlds(images: Sequence[Any], names: Sequence[str], folder: Path) -> Tensor:
+    """Return camera-to-world matrices (M, 4, 4) float64, OpenGL axes; COLMAP stores the inverse with OpenCV's axes."""
+    stored = [image.cam_from_world for image in images]
+    stored = [pose() if callable(pose) else pose for pose in stored]  # a property before pycolmap 3.12, a method since
+    quaternions = torch.tensor(np.array([pose.rotation.quat for pose in stored]), dtype=torch.float64).view(-1, 4)
+    translations = torch.tensor(np.array([pose.translation for pose in stored]), dtype=torch.float64).view(-1, 3)
+    # A quaternion of length 0 would pass for no rotation at all.
+    unit = unit_quaternions(quaternions, [f"{folder}: image {name!r}" for name in names])
+    rotation = rotations(unit).transpose(1, 2)
+    result = torch.eye(4, dtype=torch.float64).repeat(len(images), 1, 1)
+    result[:, :3, :3] = rotation * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+    result[:, :3, 3] = -(rotation @ translations[..., None])[..., 0]
     return result
 
 
@@ -163,8 +192,8 @@ def _camera(camera: Any) -> SparseCamera:
     return SparseCamera(camera.model.name, tuple(float(p) for p in camera.params), camera.width, camera.height)
 
 
-def _points(model: Any, numbers: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the sparse points that enough images confirm, their errors, and which images see them.
+def _points(model: Any, numbers: Sequence[int]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the finite sparse points, their errors, the lengths of their tracks, and which images see them.
 
     Args:
         model: the reconstruction.
@@ -173,19 +202,20 @@ def _points(model: Any, numbers: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]
     rows = {number: row for row, number in enumerate(numbers)}
     positions: list[np.ndarray] = []
     errors: list[float] = []
+    lengths: list[int] = []
     sightings: list[tuple[int, int]] = []
     for point in model.points3D.values():
-        # The error is -1 if it was not computed.
-        if point.track.length() < SHORTEST_TRACK or point.error > LARGEST_ERROR or not np.isfinite(point.xyz).all():
+        if not np.isfinite(point.xyz).all():
             continue
         # A track may meet an image twice.
         images = {rows[number] for number in (sighting.image_id for sighting in point.track.elements) if number in rows}
         sightings += [(image, len(positions)) for image in sorted(images)]
         positions.append(point.xyz)
-        errors.append(max(float(point.error), LEAST_ERROR))
+        errors.append(max(float(point.error), LEAST_ERROR))  # the error is -1 if it was not computed
+        lengths.append(point.track.length())
     points = torch.from_numpy(np.stack(positions)) if positions else torch.zeros(0, 3, dtype=torch.float64)
     seen = torch.tensor(sightings, dtype=torch.int64).view(-1, 2)
-    return points, torch.tensor(errors, dtype=torch.float64), seen
+    return points, torch.tensor(errors, dtype=torch.float64), torch.tensor(lengths, dtype=torch.int64), seen
 
 
 def _check(name: str, pose: Tensor, folder: Path) -> None:

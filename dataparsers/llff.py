@@ -9,14 +9,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dataparsers.captured import REDUCED, SUFFIXES, Captured, PosedImages, captured_scene, checked_box, has_transforms
+from dataparsers.captured import Captured, PosedImages, captured_scene, checked_box, has_transforms
 from dataparsers.colmap_model import find_models
 from dataparsers.masks import find_masks
 from framework import DataError, ParsedScene
 from framework.base.arrays import read_array
 from framework.cameras.cameras import check_pose
 from framework.cameras.ndc import NdcCameras, find_ndc, ndc_box
+from framework.data.data_folder import IMAGE_SUFFIXES
 from framework.data.dataset import Split, one_line
+from framework.data.names_on_disk import REDUCED
 
 POSES = "poses_bounds.npy"
 """File of poses and depth bounds."""
@@ -178,7 +180,7 @@ def _image_names(root: Path) -> list[str]:
     """
     folders = [root if step == 1 else root.with_name(f"{root.name}_{step}") for step in REDUCED]
     for folder in folders:
-        names = sorted(file.name for file in folder.glob("*") if file.suffix in SUFFIXES)
+        names = sorted(file.name for file in folder.glob("*") if file.suffix.lower() in IMAGE_SUFFIXES)
         if names:
             return names
     raise DataError(f"{root.parent} has no images in {', '.join(folder.name for folder in folders)}")

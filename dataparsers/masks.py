@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path, PurePath
+from pathlib import Path
 
-from dataparsers.captured import REDUCED
 from framework.base.console import say
+from framework.data.names_on_disk import REDUCED, files_below, spelled, without_ending
 
 
 def find_masks(root: Path, names: Sequence[str]) -> tuple[Path | None, ...] | None:
     """Return the masks of M images, or None if no image has one.
 
-    A mask has the name of its image, with .png appended to it (COLMAP), or with .png in place of its suffix.
+    A mask has the name of its image (`spelled`), with an ending appended to it (COLMAP) or exchanged.
 
     Args:
         root: folder of masks at full size; reduced ones are in folders beside it, such as masks_2.
@@ -21,16 +21,19 @@ def find_masks(root: Path, names: Sequence[str]) -> tuple[Path | None, ...] | No
     Returns:
         Files in `root`, even if only reduced ones exist; None for an image without mask.
     """
-    available: set[str] = set()
-    for step in REDUCED:
-        folder = root if step == 1 else root.with_name(f"{root.name}_{step}")
-        available |= {file.relative_to(folder).as_posix() for file in folder.rglob("*")}
+    folders = [root if step == 1 else root.with_name(f"{root.name}_{step}") for step in REDUCED]
+    available = sorted({file for folder in folders for file in files_below(folder)})
+    found = {key: file for file in available for key in (without_ending(file), spelled(file))}
     masks = []
     for name in names:
-        candidates = (name, f"{name}.png", PurePath(name).with_suffix(".png").as_posix())
-        masks.append(next((root / candidate for candidate in candidates if candidate in available), None))
+        candidates = (spelled(name), without_ending(name))
+        masks.append(next((root / found[candidate] for candidate in candidates if candidate in found), None))
     without = [name for name, mask in zip(names, masks, strict=True) if mask is None]
     if len(without) == len(masks):
+        if available:
+            say(
+                f"{root}: none of its {len(available)} files has an image's name, such as {names[0]}; they are not used"
+            )
         return None
     if without:
         say(f"{root}: {len(without)} of {len(masks)} images have no mask and are used without, the first {without[0]}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -11,22 +12,24 @@ import torch
 from torch import Tensor
 
 from dataparsers.captured import (
-    SUFFIXES,
     Captured,
     Division,
     PosedImages,
     captured_scene,
     checked_box,
-    image_sizes,
+    sizes_of,
 )
 from dataparsers.colmap_beside import names_in_model, tracks_beside
 from dataparsers.placing import from_original
-from dataparsers.reading import file_name, number, numbers, read_json, read_pose, read_times, rigid, shown, side
+from dataparsers.reading import file_name, number, numbers, read_json, read_pose, read_times, rigid, shown, side_or_none
 from framework import DataError, ParsedScene
 from framework.base.console import say
 from framework.base.errors import nearest
 from framework.base.evenly_spaced import evenly_spaced
+from framework.data.data_folder import IMAGE_SUFFIXES
 from framework.data.dataset import Split
+from framework.data.depths import DEPTH_SUFFIXES
+from framework.data.names_on_disk import nearest_on_disk, on_disk, spelled
 from framework.data.ply import read_points
 from framework.data.tracks import Tracks
 
@@ -47,6 +50,8 @@ CAMERA_MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     "ORTHOPHOTO": ("orthographic", ()),
 }
 """`camera_model` -> projection, and the file's name of each coefficient of `LENSES`; '' if it has none."""
+MILLIMETRE = 0.001
+"""Units of the input per unit of a stored depth by default, as in nerfstudio."""
 NGP_SCALE = 0.33
 NGP_OFFSET = [0.5, 0.5, 0.5]
 """instant-ngp maps a position x of the file to `scale * x + offset` in its unit cube; these are its defaults."""
@@ -62,7 +67,7 @@ class Nerfstudio(Captured):
     train_filenames, val_filenames and test_filenames take precedence over all rules but the last."""
     train_split_fraction: float = 0.9
     """Fraction of images to train on, evenly spaced, with --eval-mode fraction."""
-    depth_unit_scale_factor: float = 0.001
+    depth_unit_scale_factor: float = MILLIMETRE
     """Units of the input per unit of a stored depth: 0.001 for an input in metres and depths in millimetres."""
 
     @classmethod
@@ -78,7 +83,9 @@ class Nerfstudio(Captured):
             raise DataError(f"--depth-unit-scale-factor is {self.depth_unit_scale_factor}; it must be above zero")
         file = path if path.suffix == ".json" else path / TRANSFORMS
         content = read_json(file)
-        images = _posed_images(file, content)
+        images = _posed_images(file, content, split)
+        if split == "train" and self.depth_unit_scale_factor == MILLIMETRE and _has_exr(images.depths):
+            say("depths in EXR files are taken for millimetres; --depth-unit-scale-factor 1 takes them as they are")
         lists = {} if self.eval_mode == "all" else _lists(file, content, images.names)
         scene = captured_scene(self, images, split, self._division(split, lists), _applied(content, file))
         scene = replace(scene, depth_unit=self.depth_unit_scale_factor)
@@ -96,7 +103,7 @@ class Nerfstudio(Captured):
         return None
 
 
-def _posed_images(file: Path, content: dict[str, Any]) -> PosedImages:
+def _posed_images(file: Path, content: dict[str, Any], split: Split) -> PosedImages:
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise DataError(f"{file} lists no frames")
@@ -106,8 +113,9 @@ def _posed_images(file: Path, content: dict[str, Any]) -> PosedImages:
             raise DataError(f"{label} is {shown(frame)}; it must be an object with 'file_path'")
     placed = list(zip(frames, labels, strict=True))
     written = [file_name(frame.get("file_path"), "file_path", label) for frame, label in placed]
-    paths = [_image(file.parent / name) for name in written]
-    sizes = _sizes(frames, content, labels, paths)
+    paths = on_disk(file.parent, written, quiet=split != "train")
+    sides = [[side_or_none(_value(frame, content, key), key, label) for key in "wh"] for frame, label in placed]
+    sizes = sizes_of(sides, paths)
     model, keys = _camera_model(file, content, frames)
     cameras = [
         _intrinsics(frame, content, size, model, label)
@@ -117,19 +125,23 @@ def _posed_images(file: Path, content: dict[str, Any]) -> PosedImages:
     lens = [[_number(frame, content, key, label) or 0.0 for key in keys] for frame, label in placed]
     return PosedImages(
         folder=file.parent,
-        paths=tuple(paths),
+        paths=paths,
         names=tuple(str(PurePosixPath(name)) for name in written),
         poses=poses,
         intrinsics=torch.tensor(cameras, dtype=torch.float64),
         sizes=sizes,
         model=model,
         lens=torch.tensor(lens) if keys else None,
-        masks=_companions(file.parent, frames, "mask_path", labels),
-        depths=_companions(file.parent, frames, "depth_file_path", labels),
+        masks=_companions(file.parent, frames, "mask_path", labels, IMAGE_SUFFIXES, split),
+        depths=_companions(file.parent, frames, "depth_file_path", labels, DEPTH_SUFFIXES, split),
         times=read_times(frames, labels),
-        points=_points(file, content),
+        points=_points(file, content, split),
         tracks=_tracks(file, content, placed, poses),
     )
+
+
+def _has_exr(depths: tuple[Path | None, ...] | None) -> bool:
+    return any(path is not None and path.suffix.lower() == ".exr" for path in depths or ())
 
 
 def _value(frame: dict[str, Any], content: dict[str, Any], key: str) -> Any:
@@ -143,39 +155,21 @@ def _number(frame: dict[str, Any], content: dict[str, Any], key: str, labels: st
     return None if value is None else number(value, key, labels)
 
 
-def _side(frame: dict[str, Any], content: dict[str, Any], key: str, labels: str) -> int | None:
-    value = _value(frame, content, key)
-    return None if value is None else side(value, key, labels)
-
-
-def _image(path: Path) -> Path:
-    """Return the file of a path that may lack its suffix."""
-    if path.suffix in SUFFIXES or path.is_file():
-        return path
-    complete = [path.with_name(path.name + ending) for ending in SUFFIXES]
-    return next((alternative for alternative in complete if alternative.is_file()), complete[0])
-
-
 def _companions(
-    folder: Path, frames: list[dict[str, Any]], key: str, labels: list[str]
+    folder: Path,
+    frames: list[dict[str, Any]],
+    key: str,
+    labels: list[str],
+    endings: Sequence[str],
+    split: Split,
 ) -> tuple[Path | None, ...] | None:
     """Return files that belong to the frames' images; None for a frame without, and None if no frame has one."""
     named = [frame.get(key) for frame in frames]
     if all(name is None for name in named):
         return None
-    return tuple(
-        None if name is None else folder / file_name(name, key, label)
-        for name, label in zip(named, labels, strict=True)
-    )
-
-
-def _sizes(frames: list[dict[str, Any]], content: dict[str, Any], labels: list[str], paths: list[Path]) -> Tensor:
-    """Return width and height (M, 2) int64 that intrinsics refer to: those in the file, else those of the images."""
-    stated = [[_side(frame, content, key, label) for key in "wh"] for frame, label in zip(frames, labels, strict=True)]
-    if any(None in size for size in stated):
-        actual = image_sizes(paths).tolist()
-        stated = [alternative if None in size else size for size, alternative in zip(stated, actual, strict=True)]
-    return torch.tensor(stated)
+    written = [file_name(name, key, label) for name, label in zip(named, labels, strict=True) if name is not None]
+    files = iter(on_disk(folder, written, f"files of '{key}'", endings, split != "train", shared=2))
+    return tuple(None if name is None else next(files) for name in named)
 
 
 def _camera_model(file: Path, content: dict[str, Any], frames: list[dict[str, Any]]) -> tuple[str, tuple[str, ...]]:
@@ -224,13 +218,14 @@ def _focal(frame: dict[str, Any], content: dict[str, Any], axis: str, length: in
     return None
 
 
-def _points(file: Path, content: dict[str, Any]) -> Tensor | None:
+def _points(file: Path, content: dict[str, Any], split: Split) -> Tensor | None:
     """Return the sparse points, in the frame of the poses."""
     if content.get("ply_file_path") is None:
         return None
-    path = file.parent / file_name(content["ply_file_path"], "ply_file_path", str(file))
+    written = file_name(content["ply_file_path"], "ply_file_path", str(file))
+    (path,) = on_disk(file.parent, [written], "points", (".ply",), quiet=split != "train")
     if not path.is_file():
-        say(f"{path} does not exist; continuing without sparse points")
+        say(f"{path} does not exist: {nearest_on_disk(path)}; continuing without its points")
         return None
     return read_points(path)
 
@@ -248,7 +243,7 @@ def _tracks(
 
 def _lists(file: Path, content: dict[str, Any], names: tuple[str, ...]) -> dict[str, set[str]]:
     """Return split -> names of its images, for the splits that the file lists."""
-    lists = {}
+    lists, known = {}, {spelled(name): name for name in names}
     for split in ("train", "val", "test"):
         key = f"{split}_filenames"
         listed = content.get(key)
@@ -256,7 +251,7 @@ def _lists(file: Path, content: dict[str, Any], names: tuple[str, ...]) -> dict[
             continue
         if not isinstance(listed, list):
             raise DataError(f"{file}: '{key}' is {shown(listed)}; it must be a list of names")
-        lists[split] = {str(PurePosixPath(file_name(name, key, str(file)))) for name in listed}
+        lists[split] = {known.get(spelled(name), name) for name in (file_name(name, key, str(file)) for name in listed)}
         unknown = sorted(lists[split] - set(names))
         if unknown:
             raise DataError(f"{file}: '{key}' lists {shown(unknown[0])}, which is not the file_path of any frame")

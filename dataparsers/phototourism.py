@@ -18,6 +18,7 @@ from dataparsers.colmap import read_images
 from dataparsers.colmap_model import choose_model, find_models
 from framework import DataError, ParsedScene
 from framework.data.dataset import Split
+from framework.data.names_on_disk import spelled
 
 SPARSE = "dense/sparse"
 """Folder of the reconstruction in the data folder."""
@@ -46,16 +47,16 @@ class Phototourism(Captured):
         if len(tables) != 1:
             problem = f"there are {', '.join(file.name for file in tables)}" if tables else "there is none"
             raise DataError(f"{path}: the splits must be listed in one .tsv, but {problem}")
-        splits = read_splits(tables[0])
-        model = choose_model(path, self.colmap_path)
-        images = read_images(path, model, self.images_path, self.masks_path)
-        listed = [index for index, name in enumerate(images.names) if name in splits]
+        splits = {spelled(name): of for name, of in read_splits(tables[0]).items()}
+        model = choose_model(path, self.colmap_path, self.images_path)
+        images = read_images(path, model, self.images_path, self.masks_path, split)
+        listed = [index for index, name in enumerate(images.names) if spelled(name) in splits]
         if not listed:
             raise DataError(f"{tables[0]} lists none of the {len(images.names)} images of {model}")
         group = "train" if split == "train" else "test"
 
         def division(names: list[str]) -> Tensor:
-            chosen = [index for index, name in enumerate(names) if splits[name] == group]
+            chosen = [index for index, name in enumerate(names) if splits[spelled(name)] == group]
             if not chosen:
                 raise DataError(f"{tables[0]}: none of the {len(names)} existing images is of split '{group}'")
             return torch.tensor(chosen)

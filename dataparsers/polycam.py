@@ -7,11 +7,13 @@ from pathlib import Path
 
 import torch
 
-from dataparsers.captured import SUFFIXES, Captured, PosedImages, captured_scene, has_transforms
+from dataparsers.captured import Captured, PosedImages, captured_scene, has_transforms, sizes_of
 from dataparsers.placing import from_original
-from dataparsers.reading import number, read_json, rigid, side
+from dataparsers.reading import number, read_json, rigid, side_or_none
 from framework import DataError, ParsedScene
 from framework.data.dataset import Split
+from framework.data.depths import DEPTH_SUFFIXES
+from framework.data.names_on_disk import on_disk
 from framework.data.scene import PoseSource
 
 CAMERAS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
@@ -40,7 +42,7 @@ class Polycam(Captured):
         pairs = [pair for pair in CAMERAS if _is_pair(path, *pair)]
         if not pairs:
             raise DataError(f"{path} has no keyframes/cameras with keyframes/images; export Polycam's raw data")
-        images = _posed_images(path / "keyframes", *pairs[0])
+        images = _posed_images(path / "keyframes", *pairs[0], split)
         scene = captured_scene(self, images, split, applied=(Z_UP, 1.0))
         return replace(from_original(scene, Z_UP), depth_unit=self.depth_unit_scale_factor)
 
@@ -49,35 +51,28 @@ def _is_pair(path: Path, cameras: str, images: str) -> bool:
     return (path / "keyframes" / cameras).is_dir() and (path / "keyframes" / images).is_dir()
 
 
-def _posed_images(folder: Path, cameras: str, images: str) -> PosedImages:
+def _posed_images(folder: Path, cameras: str, images: str, split: Split) -> PosedImages:
     files = sorted((folder / cameras).glob("*.json"))
     if not files:
         raise DataError(f"{folder / cameras} holds no camera (.json)")
-    poses, intrinsics, sizes = [], [], []
+    stems = [file.stem for file in files]
+    paths = on_disk(folder, [f"{images}/{stem}" for stem in stems], quiet=split != "train")
+    poses, intrinsics, stated = [], [], []
     for file in files:
         content = read_json(file)
         rows = [[number(content.get(f"t_{r}{c}"), f"t_{r}{c}", str(file)) for c in range(4)] for r in range(3)]
         poses.append(Z_UP.double() @ rigid(rows, str(file), str(file)))
         focal = [number(content.get(key), key, str(file), positive=True) for key in ("fx", "fy")]
         intrinsics.append(focal + [number(content.get(key), key, str(file)) for key in ("cx", "cy")])
-        sizes.append([side(content.get(key), key, str(file)) for key in ("width", "height")])
-    depths = tuple(_depth(folder / "depth" / f"{file.stem}.png") for file in files)
+        stated.append([side_or_none(content.get(key), key, str(file)) for key in ("width", "height")])
+    depths = on_disk(folder, [f"depth/{stem}" for stem in stems], "depth images", DEPTH_SUFFIXES, quiet=True, shared=2)
+    known = tuple(file if file.is_file() else None for file in depths)
     return PosedImages(
         folder=folder,
-        paths=tuple(_image(folder / images, file.stem) for file in files),
-        names=tuple(file.stem for file in files),
+        paths=paths,
+        names=tuple(stems),
         poses=torch.stack(poses),
         intrinsics=torch.tensor(intrinsics, dtype=torch.float64),
-        sizes=torch.tensor(sizes),
-        depths=depths if any(depths) else None,
+        sizes=sizes_of(stated, paths),
+        depths=known if any(known) else None,
     )
-
-
-def _image(folder: Path, stem: str) -> Path:
-    default = folder / f"{stem}.jpg"
-    alternatives = (folder / f"{stem}{suffix}" for suffix in SUFFIXES)
-    return default if default.is_file() else next((file for file in alternatives if file.is_file()), default)
-
-
-def _depth(file: Path) -> Path | None:
-    return file if file.is_file() else None

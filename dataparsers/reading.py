@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dataparsers.rotations import nearest_rotation
 from framework import DataError
 from framework.base.errors import shown as shown
 from framework.cameras.cameras import LARGEST_SIDE, check_pose
@@ -57,7 +58,7 @@ def read_pose(frame: Any, where: str, dtype: torch.dtype = torch.float32) -> Ten
 
 
 def rigid(matrix: Any, name: str, where: str, dtype: torch.dtype = torch.float64) -> Tensor:
-    """Return a rigid motion (4, 4) from three or four rows of four numbers.
+    """Return a rigid motion (4, 4) from three or four rows of four numbers, whose rotation may be rounded.
 
     Args:
         matrix: the rows.
@@ -69,10 +70,13 @@ def rigid(matrix: Any, name: str, where: str, dtype: torch.dtype = torch.float64
         DataError: if the matrix is of another shape, not finite or not rigid.
     """
     try:
-        pose = torch.tensor(matrix, dtype=dtype)
+        pose = torch.tensor(matrix, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise DataError(f"{name} is not a 4x4 matrix of numbers") from error
+    if pose.shape in ((3, 4), (4, 4)):
+        pose[:3, :3] = nearest_rotation(pose[:3, :3])
     check_pose(pose, where)
+    pose = pose.to(dtype)
     return pose if pose.shape[0] == 4 else torch.cat([pose, torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=dtype)])
 
 
@@ -130,6 +134,17 @@ def side(value: Any, name: str, where: str) -> int:
     if not 1 <= length <= LARGEST_SIDE:
         raise DataError(f"{where}: '{name}' is {shown(value)}; it must be from 1 to {LARGEST_SIDE} pixels")
     return round(length)
+
+
+def side_or_none(value: Any, name: str, where: str) -> int | None:
+    """Return `side` of an entry, or None if it is missing.
+
+    `value`, `name` and `where` are as in `number`.
+
+    Raises:
+        DataError: as `side`.
+    """
+    return None if value is None else side(value, name, where)
 
 
 def numbers(value: Any, count: int, name: str, where: str) -> list[float]:

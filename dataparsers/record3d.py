@@ -11,17 +11,16 @@ from torch import Tensor
 
 from dataparsers.captured import Captured, PosedImages, captured_scene, has_transforms
 from dataparsers.reading import numbers, read_json, side
+from dataparsers.rotations import rotations, unit_quaternions
 from framework import DataError, ParsedScene
 from framework.data.dataset import Split, existing_files
+from framework.data.names_on_disk import on_disk
 from framework.data.scene import PoseSource
-from framework.kernels.math import cross_matrix
 
 METADATA = "metadata.json"
 """File of poses and intrinsics."""
 EXPORT = "EXR_RGBD"
 """Folder of an export."""
-NORM_TOLERANCE = 0.01
-"""Maximum deviation of a quaternion's length from 1."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +45,12 @@ class Record3D(Captured):
         file = folder / METADATA
         content = read_json(file)
         poses = _poses(content, file)
-        paths = [_image(folder / "rgb", index) for index in range(len(poses))]
+        paths = on_disk(folder, [f"rgb/{index}" for index in range(len(poses))], quiet=split != "train")
         keep = _evenly_spaced(existing_files(paths, split), self.max_images)
         width, height = (side(content.get(key), key, str(file)) for key in "wh")
         images = PosedImages(
             folder=folder,
-            paths=tuple(paths),
+            paths=paths,
             names=tuple(f"{index:09d}" for index in range(len(paths))),  # padded, so that names sort as numbers
             poses=poses,
             intrinsics=_intrinsics(content, file).expand(len(paths), 4),
@@ -63,12 +62,6 @@ class Record3D(Captured):
 def _folder(path: Path) -> Path:
     """Return the folder of the export: the folder that the user named, or one in it."""
     return path / EXPORT if (path / EXPORT).is_dir() else path
-
-
-def _image(folder: Path, index: int) -> Path:
-    """Return the image of a pose, whose file name is the pose's index."""
-    png = folder / f"{index}.png"
-    return png if png.is_file() else folder / f"{index}.jpg"
 
 
 def _evenly_spaced(indices: Tensor, limit: int) -> Tensor:
@@ -85,20 +78,8 @@ def _poses(content: dict[str, Any], file: Path) -> Tensor:
         raise DataError(f"{file}: 'poses' must be a list of the camera's poses")
     values = [numbers(pose, 7, "poses", f"{file}: pose {index}") for index, pose in enumerate(listed)]
     table = torch.tensor(values, dtype=torch.float64)
-    norms = table[:, :4].norm(dim=-1)
-    deviation = (norms - 1).abs()
-    if bool((deviation > NORM_TOLERANCE).any()):
-        index = int(deviation.argmax())
-        raise DataError(f"{file}: pose {index} has a quaternion of length {norms[index]:.3g}; a rotation's is 1")
-    return torch.cat([rotations(table[:, :4] / norms[:, None]), table[:, 4:, None]], dim=-1)
-
-
-def rotations(quaternions: Tensor) -> Tensor:
-    """Return the rotation matrices (M, 3, 3) of unit `quaternions` (M, 4) x, y, z, w."""
-    vector, scalar = quaternions[:, :3], quaternions[:, 3]
-    cross = cross_matrix(vector)
-    # Rodrigues' formula with half angles: v -> v + 2 w (u x v) + 2 u x (u x v).
-    return torch.eye(3, dtype=quaternions.dtype) + 2 * (scalar[:, None, None] * cross + cross @ cross)
+    unit = unit_quaternions(table[:, :4], [f"{file}: pose {index}" for index in range(len(table))])
+    return torch.cat([rotations(unit), table[:, 4:, None]], dim=-1)
 
 
 def _intrinsics(content: dict[str, Any], file: Path) -> Tensor:

@@ -1,18 +1,24 @@
 """Tracks: how well the distance of a sparse point is known, and which points may be learned from."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
-from framework.data.tracks import LARGEST_DEVIATION, Tracks, distance_deviations
+from framework.data.tracks import DOUBTS, LARGEST_DEVIATION, Tracks, distance_deviations, doubts_about
+
+SOUND = torch.zeros(1, dtype=torch.int64)
+"""No doubt about the only point."""
 
 
 def two_rays(angle: float, distance: float, error: float) -> tuple[Tracks, torch.Tensor]:
     """A point at the origin, seen from two cameras at the same distance, whose rays are `angle` apart."""
     half = angle / 2
     centers = distance * torch.tensor([[math.sin(half), 0.0, math.cos(half)], [-math.sin(half), 0.0, math.cos(half)]])
-    return Tracks(torch.zeros(1, 3), torch.tensor([0, 1]), torch.tensor([0, 0]), torch.full((2,), error)), centers
+    return Tracks(
+        torch.zeros(1, 3), torch.tensor([0, 1]), torch.tensor([0, 0]), torch.full((2,), error), SOUND
+    ), centers
 
 
 @pytest.mark.parametrize("angle", [0.02, 0.3, 1.5])
@@ -34,7 +40,7 @@ def test_against_triangulation_of_noisy_rays() -> None:
     )
     angles = torch.tensor([1e-3, 2e-3, 1e-3, 5e-4, 3e-3], dtype=torch.float64)
     every = torch.arange(5)
-    found = distance_deviations(Tracks(point[None], every, torch.zeros(5, dtype=torch.int64), angles), centers)
+    found = distance_deviations(Tracks(point[None], every, torch.zeros(5, dtype=torch.int64), angles, SOUND), centers)
     apart = point - centers
     distances = apart.norm(dim=-1, keepdim=True)
     noise = torch.randn(20_000, 5, 3, dtype=torch.float64) * angles[:, None]
@@ -68,7 +74,7 @@ def test_rays_that_hardly_differ_know_no_distance() -> None:
 
 def test_images_are_numbered_anew_in_the_order_given() -> None:
     images, seen = torch.tensor([0, 0, 1, 2, 2, 4]), torch.tensor([0, 1, 0, 1, 2, 2])
-    tracks = Tracks(torch.randn(3, 3), images, seen, torch.arange(6).float())
+    tracks = Tracks(torch.randn(3, 3), images, seen, torch.arange(6).float(), SOUND.expand(3))
     some = tracks.of_images(torch.tensor([4, 2, 3]))
     assert list(zip(some.images.tolist(), some.seen.tolist(), some.angles.tolist(), strict=True)) == [
         (1, 1, 3.0), (1, 2, 4.0), (0, 2, 5.0)
@@ -81,13 +87,43 @@ def test_images_are_numbered_anew_in_the_order_given() -> None:
 
 def test_points_that_leave_the_range_of_numbers_go_with_their_sightings() -> None:
     points = torch.tensor([[0.0, 0, 0], [torch.inf, 0, 0], [1.0, 1, 1]])
-    tracks = Tracks(torch.zeros(3, 3), torch.tensor([0, 1, 0, 1]), torch.tensor([0, 1, 2, 2]), torch.ones(4)).at(points)
+    images, seen, doubts = torch.tensor([0, 1, 0, 1]), torch.tensor([0, 1, 2, 2]), torch.tensor([1, 2, 3])
+    tracks = Tracks(torch.zeros(3, 3), images, seen, torch.ones(4), doubts).at(points)
+    assert tracks.doubts.tolist() == [1, 3]
     assert tracks.points.tolist() == [[0, 0, 0], [1, 1, 1]]
     assert (tracks.images.tolist(), tracks.seen.tolist()) == ([0, 0, 1], [0, 1, 1])
 
 
 def test_nothing_is_something_too() -> None:
-    tracks = Tracks(torch.zeros(0, 3), *[torch.zeros(0, dtype=torch.int64)] * 2, torch.zeros(0))
+    tracks = Tracks(torch.zeros(0, 3), *[torch.zeros(0, dtype=torch.int64)] * 2, torch.zeros(0), SOUND[:0])
     assert len(tracks.of_images(torch.tensor([0, 1])).sightings(torch.zeros(2, 3))) == 0
     without = tracks.without(torch.zeros(2, dtype=torch.bool)).sightings(torch.zeros(2, 3))
     assert len(without.of_images(torch.tensor([1]))) == 0
+
+
+def test_doubtful_points_tell_no_distance() -> None:
+    tracks, centers = two_rays(0.3, 3.0, 1e-3)
+    assert tracks.known_distances(centers).tolist() == [True, True]
+    doubted = replace(tracks, doubts=torch.ones(1, dtype=torch.int64))
+    assert doubted.known_distances(centers).tolist() == [False, False]
+    assert len(doubted.sightings(centers)) == 0
+    assert doubted.confirmed().tolist() == [True]
+
+
+def test_reasons_to_doubt_a_point() -> None:
+    lengths, errors = torch.tensor([3, 9, 2, 3, 0, 1]), torch.tensor([2.0, 0.5, 0.5, 2.1, 0.5, 7.0])
+    found = [DOUBTS[index] for index in doubts_about(lengths, errors).tolist()]
+    few, large = "seen by fewer than 3 images", "with a reprojection error above 2 pixels"
+    assert found == ["", "", few, large, "without a track", few]
+
+
+def test_what_is_known_without_held_out_images() -> None:
+    """Image 9 is held out. Points without a track, and those that training images alone see, are known as they are."""
+    sees = {0: [], 1: [3], 2: [3, 4], 3: [3, 9], 4: [3, 4, 9], 5: [9], 6: [3, 3]}
+    pairs = [(image, point) for point, images in sees.items() for image in images]
+    images, seen = torch.tensor(pairs).unbind(-1)
+    tracks = Tracks(torch.randn(7, 3), images, seen, torch.ones(len(pairs)), SOUND.expand(7))
+    held_out = torch.zeros(10, dtype=torch.bool)
+    held_out[9] = True
+    assert tracks.known_without(held_out).tolist() == [True, True, True, False, True, False, True]
+    assert bool(tracks.known_without(torch.zeros(10, dtype=torch.bool)).all())

@@ -24,8 +24,24 @@ PARTS = re.compile(
 """Names of files and folders in a data folder that users may pass instead of the folder itself."""
 MAX_LEVELS = 3
 """Maximum number of levels between such a part and the data folder."""
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".heic", ".heif")
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".heic", ".heif", ".avif", ".jp2", ".jfif")
 """Suffixes of image files."""
+UNREAD_SUFFIXES = (
+    ".jxl",
+    ".gif",
+    ".exr",
+    ".hdr",
+    ".psd",
+    ".dng",
+    ".cr2",
+    ".cr3",
+    ".nef",
+    ".arw",
+    ".orf",
+    ".raf",
+    ".rw2",
+)
+"""Suffixes of image files that are not read, and counted where they are left out."""
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 """Suffixes of video files."""
 MAX_FILES = 5000

@@ -29,6 +29,7 @@ from framework.data.image_files import read_image as read_image
 from framework.data.image_files import reduce_image as reduce_image
 from framework.data.light import APPEARANCE_STOPS, light_spread
 from framework.data.mapped_pixels import MappedPixels
+from framework.data.names_on_disk import nearest_on_disk
 from framework.data.parsed_scene import DataParser as DataParser
 from framework.data.parsed_scene import ParsedScene as ParsedScene
 from framework.data.pixel_cache import PixelMemory
@@ -204,7 +205,7 @@ def existing_files(paths: Sequence[Path], split: str) -> Tensor:
     """
     missing = [path for path in paths if not path.is_file()]
     if len(missing) == len(paths):
-        first = f"; the first is {missing[0]}" if missing else ""
+        first = f"; the first is {missing[0]}: {nearest_on_disk(missing[0])}" if missing else ""
         raise DataError(
             f"split '{split}' has no image: none of the {len(paths)} files listed in the data exists{first}"
         )

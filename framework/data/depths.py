@@ -14,10 +14,14 @@ from torch import Tensor
 from framework.base.arrays import read_array
 from framework.base.errors import DataError
 from framework.cameras.cameras import Cameras
+from framework.data.data_folder import IMAGE_SUFFIXES
+from framework.data.exr import depth_channel, read_channel, read_header
 from framework.data.image_files import Content, unreadable
 
 T = TypeVar("T")
 
+DEPTH_SUFFIXES = (*IMAGE_SUFFIXES, ".npy", ".exr")
+"""Suffixes of depth images, in lower case."""
 MOST_PIXELS = 64
 """Maximum number of pixels of a depth image per pixel of its image; most have less than one."""
 
@@ -28,7 +32,7 @@ def read_depth(path: Path, width: int, height: int) -> np.ndarray:
     Each pixel takes the nearest value, because depths must not be interpolated across edges.
 
     Args:
-        path: a .npy file, or an image file.
+        path: a .npy file, an OpenEXR file (`exr.py`), or an image file.
         width, height: size of the image, pixels.
 
     Returns:
@@ -40,7 +44,8 @@ def read_depth(path: Path, width: int, height: int) -> np.ndarray:
     if not path.is_file():
         raise DataError(f"the depth image {path} does not exist")
     stored = _or_unreadable(path, read_array) if path.suffix == ".npy" else None
-    shape = _or_unreadable(path, _shape) if stored is None else stored.shape
+    is_exr = path.suffix.lower() == ".exr"
+    shape = _or_unreadable(path, _exr_shape if is_exr else _shape) if stored is None else stored.shape
     if len(shape) != 2 or 0 in shape:
         raise DataError(f"the depth image {path} has shape {shape}; it must be (height, width)")
     if shape[0] * shape[1] > MOST_PIXELS * width * height:  # before memory is allocated
@@ -52,7 +57,7 @@ def read_depth(path: Path, width: int, height: int) -> np.ndarray:
         np.minimum((np.arange(count) + 0.5) * size / count, size - 1).astype(np.int64)
         for count, size in zip((height, width), shape, strict=True)
     )
-    values = _or_unreadable(path, _values) if stored is None else stored
+    values = _or_unreadable(path, _exr_values if is_exr else _values) if stored is None else stored
     return _or_unreadable(path, lambda _: values[np.ix_(rows, columns)].astype(np.float32))
 
 
@@ -64,6 +69,16 @@ def _shape(path: Path) -> tuple[int, ...]:
 def _values(path: Path) -> np.ndarray:
     """Return the pixels of an image, or of its first frame."""
     return np.asarray(iio.imread(Content(path), plugin="pillow", index=0))
+
+
+def _exr_shape(path: Path) -> tuple[int, ...]:
+    return read_header(Content(path).getvalue()).shape
+
+
+def _exr_values(path: Path) -> np.ndarray:
+    content = Content(path).getvalue()
+    header = read_header(content)
+    return read_channel(content, header, depth_channel(header))
 
 
 def _or_unreadable(path: Path, read: Callable[[Path], T]) -> T:

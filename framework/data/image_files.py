@@ -8,9 +8,10 @@ from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
-from PIL import EpsImagePlugin, Image, UnidentifiedImageError
+from PIL import EpsImagePlugin, Image, UnidentifiedImageError, features
 
 from framework.base.errors import DataError
+from framework.data.data_folder import UNREAD_SUFFIXES
 
 # Pillow detects the format from the content, whatever the name, and would run Ghostscript, an interpreter, for EPS.
 EpsImagePlugin.gs_binary = False
@@ -152,6 +153,10 @@ def unreadable(path: Path, error: BaseException, what: str = "") -> DataError:
         reason = "the file is empty; copy it again"
     elif unidentified and path.suffix.lower() in (".heic", ".heif"):
         reason = "HEIC needs another package: pip install pillow-heif"
+    elif unidentified and path.suffix.lower() == ".avif" and not features.check("avif"):
+        reason = "AVIF needs Pillow 11.3 or later, built with it: pip install --upgrade pillow"
+    elif unidentified and path.suffix.lower() in UNREAD_SUFFIXES:
+        reason = f"{path.suffix} is not read; convert it to PNG or JPEG"
     elif unidentified:
         reason = "its content is no image, or its beginning is damaged; copy it again"
     elif isinstance(error, Image.DecompressionBombError):

@@ -53,7 +53,7 @@ class PlyHeader:
 
 
 def read_points(file: Path) -> Tensor:
-    """Read the positions of the vertices (K, 3), float64; those that are not finite are left out.
+    """Read the positions of the vertices (K, 3), float64; those that are not finite are left out, and counted.
 
     Args:
         file: path of the PLY file.
@@ -63,7 +63,10 @@ def read_points(file: Path) -> Tensor:
     """
     columns = read_columns(file, read_header(file), "xyz")
     points = torch.from_numpy(np.stack([column.astype(np.float64) for column in columns], axis=-1))
-    return points[points.isfinite().all(-1)]
+    finite = points.isfinite().all(-1)
+    if not bool(finite.all()):
+        say(f"{file}: {int((~finite).sum()):,} of {len(points):,} points are not finite and left out")
+    return points[finite]
 
 
 def read_header(file: Path) -> PlyHeader:

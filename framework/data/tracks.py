@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -11,6 +11,17 @@ FEWEST = 2
 """Minimum number of images that see a point, of those that may be learned from; one image knows no distance."""
 LARGEST_DEVIATION = 0.1
 """Maximum standard deviation of a distance that is used, as a fraction of the distance."""
+SHORTEST_TRACK = 3
+"""Minimum number of images that observe a point whose distances are used; two can agree on a wrong one."""
+LARGEST_ERROR = 2.0
+"""Maximum mean reprojection error of a point whose distances are used, pixels."""
+DOUBTS = (
+    "",
+    "without a track",
+    f"seen by fewer than {SHORTEST_TRACK} images",
+    f"with a reprojection error above {LARGEST_ERROR:g} pixels",
+)
+"""Reasons for which the distances of a point are not used, in the order of `doubts_about`; none at first."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +60,8 @@ class Tracks:
     """(O,) int64 point of each sighting."""
     angles: Tensor
     """(O,) standard deviation of each sighting's direction, radians: the reprojection error over the focal length."""
+    doubts: Tensor
+    """(K,) int64 index in `DOUBTS` of the reason for which a point's distances are not used; 0 if they are."""
 
     def of_images(self, chosen: Tensor) -> Tracks:
         """Return all points, and the sightings in some images, which are numbered anew.
@@ -57,7 +70,7 @@ class Tracks:
             chosen: (S,) int64 the images, without repetitions.
         """
         kept, images = _renumbered(self.images, chosen)
-        return Tracks(self.points, images, self.seen[kept], self.angles[kept])
+        return replace(self, images=images, seen=self.seen[kept], angles=self.angles[kept])
 
     def without(self, images: Tensor) -> Tracks:
         """Return all points, without the sightings in some images.
@@ -66,7 +79,7 @@ class Tracks:
             images: (M,) bool, the images to leave out.
         """
         kept = ~images[self.images]
-        return Tracks(self.points, self.images[kept], self.seen[kept], self.angles[kept])
+        return replace(self, images=self.images[kept], seen=self.seen[kept], angles=self.angles[kept])
 
     def at(self, points: Tensor) -> Tracks:
         """Return the same sightings of points that were moved.
@@ -77,22 +90,64 @@ class Tracks:
         finite = points.isfinite().all(-1)
         kept = finite[self.seen]
         seen = (finite.cumsum(0) - 1)[self.seen[kept]]
-        return Tracks(points[finite], self.images[kept], seen, self.angles[kept])
+        return Tracks(points[finite], self.images[kept], seen, self.angles[kept], self.doubts[finite])
 
     def confirmed(self) -> Tensor:
         """Return whether at least `FEWEST` of the images see a point, (K,) bool."""
-        return torch.bincount(self.seen, minlength=len(self.points)) >= FEWEST
+        return self._counts() >= FEWEST
+
+    def known_without(self, images: Tensor) -> Tensor:
+        """Return whether a point's position is known without some images, (K,) bool.
+
+        It is if these do not see it, or if at least `FEWEST` others do.
+
+        Args:
+            images: (M,) bool, the images.
+        """
+        others = self.without(images)
+        return others.confirmed() | (others._counts() == self._counts())
+
+    def _counts(self) -> Tensor:
+        """Return the number of sightings of each point, (K,)."""
+        return torch.bincount(self.seen, minlength=len(self.points))
+
+    def known_distances(self, centers: Tensor) -> Tensor:
+        """Return whether a sighting's distance is known well enough to learn from, (O,) bool.
+
+        It is if at least `FEWEST` images see the point, it is not doubted, and the distance's deviation is small.
+
+        Args:
+            centers: (M, 3) positions of the cameras.
+        """
+        return self._known(distance_deviations(self, centers), centers)
 
     def sightings(self, centers: Tensor) -> Sightings:
-        """Return the sightings of confirmed points whose distance is known well enough.
+        """Return the sightings whose distance is known well enough (`known_distances`).
 
         Args:
             centers: (M, 3) positions of the cameras.
         """
         deviations = distance_deviations(self, centers)
-        distances = (self.points[self.seen] - centers[self.images].to(self.points)).norm(dim=-1)
-        known = self.confirmed()[self.seen] & (deviations <= LARGEST_DEVIATION * distances)
+        known = self._known(deviations, centers)
         return Sightings(self.images[known], self.points[self.seen[known]].float(), deviations[known].float())
+
+    def _known(self, deviations: Tensor, centers: Tensor) -> Tensor:
+        distances = (self.points[self.seen] - centers[self.images].to(self.points)).norm(dim=-1)
+        believed = self.confirmed() & (self.doubts == 0)
+        return believed[self.seen] & (deviations <= LARGEST_DEVIATION * distances)
+
+
+def doubts_about(lengths: Tensor, errors: Tensor) -> Tensor:
+    """Return for which reason in `DOUBTS` a point's distances are not used, (K,) int64; 0 if they are.
+
+    Args:
+        lengths: (K,) number of images that observe each point.
+        errors: (K,) mean reprojection error of each point, pixels.
+    """
+    doubts = torch.where(errors > LARGEST_ERROR, 3, 0)
+    doubts[lengths < SHORTEST_TRACK] = 2
+    doubts[lengths == 0] = 1
+    return doubts
 
 
 def distance_deviations(tracks: Tracks, centers: Tensor) -> Tensor:

@@ -61,7 +61,8 @@ class SplattingConfig(
     the visual hull of the images' silhouettes, or anywhere in the box. auto: the first of points and field that there
     is."""
     start_gaussians: Auto[int] = AUTO
-    """Gaussians at the start, except at the points of a reconstruction; two thirds of the maximum if not given."""
+    """Gaussians at the start, and their maximum at the points of a reconstruction; two thirds of --num-gaussians if not
+    given."""
     field_steps: Auto[int] = AUTO
     """Maximum number of training steps of that field; by the budget if not given. They end after a fifth of
     --max-seconds."""

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from framework.base.console import say
 from framework.base.errors import ConfigError
+from framework.base.evenly_spaced import evenly_spaced
 from framework.cameras.cameras import Cameras
 from framework.data.dataset import Dataset
 from framework.data.scene import Scene
@@ -87,6 +88,21 @@ def neighbour_distance(points: Tensor) -> Tensor:
         best[order] = near.sort(1).values[:, :NEIGHBOURS]
     known = best.isfinite()
     return best.masked_fill(~known, 0).sum(1) / known.sum(1).clamp(min=1)
+
+
+def thinned(points: Tensor, count: int) -> Tensor:
+    """Return at most `count` of some points, evenly spaced along a curve that fills space (Morton order).
+
+    Args:
+        points: (N, 3), which may be in the order of a scanner's lines.
+        count: maximum number of points.
+    """
+    if len(points) <= count:
+        return points
+    low, high = points.min(0).values, points.max(0).values
+    unit = (points - low) / (high - low).max().clamp(min=1e-12)
+    order = morton((unit * (2**20 - 1)).long().clamp(0, 2**20 - 1)).argsort()
+    return points[order[evenly_spaced(len(points), count).to(order.device)]]
 
 
 def morton(cells: Tensor) -> Tensor:
@@ -180,7 +196,7 @@ def first_points(kind: Literal["points", "silhouettes", "random"], dataset: Data
         kind: points: those of a reconstruction. silhouettes: random ones on the surface of the visual hull of images
             with alpha. random: anywhere in the scene's box.
         dataset: the images.
-        count: number of random points.
+        count: number of random points, and maximum number of those of a reconstruction.
 
     Raises:
         ConfigError: if the data has no points, or no pinhole images with alpha.
@@ -190,7 +206,10 @@ def first_points(kind: Literal["points", "silhouettes", "random"], dataset: Data
     if kind == "points":
         if dataset.points is None:
             raise ConfigError("--start points: the data has no points of a reconstruction; leave out --start")
-        return dataset.points.to(dataset.device)
+        points = thinned(dataset.points.to(dataset.device), count)
+        if len(points) < len(dataset.points):
+            say(f"  {len(points):,} of {len(dataset.points):,} points are taken, evenly (--start-gaussians)")
+        return points
     if kind == "silhouettes":
         if not scene.has_alpha or dataset.cameras.model != "pinhole":
             raise ConfigError("--start silhouettes needs pinhole images with alpha; leave out --start")

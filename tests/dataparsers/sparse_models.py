@@ -84,7 +84,7 @@ def write_colmap(
 
     Every point is seen by the first `tracks` images, or by those in `seen_by`.
     """
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     images = list(range(len(capture.names)))
     seeing = images[:tracks] if seen_by is None else list(seen_by)
     cameras = "".join(f"{3 * i + 5} {camera}\n" for i in images)

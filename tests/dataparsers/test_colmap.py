@@ -102,18 +102,59 @@ def test_every_eighth_by_sorted_name_is_held_out(folder: Path) -> None:
     assert train.scale == val.scale
 
 
-@pytest.mark.parametrize(("tracks", "error", "count"), [(3, 0.5, 30), (2, 0.5, None), (3, 5.0, None)])
-def test_only_points_that_images_agree_on(
-    tmp_path: Path, capture: Capture, tracks: int, error: float, count: int | None
+@pytest.mark.parametrize(
+    ("tracks", "error", "reason"),
+    [
+        (4, 0.5, ""),
+        (2, 0.5, "30 seen by fewer than 3 images"),
+        (4, 5.0, "30 with a reprojection error above 2 pixels"),
+        (0, 0.0, "30 without a track"),
+    ],
+)
+def test_poor_points_start_gaussians_and_tell_no_distance(
+    tmp_path: Path, capture: Capture, capsys: pytest.CaptureFixture[str], tracks: int, error: float, reason: str
 ) -> None:
     write_images(tmp_path / "images", capture.names)
-    write_colmap(tmp_path / "sparse", capture, tracks=tracks, error=error)
+    seen_by = range(1, 1 + tracks)  # p00 and p08 are held out
+    as_binary(write_colmap(tmp_path / "sparse", capture, error=error, seen_by=seen_by))
     scene = Colmap().parse(tmp_path, "train")
-    assert (None if scene.points is None else len(scene.points)) == count
-    if scene.points is not None and scene.transform is not None:
-        expected = scene.scale * (capture.points @ scene.transform[:, :3].T.numpy() + scene.transform[:, 3].numpy())
-        found = np.array(sorted(scene.points.tolist()))
-        np.testing.assert_allclose(found, np.array(sorted(expected.tolist())), atol=1e-5)
+    assert scene.points is not None
+    assert scene.transform is not None
+    expected = scene.scale * (capture.points @ scene.transform[:, :3].T.numpy() + scene.transform[:, 3].numpy())
+    found = np.array(sorted(scene.points.tolist()))
+    np.testing.assert_allclose(found, np.array(sorted(expected.tolist())), atol=1e-5)
+    assert (0 if scene.sightings is None else len(scene.sightings)) == (0 if reason else 120)
+    known = 0 if reason else 30
+    said = f"sparse points: 30 of 30 are used, {known} at known distances" + (f" (not {reason})" if reason else "")
+    assert said in " ".join(capsys.readouterr().err.split())
+    assert scene.near == pytest.approx(estimate_near(Colmap().parse(tmp_path, "train").cameras, scene.points), rel=0.2)
+
+
+def test_poor_points_do_not_move_the_near_distance(tmp_path: Path, capture: Capture) -> None:
+    """Points of large error right in front of the cameras, beside good ones."""
+    write_images(tmp_path / "images", capture.names)
+    model = write_colmap(tmp_path / "sparse", capture)
+    near = Colmap(eval_interval=0).parse(tmp_path, "train").near
+    wrong = capture.rotations[4].T @ (np.array([0.0, 0.0, 0.1]) - capture.translations[4])
+    row = " ".join(map(repr, wrong.tolist()))
+    with (model / "points3D.txt").open("a") as file:
+        file.writelines(f"{900 + k} {row} 9 9 9 8.0\n" for k in range(30))
+    scene = Colmap(eval_interval=0).parse(tmp_path, "train")
+    assert scene.near == pytest.approx(near)
+    assert scene.points is not None
+    assert len(scene.points) == 60
+
+
+def test_points_that_are_no_numbers_are_counted(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = folder / "sparse" / "0"
+    as_binary(model)
+    content = bytearray((model / "points3D.bin").read_bytes())
+    content[16:24] = np.array([np.nan]).tobytes()  # after the number of points and the first one's own
+    (model / "points3D.bin").write_bytes(content)
+    scene = Colmap(eval_interval=0).parse(folder, "train")
+    assert scene.points is not None
+    assert len(scene.points) == 29
+    assert "1 of 30 sparse points are not finite" in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.parametrize("camera", ["PINHOLE 60 40 50 48 31 19", "OPENCV 60 40 50 48 31 19 0.1 -0.02 0.003 -0.001"])
@@ -201,8 +242,92 @@ def test_the_largest_of_several_models_is_taken(
     assert len(Colmap(eval_interval=0).parse(folder, "train").image_paths) == 10
     said = " ".join(capsys.readouterr().err.split())
     assert "2 COLMAP reconstructions" in said
-    assert "sparse/1 has the most images (10)" in said
+    assert "sparse/1 has 10 of the images that are there, and is used; sparse/0 has 4" in said
     assert len(Colmap(eval_interval=0, colmap_path="sparse/0").parse(folder, "train").image_paths) == 4
+
+
+@pytest.mark.parametrize("place", ["sparse/1", "sparse/0/models/1", "sparse", "colmap/sparse/0", "."])
+def test_the_model_of_the_images_that_are_there_is_taken(tmp_path: Path, capture: Capture, place: str) -> None:
+    """sparse/2 has more images, of another folder."""
+    write_images(tmp_path / "images", capture.names)
+    few = Capture(capture.names[:4], capture.rotations[:4], capture.translations[:4], capture.points)
+    other = make_capture(14)
+    other.names = [f"other{index:02d}.png" for index in range(14)]
+    write_colmap(tmp_path / "sparse" / "0" / "few", few)
+    as_binary(write_colmap(tmp_path / "sparse" / "2", other))
+    write_colmap(tmp_path / place, capture)
+    assert len(Colmap(eval_interval=0).parse(tmp_path, "train").image_paths) == 10
+
+
+@pytest.mark.parametrize("kind", ["text", "binary"])
+def test_names_with_spaces(tmp_path: Path, capture: Capture, kind: str) -> None:
+    """pycolmap takes a name in text to end at its first space, so that all of them would be equal."""
+    capture.names = [f"shot {9 - index}  (of 10).png" for index in range(10)]
+    write_images(tmp_path / "images", capture.names)
+    model = write_colmap(tmp_path / "sparse" / "0", capture)
+    text = (model / "images.txt").read_text()
+    if kind == "binary":  # of its own making, as pycolmap cannot read these names
+        (model / "images.txt").write_text(text.replace("shot ", "shot_").replace("  (of 10)", "xx(of_10)"))
+        as_binary(model)
+        content = (model / "images.bin").read_bytes()
+        for name in capture.names:
+            content = content.replace(
+                name.replace("shot ", "shot_").replace("  (of 10)", "xx(of_10)").encode(), name.encode()
+            )
+        (model / "images.bin").write_bytes(content)
+    scene = Colmap(eval_interval=0).parse(tmp_path, "train")
+    assert [path.name for path in scene.image_paths] == sorted(capture.names)
+    for image, name in enumerate(sorted(capture.names)):
+        x, y = capture.seen(capture.names.index(name)).T
+        assert misses(scene, image, FX * x + CX, FY * y + CY, capture.points).max() < 1e-3
+
+
+def test_images_without_their_second_line_are_refused(folder: Path) -> None:
+    """pycolmap would take every other image for keypoints."""
+    file = folder / "sparse" / "0" / "images.txt"
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join([lines[0], *lines[1::2]]) + "\n")
+    with pytest.raises(DataError, match=r"images\.txt: the line after image 'p09\.png' is another image"):
+        Colmap().parse(folder, "train")
+
+
+def test_names_of_another_system(tmp_path: Path, capture: Capture, capsys: pytest.CaptureFixture[str]) -> None:
+    names = capture.names
+    write_images(tmp_path / "input", [name.upper() for name in names])
+    write_images(tmp_path / "masks", names[:-1])
+    capture.names = [f"C:\\scan\\{name}" for name in names]
+    write_colmap(tmp_path, capture)
+    assert Colmap.recognizes(tmp_path)
+    assert not Colmap.recognizes(write_colmap(tmp_path / "alone", capture))
+    scene = Colmap(eval_interval=0).parse(tmp_path, "train")
+    assert [path.name for path in scene.image_paths] == [name.upper() for name in names]
+    assert scene.mask_paths == (*(tmp_path / "masks" / name for name in names[:-1]), None)
+    assert "10 of 10 are on the disk in another folder" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("digits", [2, 3, 6])
+def test_rounded_rotations_are_rotations(tmp_path: Path, capture: Capture, digits: int) -> None:
+    write_images(tmp_path / "images", capture.names)
+    model = write_colmap(tmp_path / "sparse", capture)
+    lines = (model / "images.txt").read_text().splitlines()
+    for index in range(1, len(lines), 2):
+        words = lines[index].split(" ")
+        lines[index] = " ".join([words[0], *(f"{float(word):.{digits}f}" for word in words[1:5]), *words[5:]])
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+    poses = Colmap(eval_interval=0).parse(tmp_path, "train").cameras.camera_to_worlds[:, :, :3]
+    torch.testing.assert_close(poses @ poses.transpose(1, 2), torch.eye(3).expand(10, 3, 3), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("numbers", ["0 0 0 0", "2 0 0 0", "0.5 0.5 0.5 0.1"])
+def test_what_is_no_rotation_is_refused(folder: Path, numbers: str) -> None:
+    """pycolmap takes a quaternion of length 0 for no rotation."""
+    file = folder / "sparse" / "0" / "images.txt"
+    lines = file.read_text().splitlines()
+    words = lines[1].split(" ")
+    lines[1] = " ".join([words[0], numbers, *words[5:]])
+    file.write_text("\n".join(lines) + "\n")
+    with pytest.raises(DataError, match=r"image 'p09\.png' has a quaternion of length"):
+        Colmap().parse(folder, "train")
 
 
 @pytest.mark.parametrize("form", ["{stem}.png", "{name}.png"])

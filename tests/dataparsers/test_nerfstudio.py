@@ -30,6 +30,7 @@ from tests.dataparsers.captures import (
     write_capture,
     write_images,
 )
+from tests.exr_files import write_exr
 
 EXACT = 2e-6
 """What float32 leaves of a ray's direction."""
@@ -303,8 +304,56 @@ def test_masks_depths_and_times(capture: Path) -> None:
     assert scene.times.tolist() == [0, 1]
     (capture / "masks" / "001.png").unlink()
     assert Nerfstudio().parse(capture, "val").mask_paths is not None
-    with pytest.raises(DataError, match=r"mask .*masks/001\.png does not exist \(missing in all: 1\)"):
+    with pytest.raises(
+        DataError,
+        match=r"mask .*masks/001\.png does not exist \(missing in all: 1\): .*masks has no 001\.png, but 000\.png",
+    ):
         Nerfstudio().parse(capture, "train")
+
+
+def test_names_of_windows(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With masks and lists written likewise."""
+    write_images(capture / "masks", ["004.png"])
+
+    def change(content: dict[str, Any]) -> None:
+        for frame in content["frames"]:
+            frame["file_path"] = "C:\\scan\\" + frame["file_path"].replace("/", "\\").upper()
+        content["frames"][4]["mask_path"] = "masks\\004.PNG"
+        content["test_filenames"] = ["c:/scan/images/003.png"]
+
+    edit(capture, change)
+    scene = Nerfstudio().parse(capture, "train")
+    assert worst_miss(scene, np.delete(poses(), 3, axis=0)) < EXACT
+    assert scene.mask_paths == (*[None] * 3, capture / "masks" / "004.png", *[None] * 4)
+    assert [path.name for path in Nerfstudio().parse(capture, "test").image_paths] == ["003.png"]
+    said = capsys.readouterr().err
+    assert said.count("9 of 9 are on the disk in another folder") == 1  # of training alone
+    assert "files of 'mask_path': 1 of 1 are on the disk in another case" in said
+
+
+@pytest.mark.parametrize("digits", [2, 3, 5])
+def test_rounded_matrices_are_rotations(capture: Path, digits: int) -> None:
+    def change(content: dict[str, Any]) -> None:
+        for frame in content["frames"]:
+            frame["transform_matrix"] = np.round(frame["transform_matrix"], digits).tolist()
+
+    edit(capture, change)
+    rotations = ALL.parse(capture, "train").cameras.camera_to_worlds[:, :, :3].double()
+    unit = torch.eye(3, dtype=torch.float64).expand(9, 3, 3)
+    torch.testing.assert_close(rotations @ rotations.transpose(1, 2), unit, atol=1e-6, rtol=0)
+
+
+def test_the_unit_of_depth_in_exr_is_said(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (capture / "depth").mkdir()
+    write_exr(capture / "depth" / "000.exr", {"Z": np.full((HEIGHT, WIDTH), 2.5, np.float32)})
+    edit(capture, lambda c: c["frames"][0].update(depth_file_path="depth/000.exr"))
+    for factor, said in ((0.001, True), (1.0, False)):
+        flags = Nerfstudio(eval_interval=0, depth_unit_scale_factor=factor)
+        scene = flags.parse(capture, "train")
+        assert ("EXR files are taken for millimetres" in capsys.readouterr().err) == said
+        depths = load_dataset(scene, "train").depths
+        assert depths is not None
+        assert float(depths.max()) == pytest.approx(2.5 * factor * scene.scale, rel=1e-3)
 
 
 def test_missing_images_are_skipped_and_reported_once(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -354,7 +403,7 @@ BAD = {
     "letters of two bytes": (frame(file_path="é" * 200), "frame 4: 'file_path' is not the name of a file"),
     "endless way to a file": (frame(file_path="a/" * 3000 + "b"), "frame 4: 'file_path' is not the name of a file"),
     "half a letter": (frame(file_path="\ud800"), "frame 4: 'file_path' is not the name of a file"),
-    "name of two lines": (frame(mask_path="a\nb"), r"a\\nb does not exist"),
+    "name of two lines": (frame(mask_path="a\nb"), r"a\\nb\.png does not exist"),
     "no pose": (lambda c: c["frames"][4].pop("transform_matrix"), "frame 4: 'transform_matrix' is not a 4x4 matrix"),
     "nan pose": (cell(0, 3, math.nan), "frame 4: the pose holds a value that is not finite"),
     "text pose": (cell(0, 3, "x"), "frame 4: 'transform_matrix' is not a 4x4 matrix"),

@@ -71,6 +71,12 @@ def test_depth_goes_with_its_image(capture: Path) -> None:
     assert scene.depth_unit == 0.001
 
 
+def test_sizes_that_are_not_stated_are_those_of_the_images(capture: Path) -> None:
+    edit(capture, lambda content: content.pop("width"))
+    scene = Polycam(eval_interval=0).parse(capture, "train")
+    assert worst_miss(scene, poses()) < 2e-6
+
+
 def test_missing_images_do_not_shift_poses(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (capture / "keyframes" / "images" / f"{STAMPS[3]}.jpg").unlink()
     scene = Polycam(eval_interval=0).parse(capture, "train")
@@ -84,7 +90,7 @@ BAD = {
     "scaled pose": (lambda c: c.update(t_00=2.0), "the pose is not rigid"),
     "zero focal length": (lambda c: c.update(fx=0), "'fx' is 0; it must be a number above zero"),
     "no centre": (lambda c: c.pop("cx"), "'cx' is None"),
-    "no height": (lambda c: c.pop("height"), "'height' is None; it must be a number above zero"),
+    "negative height": (lambda c: c.update(height=-3), "'height' is -3; it must be a number above zero"),
     "endless height": (lambda c: c.update(height=1e300), "'height' is 1e.300; it must be from 1"),
 }
 

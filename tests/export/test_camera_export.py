@@ -62,7 +62,7 @@ def assert_round_trip(parser: DataParser, data: Path, given: dict[str, Tensor], 
     assert furthest(read, given) < 1e-6
 
     back = {split: Nerfstudio().parse(folder, split) for split in SPLITS}
-    images = read_images(folder, folder / "sparse" / "0", str(images_folder(posed)), "masks")
+    images = read_images(folder, folder / "sparse" / "0", str(images_folder(posed)), "masks", "train")
     for split, scene in scenes.items():
         names = [path.resolve() for path in scene.image_paths]
         again = back[split]

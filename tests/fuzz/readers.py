@@ -29,6 +29,7 @@ from framework.cameras.camera_path import MOST_FRAMES, CameraPath, Keyframe, rea
 from framework.cameras.poses import Placement
 from framework.cli.compare import CompareFlags, plan_of
 from framework.data.dataset import load_dataset
+from framework.data.depths import read_depth
 from framework.data.mapped_pixels import MappedPixels
 from framework.data.pixel_cache import PixelMemory, pack, unpack
 from framework.data.ply import read_points
@@ -50,6 +51,7 @@ from tests.dataparsers.sparse_models import make_capture, write_colmap, write_im
 from tests.dataparsers.test_llff import poses_bounds
 from tests.dataparsers.test_polycam import write_polycam
 from tests.dataparsers.test_record3d import write_record3d
+from tests.exr_files import NONE, RLE, ZIP, ZIPS, write_exr
 from tests.fuzz.reader import Reader, require
 from tests.fuzz.sense import check_cameras, check_dataset, check_scene
 from tests.images import noise
@@ -330,6 +332,17 @@ def read_pixel_cache(folder: Path, scratch: Path) -> None:
         require(len(pixels.look_up(torch.tensor([5, 3, 299]))) == 3, "pixels that are not there")
 
 
+def write_exr_depths(folder: Path) -> None:
+    for compression in (NONE, RLE, ZIPS, ZIP):
+        depths = noise(20, 15, compression)[..., 0].astype(np.float32)
+        write_exr(folder / f"{compression}.exr", {"Z": depths, "A": depths.astype(np.float16)}, compression)
+
+
+def read_exr_depths(folder: Path, scratch: Path) -> None:
+    for file in sorted(folder.glob("*.exr")):
+        require(read_depth(file, 20, 15).shape == (15, 20), "another shape")
+
+
 def write_archive(folder: Path) -> None:
     """Text, an image, and an entry that is stored as it is."""
     with zipfile.ZipFile(folder / "scenes.zip", "w") as archive:
@@ -366,6 +379,7 @@ READERS: dict[str, Reader] = {
     "images-to-a-file": Reader(write_blender, partial(load, Blender(), 0.0), ("train/*.png",)),
     "masks": Reader(write_masked, partial(load, Nerfstudio(), MEMORY), ("masks/*.png",)),
     "depths": Reader(write_masked, partial(load, Nerfstudio(), MEMORY), ("depths/*",)),
+    "depths-exr": Reader(write_exr_depths, read_exr_depths, ("*.exr",)),
     "photographs": Reader(write_photographs, read_photographs, ("*",)),
     "polycam-raw": Reader(write_polycam, convert_polycam, ("keyframes/cameras/*.json",), ("blur_score", "fx", "width")),
     "record3d-raw": Reader(

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, features
 
 from framework.base.errors import DataError
 from framework.tools.processing.images import output_names, prepare, prepare_all
@@ -32,6 +32,24 @@ def test_photographs_are_found_below_and_sorted_as_people_count(tmp_path: Path) 
     (tmp_path / "c").mkdir()
     with pytest.raises(DataError, match="has no image"):
         find_images(tmp_path / "c")
+
+
+def test_kinds_that_are_not_read_are_counted_and_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write(tmp_path / "a.png")
+    for name in ("b.DNG", "c.dng", "d.jxl", "notes.txt", ".e.dng"):
+        (tmp_path / name).write_bytes(b"raw")
+    assert find_images(tmp_path) == [Path("a.png")]
+    said = " ".join(capsys.readouterr().err.split())
+    assert "left out: 4 files that are no images: 2 .dng, 1 .jxl, 1 .txt; the first: b.DNG" in said
+
+
+@pytest.mark.skipif(not features.check("avif"), reason="this Pillow is built without AVIF")
+def test_avif_is_read(tmp_path: Path) -> None:
+    write(tmp_path / "in" / "a.avif", (16, 12))
+    (tmp_path / "out").mkdir()
+    assert find_images(tmp_path / "in") == [Path("a.avif")]
+    (found,), unreadable = prepare_all(tmp_path / "in", [Path("a.avif")], tmp_path / "out")
+    assert (found.name, found.width, found.height, unreadable) == ("a.png", 16, 12, [])
 
 
 def test_digits_that_are_no_numbers_are_letters(tmp_path: Path) -> None:

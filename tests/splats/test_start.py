@@ -10,7 +10,16 @@ import torch
 from dataparsers.blender import Blender
 from framework.data.dataset import load_dataset
 from framework.kernels.splat_project import DC
-from framework.splats.start import from_points, hull_points, morton, neighbour_distance, scene_size, seen_colors
+from framework.splats.start import (
+    first_points,
+    from_points,
+    hull_points,
+    morton,
+    neighbour_distance,
+    scene_size,
+    seen_colors,
+    thinned,
+)
 
 
 @pytest.mark.medium
@@ -35,6 +44,29 @@ def test_morton_interleaves_bits() -> None:
     for cell, code in zip(cells.tolist(), morton(cells).tolist(), strict=True):
         bits = [(cell[i % 3] >> (i // 3) & 1) << i for i in range(60)]
         assert code == sum(bits)
+
+
+def test_too_many_points_are_thinned_evenly() -> None:
+    """In the order of a scanner's lines, with a tenth of them in a corner: 1 in 20 of every part of space is kept."""
+    torch.manual_seed(0)
+    points = torch.cat([torch.rand(18_000, 3), 0.1 * torch.rand(2_000, 3) + 5]).sort(0).values
+    assert thinned(points, 20_000) is points
+    some = thinned(points, 1_000)
+    assert len(some) == 1_000 == len(some.unique(dim=0))
+    assert set(map(tuple, some.tolist())) <= set(map(tuple, points.tolist()))
+    assert int((some > 3).all(-1).sum()) == pytest.approx(100, abs=3)
+    near = torch.cdist(points[::50], some).min(1).values
+    assert float(near.max()) < 0.5
+
+
+def test_a_reconstruction_starts_no_more_gaussians_than_asked(
+    shared_tiny: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dataset = replace(load_dataset(Blender().parse(shared_tiny, "train"), "train"), points=torch.rand(900, 3))
+    assert len(first_points("points", dataset, 1_000)) == 900
+    assert not capsys.readouterr().err
+    assert len(first_points("points", dataset, 300)) == 300
+    assert "300 of 900 points are taken, evenly (--start-gaussians)" in capsys.readouterr().err
 
 
 def test_points_become_round_gaussians_of_their_colour() -> None:

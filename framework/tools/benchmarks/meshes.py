@@ -101,9 +101,11 @@ class Truth:
         self.size = float((poses[:, :, 3] - poses[:, :, 3].mean(0)).norm(dim=-1).mean())
         self.distance = loaded.parser.signed_distance if isinstance(loaded.parser, KnowsItsSurface) else None
         self.sparse: Tensor | None = None
-        if parsed.points is not None:
-            inside = ((parsed.points >= parsed.box[0]) & (parsed.points <= parsed.box[1])).all(-1)
-            self.sparse = placement.original_points(parsed.points[inside])
+        # Points whose distances are not known well enough to learn from are no truth either.
+        points = parsed.points if parsed.sightings is None else parsed.sightings.points.unique(dim=0)
+        if points is not None:
+            inside = ((points >= parsed.box[0]) & (points <= parsed.box[1])).all(-1)
+            self.sparse = placement.original_points(points[inside].double())
         if self.distance is not None:
             torch.manual_seed(0)
             self.points, normals = surface_sample(self.distance, parsed.box, SURFACE_POINTS)

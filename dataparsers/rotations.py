@@ -1,0 +1,61 @@
+"""Rotations as files have them: as matrices and quaternions that were rounded when they were written.
+
+What is a rotation up to rounding is made one, and nothing is said. What is none is left to be refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from framework import DataError
+from framework.kernels.math import cross_matrix
+
+LARGEST_ROUNDING = 0.02
+"""Largest deviation of R R^T from the identity, and of a quaternion's length from 1, that rounding explains: that of
+numbers with two decimals."""
+EXACT = 1e-12
+"""Deviation below which a matrix is left as it is."""
+
+
+def nearest_rotation(matrix: Tensor) -> Tensor:
+    """Return the rotation (3, 3) nearest to a matrix that is one up to rounding; any other matrix as it is.
+
+    It is U V^T of the singular value decomposition U S V^T (Higham 1989).
+
+    Args:
+        matrix: (3, 3) float64.
+    """
+    deviation = float((matrix @ matrix.T - torch.eye(3, dtype=matrix.dtype)).abs().max())
+    if not EXACT < deviation <= LARGEST_ROUNDING:  # NaN is left too
+        return matrix
+    left, _, right = torch.linalg.svd(matrix)
+    return left @ right
+
+
+def unit_quaternions(quaternions: Tensor, labels: Sequence[str]) -> Tensor:
+    """Return quaternions (M, 4) of length 1.
+
+    Args:
+        quaternions: (M, 4) float64.
+        labels: M names in messages.
+
+    Raises:
+        DataError: if a length is not 1 up to rounding.
+    """
+    norms = quaternions.norm(dim=-1)
+    deviation = (norms - 1).abs().nan_to_num(torch.inf)
+    if bool((deviation > LARGEST_ROUNDING).any()):
+        index = int(deviation.argmax())
+        raise DataError(f"{labels[index]} has a quaternion of length {norms[index]:.3g}; a rotation's is 1")
+    return quaternions / norms[:, None]
+
+
+def rotations(quaternions: Tensor) -> Tensor:
+    """Return the rotation matrices (M, 3, 3) of unit `quaternions` (M, 4) x, y, z, w."""
+    vector, scalar = quaternions[:, :3], quaternions[:, 3]
+    cross = cross_matrix(vector)
+    # Rodrigues' formula with half angles: v -> v + 2 w (u x v) + 2 u x (u x v).
+    return torch.eye(3, dtype=quaternions.dtype) + 2 * (scalar[:, None, None] * cross + cross @ cross)

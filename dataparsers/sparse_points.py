@@ -1,0 +1,93 @@
+"""Sparse points of a captured scene: which of them are used, and for what."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from framework.base.console import say
+from framework.cameras.cameras import Cameras
+from framework.cameras.poses import Placement
+from framework.data.tracks import DOUBTS, LARGEST_DEVIATION, Sightings, Tracks
+
+if TYPE_CHECKING:
+    from dataparsers.captured import PosedImages
+
+
+@dataclass(frozen=True)
+class SparsePoints:
+    """Sparse points in the scene's frame."""
+
+    points: Tensor | None
+    """(K, 3) all points that may be used; None if there are none."""
+    sound: Tensor | None
+    """(S, 3) those whose distances are believed, or all if there are none; None without points."""
+    sightings: Sightings | None
+    """Which images see which points at a distance that is known; None without tracks."""
+
+
+def sparse_points(images: PosedImages, placement: Placement, cameras: Cameras, known: Tensor | None) -> SparsePoints:
+    """Return the sparse points in the scene's frame, and say how many of them serve for what.
+
+    A point that is too poor for distances still says about where a surface is. Left out are points beyond the range of
+    float32, and those that held-out images see and fewer than two others: only held-out images know of them. (The
+    others' positions were found by all images together, as all poses were.)
+
+    Args:
+        images: M images.
+        placement: placement of the scene.
+        cameras: M cameras in the scene's frame.
+        known: the images of a split to train on, which alone may be learned from; None for all, and nothing is said.
+    """
+    points, sound, sightings, notes = None, None, None, []
+    if images.tracks is not None and len(images.tracks.points):
+        every = images.tracks.at(placement.points(images.tracks.points).float())
+        held_out = torch.zeros(len(cameras), dtype=torch.bool) if known is None else _others(known, len(cameras))
+        chosen, tracks = every.known_without(held_out), every.without(held_out)
+        centers = cameras.camera_to_worlds[:, :, 3]
+        sightings = tracks.sightings(centers) if bool(tracks.confirmed().any()) else None
+        points, sound = every.points[chosen], every.points[chosen & (every.doubts == 0)]
+        lost = {"out of range": len(images.tracks.points) - len(every.points)}
+        lost["known to held-out images alone"] = int((~chosen).sum())
+        notes = [
+            _note(len(points), len(images.tracks.points), "are used", lost),
+            _on_distances(tracks, centers, chosen),
+        ]
+    if images.points is not None:
+        points = placement.points(images.points.double()).float()
+        points = sound = points[points.isfinite().all(-1)]
+        lost = {"out of range": len(images.points) - len(points)}
+        notes = [_note(len(points), len(images.points), "of a file are used", lost), *notes[1:]]
+    if known is not None and notes:
+        say(f"sparse points: {', '.join(notes)}")
+    if points is None or not len(points):
+        return SparsePoints(None, None, sightings)
+    return SparsePoints(points, points if sound is None or not len(sound) else sound, sightings)
+
+
+def _others(known: Tensor, count: int) -> Tensor:
+    """Return which of `count` images are not `known`, (count,) bool."""
+    others = torch.ones(count, dtype=torch.bool)
+    others[known] = False
+    return others
+
+
+def _on_distances(tracks: Tracks, centers: Tensor, chosen: Tensor) -> str:
+    """Return of how many of the `chosen` points (K,) images know the distance, and what the others lack."""
+    distant = torch.zeros(len(tracks.points), dtype=torch.bool)
+    distant[tracks.seen[tracks.known_distances(centers)]] = True
+    doubts = tracks.doubts[chosen & ~distant]
+    lacking = {doubt: int((doubts == number).sum()) for number, doubt in enumerate(DOUBTS) if number}
+    lacking[f"uncertain by more than {LARGEST_DEVIATION:.0%}"] = int((doubts == 0).sum())
+    return _note(int(distant.sum()), None, "at known distances", lacking)
+
+
+def _note(count: int, total: int | None, what: str, lost: Mapping[str, int]) -> str:
+    """Return how many points serve for something, and for each reason how many do not."""
+    reasons = ", ".join(f"{number:,} {reason}" for reason, number in lost.items() if number)
+    counted = f"{count:,}" if total is None else f"{count:,} of {total:,}"
+    return f"{counted} {what}" + (f" (not {reasons})" if reasons else "")

@@ -1,0 +1,255 @@
+"""Names of files in a data set, and on the disk: one place that matches the two where they are written differently.
+
+A name is first looked for as it is written, then with other separators, in another encoding, in another case, with
+another ending, and, if no name at all was found so, in another folder. A file is taken only if no other file and no
+other name comes into question, and what was taken is said.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import posixpath
+import unicodedata
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path, PurePath
+from urllib.parse import unquote
+
+from framework.base.console import say
+from framework.data.data_folder import IMAGE_SUFFIXES
+
+LIKELIEST = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp")
+"""Endings of a name that has none, in the order in which they are tried."""
+REDUCED = (1, 2, 4, 8)
+"""Integer factors by which images may have been reduced in advance; those of `images` by 2 are in `images_2`."""
+MOST_FILES = 200_000
+"""Maximum number of files below a folder among which names are looked for."""
+COMPANIONS = ("mask", "depth", "normal", "semantic", "segment", "label", "confidence", "thumb")
+"""Beginnings of the names of folders with files that have the names of images, in lower case."""
+MOST_FOLDERS = 100
+"""Maximum number of folders that are looked into to find one image."""
+MOST_NAMED = 3
+"""Maximum number of names that a message suggests."""
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Files that are meant by names."""
+
+    files: dict[str, str]
+    """Name as it is written -> path in the folder, with slashes; names that were not found are missing."""
+    notes: tuple[str, ...]
+    """For each way in which names differ from the disk, a sentence with their number and an example."""
+
+
+def on_disk(
+    folder: Path,
+    names: Sequence[str],
+    what: str = "images",
+    endings: Sequence[str] = IMAGE_SUFFIXES,
+    quiet: bool = False,
+    shared: int = 1,
+) -> tuple[Path, ...]:
+    """Return the files that names mean, and say where they are written differently on the disk.
+
+    Args:
+        folder: the folder that the names are relative to.
+        names: M names, as a data set has them.
+        what: what the files are, as a plural, in messages.
+        endings: endings of such files, in lower case.
+        quiet: whether nothing is said.
+        shared: number of parts at the end of a path, the file's name and folders, that a file in another folder has in
+            common with a name at least. What only accompanies images has their names, and needs its own folder: 2.
+
+    Returns:
+        M paths; those of names that were not found are as the names are written. A file may exist in a folder of
+        reduced images alone: the path is then that at full size.
+    """
+    found = match_names(folder, names, endings, shared)
+    for note in () if quiet else found.notes:
+        say(f"{folder}: {what}: {note}")
+    return tuple(
+        folder / found.files.get(name, name if PurePath(name).suffix else name + LIKELIEST[0]) for name in names
+    )
+
+
+def match_names(
+    folder: Path, names: Sequence[str], endings: Sequence[str] = IMAGE_SUFFIXES, shared: int = 1
+) -> Matches:
+    """Return the files that names mean, and in how many names differ from the disk, but say nothing.
+
+    Args:
+        folder: the folder that the names are relative to.
+        names: M names, as a data set has them.
+        endings: endings of such files, in lower case.
+        shared: as in `on_disk`.
+    """
+    files = {name: written for name in names if (written := _as_written(folder, name)) is not None}
+    missing = sorted(set(names) - set(files))
+    notes: list[str] = []
+    below = files_below(folder, endings) if missing else []
+    for words, key in SPELLINGS:
+        taken = {_tidy(file) for file in files.values()}
+        pairs = _paired(missing, [file for file in below if file not in taken], key)
+        if pairs and words:
+            notes.append(_note(pairs, len(names), words))
+        files |= pairs
+        missing = [name for name in missing if name not in pairs]
+    if missing and not files:
+        for key in (spelled, without_ending):
+            if files := _moved(missing, below, key, shared):
+                notes.append(_note(files, len(names), "in another folder"))
+                break
+    return Matches(files, tuple(notes))
+
+
+def spelled(name: str) -> str:
+    """Return `name` as it is compared: with slashes, without percent-encoding, composed (NFC), in lower case."""
+    return _decoded(name).casefold()
+
+
+def files_below(folder: Path, endings: Sequence[str] = IMAGE_SUFFIXES) -> list[str]:
+    """Return the paths of files below a folder, with slashes, sorted; of too many files none. Never raises.
+
+    A file in a folder of reduced images, such as images_2, counts as one in `images` too.
+
+    Args:
+        folder: the folder; what is hidden is left out.
+        endings: endings of the files, in lower case.
+    """
+    found: set[str] = set()
+    for place, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        inside = Path(place).relative_to(folder)
+        suited = [name for name in names if not name.startswith(".") and name.lower().endswith(tuple(endings))]
+        found |= {(inside / name).as_posix() for name in suited}
+        if inside.parts and (base := _full_size(inside.parts[0])):
+            found |= {Path(base, *inside.parts[1:], name).as_posix() for name in suited}
+        if len(found) > MOST_FILES:
+            return []
+    return sorted(found)
+
+
+def has_images(folder: Path) -> bool:
+    """Return whether there is an image in or below `folder`, as far as a quick look shows. Never raises."""
+    return any(_is_image(name) for _, _, names in islice(os.walk(folder), MOST_FOLDERS) for name in names)
+
+
+def nearest_on_disk(path: Path) -> str:
+    """Return words for an error message about a `path` that does not exist: what resembles it and does."""
+    parent = path.parent
+    while not parent.is_dir() and parent != parent.parent:
+        path, parent = parent, parent.parent
+    try:
+        there = sorted(islice((entry.name for entry in os.scandir(parent) if entry.name[0] != "."), MOST_FILES))
+    except OSError:
+        there = []
+    if not there:
+        return f"{parent} is empty"
+    lower = {name.casefold(): name for name in there}
+    near = difflib.get_close_matches(path.name.casefold(), lower, MOST_NAMED, 0.5) or list(lower)[:MOST_NAMED]
+    return f"{parent} has no {path.name}, but {', '.join(lower[name] for name in near)}"
+
+
+def _as_written(folder: Path, name: str) -> str | None:
+    """Return the name if there is such a file, else the name with the first likely ending with which there is one."""
+    if (folder / name).is_file():
+        return name
+    if _is_image(name):
+        return None
+    return next((name + ending for ending in LIKELIEST if (folder / (name + ending)).is_file()), None)
+
+
+def _is_image(name: str) -> bool:
+    return name.lower().endswith(IMAGE_SUFFIXES)
+
+
+def _full_size(name: str) -> str:
+    """Return the name of a folder of images without the factor by which they are reduced; '' if it has none."""
+    base, _, factor = name.rpartition("_")
+    return base if factor in map(str, REDUCED[1:]) else ""
+
+
+def _tidy(name: str) -> str:
+    return posixpath.normpath(name.strip().replace("\\", "/"))
+
+
+def _decoded(name: str) -> str:
+    return unicodedata.normalize("NFC", unquote(_tidy(name)))
+
+
+def without_ending(name: str) -> str:
+    """Return `name` as `spelled` does, without the ending of an image."""
+    path = spelled(name)
+    stem, dot, ending = path.rpartition(".")
+    return stem if dot + ending in IMAGE_SUFFIXES else path
+
+
+SPELLINGS: tuple[tuple[str, Callable[[str], str]], ...] = (
+    ("", str),
+    ("with other separators", _tidy),
+    ("in another encoding", _decoded),
+    ("in another case", spelled),
+    ("with another ending", without_ending),
+)
+"""Ways in which a name may differ from the disk, the strictest first: the words for it, and what stays the same."""
+
+
+def _paired(names: Iterable[str], files: Iterable[str], key: Callable[[str], str]) -> dict[str, str]:
+    """Return name -> file where exactly one name and one file have the same key."""
+    groups: defaultdict[str, tuple[list[str], list[str]]] = defaultdict(lambda: ([], []))
+    for name in names:
+        groups[key(name)][0].append(name)
+    for file in files:
+        groups[key(file)][1].append(file)
+    return {ours[0]: theirs[0] for ours, theirs in groups.values() if len(ours) == len(theirs) == 1}
+
+
+def _moved(names: Sequence[str], files: Sequence[str], key: Callable[[str], str], least: int) -> dict[str, str]:
+    """Return name -> file where more than half of the names are found with one beginning exchanged for another.
+
+    The beginnings are those that leave the longest common end of path for the most names. Of several, the folder
+    called images is preferred; if that does not decide, nothing is found. Ends of fewer than `least` parts do not
+    count, nor do folders of what accompanies images, such as masks.
+    """
+    keys = Counter(map(key, files))
+    by_key = {known: file for file in files if keys[known := key(file)] == 1}
+    ends: defaultdict[str, list[list[str]]] = defaultdict(list)
+    for known in by_key:
+        ends[posixpath.basename(known)].append(known.split("/"))
+    votes: Counter[tuple[str, str]] = Counter()
+    for name in names:
+        parts = key(name).split("/")
+        shared = [(_common_end(parts, there), there) for there in ends[parts[-1]]]
+        longest = max((length for length, _ in shared), default=0)
+        if longest < least:
+            continue
+        votes.update(
+            ("/".join(parts[:-length]), "/".join(there[:-length]))
+            for length, there in shared
+            if length == longest and not any(part.startswith(COMPANIONS) for part in there[:-length])
+        )
+    most = max(votes.values(), default=0)
+    best = sorted((-there.split("/").count("images"), cut, there) for (cut, there), n in votes.items() if n == most)
+    if 2 * most <= len(names) or (len(best) > 1 and best[0][0] == best[1][0]):
+        return {}
+    _, cut, there = best[0]
+    changed = {
+        name: posixpath.join(there, key(name)[len(cut) :].lstrip("/")) for name in names if key(name).startswith(cut)
+    }
+    return {name: by_key[moved] for name, moved in changed.items() if moved in by_key}
+
+
+def _common_end(a: Sequence[str], b: Sequence[str]) -> int:
+    """Return the number of parts that two paths have in common at their end."""
+    return next(
+        (n for n, (x, y) in enumerate(zip(reversed(a), reversed(b), strict=False)) if x != y), min(len(a), len(b))
+    )
+
+
+def _note(pairs: dict[str, str], total: int, words: str) -> str:
+    name, file = next(iter(pairs.items()))
+    return f"{len(pairs)} of {total} are on the disk {words}: {name} is taken to be {file}"

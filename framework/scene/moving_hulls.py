@@ -3,8 +3,7 @@
 A transparent pixel says that its ray is empty at the time of its image. At another moment, a ball is empty if the image
 shows the larger one to be empty that matter could have come from: its radius is greater by what matter moves meanwhile
 (`framework.scene.speed`). So a cell may be occupied at a moment if no image shows the ball around it to be empty and
-some `WITNESSES` of the images about that moment show matter in its direction. Where it is not known how far matter
-moves, each image speaks of its own moment alone, and a cell may be occupied at all times if it may be in one image.
+some `WITNESSES` of the images about that moment show matter in its direction.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ BOX_CELLS = 32
 
 @torch.no_grad()
 def moving_hulls(
-    silhouettes: Silhouettes, box: Tensor, resolution: int, times: Tensor, travel: Travel | None, slices: int = 1
+    silhouettes: Silhouettes, box: Tensor, resolution: int, times: Tensor, travel: Travel, slices: int = 1
 ) -> Tensor:
     """Return the cells of a box that may be occupied in each slice of time, of a scene that moves.
 
@@ -42,14 +41,12 @@ def moving_hulls(
         box: (2, 3) minimum and maximum corner.
         resolution: number n of cells along each axis.
         times: (M,) times of the images, in [0, 1].
-        travel: how far matter may move; None if that is not known.
+        travel: how far matter may move.
         slices: number T of equal parts of the time from 0 to 1.
 
     Returns:
         (T n^3,) bool; the index of cell (x, y, z) of slice s is ((s n + x) n + y) n + z.
     """
-    if travel is None and slices > 1:
-        return moving_hulls(silhouettes, box, resolution, times, None).repeat(slices)
     hulls = torch.zeros(slices, resolution**3, dtype=torch.bool, device=box.device)
     for number, images, margins in _moments(silhouettes, box, times, travel, slices):
         hulls[number] |= held_cells(silhouettes, images, box, resolution, margins, known=hulls[number])
@@ -57,7 +54,7 @@ def moving_hulls(
 
 
 @torch.no_grad()
-def moving_box(silhouettes: Silhouettes, box: Tensor, times: Tensor, travel: Travel | None) -> Tensor:
+def moving_box(silhouettes: Silhouettes, box: Tensor, times: Tensor, travel: Travel) -> Tensor:
     """Return the smallest box (2, 3), inside `box`, of all that may be occupied at any time, of a scene that moves.
 
     If no image has matter at its border, what is outside an image's frame is taken to be empty, too.
@@ -66,7 +63,7 @@ def moving_box(silhouettes: Silhouettes, box: Tensor, times: Tensor, travel: Tra
         silhouettes: silhouettes of the M training images.
         box: (2, 3) minimum and maximum corner.
         times: (M,) times of the images, in [0, 1].
-        travel: how far matter may move; None if that is not known.
+        travel: how far matter may move.
     """
     silhouettes = silhouettes.closed_if_whole()
     for _ in range(3):  # each time with smaller cells
@@ -92,16 +89,13 @@ def nearest(margins: Tensor) -> list[int]:
 
 
 def _moments(
-    silhouettes: Silhouettes, box: Tensor, times: Tensor, travel: Travel | None, slices: int
+    silhouettes: Silhouettes, box: Tensor, times: Tensor, travel: Travel, slices: int
 ) -> Iterator[tuple[int, list[int], list[float]]]:
     """Yield the slice of each moment, the images about it, and for each how far matter may move meanwhile.
 
     `silhouettes`, `box`, `times`, `travel` and `slices` are as in `moving_hulls`.
     """
     images = silhouettes.at_full_size
-    if travel is None:
-        yield from ((0, [image], [0.0]) for image in images)
-        return
     taken = travel.at(times.cpu()[images])
     ends = travel.at(torch.linspace(0, 1, slices + 1))
     span = max(SPAN * float((box[1] - box[0]).max()), float(ends[-1] - ends[0]) / MOST_MOMENTS)

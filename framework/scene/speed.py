@@ -20,10 +20,10 @@ from framework.geometry.bounds import intersect_box
 from framework.scene.moving_hulls import nearest
 from framework.scene.silhouettes import Silhouettes, held_balls, held_cells
 
-LEAST_TIMES = 16
-"""Minimum number of different times of the images; from fewer, no speed is found."""
+LEAST_IMAGES, LEAST_TIMES = 24, 8
+"""Minimum number of images, and of their different times; from fewer, no speed is found."""
 SLOWEST = 0.25
-"""First speed that is tried, longest edges of the box for the time from 0 to 1. Lower ones take long and save little."""
+"""First speed that is tried, longest edges of the box for the time from 0 to 1. Lower ones save little."""
 FASTER = 2**0.5
 """Factor by which a speed is raised."""
 SAFETY = 2**0.5
@@ -68,7 +68,7 @@ class _Rays:
 
 @torch.no_grad()
 def travel_of(silhouettes: Silhouettes, box: Tensor, times: Tensor) -> Travel | None:
-    """Return how far matter may move, with some `SAFETY`; None if the images have too few times to tell.
+    """Return how far matter may move, with some `SAFETY`; None if the images or their times are too few to tell.
 
     Args:
         silhouettes: silhouettes of the M training images.
@@ -80,7 +80,7 @@ def travel_of(silhouettes: Silhouettes, box: Tensor, times: Tensor) -> Travel | 
     taken = times.cpu()[images].double()
     images, taken = [images[i] for i in taken.argsort(stable=True)], taken.sort(stable=True).values
     knots, which = taken.unique(return_inverse=True)
-    if len(knots) < LEAST_TIMES:
+    if len(images) < LEAST_IMAGES or len(knots) < LEAST_TIMES:
         return None
     left = _rays_to_explain(silhouettes, images, box)
     spacing = float((box[1] - box[0]).norm()) / BALLS

@@ -36,6 +36,7 @@ from framework.data.pixel_cache import PixelMemory
 from framework.data.pixel_set import PixelSet
 from framework.data.scene import Scene
 from framework.data.sparse_depth import SparseDepth, sparse_depth
+from framework.data.travel import Travel
 
 Masks = Literal["auto", "ignored", "empty"]
 """Meaning of masked-out pixels: nothing is known about them, or nothing is there."""
@@ -82,6 +83,8 @@ class Dataset:
     """(M,) int64 on the CPU, number of the scene that each image shows; None if all show the same."""
     source_images: Tensor | None = None
     """(M,) bool on the CPU, images that a method may render the others from, and is not judged by; None without."""
+    travel: Travel | None = None
+    """How far matter may move, on the CPU, found from the images; None if that is unknown, or nothing asks for it."""
 
     def __len__(self) -> int:
         return len(self.cameras)

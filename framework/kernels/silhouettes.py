@@ -17,8 +17,8 @@ from framework.kernels import native
 from framework.kernels.dispatch import BOOL, CPP, Operation
 
 _sums = native.Function("opaque_sums", "pqqp")
-_hold = native.Function("hold_balls", "pqfpffffpqqipi")
-_near = native.Function("pixels_near_balls", "pqfpffffpqqpi")
+_hold = native.Function("hold_balls", "pqfpffffpqqiipi")
+_near = native.Function("pixels_near_balls", "pqfpffffpqqipi")
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,8 @@ class Photograph:
     """Principal point along y, pixels."""
     sums: Tensor
     """(H + 1, W + 1) int32 sums of the pixels that are not fully transparent (`opaque_sums`)."""
+    closed: bool = False
+    """Whether there is nothing outside the frame, as if the image went on, transparent, on all sides."""
 
     @property
     def height(self) -> int:
@@ -58,7 +60,7 @@ class Photograph:
             native.pointer(centers, "the centres", (len(centers), 3)), len(centers), radius,
             native.pointer(self.pose, "the pose", (3, 4)), self.fx, self.fy, self.cx, self.cy,
             native.pointer(self.sums, "the sums", (self.height + 1, self.width + 1), torch.int32),
-            self.height, self.width,
+            self.height, self.width, int(self.closed),
         )  # fmt: skip
 
 
@@ -95,7 +97,7 @@ def footprint(photograph: Photograph, centers: Tensor, radius: float) -> tuple[T
 
     Returns:
         left, right, top and bottom (4, N) int64 as numbers of pixel corners, clamped to the image; and (N,) bool, True
-        for balls in front of the camera whose rectangle is entirely inside the image.
+        for balls in front of the camera whose rectangle is entirely inside the image, or anywhere if it is closed.
     """
     pose, depth = photograph.pose, photograph.depth(centers)
     nearest = depth - radius
@@ -111,7 +113,8 @@ def footprint(photograph: Photograph, centers: Tensor, radius: float) -> tuple[T
     )
     height, width = photograph.height, photograph.width
     limits = torch.tensor([[width], [width], [height], [height]], device=edges.device)
-    whole = (nearest > 0) & (edges >= 0).all(0) & (edges <= limits).all(0)
+    inside = (edges >= 0).all(0) & (edges <= limits).all(0)
+    whole = (nearest > 0) & (inside | photograph.closed)
     return torch.minimum(edges.nan_to_num().clamp(min=0), limits).long(), whole
 
 
@@ -137,7 +140,8 @@ def hold_balls_reference(photograph: Photograph, centers: Tensor, radius: float,
 def hold_balls(photograph: Photograph, centers: Tensor, radius: float, held: Tensor, every: bool) -> None:
     """Update, in place, which balls may hold matter, by one image.
 
-    An image shows a ball to be empty if the ball's `footprint` is entirely inside the image and has no opaque pixel. It
+    An image shows a ball to be empty if the ball's `footprint` is entirely inside the image, or anywhere in front of
+    the camera if it is closed, and has no opaque pixel. It
     shows matter in a ball's direction if the part of the footprint that is inside the image has an opaque pixel.
 
     Args:

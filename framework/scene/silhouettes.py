@@ -6,7 +6,7 @@ no opaque pixel can be skipped for good, and so can the pixels whose ray meets n
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,26 +20,19 @@ from framework.kernels.silhouettes import Photograph, hold_balls, opaque_sums, p
 
 COARSEST = 8
 """Maximum side of the first cubes tested, cells."""
-FASTEST = 0.5
-"""Speed that matter is assumed not to exceed, in longest edges of the box for the time from 0 to 1."""
-REACH = 0.05
-"""Distance, longest edges of the box, that matter may move between a moment and the images that are taken for it."""
 WITNESSES = 3
-"""Images about a moment, if there are as many, that must show matter in the direction of what may be occupied. Without
-them much is left that no image has in its frame at that moment."""
-MOST_MOMENTS = 32
-"""Maximum number of moments whose hulls make up those of slices."""
-FRAME = 400
-"""Maximum side of the images by which the smallest box of a moving scene is found, pixels."""
-BOX_CELLS = 32
-"""Cells along each axis by which the smallest box of a moving scene is found."""
+"""Images, if there are as many, that must show matter in the direction of what may be occupied in a scene that moves.
+Without them much is left that no image has in its frame at that moment."""
+KEPT_COUNTS = 48
+"""Number of images whose sums are kept, of images that exceed the memory."""
 
 
 class _Counts(Sequence[Tensor]):
-    """The cumulative sums of a data set's images, of which only the last requested is kept in memory."""
+    """The cumulative sums of a data set's images, of which only those requested last are kept in memory."""
 
     def __init__(self, dataset: Dataset) -> None:
-        self._dataset, self._last = dataset, (-1, torch.empty(0))
+        self._dataset = dataset
+        self._kept: dict[int, Tensor] = {}
 
     def __len__(self) -> int:
         return len(self._dataset)
@@ -47,12 +40,14 @@ class _Counts(Sequence[Tensor]):
     def __getitem__(self, image: Any) -> Any:
         if not 0 <= image < len(self):
             raise IndexError(image)
-        if self._last[0] != image:
+        if image not in self._kept:
             opaque, kept = self._dataset.image(image)[..., 3] > 0, self._dataset.kept_of(image)
             if kept is not None:
                 opaque |= ~kept  # nothing is known about these
-            self._last = image, opaque_sums(opaque)
-        return self._last[1]
+            if len(self._kept) == KEPT_COUNTS:
+                del self._kept[next(iter(self._kept))]
+            self._kept[image] = opaque_sums(opaque)
+        return self._kept[image]
 
 
 @dataclass(frozen=True)
@@ -63,6 +58,8 @@ class Silhouettes:
     """Images with alpha, and pinhole cameras."""
     sums: Sequence[Tensor]
     """M tensors (H + 1, W + 1) int32: number of such pixels above and to the left of a pixel's corner."""
+    closed: bool = False
+    """Whether there is nothing outside the images' frames."""
 
     @classmethod
     def of(cls, dataset: Dataset) -> Silhouettes:
@@ -78,34 +75,14 @@ class Silhouettes:
     def __len__(self) -> int:
         return len(self.sums)
 
-    def touch_border(self, image: int) -> bool:
-        """Return whether image `image` has a pixel at its border that is not fully transparent."""
+    def closed_if_whole(self) -> Silhouettes:
+        """Return silhouettes outside whose frames there is nothing, if no image cuts through what it shows."""
+        return replace(self, closed=not any(self._touch_border(image) for image in self.at_full_size))
+
+    def _touch_border(self, image: int) -> bool:
         sums = self.sums[image]
         inner = sums[-2, -2] - sums[-2, 1] - sums[1, -2] + sums[1, 1]
         return bool(sums[-1, -1] > inner)
-
-    def widened(self) -> Silhouettes:
-        """Return silhouettes in frames of twice the size, empty around the images, in at most `FRAME` pixels.
-
-        This is what the images show if none cuts through what it shows: nothing is outside their frames, either.
-        """
-        cameras, sums = self.dataset.cameras, []
-        factor = max(-(-int(torch.maximum(cameras.widths, cameras.heights).max()) // (FRAME // 2)), 1)
-        height, width = (int(size.max()) // (2 * factor) for size in (cameras.heights, cameras.widths))
-        for own in self.sums:
-            rows, columns = (
-                (torch.arange(-edge, -(-size // factor) + edge + 1, device=own.device) * factor).clamp(0, size)
-                for size, edge in ((own.shape[0] - 1, height), (own.shape[1] - 1, width))
-            )
-            sums.append(own[rows][:, columns].contiguous())
-        cameras = replace(
-            cameras,
-            fx=cameras.fx / factor,
-            fy=cameras.fy / factor,
-            cx=cameras.cx / factor + width,
-            cy=cameras.cy / factor + height,
-        )
-        return Silhouettes(replace(self.dataset, cameras=cameras), tuple(sums))
 
     @property
     def at_full_size(self) -> list[int]:
@@ -117,7 +94,7 @@ class Silhouettes:
         """Return camera and sums of image `image`."""
         cameras = self.dataset.cameras
         fx, fy, cx, cy = cameras.intrinsics[image]
-        return Photograph(cameras.camera_to_worlds[image].contiguous(), fx, fy, cx, cy, self.sums[image])
+        return Photograph(cameras.camera_to_worlds[image].contiguous(), fx, fy, cx, cy, self.sums[image], self.closed)
 
 
 @torch.no_grad()
@@ -132,81 +109,10 @@ def visual_hull(silhouettes: Silhouettes, box: Tensor, resolution: int) -> Tenso
     Returns:
         (n^3,) bool; the index of a cell is (x n + y) n + z.
     """
-    return _held(silhouettes, silhouettes.at_full_size, box, resolution)
+    return held_cells(silhouettes, silhouettes.at_full_size, box, resolution)
 
 
-@torch.no_grad()
-def moving_hulls(silhouettes: Silhouettes, box: Tensor, resolution: int, times: Tensor, slices: int = 1) -> Tensor:
-    """Return the cells of a box that may be occupied in each slice of time, of a scene that moves.
-
-    A transparent pixel says that its ray is empty at the time of its image. At another moment, a ball is empty if the
-    image shows the larger one to be empty that matter could have come from: its radius is greater by what matter moves
-    meanwhile, at most `FASTEST`. So a cell may be occupied at a moment if no image shows the ball around it to be empty
-    and some `WITNESSES` of the images about that time show matter in its direction. A slice has the cells of all its
-    moments.
-
-    Args:
-        silhouettes: silhouettes of the M training images.
-        box: (2, 3) minimum and maximum corner.
-        resolution: number n of cells along each axis.
-        times: (M,) times of the images, in [0, 1].
-        slices: number T of equal parts of the time from 0 to 1.
-
-    Returns:
-        (T n^3,) bool; the index of cell (x, y, z) of slice s is ((s n + x) n + y) n + z.
-    """
-    hulls = torch.zeros(slices, resolution**3, dtype=torch.bool, device=box.device)
-    for number, images, margins in _moments(silhouettes, box, times, slices):
-        hulls[number] |= _held(silhouettes, images, box, resolution, margins, known=hulls[number])
-    return hulls.view(-1)
-
-
-@torch.no_grad()
-def moving_box(silhouettes: Silhouettes, box: Tensor, times: Tensor) -> Tensor:
-    """Return the smallest box (2, 3), inside `box`, of all that may be occupied at any time, of a scene that moves.
-
-    If no image has matter at its border, what is outside an image's frame is taken to be empty, too.
-
-    Args:
-        silhouettes: silhouettes of the M training images.
-        box: (2, 3) minimum and maximum corner.
-        times: (M,) times of the images, in [0, 1].
-    """
-    if not any(silhouettes.touch_border(image) for image in silhouettes.at_full_size):
-        silhouettes = silhouettes.widened()
-    for _ in range(3):  # each time with smaller cells
-        inside = torch.zeros((BOX_CELLS,) * 3, dtype=torch.bool, device=box.device)
-        ends = None
-        for _, images, margins in _moments(silhouettes, box, times, 1):
-            inside |= _held(silhouettes, images, box, BOX_CELLS, margins, known=inside.view(-1)).view_as(inside)
-            if len(cells := inside.nonzero()):
-                ends = torch.stack([cells.amin(0), cells.amax(0) + 1])
-                (x0, y0, z0), (x1, y1, z1) = ends.tolist()
-                inside[x0:x1, y0:y1, z0:z1] = True  # what is in the middle does not change the box
-        if ends is None:
-            return box
-        box = box[0] + (box[1] - box[0]) * ends / BOX_CELLS
-    return box
-
-
-def _moments(
-    silhouettes: Silhouettes, box: Tensor, times: Tensor, slices: int
-) -> Iterator[tuple[int, list[int], list[float]]]:
-    """Yield the slice of each moment, the images about it, and for each how far matter may move meanwhile.
-
-    `silhouettes`, `box`, `times` and `slices` are as in `moving_hulls`.
-    """
-    images = silhouettes.at_full_size
-    taken = times.cpu()[images]
-    parts = max(round(min(len(taken.unique()), MOST_MOMENTS) / slices), 1)
-    speed, half = FASTEST * float((box[1] - box[0]).max()), 0.5 / (slices * parts)
-    for part in range(slices * parts):
-        apart = (taken - (2 * part + 1) * half).abs()
-        near = (apart <= max(REACH / FASTEST, float(apart.min()))).nonzero().squeeze(-1).tolist()
-        yield part // parts, [images[i] for i in near], [speed * (float(apart[i]) + half) for i in near]
-
-
-def _held(
+def held_cells(
     silhouettes: Silhouettes,
     images: Sequence[int],
     box: Tensor,
@@ -219,8 +125,8 @@ def _held(
     `silhouettes`, `box` and `resolution` are as in `visual_hull`.
 
     Args:
-        margins: distance, for each image, up to which around a cell all must be shown to be empty; `WITNESSES` must
-            then show matter in the cell's direction, too. None for a still scene, without either.
+        margins: distance, for each image, up to which around a cell all must be shown to be empty; `WITNESSES` of the
+            images must then show matter in the cell's direction, too. None for a still scene, without either.
         known: (n^3,) bool, cells that need not be found; None for none.
     """
     size = min(COARSEST, 1 << (resolution - 1).bit_length())
@@ -232,13 +138,7 @@ def _held(
         low = box[0] + (box[1] - box[0]) * cubes / resolution
         edge = (box[1] - box[0]) * size / resolution
         centers, radius = (low + edge / 2).contiguous(), float(edge.norm()) / 2
-        held = torch.ones(len(cubes), dtype=torch.bool, device=box.device)
-        reach = [radius + margin for margin in margins or [0.0] * len(images)]
-        for image, r in zip(images, reach, strict=True):
-            hold_balls(silhouettes.photograph(image), centers, r, held, every=True)
-        if margins is not None:  # only of what is left, which is little
-            held[held.clone()] = _witnessed(silhouettes, images, centers[held], reach)
-        cubes = cubes[held]
+        cubes = cubes[held_balls(silhouettes, images, centers, radius, margins)]
         if size == 1:
             break
         size //= 2
@@ -248,6 +148,26 @@ def _held(
     hull = torch.zeros(resolution**3, dtype=torch.bool, device=box.device)
     hull[(cubes[:, 0] * resolution + cubes[:, 1]) * resolution + cubes[:, 2]] = True
     return hull
+
+
+def held_balls(
+    silhouettes: Silhouettes, images: Sequence[int], centers: Tensor, radius: float, margins: Sequence[float] | None
+) -> Tensor:
+    """Return the balls (N,) bool that none of `images` shows to be empty.
+
+    `silhouettes`, `images` and `margins` are as in `held_cells`.
+
+    Args:
+        centers: (N, 3) centres of the balls, contiguous.
+        radius: radius of the balls, scene units.
+    """
+    held = torch.ones(len(centers), dtype=torch.bool, device=centers.device)
+    reach = [radius + margin for margin in margins or [0.0] * len(images)]
+    for image, r in zip(images, reach, strict=True):
+        hold_balls(silhouettes.photograph(image), centers, r, held, every=True)
+    if margins is not None:  # only of what is left, which is little
+        held[held.clone()] = _witnessed(silhouettes, images, centers[held], reach)
+    return held
 
 
 def _whole_cubes(cells: Tensor, resolution: int, size: int) -> Tensor:

@@ -26,9 +26,11 @@ from framework.ray_model import RayModel
 from framework.samplers.base import SkipsCells
 from framework.samplers.choice import SamplingConfig
 from framework.scene.motion import MotionConfig
+from framework.scene.moving_hulls import moving_box, moving_hulls
 from framework.scene.profile import SceneProfile
 from framework.scene.seen_cells import seen_cells
-from framework.scene.silhouettes import Silhouettes, moving_box, moving_hulls, pixels_near, visual_hull
+from framework.scene.silhouettes import Silhouettes, pixels_near, visual_hull
+from framework.scene.speed import LEAST_IMAGES, LEAST_TIMES, travel_of
 from framework.training.ray_starts import nearest_shown, starts_checked
 
 
@@ -48,20 +50,29 @@ def decided(method: str, config: TrainConfig, dataset: Dataset) -> tuple[Dataset
     declared = load_method(method)
     settings, made = declared.decided(config, dataset.scene)
     settings, made = starts_checked(config, settings, made, dataset)
-    samples_in_box = isinstance(settings, SamplingConfig) and str(settings.sampler) == "occupancy"
-    if not isinstance(settings, MotionConfig) or not settings.smallest_box or not samples_in_box:
+    times = dataset.times
+    if times is None or not isinstance(settings, SamplingConfig) or str(settings.sampler) != "occupancy":
         return dataset, settings, made
-    if dataset.times is None or dataset.scene.unbounded or _no_silhouettes(dataset) is not None:
+    smaller = isinstance(settings, MotionConfig) and settings.smallest_box
+    if not (smaller or settings.silhouette_cells) or dataset.scene.unbounded or _no_silhouettes(dataset) is not None:
         return dataset, settings, made
-    old = dataset.scene.box
-    box = moving_box(Silhouettes.of(dataset), old, dataset.times)
-    share = float(((box[1] - box[0]) / (old[1] - old[0])).prod())
-    shorter = float((box[1] - box[0]).norm() / (old[1] - old[0]).norm())
-    config = _with_steps_as_long(config, declared.config, settings, shorter)
-    dataset = replace(dataset, scene=replace(dataset.scene, box=box))
-    settings, made = declared.decided(config, dataset.scene)
-    small = Decision("box", f"{100 * share:.0f}% of the data's", "alpha shows that nothing is ever outside")
-    return dataset, settings, [small, *made]
+    silhouettes, old = Silhouettes.of(dataset), dataset.scene.box.cpu()
+    dataset = replace(dataset, travel=travel_of(silhouettes, old, times))
+    if dataset.travel is None:
+        return dataset, settings, made
+    edges = (
+        f"at most {dataset.travel.fastest / float((old[1] - old[0]).max()):.2g} of the box's longest edge in all time"
+    )
+    found = [Decision("motion", edges, "slower matter could not be where alpha shows some")]
+    if smaller:
+        box = moving_box(silhouettes, old, times, dataset.travel)
+        share = float(((box[1] - box[0]) / (old[1] - old[0])).prod())
+        shorter = float((box[1] - box[0]).norm() / (old[1] - old[0]).norm())
+        config = _with_steps_as_long(config, declared.config, settings, shorter)
+        dataset = replace(dataset, scene=replace(dataset.scene, box=box.to(dataset.device)))
+        settings, made = declared.decided(config, dataset.scene)
+        found.append(Decision("box", f"{100 * share:.0f}% of the data's", "alpha shows that nothing is ever outside"))
+    return dataset, settings, [*found, *made]
 
 
 def _with_steps_as_long(config: TrainConfig, default: TrainConfig, decided: TrainConfig, shorter: float) -> TrainConfig:
@@ -94,7 +105,7 @@ def profile_of(
         reason = f"{'the photographs have' if scene.has_alpha else 'no photograph has'} alpha"
         decisions.append(Decision("background", training_background(config.background, scene.has_alpha), reason))
     if isinstance(config, SamplingConfig) and config.silhouette_cells and parts(model, SkipsCells):
-        obstacle = _no_silhouettes(dataset)
+        obstacle = _no_hull(dataset)
         outside = "what is outside all of them" if scene.moving else "space outside them"
         choice = "not used" if obstacle else f"{outside} is skipped from the start"
         decisions.append(Decision("silhouettes", choice, obstacle or "alpha shows them"))
@@ -202,11 +213,11 @@ def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset
     samplers = parts(model, SkipsCells)
     if not samplers or not isinstance(config, SamplingConfig) or not config.silhouette_cells:
         return dataset
-    if _no_silhouettes(dataset) is not None:
+    if _no_hull(dataset) is not None:
         return dataset
     silhouettes, moving = Silhouettes.of(dataset), model.scene.moving
     if fresh:
-        hulls = [_hull(silhouettes, sampler, dataset.times) for sampler in samplers]
+        hulls = [_hull(silhouettes, sampler, dataset) for sampler in samplers]
         if not all(bool(hull.any()) for hull in hulls):
             say("warning: the photographs' alpha leaves no part of the box; it is not used to skip anything")
             return dataset
@@ -223,13 +234,18 @@ def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset
     return dataset.drawing(PixelSet.shared(near, 1))
 
 
-def _hull(silhouettes: Silhouettes, sampler: SkipsCells, times: Tensor | None) -> Tensor:
-    """Return the cells of `sampler` that `silhouettes`, taken at `times` if it moves, do not show to be empty."""
-    boxes, n = nested_boxes(sampler.box.cpu(), sampler.levels), sampler.resolution
-    if times is None:
+def _hull(silhouettes: Silhouettes, sampler: SkipsCells, dataset: Dataset) -> Tensor:
+    """Return the cells of `sampler` that `silhouettes`, those of `dataset`, do not show to be empty."""
+    boxes, n, times, travel = (
+        nested_boxes(sampler.box.cpu(), sampler.levels),
+        sampler.resolution,
+        dataset.times,
+        dataset.travel,
+    )
+    if times is None or travel is None:
         hulls = [visual_hull(silhouettes, box, n) for box in boxes]
     else:
-        hulls = [moving_hulls(silhouettes, box, n, times, sampler.slices) for box in boxes]
+        hulls = [moving_hulls(silhouettes, box, n, times, travel, sampler.slices) for box in boxes]
     return torch.cat(hulls).to(sampler.box.device)
 
 
@@ -241,3 +257,14 @@ def _no_silhouettes(dataset: Dataset) -> str | None:
         return "the box is in normalised device coordinates"
     camera = dataset.cameras.model
     return None if camera == "pinhole" else f"the camera is {camera}, not pinhole"
+
+
+def _no_hull(dataset: Dataset) -> str | None:
+    """Return why no cell can be emptied by the images' alpha; None if some can."""
+    obstacle = _no_silhouettes(dataset)
+    if obstacle is not None or dataset.times is None or dataset.travel is not None:
+        return obstacle
+    if dataset.scene.unbounded:
+        return "how fast something moves is found in a box alone"
+    few = f"{len(dataset)} images at {len(dataset.times.unique())} times"
+    return f"{few} are too few to tell how fast something moves: it takes {LEAST_IMAGES} at {LEAST_TIMES} times"

@@ -15,6 +15,7 @@ struct Photograph {
     float fx, fy, cx, cy;
     const int32_t* sums;
     int64_t height, width;
+    int closed;  // whether there is nothing outside the frame
 
     int32_t opaque_pixels(int64_t x0, int64_t x1, int64_t y0, int64_t y1) const {
         const int64_t stride = width + 1;
@@ -29,7 +30,7 @@ struct Rectangle {
 // Where a photograph shows LANES balls, to a pixel more on each side.
 struct Footprints {
     Floats depth;  // of the centres, along the camera's axis
-    Ints whole;    // those that lie in the photograph whole, in front of the camera
+    Ints whole;    // those that lie in the photograph whole, or outside of a closed one too, in front of the camera
     Ints x0, x1, y0, y1;
 
     // Of the balls with `count` centres (count, 3), of which the last one stands for all lanes after it.
@@ -49,7 +50,8 @@ struct Footprints {
         const Floats reach = radius / safe * std::max(photograph.fx, photograph.fy) * (1 + a * a + b * b) + 1;
         const Floats width = splat(float(photograph.width)), height = splat(float(photograph.height));
         const Floats left = column - reach, end = column + reach, top = row - reach, bottom = row + reach;
-        whole = (nearest > 0) & (left >= 0) & (end <= width) & (top >= 0) & (bottom <= height);
+        whole = nearest > 0;
+        if (!photograph.closed) whole &= (left >= 0) & (end <= width) & (top >= 0) & (bottom <= height);
         x0 = below(left, width), x1 = above(end, width), y0 = below(top, height), y1 = above(bottom, height);
     }
 
@@ -85,10 +87,10 @@ EXPORT int opaque_sums(const uint8_t* opaque, int64_t height, int64_t width, int
 // held (count): clears it for balls that the photograph shows whole and empty (every = 1), or sets it for balls in whose
 // direction it shows matter, and for balls around the camera's plane (every = 0).
 EXPORT int hold_balls(const float* centers, int64_t count, float radius, const float* pose, float fx, float fy,
-                      float cx, float cy, const int32_t* sums, int64_t height, int64_t width, int every, uint8_t* held,
-                      int threads) {
+                      float cx, float cy, const int32_t* sums, int64_t height, int64_t width, int closed, int every,
+                      uint8_t* held, int threads) {
     return guarded([&] {
-        const Photograph photograph{pose, fx, fy, cx, cy, sums, height, width};
+        const Photograph photograph{pose, fx, fy, cx, cy, sums, height, width, closed};
         for_ranges(threads, count, 4096, [&](int64_t begin, int64_t end) {
             for (int64_t n = begin; n < end; n += LANES) {
                 const int64_t count = std::min<int64_t>(LANES, end - n);
@@ -110,10 +112,10 @@ EXPORT int hold_balls(const float* centers, int64_t count, float radius, const f
 // near (height, width): whether an opaque pixel lies within twice the largest reach of a ball, or a ball that the
 // photograph does not show whole may be seen through the pixel.
 EXPORT int pixels_near_balls(const float* centers, int64_t count, float radius, const float* pose, float fx, float fy,
-                             float cx, float cy, const int32_t* sums, int64_t height, int64_t width, uint8_t* near,
-                             int threads) {
+                             float cx, float cy, const int32_t* sums, int64_t height, int64_t width, int closed,
+                             uint8_t* near, int threads) {
     return guarded([&] {
-        const Photograph photograph{pose, fx, fy, cx, cy, sums, height, width};
+        const Photograph photograph{pose, fx, fy, cx, cy, sums, height, width, closed};
         constexpr int64_t GRAIN = 4096;
         struct Part {
             float nearest = std::numeric_limits<float>::infinity();

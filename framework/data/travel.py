@@ -1,0 +1,50 @@
+"""How far matter may have moved since time 0."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Travel:
+    """The distance that matter may have moved since time 0, as a function of the time.
+
+    Between two times, no matter moves farther than their distances differ.
+    """
+
+    times: Tensor
+    """(K,) float64 increasing times, from 0 or less to 1 or more."""
+    distances: Tensor
+    """(K,) float64 distances at these times, scene units, none smaller than the one before; linear in between."""
+
+    @classmethod
+    def of(cls, times: Tensor, speeds: Tensor) -> Travel:
+        """Add up speeds.
+
+        Args:
+            times: (K,) increasing times in [0, 1].
+            speeds: (K,) speeds about these times, scene units for the time from 0 to 1. Between two times the larger
+                one counts, before the first time and after the last theirs.
+        """
+        ends = times.new_tensor([0.0, 1.0])
+        knots = torch.cat([ends[:1].minimum(times[:1]), times, ends[1:].maximum(times[-1:])]).double()
+        around = torch.cat([speeds[:1], speeds, speeds[-1:]]).double()
+        ways = knots.diff() * torch.maximum(around[1:], around[:-1])
+        return cls(knots, torch.cat([ways.new_zeros(1), ways.cumsum(0)]))
+
+    def at(self, times: Tensor) -> Tensor:
+        """Return the distances (N,) float64 at `times` (N,) in [0, 1]."""
+        times = times.double()
+        after = torch.searchsorted(self.times, times, right=True).clamp(1, len(self.times) - 1)
+        start, end = self.times[after - 1], self.times[after]
+        share = (times - start) / (end - start).clamp(min=torch.finfo(torch.float64).tiny)
+        return torch.lerp(self.distances[after - 1], self.distances[after], share.clamp(0, 1))
+
+    @property
+    def fastest(self) -> float:
+        """The greatest speed, scene units for the time from 0 to 1."""
+        spans = self.times.diff()
+        return float((self.distances.diff()[spans > 0] / spans[spans > 0]).max())

@@ -1,0 +1,107 @@
+"""Visual hulls of a scene that moves: space that transparent images show to be empty at a time.
+
+A transparent pixel says that its ray is empty at the time of its image. At another moment, a ball is empty if the image
+shows the larger one to be empty that matter could have come from: its radius is greater by what matter moves meanwhile
+(`framework.scene.speed`). So a cell may be occupied at a moment if no image shows the ball around it to be empty and
+some `WITNESSES` of the images about that moment show matter in its direction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from framework.data.travel import Travel
+from framework.scene.silhouettes import Silhouettes, held_cells
+
+NEAREST = 32
+"""Number of images that are asked about a moment: those since which, or until which, matter moves least."""
+SPAN = 1 / 64
+"""Distance, longest edges of the box, that matter may move within a moment, unless there would be too many moments."""
+MOST_MOMENTS = 96
+"""Maximum number of moments, beside one for each slice, whose hulls make up those of slices."""
+BOX_CELLS = 32
+"""Cells along each axis by which the smallest box of a moving scene is found."""
+
+
+@torch.no_grad()
+def moving_hulls(
+    silhouettes: Silhouettes, box: Tensor, resolution: int, times: Tensor, travel: Travel, slices: int = 1
+) -> Tensor:
+    """Return the cells of a box that may be occupied in each slice of time, of a scene that moves.
+
+    A slice has the cells of all its moments.
+
+    Args:
+        silhouettes: silhouettes of the M training images.
+        box: (2, 3) minimum and maximum corner.
+        resolution: number n of cells along each axis.
+        times: (M,) times of the images, in [0, 1].
+        travel: how far matter may move.
+        slices: number T of equal parts of the time from 0 to 1.
+
+    Returns:
+        (T n^3,) bool; the index of cell (x, y, z) of slice s is ((s n + x) n + y) n + z.
+    """
+    hulls = torch.zeros(slices, resolution**3, dtype=torch.bool, device=box.device)
+    for number, images, margins in _moments(silhouettes, box, times, travel, slices):
+        hulls[number] |= held_cells(silhouettes, images, box, resolution, margins, known=hulls[number])
+    return hulls.view(-1)
+
+
+@torch.no_grad()
+def moving_box(silhouettes: Silhouettes, box: Tensor, times: Tensor, travel: Travel) -> Tensor:
+    """Return the smallest box (2, 3), inside `box`, of all that may be occupied at any time, of a scene that moves.
+
+    If no image has matter at its border, what is outside an image's frame is taken to be empty, too.
+
+    Args:
+        silhouettes: silhouettes of the M training images.
+        box: (2, 3) minimum and maximum corner.
+        times: (M,) times of the images, in [0, 1].
+        travel: how far matter may move.
+    """
+    silhouettes = silhouettes.closed_if_whole()
+    for _ in range(3):  # each time with smaller cells
+        inside = torch.zeros((BOX_CELLS,) * 3, dtype=torch.bool, device=box.device)
+        ends = None
+        for _, images, margins in _moments(silhouettes, box, times, travel, 1):
+            inside |= held_cells(silhouettes, images, box, BOX_CELLS, margins, known=inside.view(-1)).view_as(inside)
+            if len(cells := inside.nonzero()):
+                ends = torch.stack([cells.amin(0), cells.amax(0) + 1])
+                (x0, y0, z0), (x1, y1, z1) = ends.tolist()
+                inside[x0:x1, y0:y1, z0:z1] = True  # what is in the middle does not change the box
+        if ends is None:
+            return box
+        box = box[0] + (box[1] - box[0]) * ends / BOX_CELLS
+    return box
+
+
+def nearest(margins: Tensor) -> list[int]:
+    """Return which `NEAREST` of `margins` (M,) are the smallest, the smallest first, and all as large as the last."""
+    largest = margins.kthvalue(min(NEAREST, len(margins))).values
+    chosen = (margins <= largest).nonzero().squeeze(-1)
+    return chosen[margins[chosen].argsort(stable=True)].tolist()
+
+
+def _moments(
+    silhouettes: Silhouettes, box: Tensor, times: Tensor, travel: Travel, slices: int
+) -> Iterator[tuple[int, list[int], list[float]]]:
+    """Yield the slice of each moment, the images about it, and for each how far matter may move meanwhile.
+
+    `silhouettes`, `box`, `times`, `travel` and `slices` are as in `moving_hulls`.
+    """
+    images = silhouettes.at_full_size
+    taken = travel.at(times.cpu()[images])
+    ends = travel.at(torch.linspace(0, 1, slices + 1))
+    span = max(SPAN * float((box[1] - box[0]).max()), float(ends[-1] - ends[0]) / MOST_MOMENTS)
+    for number, (first, last) in enumerate(pairwise(ends.tolist())):
+        parts = max(math.ceil((last - first) / span), 1)
+        for start, end in pairwise(torch.linspace(first, last, parts + 1, dtype=taken.dtype)):
+            margins = torch.maximum((taken - start).abs(), (taken - end).abs())
+            near = nearest(margins)
+            yield number, [images[i] for i in near], margins[near].tolist()

@@ -1,0 +1,159 @@
+"""How fast matter moves, found from the silhouettes alone: the slowest motion that explains all that they show.
+
+An opaque pixel needs matter on its ray at the time of its image. If matter is assumed to be slower than it is, other
+images seem to show its place to be empty, and nothing is left on the ray to be seen. So speeds are raised, about the
+times of images with such a ray, until there is none. What never moves is left out: behind what moves, it would explain
+the same pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from framework.cameras.cameras import Cameras
+from framework.data.travel import Travel
+from framework.geometry.bounds import intersect_box
+from framework.scene.moving_hulls import nearest
+from framework.scene.silhouettes import Silhouettes, held_balls, held_cells
+
+LEAST_IMAGES, LEAST_TIMES = 24, 8
+"""Minimum number of images, and of their different times; from fewer, no speed is found."""
+SLOWEST = 0.25
+"""First speed that is tried, longest edges of the box for the time from 0 to 1. Lower ones save little."""
+FASTER = 2**0.5
+"""Factor by which a speed is raised."""
+SAFETY = 2**0.5
+"""Factor by which matter may be faster than found: pixels, balls and what moves have a size, which is slack."""
+AROUND = 2
+"""Number of times, before and after that of an image with a ray left, about which speeds are raised."""
+MOST_RAYS = 2**15
+"""Number of rays that are tried, evenly over all images."""
+BALLS = 128
+"""Number of balls in a row that are as long as the box's diagonal."""
+STILL_CELLS = 64
+"""Cells along each axis by which what never moves is found."""
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """Rays through opaque pixels of an image, next to transparent ones, that must meet what moves."""
+
+    origins: Tensor
+    """(R, 3)."""
+    directions: Tensor
+    """(R, 3)."""
+    enter: Tensor
+    """(R,) distance at which a ray enters the box."""
+    leave: Tensor
+    """(R,) distance at which a ray leaves the box."""
+
+    def __len__(self) -> int:
+        return len(self.enter)
+
+    def __getitem__(self, index: Tensor) -> _Rays:
+        return _Rays(self.origins[index], self.directions[index], self.enter[index], self.leave[index])
+
+    def balls(self, spacing: float) -> tuple[Tensor, Tensor]:
+        """Return centres (N, 3) of balls along the rays, `spacing` apart, and for each the number (N,) of its ray."""
+        count = int(((self.leave - self.enter) / spacing).ceil().max())
+        positions = self.enter[:, None] + spacing * (torch.arange(count, device=self.enter.device) + 0.5)
+        owners, steps = (positions < self.leave[:, None] + spacing / 2).nonzero().unbind(1)
+        along = positions[owners, steps, None] * self.directions[owners]
+        return (self.origins[owners] + along).contiguous(), owners
+
+
+@torch.no_grad()
+def travel_of(silhouettes: Silhouettes, box: Tensor, times: Tensor) -> Travel | None:
+    """Return how far matter may move, with some `SAFETY`; None if the images or their times are too few to tell.
+
+    Args:
+        silhouettes: silhouettes of the M training images.
+        box: (2, 3) minimum and maximum corner of what the images show.
+        times: (M,) times of the images, in [0, 1].
+    """
+    silhouettes = silhouettes.closed_if_whole()
+    images = silhouettes.at_full_size
+    taken = times.cpu()[images].double()
+    images, taken = [images[i] for i in taken.argsort(stable=True)], taken.sort(stable=True).values
+    knots, which = taken.unique(return_inverse=True)
+    if len(images) < LEAST_IMAGES or len(knots) < LEAST_TIMES:
+        return None
+    left = _rays_to_explain(silhouettes, images, box)
+    spacing = float((box[1] - box[0]).norm()) / BALLS
+    speeds = torch.full_like(knots, SLOWEST * float((box[1] - box[0]).max()))
+    gaps = knots.diff()
+    enough = float((box[1] - box[0]).norm()) / torch.minimum(torch.cat([gaps[:1], gaps]), torch.cat([gaps, gaps[-1:]]))
+    while True:
+        travelled = Travel.of(knots, speeds).at(taken)
+        too_slow = torch.zeros_like(speeds, dtype=torch.bool)
+        for number, rays in enumerate(left):
+            left[number] = rays = rays[~_explained(silhouettes, images, number, rays, travelled, spacing)]
+            if len(rays):
+                middle = int(which[number])
+                too_slow[max(middle - AROUND, 0) : middle + AROUND + 1] = True
+        too_slow &= speeds < enough  # matter may be anywhere then; what is not explained yet is no motion
+        if not bool(too_slow.any()):
+            return Travel.of(knots, SAFETY * speeds)
+        speeds = torch.where(too_slow, FASTER * speeds, speeds)
+
+
+def _rays_to_explain(silhouettes: Silhouettes, images: Sequence[int], box: Tensor) -> list[_Rays]:
+    """Return, of each image, rays on which there must be something that moves."""
+    still = held_cells(silhouettes, images, box, STILL_CELLS, [0.0] * len(images))
+    most, found = max(MOST_RAYS // len(images), 1), []
+    cameras: Cameras = silhouettes.dataset.cameras
+    for image in images:
+        pixels = _edges(silhouettes, image).view(-1).nonzero().squeeze(-1)
+        pixels = pixels[:: -(-len(pixels) // most) or 1]
+        rays = cameras.pixel_rays(pixels + int(cameras.offsets[image]), 0.0, 1.0)
+        ahead = _Rays(rays.origins, rays.directions, *intersect_box(rays.origins, rays.directions, box))
+        ahead = ahead[ahead.leave > ahead.enter]
+        if len(ahead):
+            ahead = ahead[~_meet(still, ahead, box)]
+        found.append(ahead)
+    return found
+
+
+def _edges(silhouettes: Silhouettes, image: int) -> Tensor:
+    """Return the pixels (H, W) bool of an image that are opaque beside one that is not.
+
+    They show thin things and the ends of all others, which are the first to go astray.
+    """
+    sums, kept = silhouettes.sums[image], silhouettes.dataset.kept_of(image)
+    opaque = sums.diff(dim=0).diff(dim=1) > 0
+    clear = torch.nn.functional.pad(~opaque, (1, 1, 1, 1))
+    edges = opaque & (clear[:-2, 1:-1] | clear[2:, 1:-1] | clear[1:-1, :-2] | clear[1:-1, 2:])
+    return edges if kept is None else edges & kept.to(edges.device)
+
+
+def _meet(cells: Tensor, rays: _Rays, box: Tensor) -> Tensor:
+    """Return which rays (R,) pass through one of `cells` (n^3,) bool of a box."""
+    centers, owners = rays.balls(float((box[1] - box[0]).min()) / STILL_CELLS / 2)
+    place = ((centers - box[0]) / (box[1] - box[0]) * STILL_CELLS).long().clamp(0, STILL_CELLS - 1)
+    inside = cells[(place[:, 0] * STILL_CELLS + place[:, 1]) * STILL_CELLS + place[:, 2]]
+    return _any_of(owners[inside], len(rays))
+
+
+def _explained(
+    silhouettes: Silhouettes, images: Sequence[int], number: int, rays: _Rays, travelled: Tensor, spacing: float
+) -> Tensor:
+    """Return on which rays (R,) of image `number` the other images, at `travelled` (M,), leave room for something."""
+    if not len(rays):
+        return torch.zeros(0, dtype=torch.bool)
+    margins = (travelled - travelled[number]).abs()
+    margins[number] = torch.inf
+    near = [other for other in nearest(margins) if other != number]
+    centers, owners = rays.balls(spacing)
+    held = held_balls(silhouettes, [images[i] for i in near], centers, spacing / 2, margins[near].tolist())
+    return _any_of(owners[held], len(rays))
+
+
+def _any_of(owners: Tensor, count: int) -> Tensor:
+    """Return which of `count` numbers are among `owners`, (count,) bool."""
+    found = torch.zeros(count, dtype=torch.bool, device=owners.device)
+    found[owners] = True
+    return found

@@ -15,7 +15,7 @@ from framework import Cameras, DataError
 from framework.base.evenly_spaced import evenly_spaced
 from framework.cameras.poses import MOST_LOOK, NEAR, Placement, looked_at, place
 from framework.data.image_files import may_be_transparent, read_image
-from framework.scene.enclosing_box import enclosing_box
+from framework.scene.enclosing_box import enclosing_box, is_larger
 
 HALF_SIZE = 1.5
 """Half the side of a scene's box, scene units: that of NeRF-Synthetic, for which methods' settings were found."""
@@ -69,8 +69,9 @@ def find_region(
     """Return the region that renders show.
 
     Of a still scene it is the cube around a box that holds all matter by the images' silhouettes (`enclosing_box`), if
-    they show all of it. Otherwise it is around the point that the cameras look at, as large as the images show there.
-    If they look at no one point, it is the cube that the file states, else one around the cameras.
+    they show enough of it. Otherwise it is around the point that the cameras look at, as large as the images show
+    there. If they look at no one point, it is the cube that the file states, else one around the cameras. Without
+    alpha, or if matter is larger than the images, there may be more outside.
 
     Args:
         cameras: M cameras in the input's frame.
@@ -80,39 +81,39 @@ def find_region(
     """
     few = evenly_spaced(len(images), MOST_IMAGES)
     opaque = _opaque([images[index] for index in few.tolist()])
-    origins = cameras.camera_to_worlds[:, :, 3].double()
-    central = cameras.model not in ("orthographic", "equirectangular")
-    box = enclosing_box(cameras[few], opaque) if central and not moving and opaque is not None else None
-    if box is not None:
-        near, far = _distances(origins, box)
-        return Region(
-            center=box.mean(0),
-            half=float((box[1] - box[0]).max()) / 2,
-            near=near * SLACK,
-            far=far / SLACK,
-            unbounded=False,
-            reason=f"which holds what the silhouettes of {len(few)} images leave",
-        )
     seen = _where_cameras_look(cameras, every=opaque is not None)
-    if seen is not None and moving and opaque is not None:  # alpha, and no silhouettes of one time
+    ends, box, reason = False, None, LOOKED_AT
+    if opaque is not None:
+        ends = seen is not None and (moving or not is_larger(opaque))
+        central = cameras.model not in ("orthographic", "equirectangular")
+        if central and not moving:  # silhouettes of different times say nothing together
+            box = enclosing_box(cameras[few], opaque)
+            if box is None and seen is not None and ends:
+                box = enclosing_box(cameras[few], opaque, _cube(*seen))
+    if box is not None:
+        center, half = box.mean(0), float((box[1] - box[0]).max()) / 2
+        ends, reason = True, f"which holds what the silhouettes of {len(few)} images leave"
+    elif seen is not None:
         center, half = seen
-        near, far = _distances(origins, torch.stack([center - half, center + half]))
-        return Region(center, half, near * SLACK, far / SLACK, False, LOOKED_AT)
-    if seen is not None:
-        (center, half), reason = seen, LOOKED_AT
     elif cube is not None:
         center, half, reason = cube[0], cube[1] / 2, "that of the file's aabb_scale"
     else:
         around = place(cameras.camera_to_worlds, "none", "poses")
         center, half, reason = -around.transform[:, 3].double(), 1 / around.scale, "which holds the cameras"
-    return Region(center, half, NEAR * half / HALF_SIZE, FAR * half / HALF_SIZE, True, reason)
+    near, far = NEAR * half / HALF_SIZE, FAR * half / HALF_SIZE
+    if ends:
+        near, far = _distances(cameras, _cube(center, half) if box is None else box)
+    return Region(center, half, near, far, not ends, reason)
+
+
+def _cube(center: Tensor, half: float) -> Tensor:
+    return torch.stack([center - half, center + half])
 
 
 def cube_at_origin(cameras: Cameras, half: float) -> Region:
     """Return a cube of half side `half` around the origin, and near and far of `cameras` that see it."""
-    cube = torch.tensor([[-half] * 3, [half] * 3], dtype=torch.float64)
-    near, far = _distances(cameras.camera_to_worlds[:, :, 3].double(), cube)
-    return Region(torch.zeros(3, dtype=torch.float64), half, near * SLACK, far / SLACK, False, "that of --half-size")
+    center = torch.zeros(3, dtype=torch.float64)
+    return Region(center, half, *_distances(cameras, _cube(center, half)), False, "that of --half-size")
 
 
 def _opaque(images: Sequence[Path]) -> list[Tensor] | None:
@@ -134,15 +135,16 @@ def _opaque_pixels(path: Path) -> Tensor:
         return torch.ones(1, 1, dtype=torch.bool)
 
 
-def _distances(origins: Tensor, box: Tensor) -> tuple[float, float]:
-    """Return the smallest and the largest distance between `origins` (M, 3) and points of `box` (2, 3).
+def _distances(cameras: Cameras, box: Tensor) -> tuple[float, float]:
+    """Return near and far by the smallest and the largest distance between `cameras` and points of `box` (2, 3).
 
-    The smallest is at least a part of the box that cameras inside it hardly resolve.
+    Near is at least a part of the box that cameras inside it hardly resolve.
     """
+    origins = cameras.camera_to_worlds[:, :, 3].double()
     nearest = (origins - torch.minimum(torch.maximum(origins, box[0]), box[1])).norm(dim=-1)
     furthest = torch.maximum((origins - box[0]).abs(), (origins - box[1]).abs()).norm(dim=-1)
     least = NEAR * float((box[1] - box[0]).max()) / (2 * HALF_SIZE)
-    return max(float(nearest.min()), least), float(furthest.max())
+    return max(SLACK * float(nearest.min()), least), float(furthest.max()) / SLACK
 
 
 def _where_cameras_look(cameras: Cameras, every: bool) -> tuple[Tensor, float] | None:

@@ -6,7 +6,7 @@ diagonal, as anti-aliasing makes it.
 
 import json
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,6 @@ class Shot:
     k1: float = 0.0
     distance: float = 4.0
     count: int = 24
-    says: dict[str, Any] = field(default_factory=dict)
 
     @property
     def balls(self) -> np.ndarray:
@@ -154,14 +153,18 @@ def test_the_box_holds_all_matter_and_little_else(name: str, tmp_path: Path) -> 
         assert all(not mask[0].any() and not mask[:, 0].any() for mask in map(shot.opaque, shot.poses()))
 
 
-@pytest.mark.medium
-def test_images_that_show_a_part_bound_matter_by_the_sides_where_it_ends(tmp_path: Path) -> None:
-    """Every image cuts some of it off at the left."""
-    shot = Shot(middle=(12.0, 35.0), count=32)
+def test_matter_that_no_image_shows_as_a_whole_is_in_a_larger_box(tmp_path: Path) -> None:
+    """Every image cuts some of it off at the left, above which it could be higher than anything that is shown."""
+    shot = Shot(middle=(12.0, 35.0))
     assert all(shot.opaque(pose)[:, 0].any() for pose in shot.poses())
     scene = Blender().parse(shot.write(tmp_path), "train")
-    assert 1 <= room_around(scene, shot) < 1.3
-    assert not scene.unbounded
+    assert 1 <= room_around(scene, shot) < 4.6
+    assert not scene.unbounded  # it ends at the right of all images
+    for file in (tmp_path / "train").glob("*.png"):
+        image = iio.imread(file)
+        image[25:45, :, 3] = 255  # a plane without an end
+        iio.imwrite(file, image)
+    assert Blender().parse(tmp_path, "train").unbounded
 
 
 @pytest.mark.medium
@@ -169,7 +172,7 @@ def test_images_that_show_a_part_bound_matter_by_the_sides_where_it_ends(tmp_pat
 def test_without_alpha_the_box_is_where_the_cameras_look(unit: float, tmp_path: Path) -> None:
     shot = Shot(unit=unit, center=(3 * unit, 0.0, unit))
     scene = Blender().parse(shot.write(tmp_path, alpha=False), "train")
-    assert 1 <= room_around(scene, shot) < 2.5
+    assert 1 <= room_around(scene, shot) < 2.7
     assert scene.unbounded  # what is behind is in the images, too
 
 
@@ -178,7 +181,7 @@ def test_a_moving_scene_is_where_the_cameras_look_and_ends_there(tmp_path: Path)
     """At each time something may be elsewhere, so that silhouettes of different times say nothing together."""
     shot = Shot(unit=3.0, center=(1.0, 2.0, 3.0))
     scene = DNeRF().parse(shot.write(tmp_path, times=True), "train")
-    assert 1 <= room_around(scene, shot) < 2.5
+    assert 1 <= room_around(scene, shot) < 2.7
     assert not scene.unbounded
     half = 4.0 * 45 / 100 * 1.034 * 3.0
     assert scene.scale == pytest.approx(1.5 / half, rel=1e-3)
@@ -227,7 +230,7 @@ def test_contradictions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     edit(folder, "train", camera_angle_x=1.2)
     assert Blender().parse(folder, "train").cameras.fx.tolist() == [100.0] * 3
     said = capsys.readouterr().err
-    assert "'fl_x' is 100, but 'camera_angle_x' gives 65.7764 for a width of 90 pixels; fl_x is taken" in said
+    assert "'fl_x' is 100, but 'camera_angle_x' gives 65.7763 for a width of 90 pixels; fl_x is taken" in said
     Blender().parse(folder, "test")
     assert "camera_angle_x" not in capsys.readouterr().err
     edit(folder, "train", w=70, h=90)
@@ -269,7 +272,9 @@ def test_nerf_synthetic_stays_as_it_is(distance: float, scales: int, tmp_path: P
         assert torch.equal(scene.box, torch.tensor([[-1.5] * 3, [1.5] * 3]))
         assert (scene.near, scene.far, scene.scale, scene.transform) == (2.0, 6.0, 1.0, None)
         written = json.loads((folder / f"transforms_{split}.json").read_text())["frames"]
-        assert torch.equal(scene.cameras.camera_to_worlds, torch.tensor([f["transform_matrix"] for f in written])[:, :3])
+        assert torch.equal(
+            scene.cameras.camera_to_worlds, torch.tensor([f["transform_matrix"] for f in written])[:, :3]
+        )
     assert scene.cameras.model == "pinhole"
     angle = json.loads((folder / "transforms_train.json").read_text())["camera_angle_x"]
     assert torch.equal(scene.cameras.fx, torch.full((4,), 0.5 * 100 / math.tan(0.5 * angle)))
@@ -323,9 +328,5 @@ def test_what_images_do_not_bound_or_cannot_show_together_has_no_box() -> None:
     assert enclosing_box(cameras[:1], opaque[:1]) is None
     assert enclosing_box(cameras, [torch.zeros_like(mask) for mask in opaque]) is None
     assert enclosing_box(cameras, [torch.ones_like(mask) for mask in opaque]) is None
-    moved = replace(shot, center=(0.0, 0.0, 6.0))  # half of the images show something else
-    elsewhere = [torch.from_numpy(shot.opaque(pose)) for pose in replace(shot, count=12).poses(0.4)]
-    mixed = [torch.roll(mask, 18, 1) if index % 2 else mask for index, mask in enumerate(elsewhere)]
-    assert moved.count == len(mixed)
-    found = enclosing_box(cameras, [mask.roll(30, 1) if i % 2 else mask.roll(-30, 1) for i, mask in enumerate(opaque)])
-    assert found is None
+    apart = [mask.roll(30 if index % 2 else -30, 1) for index, mask in enumerate(opaque)]
+    assert enclosing_box(cameras, apart) is None

@@ -42,8 +42,7 @@ def enclosing_box(cameras: Cameras, opaque: Sequence[Tensor], within: Tensor | N
 
     Returns:
         Minimum and maximum corner; None if the images, without `within`, leave the matter unbounded, or if they
-        contradict each other, as of
-        several objects that no image shows together.
+        contradict each other, as of several objects that no image shows together.
     """
     with torch_on_one_thread():  # whose operations are small
         return _enclosing_box(cameras, opaque, within)

@@ -10,7 +10,7 @@ from framework.base.config import LEFT_TO_DATA, TrainConfig
 
 ConfigT = TypeVar("ConfigT", bound=TrainConfig)
 BY_IMAGES = ("masks", "background", "start")
-"""Settings whose "auto" stays after `Method.decide`, which does not see what decides it: the images and their points."""
+"""Settings whose "auto" stays after `Method.decide`: the images and their points decide it, which that does not see."""
 
 
 @dataclass(frozen=True)

@@ -1,28 +1,38 @@
-"""NeRF-Synthetic scenes: transforms_{train,val,test}.json written by Blender, RGBA images (Mildenhall et al. 2020)."""
+"""Renders: transforms_{train,val,test}.json as Blender's scripts write them, of NeRF-Synthetic and of any other scene.
+
+NeRF-Synthetic (Mildenhall et al. 2020) states an angle of view, and has cameras 4.03 units from the origin, to which
+they look; box, near and far are those of its paper. Of any other scene, what the images show is placed in the same box,
+whatever its units and its place (`dataparsers.region`).
+"""
 
 from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
-from torch import Tensor
 
-from dataparsers.reading import file_name, read_json, read_pose, read_times, shown
-from framework import Cameras, DataError, DataParser, ParsedScene
-from framework.data.dataset import Split, existing_files, image_size
-from framework.data.names_on_disk import on_disk
+from dataparsers.captured import placed_cameras
+from dataparsers.region import HALF_SIZE, Region, cube_at_origin, find_region
+from dataparsers.renders import Renders, read_renders
+from framework import DataError, DataParser, ParsedScene
+from framework.base.console import say
+from framework.cameras.camera_path import read_transforms
+from framework.cameras.poses import Placement
+from framework.data.dataset import Split
 
 TRANSFORMS = "transforms_train.json"
 """File by which the format is recognised."""
-SMALLEST_ANGLE = 1e-6
-"""Minimum field of view, radians; for a smaller one the focal length exceeds the range of float32."""
-
 MOST_SCALES = 8
 """Maximum number of sizes of an image; at the eighth, a pixel is the mean of 16,384."""
+DISTANCE, NEAR, FAR = 4.0311, 2.0, 6.0
+"""Distance of NeRF-Synthetic's cameras from the origin, and its near and far, in the input's units."""
+TOLERANCE = 0.01
+"""Difference up to which cameras are where those of NeRF-Synthetic are, in their distance."""
+ORIGIN = Placement(torch.eye(4, dtype=torch.float64)[:3], 1.0)
+"""Placement of a scene that stays where it is."""
 
 
 @dataclass(frozen=True)
@@ -33,12 +43,17 @@ class Blender(DataParser):
     """Integer factor by which images are reduced."""
     scale_factor: float = 1.0
     """Factor of camera positions, and thus of the scene."""
-    half_size: float = 1.5
-    """Half the side of the cube around the origin that holds the scene, in the input's units."""
-    near: float = 2.0
-    """Distance from a camera at which the scene starts, in the input's units."""
-    far: float = 6.0
-    """Distance from a camera at which the scene ends, in the input's units."""
+    half_size: float | None = None
+    """Half the side of the cube around the origin that holds the scene, in the input's units. If not given: 1.5 for
+    NeRF-Synthetic; of other data, a cube around what silhouettes leave or cameras look at."""
+    near: float | None = None
+    """Distance from a camera at which the scene starts, in the input's units. If not given: 2 for NeRF-Synthetic, else
+    by cameras and cube."""
+    far: float | None = None
+    """Distance from a camera at which the scene ends, in the input's units. If not given: 6 for NeRF-Synthetic, else by
+    cameras and cube."""
+    placement: Path | None = None
+    """dataparser_transforms.json of a run whose placement is taken instead of one by silhouettes and cameras."""
     multiscale: int = 1
     """Number of sizes at which each image is used, 1, 1/2, 1/4, ..., with a loss weighted by the area of pixels; 4 is
     Mip-NeRF's multiscale protocol."""
@@ -51,47 +66,53 @@ class Blender(DataParser):
     def parse(self, path: Path | None, split: Split) -> ParsedScene:
         if path is None:
             raise DataError("the blender format needs a folder: --data DIR")
+        self._check_flags()
+        renders = read_renders(path, split)
+        region, stays = self._region(renders if split == "train" else _training(path, renders))
+        placement = ORIGIN if stays else region.placement
+        placement = replace(placement, scale=placement.scale * self.scale_factor)
+        if not stays and self.placement is not None:
+            placement = read_transforms(self.placement)
+        if not stays and split == "train":
+            say(f"{path}: the scene is {region.description} (else: --half-size, --near, --far)")
+        images, half = renders.images, region.half if stays else HALF_SIZE
+        return ParsedScene(
+            image_paths=images.paths,
+            cameras=placed_cameras(images, placement),
+            box=torch.tensor([[-1.0], [1.0]]).expand(2, 3) * half * self.scale_factor,
+            near=(region.near if self.near is None else self.near) * placement.scale,
+            far=(region.far if self.far is None else self.far) * placement.scale,
+            times=images.times,
+            transform=None if stays else placement.transform,
+            scale=placement.scale,
+            downscale_factor=self.downscale_factor,
+            num_scales=self.multiscale,
+            unbounded=region.unbounded,
+        )
+
+    def _check_flags(self) -> None:
         if self.downscale_factor < 1:
             raise DataError(f"--downscale-factor is {self.downscale_factor}; it must be an integer of at least 1")
         if not 1 <= self.multiscale <= MOST_SCALES:
             raise DataError(f"--multiscale is {self.multiscale}; it must be from 1 to {MOST_SCALES}")
-        file = path / f"transforms_{split}.json"
-        content = read_json(file)
-        frames = content.get("frames")
-        if not isinstance(frames, list) or not frames:
-            raise DataError(f"{file} lists no frames")
-        labels = [f"{file}: frame {index}" for index in range(len(frames))]
-        names = [_image_name(frame, label) for frame, label in zip(frames, labels, strict=True)]
-        paths = on_disk(path, names, quiet=split != "train")
-        poses = torch.stack([read_pose(frame, label) for frame, label in zip(frames, labels, strict=True)])
-        keep = existing_files(paths, split)
-        width, height = image_size([paths[index] for index in keep.tolist()])
-        scene = ParsedScene(
-            image_paths=paths,
-            cameras=self._cameras(poses, _focal_length(content, width, file), width, height),
-            box=torch.tensor([[-1.0], [1.0]]).expand(2, 3) * self.half_size * self.scale_factor,
-            near=self.near * self.scale_factor,
-            far=self.far * self.scale_factor,
-            times=read_times(frames, labels),
-            scale=self.scale_factor,
-            downscale_factor=self.downscale_factor,
-            num_scales=self.multiscale,
-        )
-        return scene[keep]
+        for name in ("scale_factor", "half_size"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise DataError(f"--{name.replace('_', '-')} is {value}; it must be above zero")
 
-    def _cameras(self, poses: Tensor, focal: float, width: int, height: int) -> Cameras:
-        count = len(poses)
-        poses = poses[:, :3].clone()
-        poses[:, :, 3] *= self.scale_factor
-        return Cameras(
-            camera_to_worlds=poses,
-            fx=torch.full((count,), focal),
-            fy=torch.full((count,), focal),
-            cx=torch.full((count,), width / 2),
-            cy=torch.full((count,), height / 2),
-            widths=torch.full((count,), width),
-            heights=torch.full((count,), height),
-        )
+    def _region(self, training: Renders) -> tuple[Region, bool]:
+        """Return the region that the training images show, and whether the scene stays where it is."""
+        half = HALF_SIZE if self.half_size is None else self.half_size
+        if _is_nerf_synthetic(training):
+            return Region(torch.zeros(3), half, NEAR, FAR, False, "NeRF-Synthetic's"), True
+        images = training.images
+        if self.half_size is not None:
+            return cube_at_origin(placed_cameras(images, ORIGIN), half), True
+        middle = images.poses[:, :3, 3].mean(0)  # relative to which float32 is precise
+        cameras = placed_cameras(images, Placement(torch.cat([torch.eye(3).double(), -middle[:, None]], -1), 1.0))
+        cube = None if training.cube is None else (training.cube[0] - middle, training.cube[1])
+        region = find_region(cameras, images.paths, images.times is not None, cube)
+        return replace(region, center=region.center + middle), False
 
 
 def has_times(file: Path) -> bool:
@@ -103,14 +124,20 @@ def has_times(file: Path) -> bool:
         return False
 
 
-def _image_name(frame: Any, label: str) -> str:
-    """Return the name of a frame's image; Blender writes names without a suffix."""
-    return file_name(frame.get("file_path") if isinstance(frame, dict) else None, "file_path", label)
+def _training(path: Path, others: Renders) -> Renders:
+    """Return the training images, by which all splits are placed, or others if there are none."""
+    try:
+        return read_renders(path, "train", is_wanted=False)
+    except DataError:  # reported when they are wanted
+        return others
 
 
-def _focal_length(content: dict[str, Any], width: int, file: Path) -> float:
-    """Return the focal length in pixels, from the horizontal field of view."""
-    angle = content.get("camera_angle_x")
-    if not isinstance(angle, (int, float)) or isinstance(angle, bool) or not SMALLEST_ANGLE < angle < math.pi:
-        raise DataError(f"{file}: 'camera_angle_x' is {shown(angle)}; it must be an angle between 0 and pi radians")
-    return 0.5 * width / math.tan(0.5 * angle)
+def _is_nerf_synthetic(renders: Renders) -> bool:
+    """Return whether cameras are those of NeRF-Synthetic, whose box holds what they show where they look."""
+    images = renders.images
+    origins, ahead = images.poses[:, :3, 3], -images.poses[:, :3, 2]
+    depths = -(origins * ahead).sum(-1)  # of the origin
+    beside = (origins + depths[:, None] * ahead).norm(dim=-1)
+    shown = (images.sizes / images.intrinsics[:, :2]).amax(-1) / 2 * DISTANCE
+    near_there = ((depths - DISTANCE).abs() < TOLERANCE * DISTANCE) & (beside < TOLERANCE * DISTANCE)
+    return renders.only_angle and bool((near_there & (shown < HALF_SIZE)).all())

@@ -148,7 +148,7 @@ def captured_scene(
             "--eval-interval 0 uses all in every split"
         )
     placement = placement_of(flags, images, split, applied)
-    cameras = _cameras(images, placement)
+    cameras = placed_cameras(images, placement)
     sparse = sparse_points(images, placement, cameras, chosen if split == "train" else None)
     near = min(estimate_near(cameras, sparse.sound), flags.far / 2) if flags.near is None else flags.near
     images = images[chosen]
@@ -308,10 +308,16 @@ def checked_box(box: Tensor, source: str) -> Tensor:
     return box
 
 
+def placed_cameras(images: PosedImages, placement: Placement) -> Cameras:
+    """Return the cameras in the scene's frame, for the sizes of the image files.
 
+    Args:
+        images: M images, whose files exist.
+        placement: placement of the scene.
 
-def _cameras(images: PosedImages, placement: Placement) -> Cameras:
-    """Return the cameras in the scene's frame, for the sizes of the image files."""
+    Raises:
+        DataError: if a camera is invalid or does not fit its image.
+    """
     sizes = image_sizes(images.paths)
     _check_intrinsics(images, sizes)
     ratio = sizes / images.sizes

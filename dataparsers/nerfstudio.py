@@ -17,14 +17,13 @@ from dataparsers.captured import (
     PosedImages,
     captured_scene,
     checked_box,
-    sizes_of,
 )
 from dataparsers.colmap_beside import names_in_model, tracks_beside
+from dataparsers.intrinsics import ngp_cube, read_intrinsics
 from dataparsers.placing import from_original
-from dataparsers.reading import file_name, number, numbers, read_json, read_pose, read_times, rigid, shown, side_or_none
+from dataparsers.reading import file_name, number, read_json, read_pose, read_times, rigid, shown
 from framework import DataError, ParsedScene
 from framework.base.console import say
-from framework.base.errors import nearest
 from framework.base.evenly_spaced import evenly_spaced
 from framework.data.data_folder import IMAGE_SUFFIXES
 from framework.data.dataset import Split
@@ -37,24 +36,8 @@ TRANSFORMS = "transforms.json"
 """File by which the format is recognised."""
 EvalMode = Literal["interval", "fraction", "filename", "all"]
 """Rule by which images are held out."""
-PERSPECTIVE = ("opencv", ("k1", "k2", "p1", "p2", "k3", "", "", "", "k4"))
-"""Projection, and the file's names of its coefficients in the order of `LENSES`."""
-FISHEYE = ("fisheye", ("k1", "k2", "k3", "k4"))
-"""The same for a fisheye lens."""
-CAMERA_MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
-    **dict.fromkeys(("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), PERSPECTIVE),
-    **dict.fromkeys(("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), FISHEYE),
-    "FULL_OPENCV": ("opencv", ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "")),
-    "EQUIRECTANGULAR": ("equirectangular", ()),
-    "ORTHOGRAPHIC": ("orthographic", ()),
-    "ORTHOPHOTO": ("orthographic", ()),
-}
-"""`camera_model` -> projection, and the file's name of each coefficient of `LENSES`; '' if it has none."""
 MILLIMETRE = 0.001
 """Units of the input per unit of a stored depth by default, as in nerfstudio."""
-NGP_SCALE = 0.33
-NGP_OFFSET = [0.5, 0.5, 0.5]
-"""instant-ngp maps a position x of the file to `scale * x + offset` in its unit cube; these are its defaults."""
 
 
 @dataclass(frozen=True)
@@ -114,24 +97,19 @@ def _posed_images(file: Path, content: dict[str, Any], split: Split) -> PosedIma
     placed = list(zip(frames, labels, strict=True))
     written = [file_name(frame.get("file_path"), "file_path", label) for frame, label in placed]
     paths = on_disk(file.parent, written, quiet=split != "train")
-    sides = [[side_or_none(_value(frame, content, key), key, label) for key in "wh"] for frame, label in placed]
-    sizes = sizes_of(sides, paths)
-    model, keys = _camera_model(file, content, frames)
-    cameras = [
-        _intrinsics(frame, content, size, model, label)
-        for frame, size, label in zip(frames, sizes.tolist(), labels, strict=True)
-    ]
+    intrinsics = read_intrinsics(file, content, frames, labels, paths)
+    if intrinsics.warning and split == "train":  # once is enough
+        say(intrinsics.warning)
     poses = torch.stack([read_pose(frame, label, torch.float64) for frame, label in placed])
-    lens = [[_number(frame, content, key, label) or 0.0 for key in keys] for frame, label in placed]
     return PosedImages(
         folder=file.parent,
         paths=paths,
         names=tuple(str(PurePosixPath(name)) for name in written),
         poses=poses,
-        intrinsics=torch.tensor(cameras, dtype=torch.float64),
-        sizes=sizes,
-        model=model,
-        lens=torch.tensor(lens) if keys else None,
+        intrinsics=intrinsics.values,
+        sizes=intrinsics.sizes,
+        model=intrinsics.model,
+        lens=intrinsics.lens,
         masks=_companions(file.parent, frames, "mask_path", labels, IMAGE_SUFFIXES, split),
         depths=_companions(file.parent, frames, "depth_file_path", labels, DEPTH_SUFFIXES, split),
         times=read_times(frames, labels),
@@ -142,17 +120,6 @@ def _posed_images(file: Path, content: dict[str, Any], split: Split) -> PosedIma
 
 def _has_exr(depths: tuple[Path | None, ...] | None) -> bool:
     return any(path is not None and path.suffix.lower() == ".exr" for path in depths or ())
-
-
-def _value(frame: dict[str, Any], content: dict[str, Any], key: str) -> Any:
-    """Return a frame's own value, else the file's value for all frames; None if both are missing."""
-    own = frame.get(key)
-    return content.get(key) if own is None else own
-
-
-def _number(frame: dict[str, Any], content: dict[str, Any], key: str, labels: str) -> float | None:
-    value = _value(frame, content, key)
-    return None if value is None else number(value, key, labels)
 
 
 def _companions(
@@ -170,52 +137,6 @@ def _companions(
     written = [file_name(name, key, label) for name, label in zip(named, labels, strict=True) if name is not None]
     files = iter(on_disk(folder, written, f"files of '{key}'", endings, split != "train", shared=2))
     return tuple(None if name is None else next(files) for name in named)
-
-
-def _camera_model(file: Path, content: dict[str, Any], frames: list[dict[str, Any]]) -> tuple[str, tuple[str, ...]]:
-    """Return the projection of all frames, and the names of its coefficients in the file."""
-    if content.get("is_fisheye") is True:  # instant-ngp's key
-        return FISHEYE
-    given = [_value(frame, content, "camera_model") or "PERSPECTIVE" for frame in frames]
-    named = {name if isinstance(name, str) else shown(name) for name in given}
-    for name in sorted(named - set(CAMERA_MODELS)):
-        raise DataError(f"{file}: unknown camera_model '{shown(name)[1:-1]}'. {nearest(name, CAMERA_MODELS)}")
-    models = {CAMERA_MODELS[name] for name in named}
-    if len(models) > 1:
-        raise DataError(f"{file} mixes the camera models {' and '.join(sorted(named))}; split it into a file for each")
-    return models.pop()
-
-
-def _intrinsics(
-    frame: dict[str, Any], content: dict[str, Any], size: list[int], model: str, labels: str
-) -> tuple[float, float, float, float]:
-    """Return fx, fy, cx, cy in pixels of an image of `size`; the default principal point is its centre."""
-    fx, fy = (_focal(frame, content, axis, length, labels) for axis, length in zip("xy", size, strict=True))
-    if model == "equirectangular":  # in the file, half the width of a whole panorama; here, pixels per radian
-        fx, fy = (fx or fy or size[0] / 2) / math.pi, (fy or fx or size[1]) / math.pi
-    elif fx is None and fy is None:
-        raise DataError(f"{labels}: there is no focal length, neither 'fl_x' nor 'camera_angle_x'")
-    cx, cy = (_number(frame, content, key, labels) for key in ("cx", "cy"))
-    return (
-        fx or fy or 0.0,
-        fy or fx or 0.0,
-        size[0] / 2 if cx is None else cx,
-        size[1] / 2 if cy is None else cy,
-    )
-
-
-def _focal(frame: dict[str, Any], content: dict[str, Any], axis: str, length: int, labels: str) -> float | None:
-    """Return the focal length in pixels along an axis of `length` pixels; None if the file does not state it."""
-    for source in (frame, content):  # a frame's own angle takes precedence over the focal length of all frames
-        if source.get(f"fl_{axis}") is not None:
-            return number(source[f"fl_{axis}"], f"fl_{axis}", labels, positive=True)
-        name = f"camera_angle_{axis}"
-        if source.get(name) is not None:
-            angle = number(source[name], name, labels, positive=True)
-            if not 1e-6 < angle < math.pi:
-                raise DataError(f"{labels}: '{name}' is {angle}; it must be an angle between 0 and pi radians")
-            return 0.5 * length / math.tan(0.5 * angle)
-    return None
 
 
 def _points(file: Path, content: dict[str, Any], split: Split) -> Tensor | None:
@@ -291,15 +212,14 @@ def _by_name(names: list[str], split: Split) -> Tensor:
 def _with_cube(scene: ParsedScene, content: dict[str, Any], file: Path, scene_scale: float) -> ParsedScene:
     """Return the scene with instant-ngp's cube as box, if `aabb_scale` is given.
 
-    Placement transforms the cube's centre and its side, `aabb_scale / scale` in the file's units, but does not rotate
-    the cube: its edges are parallel to the axes of the scene.
+    Placement transforms the cube's centre and its side, but does not rotate the cube: its edges are parallel to the
+    axes of the scene.
     """
-    if content.get("aabb_scale") is None or scene.transform is None:
+    cube = ngp_cube(content, file)
+    if cube is None or scene.transform is None:
         return scene
-    unit = number(content.get("scale", NGP_SCALE), "scale", str(file), positive=True)
-    edge = number(content["aabb_scale"], "aabb_scale", str(file), positive=True) / unit
-    offset = numbers(content.get("offset", NGP_OFFSET), 3, "offset", str(file))
-    center = scene.placement.points((0.5 - torch.tensor([offset], dtype=torch.float64)) / unit)[0]
+    center, edge = cube
+    center = scene.placement.points(center[None])[0]
     half = 0.5 * edge * scene.scale * scene_scale
     box = torch.stack([center - half, center + half]).float()
     return replace(scene, box=checked_box(box, f"{file}: 'aabb_scale', 'scale' and 'offset'"))

@@ -16,6 +16,7 @@ from framework.ray_model import RayModel
 from framework.rendering.renderer import Renderer
 from framework.rendering.volume import volume_renderer as volume_renderer
 from framework.samplers.base import Sampler
+from framework.samplers.choice import SamplingConfig, sampler_choice
 from framework.scene.reasons import DEPTH_REASONS, SPARSE_DEPTH_REASON
 
 DEPTH = 0.1
@@ -92,8 +93,12 @@ class Method:
             config, more = fill(config, depth_choice(scene))
             config, _ = fill(config, Choice("rays_shared_by", SHARED_BY if scene.unbounded else 0, ""))
             made = made + more * bool(config.depth_loss_mult)  # nothing to learn from needs no words
+        if isinstance(config, SamplingConfig):
+            config, more = fill(config, sampler_choice(config, scene.unbounded))
+            made = made + more
         for name in left_open(config):
-            raise ConfigError(f"--{name.replace('_', '-')} is None, and this method does not decide it; give a value")
+            flag, value = name.replace("_", "-"), getattr(config, name)
+            raise ConfigError(f"--{flag} is {value}, and this method does not decide it; give a value")
         return config, made
 
     def build(self, config: TrainConfig, scene: Scene) -> Model[Any]:

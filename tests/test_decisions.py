@@ -10,6 +10,8 @@ from framework.base.config import AUTO, Auto, TrainConfig
 from framework.base.decisions import Choice, Decision, fill, is_open, left_open
 from framework.base.errors import ConfigError
 from framework.base.registry import load_method, registered
+from framework.method import nothing_to_decide
+from framework.samplers.choice import SamplingConfig
 from tests.truth.test_training import SCENE
 
 
@@ -79,7 +81,8 @@ def test_every_method_decides_once(method: str, facts: dict) -> None:
 
 def test_what_nobody_decides_is_refused_by_name() -> None:
     """A setting that one method leaves to the data may be None to the command line of all."""
-    assert left_open(OpenConfig(fancy=True)) == ["num_cells"]
+    assert left_open(OpenConfig(fancy=True)) == ["num_cells", "shape"]
+    assert left_open(OpenConfig(fancy=True, num_cells=3, shape="ball", experiment_name="auto")) == []
     for name, setting in {
         "nerfacto": "num_steps",
         "vanilla-nerf": "lr_schedule",
@@ -89,6 +92,29 @@ def test_what_nobody_decides_is_refused_by_name() -> None:
         config = dataclasses.replace(method.config, **{setting: None})
         with pytest.raises(ConfigError, match=f"^--{setting.replace('_', '-')} is None, .* give a value$"):
             method.decided(config, SCENE)
+
+
+@pytest.mark.parametrize("unbounded", [False, True])
+def test_a_plugin_without_decisions_gets_the_common_ones(unbounded: bool) -> None:
+    """An "auto" that stays would be an occupancy grid, in a scene that goes on beyond its box too."""
+    method, scene = load_method("instant-ngp"), dataclasses.replace(SCENE, unbounded=unbounded)
+    plugin = dataclasses.replace(method, config=SamplingConfig(), decide=nothing_to_decide)
+    config, made = plugin.decided(plugin.config, scene)
+    assert config.sampler == ("proposal" if unbounded else "occupancy")
+    assert [decision.option for decision in made] == ["sampler"]
+    assert left_open(config) == []
+    given, made = plugin.decided(SamplingConfig(sampler="occupancy"), scene)
+    assert (given.sampler, made) == ("occupancy", [])
+
+
+def test_a_choice_that_a_plugin_does_not_make_is_refused_by_name() -> None:
+    """Poses that are asked to be refined if that helps would not be."""
+    method = load_method("gaussian-splatting")
+    decided, _ = method.decided(method.config, SCENE)
+    plugin = dataclasses.replace(method, decide=nothing_to_decide)
+    with pytest.raises(ConfigError, match=r"^--camera-optimizer is auto, .* does not decide it; give a value$"):
+        plugin.decided(dataclasses.replace(decided, camera_optimizer="auto"), SCENE)
+    assert plugin.decided(decided, SCENE) == (decided, [])
 
 
 def test_rates_and_steps_of_dnerf_follow_its_canonical_field() -> None:

@@ -74,7 +74,7 @@ def scale_rotation(m: list[list[float]]) -> None:
 BAD = {
     "no frames": (put("frames", []), "transforms_train.json lists no frames"),
     "frames is not a list": (put("frames", {"a": 1}), "lists no frames"),
-    "no angle": (lambda c: c.pop("camera_angle_x"), "'camera_angle_x' is None"),
+    "no angle": (lambda c: c.pop("camera_angle_x"), "no focal length, neither 'fl_x' nor 'camera_angle_x'"),
     "zero angle": (put("camera_angle_x", 0.0), "'camera_angle_x' is 0.0"),
     "nan angle": (put("camera_angle_x", math.nan), "'camera_angle_x' is nan"),
     "text angle": (put("camera_angle_x", "wide"), "'camera_angle_x' is 'wide'"),

@@ -82,8 +82,8 @@ def moved(views: Views, scale: float = 1.0, shift: float = 0.0, placed: bool = F
 
     Formats place such a scene in one of two ways:
 
-    - Not `placed`: the blender format takes cameras as they are, and box, near and far are the user's (--half-size,
-      --near, --far), in the same unit and with the same centre. Therefore they are transformed like the cameras.
+    - Not `placed`: with --half-size, --near and --far the blender format takes cameras as they are, and these are in
+      the same unit and with the same centre. Therefore they are transformed like the cameras.
     - `placed`: formats of captures move the cameras' mean position to the origin and scale positions to [-1, 1]
       (`framework.cameras.poses.place`), in float64, as text files hold it, and round afterwards. The orientation is
       kept, so that the box can be transformed exactly. Only rounding errors of scale and shift remain.

@@ -4,6 +4,22 @@ from tests.mutations.bug import Bug
 
 BUGS = (
     Bug(
+        "auto-stays-auto",
+        "decisions",
+        "framework/base/decisions.py",
+        "return chosen or LEFT_TO_DATA in",
+        "return LEFT_TO_DATA in",
+        "a choice that nobody makes, such as --camera-optimizer auto of a plugin, is off without a word",
+    ),
+    Bug(
+        "sampler-stays-auto",
+        "decisions",
+        "framework/method.py",
+        "config, more = fill(config, sampler_choice(config, scene.unbounded))",
+        "config, more = fill(config, sampler_choice(config, False))",
+        "a plugin's captures are marched through a grid that ends where the cameras are",
+    ),
+    Bug(
         "schedule-without-clock",
         "schedule",
         "framework/training/budget.py",

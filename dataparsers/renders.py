@@ -1,0 +1,94 @@
+"""The renders that a transforms_{split}.json lists: files, cameras, and what else the file states."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dataparsers.captured import PosedImages
+from dataparsers.intrinsics import ngp_cube, read_intrinsics
+from dataparsers.reading import file_name, read_json, read_pose, read_times
+from framework import DataError
+from framework.base.console import say
+from framework.data.dataset import Split, existing_files, image_size
+from framework.data.names_on_disk import on_disk
+
+OF_LENSES = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2", "camera_model", "is_fisheye")
+"""Names by which a file states more of lenses than an angle of view."""
+
+
+@dataclass(frozen=True)
+class Renders:
+    """The images of one split whose files exist."""
+
+    images: PosedImages
+    """M images."""
+    cube: tuple[Tensor, float] | None
+    """Centre (3,) float64 and edge of instant-ngp's cube, in the input's units; None if the file states none."""
+    only_angle: bool
+    """Whether the file states an angle of view, and nothing else of lenses."""
+
+
+def read_renders(folder: Path, split: Split, is_wanted: bool = True) -> Renders:
+    """Read transforms_{split}.json.
+
+    Args:
+        folder: folder of the file.
+        split: the split to read.
+        is_wanted: False if the images only serve to place others; what is unusual about them is then not reported.
+
+    Raises:
+        DataError: if the file is missing or invalid, or none of its images exists.
+    """
+    file = folder / f"transforms_{split}.json"
+    content = read_json(file)
+    frames = content.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise DataError(f"{file} lists no frames")
+    labels = [f"{file}: frame {index}" for index in range(len(frames))]
+    names = [_image_name(frame, label) for frame, label in zip(frames, labels, strict=True)]
+    paths = on_disk(folder, names, quiet=split != "train" or not is_wanted)
+    poses = torch.stack([read_pose(frame, label, torch.float64) for frame, label in zip(frames, labels, strict=True)])
+    keep = existing_files(paths, split) if is_wanted else _existing(paths)
+    image_size([paths[index] for index in keep.tolist()])  # one must be readable
+    frames, plain = [_without_sensor(frame) for frame in frames], _without_sensor(content)
+    intrinsics = read_intrinsics(file, plain, frames, labels, paths)
+    if intrinsics.warning and is_wanted and split == "train":  # once is enough
+        say(intrinsics.warning)
+    images = PosedImages(
+        folder=folder,
+        paths=paths,
+        names=tuple(path.name for path in paths),
+        poses=poses,
+        intrinsics=intrinsics.values,
+        sizes=intrinsics.sizes,
+        model=intrinsics.model,
+        lens=intrinsics.lens,
+        times=read_times(frames, labels),
+    )
+    only_angle = not any(source.get(name) is not None for source in (content, *frames) for name in OF_LENSES)
+    return Renders(images[keep], ngp_cube(content, file), only_angle)
+
+
+def _existing(paths: Sequence[Path]) -> Tensor:
+    return torch.tensor([index for index, path in enumerate(paths) if path.is_file()], dtype=torch.int64)
+
+
+def _image_name(frame: Any, label: str) -> str:
+    """Return the name of a frame's image; Blender writes names without a suffix."""
+    return file_name(frame.get("file_path") if isinstance(frame, dict) else None, "file_path", label)
+
+
+def _without_sensor(source: dict[str, Any]) -> dict[str, Any]:
+    """Return entries without the vertical angle if the horizontal one is there.
+
+    Blender's `angle_y` is that of its sensor, 36 by 24 mm, whatever the height of the image.
+    """
+    if source.get("camera_angle_x") is None:
+        return source
+    return {name: value for name, value in source.items() if name != "camera_angle_y"}

@@ -95,6 +95,10 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
         """Return them, without gradient."""
         return self.learnt_gaussians().map(Tensor.detach)
 
+    def look(self) -> Look:
+        """Return how they are drawn."""
+        return self.config.look()
+
     def set_gaussians(self, gaussians: Gaussians) -> None:
         """Replace them.
 
@@ -182,7 +186,7 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
         Args:
             camera: one camera.
         """
-        return splat_camera(camera, self.near, self.config.antialiased)
+        return splat_camera(camera, self.near, self.look())
 
     def render_view(self, view: View, background: Tensor) -> Picture:
         return self.render_gaussians(self.gaussians(), view, background)

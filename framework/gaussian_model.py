@@ -19,9 +19,10 @@ from framework.kernels.splat_project import SplatCamera
 from framework.model import Model
 from framework.rendering.rendered import Picture
 from framework.splats.density_control import RESET, GradientMean, grown
-from framework.splats.drawing import draw_view, on_image, splat_camera
+from framework.splats.drawing import DRAWN, draw_view, on_image, splat_camera
 from framework.splats.gaussians import Gaussians
 from framework.splats.learning import as_gaussians, as_tables, row_changes
+from framework.splats.look import Look
 from framework.splats.mcmc import moved, shaken
 from framework.splats.redrawn import Redrawn
 from framework.splats.room import Room
@@ -44,6 +45,7 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
     """
 
     batches: ClassVar[Literal["pixels", "views"]] = "views"
+    cameras: ClassVar[tuple[str, ...] | None] = DRAWN
     extent: Tensor
     """Size () of the scene, scene units, in which centres are stored: so their learning rate suits any scene."""
 

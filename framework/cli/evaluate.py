@@ -17,7 +17,7 @@ class EvalFlags:
     """Compute PSNR, SSIM and LPIPS of a trained run on held-out views."""
 
     load_config: Path
-    """RUN_FOLDER, its config.yml, or a file of Gaussians (.ply, .spz); the flag's name may be left out."""
+    """RUN_FOLDER, its config.yml, or a file of Gaussians (.ply, .spz, .splat); the flag's name may be left out."""
     output_path: Path | None = None
     """JSON file to write. If not given: eval.json beside config.yml, or NAME.eval.json beside a file of Gaussians."""
     render_output_path: Path | None = None
@@ -62,9 +62,10 @@ def _command(arguments: list[str]) -> None:
     from framework.base.console import say
     from framework.evaluation.error_bound import limited_error, measured_error, parse_error
     from framework.evaluation.evaluator import evaluate
+    from framework.splats.files import is_splat_file
     from framework.training.datasets import load_split
     from framework.training.report import write_evaluation
-    from framework.training.splat_files import is_splat_file, load_run_or_splats
+    from framework.training.splat_files import load_run_or_splats
 
     trained = load_run_or_splats(
         flags.load_config,

@@ -234,9 +234,10 @@ def _splats(flags: SplatFlags, trained: Trained, placement: Placement, path: Pat
         say(f"{len(found) - len(good):,} of {len(found):,} Gaussians are not finite and are left out")
     if not len(good):
         raise ConfigError("this run has no Gaussians left; train it again")
-    for cost in write_gaussians(path, transformed(good, *placement.original_similarity()), flags.max_megabytes):
+    look, placed = trained.model.look(), transformed(good, *placement.original_similarity())
+    for cost in write_gaussians(path, placed, flags.max_megabytes, look):
         say(cost)
-    say(f"{path.stat().st_size / 1e6:.2f} MB: {path}")
+    say(f"{path.stat().st_size / 1e6:.2f} MB, {look.words()}: {path}")
 
 
 def _web(flags: WebFlags, trained: Trained, placement: Placement, path: Path) -> None:

@@ -18,7 +18,7 @@ class ViewerFlags:
     """Look at a trained run in a browser. It shows newer checkpoints as they are written; Ctrl-C ends it."""
 
     load_config: Path
-    """RUN_FOLDER, its config.yml, or a file of Gaussians (.ply, .spz); the flag's name may be left out."""
+    """RUN_FOLDER, its config.yml, or a file of Gaussians (.ply, .spz, .splat); the flag's name may be left out."""
     load_checkpoint: Path | None = None
     """Checkpoint to load; if not given, the newest, and each that is written later."""
     data: Path | None = None
@@ -41,7 +41,8 @@ def _command(arguments: list[str]) -> None:
     flags = read_flags(ViewerFlags, "ns-viewer", words, takes="RUN_FOLDER")
     if (command := install_command("viewer")) is not None:
         raise ConfigError(f"the viewer needs viser: {command}")
-    from framework.training.splat_files import is_splat_file, load_run_or_splats
+    from framework.splats.files import is_splat_file
+    from framework.training.splat_files import load_run_or_splats
     from framework.viewer.trained_viewer import view_trained
 
     trained = load_run_or_splats(

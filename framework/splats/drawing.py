@@ -40,7 +40,11 @@ def splat_camera(
     Raises:
         ConfigError: for a camera model that is not among `DRAWN`.
     """
-    check_drawn(camera.model)
+    if camera.model not in DRAWN:
+        raise ConfigError(
+            f"Gaussians cannot be drawn for {camera.model} cameras, only for pinhole, opencv and fisheye; "
+            "undistort the images first, or take a method that casts rays, such as nerfacto"
+        )
     pose = camera.camera_to_worlds[0] if pose is None else pose
     rotation = _flipped(pose.dtype, pose.device) @ pose[:, :3].T
     to_camera = torch.cat([rotation, -(rotation @ pose[:, 3])[:, None]], 1)
@@ -54,22 +58,6 @@ def splat_camera(
         to_camera, (fx, fy, cx, cy), width, height, near, look.blur, look.antialiased, lens, fisheye,
         look.sort == "depth",
     )  # fmt: skip
-
-
-def check_drawn(model: str) -> None:
-    """Raise ConfigError if Gaussians cannot be drawn for a camera model.
-
-    Args:
-        model: name of the model.
-
-    Raises:
-        ConfigError: if it is not among `DRAWN`.
-    """
-    if model not in DRAWN:
-        raise ConfigError(
-            f"Gaussians cannot be drawn for {model} cameras, only for {', '.join(DRAWN[:-1])} and {DRAWN[-1]}; cut or "
-            "undistort the images first, or take a method that casts rays, such as nerfacto"
-        )
 
 
 @lru_cache(maxsize=16)

@@ -36,6 +36,11 @@ class Look:
     sort: Sort = "distance"
     """What Gaussians are sorted by."""
 
+    def words(self) -> str:
+        """Return how they are drawn, for people."""
+        mode = "antialiased" if self.antialiased else "default render mode"
+        return f"{mode}, blurred by {self.blur:g} pixels^2, sorted by {self.sort}"
+
 
 OURS = Look()
 """How Gaussians are drawn by default."""
@@ -97,8 +102,8 @@ def discs(file: Path) -> DataError:
         file: its path.
     """
     return DataError(
-        f"{file} has the discs of 2D Gaussian Splatting, which are not drawn here; name a file of 3D Gaussians, or train"
-        " gaussian-splatting on the photographs"
+        f"{file} has the discs of 2D Gaussian Splatting, which are not drawn here; name a file of 3D Gaussians,"
+        " or train gaussian-splatting on the photographs"
     )
 
 

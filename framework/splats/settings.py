@@ -10,8 +10,8 @@ from framework.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Rang
 from framework.base.decisions import Choice, Decision, fill
 from framework.data.scene import Scene
 from framework.splats.gaussians import MAX_DEGREE
-from framework.splats.look import LEAST_BLUR, MOST_BLUR, OURS, Look, Sort
 from framework.splats.learning import number_for, rate_factor
+from framework.splats.look import LEAST_BLUR, MOST_BLUR, OURS, Look, Sort
 
 PIXELS_PER_SECOND = 25 * 400 * 400
 """Pixels that training draws in a second, about, on two cores; for what is decided by the budget."""

@@ -86,10 +86,10 @@ def look_of(lines: Sequence[str], file: Path, otherwise: Look = ELSEWHERE) -> Lo
 
 
 def _with_mode(look: Look, mode: str, file: Path) -> Look:
-    name, _, blur = mode.partition("-")
+    name, dash, blur = mode.partition("-")
     if name == "2dgs":
         raise discs(file)
-    if name not in ("default", "mip") or (blur and _blur(blur) is None):
+    if name not in ("default", "mip") or (dash and _blur(blur) is None):
         say(f"warning: {file} is for the render mode '{printable(mode)}', which is not known: drawn as 'default'")
         return replace(look, antialiased=False)
     return replace(look, antialiased=name == "mip", blur=_blur(blur) or look.blur)

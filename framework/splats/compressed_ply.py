@@ -109,7 +109,7 @@ def _quaternions(words: np.ndarray) -> np.ndarray:
 
 def _harmonics(file: Path, header: PlyHeader, count: int) -> Tensor:
     element = header.elements.get("sh")
-    if element is None:
+    if element is None or not element.columns:
         return torch.zeros(count, 3, 0)
     width = len(element.columns)
     if width not in (3 * terms for terms in DEGREES.values()) or element.count != count:

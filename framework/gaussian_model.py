@@ -19,9 +19,10 @@ from framework.kernels.splat_project import SplatCamera
 from framework.model import Model
 from framework.rendering.rendered import Picture
 from framework.splats.density_control import RESET, GradientMean, grown
-from framework.splats.drawing import draw_view, on_image, splat_camera
+from framework.splats.drawing import DRAWN, draw_view, on_image, splat_camera
 from framework.splats.gaussians import Gaussians
 from framework.splats.learning import as_gaussians, as_tables, row_changes
+from framework.splats.look import Look
 from framework.splats.mcmc import moved, shaken
 from framework.splats.redrawn import Redrawn
 from framework.splats.room import Room
@@ -44,6 +45,7 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
     """
 
     batches: ClassVar[Literal["pixels", "views"]] = "views"
+    cameras: ClassVar[tuple[str, ...] | None] = DRAWN
     extent: Tensor
     """Size () of the scene, scene units, in which centres are stored: so their learning rate suits any scene."""
 
@@ -94,6 +96,10 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
     def gaussians(self) -> Gaussians:
         """Return them, without gradient."""
         return self.learnt_gaussians().map(Tensor.detach)
+
+    def look(self) -> Look:
+        """Return how they are drawn."""
+        return self.config.look()
 
     def set_gaussians(self, gaussians: Gaussians) -> None:
         """Replace them.
@@ -182,7 +188,7 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
         Args:
             camera: one camera.
         """
-        return splat_camera(camera, self.near, self.config.antialiased)
+        return splat_camera(camera, self.near, self.look())
 
     def render_view(self, view: View, background: Tensor) -> Picture:
         return self.render_gaussians(self.gaussians(), view, background)

@@ -57,6 +57,8 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
 
     batches: ClassVar[Literal["pixels", "views"]]
     """Kind of the training batches: pixels of all images (`PixelBatch`), or one whole image (`ViewBatch`)."""
+    cameras: ClassVar[tuple[str, ...] | None] = None
+    """Camera models that it can draw images of; None for all for which there are rays."""
 
     def __init__(self, config: ConfigT, scene: Scene) -> None:
         super().__init__()

@@ -22,7 +22,7 @@ from framework.cameras.refinement import PoseRefinement
 from framework.data.dataset import Dataset
 from framework.fields.appearance import AFFINE, Appearance, affine_colors
 from framework.kernels.splat_blend import CHANNELS
-from framework.kernels.splat_project import SplatCamera
+from framework.kernels.splat_project import SplatCamera, sort_keys
 from framework.kernels.ssim import photometric_loss
 from framework.rendering.losses import mean_depth_error
 from framework.scene.reasons import DEPTH_REASONS, LIGHT_REASONS, POSE_REASONS
@@ -152,13 +152,14 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         seen, poses = batch.view.camera, self.poses
         pose = None if poses is None else poses.pose(batch.index, seen.camera_to_worlds[0])
         reduced = 2 if self.progress < config.reduced_until else 1
-        camera = splat_camera(seen, self.near, config.antialiased, pose, reduced)
+        camera = splat_camera(seen, self.near, self.look(), pose, reduced)
         target = batch.rgb if reduced == 1 else halved(batch.rgb)
         gaussians = self.learnt_gaussians()
         records = self.on_image(gaussians, camera, min(open_degree(self.progress), config.degree))
         known, trust = self.found_distances.known(batch, self.progress, config.depth_loss_mult, config.field_depth_mult)
         content = CHANNELS["rgb" if known is None else "distance"]
-        drawn = draw(records, camera, self._behind(batch), content, self.room)
+        keys = sort_keys(gaussians.means, camera)
+        drawn = draw(records, camera, self._behind(batch), content, self.room, keys)
         rgb = self.lit(drawn.image if known is None else drawn.image[..., :3], batch.index)
         if batch.kept is not None:  # what does not count is as it should be
             kept = batch.kept if reduced == 1 else halved(batch.kept[..., None].float())[..., 0] == 1
@@ -203,7 +204,7 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
     def camera(self, camera: Cameras) -> SplatCamera:
         """Return the camera of a view that is not trained on, moved as the training cameras around it were."""
         pose = None if self.poses is None else self.poses.carried_pose(camera.camera_to_worlds[0])
-        return splat_camera(camera, self.near, self.config.antialiased, pose)
+        return splat_camera(camera, self.near, self.look(), pose)
 
     def refined_cameras(self, cameras: Cameras) -> Cameras:
         """Return the training cameras with refined poses.

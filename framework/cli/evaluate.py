@@ -18,8 +18,8 @@ class EvalFlags:
     """Compute PSNR, SSIM and LPIPS of a trained run on held-out views."""
 
     load_config: Path
-    """RUN_FOLDER, its config.yml, a folder above (its newest run), or a file of Gaussians (.ply, .spz); the flag's name
-    may be left out."""
+    """RUN_FOLDER, its config.yml, a folder above (its newest run), or a file of Gaussians (.ply, .spz, .splat); the
+    flag's name may be left out."""
     output_path: Path | None = None
     """JSON file to write. If not given: eval.json beside config.yml, or NAME.eval.json beside a file of Gaussians."""
     render_output_path: Path | None = None

@@ -233,12 +233,12 @@ def _splats(flags: SplatFlags, trained: Trained, placement: Placement, path: Pat
         raise ConfigError("this run has no Gaussians left; train it again")
     # Programs read float32 from these files.
     origin = local_origin(placement.original_points(good.means), good.typical_size / placement.scale)
-    about = placement if origin is None else placement.about(origin)
-    for cost in write_gaussians(path, transformed(good, *about.original_similarity()), flags.max_megabytes):
+    about, look = placement if origin is None else placement.about(origin), trained.model.look()
+    for cost in write_gaussians(path, transformed(good, *about.original_similarity()), flags.max_megabytes, look):
         say(cost)
     if sentence := write_offset(path, origin):
         say(sentence)
-    say(f"{path.stat().st_size / 1e6:.2f} MB: {path}")
+    say(f"{path.stat().st_size / 1e6:.2f} MB, {look.words()}: {path}")
 
 
 def _web(flags: WebFlags, trained: Trained, placement: Placement, path: Path) -> None:

@@ -34,8 +34,8 @@ class RunFlags:
     """The trained run."""
 
     load_config: Path
-    """RUN_FOLDER, its config.yml, a folder above (its newest run), or a file of Gaussians (.ply, .spz); the flag's name
-    may be left out."""
+    """RUN_FOLDER, its config.yml, a folder above (its newest run), or a file of Gaussians (.ply, .spz, .splat); the
+    flag's name may be left out."""
     load_checkpoint: Path | None = None
     """Checkpoint to load; the newest if not given."""
     data: Path | None = None

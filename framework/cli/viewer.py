@@ -19,8 +19,8 @@ class ViewerFlags:
     """Look at a trained run in a browser. It shows newer checkpoints as they are written; Ctrl-C ends it."""
 
     load_config: Path
-    """RUN_FOLDER, its config.yml, a folder above (its newest run), or a file of Gaussians (.ply, .spz); the flag's name
-    may be left out."""
+    """RUN_FOLDER, its config.yml, a folder above (its newest run), or a file of Gaussians (.ply, .spz, .splat); the
+    flag's name may be left out."""
     load_checkpoint: Path | None = None
     """Checkpoint to load; if not given, the newest, and each that is written later."""
     data: Path | None = None
@@ -44,7 +44,8 @@ def _command(arguments: list[str]) -> None:
     if (command := install_command("viewer")) is not None:
         raise ConfigError(f"the viewer needs viser: {command}")
     found = trained_run(flags.load_config, flags.load_checkpoint, flags.data)
-    from framework.training.splat_files import is_splat_file, load_run_or_splats
+    from framework.splats.files import is_splat_file
+    from framework.training.splat_files import load_run_or_splats
     from framework.viewer.trained_viewer import view_trained
 
     trained = load_run_or_splats(found, flags.load_checkpoint, flags.device_type, flags.data, data_format=named)

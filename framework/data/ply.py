@@ -34,22 +34,39 @@ LONGEST_LINE = 1000
 
 
 @dataclass(frozen=True)
-class PlyHeader:
-    """The header of a PLY file, as far as it describes the vertices, which come first in the file."""
+class PlyElement:
+    """The rows of one element of a PLY file, such as its vertices."""
 
     order: str
     """Key of `ORDERS`."""
     count: int
-    """Number of vertices that it claims."""
+    """Number of rows that the header claims."""
     columns: list[tuple[str, str]]
-    """Name and numpy type of each of their properties, in the file's order; x, y and z are among them."""
+    """Name and numpy type of each property, in the file's order."""
     start: int
-    """Position of the first vertex in the file, bytes."""
+    """Position of the first row in the file, bytes."""
 
     @property
     def names(self) -> list[str]:
         """Names of the properties."""
         return [name for name, _ in self.columns]
+
+    def row(self) -> np.dtype:
+        """Return the type of a row of a binary file."""
+        return np.dtype([(name, ORDERS[self.order] + kind) for name, kind in self.columns])
+
+
+@dataclass(frozen=True)
+class PlyHeader:
+    """The header of a PLY file."""
+
+    elements: dict[str, PlyElement]
+    """Elements by name, as far as their place in the file is known: up to the first with lists or, in ascii, the first
+    with rows."""
+    first: str
+    """Name of the first element; empty if there is none."""
+    comments: list[str]
+    """Text of the comments."""
 
 
 def read_points(file: Path) -> Tensor:
@@ -61,7 +78,7 @@ def read_points(file: Path) -> Tensor:
     Raises:
         DataError: if the file cannot be read, is not a PLY file, lacks positions or is truncated.
     """
-    columns = read_columns(file, read_header(file), "xyz")
+    columns = read_columns(file, vertices(file, read_header(file)), "xyz")
     points = torch.from_numpy(np.stack([column.astype(np.float64) for column in columns], axis=-1))
     finite = points.isfinite().all(-1)
     if not bool(finite.all()):
@@ -76,42 +93,58 @@ def read_header(file: Path) -> PlyHeader:
         file: path of the PLY file.
 
     Raises:
-        DataError: if the file cannot be read, is not a PLY file, or its vertices lack positions.
+        DataError: if the file cannot be read or is not a PLY file.
     """
     with _opened(file) as stream:
-        order, count, columns = _header(stream, file)
-        return PlyHeader(order, count, columns, stream.tell())
+        return _header(stream, file)
 
 
-def read_columns(file: Path, header: PlyHeader, names: Sequence[str]) -> list[np.ndarray]:
-    """Read properties of the vertices, (count,) each: in the file's type from a binary file, float64 from an ascii one.
+def vertices(file: Path, header: PlyHeader) -> PlyElement:
+    """Return the vertices of a PLY file, which have positions.
+
+    Args:
+        file: path of the PLY file, for messages.
+        header: its header.
+
+    Raises:
+        DataError: if there are none, or they lack positions.
+    """
+    found = header.elements.get("vertex")
+    if found is None:
+        raise DataError(f"{file}: vertices must be the first element, with their number; '{header.first}' comes first")
+    if not {"x", "y", "z"} <= set(found.names):
+        raise DataError(f"{file}: vertices must have the properties x, y and z, each once")
+    return found
+
+
+def read_columns(file: Path, element: PlyElement, names: Sequence[str]) -> list[np.ndarray]:
+    """Read properties of an element, (count,) each: in the file's type from a binary file, float64 from an ascii one.
 
     The memory allocated is bounded by the size of the file, whatever count its header claims.
 
     Args:
         file: path of the PLY file.
-        header: its header.
-        names: properties that the header has.
+        element: the element.
+        names: properties that it has.
 
     Raises:
         DataError: if the file cannot be read or is truncated.
     """
     with _opened(file) as stream:
-        remaining = file.stat().st_size - header.start
-        row = np.dtype([(name, ORDERS[header.order] + kind) for name, kind in header.columns])
-        ascii_ = header.order == "ascii"
+        remaining, row = file.stat().st_size - element.start, element.row()
+        ascii_ = element.order == "ascii"
         # In ascii at least a digit and a separator, of which the last may be missing.
-        needed = 2 * len(header.columns) * header.count - 1 if ascii_ else row.itemsize * header.count
+        needed = 2 * len(element.columns) * element.count - 1 if ascii_ else row.itemsize * element.count
         if needed > remaining:
             raise DataError(
-                f"{file} is truncated: its header states {header.count} points, and {remaining} bytes follow"
+                f"{file} is truncated: its header states {element.count} points, and {max(remaining, 0)} bytes follow"
             )
         if ascii_:
-            stream.seek(header.start)
-            return _ascii_columns(stream, file, header, names)
-        table = np.fromfile(stream, row, header.count, offset=header.start)
-        if len(table) < header.count:
-            raise DataError(f"{file} is truncated: {len(table)} of {header.count} points could be read")
+            stream.seek(element.start)
+            return _ascii_columns(stream, file, element, names)
+        table = np.fromfile(stream, row, element.count, offset=element.start)
+        if len(table) < element.count:
+            raise DataError(f"{file} is truncated: {len(table)} of {element.count} points could be read")
         return [table[name] for name in names]
 
 
@@ -124,49 +157,65 @@ def _opened(file: Path) -> Iterator[BinaryIO]:
         raise DataError(f"cannot read {file}: {error.strerror}") from error
 
 
-def _header(stream: BinaryIO, file: Path) -> tuple[str, int, list[tuple[str, str]]]:
-    """Return the key of `ORDERS`, the number of vertices, and the name and numpy type of each of their properties."""
+def _header(stream: BinaryIO, file: Path) -> PlyHeader:
     if stream.readline(LONGEST_LINE).strip() != b"ply":
         raise DataError(f"{file} is not a PLY file: its first line is not 'ply'")
-    order, count, element = "", -1, ""
-    columns: list[tuple[str, str]] = []
+    order, comments = "", []
+    described: list[tuple[str, int, list[tuple[str, str]]]] = []
     for _ in range(LONGEST_HEADER):
         words = stream.readline(LONGEST_LINE).decode("ascii", "replace").split()
         if words[:1] == ["end_header"]:
             break
         if words[:1] == ["format"] and len(words) > 1:
             order = words[1]
-        elif words[:1] == ["element"] and len(words) == 3:
-            element = words[1]
-            if element == "vertex" and words[2].isdecimal() and len(words[2]) < 19:
-                count = int(words[2])
-            elif count < 0 and words[2] != "0":
-                raise DataError(
-                    f"{file}: vertices must be the first element, with their number; '{element}' comes first"
-                )
-        elif words[:1] == ["property"] and element == "vertex":
-            if len(words) != 3 or words[1] not in TYPES:
-                raise DataError(
-                    f"{file}: property '{' '.join(words[1:])}' of the vertices is not supported; it must be a number"
-                )
-            columns.append((words[2], TYPES[words[1]]))
+        elif words[:1] == ["comment"]:
+            comments.append(" ".join(words[1:]))
+        elif words[:1] == ["element"]:
+            described.append((" ".join(words[1:2]), _count(words), []))
+        elif words[:1] == ["property"] and described:
+            number = len(words) == 3 and words[1] in TYPES
+            described[-1][2].append((words[2], TYPES[words[1]]) if number else (" ".join(words[1:]), ""))
     else:
         raise DataError(f"{file} is not a PLY file: its header has no 'end_header'")
-    names = [name for name, _ in columns]
     if order not in ORDERS:
         raise DataError(f"{file}: its format is '{order}'; known: {', '.join(ORDERS)}")
-    if count < 0 or not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
-        raise DataError(f"{file}: vertices must have the properties x, y and z, each once")
-    return order, count, columns
+    first = described[0][0] if described else ""
+    return PlyHeader(_placed(file, order, described, stream.tell()), first, comments)
 
 
-def _ascii_columns(stream: BinaryIO, file: Path, header: PlyHeader, names: Sequence[str]) -> list[np.ndarray]:
-    places = [header.names.index(name) for name in names]
-    values = np.empty((len(names), header.count))
-    for index in range(header.count):
+def _count(words: list[str]) -> int:
+    """Return the number of an element's rows, -1 if the line does not say it."""
+    return int(words[2]) if len(words) == 3 and words[2].isdecimal() and len(words[2]) < 19 else -1
+
+
+def _placed(
+    file: Path, order: str, described: list[tuple[str, int, list[tuple[str, str]]]], start: int
+) -> dict[str, PlyElement]:
+    """Return the elements whose place is known, by name."""
+    elements: dict[str, PlyElement] = {}
+    for name, count, columns in described:
+        wrong = [column for column, kind in columns if not kind]
+        twice = len({column for column, _ in columns}) < len(columns)
+        if name == "vertex" and count >= 0 and wrong:
+            raise DataError(f"{file}: property '{wrong[0]}' of the vertices is not supported; it must be a number")
+        if name == "vertex" and count >= 0 and twice:
+            raise DataError(f"{file}: vertices must have the properties x, y and z, each once")
+        if count < 0 or wrong or twice or name in elements:
+            break
+        elements[name] = PlyElement(order, count, columns, start)
+        if order == "ascii" and count:
+            break
+        start += elements[name].row().itemsize * count
+    return elements
+
+
+def _ascii_columns(stream: BinaryIO, file: Path, element: PlyElement, names: Sequence[str]) -> list[np.ndarray]:
+    places = [element.names.index(name) for name in names]
+    values = np.empty((len(names), element.count))
+    for index in range(element.count):
         words = stream.readline().split()
-        if len(words) < len(header.columns):
-            raise DataError(f"{file}: point {index} has {len(words)} values instead of {len(header.columns)}")
+        if len(words) < len(element.columns):
+            raise DataError(f"{file}: point {index} has {len(words)} values instead of {len(element.columns)}")
         try:
             values[:, index] = [float(words[place]) for place in places]
         except ValueError as error:
@@ -215,13 +264,19 @@ def in_full(positions: Tensor) -> str:
     )
 
 
-def write_columns(file: Path, columns: Sequence[tuple[str, np.ndarray]], faces: Tensor | None = None) -> None:
+def write_columns(
+    file: Path,
+    columns: Sequence[tuple[str, np.ndarray]],
+    faces: Tensor | None = None,
+    comments: Sequence[str] = (),
+) -> None:
     """Write vertices to a binary PLY file, little endian, as a whole or not at all.
 
     Args:
         file: path of the PLY file.
         columns: names and values (K,) of the properties, uint8, float32 or float64.
         faces: (F, 3) int64 vertices of triangles; None if there are none.
+        comments: lines for its header.
 
     Raises:
         OSError: if the file cannot be written.
@@ -233,19 +288,23 @@ def write_columns(file: Path, columns: Sequence[tuple[str, np.ndarray]], faces: 
     triangles = np.empty(0 if faces is None else len(faces), [("count", "u1"), ("index", "<i4", 3)])
     if faces is not None:
         triangles["count"], triangles["index"] = 3, faces.numpy()
-    header = header_text(len(table), kinds, None if faces is None else len(faces))
+    header = header_text(len(table), kinds, None if faces is None else len(faces), comments)
     write_atomically(file, lambda stream: stream.writelines([header, table.data, triangles.data]))
 
 
-def header_text(count: int, kinds: Sequence[tuple[str, str]], faces: int | None = None) -> bytes:
+def header_text(
+    count: int, kinds: Sequence[tuple[str, str]], faces: int | None = None, comments: Sequence[str] = ()
+) -> bytes:
     """Return the header of a binary file, little endian.
 
     Args:
         count: number of vertices.
         kinds: names of their properties, and PLY's names of their types.
         faces: number of triangles behind them; None for no such element.
+        comments: further lines.
     """
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
+    lines += [f"element vertex {count}"]
     lines += [f"property {kind} {name}" for name, kind in kinds]
     if faces is not None:
         lines += [f"element face {faces}", "property list uchar int vertex_indices"]

@@ -29,8 +29,9 @@ from framework.export.web import (
     upright,
 )
 from framework.ray_model import RayModel
-from framework.splats.drawing import DRAWN, draw, on_image, splat_camera
+from framework.splats.drawing import DRAWN, draw_colors, splat_camera
 from framework.splats.gaussians import Gaussians, HasGaussians
+from framework.splats.look import OURS, Look
 from framework.splats.transform import transformed
 from framework.training.checkpoint import write_atomically
 from framework.training.datasets import first_split, load_split
@@ -86,11 +87,11 @@ def export_page(trained: Trained, path: Path, max_megabytes: float, fit_seconds:
     cameras = pinhole(refined_cameras(model, dataset.cameras))
     near = max(NEAR * model.scene.near, LEAST_NEAR)
     if isinstance(model, HasGaussians):
-        found, antialiased = model.gaussians(), bool(getattr(model.config, "antialiased", False))
+        found, look = model.gaussians(), model.look()
     else:
         if not fit_seconds > 0:
             raise FlagError(f"--fit-seconds is {fit_seconds:g}; it must be positive")
-        found, antialiased = fit_gaussians(model, dataset, cameras, near, fit_seconds), False
+        found, look = fit_gaussians(model, dataset, cameras, near, fit_seconds), OURS
     found = found.map(lambda values: values.detach().cpu())
     good = found[found.finite()]
     if len(good) < len(found):
@@ -104,7 +105,7 @@ def export_page(trained: Trained, path: Path, max_megabytes: float, fit_seconds:
         about=_about(trained, moment),
         background=tuple(evaluation_background(model).tolist()),
         near=near,
-        antialiased=antialiased,
+        look=look,
         focus=focus_of(cameras, turn),
         cameras=camera_rows(cameras[torch.tensor(order)], [printable(dataset.names[i]) for i in order], turn),
     )
@@ -120,11 +121,11 @@ def export_page(trained: Trained, path: Path, max_megabytes: float, fit_seconds:
     held_out = first_split(trained.run, ("test", "val"))
     views = _at((dataset if held_out is None else held_out).to(model.device), moment)
     back = transformed(drawn, turn.T, 1.0, torch.zeros(3)).map(lambda values: values.to(model.device))
-    say(closeness(trained, back, views, near, antialiased, moment).line())
+    say(closeness(trained, back, views, near, look, moment).line())
 
 
 def closeness(
-    trained: Trained, gaussians: Gaussians, dataset: Dataset, near: float, antialiased: bool, moment: float | None
+    trained: Trained, gaussians: Gaussians, dataset: Dataset, near: float, look: Look, moment: float | None
 ) -> Closeness:
     """Compare Gaussians with the run that they show.
 
@@ -133,7 +134,7 @@ def closeness(
         gaussians: N Gaussians in the scene's frame, on the model's device.
         dataset: views with images, on the model's device.
         near: smallest depth at which a centre is drawn, scene units.
-        antialiased: whether opacity makes up for the blur of small Gaussians.
+        look: how the Gaussians are drawn.
         moment: time of the views; None for a static scene.
     """
     model, background = trained.model, evaluation_background(trained.model)
@@ -147,8 +148,7 @@ def closeness(
         view = View.of(cameras, index, dataset.times)
         rgb = model.render_rgb(view, background).clamp(0, 1).float()
         with torch.no_grad():
-            camera = splat_camera(view.camera, near, antialiased)
-            shown = draw(on_image(gaussians, camera), camera, background).image.clamp(0, 1)
+            shown = draw_colors(gaussians, splat_camera(view.camera, near, look), 1, background).clamp(0, 1)
         own.append(psnr(shown, rgb))
         if as_seen and moment is None:
             target = composite(dataset.image(index).float() / 255, background)

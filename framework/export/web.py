@@ -27,6 +27,7 @@ from framework.cameras.cameras import Cameras
 from framework.cameras.poses import looked_at, rotation_between
 from framework.splats.budget import fitted_spz
 from framework.splats.gaussians import Gaussians
+from framework.splats.look import Look
 from framework.splats.spz import encoded, out_of_range, read_spz
 
 LARGEST = 32.0
@@ -55,8 +56,8 @@ class PageFacts:
     """Colour behind everything, 0 to 1."""
     near: float
     """Smallest depth at which a centre is drawn, scene units."""
-    antialiased: bool
-    """Whether opacity makes up for the blur of small Gaussians."""
+    look: Look
+    """How Gaussians are drawn."""
     focus: list[float]
     """Position x, y, z that the cameras look at, scene units."""
     cameras: list[list[Any]]
@@ -148,9 +149,9 @@ def make_page(gaussians: Gaussians, facts: PageFacts, max_megabytes: float) -> t
     check_size(max_megabytes)
     empty = page(b"", facts)
     most = (1e6 * max_megabytes - len(empty.encode())) // 4 * 3
-    payload, changes = encoded(gaussians, BITS), ""
+    payload, changes = encoded(gaussians, BITS, facts.look), ""
     if len(payload) > most:
-        payload, changes = fitted_spz(gaussians, most)
+        payload, changes = fitted_spz(gaussians, most, facts.look)
         changes = changes or "harmonics in 5 and 4 bits instead of 8"
     lost = out_of_range(gaussians)
     return page(payload, facts), [f"{max_megabytes:g} MB hold {changes}", *lost] if changes else lost
@@ -221,4 +222,4 @@ def gaussians_of(text: str) -> Gaussians:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "page.spz"
         file.write_bytes(payload_of(text))
-        return read_spz(file)
+        return read_spz(file).gaussians

@@ -10,6 +10,12 @@ The backward pass goes from front to back too. What is behind a Gaussian is what
 been passed, so T need not be divided by 1 - alpha step by step. Each entry of a tile's list has sums of its own, which
 are added up by Gaussian in a fixed order: no two threads write to one place, and the same bits come out on any number
 of them.
+
+Growth asks how much the pixels pull at a Gaussian, even where they pull it apart and their gradients cancel (AbsGS, Ye
+et al. 2024). So every form leaves, in two columns of the records' gradient that the image does not depend on, the sums
+over pixels of the absolute gradients of the centre:
+
+    gradient[ABSOLUTE_X] = sum_p |d loss / d x through pixel p|        gradient[ABSOLUTE_Y] likewise of y
 """
 
 from __future__ import annotations
@@ -23,10 +29,12 @@ from torch.utils.checkpoint import checkpoint
 
 from framework.kernels import native
 from framework.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
-from framework.kernels.splat_project import CUT, DISTANCE, OPACITY, RECORD, RGB, X, Y
+from framework.kernels.splat_project import CUT, DISTANCE, OPACITY, REACH_X, RECORD, RGB, X, Y
 from framework.kernels.splat_tiles import TILE, TileLists
 from framework.kernels.triton_kernels import later
 
+ABSOLUTE_X, ABSOLUTE_Y = CUT, REACH_X
+"""Columns of the records' gradient with the sums of absolute gradients of x and y."""
 MAX_ALPHA = 0.999
 """No Gaussian is more opaque: the gradient divides by 1 - alpha."""
 OPAQUE = 1e-4
@@ -61,8 +69,8 @@ def blend(
 ) -> Blended:
     """Blend the Gaussians on an image.
 
-    The image does not depend on the columns CUT and REACH_X of the records. The compiled form puts the sums over pixels
-    of the absolute gradients of x and y there instead (AbsGS, Ye et al. 2024).
+    The gradient of the records is that of the image, but for the columns ABSOLUTE_X and ABSOLUTE_Y, which have sums of
+    absolute gradients.
 
     Args:
         records: (N, RECORD) Gaussians on the image.
@@ -115,12 +123,33 @@ def _weights(records: Tensor, lists: TileLists, tile: int, columns: int) -> tupl
     offset_y, offset_x = (part.flatten() for part in torch.meshgrid(within, within, indexing="ij"))
     x = (tile % columns * TILE + offset_x).to(records.dtype) + 0.5
     y = (tile // columns * TILE + offset_y).to(records.dtype) + 0.5
-    dx, dy = x[:, None] - listed[:, 0], y[:, None] - listed[:, 1]
+    dx, dy = _offsets(listed[None], x, y)
     q = (listed[:, 2] * dx + listed[:, 3] * dy) ** 2 + (listed[:, 4] * dy) ** 2
     alpha = (listed[:, OPACITY] * torch.exp(-q)).clamp(max=MAX_ALPHA)
     alpha = alpha.masked_fill(q >= listed[:, CUT], 0)
     through = torch.cat([torch.ones_like(alpha[:, :1]), (1 - alpha).cumprod(1)], 1)
     return listed, (alpha * through[:, :-1]).masked_fill(through[:, :-1] < OPAQUE, 0), through
+
+
+def _offsets(listed: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the offsets dx, dy (..., P, M) of pixels x, y (..., P) from Gaussians (..., 1, M, RECORD)."""
+    pixels = x.shape[-1]
+    center_x = _OfEachPixel.apply(listed[..., X], listed[..., ABSOLUTE_X], pixels)
+    center_y = _OfEachPixel.apply(listed[..., Y], listed[..., ABSOLUTE_Y], pixels)
+    return x[..., None] - center_x, y[..., None] - center_y
+
+
+class _OfEachPixel(torch.autograd.Function):
+    """Give each pixel a coordinate (..., P, M) of its own. Backwards, their gradients are added up, (..., 1, M), and so
+    are their absolute values, which go to another column."""
+
+    @staticmethod
+    def forward(ctx: Any, coordinate: Tensor, absolute: Tensor, pixels: int) -> Tensor:
+        return coordinate.expand(*coordinate.shape[:-2], pixels, coordinate.shape[-1])
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, None]:
+        return grads[0].sum(-2, keepdim=True), grads[0].abs().sum(-2, keepdim=True), None
 
 
 def _blend_together(
@@ -159,7 +188,7 @@ def _blended_tiles(
     within = torch.arange(TILE, device=records.device) + 0.5
     x = ((tiles % columns * TILE)[:, None, None] + within).expand(-1, TILE, -1).flatten(1)
     y = ((tiles // columns * TILE)[:, None, None] + within[:, None]).expand(-1, -1, TILE).flatten(1)
-    dx, dy = x.to(records.dtype)[..., None] - listed[..., X], y.to(records.dtype)[..., None] - listed[..., Y]
+    dx, dy = _offsets(listed, x.to(records.dtype), y.to(records.dtype))
     q = (listed[..., 2] * dx + listed[..., 3] * dy) ** 2 + (listed[..., 4] * dy) ** 2
     alpha = (listed[..., OPACITY] * torch.exp(-q)).clamp(max=MAX_ALPHA)
     alpha = alpha.masked_fill((q >= listed[..., CUT]) | (place >= (end - first)[:, None])[:, None], 0)

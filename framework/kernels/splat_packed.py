@@ -14,7 +14,7 @@ from torch import Tensor
 
 from framework.kernels import native
 from framework.kernels.dispatch import CPP, Operation
-from framework.kernels.splat_project import DEGREES, MIN_ALPHA, RECORD, SplatCamera, project_gaussians
+from framework.kernels.splat_project import DEGREES, MIN_ALPHA, RECORD, SplatCamera, project_gaussians, sort_keys
 
 PACK = 16
 """Gaussians in a block."""
@@ -86,6 +86,16 @@ def project_packed(packed: PackedGaussians, camera: SplatCamera, degree: int = 3
     """
     basis = min(DEGREES[degree], packed.harmonics.shape[2])
     return PROJECT_PACKED((packed.values, packed.balls), packed, camera, basis)
+
+
+def packed_sort_keys(packed: PackedGaussians, camera: SplatCamera) -> Tensor | None:
+    """Return what `sort_keys` does of the Gaussians before they were packed, (B * PACK,).
+
+    Args:
+        packed: B blocks of Gaussians.
+        camera: the camera.
+    """
+    return sort_keys(packed.values[:, : WIDTHS[0]].transpose(1, 2).reshape(-1, WIDTHS[0]), camera)
 
 
 def project_packed_reference(packed: PackedGaussians, camera: SplatCamera, basis: int) -> Tensor:

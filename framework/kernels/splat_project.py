@@ -36,6 +36,8 @@ opacity * exp(-(u_x dx + u_y dy)^2 - (v_y dy)^2); opacity; the exponent from whi
 width of what is within it; colour; distance from the camera; normal; half the height."""
 MIN_ALPHA = 1 / 255
 """A Gaussian is not drawn where its alpha is below it."""
+BLUR = 0.3
+"""Variance that 3D Gaussian Splatting adds on the image, pixels^2."""
 DC = 0.28209479177387814
 """The harmonic of degree 0."""
 MARGIN = 0.15
@@ -59,7 +61,7 @@ class SplatCamera:
     """Height of the image, pixels."""
     near: float = 0.01
     """Smallest depth along the optical axis at which a centre is drawn, scene units."""
-    blur: float = 0.3
+    blur: float = BLUR
     """Variance added in both directions on the image, pixels^2."""
     antialiased: bool = False
     """Whether opacity makes up for the blur."""
@@ -67,6 +69,8 @@ class SplatCamera:
     """Distortion of the projection "opencv" or "fisheye"; None for a pinhole camera."""
     fisheye: bool = False
     """Whether `lens` bends angles from the optical axis ("fisheye") instead of their tangents ("opencv")."""
+    by_depth: bool = False
+    """Whether Gaussians are sorted by depth along the optical axis instead of distance."""
 
     def plain(self) -> list[float]:
         """Return the camera as 33 numbers for a kernel."""
@@ -109,6 +113,19 @@ def project_gaussians(
         raise ValueError(f"there are 0, 3, 8 or 15 harmonics beyond the first, not {harmonics.shape[2]}")
     tensors = (means, log_scales, rotations, logits, colors, harmonics, camera.pose)
     return PROJECT(tensors, *tensors[:-1], camera, min(DEGREES[degree], harmonics.shape[2]))
+
+
+def sort_keys(means: Tensor, camera: SplatCamera) -> Tensor | None:
+    """Return the depths (N,) by which a camera's Gaussians are sorted; None if they are sorted by distance.
+
+    Args:
+        means: (N, 3) centres, scene coordinates.
+        camera: the camera.
+    """
+    if not camera.by_depth:
+        return None
+    pose = camera.pose.detach().to(means)
+    return means.detach() @ pose[2, :3] + pose[2, 3]
 
 
 def rotation_matrices(quaternions: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """Lists of the Gaussians that each tile of an image shows, from front to back.
 
-The Gaussians are sorted by distance once (a radix sort of 32-bit keys), and dealt to the tiles that they touch in that
-order, so that each tile's list is sorted too.
+The Gaussians are sorted once (a radix sort of 32-bit keys), by distance or by keys that are given, and dealt to the
+tiles that they touch in that order, so that each tile's list is sorted too.
 """
 
 from __future__ import annotations
@@ -37,8 +37,9 @@ class TileLists(NamedTuple):
 
 
 def tile_lists(
-    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None
-) -> TileLists:
+    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None,
+    keys: Tensor | None = None,
+) -> TileLists:  # fmt: skip
     """Return lists of the Gaussians that each tile of an image may show, nearest first, those as near by their index.
 
     Args:
@@ -47,14 +48,21 @@ def tile_lists(
         for_gradients: whether a gradient will be asked for; without one the lists may have no slots.
         room: number of entries for which there is room, so that the device need not be waited for; Gaussians beyond it
             are left out whole. None for room for all.
+        keys: (N,) positive numbers of the visible Gaussians, by which all are sorted instead, smallest first.
+
+    Raises:
+        ValueError: if there is another number of keys than of Gaussians.
     """
-    records = records.detach()
-    return TILES((records,), records, width, height, for_gradients, room)
+    if keys is not None and keys.shape != (len(records),):
+        raise ValueError(f"{len(records)} Gaussians are sorted by as many keys, not by {tuple(keys.shape)}")
+    records, keys = records.detach(), None if keys is None else keys.detach()
+    return TILES((records, keys), records, width, height, for_gradients, room, keys)
 
 
 def tile_lists_reference(
-    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None
-) -> TileLists:
+    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None,
+    keys: Tensor | None = None,
+) -> TileLists:  # fmt: skip
     """Compute `tile_lists` in torch. A Gaussian is listed in every tile that the box around it touches.
 
     Args:
@@ -62,10 +70,11 @@ def tile_lists_reference(
         width, height: size of the image, pixels.
         for_gradients: makes no difference here.
         room: number of entries for which there is room; the nearest Gaussians have it.
+        keys: (N,) by which Gaussians are sorted instead of distance.
     """
     columns, rows = -(-width // TILE), -(-height // TILE)
     device = records.device
-    order = records[:, DISTANCE].sort(stable=True).indices
+    order = _keys(records, keys).sort(stable=True).indices
     order = order[records[order, CUT] > 0]
     x, y, wide, high = records[order][:, [X, Y, REACH_X, REACH_Y]].unbind(-1)
     edges_x, edges_y = (torch.arange(count, device=device) * TILE for count in (columns, rows))
@@ -80,6 +89,11 @@ def tile_lists_reference(
         needed, touched = touched.sum(), touched & (touched.sum(1).cumsum(0) <= room)[:, None]
     place, tile = touched.nonzero().unbind(-1)  # by Gaussian in order of distance, then by tile
     return _dealt(order.index_select(0, place), tile, columns * rows, len(records))._replace(needed=needed)
+
+
+def _keys(records: Tensor, keys: Tensor | None) -> Tensor:
+    """Return the numbers (N,) by which Gaussians are sorted: their distances, if no others are given."""
+    return records[:, DISTANCE] if keys is None else keys
 
 
 def _dealt(ids: Tensor, tiles: Tensor, num_tiles: int, num_gaussians: int) -> TileLists:
@@ -106,13 +120,14 @@ TILES = Operation("tile_lists", tile_lists_reference)
 
 @TILES.implementation(FEW_OPERATIONS, types=None)
 def _by_entries(
-    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None
-) -> TileLists:
+    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None,
+    keys: Tensor | None = None,
+) -> TileLists:  # fmt: skip
     """Compute `tile_lists` without a table of all Gaussians and tiles; the device is waited for once, if no room is
     given. The nearest Gaussians have it."""
     count, device = len(records), records.device
     columns, rows = -(-width // TILE), -(-height // TILE)
-    order = torch.sort(records[:, DISTANCE], stable=True).indices
+    order = torch.sort(_keys(records, keys), stable=True).indices
     sorted_records = records.index_select(0, order)
     x, y, wide, high = (sorted_records[:, column] for column in (X, Y, REACH_X, REACH_Y))
     left, right = _met(x, wide, columns)
@@ -144,19 +159,23 @@ def _met(centers: Tensor, reaches: Tensor, count: int) -> tuple[Tensor, Tensor]:
     return first.long(), last.long() + 1
 
 
-_sort = native.Function("splat_sort", "pqp", "q")
+_sort = native.Function("splat_sort", "pqpqp", "q")
 _bound = native.Function("splat_bound", "pqiii", "q")
 _bin = native.Function("splat_bin", "pqpqiiqppppi", "q")
 
 
-def _for_all(records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None) -> bool:
+def _for_all(
+    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None,
+    keys: Tensor | None = None,
+) -> bool:  # fmt: skip
     return room is None
 
 
 @TILES.implementation(CPP, fits=_for_all)
 def _compiled(
-    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None
-) -> TileLists:
+    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None,
+    keys: Tensor | None = None,
+) -> TileLists:  # fmt: skip
     records = records.contiguous()  # kept until the kernels have read it
     count, threads = len(records), native.threads()
     tiles = -(-width // TILE) * -(-height // TILE)
@@ -165,8 +184,8 @@ def _compiled(
     def whole(size: int) -> Tensor:
         return torch.empty(size, dtype=torch.int32)
 
-    order = whole(count)
-    visible = _sort(address, count, order.data_ptr())
+    order, sorted_by = whole(count), _keys(records, keys)
+    visible = _sort(address, count, sorted_by.data_ptr(), sorted_by.stride(0), order.data_ptr())
     bound = _bound(address, count, width, height, threads)
     offsets, ids, firsts = whole(tiles + 1), whole(bound), whole(count + 1)
     slots = whole(bound if for_gradients else 0)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from framework.base.errors import ConfigError
 from framework.splats.gaussians import Gaussians
+from framework.splats.look import OURS, Look
 from framework.splats.ply import ply_size
 from framework.splats.spz import BITS, encoded, rounded_harmonics
 
@@ -25,33 +26,35 @@ DOUBT = 1.05
 """Ratio of an estimated size to the limit beyond which a choice is not tried."""
 
 
-def fitted_ply(gaussians: Gaussians, most_bytes: float) -> tuple[Gaussians, str]:
+def fitted_ply(gaussians: Gaussians, most_bytes: float, look: Look = OURS) -> tuple[Gaussians, str]:
     """Return Gaussians whose PLY file is not larger than a limit, and what was left out, in words.
 
     Args:
         gaussians: N Gaussians.
         most_bytes: maximum size of the file.
+        look: how they are drawn.
 
     Raises:
         ConfigError: if not even one Gaussian fits.
     """
     for degree in range(gaussians.degree, -1, -1):
-        if ply_size(len(gaussians), _terms(degree)) <= most_bytes:
+        if ply_size(len(gaussians), _terms(degree), look) <= most_bytes:
             return with_degree(gaussians, degree), _changes(gaussians, degree, BITS, len(gaussians))
     # Not less than what fits: the header is longest for N.
-    header = ply_size(len(gaussians), 0) - len(gaussians) * (row := ply_size(1, 0) - ply_size(0, 0))
+    header = ply_size(len(gaussians), 0, look) - len(gaussians) * (row := ply_size(1, 0) - ply_size(0, 0))
     count = math.floor((most_bytes - header) / row)
     if count < 1:
         raise _too_small(most_bytes)
     return most_visible(with_degree(gaussians, 0), count), _changes(gaussians, 0, BITS, count)
 
 
-def fitted_spz(gaussians: Gaussians, most_bytes: float) -> tuple[bytes, str]:
+def fitted_spz(gaussians: Gaussians, most_bytes: float, look: Look = OURS) -> tuple[bytes, str]:
     """Return the content of an SPZ file that is not larger than a limit, and what was left out, in words.
 
     Args:
         gaussians: N Gaussians on the CPU.
         most_bytes: maximum size of the file.
+        look: how they are drawn.
 
     Raises:
         ConfigError: if not even one Gaussian fits, or the format cannot hold them.
@@ -63,12 +66,12 @@ def fitted_spz(gaussians: Gaussians, most_bytes: float) -> tuple[bytes, str]:
         size = len(encoded(with_degree(sample, degree), bits)) * len(gaussians) / max(len(sample), 1)
         if size > DOUBT * most_bytes:
             continue
-        content = encoded(with_degree(gaussians, degree), bits)
+        content = encoded(with_degree(gaussians, degree), bits, look)
         if len(content) <= most_bytes:
             return content, _changes(gaussians, degree, bits, len(gaussians))
     fewer, count = with_degree(gaussians, 0), len(gaussians)
     while count > 0:
-        content = encoded(most_visible(fewer, count))
+        content = encoded(most_visible(fewer, count), look=look)
         if len(content) <= most_bytes:
             return content, _changes(gaussians, 0, BITS, count)
         count = math.floor(count * min(0.99, 0.995 * most_bytes / len(content)))

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from framework.base.processes import add_up
-from framework.kernels.splat_project import CUT, OPACITY, REACH_X, X, Y, rotation_matrices
+from framework.kernels.splat_blend import ABSOLUTE_X, ABSOLUTE_Y
+from framework.kernels.splat_project import OPACITY, rotation_matrices
 from framework.splats.gaussians import Gaussians
 
 GRADIENT = 8e-4
@@ -58,7 +59,7 @@ class GradientMean(nn.Module):
             return
         if len(self.sums) != len(records):
             self.sums = records.new_zeros(len(records), 2)
-        sizes, shown = image_gradients(records, records.grad, longer_side), records[:, OPACITY] > 0
+        sizes, shown = image_gradients(records.grad, longer_side), records[:, OPACITY] > 0
         if isinstance(finite, Tensor):
             sizes, shown = torch.where(finite, sizes, 0), shown & finite
         self.sums[:, 0] += sizes
@@ -81,18 +82,14 @@ class GradientMean(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
-def image_gradients(records: Tensor, gradient: Tensor, longer_side: int) -> Tensor:
-    """Return the size (N,) of the gradient of each Gaussian's position on an image, as if its longer side were 2 units.
+def image_gradients(gradient: Tensor, longer_side: int) -> Tensor:
+    """Return how much the pixels pull at each Gaussian's position, (N,), on an image whose longer side is 2 units.
 
     Args:
-        records: (N, RECORD) Gaussians on the image.
-        gradient: (N, RECORD) its gradient. The compiled `blend` leaves sums of absolute gradients in the columns CUT
-            and REACH_X; where those are 0 (the reference), the position's own gradient is taken.
+        gradient: (N, RECORD) their gradient, in which `blend` leaves sums over pixels of absolute gradients.
         longer_side: of the image, pixels.
     """
-    absolute = torch.hypot(gradient[:, CUT], gradient[:, REACH_X])
-    plain = torch.hypot(gradient[:, X], gradient[:, Y])
-    return torch.where(absolute > 0, absolute, plain) * (longer_side / 2)
+    return torch.hypot(gradient[:, ABSOLUTE_X], gradient[:, ABSOLUTE_Y]) * (longer_side / 2)
 
 
 def grown(gaussians: Gaussians, gradients: Tensor, most: int, extent: float) -> Growth | None:

@@ -12,10 +12,11 @@ from framework.cameras.cameras import Cameras
 from framework.cameras.view import every
 from framework.geometry.lenses import LENSES, Distortion
 from framework.kernels.splat_blend import CHANNELS, Blended, blend
-from framework.kernels.splat_project import SplatCamera, project_gaussians
+from framework.kernels.splat_project import SplatCamera, project_gaussians, sort_keys
 from framework.kernels.splat_tiles import tile_lists
 from framework.rendering.rendered import Picture
 from framework.splats.gaussians import MAX_DEGREE, Gaussians
+from framework.splats.look import OURS, Look
 from framework.splats.room import Room
 
 DRAWN = ("pinhole", "opencv", "fisheye")
@@ -25,14 +26,14 @@ FLIPPED = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
 
 
 def splat_camera(
-    camera: Cameras, near: float, antialiased: bool = False, pose: Tensor | None = None, reduced: int = 1
+    camera: Cameras, near: float, look: Look = OURS, pose: Tensor | None = None, reduced: int = 1
 ) -> SplatCamera:
     """Return a camera as splatting sees it.
 
     Args:
         camera: one camera.
         near: what is nearer to it along its axis is not drawn, scene units.
-        antialiased: make up for the blur of small Gaussians by their opacity.
+        look: how Gaussians are drawn.
         pose: (3, 4) camera-to-scene pose to use instead of its own; it may require a gradient.
         reduced: factor by which the image is smaller than the camera's.
 
@@ -54,8 +55,9 @@ def splat_camera(
         lens = _lens(camera.model, given)
     height, width = (side // reduced for side in camera.sizes[0])
     return SplatCamera(
-        to_camera, (fx, fy, cx, cy), width, height, near, antialiased=antialiased, lens=lens, fisheye=fisheye
-    )
+        to_camera, (fx, fy, cx, cy), width, height, near, look.blur, look.antialiased, lens, fisheye,
+        look.sort == "depth",
+    )  # fmt: skip
 
 
 @lru_cache(maxsize=16)
@@ -91,6 +93,7 @@ def draw(
     background: Tensor,
     channels: int = CHANNELS["rgb"],
     room: Room | None = None,
+    keys: Tensor | None = None,
 ) -> Blended:
     """Blend Gaussians on an image, with a gradient.
 
@@ -100,9 +103,15 @@ def draw(
         background: (3,) colour behind everything.
         channels: number of channels, a value of `CHANNELS`.
         room: how many entries of lists a device that runs ahead of Python gets, which would be waited for otherwise.
+        keys: (N,) what they are sorted by, from `sort_keys`; None for distance.
+
+    Raises:
+        ValueError: if the camera sorts by depth, and there are no keys.
     """
+    if camera.by_depth and keys is None:
+        raise ValueError("this camera sorts Gaussians by depth: give the keys that `sort_keys` returns")
     given = None if room is None else room.of(records, camera.width * camera.height)
-    lists = tile_lists(records, camera.width, camera.height, torch.is_grad_enabled(), given)
+    lists = tile_lists(records, camera.width, camera.height, torch.is_grad_enabled(), given, keys)
     if room is not None:
         room.note(records, camera.width * camera.height, lists)
     return blend(records, lists, camera.width, camera.height, background, channels)
@@ -118,7 +127,8 @@ def draw_colors(gaussians: Gaussians, camera: SplatCamera, stride: int, backgrou
         stride: distance between the rows and columns that are kept, pixels.
         background: (3,) colour behind everything.
     """
-    return every(draw(on_image(gaussians, camera), camera, background).image, stride)
+    keys = sort_keys(gaussians.means, camera)
+    return every(draw(on_image(gaussians, camera), camera, background, keys=keys).image, stride)
 
 
 @torch.no_grad()
@@ -132,8 +142,8 @@ def draw_view(gaussians: Gaussians, camera: SplatCamera, stride: int, background
         background: (3,) colour behind everything.
         far: depth where nothing is seen, scene units.
     """
-    records = on_image(gaussians, camera)
-    lists = tile_lists(records, camera.width, camera.height, for_gradients=False)
+    records, keys = on_image(gaussians, camera), sort_keys(gaussians.means, camera)
+    lists = tile_lists(records, camera.width, camera.height, for_gradients=False, keys=keys)
     image, through, median = blend(
         records, lists, camera.width, camera.height, background, CHANNELS["normals"], median=True
     )

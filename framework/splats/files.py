@@ -1,4 +1,4 @@
-"""Files of Gaussians: PLY or SPZ, told apart by their content when read and by their suffix when written."""
+"""Files of Gaussians: PLY, SPZ or .splat, told apart by their content when read and by their suffix when written."""
 
 from __future__ import annotations
 
@@ -7,22 +7,35 @@ from pathlib import Path
 from framework.base.atomic import write_atomically
 from framework.base.errors import ConfigError, DataError
 from framework.splats.budget import fitted_ply, fitted_spz
-from framework.splats.gaussians import Gaussians
+from framework.splats.gaussians import Gaussians, Splats
+from framework.splats.look import ELSEWHERE, OURS, Look
 from framework.splats.ply import read_ply, write_ply
+from framework.splats.splat import read_splat
 from framework.splats.spz import MAGIC, encoded, out_of_range, read_spz
 
 SUFFIXES = (".ply", ".spz")
 """Suffixes of files that can be written."""
+SPLAT = ".splat"
+"""Suffix of files that can be read besides; nothing in them tells what they are."""
+OTHERS = {
+    ".ksplat": "GaussianSplats3D", ".sog": "PlayCanvas", ".splatv": "antimatter15/splaTV", ".rad": "Spark",
+}  # fmt: skip
+"""Suffixes of formats that cannot be read, and where they come from."""
 
 
-def read_gaussians(file: Path) -> Gaussians:
-    """Read Gaussians from a PLY or an SPZ file.
+def is_splat_file(path: Path) -> bool:
+    """Return whether `path` names a file of Gaussians, by its suffix."""
+    return path.suffix.lower() in (*SUFFIXES, SPLAT, *OTHERS)
+
+
+def read_gaussians(file: Path) -> Splats:
+    """Read Gaussians from a PLY file, compressed or not, an SPZ file or a .splat file, and how they are drawn.
 
     Args:
-        file: path of the file, with any suffix.
+        file: path of the file, with any suffix if it is PLY or SPZ.
 
     Raises:
-        DataError: if the file cannot be read, is neither, or is damaged.
+        DataError: if the file cannot be read, is none of these, or is damaged.
     """
     try:
         with file.open("rb") as stream:
@@ -33,16 +46,23 @@ def read_gaussians(file: Path) -> Gaussians:
         return read_ply(file)
     if start[:2] == b"\x1f\x8b" or start == MAGIC:
         return read_spz(file)
-    raise DataError(f"{file} is neither a PLY nor an SPZ file; Gaussians are read from these two")
+    suffix = file.suffix.lower()
+    if suffix == SPLAT:
+        return Splats(read_splat(file), ELSEWHERE)
+    what = f"of {OTHERS[suffix]}'s format" if suffix in OTHERS else "neither a PLY nor an SPZ file"
+    raise DataError(f"{file} is {what}; Gaussians are read from .ply, .spz and .splat files: convert it to PLY")
 
 
-def write_gaussians(file: Path, gaussians: Gaussians, max_megabytes: float | None = None) -> list[str]:
+def write_gaussians(
+    file: Path, gaussians: Gaussians, max_megabytes: float | None = None, look: Look = OURS
+) -> list[str]:
     """Write Gaussians to a file of the format that its suffix names, and return what that cost.
 
     Args:
         file: path of the file, with a suffix of `SUFFIXES`.
         gaussians: N Gaussians on the CPU.
         max_megabytes: maximum size of the file in millions of bytes; None for any.
+        look: how they are drawn.
 
     Returns:
         Sentences on what was left out to make the file small enough, or is beyond the format's range.
@@ -53,11 +73,11 @@ def write_gaussians(file: Path, gaussians: Gaussians, max_megabytes: float | Non
     """
     most = None if max_megabytes is None else 1e6 * max_megabytes
     if file.suffix == ".ply":
-        kept, changes = (gaussians, "") if most is None else fitted_ply(gaussians, most)
-        write_ply(file, kept)
+        kept, changes = (gaussians, "") if most is None else fitted_ply(gaussians, most, look)
+        write_ply(file, kept, look)
         lost = []
     elif file.suffix == ".spz":
-        content, changes = (encoded(gaussians), "") if most is None else fitted_spz(gaussians, most)
+        content, changes = (encoded(gaussians, look=look), "") if most is None else fitted_spz(gaussians, most, look)
         lost = out_of_range(gaussians)
         write_atomically(file, lambda stream: stream.write(content))
     else:

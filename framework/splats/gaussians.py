@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from torch import Tensor
 from framework.cameras.view import View
 from framework.kernels.splat_project import DEGREES
 from framework.rendering.rendered import Picture
+from framework.splats.look import Look
 
 MAX_DEGREE = max(DEGREES)
 """Highest degree of the spherical harmonics that colours are made of."""
@@ -67,12 +68,24 @@ class Gaussians:
         return torch.stack([each.flatten(1).isfinite().all(1) for each in (v.unsqueeze(-1) for v in values)]).all(0)
 
 
+class Splats(NamedTuple):
+    """Gaussians as a file holds them."""
+
+    gaussians: Gaussians
+    """The Gaussians."""
+    look: Look
+    """How they are drawn."""
+
+
 @runtime_checkable
 class HasGaussians(Protocol):
     """A model that consists of Gaussians."""
 
     def gaussians(self) -> Gaussians:
         """Return them, without gradient."""
+
+    def look(self) -> Look:
+        """Return how they are drawn."""
 
 
 @runtime_checkable

@@ -5,6 +5,13 @@ which are 0 and which readers ignore; f_dc_0 to f_dc_2, the coefficients of degr
 of higher degrees, all of red before all of green before all of blue; opacity (before the sigmoid); scale_0 to scale_2
 (logarithms); rot_0 to rot_3 (a quaternion w, x, y, z).
 
+Mip-Splatting's files have a property `filter_3D` besides: the standard deviation of a smoothing filter in space, which
+is a part of the Gaussian (Yu et al. 2024, section 4.1). With f for it, scales are sqrt(s^2 + f^2), and opacity is that
+stored times the root of the ratio of the products of s^2 and of s^2 + f^2. So they are read, and images are antialiased
+with the blur of that method, 0.1 pixels^2 (section 4.2, and kernel_size of its code).
+
+How the Gaussians are drawn stands in comments (`framework.splats.look`).
+
 Harmonics have the order and the signs of `framework.kernels.spherical_harmonics`, and are evaluated at the direction
 from the camera to the Gaussian: in utils/sh_utils.py of https://github.com/graphdeco-inria/gaussian-splatting degree 1
 is -C1 y, C1 z, -C1 x with C1 = 0.4886025119029199, and degrees 2 and 3 are equal too for unit directions, constant by
@@ -14,6 +21,7 @@ constant (Sloan 2008, with the Condon-Shortley phase). So coefficients are store
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,13 +30,19 @@ from torch import Tensor
 
 from framework.base.console import say
 from framework.base.errors import DataError
-from framework.data.ply import header_text, read_columns, read_header, write_columns
-from framework.splats.gaussians import MAX_DEGREE, Gaussians
+from framework.data.ply import PlyElement, header_text, read_columns, read_header, vertices, write_columns
+from framework.splats.compressed_ply import is_compressed, read_compressed
+from framework.splats.gaussians import MAX_DEGREE, Gaussians, Splats
+from framework.splats.look import ELSEWHERE, OURS, Look, comments, discs, look_of
 
 SURE = 16.0
 """Logit that stands for an opacity of 1, whose logit is infinite; other programs write it so. -SURE stands for 0."""
 TERMS = {0: 0, 9: 3, 24: 8, 45: 15, 72: 24}
 """Number of properties f_rest to coefficients a channel."""
+FILTER = "filter_3d"
+"""Name of the smoothing filter's property, in small letters; programs differ in that."""
+MIP_SPLATTING = replace(ELSEWHERE, antialiased=True, blur=0.1)
+"""How Gaussians with a filter are drawn, where no comment says otherwise."""
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _ROTATIONS = ("rot_0", "rot_1", "rot_2", "rot_3")
@@ -44,23 +58,25 @@ def property_names(terms: int) -> list[str]:
     return ["x", "y", "z", "nx", "ny", "nz", *_DC, *rest, "opacity", *_SCALES, *_ROTATIONS]
 
 
-def ply_size(count: int, terms: int) -> int:
+def ply_size(count: int, terms: int, look: Look = OURS) -> int:
     """Return the size of a file in bytes.
 
     Args:
         count: number of Gaussians.
         terms: coefficients of degrees 1 and higher for each channel.
+        look: how they are drawn.
     """
     names = property_names(terms)
-    return len(header_text(count, [(name, "float") for name in names])) + 4 * len(names) * count
+    return len(header_text(count, [(name, "float") for name in names], comments=comments(look))) + 4 * len(names) * count
 
 
-def write_ply(file: Path, gaussians: Gaussians) -> None:
+def write_ply(file: Path, gaussians: Gaussians, look: Look = OURS) -> None:
     """Write Gaussians to a binary PLY file, little endian, float32.
 
     Args:
         file: path of the PLY file.
         gaussians: N Gaussians on the CPU.
+        look: how they are drawn.
 
     Raises:
         OSError: if the file cannot be written.
@@ -72,11 +88,12 @@ def write_ply(file: Path, gaussians: Gaussians) -> None:
         gaussians.rotations,
     )  # fmt: skip
     values = [column for part in parts for column in part.detach().numpy().T]
-    write_columns(file, list(zip(property_names(gaussians.harmonics.shape[2]), values, strict=True)))
+    columns = list(zip(property_names(gaussians.harmonics.shape[2]), values, strict=True))
+    write_columns(file, columns, comments=comments(look))
 
 
-def read_ply(file: Path) -> Gaussians:
-    """Read Gaussians from a PLY file, in any order of properties, with others besides, ascii or binary.
+def read_ply(file: Path) -> Splats:
+    """Read Gaussians from a PLY file, in any order of properties, with others besides, ascii, binary or compressed.
 
     Gaussians with parameters that are not finite, or without a rotation, are left out, which is said on the terminal.
     An infinite opacity, as other programs write it for an opaque Gaussian, becomes `SURE`. Degree 4 is left out.
@@ -86,12 +103,47 @@ def read_ply(file: Path) -> Gaussians:
         file: path of the PLY file.
 
     Raises:
-        DataError: if the file cannot be read, is not a PLY file, has no Gaussians or is truncated.
+        DataError: if the file cannot be read, is not a PLY file, has no 3D Gaussians or is truncated.
     """
     header = read_header(file)
-    names = set(header.names)
+    if is_compressed(header):
+        return Splats(usable(read_compressed(file, header), file), look_of(header.comments, file))
+    vertex = vertices(file, header)
+    filters = [name for name in vertex.names if name.lower() == FILTER]
+    gaussians = _stored(file, vertex)
+    look = look_of(header.comments, file, MIP_SPLATTING if filters else ELSEWHERE)
+    if filters:
+        say(f"{file}: Mip-Splatting's filter becomes a part of sizes and opacities")
+        gaussians = smoothed(gaussians, _together(read_columns(file, vertex, filters[:1]))[:, 0])
+    return Splats(usable(gaussians, file), look)
+
+
+def smoothed(gaussians: Gaussians, filters: Tensor) -> Gaussians:
+    """Return Gaussians that are smoothed by a filter in space, and as much fainter as they are larger (Mip-Splatting).
+
+    Args:
+        gaussians: N Gaussians.
+        filters: (N,) standard deviations of the filters.
+    """
+    squares = (2 * gaussians.log_scales.double()).exp().clamp(min=1e-300)  # its logarithm is finite
+    larger = squares + filters.double().square()[:, None]
+    shares = (squares.log() - larger.log()).sum(1).mul(0.5).exp()
+    opacity = torch.sigmoid(gaussians.logits.double()) * shares
+    return replace(
+        gaussians,
+        log_scales=(larger.log() / 2).to(gaussians.log_scales),
+        logits=torch.logit(opacity).clamp(-SURE, SURE).to(gaussians.logits),
+    )
+
+
+def _stored(file: Path, vertex: PlyElement) -> Gaussians:
+    """Return the Gaussians that stand in the vertices of a file."""
+    names = set(vertex.names)
     needed = (*_DC, "opacity", *_SCALES, *_ROTATIONS)
-    if missing := [name for name in needed if name not in names]:
+    missing = [name for name in needed if name not in names]
+    if missing == [_SCALES[2]]:
+        raise discs(file)
+    if missing:
         raise DataError(
             f"{file} has points, but no Gaussians: {', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing;"
             " name a PLY file of Gaussian splatting"
@@ -109,26 +161,28 @@ def read_ply(file: Path) -> Gaussians:
         say(f"{file}: harmonics above degree {MAX_DEGREE} are left out")
     kept = [f"f_rest_{channel * terms + term}" for channel in range(3) for term in range(wanted)]
     named = ["x", "y", "z", *_DC, *kept, "opacity", *_SCALES, *_ROTATIONS]
-    columns = dict(zip(named, read_columns(file, header, named), strict=True))
-
-    precise = dict(header.columns)["x"] == "f8"
+    columns = dict(zip(named, read_columns(file, vertex, named), strict=True))
 
     def together(names: Sequence[str], kind: type = np.float32) -> Tensor:
-        values = np.empty((header.count, len(names)), kind)
-        with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold is left out below
-            for index, name in enumerate(names):
-                values[:, index] = columns[name]
-        return torch.from_numpy(values)
+        return _together([columns[name] for name in names], kind)
 
-    gaussians = Gaussians(
-        means=together("xyz", np.float64 if precise else np.float32),
+    return Gaussians(
+        means=together("xyz", np.float64 if dict(vertex.columns)["x"] == "f8" else np.float32),
         log_scales=together(_SCALES),
         rotations=together(_ROTATIONS),
         logits=_finite_logits(together(["opacity"])[:, 0]),
         colors=together(_DC),
-        harmonics=together(kept).reshape(header.count, 3, wanted),
+        harmonics=together(kept).reshape(vertex.count, 3, wanted),
     )
-    return usable(gaussians, file)
+
+
+def _together(columns: Sequence[np.ndarray], kind: type = np.float32) -> Tensor:
+    """Return columns (N,) side by side, (N, C), of a floating-point type."""
+    values: np.ndarray = np.empty((len(columns[0]) if columns else 0, len(columns)), kind)
+    with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold is left out later
+        for index, column in enumerate(columns):
+            values[:, index] = column
+    return torch.from_numpy(values)
 
 
 def _finite_logits(logits: Tensor) -> Tensor:

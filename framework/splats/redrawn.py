@@ -7,7 +7,7 @@ from torch import Tensor
 
 from framework.cameras.view import every
 from framework.kernels import native
-from framework.kernels.splat_packed import PackedGaussians, pack_gaussians, project_packed
+from framework.kernels.splat_packed import PackedGaussians, pack_gaussians, packed_sort_keys, project_packed
 from framework.kernels.splat_project import MIN_ALPHA, SplatCamera
 from framework.splats.drawing import draw, draw_colors
 from framework.splats.gaussians import Gaussians
@@ -45,7 +45,8 @@ class Redrawn:
             self.packed = packed(self.gaussians)
         if self.packed is None:
             return draw_colors(self.gaussians, camera, stride, background)
-        return every(draw(project_packed(self.packed, camera), camera, background).image, stride)
+        records, keys = project_packed(self.packed, camera), packed_sort_keys(self.packed, camera)
+        return every(draw(records, camera, background, keys=keys).image, stride)
 
 
 def packed(gaussians: Gaussians) -> PackedGaussians | None:

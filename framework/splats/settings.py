@@ -11,6 +11,7 @@ from framework.base.decisions import Choice, Decision, fill
 from framework.data.scene import Scene
 from framework.splats.gaussians import MAX_DEGREE
 from framework.splats.learning import number_for, rate_factor
+from framework.splats.look import LEAST_BLUR, MOST_BLUR, OURS, Look, Sort
 
 PIXELS_PER_SECOND = 25 * 400 * 400
 """Pixels that training draws in a second, about, on two cores; for what is decided by the budget."""
@@ -36,6 +37,7 @@ class SplattingConfig(
 
     RANGES: ClassVar[dict[str, Range]] = {
         "degree": (0, MAX_DEGREE),
+        "blur": (LEAST_BLUR, MOST_BLUR),
         "num_gaussians": (1, 10_000_000),
         "start_gaussians": (1, 10_000_000),
         "field_steps": (1, math.inf),
@@ -54,6 +56,11 @@ class SplattingConfig(
     """Highest degree of the spherical harmonics that colours are made of."""
     antialiased: bool = False
     """Compensate the minimum width of a Gaussian on an image by its opacity (Mip-Splatting)."""
+    blur: float = OURS.blur
+    """Variance added to every Gaussian on an image, pixels^2: 0.3 in 3DGS and gsplat, 0.1 in Mip-Splatting."""
+    sort: Sort = OURS.sort
+    """What Gaussians are sorted by. distance: from the camera, so that turning it changes nothing. depth: along its
+    axis, as 3DGS, gsplat and most viewers sort."""
     num_gaussians: Auto[int] = AUTO
     """Maximum number of Gaussians; by the budget if not given."""
     start: Literal["auto", "points", "field", "silhouettes", "random"] = "auto"
@@ -88,6 +95,10 @@ class SplattingConfig(
     """Weight of the mean opacity in the loss; by the start if not given."""
     scale_penalty: float | None = None
     """Weight of the mean scale, in scene extents, in the loss; by the start if not given."""
+
+    def look(self) -> Look:
+        """Return how Gaussians are drawn."""
+        return Look(self.antialiased, self.blur, self.sort)
 
 
 SplattingConfigT = TypeVar("SplattingConfigT", bound=SplattingConfig)

@@ -17,6 +17,9 @@ about x. So `read_spz` gives what a PLY file of the same scene gives, and what N
 RDF, number for number. (Converters that leave axes alone exist.) With y and z also change sign: y and z of quaternions,
 and the harmonics that are odd in y and z together (`SIGNS`).
 
+**How they are drawn.** The lowest bit of the flags says that the Gaussians were trained with antialiasing. What else
+`framework.splats.look` says stands in the comment of the gzip file (RFC 1952, FCOMMENT), which other programs skip.
+
 **Versions.** Version 2 is written, since some programs read no other, and 2 and 3 are read. With 8 bits of x, y and z,
 w has no bits to speak of where it is near 0, and such a rotation may be off by twelve degrees. But a Gaussian has 24
 descriptions, as its axes can be exchanged and turned around, and in one of them w is at least 0.85. That is written,
@@ -29,6 +32,7 @@ import gzip
 import math
 import struct
 import zlib
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -39,7 +43,8 @@ from torch import Tensor
 from framework.base.atomic import write_atomically
 from framework.base.console import say
 from framework.base.errors import ConfigError, DataError
-from framework.splats.gaussians import MAX_DEGREE, Gaussians
+from framework.splats.gaussians import MAX_DEGREE, Gaussians, Splats
+from framework.splats.look import ELSEWHERE, OURS, Look, comments, look_of
 from framework.splats.ply import usable
 from framework.splats.transform import quaternion_product
 
@@ -60,27 +65,32 @@ RATIO = 1032
 """Maximum ratio of sizes before and after compression by gzip."""
 FLAT = 3.0
 """Logarithm of the largest over the smallest size that is written, beyond which nobody sees it clipped."""
+ANTIALIASED = 1
+"""Bit of the header's flags."""
+FCOMMENT, COMMENT_START, LONGEST_COMMENT = 16, 10, 1000
+"""Of gzip's header: the flags' value if it has a comment alone; where that begins; its maximum length, bytes."""
 SURPLUS = 1 << 24
 """Maximum number of bytes behind the last array, where extensions of the format stand."""
 
 
-def write_spz(file: Path, gaussians: Gaussians, bits: tuple[int, int] = BITS) -> None:
+def write_spz(file: Path, gaussians: Gaussians, bits: tuple[int, int] = BITS, look: Look = OURS) -> None:
     """Write Gaussians to an SPZ file of version 2.
 
     Args:
         file: path of the file.
         gaussians: N Gaussians on the CPU.
         bits: as in `encoded`.
+        look: how they are drawn.
 
     Raises:
         ConfigError: if the format cannot hold them.
         OSError: if the file cannot be written.
     """
-    content = encoded(gaussians, bits)
+    content = encoded(gaussians, bits, look)
     write_atomically(file, lambda stream: stream.write(content))
 
 
-def encoded(gaussians: Gaussians, bits: tuple[int, int] = BITS) -> bytes:
+def encoded(gaussians: Gaussians, bits: tuple[int, int] = BITS, look: Look = OURS) -> bytes:
     """Return the content of an SPZ file of version 2.
 
     What exceeds the format's range is clipped: standard deviations to e^-10 ... e^5.9, coefficients of degree 0 to
@@ -90,6 +100,7 @@ def encoded(gaussians: Gaussians, bits: tuple[int, int] = BITS) -> bytes:
     Args:
         gaussians: N finite Gaussians on the CPU.
         bits: to which harmonics of degree 1, and of higher degrees, are rounded, at most 8. Fewer compress better.
+        look: how they are drawn.
 
     Raises:
         ConfigError: if the format cannot hold them.
@@ -110,8 +121,22 @@ def encoded(gaussians: Gaussians, bits: tuple[int, int] = BITS) -> bytes:
         _bytes(127.5 * (vectors + 1)),
         _rounded(signed, bits).transpose(0, 2, 1),
     ]
-    header = HEADER.pack(MAGIC, 2, len(gaussians), gaussians.degree, fraction, 0, 0)
-    return gzip.compress(b"".join([header, *(np.ascontiguousarray(array).tobytes() for array in arrays)]), 6, mtime=0)
+    flags = ANTIALIASED if look.antialiased else 0
+    header = HEADER.pack(MAGIC, 2, len(gaussians), gaussians.degree, fraction, flags, 0)
+    content = b"".join([header, *(np.ascontiguousarray(array).tobytes() for array in arrays)])
+    return _commented(gzip.compress(content, 6, mtime=0), "\n".join(comments(look)))
+
+
+def _commented(packed: bytes, comment: str) -> bytes:
+    """Return a gzip file with a comment."""
+    start = packed[:3] + bytes([FCOMMENT]) + packed[4:COMMENT_START]
+    return start + comment.encode("latin-1") + b"\0" + packed[COMMENT_START:]
+
+
+def _comment(packed: bytes) -> list[str]:
+    """Return the lines of the comment with which a gzip file begins; none if it has other parts besides."""
+    text, end, _ = packed[COMMENT_START : COMMENT_START + LONGEST_COMMENT].partition(b"\0")
+    return text.decode("latin-1").splitlines() if end and packed[3] == FCOMMENT else []
 
 
 def fractional_bits(gaussians: Gaussians) -> int:
@@ -204,7 +229,7 @@ def _largest_real_part(rotations: Tensor, log_scales: Tensor) -> tuple[Tensor, T
     return turned, log_scales.gather(1, images.abs().argmax(-1)[best])
 
 
-def read_spz(file: Path) -> Gaussians:
+def read_spz(file: Path) -> Splats:
     """Read Gaussians from an SPZ file of version 2 or 3, in the axes of PLY files.
 
     Opacities of 0 and 1, which have no finite logit, become 1/1020 and 1019/1020, the middle of what is rounded to
@@ -216,7 +241,7 @@ def read_spz(file: Path) -> Gaussians:
     Raises:
         DataError: if the file cannot be read, is not an SPZ file of these versions, is truncated or damaged.
     """
-    version, count, degree, fraction, raw = _unpacked(file)
+    version, count, degree, fraction, flags, raw = _unpacked(file)
     terms = (degree + 1) ** 2 - 1
     sizes = _sizes(version, terms)
     cuts = np.cumsum([0, *(size * count for size in sizes)])
@@ -242,7 +267,14 @@ def read_spz(file: Path) -> Gaussians:
         colors=_float((colors / 255.0 - 0.5) / 0.15),
         harmonics=_float(values * np.array(SIGNS[:wanted], np.float32)),
     )
-    return usable(gaussians, file)
+    return Splats(usable(gaussians, file), _look(file, flags))
+
+
+def _look(file: Path, flags: int) -> Look:
+    """Return how the Gaussians are drawn, of which the flags say first what there is to say."""
+    with file.open("rb") as stream:
+        lines = _comment(stream.read(COMMENT_START + LONGEST_COMMENT))
+    return replace(look_of(lines, file, ELSEWHERE), antialiased=bool(flags & ANTIALIASED))
 
 
 def _float(values: np.ndarray) -> Tensor:
@@ -254,15 +286,15 @@ def _sizes(version: int, terms: int) -> tuple[int, ...]:
     return 9, 1, 3, 3, 3 if version == 2 else 4, 3 * terms
 
 
-def _unpacked(file: Path) -> tuple[int, int, int, int, np.ndarray]:
-    """Return version, number of Gaussians, degree, fractional bits, and the bytes behind the header."""
+def _unpacked(file: Path) -> tuple[int, int, int, int, int, np.ndarray]:
+    """Return version, number of Gaussians, degree, fractional bits, flags, and the bytes behind the header."""
     try:
         with file.open("rb") as plain:
             if plain.read(4) == MAGIC:
                 raise DataError(f"{file} is SPZ of version 4 or later: convert it to version 3, or to a PLY file")
         with gzip.open(file, "rb") as stream:
             start = stream.read(HEADER.size)
-            version, count, degree, fraction = _checked_header(file, start)
+            version, count, degree, fraction, flags = _checked_header(file, start)
             needed = count * sum(_sizes(version, (degree + 1) ** 2 - 1))
             size = file.stat().st_size
             if needed > RATIO * size:
@@ -281,15 +313,15 @@ def _unpacked(file: Path) -> tuple[int, int, int, int, np.ndarray]:
         raise DataError(f"{file} is truncated: copy or export it again") from error
     except OSError as error:
         raise DataError(f"cannot read {file}: {error.strerror}") from error
-    return version, count, degree, fraction, np.frombuffer(content, np.uint8)
+    return version, count, degree, fraction, flags, np.frombuffer(content, np.uint8)
 
 
-def _checked_header(file: Path, start: bytes) -> tuple[int, int, int, int]:
+def _checked_header(file: Path, start: bytes) -> tuple[int, int, int, int, int]:
     if start[:4] != MAGIC:
         raise DataError(f"{file} is not an SPZ file: what it unpacks to does not begin with {MAGIC.decode()}")
     if len(start) < HEADER.size:
         raise DataError(f"{file} is truncated: copy or export it again")
-    _, version, count, degree, fraction, _, _ = HEADER.unpack(start)
+    _, version, count, degree, fraction, flags, _ = HEADER.unpack(start)
     if version not in (2, 3):
         raise DataError(f"{file} is SPZ of version {version}; versions 2 and 3 can be read: convert it")
     if degree > 4 or fraction > 30 or count > MOST:
@@ -297,7 +329,7 @@ def _checked_header(file: Path, start: bytes) -> tuple[int, int, int, int]:
             f"{file} is damaged: its header states {count:,} Gaussians of degree {degree} with {fraction} fractional"
             f" bits, and the format has up to {MOST:,}, 4 and 30; export it again"
         )
-    return version, count, degree, fraction
+    return version, count, degree, fraction, flags
 
 
 def _first_three(stored: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from torch import Tensor
 from framework.base.config import RayConfig, TrainConfig
 from framework.base.console import say
 from framework.base.decisions import Decision
+from framework.base.errors import ConfigError
 from framework.base.registry import load_method
 from framework.cameras.ndc import NdcCameras
 from framework.cameras.upright import sideways_up
@@ -46,8 +47,12 @@ def decided(method: str, config: TrainConfig, dataset: Dataset) -> tuple[Dataset
 
     Returns:
         The data set, perhaps with a smaller box, the settings, and each decision with its reason.
+
+    Raises:
+        ConfigError: if the method cannot draw the images' cameras.
     """
     declared = load_method(method)
+    _check_cameras(method, declared.model.cameras, dataset)
     settings, made = declared.decided(config, dataset.scene)
     settings, made = starts_checked(config, settings, made, dataset)
     times = dataset.times
@@ -73,6 +78,19 @@ def decided(method: str, config: TrainConfig, dataset: Dataset) -> tuple[Dataset
         settings, made = declared.decided(config, dataset.scene)
         found.append(Decision("box", f"{100 * share:.0f}% of the data's", "alpha shows that nothing is ever outside"))
     return dataset, settings, [*found, *made]
+
+
+def _check_cameras(method: str, drawn: tuple[str, ...] | None, dataset: Dataset) -> None:
+    if drawn is None:
+        return
+    instead = "take a method that casts rays, such as nerfacto"
+    if isinstance(dataset.cameras, NdcCameras):
+        raise ConfigError(f"{method} draws no normalised device coordinates: leave out --ndc, or {instead}")
+    if (model := dataset.cameras.model) not in drawn:
+        raise ConfigError(
+            f"{method} cannot draw {model} cameras, only {', '.join(drawn)}; cut perspective images out of them first,"
+            f" or {instead}"
+        )
 
 
 def _with_steps_as_long(config: TrainConfig, default: TrainConfig, decided: TrainConfig, shorter: float) -> TrainConfig:

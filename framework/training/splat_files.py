@@ -19,7 +19,7 @@ from framework.data.offsets import offset_file, read_offset
 from framework.data.pixel_cache import PixelMemory
 from framework.data.scene import Scene
 from framework.geometry.local_origin import local_origin, rounding
-from framework.splats.files import SUFFIXES, read_gaussians
+from framework.splats.files import is_splat_file, read_gaussians
 from framework.splats.gaussians import Gaussians, TakesGaussians
 from framework.splats.transform import transformed
 from framework.training.run import Run
@@ -31,11 +31,6 @@ LOOKED_AT = 4
 """Number of images that are decoded to know whether images have alpha, and how large they are."""
 DataFormat = tuple[str, DataParser]
 """Name of a data format, and its flags."""
-
-
-def is_splat_file(path: Path) -> bool:
-    """Return whether `path` names a file of Gaussians, by its suffix."""
-    return path.suffix.lower() in SUFFIXES
 
 
 def load_run_or_splats(
@@ -50,7 +45,7 @@ def load_run_or_splats(
     """Load a run with its trained model, or a file of Gaussians as one.
 
     Args:
-        path: the run's config.yml, its folder, or a file of Gaussians (.ply, .spz) in the frame of the input.
+        path: the run's config.yml, its folder, or a file of Gaussians (.ply, .spz, .splat) in the frame of the input.
         checkpoint: as for `load_trained`; a file of Gaussians has none.
         device_type: auto, cpu, cuda or mps.
         data: folder of the data; that of the run if None.
@@ -76,7 +71,8 @@ def load_run_or_splats(
 
 def _load_splats(file: Path, data: Path | None, data_format: DataFormat | None, device_type: Any) -> Trained:
     """Return a run whose model draws the Gaussians of a file."""
-    gaussians = read_gaussians(file)
+    gaussians, look = read_gaussians(file)
+    say(f"{file}: {look.words()}")
     if data is None and data_format is None:
         raise ConfigError(f"{file} is no run, and does not know its photographs: --data DIR")
     data, name = find_data(data, None if data_format is None else data_format[0])
@@ -84,7 +80,8 @@ def _load_splats(file: Path, data: Path | None, data_format: DataFormat | None, 
     method = load_method(METHOD)
     settings: Any = method.config
     machine = MachineConfig(device_type=device_type)
-    config: TrainConfig = dataclasses.replace(settings, data=data, machine=machine, degree=gaussians.degree, vis="none")
+    drawn = {"degree": gaussians.degree, **dataclasses.asdict(look)}
+    config: TrainConfig = dataclasses.replace(settings, data=data, machine=machine, vis="none", **drawn)
     run, device = Run(METHOD, config, name, parser, file.parent), choose_device(machine)
     parsed = run.parse("train")
     scene = _scene(parsed, config)

@@ -35,6 +35,7 @@ from framework.data.pixel_cache import PixelMemory, pack, unpack
 from framework.data.ply import read_points
 from framework.splats.files import SUFFIXES, read_gaussians, write_gaussians
 from framework.splats.gaussians import Gaussians
+from framework.splats.look import LEAST_BLUR, MOST_BLUR, Look
 from framework.tools.downloads import unpack as downloads
 from framework.tools.processing import polycam, record3d
 from framework.tools.processing.images import prepare_all
@@ -55,6 +56,7 @@ from tests.exr_files import NONE, RLE, ZIP, ZIPS, write_exr
 from tests.fuzz.reader import Reader, require
 from tests.fuzz.sense import check_cameras, check_dataset, check_scene
 from tests.images import noise
+from tests.splats.foreign_files import write_compressed, write_splat
 from tests.training.helpers import tiny_run
 
 MEMORY = 20e6
@@ -154,12 +156,15 @@ def write_splats(folder: Path) -> None:
     shapes = ((6, 3), (6, 3), (6, 4), (6,), (6, 3), (6, 3, 8))
     gaussians = Gaussians(*(torch.randn(shape, generator=random) for shape in shapes))
     for suffix in SUFFIXES:
-        write_gaussians(folder / f"splat{suffix}", gaussians)
+        write_gaussians(folder / f"splat{suffix}", gaussians, look=Look(True, 0.1))
+    write_splat(folder / "splat.splat", gaussians)
+    write_compressed(folder / "splat.compressed.ply", gaussians)
 
 
 def read_splats(folder: Path, scratch: Path) -> None:
     for file in sorted(folder.glob("splat*")):
-        gaussians = read_gaussians(file)
+        gaussians, look = read_gaussians(file)
+        require(LEAST_BLUR <= look.blur <= MOST_BLUR, "Gaussians that are drawn as none can be")
         require(len(gaussians), "no Gaussians")
         require(bool(gaussians.finite().all()), "Gaussians that are nowhere")
         require(bool(gaussians.log_scales.exp().isfinite().all()), "Gaussians without end")

@@ -7,7 +7,7 @@ derivatives of Legendre polynomials, and each pixel looks at all Gaussians.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,6 +21,7 @@ from framework.kernels.native import torch_on_one_thread
 from framework.kernels.splat_blend import Blended, blend
 from framework.kernels.splat_project import SplatCamera, project_gaussians
 from framework.kernels.splat_tiles import tile_lists
+from framework.splats.density_control import image_gradients
 from tests.kernels.compiled import relative_error
 
 NAMES = ("means", "log scales", "rotations", "logits", "colors", "harmonics", "pose")
@@ -277,3 +278,27 @@ def compared(
         errors,
         float(known.float().mean()),
     )
+
+
+# -- growth -------------------------------------------------------------------------------------------------------
+
+
+@torch_on_one_thread()
+def growth_error(
+    form: Callable[..., Blended], given: Sequence[Tensor], view: SplatCamera, device: torch.device | str = "cpu"
+) -> float:
+    """Compare what growth goes by, after a form of `blend`, with the truth: of each Gaussian the sum over the pixels of
+    the absolute gradient of its centre through that pixel alone, on an image whose longer side is 2 units."""
+    *parameters, pose = given
+    truth = true_image(leaves(given, torch.float64), view)
+    records = project_gaussians(*parameters, replace(view, pose=pose))[0].to(device).requires_grad_()
+    lists = tile_lists(records, view.width, view.height)
+    found = form(records, lists, view.width, view.height, BACKGROUND.to(device), 4, False)
+    (slope,) = gradients(found.image, found.transmittance, truth.certain.to(device), [records])
+    (of_offsets,) = gradients(truth.image[..., :4], truth.transmittance, truth.certain, [truth.offsets])
+    longer = max(view.width, view.height)
+    exact = of_offsets.abs().sum(0).norm(dim=-1) * longer / 2
+    order = projected([tensor.double() for tensor in given], view, 0).indices
+    cancelled = of_offsets.sum(0).norm(dim=-1) * longer / 2
+    assert float((cancelled / exact.clamp(min=1e-9)).median()) < 0.5  # it is another thing than the plain gradient
+    return relative_error(image_gradients(slope.cpu(), longer)[order], exact)

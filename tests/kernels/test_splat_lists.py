@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from framework.kernels.splat_project import CUT, DISTANCE, OPACITY, RECORD, U_X, project_gaussians
-from framework.kernels.splat_tiles import TILE, TileLists, tile_lists, tile_lists_reference
+from framework.kernels.splat_tiles import TILE, TILES, TileLists, tile_lists, tile_lists_reference
 from tests.kernels.compiled import needs_kernels
 from tests.kernels.splat_truth import camera, scene
+from tests.kernels.test_few_operations import few
 
 Form = Callable[[Tensor, int, int], TileLists]
 SIZES = [(1, 1), (16, 16), (17, 33), (64, 48), (130, 7)]
@@ -93,6 +94,22 @@ def test_needles_are_listed_where_they_are_and_hardly_elsewhere() -> None:
     assert not (must & ~listed).any()
     assert not (listed & ~boxes).any()
     assert must.sum() <= listed.sum() < 1.2 * must.sum() < 0.8 * boxes.sum()
+
+
+@pytest.mark.parametrize("form", [pytest.param(tile_lists, marks=needs_kernels), tile_lists_reference, few(TILES)])
+def test_lists_are_sorted_by_keys_that_are_given(form: Callable[..., TileLists]) -> None:
+    """Distances that are wrong do not matter then, and as keys they make the lists that they make by themselves."""
+    torch.manual_seed(3)
+    records = records_of(scene(300), 64, 48)
+    keys = torch.rand(300) + 1e-3
+    given = torch.stack([torch.zeros(300), keys], 1)[:, 1]  # not next to each other in memory
+    found, same = form(records, 64, 48, keys=given), form(records, 64, 48, keys=records[:, DISTANCE].clone())
+    assert all(torch.equal(one, other) for one, other in zip(same[:4], form(records, 64, 48)[:4], strict=True))
+    assert not torch.equal(found.ids, same.ids)
+    records[:, DISTANCE] = keys
+    check(found, records, 64, 48)
+    with pytest.raises(ValueError, match="300 Gaussians are sorted by as many keys"):
+        tile_lists(records, 64, 48, keys=keys[:4])
 
 
 @FORMS

@@ -20,8 +20,9 @@ from framework.kernels.spherical_harmonics import spherical_harmonics_reference
 from framework.splats.budget import colour_error, fitted_ply, fitted_spz, visibility
 from framework.splats.files import read_gaussians, write_gaussians
 from framework.splats.gaussians import Gaussians
+from framework.splats.look import OURS, Look
 from framework.splats.ply import SURE, ply_size, property_names, write_ply
-from framework.splats.spz import SIGNS, encoded, fractional_bits, read_spz, write_spz
+from framework.splats.spz import COMMENT_START, SIGNS, encoded, fractional_bits, write_spz
 from framework.splats.transform import quaternion, quaternion_product, rotated_harmonics, transformed
 from tests.conftest import Refused
 
@@ -38,6 +39,10 @@ def some(count: int = 50, degree: int = 3, seed: int = 0) -> Gaussians:
     return Gaussians(
         5 * normal(3), 0.7 * normal(3) - 3, normal(4), 2 * normal(), normal(3), 0.2 * normal(3, TERMS[degree])
     )
+
+
+def gaussians_in(file: Path) -> Gaussians:
+    return read_gaussians(file).gaussians
 
 
 def same(first: Gaussians, second: Gaussians) -> bool:
@@ -99,7 +104,7 @@ def test_harmonics_have_the_signs_of_the_published_code() -> None:
 def test_ply_is_exact(tmp_path: Path, degree: int) -> None:
     gaussians = some(degree=degree)
     assert write_gaussians(tmp_path / "a.ply", gaussians) == []
-    assert same(read_gaussians(tmp_path / "a.ply"), gaussians)
+    assert same(gaussians_in(tmp_path / "a.ply"), gaussians)
     assert (tmp_path / "a.ply").stat().st_size == ply_size(50, TERMS[degree])
 
 
@@ -108,7 +113,13 @@ def test_ply_has_the_published_layout(tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", gaussians)
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"] + [f"f_rest_{i}" for i in range(9)]
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    lines = ["ply", "format binary_little_endian 1.0", "element vertex 3", *[f"property float {n}" for n in names]]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment SplatRenderMode: default",
+        "comment SplatSort: distance",
+    ]
+    lines += ["element vertex 3", *[f"property float {n}" for n in names]]
     header = ("\n".join([*lines, "end_header"]) + "\n").encode()
     content = (tmp_path / "a.ply").read_bytes()
     assert content[: len(header)] == header
@@ -150,13 +161,13 @@ def by_hand(gaussians: Gaussians, order: str = "<", terms: int | None = None, ki
 def test_ply_of_other_programs(tmp_path: Path, degree: int, order: str, kind: str) -> None:
     gaussians = some(7, degree)
     (tmp_path / "b.dat").write_bytes(by_hand(gaussians, order, kind=kind))
-    assert same(read_gaussians(tmp_path / "b.dat"), gaussians)
+    assert same(gaussians_in(tmp_path / "b.dat"), gaussians)
 
 
 def test_degree_4_is_cut_to_3(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     gaussians = some(7)
     (tmp_path / "b.ply").write_bytes(by_hand(gaussians, terms=24))
-    assert same(read_gaussians(tmp_path / "b.ply"), gaussians)
+    assert same(gaussians_in(tmp_path / "b.ply"), gaussians)
     assert "harmonics above degree 3 are left out" in capsys.readouterr().err
 
 
@@ -168,20 +179,20 @@ def test_what_cannot_be_rendered_is_left_out_and_counted(tmp_path: Path, capsys:
     gaussians.log_scales[3, 0] = 100  # its exponential is infinite
     gaussians.logits[4], gaussians.logits[5] = math.inf, -math.inf  # opacities 1 and 0 of other programs
     write_ply(tmp_path / "a.ply", gaussians)
-    read = read_gaussians(tmp_path / "a.ply")
+    read = gaussians_in(tmp_path / "a.ply")
     assert "4 of 9 Gaussians are not finite and are left out" in capsys.readouterr().err
     assert torch.equal(read.means, gaussians.means[4:])
     assert read.logits[:2].tolist() == [SURE, -SURE]
     gaussians.means[:] = math.nan
     write_ply(tmp_path / "a.ply", gaussians)
     with pytest.raises(DataError, match="none of its 9 Gaussians is finite"):
-        read_gaussians(tmp_path / "a.ply")
+        gaussians_in(tmp_path / "a.ply")
 
 
 def refused_in_a_line(file: Path, content: bytes) -> str:
     file.write_bytes(content)
     with pytest.raises(DataError) as error:
-        read_gaussians(file)
+        gaussians_in(file)
     assert str(file) in str(error.value)
     assert "\n" not in str(error.value)
     return str(error.value)
@@ -201,9 +212,9 @@ def test_damaged_ply_is_refused(tmp_path: Path) -> None:
     assert "truncated" in refused_in_a_line(file, whole.replace(b"vertex 40", b"vertex 40000000000000"))
     assert "neither a PLY nor an SPZ file" in refused_in_a_line(file, b"\x89PNG")
     with pytest.raises(DataError, match="cannot read"):
-        read_gaussians(tmp_path / "none.ply")
+        gaussians_in(tmp_path / "none.ply")
     with pytest.raises(DataError, match="cannot read"):
-        read_gaussians(tmp_path)
+        gaussians_in(tmp_path)
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".spz"])
@@ -244,7 +255,7 @@ def test_version_2_by_hand(tmp_path: Path) -> None:
     """The order of arrays, the axes, and the coefficients' order, of which red, green and blue are neighbours."""
     harmonics = bytes([128 + 8 * index for index in range(9)])
     (tmp_path / "a.spz").write_bytes(packed(2, 1, 1, body(bytes([255, 127, 128]), harmonics)))
-    g = read_gaussians(tmp_path / "a.spz")
+    g = gaussians_in(tmp_path / "a.spz")
     assert g.means.tolist() == [[1.5, 2.0, -0.25]]
     assert g.log_scales.tolist() == [[-10.0, 0.0, 2.0]]
     assert float(g.logits.sigmoid()) == pytest.approx(0.2)
@@ -263,19 +274,19 @@ def test_version_3_by_hand(tmp_path: Path, largest: int) -> None:
     xyzw = [sign * value / 511 / math.sqrt(2) for sign, value in ((-1, 100), (1, 200), (-1, 300))]
     xyzw.insert(largest, math.sqrt(1 - sum(value * value for value in xyzw)))
     x, y, z, w = xyzw
-    assert read_gaussians(tmp_path / "a.spz").rotations[0].tolist() == pytest.approx([w, x, -y, -z], abs=1e-6)
+    assert gaussians_in(tmp_path / "a.spz").rotations[0].tolist() == pytest.approx([w, x, -y, -z], abs=1e-6)
 
 
 def test_largest_of_a_damaged_rotation_is_finite(tmp_path: Path) -> None:
     (tmp_path / "a.spz").write_bytes(packed(3, 1, 0, body(b"\xff\xff\xff\x3f")))
-    assert bool(read_gaussians(tmp_path / "a.spz").rotations.isfinite().all())
+    assert bool(gaussians_in(tmp_path / "a.spz").rotations.isfinite().all())
 
 
 @pytest.mark.parametrize("degree", range(4))
 def test_spz_is_as_exact_as_its_bits(tmp_path: Path, degree: int) -> None:
     gaussians = some(3000, degree)
     assert write_gaussians(tmp_path / "a.spz", gaussians) == []
-    read = read_gaussians(tmp_path / "a.spz")
+    read = gaussians_in(tmp_path / "a.spz")
     assert float((read.means - gaussians.means).abs().max()) <= 0.5 / 4096 + 1e-6
     assert float((read.logits.sigmoid() - gaussians.logits.sigmoid()).abs().max()) <= 0.5 / 255 + 1e-6
     inside = gaussians.colors.abs() < 3.3
@@ -296,7 +307,7 @@ def test_written_rotations_are_off_by_a_degree_at_most(tmp_path: Path) -> None:
     gaussians = some(20_000, 0)
     gaussians.log_scales[:] = torch.tensor([-6.0, -4.0, -2.0])
     write_spz(tmp_path / "a.spz", gaussians)
-    read = read_spz(tmp_path / "a.spz")
+    read = gaussians_in(tmp_path / "a.spz")
     assert float(read.rotations[:, 0].min()) > 0.84
     order = read.log_scales.argsort(-1)
     axes = matrices(read.rotations).gather(2, order[:, None].expand(-1, 3, -1))
@@ -310,7 +321,7 @@ def test_spz_looks_like_the_ply_of_the_same_scene(tmp_path: Path) -> None:
     gaussians.harmonics[:] = (gaussians.harmonics * 8).round() / 8
     write_gaussians(tmp_path / "a.ply", gaussians)
     write_gaussians(tmp_path / "a.spz", gaussians)
-    ply, spz = read_gaussians(tmp_path / "a.ply"), read_gaussians(tmp_path / "a.spz")
+    ply, spz = gaussians_in(tmp_path / "a.ply"), gaussians_in(tmp_path / "a.spz")
     for direction in directions(5):
         torch.testing.assert_close(seen(spz, direction), seen(ply, direction))
     # In the file itself, whose y and z are turned around, what d showed is shown by the turned d.
@@ -341,25 +352,25 @@ def test_what_is_out_of_range_is_said(tmp_path: Path) -> None:
     first, second = write_gaussians(tmp_path / "a.spz", gaussians)
     assert "rounds positions to 0.25" in first
     assert "5 of the Gaussians get the nearest" in second
-    assert bool(read_gaussians(tmp_path / "a.spz").log_scales[:5].eq(-10).all())
+    assert bool(gaussians_in(tmp_path / "a.spz").log_scales[:5].eq(-10).all())
 
 
 def test_opacities_of_0_and_1_stay_finite(tmp_path: Path) -> None:
     gaussians = some(2, 0)
     gaussians.logits[:] = torch.tensor([100.0, -100.0])
     write_spz(tmp_path / "a.spz", gaussians)
-    assert read_spz(tmp_path / "a.spz").logits.sigmoid().tolist() == pytest.approx([1019 / 1020, 1 / 1020])
+    assert gaussians_in(tmp_path / "a.spz").logits.sigmoid().tolist() == pytest.approx([1019 / 1020, 1 / 1020])
 
 
 def test_extensions_behind_the_arrays_are_passed_over(tmp_path: Path) -> None:
     content = body(bytes([255, 127, 128])) + struct.pack("<II", 0xADBE0002, 12) + 12 * b"\0"
     (tmp_path / "a.spz").write_bytes(packed(2, 1, 0, content, flags=2))
-    assert len(read_gaussians(tmp_path / "a.spz")) == 1
+    assert len(gaussians_in(tmp_path / "a.spz")) == 1
 
 
 def test_degree_4_of_spz_is_cut_to_3(tmp_path: Path) -> None:
     (tmp_path / "a.spz").write_bytes(packed(3, 1, 4, body(b"\0\0\0\0", bytes(range(72)))))
-    assert read_gaussians(tmp_path / "a.spz").degree == 3
+    assert gaussians_in(tmp_path / "a.spz").degree == 3
 
 
 def test_damaged_spz_is_refused(tmp_path: Path) -> None:
@@ -389,7 +400,7 @@ def test_truncated_spz_is_refused_wherever_it_ends(tmp_path: Path) -> None:
 
 def test_spz_with_a_wrong_byte_is_refused(tmp_path: Path) -> None:
     whole = encoded(some(300, 1))
-    for place in range(10, len(whole), 97):
+    for place in range(whole.index(0, COMMENT_START), len(whole), 97):
         damaged = bytearray(whole)
         damaged[place] ^= 16
         assert "a.spz" in refused_in_a_line(tmp_path / "a.spz", bytes(damaged)), place
@@ -462,7 +473,7 @@ def test_max_megabytes_holds_and_no_more_is_given_up_than_needed(tmp_path: Path,
     for limit in np.linspace(whole - 1, whole / 200, 16).tolist():
         said = write_gaussians(file, gaussians, limit / 1e6)
         assert limit * 0.5 < file.stat().st_size <= limit
-        read = read_gaussians(file)
+        read = gaussians_in(file)
         counts.append(len(read))
         degrees.append(read.degree)
         assert len(said) == 1
@@ -505,6 +516,32 @@ def test_limits_that_hold_nothing_are_refused(tmp_path: Path) -> None:
         write_gaussians(tmp_path / "a.obj", some(5))
 
 
+# -- how they are drawn -----------------------------------------------------------------------------------------------
+
+LOOKS = (OURS, Look(antialiased=True), Look(blur=0.1), Look(True, 0.125, "depth"), Look(sort="depth"))
+
+
+@pytest.mark.parametrize("suffix", ["ply", "spz"])
+@pytest.mark.parametrize("look", LOOKS)
+def test_files_say_how_gaussians_are_drawn(tmp_path: Path, suffix: str, look: Look) -> None:
+    file = tmp_path / f"a.{suffix}"
+    write_gaussians(file, some(20), look=look)
+    assert read_gaussians(file).look == look
+    if suffix == "spz":  # the bit that other programs read
+        assert gzip.decompress(file.read_bytes())[14] == (1 if look.antialiased else 0)
+    else:
+        assert f"comment SplatRenderMode: {'mip' if look.antialiased else 'default'}\n".encode() in file.read_bytes()
+    write_gaussians(file, some(3000), 0.1, look)  # and where some are left out
+    assert file.stat().st_size <= 1e5
+    assert read_gaussians(file).look == look
+
+
+@pytest.mark.parametrize("flags", [0, 1, 3])
+def test_spz_of_other_programs_is_sorted_by_depth(tmp_path: Path, flags: int) -> None:
+    (tmp_path / "a.spz").write_bytes(packed(2, 1, 0, body(bytes([255, 127, 128])), flags=flags))
+    assert read_gaussians(tmp_path / "a.spz").look == Look(antialiased=bool(flags & 1), sort="depth")
+
+
 # -- ns-export ------------------------------------------------------------------------------------------------------
 
 
@@ -513,8 +550,11 @@ class Splats:
 
     scene = SimpleNamespace(warped=False)
 
-    def __init__(self, gaussians: Gaussians) -> None:
-        self.found = gaussians
+    def __init__(self, gaussians: Gaussians, look: Look = OURS) -> None:
+        self.found, self.drawn = gaussians, look
+
+    def look(self) -> Look:
+        return self.drawn
 
     def gaussians(self) -> Gaussians:
         return self.found
@@ -543,12 +583,13 @@ def test_ns_export(
     placement = Placement(torch.cat([turn(), torch.tensor([[1.0], [2.0], [3.0]])], -1), 0.25)
     gaussians = some(40)
     gaussians.means[3] = math.nan
-    pretend(monkeypatch, Splats(gaussians), placement, "gaussian-splatting")
+    pretend(monkeypatch, Splats(gaussians, Look(True)), placement, "gaussian-splatting")
     exported(monkeypatch, tmp_path, suffix)
     said = capsys.readouterr().err
     assert "1 of 40 Gaussians are not finite" in said
     assert f"splat.{suffix}" in said
-    read = read_gaussians(tmp_path / f"splat.{suffix}")
+    read, look = read_gaussians(tmp_path / f"splat.{suffix}")
+    assert look == Look(True)
     kept = gaussians[gaussians.finite()]
     # Input's units are four times the scene's.
     atol = 1e-4 if suffix == "ply" else 1e-3

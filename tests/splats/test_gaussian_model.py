@@ -21,7 +21,7 @@ class Plain(GaussianModel[SplattingConfig]):
         self.set_gaussians(from_points(points, seen_colors(points, dataset), self.config.degree))
 
     def loss(self, batch: ViewBatch, step: int) -> Loss:
-        camera = splat_camera(batch.view.camera, self.near, self.config.antialiased)
+        camera = splat_camera(batch.view.camera, self.near, self.look())
         records = self.on_image(self.learnt_gaussians(), camera, self.config.degree)
         rgb = draw(records, camera, batch.background, room=self.room).image
         return Loss({"rgb": (rgb - batch.rgb).abs().mean()}, rgb.detach())

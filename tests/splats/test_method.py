@@ -17,6 +17,8 @@ from framework.splats.drawing import draw_colors, draw_view, splat_camera
 from framework.splats.gaussians import Gaussians, HasGaussians
 from framework.training.checkpoint import load_checkpoint
 from methods.gaussian_splatting import METHOD, GaussianSplatting, GaussianSplattingConfig, decide
+from tests.cli.helpers import called
+from tests.dataparsers.captures import write_capture
 from tests.training.helpers import tiny_trainer
 
 SCENE = Scene(torch.tensor([[-1.0] * 3, [1.0] * 3]), 1.0, 6.0, 4, True, False, 32, image_pixels=400 * 400)
@@ -36,6 +38,18 @@ def ball(logit: float = 20.0, **changes: Any) -> Gaussians:
     turn, rest = torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1, 3, 0)
     whole = Gaussians(torch.zeros(1, 3), flat, turn, torch.tensor([logit]), torch.ones(1, 3), rest)
     return dataclasses.replace(whole, **changes)
+
+
+def test_cameras_that_cannot_be_drawn_are_refused_before_the_run_has_a_folder(tmp_path: Path) -> None:
+    """Panoramas, of which a method that casts rays learns."""
+    data = write_capture(tmp_path / "panoramas", 8, camera_model="EQUIRECTANGULAR")
+    words = ("--data", data, "--output-dir", tmp_path / "out", "--vis", "none", "--max-num-iterations", 1)
+    done = called("ns-train", "gaussian-splatting", *words)
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].startswith(
+        "error: gaussian-splatting cannot draw equirectangular cameras, only pinhole, opencv, fisheye; cut perspective"
+    )
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(("less", "more"), [(20.0, 60.0), (60.0, 300.0), (300.0, 3000.0)])

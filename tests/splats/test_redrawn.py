@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from framework import View
-from framework.splats.drawing import draw_colors, splat_camera
+from framework.splats.drawing import draw, draw_colors, draw_view, on_image, splat_camera
 from framework.splats.gaussians import Gaussians
+from framework.splats.look import ELSEWHERE, OURS
 from framework.splats.redrawn import Redrawn, packed
 from framework.tools.benchmarks.frames import measure
 from tests.kernels.compiled import needs_kernels
@@ -31,6 +32,28 @@ def test_every_picture_is_the_first() -> None:
     for _ in range(3):
         torch.testing.assert_close(redrawn.colors(seen, 1, background), truth, atol=1e-6, rtol=0)
     torch.testing.assert_close(redrawn.colors(seen, 4, background), truth[2::4, 2::4], atol=1e-6, rtol=0)
+
+
+def test_pictures_by_depth() -> None:
+    """Of two Gaussians one is nearer along the axis, the other to the camera; packed or not, the former is in front."""
+    pair = dataclasses.replace(
+        ball(),
+        means=torch.tensor([[0.0, 0.0, 0.05], [0.9, 0.0, 0.1]]),
+        log_scales=torch.tensor([[0.5, 0.5, 1e-3], [1.0, 1.0, 1e-3]]).log(),
+        **{name: getattr(ball(), name).expand(2, -1) for name in ("rotations",)},
+        logits=torch.full((2,), 8.0), colors=torch.tensor([[1.7, -1.7, -1.7], [-1.7, 1.7, -1.7]]),
+        harmonics=torch.zeros(2, 3, 0),
+    )  # fmt: skip
+    assert float((pair.means - torch.tensor([0.0, 0, 3.0])).norm(dim=-1).diff()) > 0  # the first is nearer
+    for look, color in ((OURS, 0), (ELSEWHERE, 1)):
+        seen = splat_camera(camera(), 0.1, look)
+        redrawn, background = Redrawn(pair), torch.zeros(3)
+        pictures = [redrawn.colors(seen, 1, background) for _ in range(3)]
+        pictures.append(draw_view(pair, seen, 1, background, 9.0).rgb)
+        for picture in pictures:
+            assert int(picture[16, 20].argmax()) == color, look
+    with pytest.raises(ValueError, match="give the keys that `sort_keys` returns"):
+        draw(on_image(pair, seen), seen, background)
 
 
 @needs_kernels

@@ -7,14 +7,18 @@ import numpy as np
 import pytest
 import torch
 
+from framework.base.errors import DataError
 from framework.cli import evaluate as eval_command
 from framework.data.offsets import offset_file
 from framework.splats.files import read_gaussians, write_gaussians
+from framework.splats.gaussians import HasGaussians
+from framework.splats.look import Look
 from framework.splats.transform import transformed
 from framework.training.splat_files import load_run_or_splats
 from tests.cli.helpers import called
 from tests.conftest import Refused
 from tests.dataparsers.captures import moved, poses, write_capture
+from tests.splats.foreign_files import write_splat
 
 FLAGS = "--num-gaussians 200 --start-gaussians 200 --start random --vis none --max-eval-images 0 --timestamp t"
 
@@ -56,7 +60,7 @@ def test_a_file_has_the_psnr_of_its_run(kind: str, capture: Path, capture_run: P
     found, expected = psnr(tmp_path / "splat.eval.json"), psnr(capture_run / "eval.json")
     assert found == pytest.approx(expected, abs=0.01 if kind == "ply" else 0.3)
     if kind == "ply":  # not because pictures are empty
-        unplaced = read_gaussians(file)
+        unplaced = read_gaussians(file).gaussians
         write_gaussians(tmp_path / "else.ply", unplaced.map(torch.clone)[:1])
         called("ns-eval", tmp_path / "else.ply", "--data", capture)
         assert abs(psnr(tmp_path / "else.eval.json") - expected) > 0.5
@@ -90,6 +94,42 @@ def test_a_survey_is_trained_exported_and_read_back(
     capsys.readouterr()
     load_run_or_splats(tmp_path / "rounded.ply", data=data)
     assert "float32 has rounded its centres by up to 0.3" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("kind", ["ply", "spz"])
+def test_a_file_is_drawn_as_its_run(kind: str, capture: Path, tmp_path: Path) -> None:
+    """Antialiased, with a blur of its own, sorted by depth; drawn otherwise, pictures differ."""
+    flags = ("--antialiased", True, "--blur", 0.5, "--sort", "depth")
+    run = trained(capture, tmp_path / "out", *flags)
+    called("ns-export", "gaussian-splat", run, "--output-dir", tmp_path, "--format", kind)
+    model = load_run_or_splats(tmp_path / f"splat.{kind}", data=capture).model
+    assert isinstance(model, HasGaussians)
+    assert model.look() == Look(True, 0.5, "depth")
+    for words in ((run,), (tmp_path / f"splat.{kind}", "--data", capture)):
+        done = called("ns-eval", *words)
+        assert done.returncode == 0, done.stderr
+    assert "antialiased, blurred by 0.5 pixels^2, sorted by depth" in done.stderr
+    expected = psnr(run / "eval.json")
+    assert psnr(tmp_path / "splat.eval.json") == pytest.approx(expected, abs=0.01 if kind == "ply" else 0.3)
+    if kind == "ply":
+        write_gaussians(tmp_path / "else.ply", read_gaussians(tmp_path / "splat.ply").gaussians)
+        called("ns-eval", tmp_path / "else.ply", "--data", capture)
+        assert abs(psnr(tmp_path / "else.eval.json") - expected) > 0.05
+
+
+def test_files_of_other_programs_stand_for_a_run(capture: Path, capture_run: Path, tmp_path: Path) -> None:
+    """A .splat file is loaded, and what cannot be read is named, not taken for settings."""
+    called("ns-export", "gaussian-splat", capture_run, "--output-dir", tmp_path)
+    given = read_gaussians(tmp_path / "splat.ply").gaussians
+    write_splat(tmp_path / "a.splat", given)
+    model = load_run_or_splats(tmp_path / "a.splat", data=capture).model
+    assert isinstance(model, HasGaussians)
+    assert len(model.gaussians()) == len(given)
+    assert model.look() == Look(sort="depth")
+    (tmp_path / "a.ksplat").write_bytes(bytes(10))
+    with pytest.raises(DataError, match=r"a\.ksplat is of GaussianSplats3D's format; Gaussians are read from"):
+        load_run_or_splats(tmp_path / "a.ksplat", data=capture)
 
 
 def test_the_format_and_its_flags_may_be_named(shared_tiny: Path, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from framework.cameras.cameras import Cameras
 from framework.evaluation.paths import look_at
 from framework.export.web import PageFacts, camera_rows, focus_of
 from framework.splats.gaussians import Gaussians
+from framework.splats.look import OURS, Look
 
 SIZE = (200, 150)
 
@@ -39,8 +40,8 @@ def some_cameras(count: int = 4) -> Cameras:
     return Cameras(poses, 180 + 10 * steps, 190 + 5 * steps, 95 + 4 * steps, 80 - 3 * steps, width, height)
 
 
-def some_facts(title: str = "test", antialiased: bool = False) -> PageFacts:
+def some_facts(title: str = "test", look: Look = OURS) -> PageFacts:
     """Facts about those cameras."""
     cameras, turn = some_cameras(), torch.eye(3, dtype=torch.float64)
     rows = camera_rows(cameras, ["a.png", "b.png", "c.png", "</script>"], turn)
-    return PageFacts(title, "About.", (1.0, 1.0, 1.0), 0.05, antialiased, focus_of(cameras, turn), rows)
+    return PageFacts(title, "About.", (1.0, 1.0, 1.0), 0.05, look, focus_of(cameras, turn), rows)

@@ -11,7 +11,8 @@ import torch
 
 from framework.evaluation.metrics import psnr
 from framework.export.web import gaussians_of, make_page
-from framework.splats.drawing import draw, on_image, splat_camera
+from framework.splats.drawing import draw_colors, splat_camera
+from framework.splats.look import OURS, Look
 from tests.web.helpers import SIZE, some_cameras, some_facts, some_gaussians
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
@@ -47,17 +48,15 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-def compared(
-    browser: str, scene: Path, tmp_path: Path, camera: int, more: str = "", antialiased: bool = False
-) -> float:
+def compared(browser: str, scene: Path, tmp_path: Path, camera: int, more: str = "", look: Look = OURS) -> float:
     """PSNR of the browser's picture against our own."""
     shot = tmp_path / "shot.png"
     opened(browser, tmp_path, f"{scene.as_uri()}#camera={camera}&plain=1{more}", f"--screenshot={shot}")
     width, height = SIZE
     seen = torch.from_numpy(iio.imread(shot)[:height, :width, :3].copy()).float() / 255
     gaussians = gaussians_of(scene.read_text(encoding="utf-8"))
-    chosen = splat_camera(some_cameras()[camera : camera + 1], 0.05, antialiased)
-    own = draw(on_image(gaussians, chosen), chosen, torch.ones(3)).image.clamp(0, 1)
+    chosen = splat_camera(some_cameras()[camera : camera + 1], 0.05, look)
+    own = draw_colors(gaussians, chosen, 1, torch.ones(3)).clamp(0, 1)
     assert float(own.std()) > 0.05  # there is something to see
     found = psnr(seen, own)
     print(f"camera {camera}{more}: PSNR of the browser's picture against ours {found:.1f} dB")
@@ -78,9 +77,10 @@ def test_the_browser_draws_without_its_own_gunzip(browser: str, scene: Path, tmp
 @pytest.mark.parametrize("degree", [0, 1, 2])
 def test_the_browser_draws_fewer_harmonics(browser: str, tmp_path: Path, degree: int) -> None:
     file = tmp_path / "scene.html"
-    facts = some_facts(antialiased=True)
+    look = Look(True, 0.2, "depth")
+    facts = some_facts(look=look)
     file.write_text(make_page(some_gaussians(1500, degree), facts, 30)[0], encoding="utf-8")
-    assert compared(browser, file, tmp_path, 2, antialiased=True) > CLOSE
+    assert compared(browser, file, tmp_path, 2, look=look) > CLOSE
 
 
 DRAG = """<script>

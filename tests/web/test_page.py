@@ -26,6 +26,8 @@ from framework.export.web import (
     upright,
 )
 from framework.kernels.splat_project import rotation_matrices
+from framework.splats.look import Look
+from framework.splats.spz import read_spz
 from framework.training.trained import load_trained
 from tests.conftest import EditJson, Refused
 from tests.training.helpers import tiny_trainer
@@ -87,6 +89,16 @@ def test_a_page_is_as_small_as_asked(megabytes: float) -> None:
 def test_impossible_sizes_are_refused(megabytes: float) -> None:
     with pytest.raises(ConfigError, match="max-megabytes"):
         make_page(some_gaussians(10), some_facts(), megabytes)
+
+
+def test_a_page_says_how_its_gaussians_are_drawn(tmp_path: Path) -> None:
+    """To its program, and in its SPZ file to whoever takes it out."""
+    look = Look(True, 0.1, "depth")
+    text = make_page(some_gaussians(20), some_facts(look=look), 30)[0]
+    found = json.loads(Elements(text).scripts[0])["look"]
+    assert found == {"antialiased": True, "blur": 0.1, "sort": "depth"}
+    (tmp_path / "page.spz").write_bytes(payload_of(text))
+    assert read_spz(tmp_path / "page.spz").look == look
 
 
 def test_no_name_leaves_its_place() -> None:

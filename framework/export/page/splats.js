@@ -147,7 +147,7 @@ function program(gl, vertex, fragment) {
  *
  * Colours are summed in 16-bit floats where the browser can: in 8 bits each of a hundred layers would be rounded.
  */
-function drawer(gl, gaussians, { antialiased, near }) {
+function drawer(gl, gaussians, { look, near }) {
   const splat = program(gl, vertexShader(gaussians.degree), FRAGMENT), copy = program(gl, WHOLE, COPY);
   const most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
   if (gaussians.width > most || gaussians.rows > most) {
@@ -218,8 +218,8 @@ function drawer(gl, gaussians, { antialiased, near }) {
       gl.uniform2f(uniforms.center, camera.cx, camera.cy);
       gl.uniform2f(uniforms.size, width, height);
       gl.uniform1f(uniforms.near, near);
-      gl.uniform1f(uniforms.blur, 0.3);
-      gl.uniform1i(uniforms.antialiased, antialiased ? 1 : 0);
+      gl.uniform1f(uniforms.blur, look.blur);
+      gl.uniform1i(uniforms.antialiased, look.antialiased ? 1 : 0);
       gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(drawn / BATCH));
       if (!first) return;
       gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -232,16 +232,16 @@ function drawer(gl, gaussians, { antialiased, near }) {
   };
 }
 
-/** Return a function that sorts Gaussians from far to near, by radix on the bits of their squared distances. */
+/** Return a function that sorts Gaussians from far to near, by radix on the bits of their squared distances, or of their
+ * depths along an axis where one is given. */
 function sorter(centers) {
   const count = centers.length / 3;
   const keys = new Float32Array(count), bits = new Uint32Array(keys.buffer), counts = new Uint32Array(65536);
   const order = new Uint32Array(count), between = new Uint32Array(count);
-  return (eye) => {
-    const [x, y, z] = eye;
+  return ({ eye: [x, y, z], axis }) => {
     for (let i = 0, k = 0; i < count; i++, k += 3) {
       const a = centers[k] - x, b = centers[k + 1] - y, c = centers[k + 2] - z;
-      keys[i] = a * a + b * b + c * c;
+      keys[i] = axis ? Math.max(a * axis[0] + b * axis[1] + c * axis[2], 0) : a * a + b * b + c * c;
     }
     for (const shift of [0, 16]) {
       counts.fill(0);
@@ -260,18 +260,18 @@ function sorter(centers) {
   };
 }
 
-/** Return a function (eye, done) that sorts in a worker; in the page itself where workers are refused. */
+/** Return a function ({ eye, axis }, done) that sorts in a worker; in the page itself where workers are refused. */
 function sortingElsewhere(centers, here) {
   const local = () => {
     const sort = sorter(centers);
-    return (eye, done) => done(sort(eye));
+    return (from, done) => done(sort(from));
   };
   if (here || typeof Worker !== "function") return local();
   const source = `${sorter}
 let sort;
 onmessage = ({ data }) => {
   if (data.centers) { sort = sorter(data.centers); return; }
-  const order = sort(data.eye).slice();
+  const order = sort(data).slice();
   postMessage(order, [order.buffer]);
 };`;
   let worker, waiting = null, fallback = null;
@@ -293,9 +293,9 @@ onmessage = ({ data }) => {
   } catch (error) {
     refused();
   }
-  return (eye, done) => {
-    if (!worker) { fallback(eye, done); return; }
-    waiting = [eye, done];
-    worker.postMessage({ eye });
+  return (from, done) => {
+    if (!worker) { fallback(from, done); return; }
+    waiting = [from, done];
+    worker.postMessage(from);
   };
 }

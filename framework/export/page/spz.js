@@ -29,7 +29,8 @@ async function gunzip(bytes, plain) {
       return new Uint8Array(await new Response(stream).arrayBuffer());
     }
     const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
-    const out = inflate(bytes.subarray(10, bytes.length - 8), view.getUint32(bytes.length - 4, true));
+    const start = bytes[3] & 16 ? bytes.indexOf(0, 10) + 1 : 10; // behind the comment
+    const out = inflate(bytes.subarray(start, bytes.length - 8), view.getUint32(bytes.length - 4, true));
     if (crc32(out) !== view.getUint32(bytes.length - 8, true)) throw new Error("checksum");
     return out;
   } catch (error) {

@@ -127,10 +127,12 @@ function show(gl, gaussians, facts) {
   }
 
   function requestOrder() {
-    if (sorting || (sortedFor && sortedFor.every((x, k) => x === view.eye[k]))) return;
+    const from = { eye: view.eye, axis: facts.look.sort === "depth" ? axesOf(view).forward : null };
+    const numbers = [...from.eye, ...(from.axis || [])];
+    if (sorting || (sortedFor && sortedFor.every((x, k) => x === numbers[k]))) return;
     sorting = true;
-    sortedFor = view.eye;
-    sort(view.eye, (sorted) => {
+    sortedFor = numbers;
+    sort(from, (sorted) => {
       order = sorted;
       sorting = false;
       needsOrder = dirty = true;

@@ -59,9 +59,11 @@ void for_tiles(const float* g, const Grid& grid, const Body& body) {
 
 }  // namespace
 
-// The visible Gaussians by their distance, nearest first, and those of the same distance by index; `order` has room
-// for `count`. A radix sort by the bits of a positive float. Returns how many there are.
-EXPORT int splat_sort(const float* records, int64_t count, int32_t* order, int64_t* visible) {
+// The visible Gaussians by their keys, such as distances, smallest first, and those of the same key by index; `order`
+// has room for `count`, and keys are `stride` apart. A radix sort by the bits of a positive float. Returns how many
+// there are.
+EXPORT int splat_sort(const float* records, int64_t count, const float* keys, int64_t stride, int32_t* order,
+                      int64_t* visible) {
     return guarded([&] {
         constexpr int BITS = 11, BUCKETS = 1 << BITS, PASSES = 3;
         std::vector<uint64_t> items, others;  // the key above the index
@@ -70,7 +72,7 @@ EXPORT int splat_sort(const float* records, int64_t count, int32_t* order, int64
         for (int64_t g = 0; g < count; g++) {
             if (!(records[g * RECORD + CUT] > 0)) continue;
             uint32_t key;
-            std::memcpy(&key, records + g * RECORD + DISTANCE, sizeof key);
+            std::memcpy(&key, keys + g * stride, sizeof key);
             items.push_back(uint64_t(key) << 32 | uint32_t(g));
             for (int pass = 0; pass < PASSES; pass++)
                 starts[size_t(pass * BUCKETS + int(key >> (pass * BITS) & (BUCKETS - 1)))]++;

@@ -1,8 +1,9 @@
 """Lists of the Gaussians that each tile of an image shows, in Triton; the reference: `framework.kernels.splat_tiles`.
 
-Each entry's key is its tile, above the bits of the distance, which rise with it as those of all positive floats do. So
-one stable sort puts the entries in order, those of the same distance by Gaussian. The host waits once, for the number
-of entries, unless it says for how many there is room; keys of what is left of it come last.
+Each entry's key is its tile, above the bits of the distance (or of what else is sorted by), which rise with it as those
+of all positive floats do. So one stable sort puts the entries in order, those of the same distance by Gaussian. The
+host waits once, for the number of entries, unless it says for how many there is room; keys of what is left of it come
+last.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ BLOCK = 32
 LAST = 2**63 - 1
 """Key behind those of all entries."""
 RECORD, TILE = tl.constexpr(splat_project.RECORD), tl.constexpr(splat_tiles.TILE)
-CUT, DISTANCE = tl.constexpr(splat_project.CUT), tl.constexpr(splat_project.DISTANCE)
+CUT = tl.constexpr(splat_project.CUT)
 REACH_X, REACH_Y = tl.constexpr(splat_project.REACH_X), tl.constexpr(splat_project.REACH_Y)
 
 
@@ -59,7 +60,7 @@ def _touches(record, here, column, row):
 
 
 @triton.jit(do_not_specialize=["count"])
-def _list(records, counts, firsts, keys, owners, count, columns, rows, BLOCK: tl.constexpr):
+def _list(records, distances, counts, firsts, keys, owners, count, columns, rows, BLOCK: tl.constexpr):
     """Count the tiles of each Gaussian, or, if there are `firsts`, write the keys and owners of the entries."""
     g = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = g < count
@@ -68,7 +69,7 @@ def _list(records, counts, firsts, keys, owners, count, columns, rows, BLOCK: tl
     if firsts is not None:
         first = tl.load(firsts + g, mask=here, other=0)
         here = here & (tl.load(firsts + g + 1, mask=here, other=0) > first)  # else there is no room
-        distance = tl.load(record + DISTANCE, mask=here, other=0.0).to(tl.int32, bitcast=True).to(tl.int64)
+        distance = tl.load(distances + g, mask=here, other=0.0).to(tl.int32, bitcast=True).to(tl.int64)
     x = tl.load(record, mask=here, other=0.0)
     y = tl.load(record + 1, mask=here, other=0.0)
     left, right = _span(x, tl.load(record + REACH_X, mask=here, other=0.0), columns)
@@ -91,20 +92,23 @@ def _list(records, counts, firsts, keys, owners, count, columns, rows, BLOCK: tl
 
 
 def tile_lists(
-    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None
-) -> TileLists:
+    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None,
+    keys: Tensor | None = None,
+) -> TileLists:  # fmt: skip
     """Compute `framework.kernels.splat_tiles.tile_lists` of `records`, `width` and `height`; `for_gradients` or not.
 
     A Gaussian is listed in a tile only if its ellipse reaches it, not its box alone. The first Gaussians have the
-    `room`.
+    `room`. They are sorted by `keys`, if there are some.
 
     Raises:
         ValueError: if there are 2^31 entries or more.
     """
     records, count, device = records.contiguous(), len(records), records.device
     columns, rows = blocks(width, splat_tiles.TILE), blocks(height, splat_tiles.TILE)
+    distances = (records[:, splat_project.DISTANCE] if keys is None else keys).contiguous()
     counts, programs = torch.empty(count, dtype=torch.int32, device=device), (blocks(count, BLOCK),)
-    launch(_list, programs, records, counts, None, None, None, count, columns, rows, BLOCK=BLOCK, num_warps=1)
+    shared = (count, columns, rows)
+    launch(_list, programs, records, distances, counts, None, None, None, *shared, BLOCK=BLOCK, num_warps=1)
     needed = None if room is None else counts.sum()
     if room is None:
         room = int(counts.sum())
@@ -113,10 +117,10 @@ def tile_lists(
     if room >= 2**31:
         raise ValueError("more than 2^31 Gaussians on the image's tiles")
     firsts = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
-    keys = torch.full((room,), LAST, dtype=torch.int64, device=device)
+    places = torch.full((room,), LAST, dtype=torch.int64, device=device)
     owners = torch.zeros(room, dtype=torch.int32, device=device)
-    launch(_list, programs, records, None, firsts, keys, owners, count, columns, rows, BLOCK=BLOCK, num_warps=1)
-    keys, slots = keys.sort(stable=True)
+    launch(_list, programs, records, distances, None, firsts, places, owners, *shared, BLOCK=BLOCK, num_warps=1)
+    places, slots = places.sort(stable=True)
     tiles = torch.arange(columns * rows + 1, device=device) << 32
-    offsets = torch.searchsorted(keys, tiles, out_int32=True)
+    offsets = torch.searchsorted(places, tiles, out_int32=True)
     return TileLists(offsets, owners.index_select(0, slots), slots.int(), firsts.int(), needed)

@@ -78,7 +78,7 @@ def _blending(records: Tensor) -> Kernel:
         wide = _wide(records)
         listed = tile_lists(wide, WIDTH, HEIGHT)
         kept = torch.ones(wide.shape[1])
-        kept[[CUT, REACH_X, REACH_Y]] = 0  # the compiled gradient has something else there
+        kept[[CUT, REACH_X, REACH_Y]] = 0  # the gradient has sums of absolute gradients there
 
         def colored(form: Callable[..., Blended]) -> Callable[[Tensor], Tensor]:
             run = image(form, listed)

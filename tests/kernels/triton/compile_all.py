@@ -112,7 +112,9 @@ def gaussians() -> None:
     splat_blend.blend(records, lists, 37, 30, torch.rand(3), 7, True)
     counts, keys = torch.zeros(20, dtype=torch.int32), torch.zeros(9, dtype=torch.int64)
     for given in ((counts, None, None, None), (None, keys, keys, counts)):
-        launch.launch(splat_tiles._list, (1,), records, *given, 20, 3, 2, BLOCK=32, num_warps=1)
+        launch.launch(
+            splat_tiles._list, (1,), records, records[:, 0].contiguous(), *given, 20, 3, 2, BLOCK=32, num_warps=1
+        )
 
 
 def marching() -> None:

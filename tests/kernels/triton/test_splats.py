@@ -9,6 +9,7 @@ from torch import Tensor
 from framework.kernels.splat_blend import blend
 from framework.kernels.splat_project import CUT, REACH_X, RGB, SplatCamera, project_gaussians, project_reference
 from framework.kernels.splat_tiles import TileLists, tile_lists, tile_lists_reference
+from tests.kernels.splat_truth import camera, growth_error, scene
 from tests.kernels.test_splat_lists import check, needed
 from tests.kernels.triton.compared import DEVICE, compare
 
@@ -103,6 +104,14 @@ def test_lists(count: int, width: int, height: int) -> None:
     assert not (listed & ~boxes).any()
 
 
+def test_lists_sorted_by_other_keys() -> None:
+    records = records_of(gaussians(50))
+    keys = torch.rand(50, generator=torch.Generator().manual_seed(1)) + 0.1
+    found = tile_lists(records.to(DEVICE), WIDTH, HEIGHT, keys=keys.to(DEVICE))
+    records[:, 11] = keys  # where the distance is
+    check(TileLists(*(part.cpu() for part in found[:4])), records, WIDTH, HEIGHT)
+
+
 @pytest.mark.parametrize("room", [0, 40, 400])
 def test_lists_with_little_room(room: int) -> None:
     """The first Gaussians are listed as they are with room for all; nothing is written beyond it."""
@@ -148,6 +157,15 @@ def test_extremes_of_blending() -> None:
     records[:, 11] = torch.arange(30.0) + 1
     given = {"records": records, "background": torch.zeros(3)}
     compare(blended(16, 16, 4, median=True), given, "records", tolerance=1e-4)  # what is left is 1e-4 at most
+
+
+@pytest.mark.parametrize("size", [(37, 41), (60, 20)])
+def test_growth_is_by_the_pixels_absolute_gradients(size: tuple[int, int]) -> None:
+    """As on the other backends: tests/kernels/test_growth.py."""
+    from framework.kernels.triton_kernels.splat_blend import blend as triton_blend
+
+    torch.manual_seed(5)
+    assert growth_error(triton_blend, scene(80), camera(*size), DEVICE) < 1e-5
 
 
 def test_sums_of_absolute_gradients() -> None:

@@ -2,6 +2,7 @@
 
 from tests.mutations.bug import Bug
 
+LOOK, PLY, SPZ = (f"framework/splats/{part}.py" for part in ("look", "ply", "spz"))
 PROJECT, TILES, BLEND = (f"framework/kernels/splat_{part}.py" for part in ("project", "tiles", "blend"))
 
 BUGS = (
@@ -59,7 +60,7 @@ BUGS = (
         PROJECT,
         "*rgb.clamp(min=0).unbind(-1), at.norm(dim=-1),",
         "*rgb.clamp(min=0).unbind(-1), at[:, 2],",
-        "without compiled kernels depth is along the camera's axis, and Gaussians are sorted by it",
+        "without compiled kernels depth is along the camera's axis, and Gaussians are always sorted by it",
     ),
     Bug(
         "splats-antialiasing-brightens",
@@ -81,8 +82,8 @@ BUGS = (
         "splats-order-not-stable",
         "splats",
         TILES,
-        "order = records[:, DISTANCE].sort(stable=True).indices",
-        "order = records[:, DISTANCE].flip(0).sort(stable=True).indices.neg() + len(records) - 1",
+        "order = _keys(records, keys).sort(stable=True).indices",
+        "order = _keys(records, keys).flip(0).sort(stable=True).indices.neg() + len(records) - 1",
         "without compiled kernels Gaussians as far as each other are drawn in another order",
     ),
     Bug(
@@ -132,5 +133,77 @@ BUGS = (
         "alpha = (listed[:, OPACITY] * torch.exp(-q)).clamp(max=MAX_ALPHA)",
         "alpha = listed[:, OPACITY] * torch.exp(-q)",
         "without compiled kernels an opaque Gaussian hides all that is behind it for ever",
+    ),
+    Bug(
+        "splats-growth-cancels",
+        "splats",
+        BLEND,
+        "grads[0].abs().sum(-2, keepdim=True), None",
+        "grads[0].sum(-2, keepdim=True).abs(), None",
+        "without compiled kernels Gaussians whose pixels pull them apart do not grow",
+    ),
+    Bug(
+        "splats-keys-ignored",
+        "splats",
+        TILES,
+        "order, sorted_by = whole(count), _keys(records, keys)",
+        "order, sorted_by = whole(count), _keys(records, None)",
+        "Gaussians are sorted by distance whatever they were trained with",
+    ),
+    Bug(
+        "splats-mode-lost-in-ply",
+        "splats",
+        PLY,
+        "write_columns(file, columns, comments(look))",
+        "write_columns(file, columns)",
+        "antialiased Gaussians look wrong once they are exported to PLY",
+    ),
+    Bug(
+        "splats-mode-lost-in-spz",
+        "splats",
+        SPZ,
+        "flags = ANTIALIASED if look.antialiased else 0",
+        "flags = 0",
+        "antialiased Gaussians look wrong in other programs once they are exported to SPZ",
+    ),
+    Bug(
+        "splats-mode-of-a-file-unused",
+        "splats",
+        "framework/training/splat_files.py",
+        'drawn = {"degree": gaussians.degree, **dataclasses.asdict(look)}',
+        'drawn = {"degree": gaussians.degree}',
+        "a file is drawn by the default mode, whatever it says",
+    ),
+    Bug(
+        "splats-filter-brightens",
+        "splats",
+        PLY,
+        "opacity = torch.sigmoid(gaussians.logits.double()) * shares",
+        "opacity = torch.sigmoid(gaussians.logits.double())",
+        "Mip-Splatting's Gaussians are larger by their filter, and no fainter",
+    ),
+    Bug(
+        "splats-elsewhere-as-ours",
+        "splats",
+        LOOK,
+        'ELSEWHERE = Look(sort="depth")',
+        "ELSEWHERE = Look()",
+        "files of other programs are sorted by distance, which they were not trained with",
+    ),
+    Bug(
+        "splats-chunks-of-others",
+        "splats",
+        "framework/splats/compressed_ply.py",
+        "rows = np.arange(vertex.count) // CHUNK",
+        "rows = np.arange(vertex.count) % chunk.count",
+        "Gaussians of a compressed PLY file are somewhere else in the scene",
+    ),
+    Bug(
+        "splats-quaternions-of-splat-files",
+        "splats",
+        "framework/splats/splat.py",
+        '(rows["rotation"].astype(np.float64) - 128) / 128',
+        '(rows["rotation"].astype(np.float64) - 128)[:, [1, 2, 3, 0]] / 128',
+        "Gaussians of a .splat file are turned otherwise",
     ),
 )

@@ -1,0 +1,115 @@
+"""How Gaussians are drawn, which belongs to them: what was trained to be drawn one way looks different another way.
+
+A PLY file says it in comments of its header. `SplatRenderMode: default` or `mip` (with opacity that makes up for the
+blur of small Gaussians) is what Brush and PlayCanvas's splat-transform write and read; `mip-0.1` of NeRFICG names the
+blur too; Postshot writes `antialiased 0` or `1`. `SplatBlur` and `SplatSort` are our own, and say what the others leave
+open. A file without them comes from elsewhere, where Gaussians are sorted by depth, as in the code of 3D Gaussian
+Splatting and in gsplat.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from framework.base.console import say
+from framework.base.errors import DataError, printable
+from framework.kernels.splat_project import BLUR
+
+Sort = Literal["distance", "depth"]
+"""What Gaussians are sorted by: distance from the camera, or depth along its optical axis."""
+LEAST_BLUR, MOST_BLUR = 1e-3, 10.0
+"""Range of the blur: without any, a Gaussian seen edge-on has no area."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """How Gaussians are drawn."""
+
+    antialiased: bool = False
+    """Whether opacity makes up for the blur of small Gaussians."""
+    blur: float = BLUR
+    """Variance added in both directions on the image, pixels^2."""
+    sort: Sort = "distance"
+    """What Gaussians are sorted by."""
+
+    def words(self) -> str:
+        """Return how they are drawn, for people."""
+        mode = "antialiased" if self.antialiased else "default render mode"
+        return f"{mode}, blurred by {self.blur:g} pixels^2, sorted by {self.sort}"
+
+
+OURS = Look()
+"""How Gaussians are drawn by default."""
+ELSEWHERE = Look(sort="depth")
+"""How Gaussians of a file that does not say it are drawn."""
+
+
+def comments(look: Look) -> list[str]:
+    """Return the comments of a file that say how its Gaussians are drawn.
+
+    Args:
+        look: how.
+    """
+    blur = [] if look.blur == BLUR else [f"SplatBlur: {look.blur:g}"]
+    return [f"SplatRenderMode: {'mip' if look.antialiased else 'default'}", *blur, f"SplatSort: {look.sort}"]
+
+
+def look_of(lines: Sequence[str], file: Path, otherwise: Look = ELSEWHERE) -> Look:
+    """Return how the Gaussians of a file are drawn; what it says and is not known is said on the terminal.
+
+    Args:
+        lines: its comments, of which later ones count.
+        file: its path, for messages.
+        otherwise: how they are drawn where no comment says anything.
+
+    Raises:
+        DataError: if they are discs of 2D Gaussian Splatting.
+    """
+    look = otherwise
+    for line in lines:
+        key, _, value = (part.strip().lower() for part in line.replace(":", " ", 1).strip().partition(" "))
+        if key == "splatrendermode":
+            look = _with_mode(look, value, file)
+        elif key == "antialiased" and value in ("0", "1"):
+            look = replace(look, antialiased=value == "1")
+        elif key == "splatblur" and (blur := _blur(value)) is not None:
+            look = replace(look, blur=blur)
+        elif key == "splatsort" and value in ("distance", "depth"):
+            look = replace(look, sort="depth" if value == "depth" else "distance")
+        elif key in ("splatblur", "splatsort"):
+            say(f"warning: {file} has the comment '{printable(line)}', which is not known, and is drawn without it")
+    return look
+
+
+def _with_mode(look: Look, mode: str, file: Path) -> Look:
+    name, dash, blur = mode.partition("-")
+    if name == "2dgs":
+        raise discs(file)
+    if name not in ("default", "mip") or (dash and _blur(blur) is None):
+        say(f"warning: {file} is for the render mode '{printable(mode)}', which is not known: drawn as 'default'")
+        return replace(look, antialiased=False)
+    return replace(look, antialiased=name == "mip", blur=_blur(blur) or look.blur)
+
+
+def discs(file: Path) -> DataError:
+    """Return the error of a file with discs instead of Gaussians.
+
+    Args:
+        file: its path.
+    """
+    return DataError(
+        f"{file} has the discs of 2D Gaussian Splatting, which are not drawn here; name a file of 3D Gaussians,"
+        " or train gaussian-splatting on the photographs"
+    )
+
+
+def _blur(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) and LEAST_BLUR <= value <= MOST_BLUR else None

@@ -1,0 +1,72 @@
+"""Gaussians in .splat files: 32 bytes each, one after the other, without a header.
+
+The format is that of https://github.com/antimatter15/splat (convert.py and main.js):
+
+    position    3 x float32
+    scale       3 x float32   standard deviations
+    colour      3 x 8 bits    255 (0.5 + DC f) of the coefficient f of degree 0
+    opacity     1 x 8 bits    255 sigmoid(logit)
+    rotation    4 x 8 bits    128 (q + 1) of w, x, y and z of a unit quaternion
+
+There are no harmonics of higher degrees: colours are the same from everywhere.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from framework.base.errors import DataError
+from framework.kernels.splat_project import DC
+from framework.splats.gaussians import Gaussians
+from framework.splats.ply import usable
+
+ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
+"""A Gaussian."""
+SMALLEST = 1e-30
+"""Standard deviation that stands for 0, whose logarithm is infinite."""
+
+
+def read_splat(file: Path) -> Gaussians:
+    """Read Gaussians from a .splat file, of degree 0.
+
+    Those that are not finite are left out, which is said on the terminal. Opacities of 0 and 1, which have no finite
+    logit, become 1/1020 and 1019/1020, the middle of what is rounded to them.
+
+    Args:
+        file: path of the file.
+
+    Raises:
+        DataError: if the file cannot be read, is truncated, or is something else.
+    """
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        raise DataError(f"cannot read {file}: {error.strerror}") from error
+    if not content or len(content) % ROW.itemsize:
+        raise DataError(
+            f"{file} is no .splat file, or is truncated: it has {len(content):,} bytes, and each Gaussian has"
+            f" {ROW.itemsize}; copy or export it again"
+        )
+    rows = np.frombuffer(content, ROW)
+    scales = rows["scale"].astype(np.float64)
+    with np.errstate(invalid="ignore"):  # what is not finite, or negative, is left out below
+        log_scales = np.log(np.where(scales == 0, SMALLEST, scales))
+    color = rows["color"].astype(np.float64)
+    opacity = color[:, 3].clip(0.25, 254.75) / 255
+    gaussians = Gaussians(
+        means=_float(rows["position"]),
+        log_scales=_float(log_scales),
+        rotations=_float((rows["rotation"].astype(np.float64) - 128) / 128),
+        logits=_float(np.log(opacity / (1 - opacity))),
+        colors=_float((color[:, :3] / 255 - 0.5) / DC),
+        harmonics=torch.zeros(len(rows), 3, 0),
+    )
+    return usable(gaussians, file)
+
+
+def _float(values: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.array(values, np.float32))

@@ -32,7 +32,7 @@ def test_every_methods_config_survives_yaml(method: str) -> None:
         ({"max_num_iterations": "many"}, "'max_num_iterations' is 'many'; it must be int"),
         ({"max_num_iterations": 1.5}, "must be int"),
         ({"max_num_iterations": True}, "must be int"),
-        ({"max_num_iterations": None}, "must be int"),
+        ({"steps_per_save": None}, "must be int"),
         ({"save_only_latest_checkpoint": 1}, "must be bool"),
         ({"lr_schedule": "linear"}, "must be one of constant, exponential"),
         ({"data": 3}, "must be Path"),

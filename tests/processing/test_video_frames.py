@@ -1,13 +1,23 @@
-"""The sharpest frame of each interval."""
+"""Frames of a video: as they are stored, each once, evenly over time, and the sharpest nearby."""
+
+import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from framework.tools.processing.video import sharpest, sharpness
+from framework.base.errors import DataError
+from framework.tools.processing.ffmpeg import chosen_frames, frame_count, survey
+from framework.tools.processing.frame_choice import blocks, different, intervals, sharpest, sharpness
+from framework.tools.processing.video import line, write_frames
+
+BITS = 6
+"""Squares of a frame whose brightness is its number in binary."""
 
 
 def frame(blur: int, seed: int = 0) -> np.ndarray:
-    noise = np.random.default_rng(seed).integers(0, 255, (40, 60, 3)).astype(np.float64)
+    noise = np.random.default_rng(seed).integers(0, 255, (40, 60)).astype(np.float64)
     for _ in range(blur):
         noise = (noise + np.roll(noise, 1, 0) + np.roll(noise, 1, 1)) / 3
     return noise.astype(np.uint8)
@@ -16,17 +26,103 @@ def frame(blur: int, seed: int = 0) -> np.ndarray:
 def test_blur_lowers_sharpness() -> None:
     found = [sharpness(frame(blur)) for blur in range(4)]
     assert found == sorted(found, reverse=True)
-    assert sharpness(np.zeros((2, 2, 3), np.uint8)) == 0
+    assert sharpness(np.zeros((2, 2), np.uint8)) == 0
 
 
-@pytest.mark.parametrize(("count", "target", "taken"), [(12, 4, 4), (3, 10, 3), (0, 5, 0), (10, 3, 3)])
-def test_one_frame_an_interval(count: int, target: int, taken: int) -> None:
-    assert len(list(sharpest((frame(1, index) for index in range(count)), count, target))) == taken
+def test_the_sharpest_of_each_interval_is_taken() -> None:
+    values = np.array([sharpness(frame(blur, index)) for index, blur in enumerate([2, 0, 3, 1, 3, 2])])
+    assert sharpest(values, intervals(np.arange(6.0), 2)).tolist() == [1, 3]
+    assert sharpest(np.ones(4), np.array([0, 0, 1, 1])).tolist() == [0, 2]
 
 
-def test_the_sharpest_is_taken() -> None:
-    blurs = [2, 0, 3, 1, 3, 2]
-    frames = [frame(blur, index) for index, blur in enumerate(blurs)]
-    chosen = list(sharpest(frames, 6, 2))
-    assert np.array_equal(chosen[0], frames[1])
-    assert np.array_equal(chosen[1], frames[3])
+@pytest.mark.parametrize("seed", range(5))
+def test_there_are_as_many_intervals_as_asked_for_whatever_the_times(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    times = np.cumsum(random.choice([0.0, 0.01, 0.02, 0.5, 20.0], 200))
+    for count in (1, 3, 50, 199, 200, 300):
+        found = intervals(times, count)
+        assert np.array_equal(np.unique(found), np.arange(min(count, 200)))
+        assert (np.diff(found) >= 0).all()
+
+
+def test_intervals_are_equal_in_time_and_not_in_frames() -> None:
+    """Of 90 frames in a second and 10 in the next, half of the intervals are in each second."""
+    times = np.concatenate([np.arange(90) / 90, 1 + np.arange(10) / 10])
+    found = intervals(times, 10)
+    assert np.array_equal(found[:90], np.arange(90) // 18)
+    assert np.array_equal(found[90:], 5 + np.arange(10) // 2)
+    assert np.array_equal(intervals(np.arange(12.0), 4), np.arange(12) // 3)
+    assert np.array_equal(intervals(np.zeros(6), 3), np.arange(6) // 2)
+
+
+def test_repeats_are_told_from_slow_motion() -> None:
+    random = np.random.default_rng(0)
+    wide = np.asarray(Image.fromarray(random.integers(0, 255, (16, 30)).astype(np.uint8)).resize((480, 256)), float)
+    noisy = [blocks((wide[:, :320] + random.normal(0, 1, (256, 320))).clip(0, 255).astype(np.uint8)) for _ in range(3)]
+    moved = [blocks(wide[:, shift : 320 + shift].clip(0, 255).astype(np.uint8)) for shift in (2, 2, 4)]
+    assert different([*noisy, *moved]).tolist() == [0, 3, 5]
+    assert different([]).tolist() == []
+
+
+def numbered(number: int) -> np.ndarray:
+    """A frame (64, 64 BITS, 3) that shows its number in binary."""
+    row = np.repeat([40 + 160 * (number >> bit & 1) for bit in range(BITS)], 64)
+    return np.broadcast_to(row[None, :, None], (64, 64 * BITS, 3)).astype(np.uint8)
+
+
+def number_of(picture: np.ndarray) -> int:
+    return sum(int(picture[..., 0][:, 64 * bit + 20 : 64 * bit + 44].mean() > 120) << bit for bit in range(BITS))
+
+
+def write_video(path: Path, numbers: list[int], times: str) -> None:
+    """Write frames at times given as an expression of ffmpeg in seconds, with N, the frame's index."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    size = f"{64 * BITS}x64"
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", "30", "-i", "-"]
+    uneven = ["-vf", f"settb=1/1000,setpts='({times})*1000'", "-fps_mode", "passthrough", "-enc_time_base", "1/1000"]
+    command = [ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", *source, *uneven, "-c:v", "mpeg4", "-q:v", "2", str(path)]
+    subprocess.run(command, input=b"".join(numbered(n).tobytes() for n in numbers), check=True)
+
+
+@pytest.mark.medium
+def test_frames_at_uneven_times_are_taken_as_they_are(tmp_path: Path) -> None:
+    """40 frames in one second, a pause, then 20 frames in ten seconds."""
+    write_video(tmp_path / "uneven.mp4", list(range(60)), "if(lt(N,40),N/40,3+(N-40)/2)")
+    assert frame_count(tmp_path / "uneven.mp4") == 60
+    times, numbers = survey(tmp_path / "uneven.mp4", lambda picture: number_of(picture[..., None]))
+    assert numbers == list(range(60))
+    assert np.abs(times - [n / 40 if n < 40 else 3 + (n - 40) / 2 for n in range(60)]).max() < 0.002
+    assert [number_of(f) for f in chosen_frames(tmp_path / "uneven.mp4", np.array([3, 40, 59]))] == [3, 40, 59]
+
+    names = write_frames(tmp_path / "uneven.mp4", tmp_path / "frames", 22)
+    taken = [number_of(np.asarray(Image.open(tmp_path / "frames" / name))) for name in names]
+    assert len(taken) == 22
+    assert len(set(taken)) == 22
+    assert taken == sorted(taken)
+    assert sum(number >= 40 for number in taken) >= 18
+
+
+@pytest.mark.medium
+def test_repeats_are_dropped_and_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_video(tmp_path / "repeats.mp4", [n // 3 for n in range(30)], "N/30")
+    assert len(write_frames(tmp_path / "repeats.mp4", tmp_path / "frames", 50)) == 10
+    said = " ".join(capsys.readouterr().err.split())
+    assert "30 frames" in said
+    assert "20 repeat the one before and are dropped" in said
+    assert "all 10 are taken, as there are no more, though --num-frames-target is 50" in said
+
+
+def test_what_a_video_holds_is_said() -> None:
+    assert (
+        line(np.arange(4) / 2, 4, 2, 2) == "video: 4 frames in 1.5 s; 2 are taken, the sharpest of each of 2 intervals"
+    )
+    assert "at uneven times" in line(np.array([0, 1, 1.1, 1.2, 3]), 5, 2, 2)
+
+
+def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    with pytest.raises(DataError, match="there is no such file"):
+        frame_count(tmp_path / "none.mp4")
+    (tmp_path / "damaged.mp4").write_bytes(b"no video")
+    with pytest.raises(DataError, match="not a readable video"):
+        frame_count(tmp_path / "damaged.mp4")

@@ -18,6 +18,8 @@ EXAMPLES = ("my-method", "voxels")
 """Methods that the documents let their readers write."""
 UNCHECKED = ("nerfbaselines", "export", ".", "source", "pytest")
 """Commands of others, and those that no parser here knows."""
+TAKE_RUNS = ("bench", "evaluate", "export", "render", "viewer")
+"""Commands that take a trained run, and look whether it is there."""
 FORMATS = {"lego": "blender", "balls": "dnerf", "ring": "blender"}
 """Name of a folder in the documents -> its format; of any other, nerfstudio."""
 
@@ -49,6 +51,10 @@ class Checker:
         (folder / "path" / "to" / "masks").mkdir(parents=True)
         exchanged: dict[str, Callable[..., Any]] = {
             "framework.data.data_folder.find_data": found,
+            "framework.cli.train_paths.check_paths": lambda *_: None,
+            "framework.training.run_path.config_file": lambda path: path if path.suffix else path / "config.yml",
+            **{f"framework.cli.{name}.trained_run": lambda path, *_: path for name in TAKE_RUNS},
+            **{f"framework.cli.{name}.check_data": lambda path: None for name in ("bench", "compare", "stress")},
             "framework.cli.session.start": begin,
             "framework.cli.session.resume": begin,
             "framework.training.splat_files.load_run_or_splats": begin,

@@ -30,7 +30,7 @@ def rows(database: Path, table: str, what: str = "COUNT(*)") -> int:
 
 
 def features(database: Path) -> dict[str, int]:
-    """Return the number of features of each image, by its name, of images whose features were extracted."""
+    """Return the number of features of each image in the `database`, by its name."""
     query = "SELECT name, rows FROM images JOIN descriptors USING (image_id)"
     return dict(_read(database, query))
 
@@ -47,7 +47,7 @@ def camera_of(database: Path, names: list[str]) -> int | None:
 
 
 def pairs(database: Path) -> set[tuple[str, str]]:
-    """Return the pairs of names that were matched, each in both orders."""
+    """Return the pairs of names that were matched by the `database`, each in both orders."""
     names = dict(_read(database, "SELECT image_id, name FROM images"))
     numbers = [number for (number,) in _read(database, "SELECT pair_id FROM two_view_geometries")]
     found = {(names[number // PAIR_BASE], names[number % PAIR_BASE]) for number in numbers}
@@ -55,7 +55,7 @@ def pairs(database: Path) -> set[tuple[str, str]]:
 
 
 def connected(database: Path) -> int:
-    """Return the number of pairs with matches that fit a geometry."""
+    """Return the number of pairs in the `database` with matches that fit a geometry."""
     return rows(database, "two_view_geometries", "SUM(rows > 0)")
 
 

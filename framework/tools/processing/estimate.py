@@ -1,4 +1,4 @@
-"""How long a stage will take, in words."""
+"""Durations in words, of what is roughly known."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ def sharpness(picture: np.ndarray) -> float:
 
 
 def blocks(picture: np.ndarray) -> np.ndarray:
-    """Return the mean of each square of `BLOCK` pixels a side of a picture (H, W), as (h, w) float32."""
+    """Return the mean of each square of `BLOCK` pixels a side, (h, w) float32, of a `picture` (H, W) uint8."""
     height, width = (max(side // BLOCK, 1) for side in picture.shape)
     rows, columns = (min(side, BLOCK) for side in picture.shape)
     squares = picture[: height * rows, : width * columns].reshape(height, rows, width, columns)
@@ -68,9 +68,8 @@ def intervals(times: np.ndarray, count: int) -> np.ndarray:
     if len(times) <= count:
         return np.arange(len(times))
     gaps = np.diff(times)
-    durations = np.append(gaps, gaps.mean())
-    if durations.sum() <= 0:  # no times at all
-        durations = np.ones(len(times))
+    durations = np.append(gaps, gaps[-1])
+    durations = np.maximum(durations, 1e-3 * durations.mean()) if durations.any() else np.ones(len(times))
     low, high = 0.0, float(durations.sum()) / count
     for _ in range(100):
         middle = (low + high) / 2

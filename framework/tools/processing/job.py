@@ -59,7 +59,11 @@ class Job:
         count: Callable[[], int] | None = None,
         unit: str | None = None,
     ) -> Any:
-        """Run a function in a child process with this job's log (`run_in_child`)."""
+        """Run a function in a child process with this job's log.
+
+        Args:
+            work, arguments, title, total, count, unit: as `run_in_child` takes them.
+        """
         return run_in_child(work, arguments, title, total, self.log, count, unit)
 
     @contextmanager

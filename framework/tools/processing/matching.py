@@ -1,4 +1,4 @@
-"""Which images are matched with which, and the matching: pairs that are not in COLMAP's database yet."""
+"""The choice of pairs of images to match, and the matching of those that are not in COLMAP's database yet."""
 
 from __future__ import annotations
 

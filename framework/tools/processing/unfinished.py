@@ -1,4 +1,4 @@
-"""What a run that was stopped has left, and whether another can go on with it."""
+"""The files of a run that was stopped, and the check whether another can go on with them."""
 
 from __future__ import annotations
 

@@ -1,0 +1,53 @@
+"""What a folder holds, and what is said of what is left out."""
+
+from pathlib import Path
+
+import pytest
+
+from framework.base.errors import DataError
+from framework.tools.processing.listing import find_images, kind_of
+from framework.tools.processing.sequence import is_sequence
+
+
+def touch(folder: Path, *names: str) -> Path:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(b"")
+    return folder
+
+
+def test_other_files_are_counted_and_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    touch(tmp_path, "a.AVIF", "b.heic", "c.jpg", "raw/d.dng", "raw/e.dng", "clip.mov", ".hidden.dng")
+    assert [path.as_posix() for path in find_images(tmp_path)] == ["a.AVIF", "b.heic", "c.jpg"]
+    said = capsys.readouterr().err.replace("\n", " ")
+    assert "left out: 3 files that are no images: 2 .dng, 1 .mov; the first: clip.mov" in said
+    with pytest.raises(DataError, match=r"has no image .*: 2 \.dng; the first: d\.dng"):
+        find_images(tmp_path / "raw")
+
+
+def test_a_video_and_a_folder_are_told_apart(tmp_path: Path) -> None:
+    images, films = touch(tmp_path / "i", "1.jpg", "x.mp4"), touch(tmp_path / "v", "clip.MP4", "notes.txt")
+    assert kind_of("images", images) == ("images", images)
+    assert kind_of("video", images) == ("images", images)
+    assert kind_of("images", films) == kind_of("video", films) == ("video", films / "clip.MP4")
+    assert kind_of("images", films / "clip.MP4") == ("video", films / "clip.MP4")
+    assert kind_of("video", tmp_path / "none") == ("video", tmp_path / "none")
+    touch(films, "other.mkv")
+    with pytest.raises(DataError, match="has 2 videos and no image; name one of them"):
+        kind_of("images", films)
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["IMG_0001.jpg", "IMG_0002.jpg", "IMG_0005.jpg"], True),
+        (["a/1.png", "a/2.png", "a/3.png", "a/4.png", "a/5.png", "b/1.png", "b/2.png"], True),
+        (["PXL_20240501_101500123.jpg", "PXL_20240501_101532456.jpg", "PXL_20240501_102001789.jpg"], True),
+        (["9971_38.jpg", "12033_15.jpg", "45501_97.jpg"], False),
+        (["1359873828_f0.jpg", "14053639689_10.jpg", "14053679420_82.jpg"], False),
+        (["door.jpg", "garden.jpg", "window.jpg"], False),
+        (["1.jpg"], False),
+    ],
+)
+def test_names_in_sequence(names: list[str], expected: bool) -> None:
+    assert is_sequence([Path(name) for name in names]) == expected

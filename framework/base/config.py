@@ -139,6 +139,8 @@ class TrainConfig:
     """Seconds of training between evaluations of all images; 15 if --target-psnr is given and this is not."""
     max_eval_images: int | None = None
     """Maximum number of evaluated images, evenly spaced; all if not given, none if 0."""
+    lpips_weights: Path | None = None
+    """File of weights of LPIPS with AlexNet (.npz), for evaluations; the lpips package's if not given."""
     vis: Literal["tensorboard", "viewer", "viewer+tensorboard", "none"] = "tensorboard"
     """Where training curves and rendered images are shown: in TensorBoard's files, in a browser, or in both."""
     viewer_share: float = 0.1
@@ -166,9 +168,8 @@ class TrainConfig:
     adam_eps: float = 1e-8
     """Adam's epsilon."""
     masks: Literal["auto", "ignored", "empty"] = "auto"
-    """Meaning of masked-out pixels in training. ignored: nothing is known about them; empty: nothing is there, as
-    around an object that was cut out; auto: empty if masks remove over half of all pixels, not the same of each
-    image."""
+    """Meaning of masked-out pixels in training. ignored: nothing is known of them; empty: nothing is there, as around
+    what was cut out; auto: empty if masks remove over half of all pixels, not the same of each image."""
     background: Literal["auto", "random", "white", "black"] = "auto"
     """Colour behind transparent pixels in training; auto: random if images have alpha. Evaluation: white or black."""
     machine: MachineConfig = field(default_factory=MachineConfig)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,8 +23,10 @@ from framework.data.dataset import Dataset
 from framework.data.pixels import composite
 from framework.evaluation.appearance import appearance_of, fitted_appearance, right_half
 from framework.evaluation.images import write_image
-from framework.evaluation.metrics import SMALLEST_OF_SCALES, load_lpips, ms_ssim, psnr, quick_ssim
+from framework.evaluation.lpips import NETWORK, SMALLEST_OF_LPIPS, Lpips, load_lpips
+from framework.evaluation.metrics import SMALLEST_OF_SCALES, ms_ssim, psnr, quick_ssim
 from framework.evaluation.panels import composed, view_panels
+from framework.kernels.ssim import WINDOW
 from framework.model import Model, RendersFromImages
 from framework.rendering.rendered import Picture
 
@@ -35,6 +36,11 @@ FAR_BELOW, MOST_NAMED = 3.0, 3
 """Distance from the mean PSNR, dB, from which a view is named, and the maximum number of views that are."""
 WORST = "worst"
 """Name, without suffix, of the files of the view with the lowest PSNR; the next evaluation overwrites them."""
+MASKED = (
+    "PSNR is of kept pixels, SSIM and MS-SSIM are of windows without ignored pixels, LPIPS is the mean of its map over "
+    "kept pixels, for which ignored pixels are copied from the true image"
+)
+"""What is measured of images of which masks ignore pixels."""
 LONGEST_STEM = 150
 """Maximum number of bytes of an image's name in the names of the files written for it."""
 
@@ -56,18 +62,18 @@ class Measured:
     psnr: float
     """Peak signal-to-noise ratio, dB."""
     ssim: float | None
-    """Structural similarity; None if the image is smaller than SSIM's window."""
+    """Structural similarity; None if no window of SSIM lies inside what counts."""
 
 
 def measure(rgb: Tensor, target: Tensor, kept: Tensor | None) -> Measured:
-    """Compute the PSNR of the kept pixels and the SSIM of the whole image, in which other pixels should be equal.
+    """Compute the PSNR of the kept pixels, and the SSIM over the windows that have no other pixels.
 
     Args:
         rgb, target: (H, W, 3) rendered and true image in [0, 1].
         kept: (H, W) bool, pixels that count; all if None.
     """
     judged = (rgb, target) if kept is None else (rgb[kept], target[kept])
-    return Measured(psnr(*judged), quick_ssim(rgb, target) if min(rgb.shape[:2]) >= 11 else None)
+    return Measured(psnr(*judged), quick_ssim(rgb, target, kept) if min(rgb.shape[:2]) >= WINDOW else None)
 
 
 def measure_view(model: Model, dataset: Dataset, index: int, background: Tensor, stride: int = 1) -> Measured:
@@ -145,12 +151,13 @@ class Evaluation:
     """Metrics of a set of images."""
 
     per_image: list[dict[str, Any]]
-    """Name, psnr, ssim, ms_ssim, lpips, floaters and rendering seconds of each image, and its reduction if images have
-    several sizes."""
+    """Name, psnr, ssim, ms_ssim, lpips, floaters and rendering seconds of each image, the number of pixels that count
+    and that masks ignore, and its reduction if images have several sizes."""
     results: dict[str, Any]
-    """Means, standard deviations and rendering speed, with nerfstudio's keys; by_size, those of images of each size."""
+    """Means, standard deviations and rendering speed, with nerfstudio's keys; the number of images that each mean is
+    over; the numbers of pixels that count and that masks ignore; by_size, the statistics of images of each size."""
     lpips_note: str
-    """Network of LPIPS, or the reason why it is absent."""
+    """Network of LPIPS and source of its weights, or the reason why it is absent."""
     eval_appearance: Literal["mean", "half"] | None = None
     """Source of the held-out images' appearance; None if the method has none."""
     pictures_note: str | None = None
@@ -169,6 +176,16 @@ class Evaluation:
         )
 
     @property
+    def masks_note(self) -> str | None:
+        """What is measured of masked images; None if all pixels count."""
+        if not self.results["num_ignored_pixels"]:
+            return None
+        images = self.results["num_images"]
+        lacking = {name: images - self.results[f"{name}_images"] for name in ("ssim", "ms_ssim")}
+        absent = [f"{number} of {images} images have no {name}" for name, number in lacking.items() if number]
+        return MASKED + (f"; {' and '.join(absent)}: no such window" if absent else "")
+
+    @property
     def far_below(self) -> str | None:
         """The views whose PSNR is `FAR_BELOW` or more below the mean, worst first, as text; None if there is none."""
         mean = self.results["psnr"]
@@ -181,15 +198,23 @@ class Evaluation:
     def line(self) -> str:
         """Return the results as a line of text."""
         r = self.results
-        ssim, lpips = ("absent" if r[name] is None else f"{r[name]:.4f}" for name in ("ssim", "lpips"))
-        scales = "" if r["ms_ssim"] is None else f"  MS-SSIM {r['ms_ssim']:.4f}"
+        ssim, scales, lpips = (self._mean(name) for name in ("ssim", "ms_ssim", "lpips"))
+        scales = "" if r["ms_ssim"] is None and not r["num_ignored_pixels"] else f"  MS-SSIM {scales}"
         before = "" if r["floaters"] is None else f"  floaters {r['floaters']:.1f} %"
         rays = r["num_rays_per_sec"]
         speed = f"{rays / 1e3:.1f}k rays/s  {1 / r['fps']:.2f} s/image" if rays else f"{r['fps']:.1f} images/s"
         sizes = ", ".join(f"{size}: {found['psnr']:.2f}" for size, found in r.get("by_size", {}).items())
         sizes = f" ({sizes})" if sizes else ""
-        quality = f"PSNR {r['psnr']:.2f} dB{sizes}  SSIM {ssim}{scales}  LPIPS {lpips}{before}"
-        return f"{quality}  {speed}  ({r['num_images']} images)"
+        quality = f"PSNR {r['psnr']:.2f} dB{sizes}  SSIM {ssim}{scales}  LPIPS ({NETWORK}) {lpips}{before}"
+        kept, ignored = r["num_pixels"], r["num_ignored_pixels"]
+        masks = f", {kept:,} pixels; masks ignore {ignored / (kept + ignored):.0%}" if ignored else ""
+        return f"{quality}  {speed}  ({r['num_images']} images{masks})"
+
+    def _mean(self, name: str) -> str:
+        """Return a mean as text, with the number of images that it is over if others have no such value."""
+        mean, images = self.results[name], self.results[f"{name}_images"]
+        over = f" ({images} of {self.results['num_images']} images)" if images < self.results["num_images"] else ""
+        return "absent" if mean is None else f"{mean:.4f}{over}"
 
 
 def evaluate(
@@ -200,14 +225,16 @@ def evaluate(
     pictures: Path | None = None,
     max_pictures: int | None = None,
     round_to_uint8: bool = False,
+    lpips_weights: Path | None = None,
     title: str = "Evaluating",
 ) -> Evaluation:
     """Render views and compute their metrics.
 
     Images that are given to the method (`Dataset.source_images`) are shown to it and not judged. Masked-out pixels do
-    not count: PSNR omits them; for SSIM and LPIPS they are copied from the true image. Images without other pixels are
-    skipped. If appearance is fitted to left halves (`eval_appearance`), right halves count. SSIM is at one scale and at
-    five (`ms_ssim`).
+    not count: PSNR omits them, SSIM omits the windows that have any, at one scale and at five (`ms_ssim`), and LPIPS is
+    the mean of its map over the others, for which masked-out pixels are copied from the true image. Images without
+    other pixels are skipped. If appearance is fitted to left halves (`eval_appearance`), right halves count. An image
+    has no SSIM if no window counts.
 
     Args:
         model: the trained model.
@@ -217,9 +244,11 @@ def evaluate(
         max_pictures: maximum number of views of which files are written, evenly spaced; all if None. If that is some of
             them, files of the view with the lowest PSNR are written besides, as worst.png and so on.
         round_to_uint8: whether colours are rounded to 8 bits before they are measured.
+        lpips_weights: file of LPIPS's weights; that of the model's settings if None.
         title: text of the progress bar.
 
     Raises:
+        ConfigError: if the file of weights cannot be used.
         DataError: if there is no image to evaluate.
     """
     has_appearance = appearance_of(model) is not None
@@ -230,7 +259,7 @@ def evaluate(
         raise DataError(f"there is no image to evaluate: masks leave nothing of the {len(dataset)} that there are")
     if isinstance(model, RendersFromImages) and dataset.source_images is not None:
         model.show_images(dataset)
-    lpips, lpips_note = load_lpips()
+    lpips, lpips_note = load_lpips(lpips_weights or model.config.lpips_weights, model.device)
     background = evaluation_background(model)
     rows, seconds, rays = [], 0.0, 0
     pictures_note: str | None = None
@@ -250,7 +279,13 @@ def evaluate(
     if pictures is not None and worst is not None and pictures_note is None:
         pictures_note = _write_pictures(pictures, WORST, *worst)
     speed = rays / seconds if rays else None  # None of a method that casts none
-    results = {**_statistics(rows), **_by_size(rows), "num_rays_per_sec": speed, "fps": len(rows) / seconds}
+    results = {
+        **_statistics(rows),
+        **_num_pixels(rows),
+        **_by_size(rows),
+        "num_rays_per_sec": speed,
+        "fps": len(rows) / seconds,
+    }
     protocol: Literal["mean", "half"] | None = ("half" if half else "mean") if has_appearance else None
     return Evaluation(rows, {**results, "num_images": len(rows)}, lpips_note, protocol, pictures_note)
 
@@ -262,7 +297,7 @@ def _judge(
     background: Tensor,
     half: bool,
     round_to_uint8: bool,
-    lpips: Callable[[Tensor, Tensor], float] | None,
+    lpips: Lpips | None,
 ) -> tuple[dict[str, Any], tuple[Tensor, Tensor, Picture]]:
     """Return what is reported of a view, and its rendered image, true image and picture."""
     target = composite(dataset.image(index).float() / 255, background)
@@ -273,8 +308,11 @@ def _judge(
         rgb = (rgb * 255).round() / 255
     pair, kept = _judged(rgb, target, dataset.kept_of(index), half)
     row = _row(dataset, index, measure(*pair, kept), spent)
-    row["ms_ssim"] = None if min(target.shape[:2]) < SMALLEST_OF_SCALES else ms_ssim(*pair)
-    row["lpips"] = None if lpips is None else lpips(*pair)
+    smallest = min(pair[0].shape[:2])
+    row["ms_ssim"] = None if smallest < SMALLEST_OF_SCALES else ms_ssim(*pair, kept)
+    row["lpips"] = None if lpips is None or smallest < SMALLEST_OF_LPIPS else lpips(*pair, kept)
+    row["pixels"] = pair[0][..., 0].numel() if kept is None else int(kept.sum())
+    row["ignored_pixels"] = pair[0][..., 0].numel() - row["pixels"]
     return row | {"floaters": floaters(picture, dataset, index)}, (rgb, target, picture)
 
 
@@ -304,6 +342,7 @@ def _judged(
     if half:
         rgb, target = right_half(rgb), right_half(target)
         kept = None if kept is None else right_half(kept)
+    kept = None if kept is None or kept.all() else kept
     return (rgb if kept is None else torch.where(kept[..., None], rgb, target), target), kept
 
 
@@ -340,13 +379,20 @@ def _by_size(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _statistics(rows: list[dict[str, Any]]) -> dict[str, float | None]:
-    """Return the mean and the standard deviation of each metric; None if it is absent."""
+    """Return the mean and the standard deviation of each metric, None if it is absent, and its number of images."""
     statistics: dict[str, float | None] = {}
     for name in ("psnr", "ssim", "ms_ssim", "lpips", "floaters"):
         values = [row[name] for row in rows if row[name] is not None]
         statistics[name] = fmean(values) if values else None
         statistics[f"{name}_std"] = _deviation(values) if values else None
+        if name != "psnr":  # every image has one
+            statistics[f"{name}_images"] = len(values)
     return statistics
+
+
+def _num_pixels(rows: list[dict[str, Any]]) -> dict[str, int]:
+    """Return the number of pixels that count, and of those that masks ignore."""
+    return {f"num_{name}": sum(row[name] for row in rows) for name in ("pixels", "ignored_pixels")}
 
 
 def _deviation(values: list[float]) -> float:

@@ -8,7 +8,6 @@ import time
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean, stdev
 from typing import Any, Literal
 
 import torch
@@ -26,6 +25,7 @@ from framework.evaluation.images import write_image
 from framework.evaluation.lpips import NETWORK, SMALLEST_OF_LPIPS, Lpips, load_lpips
 from framework.evaluation.metrics import SMALLEST_OF_SCALES, ms_ssim, psnr, quick_ssim
 from framework.evaluation.panels import composed, view_panels
+from framework.evaluation.statistics import statistics
 from framework.kernels.ssim import WINDOW
 from framework.model import Model, RendersFromImages
 from framework.rendering.rendered import Picture
@@ -279,13 +279,7 @@ def evaluate(
     if pictures is not None and worst is not None and pictures_note is None:
         pictures_note = _write_pictures(pictures, WORST, *worst)
     speed = rays / seconds if rays else None  # None of a method that casts none
-    results = {
-        **_statistics(rows),
-        **_num_pixels(rows),
-        **_by_size(rows),
-        "num_rays_per_sec": speed,
-        "fps": len(rows) / seconds,
-    }
+    results = {**statistics(rows), "num_rays_per_sec": speed, "fps": len(rows) / seconds}
     protocol: Literal["mean", "half"] | None = ("half" if half else "mean") if has_appearance else None
     return Evaluation(rows, {**results, "num_images": len(rows)}, lpips_note, protocol, pictures_note)
 
@@ -368,35 +362,3 @@ def _row(dataset: Dataset, index: int, measured: Measured, seconds: float) -> di
         "seconds": seconds,
     }
     return row if dataset.reductions is None else {**row, "reduction": int(dataset.reductions[index])}
-
-
-def _by_size(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the statistics of the images of each size, "1", "1/2", ..., as `by_size`; nothing if all have one size."""
-    sizes = sorted({row["reduction"] for row in rows if "reduction" in row})
-    names = {size: "1" if size == 1 else f"1/{size}" for size in sizes}
-    found = {names[size]: _statistics([row for row in rows if row["reduction"] == size]) for size in sizes}
-    return {"by_size": found} if found else {}
-
-
-def _statistics(rows: list[dict[str, Any]]) -> dict[str, float | None]:
-    """Return the mean and the standard deviation of each metric, None if it is absent, and its number of images."""
-    statistics: dict[str, float | None] = {}
-    for name in ("psnr", "ssim", "ms_ssim", "lpips", "floaters"):
-        values = [row[name] for row in rows if row[name] is not None]
-        statistics[name] = fmean(values) if values else None
-        statistics[f"{name}_std"] = _deviation(values) if values else None
-        if name != "psnr":  # every image has one
-            statistics[f"{name}_images"] = len(values)
-    return statistics
-
-
-def _num_pixels(rows: list[dict[str, Any]]) -> dict[str, int]:
-    """Return the number of pixels that count, and of those that masks ignore."""
-    return {f"num_{name}": sum(row[name] for row in rows) for name in ("pixels", "ignored_pixels")}
-
-
-def _deviation(values: list[float]) -> float:
-    """Return the standard deviation, NaN if a value is not finite, of which `stdev` fails with another error."""
-    if not all(map(math.isfinite, values)):
-        return math.nan
-    return stdev(values) if len(values) > 1 else 0.0

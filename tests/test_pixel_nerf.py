@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from dataparsers.procedural import Procedural
-from framework.base.config import MachineConfig
 from framework.base.errors import ConfigError, DataError
+from framework.base.machine_config import MachineConfig
 from framework.data.dataset import Dataset, load_dataset
 from framework.data.pixels import composite
 from framework.data.source_views import images_of, nearest_in_direction, other_images

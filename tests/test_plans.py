@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 
-from framework.base.config import MachineConfig
 from framework.base.device import relative_speed
+from framework.base.machine_config import MachineConfig
 from framework.base.processes import Processes
 from framework.base.registry import load_method
 from framework.data.scene import Scene

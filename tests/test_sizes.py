@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 import torch
 
-from framework.base.config import MachineConfig, TrainConfig, from_plain
+from framework.base.config import TrainConfig, from_plain
 from framework.base.errors import ConfigError, NerfloomError
+from framework.base.machine_config import MachineConfig
 from framework.base.registry import load_method, registered
 from framework.data.scene import Scene
 from framework.encodings.hash_grid import HashGrid

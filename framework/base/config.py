@@ -18,6 +18,7 @@ import yaml
 
 from framework.base.errors import ConfigError, nearest, shown
 from framework.base.from_nerfstudio import config_answer
+from framework.base.machine_config import MachineConfig, ViewerConfig
 
 T = TypeVar("T")
 RaysPerPixel = Literal[1, 4, 9, 16]
@@ -39,49 +40,11 @@ else:
 
 AUTO: Any = None
 """The default of an `Auto` setting."""
-MOST_THREADS = 1024
-"""Maximum number of CPU threads that a run may ask for."""
 Range = tuple[float, float]
 """Minimum and maximum of a setting, both allowed."""
 AT_LEAST_0: Range = (0, math.inf)
 SMALLEST_EPS = 1e-37
 """Minimum epsilon of Adam, close to the smallest normal float32. Without epsilon, a gradient of 0 gives 0 / 0."""
-
-
-@dataclass(frozen=True)
-class MachineConfig:
-    """The device of a run, its threads and its seed."""
-
-    seed: int = 42
-    """Random seed. The same seed, CPU and thread count give the same bits; on a GPU, sums differ in rounding."""
-    device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
-    """Device to train on; auto: CUDA if available, else the CPU."""
-    num_threads: int | None = None
-    """CPU threads; all cores if not given."""
-    cuda_graphs: Literal["auto", "on", "off"] = "auto"
-    """Record training steps on a GPU as CUDA graphs and repeat them, which saves the time to start each operation.
-    auto: where steps are alike, if a repeated step has the loss and the effect of one without; a line says why not."""
-
-    def __post_init__(self) -> None:
-        if not -(2**63) <= self.seed < 2**63:
-            raise ConfigError(f"--machine.seed is {shown(self.seed)}; it must be an integer of 64 bits")
-        if self.num_threads is not None and not 1 <= self.num_threads <= MOST_THREADS:
-            number = shown(self.num_threads)
-            raise ConfigError(f"--machine.num-threads is {number}; it must be from 1 to {MOST_THREADS}")
-
-
-@dataclass(frozen=True)
-class ViewerConfig:
-    """The address of the viewer."""
-
-    websocket_host: str = "127.0.0.1"
-    """Interface to listen on; 0.0.0.0 for all, from which other machines can connect. There is no password."""
-    websocket_port: int = 7007
-    """Port to listen on; the next free one if it is taken."""
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.websocket_port <= 65535:
-            raise ConfigError(f"--viewer.websocket-port is {shown(self.websocket_port)}; it must be from 1 to 65535")
 
 
 @dataclass(frozen=True)
@@ -140,6 +103,8 @@ class TrainConfig:
     """Maximum number of evaluated images, evenly spaced; all if not given, none if 0."""
     eval: Literal["in-time", "all"] = "in-time"
     """Evaluated images. in-time: as many, evenly spaced, as take half of the time of training at most; all: all."""
+    lpips_weights: Path | None = None
+    """File of weights of LPIPS with AlexNet (.npz), for evaluations; the lpips package's if not given."""
     vis: Literal["tensorboard", "viewer", "viewer+tensorboard", "none"] = "tensorboard"
     """Where training curves and rendered images are shown: in TensorBoard's files, in a browser, or in both."""
     viewer_share: float = 0.1
@@ -167,9 +132,8 @@ class TrainConfig:
     adam_eps: float = 1e-8
     """Adam's epsilon."""
     masks: Literal["auto", "ignored", "empty"] = "auto"
-    """Meaning of masked-out pixels in training. ignored: nothing is known about them; empty: nothing is there, as
-    around an object that was cut out; auto: empty if masks remove over half of all pixels, not the same of each
-    image."""
+    """Meaning of masked-out pixels in training. ignored: nothing is known of them; empty: nothing is there, as around
+    what was cut out; auto: empty if masks remove over half of all pixels, not the same of each image."""
     background: Literal["auto", "random", "white", "black"] = "auto"
     """Colour behind transparent pixels in training; auto: random if images have alpha. Evaluation: white or black."""
     machine: MachineConfig = field(default_factory=MachineConfig)

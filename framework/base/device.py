@@ -13,8 +13,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from framework.base.config import MachineConfig
 from framework.base.errors import ConfigError
+from framework.base.machine_config import MachineConfig
 from framework.base.processes import processes
 
 GPU_SPEED = 10.0

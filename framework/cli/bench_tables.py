@@ -10,7 +10,7 @@ from typing import Literal
 from framework.base.console import say
 from framework.base.errors import ConfigError, FlagError, shown
 from framework.cli.bench_results import RESULTS
-from framework.cli.common import make_room
+from framework.cli.common import check_weights, make_room
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +30,8 @@ class TablesFlags:
     over seeds."""
     seconds_scale: float = 1.0
     """Factor of all budgets, such as 0.02 to try a table; then three held-out images of each row are judged."""
+    lpips_weights: Path | None = None
+    """File of weights of LPIPS with AlexNet (.npz), for the rows that are run."""
     run_dir: Path = Path("outputs/tables")
     """Folder of the runs, with the last checkpoint and some pictures of each."""
     output_dir: Path = RESULTS
@@ -54,7 +56,11 @@ def measure_tables(flags: TablesFlags) -> None:
         wanted = re.compile(flags.only)
     except re.error as error:
         raise FlagError(f"--only {shown(flags.only)} is no regular expression: {error}") from error
-    tables = [read_table(path, flags.data_root, flags.run_dir, flags.seconds_scale) for path in flags.tables]
+    check_weights(flags.lpips_weights)
+    tables = [
+        read_table(path, flags.data_root, flags.run_dir, flags.seconds_scale, flags.lpips_weights)
+        for path in flags.tables
+    ]
     if flags.show == "markdown":
         print("\n\n".join(markdown(table, flags.output_dir, wanted) for table in tables))
         return

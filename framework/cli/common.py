@@ -121,6 +121,21 @@ def make_room(path: Path) -> None:
         raise ConfigError(f"cannot write {path}: {reason}; name another place") from error
 
 
+def check_weights(path: Path | None) -> None:
+    """Check a file of LPIPS's weights, before any work is done whose result is evaluated with it.
+
+    Args:
+        path: the file; None for none.
+
+    Raises:
+        ConfigError: if it cannot be used.
+    """
+    if path is not None:
+        from framework.evaluation.lpips import read_weights
+
+        read_weights(path)
+
+
 def run_command(command: Callable[[list[str]], None]) -> None:
     """Run a command on the arguments of the process, and exit with its status.
 

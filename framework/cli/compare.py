@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from framework.base.errors import ConfigError, FlagError
-from framework.cli.common import run_command
+from framework.cli.common import check_weights, run_command
 from framework.cli.flags import read_flags
 from framework.training.run_path import check_data, check_writable
 
@@ -42,6 +42,8 @@ class CompareFlags:
     max_eval_images: int | None = None
     """Maximum number of held-out views of the final evaluation, evenly spaced. If not given: one for each second of
     training, at least 25; all without --max-seconds. The report says how many they are."""
+    lpips_weights: Path | None = None
+    """File of weights of LPIPS with AlexNet (.npz); without it, the lpips package is looked for."""
     curve_images: int = 4
     """Number of views of the evaluations during training; 0 for none."""
     num_threads: int | None = None
@@ -97,6 +99,7 @@ def plan_of(flags: CompareFlags) -> Plan:
 
     if flags.data is not None and not os.path.isdir(flags.data):
         flags = replace(flags, data=find_data(flags.data)[0])
+    check_weights(flags.lpips_weights)
     conditions = Conditions(
         data=None if flags.data is None else str(flags.data.resolve()),
         data_flags=split_words(flags.data_flags, "--data-flags"),
@@ -107,6 +110,7 @@ def plan_of(flags: CompareFlags) -> Plan:
         device_type=flags.device_type,
         curve_images=flags.curve_images,
         max_eval_images=views_for(flags.max_seconds) if flags.max_eval_images is None else flags.max_eval_images,
+        lpips_weights=None if flags.lpips_weights is None else str(flags.lpips_weights.resolve()),
     )
     name = "procedural" if flags.data is None else flags.data.resolve().name
     folder = flags.output_dir or Path("outputs") / f"compare-{name}"

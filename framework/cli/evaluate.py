@@ -39,6 +39,8 @@ class EvalFlags:
     eval_appearance: Literal["mean", "half"] | None = None
     """Appearance of held-out images. mean: the mean of the training images'. half: fitted to the left half of each,
     with metrics of the right half (NeRF-W's protocol). The run's setting if not given."""
+    lpips_weights: Path | None = None
+    """File of weights of LPIPS with AlexNet (.npz); the run's setting if not given."""
     max_error: str | None = None
     """Maximum error of a colour, such as 1/255: rays end where the rest cannot change it by more; 1e-4 if not given."""
     round_to_uint8: bool = False
@@ -92,6 +94,7 @@ def _command(arguments: list[str]) -> None:
             pictures=flags.render_output_path,
             max_pictures=flags.max_pictures,
             round_to_uint8=flags.round_to_uint8,
+            lpips_weights=flags.lpips_weights,
         )
     say(f"{flags.split}: {evaluation.line()}")
     if evaluation.far_below is not None:
@@ -101,7 +104,9 @@ def _command(arguments: list[str]) -> None:
         say(f"--max-error {bound:.2g}: colours off by at most {worst:.2g} (measured), {faster:.2f} x as fast as exact")
     if flags.eval_appearance == "half" and evaluation.eval_appearance is None:
         say("--eval-appearance half: this run has no appearance vectors; whole images were evaluated")
-    say(f"LPIPS {evaluation.lpips_note}")
+    say(f"LPIPS: {evaluation.lpips_note}")
+    if evaluation.masks_note is not None:
+        say(f"masks: {evaluation.masks_note}")
     write_evaluation(output, trained.run, trained.checkpoint, evaluation, trained.model.device)
     say(f"written to {output}")
     if (wrong := evaluation.pictures_note or evaluation.warning) is not None:

@@ -15,6 +15,7 @@ from framework.base.device import choose_device, peak_memory
 from framework.base.errors import ConfigError, LostProcessError
 from framework.base.extras import install_command
 from framework.base.processes import from_first, joined_processes, processes
+from framework.cli.common import check_weights
 from framework.cli.next_steps import after_training
 from framework.data.dataset import Dataset
 from framework.data.residence import on_device
@@ -83,6 +84,7 @@ def resume(run: Run) -> None:
 def _prepare(run: Run) -> Trainer:
     if "viewer" in run.config.vis and (command := install_command("viewer")) is not None:
         raise ConfigError(f"--vis {run.config.vis} needs viser: {command}")
+    check_weights(run.config.lpips_weights)
     device = choose_device(run.config.machine)
     train_set, images = on_device(load_split(run, "train"), device)
     eval_set = _held_out(run, device, FEW) if processes().first else None

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from framework.base.config import ViewerConfig
 from framework.base.errors import ConfigError
 from framework.base.extras import install_command
+from framework.base.machine_config import ViewerConfig
 from framework.cli.common import run_command, with_format, with_run
 from framework.cli.flags import read_flags
 from framework.training.run_path import trained_run

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from statistics import fmean, stdev
 from typing import Any, Literal, TypeVar
 
 import torch
@@ -25,8 +24,11 @@ from framework.cameras.view import View, every
 from framework.data.dataset import Dataset
 from framework.data.pixels import composite
 from framework.evaluation.appearance import appearance_of, fitted_appearance, right_half
-from framework.evaluation.metrics import SMALLEST_OF_SCALES, load_lpips, ms_ssim, psnr, quick_ssim
+from framework.evaluation.lpips import NETWORK, SMALLEST_OF_LPIPS, Lpips, load_lpips
+from framework.evaluation.metrics import SMALLEST_OF_SCALES, ms_ssim, psnr, quick_ssim
+from framework.evaluation.statistics import statistics
 from framework.evaluation.view_files import Judged, ViewFiles
+from framework.kernels.ssim import WINDOW
 from framework.model import Model, RendersFromImages
 from framework.rendering.rendered import Picture
 
@@ -36,6 +38,11 @@ BEFORE = 0.9
 """Share of a sparse point's distance before which a view that sees the point should show nothing."""
 FAR_BELOW, MOST_NAMED = 3.0, 3
 """Distance from the mean PSNR, dB, from which a view is named, and the maximum number of views that are."""
+MASKED = (
+    "PSNR is of kept pixels, SSIM and MS-SSIM are of windows without ignored pixels, LPIPS is the mean of its map over "
+    "kept pixels, for which ignored pixels are copied from the true image"
+)
+"""What is measured of images of which masks ignore pixels."""
 
 
 def evaluation_background(model: Model) -> Tensor:
@@ -55,18 +62,18 @@ class Measured:
     psnr: float
     """Peak signal-to-noise ratio, dB."""
     ssim: float | None
-    """Structural similarity; None if the image is smaller than SSIM's window."""
+    """Structural similarity; None if no window of SSIM lies inside what counts."""
 
 
 def measure(rgb: Tensor, target: Tensor, kept: Tensor | None) -> Measured:
-    """Compute the PSNR of the kept pixels and the SSIM of the whole image, in which other pixels should be equal.
+    """Compute the PSNR of the kept pixels, and the SSIM over the windows that have no other pixels.
 
     Args:
         rgb, target: (H, W, 3) rendered and true image in [0, 1].
         kept: (H, W) bool, pixels that count; all if None.
     """
     judged = (rgb, target) if kept is None else (rgb[kept], target[kept])
-    return Measured(psnr(*judged), quick_ssim(rgb, target) if min(rgb.shape[:2]) >= 11 else None)
+    return Measured(psnr(*judged), quick_ssim(rgb, target, kept) if min(rgb.shape[:2]) >= WINDOW else None)
 
 
 def measure_view(model: Model, dataset: Dataset, index: int, background: Tensor, stride: int = 1) -> Measured:
@@ -144,12 +151,13 @@ class Evaluation:
     """Metrics of a set of images."""
 
     per_image: list[dict[str, Any]]
-    """Name, psnr, ssim, ms_ssim, lpips, floaters and rendering seconds of each image, and its reduction if images have
-    several sizes."""
+    """Name, psnr, ssim, ms_ssim, lpips, floaters and rendering seconds of each image, the number of pixels that count
+    and that masks ignore, and its reduction if images have several sizes."""
     results: dict[str, Any]
-    """Means, standard deviations and rendering speed, with nerfstudio's keys; by_size, those of images of each size."""
+    """Means, standard deviations and rendering speed, with nerfstudio's keys; the number of images that each mean is
+    over; the numbers of pixels that count and that masks ignore; by_size, the statistics of images of each size."""
     lpips_note: str
-    """Network of LPIPS, or the reason why it is absent."""
+    """Network of LPIPS and source of its weights, or the reason why it is absent."""
     eval_appearance: Literal["mean", "half"] | None = None
     """Source of the held-out images' appearance; None if the method has none."""
     pictures_note: str | None = None
@@ -168,6 +176,16 @@ class Evaluation:
         )
 
     @property
+    def masks_note(self) -> str | None:
+        """The text that says what is measured of masked images; None if all pixels count."""
+        if not self.results["num_ignored_pixels"]:
+            return None
+        images = self.results["num_images"]
+        lacking = {name: images - self.results[f"{name}_images"] for name in ("ssim", "ms_ssim")}
+        absent = [f"{number} of {images} images have no {name}" for name, number in lacking.items() if number]
+        return MASKED + (f"; {' and '.join(absent)}: no such window" if absent else "")
+
+    @property
     def far_below(self) -> str | None:
         """The views whose PSNR is `FAR_BELOW` or more below the mean, worst first, as text; None if there is none."""
         mean = self.results["psnr"]
@@ -180,16 +198,24 @@ class Evaluation:
     def line(self) -> str:
         """Return the results as a line of text."""
         r = self.results
-        ssim, lpips = ("absent" if r[name] is None else f"{r[name]:.4f}" for name in ("ssim", "lpips"))
-        scales = "" if r["ms_ssim"] is None else f"  MS-SSIM {r['ms_ssim']:.4f}"
+        ssim, scales, lpips = (self._mean(name) for name in ("ssim", "ms_ssim", "lpips"))
+        scales = "" if r["ms_ssim"] is None and not r["num_ignored_pixels"] else f"  MS-SSIM {scales}"
         before = "" if r["floaters"] is None else f"  floaters {r['floaters']:.1f} %"
         rays = r["num_rays_per_sec"]
         speed = f"{rays / 1e3:.1f}k rays/s  {1 / r['fps']:.2f} s/image" if rays else f"{r['fps']:.1f} images/s"
         sizes = ", ".join(f"{size}: {found['psnr']:.2f}" for size, found in r.get("by_size", {}).items())
         sizes = f" ({sizes})" if sizes else ""
-        quality = f"PSNR {r['psnr']:.2f} dB{sizes}  SSIM {ssim}{scales}  LPIPS {lpips}{before}"
+        quality = f"PSNR {r['psnr']:.2f} dB{sizes}  SSIM {ssim}{scales}  LPIPS ({NETWORK}) {lpips}{before}"
         count, of = r["num_images"], r["num_images_in_split"]
-        return f"{quality}  {speed}  ({count if count == of else f'{count} of {of}'} images)"
+        kept, ignored = r["num_pixels"], r["num_ignored_pixels"]
+        masks = f", {kept:,} pixels; masks ignore {ignored / (kept + ignored):.0%}" if ignored else ""
+        return f"{quality}  {speed}  ({count if count == of else f'{count} of {of}'} images{masks})"
+
+    def _mean(self, name: str) -> str:
+        """Return a mean as text, with the number of images that it is over if others have no such value."""
+        mean, images = self.results[name], self.results[f"{name}_images"]
+        over = f" ({images} of {self.results['num_images']} images)" if images < self.results["num_images"] else ""
+        return "absent" if mean is None else f"{mean:.4f}{over}"
 
 
 def evaluate(
@@ -201,14 +227,16 @@ def evaluate(
     pictures: Path | None = None,
     max_pictures: int | None = None,
     round_to_uint8: bool = False,
+    lpips_weights: Path | None = None,
     title: str = "Evaluating",
 ) -> Evaluation:
     """Render views and compute their metrics.
 
     Images that are given to the method (`Dataset.source_images`) are shown to it and not judged. Masked-out pixels do
-    not count: PSNR omits them; for SSIM and LPIPS they are copied from the true image. Images without other pixels are
-    skipped. If appearance is fitted to left halves (`eval_appearance`), right halves count. SSIM is at one scale and at
-    five (`ms_ssim`).
+    not count: PSNR omits them, SSIM omits the windows that have any, at one scale and at five (`ms_ssim`), and LPIPS is
+    the mean of its map over the others, for which masked-out pixels are copied from the true image. Images without
+    other pixels are skipped. If appearance is fitted to left halves (`eval_appearance`), right halves count. An image
+    has no SSIM if no window counts.
 
     Args:
         model: the trained model.
@@ -220,9 +248,11 @@ def evaluate(
             them, files of the view with the lowest PSNR are written besides, as worst.png and so on. Views with files
             are evaluated before the others.
         round_to_uint8: whether colours are rounded to 8 bits before they are measured.
+        lpips_weights: file of LPIPS's weights; that of the model's settings if None.
         title: text of the progress bar.
 
     Raises:
+        ConfigError: if the file of weights cannot be used.
         DataError: if there is no image to evaluate.
     """
     has_appearance = appearance_of(model) is not None
@@ -233,7 +263,7 @@ def evaluate(
         raise DataError(f"there is no image to evaluate: masks leave nothing of the {len(dataset)} that there are")
     if isinstance(model, RendersFromImages) and dataset.source_images is not None:
         model.show_images(dataset)
-    lpips, lpips_note = load_lpips()
+    lpips, lpips_note = load_lpips(lpips_weights or model.config.lpips_weights, model.device)
     background = evaluation_background(model)
     judge = partial(_judge, model, dataset, background, half, round_to_uint8, lpips)
     if seconds is not None and runs_ahead(model.device):
@@ -255,7 +285,7 @@ def evaluate(
     speed = {"num_rays_per_sec": rays / spent if rays else None, "fps": len(rows) / spent}  # None: no rays are cast
     counts = {"num_images": len(rows), "num_images_in_split": len(views)}
     protocol: Literal["mean", "half"] | None = ("half" if half else "mean") if has_appearance else None
-    results = {**_statistics(rows), **_by_size(rows), **speed, **counts}
+    results = {**statistics(rows), **speed, **counts}
     return Evaluation(rows, results, lpips_note, protocol, files.note)
 
 
@@ -280,7 +310,7 @@ def _judge(
     background: Tensor,
     half: bool,
     round_to_uint8: bool,
-    lpips: Callable[[Tensor, Tensor], float] | None,
+    lpips: Lpips | None,
     index: int,
 ) -> tuple[dict[str, Any], Judged]:
     """Return what is reported of a view, and its images."""
@@ -292,8 +322,11 @@ def _judge(
         rgb = (rgb * 255).round() / 255
     pair, kept = _judged(rgb, target, dataset.kept_of(index), half)
     row = _row(dataset, index, measure(*pair, kept), spent)
-    row["ms_ssim"] = None if min(target.shape[:2]) < SMALLEST_OF_SCALES else ms_ssim(*pair)
-    row["lpips"] = None if lpips is None else lpips(*pair)
+    smallest = min(pair[0].shape[:2])
+    row["ms_ssim"] = None if smallest < SMALLEST_OF_SCALES else ms_ssim(*pair, kept)
+    row["lpips"] = None if lpips is None or smallest < SMALLEST_OF_LPIPS else lpips(*pair, kept)
+    row["pixels"] = pair[0][..., 0].numel() if kept is None else int(kept.sum())
+    row["ignored_pixels"] = pair[0][..., 0].numel() - row["pixels"]
     return row | {"floaters": floaters(picture, dataset, index)}, Judged(rgb, target, picture)
 
 
@@ -304,6 +337,7 @@ def _judged(
     if half:
         rgb, target = right_half(rgb), right_half(target)
         kept = None if kept is None else right_half(kept)
+    kept = None if kept is None or kept.all() else kept
     return (rgb if kept is None else torch.where(kept[..., None], rgb, target), target), kept
 
 
@@ -329,28 +363,3 @@ def _row(dataset: Dataset, index: int, measured: Measured, seconds: float) -> di
         "seconds": seconds,
     }
     return row if dataset.reductions is None else {**row, "reduction": int(dataset.reductions[index])}
-
-
-def _by_size(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the statistics of the images of each size, "1", "1/2", ..., as `by_size`; nothing if all have one size."""
-    sizes = sorted({row["reduction"] for row in rows if "reduction" in row})
-    names = {size: "1" if size == 1 else f"1/{size}" for size in sizes}
-    found = {names[size]: _statistics([row for row in rows if row["reduction"] == size]) for size in sizes}
-    return {"by_size": found} if found else {}
-
-
-def _statistics(rows: list[dict[str, Any]]) -> dict[str, float | None]:
-    """Return the mean and the standard deviation of each metric; None if it is absent."""
-    statistics: dict[str, float | None] = {}
-    for name in ("psnr", "ssim", "ms_ssim", "lpips", "floaters"):
-        values = [row[name] for row in rows if row[name] is not None]
-        statistics[name] = fmean(values) if values else None
-        statistics[f"{name}_std"] = _deviation(values) if values else None
-    return statistics
-
-
-def _deviation(values: list[float]) -> float:
-    """Return the standard deviation, NaN if a value is not finite, of which `stdev` fails with another error."""
-    if not all(map(math.isfinite, values)):
-        return math.nan
-    return stdev(values) if len(values) > 1 else 0.0

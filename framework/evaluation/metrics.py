@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Sequence
 from statistics import fmean
 
 import torch
@@ -12,8 +10,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from framework.base.device import to_float64
-from framework.base.extras import install_command
-from framework.kernels.ssim import PHOTOMETRIC, WINDOW, structure
+from framework.kernels.dispatch import Operation
+from framework.kernels.ssim import PHOTOMETRIC, SIMILARITY, WINDOW, structure, windows_inside
 from framework.kernels.ssim import ssim as similarity
 from framework.splats.resolution import halved
 
@@ -23,8 +21,6 @@ EXPONENTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of SSIM at five scales, from the finest (Wang, Simoncelli and Bovik 2003, section 3.2)."""
 SMALLEST_OF_SCALES = WINDOW << (len(EXPONENTS) - 1)
 """Minimum width and height of an image that has SSIM at five scales, pixels: 176."""
-FETCH_ALEXNET = "python -c 'import torchvision; torchvision.models.alexnet(weights=\"DEFAULT\")'"
-"""Command that downloads the weights on which LPIPS is built, which come in no package."""
 
 
 def psnr(prediction: Tensor, target: Tensor) -> float:
@@ -37,13 +33,14 @@ def psnr(prediction: Tensor, target: Tensor) -> float:
     return float(-10 * error.log10())
 
 
-def ssim(prediction: Tensor, target: Tensor) -> float:
+def ssim(prediction: Tensor, target: Tensor, counted: Tensor | None = None) -> float:
     """Compute the structural similarity (Wang et al. 2004) with an 11x11 Gaussian window, sigma 1.5, data range 1.
 
-    It is averaged over the windows inside the image and over channels.
+    It is averaged over windows and over channels.
 
     Args:
         prediction, target: (H, W, 3) colours in [0, 1].
+        counted: (H - 10, W - 10) bool, the windows that count; all that lie inside the image if None.
 
     Raises:
         ValueError: if the image is smaller than the window.
@@ -63,29 +60,40 @@ def ssim(prediction: Tensor, target: Tensor) -> float:
     variance_x, variance_y = blur(x * x) - mean_x**2, blur(y * y) - mean_y**2
     covariance = blur(x * y) - mean_x * mean_y
     c1, c2 = 0.01**2, 0.03**2
-    similarity = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
-    return float((similarity / ((mean_x**2 + mean_y**2 + c1) * (variance_x + variance_y + c2))).mean())
+    similar = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
+    similar = (similar / ((mean_x**2 + mean_y**2 + c1) * (variance_x + variance_y + c2)))[:, 0]
+    return float((similar if counted is None else similar[:, counted]).mean())
 
 
-def quick_ssim(prediction: Tensor, target: Tensor) -> float:
+def quick_ssim(prediction: Tensor, target: Tensor, kept: Tensor | None = None) -> float | None:
     """Compute `ssim` by a kernel in float32, which is off by less than 1e-6, if the device has one; else in float64.
 
     In float64 it takes longer than many methods need to render the image.
 
     Args:
         prediction, target: (H, W, 3) colours in [0, 1].
+        kept: (H, W) bool, pixels that count: the mean is over the windows that have no other pixels. All if None.
+
+    Returns:
+        The similarity; None if no window counts.
 
     Raises:
         ValueError: if the image is smaller than the window.
     """
+    if min(prediction.shape[:2]) < WINDOW:
+        return ssim(prediction, target)  # refuses it
+    counted = None if kept is None else windows_inside(kept)
+    if counted is not None and not counted.any():
+        return None
     pair = prediction.detach().float(), target.detach().float()
-    chosen = PHOTOMETRIC.choose(pair, *pair, 1.0)
-    if chosen is PHOTOMETRIC.reference or min(prediction.shape[:2]) < 11:
-        return ssim(prediction, target)
-    return 1 - float(chosen.run(*pair, 1.0))
+    operation: Operation[..., Tensor] = PHOTOMETRIC if counted is None else SIMILARITY
+    arguments = (1.0,) if counted is None else (counted, True)
+    if operation.choose(pair, *pair, *arguments) is operation.reference:
+        return ssim(prediction, target, counted)
+    return float(similarity(*pair, counted))
 
 
-def ms_ssim(prediction: Tensor, target: Tensor) -> float:
+def ms_ssim(prediction: Tensor, target: Tensor, kept: Tensor | None = None) -> float | None:
     """Compute SSIM at five scales (Wang, Simoncelli and Bovik 2003), the mean over channels.
 
     A coarser scale has half the width and height, by means of 2 x 2 pixels; an odd last row or column is left out. Of
@@ -94,6 +102,11 @@ def ms_ssim(prediction: Tensor, target: Tensor) -> float:
 
     Args:
         prediction, target: (H, W, 3) colours in [0, 1], of at least 176 x 176 pixels.
+        kept: (H, W) bool, pixels that count; all if None. A pixel of a coarser scale counts if the four that it is the
+            mean of do. Each mean is over the windows that have no other pixels.
+
+    Returns:
+        The similarity; None if no window counts at the coarsest scale.
 
     Raises:
         ValueError: if the window does not fit into the image at the coarsest scale.
@@ -102,38 +115,29 @@ def ms_ssim(prediction: Tensor, target: Tensor) -> float:
         height, width = prediction.shape[:2]
         least = SMALLEST_OF_SCALES
         raise ValueError(f"SSIM at five scales needs at least {least}x{least} pixels, not {width}x{height}")
+    counted = [None] * len(EXPONENTS) if kept is None else windows_of_scales(kept)
+    if counted[-1] is not None and not counted[-1].any():
+        return None
     channels = (each.detach().split(1, dim=-1) for each in (prediction, target))
-    return fmean(_ms_ssim_of_channel(x, y) for x, y in zip(*channels, strict=True))
+    return fmean(_ms_ssim_of_channel(x, y, counted) for x, y in zip(*channels, strict=True))
 
 
-def _ms_ssim_of_channel(x: Tensor, y: Tensor) -> float:
-    product = 1.0
-    for exponent in EXPONENTS[:-1]:
-        product *= max(float(structure(x, y)), 0.0) ** exponent  # a NaN stays one
-        x, y = halved(x), halved(y)
-    return product * max(float(similarity(x, y)), 0.0) ** EXPONENTS[-1]
+def windows_of_scales(kept: Tensor) -> list[Tensor]:
+    """Return which windows count at each of the five scales, from the finest: (h - 10, w - 10) bool each.
 
-
-def load_lpips() -> tuple[Callable[[Tensor, Tensor], float] | None, str]:
-    """Load LPIPS with AlexNet (Zhang et al. 2018), if the `lpips` extra and the network's weights are installed.
-
-    Returns:
-        The metric, a function of two images (H, W, 3) in [0, 1], or None; and the network's name, or why it is absent.
+    Args:
+        kept: (H, W) bool, pixels that count, at least 176 x 176.
     """
-    if (advice := install_command("lpips")) is not None:
-        return None, f"absent: {advice}; then AlexNet's weights, which no package has: {FETCH_ALEXNET}"
-    weights = Path(torch.hub.get_dir()) / "checkpoints"
-    if not list(weights.glob("alexnet-*.pth")):
-        return None, f"absent: AlexNet's weights, which no package has, are not in {weights}: {FETCH_ALEXNET}"
-    import lpips
+    windows = []
+    for _ in EXPONENTS:
+        windows.append(windows_inside(kept))
+        kept = halved(kept[..., None].float())[..., 0] == 1
+    return windows
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torchvision warns of renamed arguments
-        network = lpips.LPIPS(net="alex", verbose=False).eval()
 
-    def measure(prediction: Tensor, target: Tensor) -> float:
-        pair = [(image.float().cpu().permute(2, 0, 1)[None] * 2 - 1) for image in (prediction, target)]
-        with torch.no_grad():
-            return float(network(*pair))
-
-    return measure, "AlexNet"
+def _ms_ssim_of_channel(x: Tensor, y: Tensor, counted: Sequence[Tensor | None]) -> float:
+    product = 1.0
+    for exponent, windows in zip(EXPONENTS[:-1], counted[:-1], strict=True):
+        product *= max(float(structure(x, y, windows)), 0.0) ** exponent  # a NaN stays one
+        x, y = halved(x), halved(y)
+    return product * max(float(similarity(x, y, counted[-1])), 0.0) ** EXPONENTS[-1]

@@ -39,7 +39,7 @@ C1, C2 = 0.01**2, 0.03**2
 """Constants that bound the quotients of dark and of flat windows, for values in [0, 1]."""
 
 
-def ssim(image: Tensor, target: Tensor) -> Tensor:
+def ssim(image: Tensor, target: Tensor, counted: Tensor | None = None) -> Tensor:
     """Return the mean structural similarity of an image and its target: 1 where they are equal.
 
     The definition is that of `framework.evaluation.metrics.ssim`, which is for measuring: in float64, without gradient.
@@ -48,16 +48,33 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     Args:
         image: (H, W, C) values whose range is taken to be [0, 1]. Compiled with its first derivative.
         target: (H, W, C) values to compare with. A gradient to it takes the slow reference.
+        counted: (H - 10, W - 10) bool, the windows that count, by their first pixel (`windows_inside`); all that lie
+            inside the image if None. With it, only the reference has a gradient.
 
     Returns:
-        The mean over channels and over all windows that lie inside the image, a tensor without dimensions.
+        The mean over channels and over the windows that count, a tensor without dimensions.
 
     Raises:
-        ValueError: The shapes differ or are not those of images, or a side is shorter than the window.
+        ValueError: The shapes differ or are not those of images, a side is shorter than the window, or no window
+            counts.
     """
     _check(image, target)
-    _check_window(image)
+    _check_window(image, counted)
+    if counted is not None:
+        return SIMILARITY((image, target), image, target, counted, True)
     return 1 - PHOTOMETRIC((image, target), image, target, 1.0)
+
+
+def windows_inside(kept: Tensor) -> Tensor:
+    """Return which windows have no pixel but kept ones, (H - 10, W - 10) bool, each at the place of its first pixel.
+
+    Args:
+        kept: (H, W) bool; each side has at least 11 pixels.
+    """
+    ignored = (~kept)[None].float()  # a maximum along one axis after the other takes less time than over both
+    for size in ((WINDOW, 1), (1, WINDOW)):
+        ignored = torch.nn.functional.max_pool2d(ignored, size, 1)
+    return ignored[0] == 0
 
 
 def _check(image: Tensor, target: Tensor) -> None:
@@ -65,9 +82,14 @@ def _check(image: Tensor, target: Tensor) -> None:
         raise ValueError(f"SSIM needs two images (H, W, C), not {tuple(image.shape)} and {tuple(target.shape)}")
 
 
-def _check_window(image: Tensor) -> None:
-    if min(image.shape[:2]) < WINDOW:
-        raise ValueError(f"SSIM needs at least {WINDOW}x{WINDOW} pixels, not {image.shape[1]}x{image.shape[0]}")
+def _check_window(image: Tensor, counted: Tensor | None = None) -> None:
+    height, width = image.shape[:2]
+    if min(height, width) < WINDOW:
+        raise ValueError(f"SSIM needs at least {WINDOW}x{WINDOW} pixels, not {width}x{height}")
+    if counted is not None and counted.shape != (height - WINDOW + 1, width - WINDOW + 1):
+        raise ValueError(f"an image of {width}x{height} pixels has no windows of shape {tuple(counted.shape)}")
+    if counted is not None and not counted.any():
+        raise ValueError("SSIM needs at least one window that counts")
 
 
 def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
@@ -114,11 +136,10 @@ def ssim_reference(image: Tensor, target: Tensor) -> Tensor:
     Returns:
         The mean over channels and windows, a tensor without dimensions.
     """
-    of_means, of_variances = _similarities(image, target)
-    return (of_means * of_variances).mean()
+    return similarity_reference(image, target, None, True)
 
 
-def structure(image: Tensor, target: Tensor) -> Tensor:
+def structure(image: Tensor, target: Tensor, counted: Tensor | None = None) -> Tensor:
     """Return the mean of S without its first factor, which compares means: what is left of contrast and structure.
 
     SSIM at several scales (Wang, Simoncelli and Bovik 2003) takes it of all scales but the coarsest. With NaN the
@@ -126,26 +147,32 @@ def structure(image: Tensor, target: Tensor) -> Tensor:
 
     Args:
         image, target: (H, W, C) values whose range is taken to be [0, 1]. Compiled without a derivative.
+        counted: as for `ssim`.
 
     Returns:
-        The mean over channels and over all windows that lie inside the image, a tensor without dimensions.
+        The mean over channels and over the windows that count, a tensor without dimensions.
 
     Raises:
-        ValueError: The shapes differ or are not those of images, or a side is shorter than the window.
+        ValueError: The shapes differ or are not those of images, a side is shorter than the window, or no window
+            counts.
     """
     _check(image, target)
-    _check_window(image)
-    return STRUCTURE((image, target), image, target)
+    _check_window(image, counted)
+    return SIMILARITY((image, target), image, target, counted, False)
 
 
-def structure_reference(image: Tensor, target: Tensor) -> Tensor:
-    """Compute `structure` in torch, on any device, in any float type, with derivatives of any order by both images.
+def similarity_reference(image: Tensor, target: Tensor, counted: Tensor | None, of_means: bool) -> Tensor:
+    """Compute `ssim` or `structure` over some windows, in torch, with derivatives of any order by both images.
 
     Args:
-        image: (H, W, C) values.
+        image: (H, W, C) values, on any device, of any float type.
         target: (H, W, C) values to compare with.
+        counted: (H - 10, W - 10) bool, the windows that count; all if None.
+        of_means: whether the first factor of S, which compares means, counts: `ssim`; else `structure`.
     """
-    return _similarities(image, target)[1].mean()
+    by_means, by_variances = _similarities(image, target)
+    similar = by_means * by_variances if of_means else by_variances
+    return (similar if counted is None else similar[counted]).mean()
 
 
 def _similarities(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
@@ -171,8 +198,8 @@ def _blurred(values: Tensor) -> Tensor:
 
 
 PHOTOMETRIC = Operation("photometric", photometric_reference)
-STRUCTURE = Operation("structure", structure_reference)
-_photometric = native.Function("photometric", "ppqqqffpi", "d")
+SIMILARITY = Operation("similarity", similarity_reference)
+_photometric = native.Function("photometric", "ppqqqffppi", "d")
 
 
 class _Photometric(torch.autograd.Function):
@@ -183,7 +210,8 @@ class _Photometric(torch.autograd.Function):
         derivative = torch.empty_like(image) if learned else None
         value = _photometric(
             native.pointer(image, "the image", image.shape), native.pointer(target, "the target", image.shape),
-            *image.shape, ssim_weight, C1, None if derivative is None else derivative.data_ptr(), native.threads(),
+            *image.shape, ssim_weight, C1, None,
+            None if derivative is None else derivative.data_ptr(), native.threads(),
         )  # fmt: skip
         if derivative is not None:
             ctx.save_for_backward(derivative)
@@ -204,12 +232,16 @@ def _compiled(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
     return out
 
 
-@STRUCTURE.implementation(CPP, order=0)
-def _compiled_structure(image: Tensor, target: Tensor) -> Tensor:
+@SIMILARITY.implementation(CPP, order=0)
+def _compiled_similarity(image: Tensor, target: Tensor, counted: Tensor | None, of_means: bool) -> Tensor:
     image, target = image.contiguous(), target.contiguous()
+    counted = None if counted is None else counted.contiguous()
+    windows = image.shape[0] - WINDOW + 1, image.shape[1] - WINDOW + 1
     value = _photometric(
         native.pointer(image, "the image", image.shape), native.pointer(target, "the target", image.shape),
-        *image.shape, 1.0, math.inf, None, native.threads(),
+        *image.shape, 1.0, C1 if of_means else math.inf,
+        None if counted is None else native.pointer(counted, "the windows that count", windows, torch.bool),
+        None, native.threads(),
     )  # fmt: skip
     return image.new_tensor(1 - value)
 

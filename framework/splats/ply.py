@@ -67,7 +67,9 @@ def ply_size(count: int, terms: int, look: Look = OURS) -> int:
         look: how they are drawn.
     """
     names = property_names(terms)
-    return len(header_text(count, [(name, "float") for name in names], comments=comments(look))) + 4 * len(names) * count
+    return (
+        len(header_text(count, [(name, "float") for name in names], comments=comments(look))) + 4 * len(names) * count
+    )
 
 
 def write_ply(file: Path, gaussians: Gaussians, look: Look = OURS) -> None:

@@ -43,6 +43,7 @@ def write_evaluation(path: Path, run: Run, checkpoint: Path, found: Evaluation, 
         "eval_appearance": found.eval_appearance,
         "results": finite_or_null(found.results),
         "lpips": found.lpips_note,
+        "masks": found.masks_note,
         "per_image": finite_or_null(found.per_image),
     }
     try:

@@ -138,9 +138,9 @@ def create_folder(run: Run) -> None:
             f"{run.folder} already holds a run; continue it with 'ns-train --resume {run.folder}', "
             "or choose another --timestamp"
         )
-    config = run.config
-    if config.data is not None:
-        config = dataclasses.replace(config, data=config.data.resolve())
+    paths = {"data": run.config.data, "lpips_weights": run.config.lpips_weights}  # wherever the run is evaluated from
+    resolved: dict[str, Any] = {name: path.resolve() for name, path in paths.items() if path is not None}
+    config = dataclasses.replace(run.config, **resolved)
     document = {
         "method": run.method,
         "dataparser": {"name": run.dataparser, **to_plain(run.parser)},

@@ -8,10 +8,11 @@ from typing import Any, Literal
 
 import torch
 
-from framework.base.config import MachineConfig, RaysPerPixel, TrainConfig
+from framework.base.config import RaysPerPixel, TrainConfig
 from framework.base.console import say
 from framework.base.device import choose_device
 from framework.base.errors import ConfigError, DataError
+from framework.base.machine_config import MachineConfig
 from framework.base.registry import load_dataparser, load_method
 from framework.data.data_folder import find_data
 from framework.data.dataset import DataParser, ParsedScene, load_dataset

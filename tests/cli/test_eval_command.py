@@ -100,7 +100,8 @@ def test_lpips_that_is_absent_is_null_with_a_reason(finished: Path, monkeypatch:
     monkeypatch.setattr("framework.base.extras.find_spec", lambda name: None)
     found = evaluate(monkeypatch, finished, "--max-images", 1)
     assert (found["results"]["lpips"], found["results"]["lpips_std"]) == (None, None)
-    assert found["lpips"].startswith("absent: pip install lpips torchvision; then AlexNet's weights, ")
+    advice = "absent: give a file of weights by --lpips-weights (docs/commands.md), or pip install lpips torchvision, "
+    assert found["lpips"].startswith(advice)
 
 
 def test_rounded_numbers_are_those_of_the_written_pictures(

@@ -69,8 +69,12 @@ def test_without_a_kernel_quick_ssim_is_ssim(monkeypatch: pytest.MonkeyPatch) ->
 # -- SSIM at five scales ----------------------------------------------------------------------------------------------
 
 
-def five_scales(image: np.ndarray, target: np.ndarray) -> float:
-    """Wang, Simoncelli and Bovik 2003, in float64: scipy's filters on one channel after the other."""
+def five_scales(image: np.ndarray, target: np.ndarray, kept: np.ndarray | None = None) -> float:
+    """Wang, Simoncelli and Bovik 2003, in float64: scipy's filters on one channel after the other.
+
+    With masks, over the windows of each scale that lie on no pixel of the whole image that is ignored.
+    """
+    kept = np.ones(image.shape[:2], bool) if kept is None else kept
     taps = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
     taps /= taps.sum()
 
@@ -87,7 +91,15 @@ def five_scales(image: np.ndarray, target: np.ndarray) -> float:
             similar = (2 * covariance + 0.03**2) / (variances + 0.03**2)
             if scale == 4:
                 similar *= (2 * mean_x * mean_y + 0.01**2) / (mean_x**2 + mean_y**2 + 0.01**2)
-            product *= max(similar.mean(), 0.0) ** exponent
+            side = 2**scale
+            inside = np.array(
+                [
+                    [kept[side * row : side * (row + 11), side * column : side * (column + 11)].all()
+                     for column in range(similar.shape[1])]
+                    for row in range(similar.shape[0])
+                ]
+            )  # fmt: skip
+            product *= max(similar[inside].mean(), 0.0) ** exponent
             rows, columns = (side // 2 * 2 for side in x.shape)
             x, y = (
                 (each[:rows:2, :columns:2] + each[1:rows:2, :columns:2]
@@ -124,3 +136,31 @@ def test_blur_costs_less_at_five_scales_and_a_negative_is_nothing() -> None:
 def test_images_too_small_for_five_scales_are_refused() -> None:
     with pytest.raises(ValueError, match="at least 176x176 pixels, not 300x175"):
         ms_ssim(torch.rand(175, 300, 3), torch.rand(175, 300, 3))
+
+
+@pytest.mark.medium
+def test_at_five_scales_windows_with_ignored_pixels_do_not_count() -> None:
+    torch.manual_seed(0)
+    size = 203, 250
+    target = functional.interpolate(torch.rand(1, 3, 20, 20, dtype=torch.float64), size, mode="bicubic")
+    target = target[0].permute(1, 2, 0).clamp(0, 1)
+    image = (target + 0.2 * torch.randn_like(target)).clamp(0, 1)
+    kept = torch.ones(size, dtype=torch.bool)
+    kept[:, :45] = False
+    kept[2, 240] = kept[201, 60] = False
+    expected = five_scales(image.numpy(), target.numpy(), kept.numpy())
+    assert ms_ssim(image, target, kept) == pytest.approx(expected, abs=1e-12)
+    assert ms_ssim(image.float(), target.float(), kept) == pytest.approx(expected, abs=2e-6)
+    image[~kept] = target[~kept]
+    assert ms_ssim(image, target, kept) == pytest.approx(expected, abs=1e-12)
+    assert abs(five_scales(image.numpy(), target.numpy()) - expected) > 0.005  # what is ignored is no better
+
+
+def test_without_a_window_of_kept_pixels_there_is_no_similarity() -> None:
+    image = torch.rand(180, 190, 3)
+    kept = torch.zeros(180, 190, dtype=torch.bool)
+    kept[20:31, 30:41] = True
+    assert quick_ssim(image, image, kept) == pytest.approx(1)
+    assert ms_ssim(image, image, kept) is None
+    kept[25, 35] = False
+    assert quick_ssim(image, image, kept) is None

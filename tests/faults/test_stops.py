@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from framework.base.config import MachineConfig
+from framework.base.machine_config import MachineConfig
 from framework.cli.session import resume, start
 from framework.training.checkpoint import FOLDER
 from framework.training.lock import LOCK

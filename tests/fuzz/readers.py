@@ -33,6 +33,7 @@ from framework.data.depths import read_depth
 from framework.data.mapped_pixels import MappedPixels
 from framework.data.pixel_cache import PixelMemory, pack, unpack
 from framework.data.ply import read_points
+from framework.evaluation.lpips import SHAPES, read_weights
 from framework.splats.files import SUFFIXES, read_gaussians, write_gaussians
 from framework.splats.gaussians import Gaussians
 from framework.splats.look import LEAST_BLUR, MOST_BLUR, Look
@@ -366,6 +367,21 @@ def unpack_archive(folder: Path, scratch: Path) -> None:
         require(sum(path.stat().st_size for path in scratch.rglob("*") if path.is_file()) < 4e6, "too much")
 
 
+def write_weights(folder: Path) -> None:
+    """Compressed, as ten megabytes would be copied for each input."""
+    arrays = {}
+    for index, shape in enumerate(SHAPES):
+        arrays[f"AlexNet_0.Conv_{index}.kernel"] = np.full(shape, 0.01, np.float32)
+        arrays[f"AlexNet_0.Conv_{index}.bias"] = np.zeros(shape[-1], np.float32)
+        arrays[f"NetLinLayer_{index}.Conv_0.kernel"] = np.ones((1, 1, shape[-1], 1), np.float32)
+    np.savez_compressed(folder / "weights.npz", **arrays)
+
+
+def read_lpips(folder: Path, scratch: Path) -> None:
+    for layer in read_weights(folder / "weights.npz"):
+        require(all(bool(values.isfinite().all()) for values in vars(layer).values()), "weights that are not finite")
+
+
 READERS: dict[str, Reader] = {
     "blender": Reader(write_blender, partial(parse, Blender()), ("transforms_train.json",), ("camera_angle_x", "time")),
     "dnerf": Reader(write_dnerf, partial(parse, DNeRF()), ("transforms_train.json",), ("camera_angle_x", "time")),
@@ -396,5 +412,6 @@ READERS: dict[str, Reader] = {
     "run": Reader(write_run, restore, ("run/nerfstudio_models/*.ckpt",)),
     "archive": Reader(write_archive, unpack_archive, ("scenes.zip",)),
     "pixel-cache": Reader(write_pixel_cache, read_pixel_cache, ("pixels.bin",)),
+    "lpips-weights": Reader(write_weights, read_lpips, ("weights.npz",)),
 }
 """By name."""

@@ -50,7 +50,7 @@ from framework.kernels.splat_project import (
     project_gaussians,
 )
 from framework.kernels.splat_tiles import TILES, tile_lists
-from framework.kernels.ssim import PHOTOMETRIC, STRUCTURE
+from framework.kernels.ssim import PHOTOMETRIC, SIMILARITY
 from framework.kernels.step_functions import BLURRED_EXCESS
 from framework.kernels.trace import TRACE, GridDensity
 from framework.kernels.traced_colors import TRACED_COLORS, GridColor
@@ -192,7 +192,7 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     TILES: lambda: (everywhere(1, 9), 32, 32, True),
     BLEND: lambda: (records := projected(), tile_lists(records, 37, 30), 37, 30, rand(3), 7, True),
     PHOTOMETRIC: lambda: (rand(13, 15, 3), rand(13, 15, 3), 0.2),
-    STRUCTURE: lambda: (rand(13, 15, 3), rand(13, 15, 3)),
+    SIMILARITY: lambda: (rand(13, 15, 3), rand(13, 15, 3), rand(3, 5) < 0.5, True),
     GATHER_COLORS: lambda: (torch.randint(256, (60, 4), dtype=torch.uint8), torch.randint(60, (9,)), rand(9, 3)),
     RIGID_MOTIONS: lambda: (torch.randn(9, 6), True),
     CAMERA_RAYS: lambda: (cameras(), torch.arange(0, 72, 5), 0.0, 1.0, None, subpixels(4)),
@@ -312,7 +312,7 @@ def test_what_is_taken() -> None:
         (PROJECT, 6, "c++"),
         (PHOTOMETRIC, 0, "c++"),
         (PHOTOMETRIC, 1, "reference"),
-        (STRUCTURE, 0, "reference"),
+        (SIMILARITY, 0, "reference"),
         (COMPOSITE, 1, "c++"),
         (COMPOSITE, 2, "reference"),
         (COMPOSITE, 6, "reference"),

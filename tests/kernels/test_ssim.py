@@ -14,10 +14,11 @@ from framework.kernels.ssim import (
     WINDOW,
     photometric_loss,
     photometric_reference,
+    similarity_reference,
     ssim,
     ssim_reference,
     structure,
-    structure_reference,
+    windows_inside,
 )
 from tests.kernels.compiled import needs_kernels, relative_error
 
@@ -286,9 +287,9 @@ def test_the_loss_as_a_part_of_another() -> None:
 @needs_kernels
 @pytest.mark.parametrize("size", [(10, 11, 3), (11, 10, 3), (11, 11, 0)])
 def test_the_kernel_refuses_too_small_images_itself(size: tuple[int, int, int]) -> None:
-    kernel = native.Function("photometric", "ppqqqffpi", "d")
+    kernel = native.Function("photometric", "ppqqqffppi", "d")
     with pytest.raises(ValueError, match="SSIM needs 11x11 pixels"):
-        kernel(None, None, *size, 1, 1e-4, None, 1)
+        kernel(None, None, *size, 1, 1e-4, None, None, 1)
 
 
 @pytest.mark.parametrize("size", SIZES, ids=str)
@@ -302,7 +303,9 @@ def test_structure_is_similarity_without_the_means(size: tuple[int, int, int], a
         target.double().numpy(), image.double().numpy(), channel_axis=-1, data_range=1.0,
         gaussian_weights=True, sigma=1.5, use_sample_covariance=False, K1=1e6,
     )  # fmt: skip
-    assert structure_reference(image.double(), target.double()).item() == pytest.approx(expected, abs=1e-9)
+    assert similarity_reference(image.double(), target.double(), None, False).item() == pytest.approx(
+        expected, abs=1e-9
+    )
     assert structure(image, target).item() == pytest.approx(expected, abs=1e-6)
 
 
@@ -312,3 +315,68 @@ def test_structure_does_not_see_another_brightness_and_sees_nan() -> None:
     assert ssim(0.5 * target + 0.4, 0.5 * target).item() < 0.9
     target[3, 4, 1] = torch.nan
     assert structure(torch.rand(40, 50, 3), target.float()).isnan()
+
+
+# -- Over some of the windows -----------------------------------------------------------------------------------------
+
+
+def window_by_window(image: Tensor, target: Tensor, kept: Tensor, of_means: bool) -> float:
+    """Wang et al. 2004 of one window after the other in float64, each of them of kept pixels alone."""
+    taps = torch.exp(-((torch.arange(11.0, dtype=torch.float64) - 5) ** 2) / (2 * 1.5**2))
+    weights = (taps[:, None] * taps / taps.sum() ** 2)[..., None]
+    found = []
+    for row in range(image.shape[0] - 10):
+        for column in range(image.shape[1] - 10):
+            window = slice(row, row + 11), slice(column, column + 11)
+            if not kept[window].all():
+                continue
+            x, y = image[window].double(), target[window].double()
+            mean_x, mean_y = ((weights * each).sum((0, 1)) for each in (x, y))
+            variances = (weights * ((x - mean_x) ** 2 + (y - mean_y) ** 2)).sum((0, 1))
+            covariance = (weights * (x - mean_x) * (y - mean_y)).sum((0, 1))
+            similar = (2 * covariance + 9e-4) / (variances + 9e-4)
+            found.append(
+                similar * (2 * mean_x * mean_y + 1e-4) / (mean_x**2 + mean_y**2 + 1e-4) if of_means else similar
+            )
+    return torch.stack(found).mean().item()
+
+
+@pytest.mark.parametrize("size", [(11, 30, 3), (37, 26, 1), (45, 29, 4)], ids=str)
+@pytest.mark.parametrize("of_means", [True, False])
+def test_windows_with_ignored_pixels_do_not_count(size: tuple[int, int, int], of_means: bool) -> None:
+    """Nor does what stands in such pixels."""
+    torch.manual_seed(0)
+    target = smooth(*size)
+    image = noisy(target, 0.2)
+    kept = torch.ones(size[:2], dtype=torch.bool)
+    kept[:, size[1] // 2 + 8 :] = False
+    kept[size[0] - 1, 3] = kept[0, 9] = False
+    expected = window_by_window(image, target, kept, of_means)
+    image[~kept] = 7
+    counted = windows_inside(kept)
+    form = ssim if of_means else structure
+    print(f"{int(counted.sum())} windows: off by {abs(form(image, target, counted).item() - expected):.1e}")
+    assert form(image, target, counted).item() == pytest.approx(expected, abs=1e-6)
+    exact = similarity_reference(image.double(), target.double(), counted, of_means)
+    assert exact.item() == pytest.approx(expected, abs=1e-12)
+    every = torch.ones_like(counted)
+    assert form(target, target.flip(0), every).item() == pytest.approx(form(target, target.flip(0)).item(), abs=1e-7)
+
+
+@needs_kernels
+def test_some_windows_have_the_same_bits_on_any_number_of_threads(threads: Callable[[int], None]) -> None:
+    torch.manual_seed(0)
+    image, target, counted = torch.rand(TALL), torch.rand(TALL), torch.rand(TALL[0] - 10, TALL[1] - 10) < 0.3
+    threads(1)
+    value = ssim(image, target, counted)
+    for count in (2, 5):
+        threads(count)
+        assert torch.equal(ssim(image, target, counted), value)
+
+
+def test_windows_that_do_not_fit_are_refused() -> None:
+    image = torch.rand(20, 30, 3)
+    with pytest.raises(ValueError, match="an image of 30x20 pixels has no windows of shape"):
+        ssim(image, image, torch.ones(20, 30, dtype=torch.bool))
+    with pytest.raises(ValueError, match="at least one window that counts"):
+        structure(image, image, torch.zeros(10, 20, dtype=torch.bool))

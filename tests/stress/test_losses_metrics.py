@@ -16,7 +16,8 @@ from torch import Tensor
 from framework.data.depths import read_depths
 from framework.data.scene import Scene
 from framework.encodings.planes import FeaturePlanes
-from framework.evaluation.metrics import MAX_PSNR, load_lpips, psnr, ssim
+from framework.evaluation.lpips import load_lpips
+from framework.evaluation.metrics import MAX_PSNR, psnr, ssim
 from framework.geometry.rays import Histogram, Samples
 from framework.kernels.compositing import distortion, distortion_by_pairs
 from framework.kernels.plane_bands import squared_steps, variation
@@ -261,6 +262,9 @@ def test_lpips_is_shown_images_from_minus_one_to_one(
         def eval(self) -> "Network":
             return self
 
+        def to(self, device: torch.device) -> "Network":
+            return self
+
         def __call__(self, *pair: Tensor) -> Tensor:
             shown.extend(pair)
             return torch.tensor([[[[0.25]]]])
@@ -273,12 +277,12 @@ def test_lpips_is_shown_images_from_minus_one_to_one(
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / "alexnet-double.pth").touch()
-    measure, note = load_lpips()
-    assert note == "AlexNet"
+    measure, note = load_lpips(None, torch.device("cpu"))
+    assert note == "alex, version 0.1, of the lpips package"
     assert measure is not None
     prediction = torch.zeros(12, 16, 3, dtype=dtype)
     prediction[0] = 0.5
-    assert measure(prediction, torch.ones(12, 16, 3, dtype=dtype)) == 0.25
+    assert measure(prediction, torch.ones(12, 16, 3, dtype=dtype), None) == 0.25
     assert [image.dtype for image in shown] == [torch.float32] * 2
     assert [tuple(image.shape) for image in shown] == [(1, 3, 12, 16)] * 2
     assert shown[0][:, :, 0].unique().tolist() == [0]

@@ -15,8 +15,8 @@ import pytest
 import torch
 
 from framework.base import device, processes
-from framework.base.config import MachineConfig
 from framework.base.device import choose_device, seed_step, shared_stream, stream_seed
+from framework.base.machine_config import MachineConfig
 from framework.base.processes import Processes, gathered
 from framework.cli.session import resume
 from framework.data.dataset import Dataset, load_dataset

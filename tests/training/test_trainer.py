@@ -81,7 +81,7 @@ def test_resuming_continues_with_the_same_bits(kind: str, shared_tiny: Path, tmp
 
 
 def test_another_seed_gives_other_bits(shared_tiny: Path, tmp_path: Path) -> None:
-    from framework.base.config import MachineConfig
+    from framework.base.machine_config import MachineConfig
 
     runs = [
         tiny_trainer("instant-ngp", shared_tiny, tmp_path / str(seed), machine=MachineConfig(seed=seed))

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.base.config import MachineConfig
+from framework.base.machine_config import MachineConfig
 from framework.base.registry import load_method
 from framework.data.dataset import Dataset
 from framework.data.pixel_set import PixelSet

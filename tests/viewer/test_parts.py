@@ -14,8 +14,9 @@ import torch
 from torch import nn
 
 from framework.base import extras
-from framework.base.config import TrainConfig, ViewerConfig
+from framework.base.config import TrainConfig
 from framework.base.errors import ConfigError
+from framework.base.machine_config import ViewerConfig
 from framework.cameras.poses import Placement
 from framework.cameras.view import View
 from framework.cli import train as train_command

@@ -7,6 +7,7 @@
 // gives the gradient.
 #include "common.h"
 
+#include <algorithm>
 #include <cmath>
 #include <stdexcept>
 #include <vector>
@@ -71,6 +72,7 @@ struct Images {
     const float *image, *target;
     int64_t height, width, channels;
     float c1;  // of the means; where it is infinite, variances alone are compared
+    const bool* counted;  // (height - REACH, width - REACH): the windows that count; all if null
 };
 
 inline int64_t whole_vectors(int64_t floats) { return (floats + LANES - 1) / LANES * LANES; }
@@ -95,14 +97,17 @@ class Band {
           margin(whole_vectors(reach)) {
         // Rows have room for a window's reach on both sides, and for whole vectors.
         const int64_t stride = margin + whole_vectors(row_floats + reach) + LANES;
-        scratch.assign(size_t((7 * KEPT + 3 * ROWS + 3) * stride + LANES), 0.0f);
+        scratch.assign(size_t((7 * KEPT + 4 * ROWS + 2) * stride + LANES), 0.0f);
         float* at = scratch.data();
         while (reinterpret_cast<uintptr_t>(at) % sizeof(Floats)) at++;
         for (Rows& map : moments) map = {at, stride}, at += KEPT * stride;
         for (Rows& map : slopes) map = {at, stride}, at += KEPT * stride;
         for (Rows& map : blurred) map = {at, stride}, at += ROWS * stride;
-        for (float** row : {&sums, &differences, &inside}) *row = at, at += stride;
-        for (int64_t i = 0; i < windows; i++) inside[i] = 1;
+        for (float** row : {&sums, &differences}) *row = at, at += stride;
+        for (float*& row : inside) {
+            row = at, at += stride;
+            for (int64_t i = 0; i < windows; i++) row[i] = 1;
+        }
     }
 
     // Writes what is measured of each row and, unless `gradient` is null, the derivative.
@@ -149,16 +154,28 @@ class Band {
         return total;
     }
 
+    // Which windows of ROWS rows count, for each channel.
+    void choose(int64_t row) {
+        for (int r = 0; r < ROWS; r++) {
+            const int64_t y = top + row + r;
+            if (y < 0 || y >= images.height - REACH) continue;  // it has no windows
+            const bool* counted = images.counted + y * (images.width - REACH);
+            for (int64_t i = 0; i < windows; i += step, counted++)
+                for (int64_t c = 0; c < step; c++) inside[r][i + c] = *counted ? 1.0f : 0.0f;
+        }
+    }
+
     // The slopes of ROWS rows of windows, and how dissimilar those are.
     void compare(int64_t row, double* dissimilarity) {
         const float* from[4][KEPT];
         for (int m = 0; m < 4; m++) moments[m].pointers(row, from[m]);
+        if (images.counted) choose(row);
         Floats total[ROWS] = {};
         for (int64_t i = 0; i < windows; i += LANES) {
             Floats moment[4][ROWS];
             for (int m = 0; m < 4; m++) blur_down(from[m], i, moment[m]);
-            const Floats counts = load(inside + i);
             for (int r = 0; r < ROWS; r++) {
+                const Floats counts = load(inside[r] + i);
                 // S = (1 - darker) (1 - flatter), by means and by variances. `full` is the sum without its offset.
                 const Floats sum = moment[0][r], full = sum + 1.0f, difference = moment[1][r];
                 const Floats square = difference * difference;
@@ -230,20 +247,22 @@ class Band {
     Rows slopes[3];             // by the mean, and twice those by the means of both squares, after `margin` zeros
     Rows blurred[3];            // the slopes, blurred down
     float *sums, *differences;  // of a row of both images
-    float* inside;              // 1 where a row has a window, 0 behind
+    float* inside[ROWS];        // 1 where a row has a window that counts, 0 elsewhere
 };
 
 }  // namespace
 
 // out: 1 - ssim_weight times the mean absolute error, and ssim_weight times 1 - the mean similarity, of image and target
-// (height, width, channels), of 11 pixels at least along each side; gradient (height, width, channels): its derivative by
-// the image, unless null.
+// (height, width, channels), of 11 pixels at least along each side; counted (height - 10, width - 10): the windows over
+// which the similarity is averaged, one at least, all if null; gradient (height, width, channels): its derivative by the
+// image, unless null.
 EXPORT int photometric(const float* image, const float* target, int64_t height, int64_t width, int64_t channels,
-                       float ssim_weight, float c1, float* gradient, int threads, double* out) {
+                       float ssim_weight, float c1, const bool* counted, float* gradient, int threads, double* out) {
     return guarded([&] {
         if (std::min(height, width) < TAPS || channels < 1) throw std::invalid_argument("SSIM needs 11x11 pixels");
-        const Images images{image, target, height, width, channels, c1};
-        const double count = double(height - REACH) * double(width - REACH) * double(channels);
+        const Images images{image, target, height, width, channels, c1, counted};
+        const int64_t windows = (height - REACH) * (width - REACH);
+        const double count = double(counted ? std::count(counted, counted + windows, true) : windows) * double(channels);
         const double values = double(height) * double(width) * double(channels);
         // Neighbours both read the rows between them, so there are no more bands than threads have use for. What a row
         // gets does not depend on them: each begins at a multiple of ROWS, and sums are of rows first, then of all.

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import fmean, stdev
 
+from framework.evaluation.lpips import NETWORK
 from framework.tools.benchmarks.tables import Result, Row, Table, kept
 
 LOADING, EVALUATION = 20.0, 60.0
@@ -40,7 +41,7 @@ def columns(table: Table, found: Sequence[Result]) -> list[Column]:
         ("test PSNR", lambda result: result["results"]["psnr"], "{:.2f} dB"),
         ("SSIM", lambda result: result["results"]["ssim"], "{:.3f}"),
         ("MS-SSIM", lambda result: result["results"].get("ms_ssim"), "{:.3f}"),
-        ("LPIPS", lambda result: result["results"]["lpips"], "{:.3f}"),
+        (f"LPIPS ({NETWORK})", lambda result: result["results"]["lpips"], "{:.3f}"),
         *((f"size {size}", of_size(size), "{:.2f} dB") for size in sizes),
         *((heading, of_image(name), "{:.2f} dB") for heading, name in table.images.items()),
         ("floaters", lambda result: result["results"].get("floaters"), "{:.1f} %"),

@@ -82,7 +82,7 @@ class Table:
     images: Mapping[str, str]
 
 
-def read_table(path: Path, root: Path, runs: Path, scale: float = 1.0) -> Table:
+def read_table(path: Path, root: Path, runs: Path, scale: float = 1.0, lpips_weights: Path | None = None) -> Table:
     """Read a table.
 
     Args:
@@ -90,6 +90,7 @@ def read_table(path: Path, root: Path, runs: Path, scale: float = 1.0) -> Table:
         root: folder of the folders of all data.
         runs: folder in which runs are kept.
         scale: factor of all budgets; if not 1, the rows are trials.
+        lpips_weights: file of LPIPS's weights, for the rows that are run; None to look for the lpips package.
 
     Raises:
         ConfigError: if the file is not a table, or names an unknown method.
@@ -99,8 +100,10 @@ def read_table(path: Path, root: Path, runs: Path, scale: float = 1.0) -> Table:
     if not isinstance(blocks, list) or content.keys() - {"images", "rows"}:
         raise ConfigError(f"{path}: a table has a list of 'rows', and perhaps 'images', and nothing else")
     rows: dict[str, Row] = {}
+    weights = None if lpips_weights is None else str(lpips_weights.resolve())
     for number, block in enumerate(blocks):
         for row in _rows(block, f"{path}: rows {number + 1}", root.resolve(), runs.resolve(), scale):
+            row = replace(row, conditions=replace(row.conditions, lpips_weights=weights))
             if not re.fullmatch(r"[\w.-]+", row.name):
                 raise ConfigError(
                     f"{path}: {shown(row.name)} names no file; take letters, digits and hyphens for names"

@@ -38,6 +38,7 @@ class Measured:
         machine: description of the machine.
         folder: folder of the run.
         lpips_note: how LPIPS was computed, or why not.
+        masks_note: what was measured of masked images; None if all pixels count.
     """
 
     label: str
@@ -75,6 +76,7 @@ class Measured:
     """The training command."""
     folder: str
     lpips_note: str
+    masks_note: str | None
 
     def as_plain(self) -> dict[str, Any]:
         """Return the measurements as a dictionary for JSON."""
@@ -128,6 +130,7 @@ def measure(job: Job, conditions: Conditions) -> Measured | None:
         command=shlex.join(["ns-train", job.contender.method, *_user_flags(job, conditions)]),
         folder=str(job.folder),
         lpips_note=evaluation["lpips"],
+        masks_note=evaluation.get("masks"),
     )
 
 

@@ -112,6 +112,8 @@ class Conditions:
     """Maximum number of views of the learning curve; 0 for no curve."""
     max_eval_images: int | None
     """Maximum number of views of the final evaluation; None for all."""
+    lpips_weights: str | None = None
+    """Absolute path of the file of LPIPS's weights; None to look for the lpips package."""
 
     def __post_init__(self) -> None:
         if self.max_seconds is None and self.max_num_iterations is None and self.target_psnr is None:
@@ -202,6 +204,8 @@ class Job:
         command += ["--max-pictures", str(PICTURES), "--device-type", conditions.device_type]
         if conditions.max_eval_images is not None:
             command += ["--max-images", str(conditions.max_eval_images)]
+        if conditions.lpips_weights is not None:
+            command += ["--lpips-weights", conditions.lpips_weights]
         return command
 
 

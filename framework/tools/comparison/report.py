@@ -16,6 +16,7 @@ from typing import Any
 from rich.table import Table
 
 from framework.evaluation.images import ERROR_AT_WHITE
+from framework.evaluation.lpips import NETWORK
 from framework.tools.comparison import plots
 from framework.tools.comparison.crops import views
 from framework.tools.comparison.measures import SAME_TIME, Measured, Row, pareto
@@ -46,7 +47,7 @@ COLUMNS = (
     Column("PSNR, dB", "psnr", "{:.2f}".format, max),
     Column("SSIM", "ssim", "{:.4f}".format, max),
     Column("MS-SSIM", "ms_ssim", "{:.4f}".format, max),
-    Column("LPIPS", "lpips", "{:.4f}".format, min),
+    Column(f"LPIPS ({NETWORK})", "lpips", "{:.4f}".format, min),
     Column("floaters, %", "floaters", "{:.1f}".format, min),
     Column("training, s", "seconds", "{:.1f}".format, min, SAME_TIME),
     Column("steps", "steps", "{:,.0f}".format, None),
@@ -158,8 +159,8 @@ def condition_lines(conditions: Conditions, repeats: int, runs: Sequence[Measure
     ]
     if used := sorted({str(run.machine.get("kernels")) for run in runs}):
         lines.append(f"Kernels: {' and '.join(used)}.")
-    notes = sorted({run.lpips_note for run in runs if run.lpips is None})
-    return lines + [f"LPIPS {note}" for note in notes]
+    lines += [f"LPIPS: {note}." for note in sorted({run.lpips_note for run in runs})]
+    return lines + [f"Masks: {note}." for note in sorted({run.masks_note for run in runs if run.masks_note})]
 
 
 def _of_all(conditions: Conditions) -> str:

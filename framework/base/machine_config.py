@@ -1,0 +1,47 @@
+"""Settings of the machine that a run is on, and of the viewer that it opens there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from framework.base.errors import ConfigError, shown
+
+MOST_THREADS = 1024
+"""Maximum number of CPU threads that a run may ask for."""
+
+
+@dataclass(frozen=True)
+class MachineConfig:
+    """The device of a run, its threads and its seed."""
+
+    seed: int = 42
+    """Random seed. The same seed, CPU and thread count give the same bits; on a GPU, sums differ in rounding."""
+    device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
+    """Device to train on; auto: CUDA if available, else the CPU."""
+    num_threads: int | None = None
+    """CPU threads; all cores if not given."""
+    cuda_graphs: Literal["auto", "on", "off"] = "auto"
+    """Record training steps on a GPU as CUDA graphs and repeat them, which saves the time to start each operation.
+    auto: where steps are alike, if a repeated step has the loss and the effect of one without; a line says why not."""
+
+    def __post_init__(self) -> None:
+        if not -(2**63) <= self.seed < 2**63:
+            raise ConfigError(f"--machine.seed is {shown(self.seed)}; it must be an integer of 64 bits")
+        if self.num_threads is not None and not 1 <= self.num_threads <= MOST_THREADS:
+            number = shown(self.num_threads)
+            raise ConfigError(f"--machine.num-threads is {number}; it must be from 1 to {MOST_THREADS}")
+
+
+@dataclass(frozen=True)
+class ViewerConfig:
+    """The address of the viewer."""
+
+    websocket_host: str = "127.0.0.1"
+    """Interface to listen on; 0.0.0.0 for all, from which other machines can connect. There is no password."""
+    websocket_port: int = 7007
+    """Port to listen on; the next free one if it is taken."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.websocket_port <= 65535:
+            raise ConfigError(f"--viewer.websocket-port is {shown(self.websocket_port)}; it must be from 1 to 65535")

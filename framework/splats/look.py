@@ -1,4 +1,4 @@
-"""How Gaussians are drawn, which belongs to them: what was trained to be drawn one way looks different another way.
+"""A way of drawing belongs to Gaussians: drawn otherwise than in training, they look different.
 
 A PLY file says it in comments of its header. `SplatRenderMode: default` or `mip` (with opacity that makes up for the
 blur of small Gaussians) is what Brush and PlayCanvas's splat-transform write and read; `mip-0.1` of NeRFICG names the
@@ -27,7 +27,7 @@ LEAST_BLUR, MOST_BLUR = 1e-3, 10.0
 
 @dataclass(frozen=True)
 class Look:
-    """How Gaussians are drawn."""
+    """A way of drawing Gaussians."""
 
     antialiased: bool = False
     """Whether opacity makes up for the blur of small Gaussians."""

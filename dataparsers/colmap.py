@@ -39,7 +39,7 @@ class Colmap(Captured):
     def parse(self, path: Path | None, split: Split) -> ParsedScene:
         if path is None:
             raise DataError("the colmap format needs a folder: --data DIR")
-        model = choose_model(path, self.colmap_path, self.images_path)
+        model = choose_model(path, self.colmap_path, self.images_path, quiet=split != "train")
         return captured_scene(self, read_images(path, model, self.images_path, self.masks_path, split), split)
 
 

@@ -97,14 +97,14 @@ def _is_model(folder: Path) -> bool:
         return False
 
 
-def choose_model(path: Path, location: str | None, images: str = "images", flag: str = "--colmap-path") -> Path:
+def choose_model(path: Path, location: str | None, images: str = "images", quiet: bool = False) -> Path:
     """Return the reconstruction of most of the images that are there; of several, say which others there are.
 
     Args:
         path: the data folder.
         location: subfolder to search; None for the default ones.
         images: folder of the images in `path`.
-        flag: the flag that sets `location`, for messages.
+        quiet: whether nothing is said.
 
     Raises:
         DataError: if there is none.
@@ -114,19 +114,20 @@ def choose_model(path: Path, location: str | None, images: str = "images", flag:
     if not models:
         raise DataError(
             f"{path} has no COLMAP reconstruction: no images.bin or images.txt in {', '.join(locations)} or a folder "
-            f"below; run COLMAP, or set its folder with {flag}"
+            f"below; run COLMAP, or set its folder with --colmap-path"
         )
     if len(models) == 1:
         return models[0]
     names = [image_names(model) for model in models]
     there = [len(match_names(path, [f"{images}/{name}" for name in some]).files) for some in names]
     best = max(range(len(models)), key=lambda index: (there[index], len(names[index]), -index))
-    shown = [model.relative_to(path).as_posix() for model in models]
-    others = ", ".join(f"{shown[index]} has {there[index]}" for index in range(len(models)) if index != best)
-    say(
-        f"{len(models)} COLMAP reconstructions in {path}: {shown[best]} has {there[best]} of the images that are "
-        f"there, and is used; {others} ({flag} chooses another)"
-    )
+    if not quiet:
+        shown = [model.relative_to(path).as_posix() for model in models]
+        others = ", ".join(f"{shown[index]} has {there[index]}" for index in range(len(models)) if index != best)
+        say(
+            f"{len(models)} COLMAP reconstructions in {path}: {shown[best]} has {there[best]} of the images that are "
+            f"there, and is used; {others} (--colmap-path chooses another)"
+        )
     return models[best]
 
 

@@ -48,7 +48,7 @@ class Phototourism(Captured):
             problem = f"there are {', '.join(file.name for file in tables)}" if tables else "there is none"
             raise DataError(f"{path}: the splits must be listed in one .tsv, but {problem}")
         splits = {spelled(name): of for name, of in read_splits(tables[0]).items()}
-        model = choose_model(path, self.colmap_path, self.images_path)
+        model = choose_model(path, self.colmap_path, self.images_path, quiet=split != "train")
         images = read_images(path, model, self.images_path, self.masks_path, split)
         listed = [index for index, name in enumerate(images.names) if spelled(name) in splits]
         if not listed:

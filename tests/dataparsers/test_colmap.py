@@ -240,8 +240,9 @@ def test_the_largest_of_several_models_is_taken(
     write_colmap(folder / "sparse" / "0", few)
     as_binary(write_colmap(folder / "sparse" / "1", capture))
     assert len(Colmap(eval_interval=0).parse(folder, "train").image_paths) == 10
+    assert len(Colmap(eval_interval=0).parse(folder, "test").image_paths) == 10
     said = " ".join(capsys.readouterr().err.split())
-    assert "2 COLMAP reconstructions" in said
+    assert said.count("2 COLMAP reconstructions") == 1
     assert "sparse/1 has 10 of the images that are there, and is used; sparse/0 has 4" in said
     assert len(Colmap(eval_interval=0, colmap_path="sparse/0").parse(folder, "train").image_paths) == 4
 

@@ -111,9 +111,7 @@ def read_ply(file: Path) -> Gaussians:
     named = ["x", "y", "z", *_DC, *kept, "opacity", *_SCALES, *_ROTATIONS]
     columns = dict(zip(named, read_columns(file, header, named), strict=True))
 
-    precise = dict(header.columns)["x"] == "f8"
-
-    def together(names: Sequence[str], kind: type = np.float32) -> Tensor:
+    def together(names: Sequence[str], kind: str = "f4") -> Tensor:
         values = np.empty((header.count, len(names)), kind)
         with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold is left out below
             for index, name in enumerate(names):
@@ -121,7 +119,7 @@ def read_ply(file: Path) -> Gaussians:
         return torch.from_numpy(values)
 
     gaussians = Gaussians(
-        means=together("xyz", np.float64 if precise else np.float32),
+        means=together("xyz", "f8" if dict(header.columns)["x"] == "f8" else "f4"),
         log_scales=together(_SCALES),
         rotations=together(_ROTATIONS),
         logits=_finite_logits(together(["opacity"])[:, 0]),

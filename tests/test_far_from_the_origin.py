@@ -113,7 +113,7 @@ def test_placements_that_were_rounded_to_float32_are_still_read(tmp_path: Path) 
 
 
 def test_a_placement_is_what_a_checkpoint_holds() -> None:
-    rows = [[1.0, 0.0, 0.0, -UTM[0]], [0.0, 1.0, 0.0, -UTM[1]], [0.0, 0.0, 1.0, -UTM[2]]]
+    rows = np.concatenate([np.eye(3), -UTM[:, None]], axis=1).tolist()
     for held in (rows, torch.tensor(rows, dtype=torch.float64)):
         assert Placement.of(held, 2.0).transform.tolist() == rows
     assert torch.equal(Placement.of(torch.tensor(rows), 2.0).transform, torch.tensor(rows).double())

@@ -257,7 +257,7 @@ def coordinate_columns(file: Path, positions: Tensor) -> list[tuple[str, np.ndar
 
 
 def in_full(positions: Tensor) -> str:
-    """Return a sentence on positions (K, 3) that are written in float64, since float32 is too coarse for them."""
+    """Return a sentence on `positions` (K, 3) that are written in float64, since float32 is too coarse for them."""
     return (
         f"so far from the origin, float32 would round coordinates by up to {rounding(positions):.2g}; they are "
         "written in double precision, for programs that read it"

@@ -1,4 +1,4 @@
-"""Whether float32 holds coordinates far from the origin, and an origin among them about which it does."""
+"""Coordinates far from the origin: whether float32 is too coarse for them, and a local origin near them."""
 
 from __future__ import annotations
 

@@ -80,3 +80,31 @@ def test_poses_of_photographs_are_found(tmp_path: Path, monkeypatch: pytest.Monk
     for folder in ("images", "images_2", "images_4", "images_8", "colmap/sparse/0"):
         assert any((output / folder).iterdir())
     assert not (output / "colmap" / "unfinished").exists()
+
+
+@pytest.mark.slow
+def test_a_stopped_run_keeps_features_and_matches(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("pycolmap")
+    write_corner(tmp_path / "photographs", 8)
+    output = tmp_path / "out"
+    words = ["images", "--data", tmp_path / "photographs", "--output-dir", output, "--num-downscales", 0]
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as stopped:
+        stopped.setattr("sys.argv", ["ns-process-data", *map(str, words)])
+        stopped.setattr("framework.tools.processing.mapping.reconstruct", stop)
+        with pytest.raises(SystemExit):
+            main()
+    assert "features and matches are kept: --resume goes on" in " ".join(capsys.readouterr().err.split())
+    monkeypatch.setattr("sys.argv", ["ns-process-data", *map(str, words), "--resume"])
+    main()
+    said = " ".join(capsys.readouterr().err.split())
+    assert "8 images by 1 camera, 8 kept from before" in said
+    assert "28 of 28 pairs, 28 of them kept from before" in said
+    assert len(json.loads((output / "transforms.json").read_text())["frames"]) >= 6
+    main()
+    assert "nothing to resume: it is finished" in " ".join(capsys.readouterr().err.split())

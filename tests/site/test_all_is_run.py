@@ -26,6 +26,7 @@ ELSEWHERE = {
     r"ns-render (camera-path|time) ": "tests/cli/test_render_command.py",
     r"ns-process-data (polycam|record3d) ": "tests/truth/test_processing.py",
     r"ns-process-data images .*(FISHEYE|scan/images)": "tests/truth/test_processing.py",
+    r"ns-process-data images .*--resume": "tests/processing/test_process_command.py",
     r"ns-compare --load-config": "tests/cli/test_compare_command.py",
     r"ns-bench (gpu|quadrature|processes|contention|cache|poses|tables) ?": "tests/benchmarks/test_bench_command.py",
     r"python -m framework.cli.bench gpu": "tests/benchmarks/test_gpu.py",

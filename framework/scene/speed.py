@@ -2,8 +2,8 @@
 
 An opaque pixel needs matter on its ray at the time of its image. If matter is assumed to be slower than it is, other
 images seem to show its place to be empty, and nothing is left on the ray to be seen. So speeds are raised, about the
-times of images with such a ray, until there is none. What never moves is left out: behind what moves, it would explain
-the same pixel.
+times of images with such a ray, until there is none. A pixel before something that stays says nothing, for that is left
+on its ray at any speed: what moves must be seen beside it, in some images.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from framework.cameras.cameras import Cameras
 from framework.data.travel import Travel
 from framework.geometry.bounds import intersect_box
 from framework.scene.moving_hulls import nearest
-from framework.scene.silhouettes import Silhouettes, held_balls, held_cells
+from framework.scene.silhouettes import Silhouettes, held_balls
 
 LEAST_IMAGES, LEAST_TIMES = 24, 8
 """Minimum number of images, and of their different times; from fewer, no speed is found."""
@@ -34,13 +34,11 @@ MOST_RAYS = 2**15
 """Number of rays that are tried, evenly over all images."""
 BALLS = 128
 """Number of balls in a row that are as long as the box's diagonal."""
-STILL_CELLS = 64
-"""Cells along each axis by which what never moves is found."""
 
 
 @dataclass(frozen=True)
 class _Rays:
-    """Rays through opaque pixels of an image, next to transparent ones, that must meet what moves."""
+    """Rays through opaque pixels of an image, next to transparent ones, that must meet something."""
 
     origins: Tensor
     """(R, 3)."""
@@ -102,19 +100,15 @@ def travel_of(silhouettes: Silhouettes, box: Tensor, times: Tensor) -> Travel | 
 
 
 def _rays_to_explain(silhouettes: Silhouettes, images: Sequence[int], box: Tensor) -> list[_Rays]:
-    """Return, of each image, rays on which there must be something that moves."""
-    still = held_cells(silhouettes, images, box, STILL_CELLS, [0.0] * len(images))
+    """Return, of each image, rays on which there must be something."""
     most, found = max(MOST_RAYS // len(images), 1), []
     cameras: Cameras = silhouettes.dataset.cameras
     for image in images:
         pixels = _edges(silhouettes, image).view(-1).nonzero().squeeze(-1)
         pixels = pixels[:: -(-len(pixels) // most) or 1]
         rays = cameras.pixel_rays(pixels + int(cameras.offsets[image]), 0.0, 1.0)
-        ahead = _Rays(rays.origins, rays.directions, *intersect_box(rays.origins, rays.directions, box))
-        ahead = ahead[ahead.leave > ahead.enter]
-        if len(ahead):
-            ahead = ahead[~_meet(still, ahead, box)]
-        found.append(ahead)
+        meeting = _Rays(rays.origins, rays.directions, *intersect_box(rays.origins, rays.directions, box))
+        found.append(meeting[meeting.leave > meeting.enter])
     return found
 
 
@@ -130,14 +124,6 @@ def _edges(silhouettes: Silhouettes, image: int) -> Tensor:
     return edges if kept is None else edges & kept.to(edges.device)
 
 
-def _meet(cells: Tensor, rays: _Rays, box: Tensor) -> Tensor:
-    """Return which rays (R,) pass through one of `cells` (n^3,) bool of a box."""
-    centers, owners = rays.balls(float((box[1] - box[0]).min()) / STILL_CELLS / 2)
-    place = ((centers - box[0]) / (box[1] - box[0]) * STILL_CELLS).long().clamp(0, STILL_CELLS - 1)
-    inside = cells[(place[:, 0] * STILL_CELLS + place[:, 1]) * STILL_CELLS + place[:, 2]]
-    return _any_of(owners[inside], len(rays))
-
-
 def _explained(
     silhouettes: Silhouettes, images: Sequence[int], number: int, rays: _Rays, travelled: Tensor, spacing: float
 ) -> Tensor:
@@ -149,11 +135,6 @@ def _explained(
     near = [other for other in nearest(margins) if other != number]
     centers, owners = rays.balls(spacing)
     held = held_balls(silhouettes, [images[i] for i in near], centers, spacing / 2, margins[near].tolist())
-    return _any_of(owners[held], len(rays))
-
-
-def _any_of(owners: Tensor, count: int) -> Tensor:
-    """Return which of `count` numbers are among `owners`, (count,) bool."""
-    found = torch.zeros(count, dtype=torch.bool, device=owners.device)
-    found[owners] = True
-    return found
+    explained = torch.zeros(len(rays), dtype=torch.bool)
+    explained[owners[held]] = True
+    return explained

@@ -72,14 +72,15 @@ def for_features(folder: Path, prepared: list[PreparedImage], images: Path, targ
 def _report_blank(blank: list[PreparedImage], count: int) -> None:
     if not blank:
         return
+    first = blank[0].source
     dark = all(image.tones[1] < DARK for image in blank)
     what = "black" if dark else "of one colour"
     if len(blank) > count - 2:
         why = " Was the lens covered, or the exposure far too short?" if dark else ""
         raise DataError(
-            f"{len(blank)} of {count} images are {what}, as {blank[0].source}: there is nothing to find in them.{why}"
+            f"{len(blank)} of {count} images are {what}, as {first}: there is nothing to find in them.{why}"
         )
-    say(f"{len(blank)} of {count} images are {what} and cannot be placed, the first: {blank[0].source}")
+    say(f"{len(blank)} of {count} images are {what} and cannot be placed, the first: {first}")
 
 
 def _link(source: Path, target: Path) -> None:

@@ -33,7 +33,8 @@ def find_images(folder: Path, leave_out: Iterable[Path] = ()) -> list[Path]:
     if not images:
         raise DataError(f"--data {folder} has no image (looked for {', '.join(READABLE)}){_listed(others)}")
     if others:
-        say(f"left out: {len(others)} files that are no images{_listed(others)}")
+        files = "1 file that is no image" if len(others) == 1 else f"{len(others)} files that are no images"
+        say(f"left out: {files}{_listed(others)}")
     return images
 
 

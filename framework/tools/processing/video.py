@@ -55,5 +55,6 @@ def line(times: np.ndarray, fresh: int, target: int, written: int) -> str:
     if fresh < count:
         text += f", of which {count - fresh} repeat the one before and are dropped"
     if written < target:
-        return f"{text}; all {written} are taken, as there are no more, though --num-frames-target is {target}"
+        taken = "the only one is" if written == 1 else f"all {written} are"
+        return f"{text}; {taken} taken, as there are no more, though --num-frames-target is {target}"
     return f"{text}; {written} are taken, the sharpest of each of {target} intervals"

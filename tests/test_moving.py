@@ -16,7 +16,6 @@ from framework.fields.nerf import NeRFField
 from framework.geometry.points import Points
 from framework.geometry.rays import Rays
 from framework.samplers.proposal import ProposalSampler
-from framework.scene.silhouettes import Silhouettes, moving_hulls, visual_hull
 from framework.training.trainer import Trainer
 from tests.training.helpers import tiny_run, tiny_trainer
 
@@ -176,16 +175,3 @@ def test_nothing_is_displaced_at_time_zero() -> None:
     torch.testing.assert_close(features, known)
     with pytest.raises(ValueError, match="needs the times"):
         field.density(Points(positions))
-
-
-def test_a_moving_scene_keeps_its_pixels_and_its_union_of_cells(shared_tiny: Path, tmp_path: Path) -> None:
-    trainer = moving_trainer("kplanes hybrid", shared_tiny, tmp_path, max_num_iterations=1)
-    trainer.train()
-    assert trainer.train_set.drawn is None
-    sampler = trainer.model.sampler
-    silhouettes, times = Silhouettes.of(trainer.train_set), trainer.train_set.times
-    assert times is not None
-    hull = moving_hulls(silhouettes, sampler.box, sampler.resolution, times, sampler.slices)
-    still = visual_hull(silhouettes, sampler.box, sampler.resolution)
-    assert torch.equal(sampler.carved, ~hull)
-    assert bool(hull[still].all())

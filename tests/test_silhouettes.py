@@ -10,9 +10,12 @@ import torch
 from dataparsers.blender import Blender
 from framework.cameras.cameras import Cameras
 from framework.data.dataset import Dataset, load_dataset
+from framework.data.travel import Travel
 from framework.kernels.march import Occupancy, candidates
 from framework.kernels.silhouettes import hold_balls
-from framework.scene.silhouettes import Silhouettes, moving_box, moving_hulls, pixels_near, visual_hull
+from framework.scene.moving_hulls import moving_box, moving_hulls
+from framework.scene.silhouettes import Silhouettes, pixels_near, visual_hull
+from framework.scene.speed import travel_of
 from tests.conftest import write_tiny
 
 BOX = torch.tensor([[-1.2, -1.2, -1.2], [1.2, 1.2, 1.2]])
@@ -97,9 +100,11 @@ def test_of_a_moving_scene_all_that_is_ever_seen_stays(ball: Dataset) -> None:
     silhouettes = Silhouettes.of(replace(ball, pixels=pixels))
     assert not bool(visual_hull(silhouettes, BOX / 2, 16).any())
     times = torch.linspace(0, 1, 24)
-    hull = moving_hulls(silhouettes, BOX, 16, times)
+    travel = travel_of(silhouettes, BOX, times)
+    assert travel is not None
+    hull = moving_hulls(silhouettes, BOX, 16, times, travel)
     assert bool(hull[centers(16).norm(dim=-1) < 1].all())
-    assert bool(moving_hulls(silhouettes, BOX / 4, 4, times).all())
+    assert bool(moving_hulls(silhouettes, BOX / 4, 4, times, travel).all())
 
 
 def test_of_a_moving_scene_what_all_photographs_show_empty_goes(ball: Dataset) -> None:
@@ -107,7 +112,8 @@ def test_of_a_moving_scene_what_all_photographs_show_empty_goes(ball: Dataset) -
     wide = replace(ball, cameras=replace(ball.cameras, fx=ball.cameras.fx / 3, fy=ball.cameras.fy / 3))
     pixels = torch.zeros_like(wide.pixels).view(24, 80, 80, 4)
     pixels[:, 38:42, 38:42, 3] = 255  # all that any of them shows is in the middle
-    hull = moving_hulls(Silhouettes.of(replace(wide, pixels=pixels.view(-1, 4))), BOX, 16, torch.linspace(0, 1, 24))
+    times, travel = torch.linspace(0, 1, 24), Travel.of(torch.tensor([0.0, 1.0]), torch.tensor([1.2, 1.2]))
+    hull = moving_hulls(Silhouettes.of(replace(wide, pixels=pixels.view(-1, 4))), BOX, 16, times, travel)
     assert bool(hull[centers(16).norm(dim=-1) < 0.2].all())
     assert not bool(hull.all())
     assert hull.float().mean() < 0.9
@@ -141,14 +147,16 @@ def test_a_flying_ball_is_never_outside_the_hull_of_its_time(ball: Dataset, slic
     radius = 0.25
     seen, times = flight(ball, place, radius)
     silhouettes = Silhouettes.of(seen)
-    hull = moving_hulls(silhouettes, BOX, 16, times, slices).view(slices, -1)
+    travel = travel_of(silhouettes, BOX, times)
+    assert travel is not None
+    hull = moving_hulls(silhouettes, BOX, 16, times, travel, slices).view(slices, -1)
     for time in torch.linspace(0, 1, 97).tolist():
         inside = (centers(16) - place(time)).norm(dim=-1) < radius
         assert bool(inside.any())
         assert bool(hull[min(int(time * slices), slices - 1)][inside].all())
     far = (centers(16) - place(0.0)).norm(dim=-1) > 0.8
     assert hull[0][far].float().mean() < {1: 0.15, 3: 0.05, 8: 0.02}[slices]
-    box = moving_box(silhouettes, BOX, times)
+    box = moving_box(silhouettes, BOX, times, travel)
     for time in torch.linspace(0, 1, 97).tolist():
         assert bool((box[0] < place(time) - radius).all())
         assert bool((box[1] > place(time) + radius).all())
@@ -159,12 +167,13 @@ def test_the_box_of_a_scene_that_frames_cut_is_larger(ball: Dataset) -> None:
     """The same ball in the same place: where an image shows matter at its border, there may be more outside."""
     seen, times = flight(ball, lambda time: torch.zeros(3), 0.25, zoom=1.2)
     whole = Silhouettes.of(seen)
-    assert not any(whole.touch_border(image) for image in range(24))
+    assert whole.closed_if_whole().closed
     pixels = seen.pixels.clone()
     pixels[79, 3] = 255  # a corner of the first image
     cut = Silhouettes.of(replace(seen, pixels=pixels))
-    assert cut.touch_border(0)
-    small, large = (moving_box(silhouettes, 1.5 * BOX, times) for silhouettes in (whole, cut))
+    assert not cut.closed_if_whole().closed
+    travel = Travel.of(torch.tensor([0.0, 1.0]), torch.tensor([1.2, 1.2]))
+    small, large = (moving_box(silhouettes, 1.5 * BOX, times, travel) for silhouettes in (whole, cut))
     assert bool((small[0] < -0.25).all())
     assert bool((small[1] > 0.25).all())
     assert bool((large[0] <= small[0]).all())
@@ -172,13 +181,12 @@ def test_the_box_of_a_scene_that_frames_cut_is_larger(ball: Dataset) -> None:
     assert float((small[1] - small[0]).prod()) < 0.95 * float((large[1] - large[0]).prod())
 
 
-def test_wider_frames_show_the_same_and_nothing_around(ball: Dataset) -> None:
+def test_closed_frames_show_the_same_and_nothing_around(ball: Dataset) -> None:
     silhouettes = Silhouettes.of(ball)
     points = torch.rand(500, 3) * 2.4 - 1.2
     for image in (0, 7):
         held = [torch.ones(500, dtype=torch.bool) for _ in range(2)]
-        for wider, found in zip((False, True), held, strict=True):
-            chosen = silhouettes.widened() if wider else silhouettes
-            hold_balls(chosen.photograph(image), points, 0.05, found, every=True)
+        for closed, found in zip((False, True), held, strict=True):
+            hold_balls(replace(silhouettes, closed=closed).photograph(image), points, 0.05, found, every=True)
         assert bool((held[0] | ~held[1]).all())  # what was empty stays so
         assert held[1].float().mean() < held[0].float().mean()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -38,14 +40,15 @@ def test_sums_are_those_of_every_rectangle(seed: int) -> None:
         assert int(counted) == int(opaque[y0:y1, x0:x1].sum())
 
 
+@pytest.mark.parametrize("closed", [False, True])
 @pytest.mark.parametrize("every", [True, False])
 @pytest.mark.parametrize("distance", [0.2, 2.0, 6.0])
-def test_balls_are_held_as_by_the_reference(distance: float, every: bool) -> None:
+def test_balls_are_held_as_by_the_reference(distance: float, every: bool, closed: bool) -> None:
     """Balls all around, some behind the camera, some around it, some cut off by the picture's edge."""
     generator = torch.Generator().manual_seed(0)
     centers, known = torch.rand(5000, 3, generator=generator) * 4 - 2, torch.rand(5000, generator=generator) > 0.3
     centers[0] = torch.nan
-    taken, _ = photograph(1, distance)
+    taken = replace(photograph(1, distance)[0], closed=closed)
     found, expected = known.clone(), known.clone()
     hold_balls(taken, centers, 0.05, found, every)
     hold_balls_reference(taken, centers, 0.05, expected, every)

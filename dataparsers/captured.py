@@ -191,19 +191,16 @@ def image_sizes(paths: Sequence[Path]) -> Tensor:
     return torch.tensor(sizes)
 
 
-def sizes_of(stated: Sequence[Sequence[int | None]], paths: Sequence[Path]) -> Tensor:
+def sizes_of(stated: Sequence[Sequence[int | None]], unstated: Callable[[], Tensor]) -> Tensor:
     """Return width and height (M, 2) int64 that intrinsics refer to: those stated, or the image's if one is missing.
 
     Args:
         stated: M widths and heights; None for what is missing.
-        paths: M image files.
-
-    Raises:
-        DataError: if sizes are missing and no image is readable.
+        unstated: returns width and height (M, 2) int64 of the images; called if one is missing.
     """
     if not any(None in size for size in stated):
         return torch.tensor(stated)
-    actual = image_sizes(paths).tolist()
+    actual = unstated().tolist()
     return torch.tensor([found if None in size else size for size, found in zip(stated, actual, strict=True)])
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,7 +55,7 @@ class Intrinsics:
 
 
 def read_intrinsics(
-    file: Path, content: dict[str, Any], frames: list[dict[str, Any]], labels: list[str], paths: Sequence[Path]
+    file: Path, content: dict[str, Any], frames: list[dict[str, Any]], labels: list[str], unstated: Callable[[], Tensor]
 ) -> Intrinsics:
     """Return the intrinsics that a transforms file states.
 
@@ -67,14 +67,14 @@ def read_intrinsics(
         content: the file's JSON object.
         frames: the JSON objects of M frames.
         labels: M names of the frames in messages.
-        paths: M image files, which are asked for sizes that the file does not state.
+        unstated: returns width and height (M, 2) int64 of the images; called if the file does not state them for all.
 
     Raises:
         DataError: if a value is invalid, or there is no focal length.
     """
     placed = list(zip(frames, labels, strict=True))
     sizes = sizes_of(
-        [[side_or_none(_value(frame, content, key), key, label) for key in "wh"] for frame, label in placed], paths
+        [[side_or_none(_value(frame, content, key), key, label) for key in "wh"] for frame, label in placed], unstated
     )
     model, keys = _camera_model(file, content, frames)
     values = [_values(*pair, content, size, model) for pair, size in zip(placed, sizes.tolist(), strict=True)]

@@ -17,6 +17,7 @@ from dataparsers.captured import (
     PosedImages,
     captured_scene,
     checked_box,
+    image_sizes,
 )
 from dataparsers.colmap_beside import names_in_model, tracks_beside
 from dataparsers.intrinsics import ngp_cube, read_intrinsics
@@ -97,7 +98,7 @@ def _posed_images(file: Path, content: dict[str, Any], split: Split) -> PosedIma
     placed = list(zip(frames, labels, strict=True))
     written = [file_name(frame.get("file_path"), "file_path", label) for frame, label in placed]
     paths = on_disk(file.parent, written, quiet=split != "train")
-    intrinsics = read_intrinsics(file, content, frames, labels, paths)
+    intrinsics = read_intrinsics(file, content, frames, labels, lambda: image_sizes(paths))
     if intrinsics.warning and split == "train":  # once is enough
         say(intrinsics.warning)
     poses = torch.stack([read_pose(frame, label, torch.float64) for frame, label in placed])

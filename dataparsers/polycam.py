@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from dataparsers.captured import Captured, PosedImages, captured_scene, has_transforms, sizes_of
+from dataparsers.captured import Captured, PosedImages, captured_scene, has_transforms, image_sizes, sizes_of
 from dataparsers.placing import from_original
 from dataparsers.reading import number, read_json, rigid, side_or_none
 from framework import DataError, ParsedScene
@@ -73,6 +73,6 @@ def _posed_images(folder: Path, cameras: str, images: str, split: Split) -> Pose
         names=tuple(stems),
         poses=torch.stack(poses),
         intrinsics=torch.tensor(intrinsics, dtype=torch.float64),
-        sizes=sizes_of(stated, paths),
+        sizes=sizes_of(stated, lambda: image_sizes(paths)),
         depths=known if any(known) else None,
     )

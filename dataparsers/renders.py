@@ -55,9 +55,9 @@ def read_renders(folder: Path, split: Split, is_wanted: bool = True) -> Renders:
     paths = on_disk(folder, names, quiet=split != "train" or not is_wanted)
     poses = torch.stack([read_pose(frame, label, torch.float64) for frame, label in zip(frames, labels, strict=True)])
     keep = existing_files(paths, split) if is_wanted else _existing(paths)
-    image_size([paths[index] for index in keep.tolist()])  # one must be readable
+    size = image_size([paths[index] for index in keep.tolist()])
     frames, plain = [_without_sensor(frame) for frame in frames], _without_sensor(content)
-    intrinsics = read_intrinsics(file, plain, frames, labels, paths)
+    intrinsics = read_intrinsics(file, plain, frames, labels, lambda: torch.tensor([size]).expand(len(paths), 2))
     if intrinsics.warning and is_wanted and split == "train":  # once is enough
         say(intrinsics.warning)
     images = PosedImages(

@@ -181,7 +181,7 @@ def test_points_are_double_where_float_is_too_coarse(
 ) -> None:
     points = ball(unit, shift).vertices
     write_points(tmp_path / "points.ply", points, torch.full_like(points, 0.5))
-    kinds = dict(read_header(tmp_path / "points.ply").columns)
+    kinds = dict(read_header(tmp_path / "points.ply").elements["vertex"].columns)
     found, said = read_points(tmp_path / "points.ply"), " ".join(capsys.readouterr().err.split())
     if shift.any():
         assert kinds["x"] == kinds["y"] == kinds["z"] == "f8"

@@ -113,7 +113,7 @@ def write_capture(folder: Path) -> Path:
 def test_one_image_of_another_size(tiny: Path, tmp_path: Path, refused: Refused) -> None:
     Image.new("RGBA", (24, 20)).save(tiny / "train" / "r_3.png")
     said = refused(train_command.main, "instant-ngp", "--data", tiny, *TINY_NGP)
-    assert "r_3.png is 24x20 pixels, but its camera is for 20x20: resize it, or remove it" in said
+    assert "r_3.png is 24x20 pixels, but its camera is for 20x20: it was cropped or rotated" in said
     capture = write_capture(tmp_path / "capture")
     Image.new("RGB", (30, 20)).save(capture / "images" / "3.jpg")
     said = refused(train_command.main, "instant-ngp", "--data", capture, *TINY_NGP)

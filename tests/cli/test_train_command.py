@@ -38,7 +38,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "a list": (lambda d: (d / "transforms_train.json").write_text("[]"), "must hold a JSON object"),
     "deep": (lambda d: (d / "transforms_train.json").write_text("[" * 100_000), "transforms_train.json is not JSON"),
     "no frames": (lambda d: change(d, lambda c: c.update(frames=[])), "transforms_train.json lists no frames"),
-    "no angle": (lambda d: change(d, lambda c: c.pop("camera_angle_x")), "'camera_angle_x' is None"),
+    "no angle": (lambda d: change(d, lambda c: c.pop("camera_angle_x")), "there is no focal length"),
     "no file": (lambda d: change(d, lambda c: c["frames"][2].pop("file_path")), "frame 2: 'file_path' is missing"),
     "nan pose": (
         lambda d: change(d, lambda c: c["frames"][2]["transform_matrix"][0].__setitem__(0, np.nan)),

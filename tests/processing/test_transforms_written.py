@@ -38,8 +38,7 @@ def test_points_are_seen_where_colmap_sees_them(tmp_path: Path) -> None:
         column, row, depth = draws.uniform(1, 63), draws.uniform(1, 47), 3.0
         local = np.array([(column - 31) / 50 * depth, (row - 25) / 52 * depth, depth])
         point = extrinsic[:, :3].T @ (local - extrinsic[:, 3])
-        place = torch.tensor(point, dtype=torch.float32)
-        inside = scene.scale * (scene.transform[:, :3] @ place + scene.transform[:, 3])
+        inside = scene.placement.points(torch.tensor(point)[None])[0].float()
         at = torch.tensor([index])
         found = scene.cameras.project(inside[None], at)
         assert float(found[0][0]) == pytest.approx(column - 0.5, abs=0.01)

@@ -566,6 +566,7 @@ UTM = torch.tensor([512345.678, 5403210.987, 432.1], dtype=torch.float64)
 
 def pretend(monkeypatch: pytest.MonkeyPatch, model: object, placement: Placement, method: str) -> None:
     trained = SimpleNamespace(model=model, placement=placement, run=SimpleNamespace(method=method))
+    monkeypatch.setattr("framework.cli.export.trained_run", lambda path, *_: path)
     monkeypatch.setattr("framework.training.trained.load_trained", lambda *_: trained)
 
 
@@ -634,7 +635,7 @@ def test_ns_export_far_from_the_origin_writes_about_a_local_one(
     exported(monkeypatch, tmp_path, suffix)
     file = tmp_path / f"splat.{suffix}"
     assert f"which splat.{suffix}.offset.json says too" in " ".join(capsys.readouterr().err.split())
-    read = read_gaussians(file)
+    read = read_gaussians(file).gaussians
     truth = (gaussians.means.double() / placement.scale) @ turn() + UTM
     step = 1e-5 * unit + (0.5 * 2.0 ** -fractional_bits(read) if suffix == "spz" else 0.0)
     torch.testing.assert_close(read.means.double() + read_offset(file), truth, atol=step, rtol=0)
@@ -650,10 +651,10 @@ def test_centres_in_double_precision_stay_in_it_until_they_are_placed(tmp_path: 
     """Files of other programs, which hold the coordinates of a survey as double."""
     gaussians, names = some(40), property_names(15)
     write_ply(tmp_path / "a.ply", gaussians)
-    values = read_columns(tmp_path / "a.ply", read_header(tmp_path / "a.ply"), names)
+    values = read_columns(tmp_path / "a.ply", read_header(tmp_path / "a.ply").elements["vertex"], names)
     far = gaussians.means.double() + UTM
     write_columns(tmp_path / "b.ply", list(zip(names, [*far.numpy().T, *values[3:]], strict=True)))
-    read = read_gaussians(tmp_path / "b.ply")
+    read = read_gaussians(tmp_path / "b.ply").gaussians
     assert torch.equal(read.means, far)
     placed = transformed(read, torch.eye(3), 1.0, -UTM)
     assert placed.means.dtype == torch.float32

@@ -12,7 +12,9 @@ from PIL import Image
 from dataparsers.nerfstudio import Nerfstudio
 from framework.data.dataset import load_dataset
 from framework.data.ply import read_points
-from framework.tools.processing import pipeline, transforms
+from framework.tools.processing import features, mapping, matching, transforms
+from framework.tools.processing import job as job_module
+from framework.tools.processing.job import Job
 from tests.cli.helpers import called
 from tests.dataparsers.sparse_models import write_colmap
 from tests.truth.ball import CENTRE, COUNT, HEIGHT, NAMES, PINHOLE, RADIUS, WIDTH, Lens, photograph, write_photographs
@@ -39,17 +41,18 @@ def without_colmap(monkeypatch: pytest.MonkeyPatch, camera: str, order: list[str
         order: names that the photographs have been given.
     """
 
-    def extract(database: Path, *_: object) -> None:
-        database.touch()
+    def extract(job: Job, *_: object) -> None:
+        job.database.touch()
 
-    def reconstruct(database: Path, images: Path, output: Path, *_: object) -> list[int]:
-        write_colmap(output / "0", model_of(order), camera)
+    def reconstruct(job: Job, *_: object) -> list[int]:
+        write_colmap(job.work / "sparse" / "0", model_of(order), camera)
         return [COUNT]
 
-    monkeypatch.setattr(pipeline, "_extract", extract)
-    monkeypatch.setattr(pipeline, "_match", lambda *_: "exhaustive")
-    monkeypatch.setattr(pipeline, "_reconstruct", reconstruct)
-    monkeypatch.setattr(pipeline, "run_in_child", lambda work, arguments, *_: work(None, *arguments))
+    monkeypatch.setattr(features, "extract", extract)
+    monkeypatch.setattr(matching, "choose_pairs", lambda *_: [])
+    monkeypatch.setattr(matching, "match", lambda *_: None)
+    monkeypatch.setattr(mapping, "reconstruct", reconstruct)
+    monkeypatch.setattr(job_module, "run_in_child", lambda work, arguments, *_: work(None, *arguments))
 
 
 @pytest.mark.medium

@@ -11,7 +11,7 @@ from framework.base.console import say
 from framework.base.errors import DataError
 from framework.data.data_folder import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 
-READABLE = (*IMAGE_SUFFIXES, ".tga", ".gif", ".ppm", ".pgm")
+READABLE = (*IMAGE_SUFFIXES, ".tga", ".ppm", ".pgm")
 """Suffixes of image files that Pillow reads, HEIC with the package pillow-heif."""
 
 

@@ -48,3 +48,7 @@ class Travel:
         """The greatest speed, scene units for the time from 0 to 1."""
         spans = self.times.diff()
         return float((self.distances.diff()[spans > 0] / spans[spans > 0]).max())
+
+    def in_a_slice(self, slices: int) -> float:
+        """Return the greatest distance in one of `slices` equal parts of the time from 0 to 1, scene units."""
+        return float(self.at(torch.linspace(0, 1, slices + 1)).diff().max())

@@ -52,3 +52,24 @@ def densities_at(density: DensityFunction, positions: Tensor, times: Tensor | No
     parts = positions.split(CHUNK)
     part_times = [None] * len(parts) if times is None else times.split(CHUNK)
     return torch.cat([density(Points(part, t))[0] for part, t in zip(parts, part_times, strict=True)])
+
+
+def densities_over_time(
+    density: DensityFunction, positions: Tensor, starts: Tensor, length: float, looks: int
+) -> Tensor:
+    """Return the maximum density (N,) over random times, one in each of a few equal parts of a slice of time.
+
+    Args:
+        density: the density.
+        positions: (N, 3) scene coordinates.
+        starts: (N,) times in [0, 1] at which the positions' slices start.
+        length: length of a slice.
+        looks: number of parts; 0 for a static scene.
+    """
+    if not looks:
+        return densities_at(density, positions)
+    found = []
+    for part in range(looks):
+        shares = (part + torch.rand(len(positions), device=positions.device)) / looks
+        found.append(densities_at(density, positions, starts + shares * length))
+    return torch.stack(found).amax(0)

@@ -32,7 +32,7 @@ from framework.kernels.occupancy import own_cells
 from framework.kernels.rows import gather_rows
 from framework.kernels.trace import trace
 from framework.samplers.base import Sampler
-from framework.samplers.cells import beside, densities_at, places
+from framework.samplers.cells import beside, densities_over_time, places
 from framework.samplers.fixed import Steps, attached, sample_into_slots
 from framework.samplers.room import Room
 
@@ -46,9 +46,10 @@ WARM_UP_STEPS = 256
 """Number of training steps in which the cells are updated in the order of a fixed shuffle."""
 WARM_UP_DECAY, DECAY = 0.7, 0.8
 """Factors of a cell's density at each update, during warm-up and afterwards."""
-TIMES_PER_VISIT, MOVING_DECAY = 4, 0.95
-"""Number of times at which a cell of a moving scene is evaluated at each update, and the factor of its density, which
-is larger because a cell may be occupied for a short time only. Both are for a grid with one slice of time."""
+TIMES_PER_VISIT, CELLS_A_TIME, MOVING_DECAY = 4, 6, 0.95
+"""Number of times at which a cell of a moving scene is evaluated at each update; with slices of time, one for as many
+cells as matter may cross in a slice, up to that number. And the factor of its density with one slice, which is larger
+because a cell may be occupied for a short time only."""
 SHARE, SHARE_OF_SLICES = 64, 512
 """Numbers of cells for each one that is drawn from all cells at an update after warm-up, without and with slices of
 time. With them there are more cells, of which fewer are occupied."""
@@ -134,6 +135,7 @@ class OccupancySampler(Sampler):
         self.cone = cone
         self.moving = moving
         self._stride, self._eval_stride = 1.0, eval_step_scale
+        self._times_per_visit = max(TIMES_PER_VISIT // slices, 1)
         self.register_buffer("box", box.clone())
         self.register_buffer("occupied", own_cells(levels, resolution).repeat(slices).to(box.device))
         self.register_buffer("carved", ~self.occupied)
@@ -298,6 +300,16 @@ class OccupancySampler(Sampler):
         self.occupied.masked_fill_(self.carved, False)
         self.forget_all()
 
+    def expect_motion(self, distance: float) -> None:
+        """Evaluate a cell at more times in each update if matter crosses many cells in one slice of time.
+
+        Args:
+            distance: distance that matter may move in one slice, scene units.
+        """
+        crossed = distance * self.resolution / float((self.box[1] - self.box[0]).max())
+        wanted = min(math.ceil(crossed / CELLS_A_TIME), TIMES_PER_VISIT)
+        self._times_per_visit = max(self._times_per_visit, wanted)
+
     @torch.no_grad()
     def update(self, step: int, density: DensityFunction) -> None:
         """Evaluate the density in some cells and update `occupied`, every 8 steps during warm-up and every 16 later.
@@ -323,7 +335,8 @@ class OccupancySampler(Sampler):
         unit = (place[:, 1:] + torch.rand(len(cells), 3, device=cells.device)) / self.resolution
         low, high = self.box if self.levels == 1 else nested_boxes(self.box, self.levels)[place[:, 0]].unbind(1)
         positions = torch.lerp(low, high, unit)
-        sigma = self._over_time(density, positions, place[:, 0]) if self.moving else densities_at(density, positions)
+        looks, starts = self._times_per_visit if self.moving else 0, place[:, 0] * (self.levels == 1) / self.slices
+        sigma = densities_over_time(density, positions, starts, 1 / self.slices, looks)
         before = self.density_grid.index_select(0, cells)
         before *= WARM_UP_DECAY if warming_up else MOVING_DECAY if self.moving and self.slices == 1 else DECAY
         evaluated = torch.isfinite(before)
@@ -379,15 +392,6 @@ class OccupancySampler(Sampler):
         drawn, centers = (occupied[torch.randint(len(occupied), (third,), device=device)] for _ in range(2))
         neighbours = beside(centers, self.resolution, self.levels * self.slices, self.slices > 1)
         return torch.cat([anywhere, drawn, neighbours[~self.carved[neighbours]]])
-
-    def _over_time(self, density: DensityFunction, positions: Tensor, slices: Tensor) -> Tensor:
-        """Return the maximum density (N,) over random times, one in each of a few equal parts of a position's slice."""
-        densities, parts = [], max(TIMES_PER_VISIT // self.slices, 1)
-        first = slices if self.slices > 1 else torch.zeros_like(slices)  # of several boxes there is one slice
-        for part in range(parts):
-            shares = (part + torch.rand(len(positions), device=positions.device)) / parts
-            densities.append(densities_at(density, positions, (first + shares) / self.slices))
-        return torch.stack(densities).amax(0)
 
 
 def _opened(samples: Samples, rays: Tensor) -> Samples:

@@ -26,6 +26,7 @@ from framework.model import HasAppearance, LearnsMotion, Model, RefinesPoses, Re
 from framework.ray_model import RayModel
 from framework.samplers.base import SkipsCells
 from framework.samplers.choice import SamplingConfig
+from framework.samplers.occupancy import OccupancySampler
 from framework.scene.motion import MotionConfig
 from framework.scene.moving_hulls import moving_box, moving_hulls
 from framework.scene.profile import SceneProfile
@@ -191,6 +192,9 @@ def skip_empty(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: 
         The data set, without pixels whose rays meet emptied cells only.
     """
     dataset = skip_by_silhouettes(config, model, dataset, fresh)
+    if dataset.travel is not None:
+        for sampler in parts(model, OccupancySampler):
+            sampler.expect_motion(dataset.travel.in_a_slice(sampler.slices))
     if fresh:
         skip_unseen(config, model, dataset)
         if isinstance(config, RayConfig) and isinstance(model, RayModel) and model.shared_space is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -274,19 +274,24 @@ def evaluate(
     files = ViewFiles(pictures, dataset.names, shown, with_worst=0 < len(shown) < len(chosen))
     order = sorted(chosen, key=lambda index: index not in shown)
     others = ((index, judge(index)) for index in track(order[1:], title, len(order), done=1, spent=cost))
-    found, rays = {}, 0
-    for index, (row, judged) in chain([(order[0], first)], others):
-        found[index] = row
-        rays += judged.picture.num_rays
-        files.take(index, row["psnr"], judged)
-    files.write_worst()
-    rows = [found[index] for index in chosen]
+    rows, rays = _collected(chain([(order[0], first)], others), files)
     spent = sum(row["seconds"] for row in rows)
     speed = {"num_rays_per_sec": rays / spent if rays else None, "fps": len(rows) / spent}  # None: no rays are cast
     counts = {"num_images": len(rows), "num_images_in_split": len(views)}
     protocol: Literal["mean", "half"] | None = ("half" if half else "mean") if has_appearance else None
     results = {**statistics(rows), **speed, **counts}
     return Evaluation(rows, results, lpips_note, protocol, files.note)
+
+
+def _collected(judged: Iterable[tuple[int, tuple[dict[str, Any], Judged]]], files: ViewFiles) -> tuple[list[Any], int]:
+    """Write the files of views as they are judged; return their rows in the order of the data, and the rays cast."""
+    found, rays = {}, 0
+    for index, (row, images) in judged:
+        found[index] = row
+        rays += images.picture.num_rays
+        files.take(index, row["psnr"], images)
+    files.write_worst()
+    return [found[index] for index in sorted(found)], rays
 
 
 def _timed(work: Callable[[], T], title: str) -> tuple[T, float]:

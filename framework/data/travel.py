@@ -1,4 +1,4 @@
-"""The distance that matter may have moved since time 0."""
+"""Distances that matter may have moved since time 0."""
 
 from __future__ import annotations
 

@@ -47,9 +47,8 @@ WARM_UP_STEPS = 256
 WARM_UP_DECAY, DECAY = 0.7, 0.8
 """Factors of a cell's density at each update, during warm-up and afterwards."""
 TIMES_PER_VISIT, CELLS_A_TIME, MOVING_DECAY = 4, 6, 0.95
-"""Number of times at which a cell of a moving scene is evaluated at each update; with slices of time, one for as many
-cells as matter may cross in a slice, up to that number. And the factor of its density with one slice, which is larger
-because a cell may be occupied for a short time only."""
+"""Times at which a cell of a moving scene is evaluated at each update: with slices of time, one for as many cells as
+matter may cross in a slice, up to this number. Factor of a density that is not kept in slices, for it may be rare."""
 SHARE, SHARE_OF_SLICES = 64, 512
 """Numbers of cells for each one that is drawn from all cells at an update after warm-up, without and with slices of
 time. With them there are more cells, of which fewer are occupied."""
@@ -301,13 +300,13 @@ class OccupancySampler(Sampler):
         self.forget_all()
 
     def expect_motion(self, distance: float) -> None:
-        """Evaluate a cell at more times in each update if matter crosses many cells in one slice of time.
+        """Evaluate a cell at more times in each update if matter crosses many cells meanwhile.
 
         Args:
-            distance: distance that matter may move in one slice, scene units.
+            distance: distance that matter may move in one slice of time, scene units.
         """
-        crossed = distance * self.resolution / float((self.box[1] - self.box[0]).max())
-        wanted = min(math.ceil(crossed / CELLS_A_TIME), TIMES_PER_VISIT)
+        cells = distance * self.resolution / float((self.box[1] - self.box[0]).max())
+        wanted = min(math.ceil(cells / CELLS_A_TIME), TIMES_PER_VISIT)
         self._times_per_visit = max(self._times_per_visit, wanted)
 
     @torch.no_grad()

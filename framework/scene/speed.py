@@ -1,4 +1,4 @@
-"""The speed of matter, found from the silhouettes alone: the slowest motion that explains all that they show.
+"""Speeds of matter about each time, found from silhouettes alone: the slowest motion that explains all they show.
 
 An opaque pixel needs matter on its ray at the time of its image. If matter is assumed to be slower than it is, other
 images seem to show its place to be empty, and nothing is left on the ray to be seen. So speeds are raised, about the

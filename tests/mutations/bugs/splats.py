@@ -154,7 +154,7 @@ BUGS = (
         "splats-mode-lost-in-ply",
         "splats",
         PLY,
-        "write_columns(file, columns, comments(look))",
+        "write_columns(file, columns, comments=comments(look))",
         "write_columns(file, columns)",
         "antialiased Gaussians look wrong once they are exported to PLY",
     ),

@@ -65,6 +65,9 @@ def _command(arguments: list[str]) -> None:
     recipe, arguments = _recipe(arguments)
     default = CompareFlags() if recipe is None else from_plain(CompareFlags(), read_yaml(recipe), str(recipe))
     flags = read_flags(CompareFlags, "ns-compare", arguments, default=default)
+    if flags.data is not None:
+        check_data(flags.data)
+    check_writable(flags.output_dir or Path("outputs"), "the comparison's folder")
     plan = plan_of(flags)
     from framework.base.console import say
 
@@ -91,9 +94,6 @@ def plan_of(flags: CompareFlags) -> Plan:
     Raises:
         ConfigError: if a flag's value is invalid, or flags contradict each other.
     """
-    if flags.data is not None:
-        check_data(flags.data)
-    check_writable(flags.output_dir or Path("outputs"), "the comparison's folder")
     from framework.data.data_folder import find_data
     from framework.tools.comparison.plan import Conditions, Contender, Plan, split_words, views_for
 

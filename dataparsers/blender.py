@@ -125,7 +125,7 @@ def has_times(file: Path) -> bool:
 
 
 def _training(path: Path, others: Renders) -> Renders:
-    """Return the training images, by which all splits are placed, or others if there are none."""
+    """Return the training images, which place all splits, or others if there are none."""
     try:
         return read_renders(path, "train", is_wanted=False)
     except DataError:  # reported when they are wanted

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from dataparsers.parallax import SMALL, camera_spread, warning
+from dataparsers.camera_spread import SMALL, camera_spread, warning
 from framework import ParsedScene
 from framework.base.console import say
 from framework.cameras.camera_path import read_transforms

@@ -24,10 +24,10 @@ SHOWN = 1.034
 MOST_IMAGES = 32
 """Maximum number of images whose silhouettes are read."""
 SLACK = 0.8
-"""Share of the smallest distance between a camera and the matter at which rays start, and of where they end at which
-it may end: cameras of other splits may be nearer or further."""
+"""Rays start at this share of the smallest distance between a camera and the matter. Matter may end at this share of
+the distance where rays end, since cameras of other splits may be nearer or further."""
 FAR = 1000.0
-"""Distance, scene units, at which a scene ends of which nothing says where it does."""
+"""Distance, scene units, at which a scene ends if nothing says where it does."""
 
 LOOKED_AT = "which the images show where the cameras look"
 """Reason of a region that is not known by silhouettes."""
@@ -52,7 +52,7 @@ class Region:
 
     @property
     def placement(self) -> Placement:
-        """The placement by which the cube is the box of NeRF-Synthetic."""
+        """The placement that makes the cube the box of NeRF-Synthetic."""
         transform = torch.cat([torch.eye(3, dtype=torch.float64), -self.center[:, None]], -1)
         return Placement(transform, HALF_SIZE / self.half)
 

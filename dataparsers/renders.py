@@ -19,7 +19,7 @@ from framework.data.dataset import Split, existing_files, image_size
 from framework.data.names_on_disk import on_disk
 
 OF_LENSES = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2", "camera_model", "is_fisheye")
-"""Names by which a file states more of lenses than an angle of view."""
+"""Entries that state more of a lens than its angle of view."""
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from framework.base.config import from_plain, to_plain
-from framework.base.given import limited_as_given
 from framework.base.registry import load_dataparser, load_method, registered, summary
 from framework.base.splits import Split
+from framework.base.step_limit import limited_as_given
 from framework.cameras.cameras import Cameras
 from framework.cameras.view import View
 from framework.data.data_folder import find_data
@@ -103,7 +103,7 @@ def load(run: str | Path, data: str | Path | None = None, device: Device = "auto
     """Load a trained run.
 
     Args:
-        run: folder of the run, its config.yml, or a folder above it, of which the newest run is taken.
+        run: folder of the run, its config.yml, or a folder above it, whose newest run is taken.
         data: new location of the data, if it has been moved.
         device: device of the model.
 

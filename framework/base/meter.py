@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 
 UNKNOWN = "–"
-"""Text in place of what is not known yet."""
+"""Text that stands for an unknown value."""
 
 
 def time_text(seconds: float) -> str:

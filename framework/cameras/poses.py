@@ -97,7 +97,7 @@ class Placement:
         return Placement(torch.cat([rotation, shift[:, None]], dim=-1), self.scale / scale)
 
     def before(self, applied: Tensor, scale: float) -> Placement:
-        """Return the placement of an earlier frame by which the scene is where it is by this one.
+        """Return the placement of an earlier frame that leaves the scene where this one puts it.
 
         Args:
             applied: (4, 4) rigid transform from the earlier frame to the input's, applied before `scale`.

@@ -132,8 +132,8 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
 
     Flags are parsed with those of the data format, so that --data and the format's name must be found before.
     """
-    from framework.base.given import limited_as_given
     from framework.base.registry import load_dataparser
+    from framework.base.step_limit import limited_as_given
     from framework.data.data_folder import find_data
     from framework.training.run import run_folder
 

@@ -35,7 +35,7 @@ class ExrHeader:
     """Header of a file."""
 
     channels: tuple[tuple[str, np.dtype], ...]
-    """Name and type of each channel, in the order in which a row has them."""
+    """Name and type of each channel, in the order of a row."""
     compression: int
     """Number of the compression, a key of `ROWS`."""
     box: tuple[int, int, int, int]

@@ -22,9 +22,9 @@ from framework.base.console import say
 from framework.data.data_folder import IMAGE_SUFFIXES
 
 LIKELIEST = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp")
-"""Endings of a name that has none, in the order in which they are tried."""
+"""Endings that are tried, in this order, for a name without one."""
 REDUCED = (1, 2, 4, 8)
-"""Integer factors by which images may have been reduced in advance; those of `images` by 2 are in `images_2`."""
+"""Factors of images that were reduced in advance; images reduced by 2 are in `images_2`."""
 MOST_FILES = 200_000
 """Maximum number of files below a folder among which names are looked for."""
 COMPANIONS = ("mask", "depth", "normal", "semantic", "segment", "label", "confidence", "thumb")
@@ -42,7 +42,7 @@ class Matches:
     files: dict[str, str]
     """Name as it is written -> path in the folder, with slashes; names that were not found are missing."""
     notes: tuple[str, ...]
-    """For each way in which names differ from the disk, a sentence with their number and an example."""
+    """A sentence for each difference between names and the disk, with their number and an example."""
 
 
 def on_disk(
@@ -155,7 +155,7 @@ def nearest_on_disk(path: Path) -> str:
 
 
 def _as_written(folder: Path, name: str) -> str | None:
-    """Return the name if there is such a file, else the name with the first likely ending with which there is one."""
+    """Return the name if the file exists, else the name with the first likely ending that makes a file."""
     if (folder / name).is_file():
         return name
     if _is_image(name):
@@ -168,7 +168,7 @@ def _is_image(name: str) -> bool:
 
 
 def _full_size(name: str) -> str:
-    """Return the name of a folder of images without the factor by which they are reduced; '' if it has none."""
+    """Return the name of a folder of reduced images without its factor; '' if it has none."""
     base, _, factor = name.rpartition("_")
     return base if factor in map(str, REDUCED[1:]) else ""
 
@@ -195,7 +195,7 @@ SPELLINGS: tuple[tuple[str, Callable[[str], str]], ...] = (
     ("in another case", spelled),
     ("with another ending", without_ending),
 )
-"""Ways in which a name may differ from the disk, the strictest first: the words for it, and what stays the same."""
+"""Differences between a name and the disk, the strictest first: words for it, and what is compared."""
 
 
 def _paired(names: Iterable[str], files: Iterable[str], key: Callable[[str], str]) -> dict[str, str]:

@@ -42,7 +42,7 @@ MASKED = (
     "PSNR is of kept pixels, SSIM and MS-SSIM are of windows without ignored pixels, LPIPS is the mean of its map over "
     "kept pixels, for which ignored pixels are copied from the true image"
 )
-"""What is measured of images of which masks ignore pixels."""
+"""What is measured of images with ignored pixels."""
 
 
 def evaluation_background(model: Model) -> Tensor:

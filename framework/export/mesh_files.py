@@ -75,7 +75,7 @@ def _bytes(mesh: Mesh) -> np.ndarray | None:
 
 
 def decimals(vertices: Tensor) -> int:
-    """Return the number of decimals with which `vertices` (V, 3) are written as text: 1e-7 of their extent or finer."""
+    """Return the decimals for writing `vertices` (V, 3) as text: 1e-7 of their extent or finer."""
     extent = float((vertices.amax(0) - vertices.amin(0)).max()) if len(vertices) else 0.0
     return DECIMALS if not extent > 0 else max(DECIMALS, math.ceil(7 - math.log10(extent)))
 

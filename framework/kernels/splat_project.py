@@ -116,7 +116,7 @@ def project_gaussians(
 
 
 def sort_keys(means: Tensor, camera: SplatCamera) -> Tensor | None:
-    """Return the depths (N,) by which a camera's Gaussians are sorted; None if they are sorted by distance.
+    """Return the depths (N,) that sort a camera's Gaussians; None if distances sort them.
 
     Args:
         means: (N, 3) centres, scene coordinates.

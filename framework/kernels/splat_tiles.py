@@ -48,7 +48,7 @@ def tile_lists(
         for_gradients: whether a gradient will be asked for; without one the lists may have no slots.
         room: number of entries for which there is room, so that the device need not be waited for; Gaussians beyond it
             are left out whole. None for room for all.
-        keys: (N,) positive numbers of the visible Gaussians, by which all are sorted instead, smallest first.
+        keys: (N,) positive numbers that sort the visible Gaussians instead, smallest first.
 
     Raises:
         ValueError: if there is another number of keys than of Gaussians.
@@ -70,7 +70,7 @@ def tile_lists_reference(
         width, height: size of the image, pixels.
         for_gradients: makes no difference here.
         room: number of entries for which there is room; the nearest Gaussians have it.
-        keys: (N,) by which Gaussians are sorted instead of distance.
+        keys: (N,) numbers that sort Gaussians instead of their distances.
     """
     columns, rows = -(-width // TILE), -(-height // TILE)
     device = records.device
@@ -92,7 +92,7 @@ def tile_lists_reference(
 
 
 def _keys(records: Tensor, keys: Tensor | None) -> Tensor:
-    """Return the numbers (N,) by which Gaussians are sorted: their distances, if no others are given."""
+    """Return the numbers (N,) that sort Gaussians: their distances, if no others are given."""
     return records[:, DISTANCE] if keys is None else keys
 
 

@@ -62,7 +62,7 @@ def densities_over_time(
     Args:
         density: the density.
         positions: (N, 3) scene coordinates.
-        starts: (N,) times in [0, 1] at which the positions' slices start.
+        starts: (N,) first times of the positions' slices, in [0, 1].
         length: length of a slice.
         looks: number of parts; 0 for a static scene.
     """

@@ -22,7 +22,7 @@ REACH = 3.0
 """Half the side of the cube around the point that cameras look at outside which no matter is assumed, in the largest
 distance of a camera from that point. A box that reaches it is taken to be unknown."""
 SAME = 1e-9
-"""Distance, relative to the largest of a camera, by which a vertex may be outside a plane because of rounding."""
+"""Distance that rounding may put a vertex outside of a plane, relative to the farthest camera's."""
 BEYOND = (2.0, 0.1)
 """Pixels, and share of the matter's size in an image, by which matter may go beyond the box there: the pixels at its
 edge are opaque as a whole, and poses are not exact."""
@@ -36,7 +36,7 @@ def enclosing_box(cameras: Cameras, opaque: Sequence[Tensor], within: Tensor | N
     """Return a box (2, 3) float64 that holds all matter, as small as the images' rectangles of opaque pixels allow.
 
     Args:
-        cameras: M cameras with a point from which all rays start.
+        cameras: M central cameras: all rays of one start at one point.
         opaque: for each, its pixels (H, W) bool that are not fully transparent.
         within: box (2, 3) that holds all matter; None if none is known.
 

@@ -25,7 +25,7 @@ SPAN = 1 / 64
 MOST_MOMENTS = 96
 """Maximum number of moments, beside one for each slice, whose hulls make up those of slices."""
 BOX_CELLS = 32
-"""Cells along each axis by which the smallest box of a moving scene is found."""
+"""Cells along each axis in the search for the smallest box of a moving scene."""
 
 
 @torch.no_grad()

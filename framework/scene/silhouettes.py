@@ -28,7 +28,7 @@ KEPT_COUNTS = 48
 
 
 class _Counts(Sequence[Tensor]):
-    """The cumulative sums of a data set's images, of which only those requested last are kept in memory."""
+    """The cumulative sums of a data set's images; memory keeps only those requested last."""
 
     def __init__(self, dataset: Dataset) -> None:
         self._dataset = dataset

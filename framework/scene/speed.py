@@ -25,9 +25,9 @@ LEAST_IMAGES, LEAST_TIMES = 24, 8
 SLOWEST = 0.25
 """First speed that is tried, longest edges of the box for the time from 0 to 1. Lower ones save little."""
 FASTER = 2**0.5
-"""Factor by which a speed is raised."""
+"""Ratio between a speed and the next one that is tried."""
 SAFETY = 2**0.5
-"""Factor by which matter may be faster than found: pixels, balls and what moves have a size, which is slack."""
+"""Ratio of the speed that is used to the speed found: pixels, balls and moving matter have a size, which is slack."""
 AROUND = 2
 """Number of times, before and after that of an image with a ray left, about which speeds are raised."""
 MOST_RAYS = 2**15
@@ -45,9 +45,9 @@ class _Rays:
     directions: Tensor
     """(R, 3)."""
     enter: Tensor
-    """(R,) distance at which a ray enters the box."""
+    """(R,) distances where the rays enter the box."""
     leave: Tensor
-    """(R,) distance at which a ray leaves the box."""
+    """(R,) distances where the rays leave the box."""
 
     def __len__(self) -> int:
         return len(self.enter)
@@ -100,7 +100,7 @@ def travel_of(silhouettes: Silhouettes, box: Tensor, times: Tensor) -> Travel | 
 
 
 def _rays_to_explain(silhouettes: Silhouettes, images: Sequence[int], box: Tensor) -> list[_Rays]:
-    """Return, of each image, rays on which there must be something."""
+    """Return the rays of each image that must meet matter."""
     most, found = max(MOST_RAYS // len(images), 1), []
     cameras: Cameras = silhouettes.dataset.cameras
     for image in images:
@@ -127,7 +127,7 @@ def _edges(silhouettes: Silhouettes, image: int) -> Tensor:
 def _explained(
     silhouettes: Silhouettes, images: Sequence[int], number: int, rays: _Rays, travelled: Tensor, spacing: float
 ) -> Tensor:
-    """Return on which rays (R,) of image `number` the other images, at `travelled` (M,), leave room for something."""
+    """Return the rays (R,) bool of image `number` that the other images, at `travelled` (M,), leave room for matter."""
     if not len(rays):
         return torch.zeros(0, dtype=torch.bool)
     margins = (travelled - travelled[number]).abs()

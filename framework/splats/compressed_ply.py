@@ -49,7 +49,7 @@ def read_compressed(file: Path, header: PlyHeader) -> Gaussians:
 
     Args:
         file: path of the file.
-        header: its header, of which `is_compressed`.
+        header: its header, which `is_compressed` accepts.
 
     Raises:
         DataError: if the file cannot be read, is truncated, or its elements do not fit each other.

@@ -86,7 +86,7 @@ def image_gradients(gradient: Tensor, longer_side: int) -> Tensor:
     """Return how much the pixels pull at each Gaussian's position, (N,), on an image whose longer side is 2 units.
 
     Args:
-        gradient: (N, RECORD) their gradient, in which `blend` leaves sums over pixels of absolute gradients.
+        gradient: (N, RECORD) their gradient; two columns hold `blend`'s sums of absolute gradients over pixels.
         longer_side: of the image, pixels.
     """
     return torch.hypot(gradient[:, ABSOLUTE_X], gradient[:, ABSOLUTE_Y]) * (longer_side / 2)

@@ -134,7 +134,7 @@ def _commented(packed: bytes, comment: str) -> bytes:
 
 
 def _comment(packed: bytes) -> list[str]:
-    """Return the lines of the comment with which a gzip file begins; none if it has other parts besides."""
+    """Return the lines of the comment at the start of a gzip file; none if its header has other parts."""
     text, end, _ = packed[COMMENT_START : COMMENT_START + LONGEST_COMMENT].partition(b"\0")
     return text.decode("latin-1").splitlines() if end and packed[3] == FCOMMENT else []
 
@@ -271,7 +271,7 @@ def read_spz(file: Path) -> Splats:
 
 
 def _look(file: Path, flags: int) -> Look:
-    """Return how the Gaussians are drawn, of which the flags say first what there is to say."""
+    """Return how the Gaussians are drawn: by the flags, then by the comment."""
     with file.open("rb") as stream:
         lines = _comment(stream.read(COMMENT_START + LONGEST_COMMENT))
     return replace(look_of(lines, file, ELSEWHERE), antialiased=bool(flags & ANTIALIASED))

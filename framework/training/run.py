@@ -29,8 +29,8 @@ import yaml
 from framework.base.config import TrainConfig, from_plain, read_yaml, to_plain
 from framework.base.console import say
 from framework.base.errors import ConfigError, DataError
-from framework.base.given import limited_as_given
 from framework.base.registry import load_dataparser, load_method
+from framework.base.step_limit import limited_as_given
 from framework.cameras.camera_path import read_transforms
 from framework.cameras.poses import Placement
 from framework.data.data_folder import find_data

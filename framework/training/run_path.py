@@ -1,4 +1,4 @@
-"""Paths of runs and of what commands need of them, found without torch."""
+"""Paths of runs and of their files, found without torch."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def check_data(data: Path) -> None:
 
 
 def check_writable(folder: Path, what: str) -> None:
-    """Refuse a folder in which nothing can be written, whether it exists or is to be created; nothing is left there.
+    """Refuse a folder that cannot be written to, whether it exists or is to be created; nothing is left there.
 
     Args:
         folder: the folder.

@@ -1,4 +1,4 @@
-"""What a folder holds, and what is said of what is left out."""
+"""The files of a folder, and what is said about those left out."""
 
 from pathlib import Path
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from dataparsers.parallax import camera_spread
+from dataparsers.camera_spread import camera_spread
 from framework.tools.processing.parallax import share_that_turned
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from framework.base.config import TrainConfig
 from framework.base.errors import FlagError
-from framework.base.given import limited_as_given
+from framework.base.step_limit import limited_as_given
 from framework.cli.train import run_of
 from framework.training.budget import evaluation_seconds, reason_to_stop, spent
 from framework.training.run import Run, create_folder, read_run

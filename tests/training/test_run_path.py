@@ -1,4 +1,4 @@
-"""What stands for a run: its folder, its settings, or a folder above it, of which the newest run is taken."""
+"""What stands for a run: its folder, its settings, or a folder above it, whose newest run is taken."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The web page's program in Node.js, as far as it needs no WebGL: what it unpacks, and the order in which it draws."""
+"""The web page's program in Node.js, as far as it needs no WebGL: what it unpacks, and the order of drawing."""
 
 import base64
 import json

@@ -8,7 +8,7 @@ from PIL import Image
 from framework.base.errors import DataError
 
 SAMPLES = 500
-"""Rows and columns at which the range is measured."""
+"""Rows and columns that are measured for the range."""
 ENDS = (1.0, 99.0)
 """Percentiles between which the range of brightness lies: single bright pixels do not count."""
 

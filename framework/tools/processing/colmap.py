@@ -17,7 +17,7 @@ from framework.tools.processing.settings import ColmapFlags
 from framework.tools.processing.worker import Report
 
 FIRST_PAIRS = 8
-"""Number of pairs that are matched first, by which the time of all is estimated; no part has fewer."""
+"""Number of pairs that are matched first, to estimate the time of all; no part has fewer."""
 SECONDS_OF_A_PART = 5.0
 """Seconds after which matches are added to the database: what is lost if matching is stopped."""
 MOST_PAIRS = 1000

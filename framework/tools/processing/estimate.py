@@ -1,4 +1,4 @@
-"""Durations in words, of what is roughly known."""
+"""Rough durations in words."""
 
 from __future__ import annotations
 

@@ -137,7 +137,7 @@ def _times(listed: Path) -> np.ndarray:
 
 
 def _passthrough() -> list[str]:
-    """Return the option by which ffmpeg keeps each frame once, at its time; versions before 5.1 call it -vsync."""
+    """Return ffmpeg's option to keep each frame once, at its time; versions before 5.1 call it -vsync."""
     import imageio_ffmpeg
 
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-h", "long"]

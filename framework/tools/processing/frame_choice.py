@@ -53,7 +53,7 @@ def different(frames: list[np.ndarray]) -> np.ndarray:
 
 
 def intervals(times: np.ndarray, count: int) -> np.ndarray:
-    """Divide frames into intervals of equal duration, none of which is empty.
+    """Divide frames into intervals of equal duration that are not empty.
 
     A pause without frames that is longer than an interval counts as one interval, so that there are always as many as
     asked for: the interval's length L solves sum(min(d, L)) = count L, with the durations d of frames.

@@ -72,7 +72,7 @@ def kind_of(kind: str, data: Path) -> tuple[str, Path]:
 
 
 def natural_order(path: Path) -> list[tuple[int, int, str]]:
-    """Return a sorting key of `path` by which numbers in names are compared as numbers."""
+    """Return a sorting key of `path` that compares numbers in names as numbers."""
     parts = re.split(r"(\d+)", path.as_posix().lower())
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts if part]
 

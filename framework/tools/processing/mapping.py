@@ -29,7 +29,7 @@ def reconstruct(job: Job, names: list[str], matching: str, turned: float) -> lis
     Args:
         job: the reconstruction, with matches.
         names: names of all images.
-        matching: the rule by which pairs were selected.
+        matching: the rule that selected the pairs.
         turned: share of pairs of images between which the camera only turned; more pairs cannot help if it is large.
 
     Returns:

@@ -64,7 +64,7 @@ def advice(matching: str) -> str:
     """Return advice for images that cannot be connected.
 
     Args:
-        matching: the rule by which pairs were selected.
+        matching: the rule that selected the pairs.
     """
     steps = [
         "take images with more overlap (two thirds or more with the next), sharp, in constant light",

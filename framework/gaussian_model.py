@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from framework.base.device import HostValue
 from framework.base.optimised import Optimised, RowChange
+from framework.base.pace import Pace
 from framework.cameras.cameras import Cameras
 from framework.cameras.view import View
 from framework.data.scene import Scene
@@ -21,10 +22,11 @@ from framework.rendering.rendered import Picture
 from framework.splats.density_control import RESET, GradientMean, grown
 from framework.splats.drawing import DRAWN, draw_view, on_image, splat_camera
 from framework.splats.gaussians import Gaussians
-from framework.splats.learning import as_gaussians, as_tables, row_changes
+from framework.splats.learning import as_gaussians, as_tables, row_changes, steps_per_move
 from framework.splats.look import Look
 from framework.splats.mcmc import moved, shaken
 from framework.splats.redrawn import Redrawn
+from framework.splats.resolution import ImageSizes, most_octaves
 from framework.splats.room import Room
 from framework.splats.settings import SplattingConfigT
 from framework.splats.start import from_points, scene_size
@@ -71,6 +73,9 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
         self._longer_side = scene.image_size
         self._redrawn: Redrawn | None = None
         self._extent = HostValue()
+        most = most_octaves(scene.image_pixels or scene.image_size**2)
+        self.sizes = ImageSizes(config.reduced_until, most, config.paced)
+        self.steps_per_move, self._first = config.steps_per_move, 0
         anywhere = torch.lerp(scene.box[0], scene.box[1], torch.rand(min(config.start_gaussians, WITHOUT_IMAGES), 3))
         self.set_gaussians(from_points(anywhere, torch.full_like(anywhere, 0.5), config.degree))
 
@@ -113,6 +118,21 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
 
     # -- training ---------------------------------------------------------------------------------------------
 
+    def keep_pace(self, pace: Pace) -> None:
+        """Choose the size of the images, and when the number of Gaussians changes, by the time that steps take.
+
+        Args:
+            pace: the run before a step.
+        """
+        config = self.config
+        if not config.paced:
+            return
+        self.sizes.learn(pace)
+        steps = self.sizes.steps_until(pace, config.growth_end)
+        self._first = self._first or len(self.means.values)
+        if steps is not None:
+            self.steps_per_move = steps_per_move(pace.step + steps, self._first, config.num_gaussians, config.strategy)
+
     def before_step(self, step: int, progress: float) -> None:
         self._redrawn = None
 
@@ -147,8 +167,7 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
         self.means.values.data[which] += by / self.extent
 
     def changes_rows(self, step: int, progress: float) -> bool:
-        config = self.config
-        return step % config.steps_per_move == config.steps_per_move - 1 and progress <= config.growth_end
+        return step % self.steps_per_move == self.steps_per_move - 1 and progress <= self.config.growth_end
 
     @torch.no_grad()
     def after_step(self, step: int, progress: float) -> Sequence[RowChange]:

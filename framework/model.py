@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from framework.base.config import TrainConfig
 from framework.base.device import has_bfloat16
 from framework.base.optimised import ParameterGroup, RowChange, parameter_groups
+from framework.base.pace import Pace
 from framework.base.protocols import SeesRegistered
 from framework.base.step_kind import StepKind
 from framework.cameras.cameras import Cameras
@@ -205,6 +206,18 @@ class StartsFromImages(Protocol):
 
         Args:
             dataset: images to learn from, on the model's device.
+        """
+
+
+@runtime_checkable
+class KeepsPace(Protocol):
+    """A model that chooses sizes by how fast its steps are, in a run with a budget in seconds."""
+
+    def keep_pace(self, pace: Pace) -> None:
+        """Take the time of the last steps into account; called before each training step.
+
+        Args:
+            pace: the run before the step.
         """
 
 

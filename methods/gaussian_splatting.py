@@ -29,7 +29,7 @@ from framework.scene.reasons import DEPTH_REASONS, LIGHT_REASONS, POSE_REASONS
 from framework.splats.drawing import draw, splat_camera
 from framework.splats.guide import GUIDE, FoundDistances
 from framework.splats.learning import open_degree
-from framework.splats.resolution import doubled, halved, halved_distances
+from framework.splats.resolution import enlarged, reduced, reduced_distances
 from framework.splats.settings import SplattingConfig, decide_splatting
 from framework.splats.start import PLACES, first_points, from_points, scene_size, seen_colors
 from framework.tools.surfaces import found_surfaces
@@ -151,9 +151,8 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         config = self.config
         seen, poses = batch.view.camera, self.poses
         pose = None if poses is None else poses.pose(batch.index, seen.camera_to_worlds[0])
-        reduced = 2 if self.progress < config.reduced_until else 1
-        camera = splat_camera(seen, self.near, self.look(), pose, reduced)
-        target = batch.rgb if reduced == 1 else halved(batch.rgb)
+        octaves = self.sizes.next(self.progress)
+        camera, target = splat_camera(seen, self.near, self.look(), pose, 1 << octaves), reduced(batch.rgb, octaves)
         gaussians = self.learnt_gaussians()
         records = self.on_image(gaussians, camera, min(open_degree(self.progress), config.degree))
         known, trust = self.found_distances.known(batch, self.progress, config.depth_loss_mult, config.field_depth_mult)
@@ -162,17 +161,17 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         drawn = draw(records, camera, self._behind(batch), content, self.room, keys)
         rgb = self.lit(drawn.image if known is None else drawn.image[..., :3], batch.index)
         if batch.kept is not None:  # what does not count is as it should be
-            kept = batch.kept if reduced == 1 else halved(batch.kept[..., None].float())[..., 0] == 1
+            kept = reduced(batch.kept[..., None].float(), octaves)[..., 0] == 1
             target = torch.where(kept[..., None], target, rgb.detach())
         terms = {"rgb": photometric_loss(rgb, target, config.ssim_weight)}
         if known is not None:
-            known = known if reduced == 1 else halved_distances(known)
+            known = reduced_distances(known, octaves)
             terms["depth"] = trust * mean_depth_error(drawn.image[..., 3], drawn.transmittance, known)
         if (weight := self._chosen(config.opacity_penalty, OPACITY_PENALTY)) > 0 and len(gaussians):
             terms["opacity"] = weight * torch.sigmoid(gaussians.logits).mean()
         if (weight := self._chosen(config.scale_penalty, SCALE_PENALTY)) > 0 and len(gaussians):
             terms["scale"] = weight / self.extent * gaussians.log_scales.exp().mean()
-        return Loss(terms, rgb.detach() if reduced == 1 else doubled(rgb.detach(), batch.rgb))
+        return Loss(terms, enlarged(rgb.detach(), batch.rgb, octaves))
 
     def _behind(self, batch: ViewBatch) -> Tensor:
         """Return the background (3,) of a step. Images without alpha show something everywhere: a background that

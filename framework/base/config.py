@@ -180,6 +180,7 @@ class RayConfig(TrainConfig):
 
     RANGES: ClassVar[dict[str, Range]] = {
         "num_rays_per_batch": (1, 2**20),
+        "steps_per_ray": (0, 1e6),
         "eval_num_rays_per_chunk": (1, 2**20),
         "samples_per_batch": (1, 2**24),
         "train_rays_per_pixel_from": (0, 1),
@@ -190,7 +191,10 @@ class RayConfig(TrainConfig):
     }
     """Allowed ranges."""
     num_rays_per_batch: int = 4_096
-    """Rays per training step."""
+    """Rays per training step; with --max-seconds the maximum, see --steps-per-ray."""
+    steps_per_ray: float = 3.0
+    """With --max-seconds, as measured, a training step has no more rays than steps fit into the time, over this: few
+    steps are better small. 0: always --num-rays-per-batch. Without effect on --samples-per-batch."""
     rays_per_pixel: RaysPerPixel = 1
     """Rays averaged for a pixel, which covers an area, not a point. More rays are more accurate and slower."""
     train_rays_per_pixel_from: Auto[float] = 1.0

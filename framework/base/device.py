@@ -59,7 +59,7 @@ def device_kind(machine: MachineConfig) -> str:
 
 
 def relative_speed(machine: MachineConfig) -> float:
-    """Return how fast kernels train here, relative to two threads of a CPU, by the device and the number of threads.
+    """Return how fast kernels train here, relative to two threads of a CPU: as given, or by device and threads.
 
     One thread was measured to be 0.55 to 0.58 as fast as two, as if a quarter of a step on two threads were not shared
     out (Amdahl 1967); 4 and 8 were 1.7 and 2.3 times as fast as two. A GPU counts as ten times: one of a data
@@ -67,10 +67,12 @@ def relative_speed(machine: MachineConfig) -> float:
     since all must decide the same.
 
     Args:
-        machine: the device type; threads are those that torch is set to.
+        machine: the device type, and its speed if it is given or was measured; threads are those that torch is set to.
     """
     if processes().count > 1:
         return 1.0
+    if machine.speed is not None:
+        return machine.speed
     if device_kind(machine) != "cpu":
         return GPU_SPEED
     return 1 / (0.25 + 1.5 / torch.get_num_threads())

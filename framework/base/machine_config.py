@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -21,6 +22,9 @@ class MachineConfig:
     """Device to train on; auto: CUDA if available, else the CPU."""
     num_threads: int | None = None
     """CPU threads; all cores if not given."""
+    speed: float | None = None
+    """How fast this machine trains, relative to two quiet cores of the server on which settings were found. If not
+    given: measured on a CPU if there is --max-seconds, else by the number of threads."""
     cuda_graphs: Literal["auto", "on", "off"] = "auto"
     """Record training steps on a GPU as CUDA graphs and repeat them, which saves the time to start each operation.
     auto: where steps are alike, if a repeated step has the loss and the effect of one without; a line says why not."""
@@ -31,6 +35,8 @@ class MachineConfig:
         if self.num_threads is not None and not 1 <= self.num_threads <= MOST_THREADS:
             number = shown(self.num_threads)
             raise ConfigError(f"--machine.num-threads is {number}; it must be from 1 to {MOST_THREADS}")
+        if self.speed is not None and not 0 < self.speed < math.inf:
+            raise ConfigError(f"--machine.speed is {shown(self.speed)}; it must be more than 0")
 
 
 @dataclass(frozen=True)

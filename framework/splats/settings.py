@@ -7,11 +7,14 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal, TypeVar
 
 from framework.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
-from framework.base.decisions import Choice, Decision, fill
+from framework.base.decisions import Choice, Decision, fill, is_open
+from framework.base.device import device_kind, relative_speed
+from framework.base.processes import processes
 from framework.data.scene import Scene
 from framework.splats.gaussians import MAX_DEGREE
-from framework.splats.learning import number_for, rate_factor
+from framework.splats.learning import MOST_STEPS, number_for, rate_factor
 from framework.splats.look import LEAST_BLUR, MOST_BLUR, OURS, Look, Sort
+from framework.splats.resolution import REDUCED_SHARE
 
 PIXELS_PER_SECOND = 25 * 400 * 400
 """Pixels that training draws in a second, about, on two cores; for what is decided by the budget."""
@@ -23,6 +26,7 @@ LARGE_IMAGE = 250_000
 """Pixels from which training begins with images of half the size."""
 LONG_RUN, NEVER = 15_000, 10**9
 """Steps of a run in which opacity is reset, which it takes a thousand steps to recover from."""
+PACED_WORDS = {True: "the time is limited, not the steps", False: "they are given, or the time has no limit"}
 RESET_WORDS = {
     True: ("the run is long", "resets of opacity", "every 3,000 steps"),
     False: ("the run is too short to recover from one", "resets of opacity", "none"),
@@ -78,15 +82,20 @@ class SplattingConfig(
     position_rate: float = 8e-5
     """Learning rate of centres before that factor, in sizes of the scene."""
     reduced_until: Auto[float] = AUTO
-    """Share of the budget in which images are half as wide and high. If not given: 0.4 of large images, else 0."""
+    """Share of the budget in which images are half as wide and high, a quarter in its first half, and so on. If not
+    given: 0.4 of large images, else 0."""
+    paced: Auto[bool] = AUTO
+    """Whether measured times of steps change the share of reduced images and the steps between moves. If not given:
+    with --max-seconds, if neither --reduced-until nor --steps-per-move is given."""
     strategy: Literal["adc", "mcmc"] = "adc"
     """How Gaussians come and go. adc: transparent ones are dropped, and those whose image positions have large
     gradients are cloned or split (adaptive density control of 3DGS). mcmc: transparent ones are moved to opaque ones
     (3DGS-MCMC)."""
     growth_end: float = 0.8
     """Share of the budget after which no Gaussian is added or moved."""
-    steps_per_move: int = 100
-    """Steps between two changes of the Gaussians' number."""
+    steps_per_move: Auto[int] = AUTO
+    """Steps between two changes of the Gaussians' number. If not given: 100, or fewer, down to 20, where too few
+    changes would be left to reach --num-gaussians."""
     steps_per_reset: Auto[int] = AUTO
     """Steps after which strategy adc makes all Gaussians nearly transparent; by the budget if not given."""
     noise: float | None = None
@@ -114,21 +123,27 @@ def decide_splatting(config: SplattingConfigT, scene: Scene) -> tuple[SplattingC
     Returns:
         The settings, and a record of each that was filled in.
     """
-    speed = min(PIXELS_PER_SECOND / (scene.image_pixels or scene.image_size**2), MOST_STEPS_PER_SECOND)
+    pixels = scene.image_pixels or scene.image_size**2
+    speed = min(PIXELS_PER_SECOND / pixels, MOST_STEPS_PER_SECOND)  # steps a second of two threads
     seconds = min(config.max_seconds or math.inf, (config.max_num_iterations or math.inf) / speed)
-    count, factor = number_for(seconds, MOST_GAUSSIANS), rate_factor(speed * seconds, MOST_RATE)
+    usual = relative_speed(config.machine) if device_kind(config.machine) == "cpu" else 1.0
+    count, factor = number_for(seconds, MOST_GAUSSIANS), rate_factor(usual * speed * seconds, MOST_RATE)
     why = "that suits the time"
     config, made = fill(config, Choice("num_gaussians", count, why, "Gaussians", f"up to {count:,}"))
-    large = PIXELS_PER_SECOND / speed > LARGE_IMAGE
+    large = pixels > LARGE_IMAGE
     detail = "large images can wait" if large else "the images are small"
+    free = is_open(config.reduced_until) and is_open(config.steps_per_move) and processes().count == 1
+    paced = free and config.max_seconds is not None
     first, most = max(config.num_gaussians * 2 // 3, 1), 800 if scene.unbounded else 400
     resets = speed * seconds >= LONG_RUN
     config, more = fill(
         config,
         Choice("start_gaussians", first, "the others are added", "Gaussians at the start", f"{first:,}"),
         Choice("field_steps", int(min(max(2 * seconds, 120), most)), why, "steps of a field to start from"),
-        Choice("reduced_until", 0.4 if large else 0.0, detail, "share of the budget with images of half the size"),
+        Choice("paced", paced, PACED_WORDS[paced], "sizes by measured steps"),
+        Choice("reduced_until", REDUCED_SHARE if large else 0.0, detail, "share of the budget with reduced images"),
         Choice("steps_per_reset", 3_000 if resets else NEVER, *RESET_WORDS[resets]),
+        Choice("steps_per_move", MOST_STEPS, "the paper has it so", "steps between changes of the number"),
         Choice("rate_factor", round(factor, 2), "fewer steps have to go farther", "factor of learning rates"),
     )
     return config, made + more

@@ -34,6 +34,7 @@ from framework.scene.seen_cells import seen_cells
 from framework.scene.silhouettes import Silhouettes, pixels_near, visual_hull
 from framework.scene.speed import LEAST_IMAGES, LEAST_TIMES, travel_of
 from framework.training.ray_starts import nearest_shown, starts_checked
+from framework.training.speed import with_speed
 
 
 def decided(method: str, config: TrainConfig, dataset: Dataset) -> tuple[Dataset, TrainConfig, list[Decision]]:
@@ -54,7 +55,9 @@ def decided(method: str, config: TrainConfig, dataset: Dataset) -> tuple[Dataset
     """
     declared = load_method(method)
     _check_cameras(method, declared.model.cameras, dataset)
+    config, measured = with_speed(config)
     settings, made = declared.decided(config, dataset.scene)
+    made = measured + made
     settings, made = starts_checked(config, settings, made, dataset)
     times = dataset.times
     if times is None or not isinstance(settings, SamplingConfig) or str(settings.sampler) != "occupancy":
@@ -77,6 +80,7 @@ def decided(method: str, config: TrainConfig, dataset: Dataset) -> tuple[Dataset
         config = _with_steps_as_long(config, declared.config, settings, shorter)
         dataset = replace(dataset, scene=replace(dataset.scene, box=box.to(dataset.device)))
         settings, made = declared.decided(config, dataset.scene)
+        made = measured + made
         found.append(Decision("box", f"{100 * share:.0f}% of the data's", "alpha shows that nothing is ever outside"))
     return dataset, settings, [*found, *made]
 

@@ -18,6 +18,7 @@ from framework.model import evaluating, parts
 from framework.ray_model import RayModel
 from framework.samplers.base import SkipsCells
 from framework.samplers.occupancy import OccupancySampler
+from framework.splats.resolution import ImageSizes
 from framework.splats.room import Room as SplatRoom
 
 if TYPE_CHECKING:
@@ -70,6 +71,11 @@ def skip_report(trainer: Trainer) -> list[Rung]:
         share = splats.left_out / splats.entries
         says = f"entries of lists of Gaussians for which there was no room on the device: {share:.1%}"
         rungs.append(Rung("entries of tiles' lists, for want of room", share, None, "no switch", says))
+    if isinstance(sizes := getattr(model, "sizes", None), ImageSizes) and (count := sizes.steps.total()):
+        share = 1 - sum(steps / 4**octaves for octaves, steps in sizes.steps.items()) / count
+        widths = ", ".join(f"{sizes.steps[o] / count:.0%} of steps 1/{1 << o}" for o in sorted(sizes.steps) if o)
+        says = f"pixels of training images: {share:.0%}, as images have less than their width ({widths})"
+        rungs.append(Rung("pixels of training images", share, None, "--reduced-until 0", says))
     updated, there = trainer.optimizer.entries
     if there:
         share = updated / there

@@ -19,13 +19,15 @@ from framework.base.config import RayConfig, TrainConfig, to_plain
 from framework.base.console import say
 from framework.base.device import BEFORE_STEP, seed_step
 from framework.base.errors import CheckpointError, DivergenceError
+from framework.base.pace import Pace
 from framework.base.processes import alone, from_first, processes
 from framework.data.dataset import Dataset
 from framework.data.sources import POINTS_UNTIL, BatchSource, Request, make_source
 from framework.evaluation.metrics import MAX_PSNR
 from framework.kernels.native import torch_on_one_thread
-from framework.model import StartsFromImages
+from framework.model import KeepsPace, StartsFromImages
 from framework.scene.profile import SceneProfile
+from framework.training.batch_size import BatchSize
 from framework.training.budget import reason_to_stop, spent
 from framework.training.checkpoint import FOLDER, checkpoint_path, load_checkpoint, load_newest, save_checkpoint
 from framework.training.graphs import kind_of_step, make_graphs
@@ -46,10 +48,6 @@ TOLD_SECONDS = 0.5
 """Seconds of preparation from which on they are reported."""
 MAX_BAD_STEPS = 10
 """Number of consecutive non-finite steps after which a run stops."""
-SMALLEST_BATCH, LARGEST_BATCH = 64, 2**17
-"""Minimum and maximum number of rays per step, if it depends on the number of samples."""
-BATCH_CHANGES = 1.2
-"""Factor by which the wanted number of rays must have changed where steps are recorded, which holds for their sizes."""
 BetweenSteps = Callable[[StepReport, Sequence[int]], None]
 """Function of a step's report and of the signals received so far, which grow while it runs."""
 
@@ -90,7 +88,9 @@ class Trainer:
         mode = self.config.machine.cuda_graphs
         self.graphs = make_graphs(mode, self.device, self._learnt, lambda taken: taken[1].loss.total)
         self.held_out = HeldOut(self.run, self.model, eval_set)
-        self._rays_a_step = 0
+        self.batch_size: BatchSize | None = None
+        if isinstance(self.config, RayConfig):
+            self.batch_size = BatchSize(self.config, recorded=self.graphs is not None)
         self._bad_in_a_row = 0
         self._prepared = False
         self._saved_step: int | None = None
@@ -255,6 +255,8 @@ class Trainer:
 
     def _train_step(self) -> StepReport:
         state, start = self.state, time.perf_counter()
+        if self.config.max_seconds is not None and processes().count == 1:  # several must take steps of one size
+            self._keep_pace(Pace(state.step, state.seconds, self.config.max_seconds, self.steps_per_read))
         batch, result = self._drawn_and_taken()
         self.source.learn(batch, result.squared_errors)
         weights = getattr(batch, "weights", None)
@@ -281,6 +283,13 @@ class Trainer:
             held_out=state.newest_held_out(self.first_step),
         )
 
+    def _keep_pace(self, pace: Pace) -> None:
+        """Let sizes follow the time of the last steps."""
+        if isinstance(self.model, KeepsPace):
+            self.model.keep_pace(pace)
+        if self.batch_size is not None:
+            self.batch_size.keep_pace(pace)
+
     def _drawn_and_taken(self) -> tuple[Any, StepResult]:
         """Return a batch and the result of a step on it; both are written to by the next step."""
         model, source, optimizer, request = self.model, self.source, self.optimizer, self._request()
@@ -306,24 +315,15 @@ class Trainer:
 
     def _request(self) -> Request:
         """Return what the next batch is to hold: one ray per pixel at first, later as many as in rendering."""
-        config = self.config
-        if not isinstance(config, RayConfig):
-            return Request(self.state.step, 0)
+        config, state = self.config, self.state
+        if self.batch_size is None:
+            return Request(state.step, 0)
+        assert isinstance(config, RayConfig)
         late = self.progress >= config.train_rays_per_pixel_from
         rays_per_pixel = config.rays_per_pixel if late else 1
-        num_pixels = max(self._num_rays(config) // rays_per_pixel, 1)
+        rays = self.batch_size.rays(self.model.samples_per_step, state.samples_per_ray)
         points = self.train_set.sparse_depth is not None and self.progress < POINTS_UNTIL
-        return Request(self.state.step, num_pixels, rays_per_pixel, points)
-
-    def _num_rays(self, config: RayConfig) -> int:
-        samples = self.model.samples_per_step
-        if samples is None:
-            return config.num_rays_per_batch
-        wanted = round(samples / max(self.state.samples_per_ray, 0.1))
-        wanted = min(max(wanted, SMALLEST_BATCH), LARGEST_BATCH)
-        if self.graphs is None or not wanted / BATCH_CHANGES <= self._rays_a_step <= wanted * BATCH_CHANGES:
-            self._rays_a_step = wanted
-        return self._rays_a_step
+        return Request(state.step, max(rays // rays_per_pixel, 1), rays_per_pixel, points)
 
     def _count_bad(self, step: int, finite: bool) -> None:
         """Count dropped steps; raise DivergenceError after too many in a row."""

@@ -6,8 +6,10 @@ from typing import Any
 import pytest
 import torch
 
-from framework import Dataset, GaussianModel, Loss, Method, ViewBatch
+from framework import Dataset, GaussianModel, Loss, Method, Scene, ViewBatch
+from framework.base.pace import Pace
 from framework.splats.drawing import draw, splat_camera
+from framework.splats.learning import FEWEST_STEPS, MOST_MOVES, MOST_STEPS, MOVES_PER_DOUBLING, steps_per_move
 from framework.splats.settings import SplattingConfig, decide_splatting
 from framework.splats.start import first_points, from_points, seen_colors
 from framework.tools.testing import check_method
@@ -28,6 +30,7 @@ class Plain(GaussianModel[SplattingConfig]):
 
 
 METHOD = Method(SplattingConfig(), paper="", model=Plain, decide=decide_splatting)
+SCENE = Scene(torch.tensor([[-1.0] * 3, [1.0] * 3]), 1.0, 6.0, 4, True, False, 32, image_pixels=400 * 400)
 FEW: dict[str, Any] = {"num_gaussians": 600, "start_gaussians": 400, "steps_per_move": 10}
 
 
@@ -38,3 +41,25 @@ def test_a_start_and_a_loss_are_a_method(strategy: str) -> None:
     findings = check_method(METHOD, "plain", dataclasses.replace(METHOD.config, strategy=strategy, **FEW))
     assert [finding.line() for finding in findings if not finding.ok] == []
     assert len(findings) > 10
+
+
+def test_there_are_enough_changes_to_reach_the_maximum() -> None:
+    for strategy, changes in MOVES_PER_DOUBLING.items():
+        once = steps_per_move(300.0, 30_000, 60_000, strategy)
+        assert once == pytest.approx(300 / min(changes, MOST_MOVES), abs=1)
+        assert 300 / steps_per_move(300.0, 100, 60_000, strategy) == pytest.approx(300 / FEWEST_STEPS)
+        assert steps_per_move(1_000.0, 100, 60_000, strategy) == 1_000 // MOST_MOVES
+    assert steps_per_move(500.0, 60_000, 60_000, "adc") == MOST_STEPS
+    assert steps_per_move(0.0, 10, 60_000, "adc") == FEWEST_STEPS
+
+
+@pytest.mark.parametrize(("given", "expected"), [({}, FEWEST_STEPS), ({"steps_per_move": 40}, 40)])
+def test_a_slow_run_changes_the_number_more_often(given: dict[str, Any], expected: int) -> None:
+    """A second a step leaves 50 steps: far too few for changes each 100 steps, whatever was expected."""
+    config, _ = decide_splatting(SplattingConfig(max_seconds=60.0, start_gaussians=100, **given), SCENE)
+    model = Plain(config, SCENE)
+    assert model.steps_per_move == given.get("steps_per_move", MOST_STEPS)
+    for step in range(4):
+        model.keep_pace(Pace(step, float(step), 60.0))
+        model.before_step(step, step / 60)
+    assert model.steps_per_move == expected

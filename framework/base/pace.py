@@ -1,0 +1,70 @@
+"""The pace of a run with a budget in seconds, and the times of its steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+SHARE_OF_LAST = 0.1
+"""Share that the last measurement has in the running mean."""
+
+
+@dataclass(frozen=True)
+class Pace:
+    """Steps and seconds of a run so far, and the seconds that it has."""
+
+    step: int
+    """Number of training steps done."""
+    seconds: float
+    """Seconds of training so far."""
+    budget: float
+    """Seconds of training in all."""
+    steps_per_read: int = 1
+    """Steps after which the device is waited for: seconds count what it computes only over so many steps."""
+
+    @property
+    def progress(self) -> float:
+        """Share of the budget that is spent."""
+        return min(self.seconds / self.budget, 1.0)
+
+
+class StepTimes:
+    """Seconds that steps of different sizes take, measured while they are taken.
+
+    The first measurement of a run is left out, as the first step allocates and compiles. When a size is measured again,
+    all sizes are taken to have changed by its ratio: more primitives and other programs slow down all of them.
+    """
+
+    def __init__(self) -> None:
+        self._seconds: dict[int, float] = {}
+        self._size: int | None = None
+        self._start: Pace | None = None
+        self._last: Pace | None = None
+        self._warm = False
+
+    def of(self, size: int) -> float | None:
+        """Return the seconds of a step of `size`; None if none was measured."""
+        return self._seconds.get(size)
+
+    def learn(self, pace: Pace, size: int) -> None:
+        """Measure the steps since the last call.
+
+        Args:
+            pace: the run after these steps.
+            size: their size.
+        """
+        if size != self._size:
+            self._size, self._start = size, self._last
+        if self._start is not None and pace.step - self._start.step >= pace.steps_per_read:
+            self._take(size, (pace.seconds - self._start.seconds) / (pace.step - self._start.step))
+            self._start = pace
+        self._last = pace
+        self._start = self._start or pace
+
+    def _take(self, size: int, found: float) -> None:
+        if not self._warm:
+            self._warm = True
+        elif not (known := self._seconds.get(size, 0.0)) > 0:
+            self._seconds[size] = found
+        else:
+            ratio = 1 + SHARE_OF_LAST * (found / known - 1)
+            self._seconds = {other: seconds * ratio for other, seconds in self._seconds.items()}

@@ -1,0 +1,70 @@
+"""The number of rays of a training step."""
+
+from __future__ import annotations
+
+import math
+
+from framework.base.config import RayConfig
+from framework.base.pace import Pace
+
+SMALLEST_BATCH, LARGEST_BATCH = 64, 2**17
+"""Minimum and maximum number of rays per step, if it depends on the number of samples or on the time."""
+BATCH_CHANGES = 1.2
+"""Factor by which the wanted number of rays must have changed where steps are recorded, which holds for their sizes."""
+SHARE_OF_LAST = 0.2
+"""Share that the last measurement has in the running mean."""
+
+
+class BatchSize:
+    """Number of rays of a training step: as configured, to have a number of samples, or by how fast steps are.
+
+    Args:
+        config: settings of a method that casts rays.
+        recorded: whether steps are recorded and repeated, so that each change costs time.
+    """
+
+    def __init__(self, config: RayConfig, recorded: bool) -> None:
+        self.config, self.recorded = config, recorded
+        self._most: float = config.num_rays_per_batch
+        self._rays_per_second: float | None = None
+        self._measured: Pace | None = None
+        self._drawn = self._last = 0
+
+    def keep_pace(self, pace: Pace) -> None:
+        """Limit the number of rays by the time, so that there are enough steps.
+
+        A time in which N rays can be drawn has N / R steps of R rays: there are S steps for each ray of a step if R is
+        the square root of N / S. The first steps are small, as it is not known how long they take.
+
+        Args:
+            pace: the run before a step.
+        """
+        balance = self.config.steps_per_ray
+        if not balance:
+            return
+        if self._measured is None:
+            self._measured = pace
+            self._most = self.config.num_rays_per_batch if self.recorded else SMALLEST_BATCH
+        elif pace.step - self._measured.step >= pace.steps_per_read and pace.seconds > self._measured.seconds:
+            found = self._drawn / (pace.seconds - self._measured.seconds)
+            known = found if self._rays_per_second is None else self._rays_per_second
+            self._rays_per_second = known + SHARE_OF_LAST * (found - known)
+            self._most = math.sqrt(pace.budget * self._rays_per_second / balance)
+            self._measured, self._drawn = pace, 0
+
+    def rays(self, samples: int | None, samples_per_ray: float) -> int:
+        """Return the number of rays of the next step.
+
+        Args:
+            samples: number of samples that it is to have; None if the number of rays is given.
+            samples_per_ray: mean over recent steps.
+        """
+        if samples is None:
+            given = self.config.num_rays_per_batch
+            wanted = min(max(round(self._most), min(SMALLEST_BATCH, given)), given)
+        else:
+            wanted = min(max(round(samples / max(samples_per_ray, 0.1)), SMALLEST_BATCH), LARGEST_BATCH)
+        if not self.recorded or not wanted / BATCH_CHANGES <= self._last <= wanted * BATCH_CHANGES:
+            self._last = wanted
+        self._drawn += self._last
+        return self._last

@@ -1,0 +1,75 @@
+"""The speed of this machine, which is measured before a run decides on its sizes."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import TypeVar
+
+import torch
+
+from framework.base.config import TrainConfig
+from framework.base.decisions import Decision
+from framework.base.device import device_kind, relative_speed
+from framework.base.processes import processes
+from framework.encodings.hash_grid import HashGrid
+from framework.fields.encoded import EncodedField
+from framework.geometry.points import Points
+
+ConfigT = TypeVar("ConfigT", bound=TrainConfig)
+SAMPLES = 2**14
+"""Samples of the step that is timed."""
+REFERENCE = 11.6e-3
+"""Seconds that it takes on two quiet cores of the machine on which settings were found by trials: an AMD EPYC (Zen 4)
+with AVX-512."""
+MEASURED_FOR = 0.25
+"""Seconds for which steps are timed."""
+LEAST_BUDGET = 10.0
+"""Seconds of training below which it is not worth the time of a measurement."""
+USUAL = 1.4
+"""Ratio to the expected speed up to which a measurement counts as that, so that equal runs decide alike."""
+
+
+def with_speed(config: ConfigT) -> tuple[ConfigT, list[Decision]]:
+    """Return settings with the speed of this machine.
+
+    It is measured where settings depend on it: in one process, on a CPU, with a budget of `LEAST_BUDGET` seconds.
+
+    Args:
+        config: a method's settings; a speed that is given stays.
+
+    Returns:
+        The settings, and a record of a speed that differs from the usual one.
+    """
+    machine = config.machine
+    fixed = (config.max_seconds or 0.0) < LEAST_BUDGET or machine.speed is not None or processes().count > 1
+    if fixed or device_kind(machine) != "cpu":
+        return config, []
+    usual, found = relative_speed(machine), REFERENCE / step_seconds()
+    if usual / USUAL < found < usual * USUAL:
+        return config, []
+    found = float(f"{found:.2g}")
+    return replace(config, machine=replace(machine, speed=found)), [
+        Decision("speed of this machine", f"{found:g} of the usual", "measured (else: --machine.speed)")
+    ]
+
+
+def step_seconds() -> float:
+    """Return the mean seconds of a small training step of a hash grid and two networks, without the first."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        grid = HashGrid(max_resolution=256, log2_table_size=16, sparse=True)
+        field = EncodedField(torch.tensor([[0.0] * 3, [1.0] * 3]), grid, 64, direction_levels=4)
+        points = Points(torch.rand(SAMPLES, 3))
+        directions = torch.nn.functional.normalize(torch.randn(SAMPLES, 3), dim=-1)
+    steps, start = -1, time.perf_counter()
+    while steps < 1 or time.perf_counter() - start < MEASURED_FOR:
+        density, features = field.density(points)
+        colors = field.color(features, directions)
+        (density.mean() + colors.mean()).backward()
+        field.zero_grad()
+        grid.deferred.clear()
+        steps += 1
+        if steps == 0:
+            start = time.perf_counter()
+    return (time.perf_counter() - start) / steps

@@ -192,7 +192,7 @@ class RayConfig(TrainConfig):
     """Allowed ranges."""
     num_rays_per_batch: int = 4_096
     """Rays per training step; with --max-seconds the maximum, see --steps-per-ray."""
-    steps_per_ray: float = 3.0
+    steps_per_ray: float = 1.0
     """With --max-seconds, as measured, a training step has no more rays than steps fit into the time, over this: few
     steps are better small. 0: always --num-rays-per-batch. Without effect on --samples-per-batch."""
     rays_per_pixel: RaysPerPixel = 1

@@ -30,8 +30,8 @@ def steps(config: RayConfig, budget: float, fixed: float, each: float, slower: f
     return rays
 
 
-@pytest.mark.parametrize("each", [1e-5, 3e-5, 1e-3])
-def test_there_are_three_steps_for_each_ray_of_one(each: float) -> None:
+@pytest.mark.parametrize("each", [3e-5, 1e-3])
+def test_there_are_as_many_steps_as_rays_in_one(each: float) -> None:
     rays = steps(CONFIG, 60.0, 0.005, each)
     assert rays[0] == SMALLEST_BATCH  # as it is not known how long a step takes
     usual = rays[len(rays) // 2]

@@ -19,7 +19,7 @@ class Pace:
     budget: float
     """Seconds of training in all."""
     steps_per_read: int = 1
-    """Steps after which the device is waited for: seconds count what it computes only over so many steps."""
+    """Steps between two waits for the device. Seconds are exact only over a multiple of this number."""
 
     @property
     def progress(self) -> float:

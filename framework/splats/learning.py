@@ -36,7 +36,7 @@ def steps_per_move(steps: float, first: int, most: int, strategy: str) -> int:
     """Return after how many steps the number of Gaussians changes, so that there are changes enough in a short run.
 
     Args:
-        steps: steps of the run in which it may change.
+        steps: steps of the run during growth.
         first: number of Gaussians at the start.
         most: maximum number.
         strategy: how they come and go.

@@ -1,4 +1,4 @@
-"""Images of reduced sizes, from which training begins: coarse to fine."""
+"""Images of reduced sizes: training goes from coarse to fine."""
 
 from __future__ import annotations
 

@@ -23,8 +23,8 @@ class MachineConfig:
     num_threads: int | None = None
     """CPU threads; all cores if not given."""
     speed: float | None = None
-    """How fast this machine trains, relative to two quiet cores of the server on which settings were found. If not
-    given: measured on a CPU if there is --max-seconds, else by the number of threads."""
+    """How fast this machine trains, relative to two quiet cores of the server that settings were tuned on. If not
+    given: measured on a CPU if --max-seconds is at least 10, else by the number of threads."""
     cuda_graphs: Literal["auto", "on", "off"] = "auto"
     """Record training steps on a GPU as CUDA graphs and repeat them, which saves the time to start each operation.
     auto: where steps are alike, if a repeated step has the loss and the effect of one without; a line says why not."""

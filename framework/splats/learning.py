@@ -14,10 +14,11 @@ USUAL_STEPS = 30_000
 """Steps of a run of 3D Gaussian Splatting, for which its learning rates are."""
 
 MOVES_PER_DOUBLING = {"adc": 5, "mcmc": 15}
-"""Changes of the number of Gaussians in which it doubles, about, by strategy: growth by gradients was seen to double it
-in 4.5 to 6, and the other adds 5 % at a time."""
+"""Changes that double the number of Gaussians, about, by strategy: growth by gradients was seen to need 4.5 to 6, and
+the other strategy adds 5 % at a time."""
 MOST_MOVES = 16
-"""Changes that are wanted in a run at most; with more, captures of 2,000 steps had more Gaussians and were worse."""
+"""Maximum number of changes that are wanted in a run. More gave a capture of 2,000 steps half as many Gaussians again,
+and no better images."""
 FEWEST_STEPS, MOST_STEPS = 20, 100
 """Least and most steps between two changes of the number of Gaussians."""
 

@@ -13,12 +13,12 @@ from framework.base.pace import Pace, StepTimes
 REDUCED_SHARE = 0.4
 """Share of the budget for reduced images where there are enough steps at full size."""
 ENOUGH_STEPS, SHARE_POWER, LEAST_WHOLE = 700, 0.7, 0.1
-"""Steps at full size that a whole budget should have room for; power by which the share for full size falls with their
+"""Steps at full size that should fit into a whole budget; exponent of the share for full size as a function of their
 number; and the least share for full size."""
 LEAST_SIDE = 150
 """Minimum side of reduced images, pixels of a square with as many."""
 QUICKER = 3.0
-"""Ratio of the times of two steps, of which one has images of half the size, where only one was measured."""
+"""Assumed ratio of the time of a step to that of a step with images of half the size, until both are measured."""
 
 
 def octaves_at(progress: float, share: float, most: int) -> int:
@@ -42,7 +42,7 @@ def share_for(steps: float) -> float:
     """Return the share of the budget for reduced images.
 
     Args:
-        steps: number of steps at full size for which the whole budget has room.
+        steps: number of steps at full size that fit into the whole budget.
     """
     whole = (1 - REDUCED_SHARE) * min(steps / ENOUGH_STEPS, 1.0) ** SHARE_POWER
     return 1 - max(whole, LEAST_WHOLE)

@@ -10,7 +10,7 @@ from framework.base.pace import Pace
 SMALLEST_BATCH, LARGEST_BATCH = 64, 2**17
 """Minimum and maximum number of rays per step, if it depends on the number of samples or on the time."""
 BATCH_CHANGES = 1.2
-"""Factor by which the wanted number of rays must have changed where steps are recorded, which holds for their sizes."""
+"""Ratio of two numbers of rays up to which recorded steps keep theirs: a recording is for one size."""
 SHARE_OF_LAST = 0.2
 """Share that the last measurement has in the running mean."""
 

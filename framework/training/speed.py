@@ -68,7 +68,8 @@ def step_seconds() -> float:
         colors = field.color(features, directions)
         (density.mean() + colors.mean()).backward()
         field.zero_grad()
-        grid.deferred.clear()
+        if grid.deferred is not None:
+            grid.deferred.clear()
         steps += 1
         if steps == 0:
             start = time.perf_counter()

@@ -21,6 +21,7 @@ from framework.samplers import proposal
 from framework.tools.benchmarks.operations import trainer_of
 from framework.tools.testing.scenes import moving_ball
 from framework.training import graphs
+from framework.training.batch_size import BatchSize
 from framework.training.graphs import WARM_UP, CudaRecorder, StepGraphs, kind_of_step, make_graphs
 from framework.training.state import State
 from framework.training.trainer import MAX_BAD_STEPS, Trainer
@@ -43,6 +44,8 @@ def recorded(trainer: Trainer, must: bool = False) -> FakeRecorder:
     """Let a trainer record its steps, by the stand-in for graphs."""
     recorder = FakeRecorder()
     trainer.graphs = StepGraphs(recorder, trainer._learnt, must)
+    if trainer.batch_size is not None:
+        trainer.batch_size = BatchSize(trainer.batch_size.config, recorded=True)
     return recorder
 
 

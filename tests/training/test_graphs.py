@@ -43,10 +43,15 @@ def said(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def recorded(trainer: Trainer, must: bool = False) -> FakeRecorder:
     """Let a trainer record its steps, by the stand-in for graphs."""
     recorder = FakeRecorder()
-    trainer.graphs = StepGraphs(recorder, trainer._learnt, must)
+    repeat_by(trainer, StepGraphs(recorder, trainer._learnt, must))
+    return recorder
+
+
+def repeat_by(trainer: Trainer, graphs: StepGraphs[Any]) -> None:
+    """Let a trainer take its steps by graphs, in sizes that hold for a while."""
+    trainer.graphs = graphs
     if trainer.batch_size is not None:
         trainer.batch_size = BatchSize(trainer.batch_size.config, recorded=True)
-    return recorder
 
 
 @functools.cache
@@ -127,7 +132,8 @@ def test_repeated_steps_with_an_occupancy_grid_learn_what_steps_learn(
     if method == "tensorf":
         sizes |= {"max_num_iterations": 100, "upsample_at": (0.22,), "first_voxels": 8**3, "last_voxels": 16**3}
     usual, repeating = (small(tmp_path / name, method, moving, **sizes) for name in ("usual", "repeating"))
-    usual.graphs, recorder = Unrepeated(FakeRecorder(), usual._learnt), recorded(repeating)
+    repeat_by(usual, Unrepeated(FakeRecorder(), usual._learnt))
+    recorder = recorded(repeating)
     kinds, steps = set(), 34
     for trainer in (usual, repeating):
         trainer.steps_per_read = 8
